@@ -1,0 +1,1 @@
+"""Blocks, the Dask run, the Zarr store. Nothing here knows of OpenCV."""

@@ -1,0 +1,341 @@
+"""The Zarr store: laid out by the template, written a block at a time, committed by receipts.
+
+A block's values are written first and its receipt last, so that a block is either whole or not
+there. The receipts are the checkpoint; that a chunk exists says nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+import uuid
+import warnings
+from collections.abc import AsyncIterator, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+import zarr
+import zarr.errors
+from numpy.typing import NDArray
+from zarr.abc.store import Store
+from zarr.codecs import Crc32cCodec, ZstdCodec
+from zarr.core.buffer import cpu, default_buffer_prototype
+from zarr.core.sync import sync
+from zarr.dtype import VariableLengthUTF8
+
+from sweep.engine.fingerprint import environment, fingerprint
+from sweep.errors import StoreError
+from sweep.model.camera import intrinsics
+from sweep.plan.axes import Axis
+from sweep.plan.grid import CAMERA, Block, Blocks, scene_axes
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.template import LABELS, TEMPLATE, Variable
+
+FORMAT = 1
+"""Version of the store's layout."""
+
+RECEIPTS = "sweep-blocks"
+"""Where the receipts of committed blocks lie, beside the arrays."""
+
+COORDINATE_CHUNK = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class RunStore:
+    """An open store: where it is, what it holds, and how its grid is cut."""
+
+    url: str
+    group: zarr.Group
+    pipeline: Pipeline
+    run_id: str
+    blocks: Blocks
+
+    @property
+    def finished(self) -> bool:
+        """Whether every block is committed and the store is closed."""
+        return bool(self.group.attrs.get("sweep", {}).get("finished", False))
+
+    @property
+    def fingerprint(self) -> dict[str, Any]:
+        """The fingerprint of the run that made the store."""
+        return dict(self.group.attrs["sweep"]["fingerprint"])
+
+
+def is_remote(url: str) -> bool:
+    """Tell whether a store is not a local path."""
+    return "://" in url
+
+
+def _open_group(url: str, mode: str) -> zarr.Group:
+    return zarr.open_group(url, mode=mode, use_consolidated=False)  # type: ignore[arg-type]
+
+
+def exists(url: str) -> bool:
+    """Tell whether anything is at a store's place."""
+    if not is_remote(url):
+        return Path(url).exists() or Path(url).is_symlink()
+    try:
+        _open_group(url, "r")
+    except (FileNotFoundError, zarr.errors.GroupNotFoundError):
+        return False
+    return True
+
+
+def open_store(url: str, mode: str = "r") -> RunStore:
+    """Open a store that :func:`create_store` made.
+
+    Raises
+    ------
+    StoreError
+        Where there is none, or something else.
+    """
+    if not exists(url):
+        raise StoreError(f"{url}: there is no store; `sweep run` makes one")
+    try:
+        group = _open_group(url, mode)
+        about = dict(group.attrs["sweep"])
+        pipeline = Pipeline.from_text(
+            group.attrs["pipeline"], name=about["name"], source=f"{url} (its pipeline)",
+            folder=about["folder"], files=about["fingerprint"]["files"],
+        )
+        if about["format"] != FORMAT:
+            raise StoreError(f"{url}: store format {about['format']}, expected {FORMAT}")
+        blocks = Blocks(
+            tuple(len(axis) for axis in scene_axes(pipeline)), tuple(about["block"])
+        )
+        return RunStore(url, group, pipeline, about["run_id"], blocks)
+    except (KeyError, TypeError, ValueError, OSError, zarr.errors.BaseZarrError) as error:
+        if isinstance(error, PermissionError):
+            raise StoreError(f"{url}: cannot be read: {error.strerror}") from None
+        raise StoreError(
+            f"{url}: holds something else than a store of sweep; name another place"
+        ) from None
+
+
+def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunStore:
+    """Lay out an empty store for a pipeline, its chunks equal to blocks of ``extents``.
+
+    Raises
+    ------
+    StoreError
+        Where the place cannot be written.
+    """
+    run_id = uuid.uuid4().hex
+    try:
+        if not is_remote(url):
+            Path(url).parent.mkdir(parents=True, exist_ok=True)
+        group = _open_group(url, "w-")
+        scene_extent = dict(
+            zip((axis.name for axis in scene_axes(pipeline)), extents, strict=True)
+        )
+        for axis in pipeline.axes:
+            _write_axis(group, axis)
+        used = {name for variable in TEMPLATE for name in variable.inner}
+        for name in sorted(used):
+            _write_strings(group, name, LABELS[name], {})
+        coordinates = _write_distance(group, pipeline)
+        for variable in TEMPLATE:
+            _create_variable(group, variable, pipeline, scene_extent)
+        group.attrs.update(
+            {
+                "title": pipeline.title or pipeline.name,
+                "pipeline": pipeline.text,
+                **({"coordinates": " ".join(coordinates)} if coordinates else {}),
+                "sweep": {
+                    "format": FORMAT,
+                    "name": pipeline.name,
+                    "folder": pipeline.folder,
+                    "run_id": run_id,
+                    "block": list(extents),
+                    "fingerprint": fingerprint(pipeline),
+                    "environment": environment(),
+                    "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+                    "finished": False,
+                },
+            }
+        )
+    except OSError as error:
+        raise StoreError(f"{url}: cannot be written: {error.strerror or error}") from None
+    return open_store(url, "r+")
+
+
+def remove_store(url: str) -> None:
+    """Delete a store of sweep, and nothing else.
+
+    Raises
+    ------
+    StoreError
+        Where something else is there, or it cannot be deleted.
+    """
+    store = open_store(url, "r+")
+    try:
+        if is_remote(url):
+            sync(store.group.store.clear())
+            return
+        # Out of the way at once, then at leisure: a kill between leaves no half a store.
+        doomed = Path(url).with_name(f".{Path(url).name}.{uuid.uuid4().hex[:8]}.deleted")
+        Path(url).rename(doomed)
+        shutil.rmtree(doomed, ignore_errors=True)
+    except OSError as error:
+        raise StoreError(f"{url}: cannot be overwritten: {error.strerror or error}") from None
+
+
+def _codecs() -> list[Any]:
+    """Return the codecs of every array: a damaged chunk fails its checksum when it is read."""
+    return [ZstdCodec(level=3), Crc32cCodec()]
+
+
+def _create_variable(
+    group: zarr.Group, variable: Variable, pipeline: Pipeline, scene_extent: dict[str, int]
+) -> None:
+    names, shape = variable.dimensions(pipeline), variable.shape(pipeline)
+    chunks = tuple(
+        scene_extent.get(name, length) for name, length in zip(names, shape, strict=True)
+    )
+    group.create_array(
+        variable.name, shape=shape, chunks=chunks or (), dtype=variable.dtype,
+        fill_value=variable.fill, dimension_names=names, compressors=_codecs(),
+        attributes=variable.attributes(),
+    )
+
+
+def _write_axis(group: zarr.Group, axis: Axis) -> None:
+    attributes = {"long_name": axis.meaning, **({"units": axis.unit} if axis.unit else {})}
+    first = axis.coordinates(0, 1)
+    if isinstance(first.dtype, np.dtypes.StringDType):
+        _write_strings(group, axis.name, axis.coordinates().tolist(), attributes)
+        return
+    chunk = min(len(axis), COORDINATE_CHUNK)
+    array = group.create_array(
+        axis.name, shape=(len(axis),), chunks=(chunk,), dtype=first.dtype,
+        dimension_names=(axis.name,), compressors=_codecs(), attributes=attributes,
+    )
+    for start in range(0, len(axis), chunk):
+        stop = min(start + chunk, len(axis))
+        array[start:stop] = axis.coordinates(start, stop)
+
+
+def _write_strings(
+    group: zarr.Group, name: str, labels: Iterable[str], attributes: dict[str, str]
+) -> None:
+    values = np.array(list(labels), dtype=object)
+    array = group.create_array(
+        name, shape=values.shape, chunks=values.shape, dtype=VariableLengthUTF8(),
+        dimension_names=(name,), attributes=attributes,
+    )
+    array[:] = values
+
+
+def _write_distance(group: zarr.Group, pipeline: Pipeline) -> list[str]:
+    """Write ``distance_m`` as a coordinate where it follows from ``side_px``; return its name."""
+    sides = pipeline.values_of("side_px")
+    if not sides or sides[0] is None:
+        return []
+    names = (*CAMERA, "size_m", "side_px")
+    axes = [axis for axis in scene_axes(pipeline) if axis.name in names]
+    grids = np.meshgrid(
+        *(np.array(axis.values, dtype=np.float64) for axis in axes), indexing="ij", sparse=True
+    )
+    values = {**{name: pipeline.fixed.get(name) for name in names},
+              **{axis.name: grid for axis, grid in zip(axes, grids, strict=True)}}
+    fx = intrinsics(*(values[name] for name in CAMERA))[0]
+    distance = np.asarray(fx * values["size_m"] / values["side_px"], dtype=np.float64)
+    array = group.create_array(
+        "distance_m", shape=distance.shape, chunks=distance.shape, dtype="f8",
+        dimension_names=tuple(axis.name for axis in axes),
+        attributes={"long_name": "depth of the marker's centre along the optical axis",
+                    "units": "m"},
+    )
+    array[...] = distance
+    return ["distance_m"]
+
+
+def region(variable: Variable, pipeline: Pipeline, block: Block) -> tuple[slice, ...]:
+    """Return a block's part of a variable's array."""
+    cuts = {
+        axis.name: slice(start, stop)
+        for axis, start, stop in zip(
+            scene_axes(pipeline), block.starts, block.stops, strict=True
+        )
+    }
+    return tuple(cuts.get(name, slice(None)) for name in variable.dimensions(pipeline))
+
+
+def write_block(
+    store: RunStore, block: Block, values: dict[str, NDArray[Any]], receipt: dict[str, Any]
+) -> None:
+    """Write a block's values, then commit them by its receipt."""
+    # A committed chunk exists even where it is all fill value: a missing one is a deleted one.
+    with zarr.config.set({"array.write_empty_chunks": True}):
+        for variable in TEMPLATE:
+            array = store.group[variable.name]
+            array[region(variable, store.pipeline, block)] = values[variable.name]
+    put(store.group.store, f"{RECEIPTS}/{block}.json", {"run_id": store.run_id, **receipt})
+
+
+def put(store: Store, key: str, content: dict[str, Any]) -> None:
+    """Write a small JSON document beside the arrays."""
+    encoded = json.dumps(content, separators=(",", ":")).encode()
+    sync(store.set(key, cpu.Buffer.from_bytes(encoded)))
+
+
+def get(store: Store, key: str) -> dict[str, Any] | None:
+    """Read a small JSON document; None where it is not there or is torn."""
+    buffer = sync(store.get(key, default_buffer_prototype()))
+    if buffer is None:
+        return None
+    try:
+        content = json.loads(buffer.to_bytes())
+    except ValueError:
+        return None
+    return content if isinstance(content, dict) else None
+
+
+def committed(store: RunStore) -> set[str]:
+    """Return the names of the blocks that are committed."""
+    async def gather(keys: AsyncIterator[str]) -> set[str]:
+        return {key.removesuffix(".json") async for key in keys if key.endswith(".json")}
+
+    try:
+        return sync(gather(store.group.store.list_dir(RECEIPTS)))
+    except FileNotFoundError:
+        return set()
+
+
+def receipts(store: RunStore, names: Iterable[str]) -> Iterable[tuple[str, dict[str, Any]]]:
+    """Yield the receipts of committed blocks by name."""
+    for name in names:
+        receipt = get(store.group.store, f"{RECEIPTS}/{name}.json")
+        if receipt is not None:
+            yield name, receipt
+
+
+def finish(store: RunStore, cost: xr.Dataset) -> None:
+    """Close a complete store: its cost group, the mark, and the metadata in one place."""
+    about = dict(store.group.attrs["sweep"])
+    about["finished"] = True
+    about["finished_at"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+    with warnings.catch_warnings():
+        # Consolidated metadata is not part of the Zarr 3 specification; xarray reads it, and
+        # warns where it is missing.
+        warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
+        cost.to_zarr(store.url, group="cost", mode="w", zarr_format=3, consolidated=False)
+        store.group.attrs["sweep"] = about
+        zarr.consolidate_metadata(store.group.store, zarr_format=3)
+
+
+def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
+    """Open a store's results, lazily; also those of an unfinished one.
+
+    Raises
+    ------
+    StoreError
+        Where there is none, or something else.
+    """
+    store = open_store(os.fspath(url))
+    return xr.open_zarr(store.url, consolidated=store.finished)

@@ -1,0 +1,31 @@
+"""The few errors that reach a user: each prints as lines that say what to change."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+class SweepError(Exception):
+    """Something the user can mend; the message is one line a fault, and no traceback is shown."""
+
+
+class PipelineError(SweepError):
+    """A pipeline that cannot be run; it carries all its faults at once.
+
+    Parameters
+    ----------
+    faults
+        One line a fault, each naming file, key, value and what was expected.
+    """
+
+    def __init__(self, faults: Sequence[str]) -> None:
+        super().__init__("\n".join(faults))
+        self.faults = tuple(faults)
+
+
+class StoreError(SweepError):
+    """A store that cannot be written, read or continued as asked."""
+
+
+class RunError(SweepError):
+    """A run that could not go on; what is finished stays in the store."""

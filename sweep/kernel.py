@@ -1,0 +1,390 @@
+"""One block of the experiment: the nested stages scene -> image -> detection -> estimate.
+
+The paper's eleven steps (Poroykov et al., 2020) are found by name: steps 1-6 in
+:func:`sweep.model.scene.build_scenes`, 7-8 in :mod:`sweep.model.render`, 9 in
+:mod:`sweep.measure.detector` and :mod:`sweep.measure.solver`, 10 in
+:mod:`sweep.measure.pose_error`; step 11 is the block. A scene is rendered once for all detector
+settings, and a detection is shared by all estimators.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.measure.detector import Detector, DetectorSetting, full_frame_reason, margin_px, windows
+from sweep.measure.finding import REJECTED_ID, classify
+from sweep.measure.flags import Detection, Estimate, Flipped
+from sweep.measure.pose_error import pose_error, rotation_difference
+from sweep.measure.solver import Estimates, Estimator, estimate
+from sweep.model.camera import Cameras
+from sweep.model.lens import pack
+from sweep.model.pose import vector_of_rotation
+from sweep.model.render import render
+from sweep.model.scene import (
+    Scenes,
+    areas_px,
+    build_scenes,
+    hidden,
+    marker_boxes,
+    not_modelled,
+    outside_frame,
+)
+from sweep.plan.grid import Block, block_indices, detector_settings, estimators, scene_values
+from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.template import TEMPLATE, Variable
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """An exception that one cell raised: which scene of the block, in which stage, and the text."""
+
+    scene: int
+    stage: str
+    text: str
+
+
+@dataclass(slots=True)
+class CellsResult:
+    """What N scene cells gave.
+
+    Attributes
+    ----------
+    columns
+        Variable -> one array (N, ...) per treatment of its stage, the last axis fastest.
+    seconds
+        Time spent: "scene", then "detection" and "estimation" per treatment.
+    row_seconds
+        (N,) time spent on rendering and searching each scene.
+    failures
+        The exceptions that were raised; their cells are flagged ``failed``.
+    """
+
+    columns: dict[str, list[NDArray[Any]]]
+    seconds: dict[str, list[float]]
+    row_seconds: Floats
+    failures: list[Failure] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class BlockResult:
+    """What a block gave: variable -> array in the template's dimensions, and as above."""
+
+    values: dict[str, NDArray[Any]]
+    seconds: dict[str, list[float]]
+    failures: list[Failure] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class Search:
+    """What one detector setting gave on N scenes: flags (N,), found corners (N, 4, 2) px."""
+
+    flags: NDArray[np.uint8]
+    corners: Floats
+    seconds: float
+
+
+def single_thread() -> None:
+    """Keep OpenCV to one thread in this process: parallelism is over blocks."""
+    cv2.setNumThreads(1)
+
+
+def run_block(pipeline: Pipeline, block: Block) -> BlockResult:
+    """Render, detect and estimate every scene of a block."""
+    cells = run_cells(pipeline, block_indices(block))
+    return BlockResult(
+        {v.name: shaped(v, pipeline, block, cells.columns[v.name]) for v in TEMPLATE},
+        cells.seconds,
+        cells.failures,
+    )
+
+
+def run_cells(
+    pipeline: Pipeline,
+    indices: Sequence[NDArray[np.intp]],
+    need: NDArray[np.bool_] | None = None,
+) -> CellsResult:
+    """Render, detect and estimate the scenes at ``indices`` (N,) along each scene axis.
+
+    ``need`` (N, detector settings, estimators) restricts the work to what is asked for; the rest
+    is flagged ``not_run``.
+    """
+    single_thread()
+    count = len(indices[0]) if indices else 1
+    failures: list[Failure] = []
+    start = time.perf_counter()
+    values = scene_values(pipeline, indices)
+    scenes = build_scenes(values, count)
+    visibility = visibility_flags(scenes)
+    settings = detector_settings(pipeline)
+    estimating = estimators(pipeline)
+    if need is None:
+        need = np.ones((count, len(settings), len(estimating)), dtype=bool)
+    to_search = need.any(axis=2) & (visibility == Detection.not_run)[:, None]
+    geometry_s = time.perf_counter() - start
+
+    searches, render_s, row_s = search(
+        scenes, to_search, settings, _full(values, count), failures
+    )
+    seconds: dict[str, list[float]] = {
+        "scene": [geometry_s + render_s],
+        "detection": [found.seconds for found in searches],
+        "estimation": [],
+    }
+    out: dict[str, list[NDArray[Any]]] = {v.name: [] for v in TEMPLATE}
+    out["true_rvec"] = [vector_of_rotation(scenes.rotation)]
+    out["true_tvec_m"] = [scenes.translation]
+    out["marker_area_px"] = [areas_px(scenes)]
+    for k, found in enumerate(searches):
+        flags = np.where(visibility == Detection.not_run, found.flags, visibility)
+        flags[~need[:, k].any(axis=1)] = Detection.not_run
+        out["detection"].append(flags.astype(np.uint8))
+        out["corner_error_px"].append(found.corners - scenes.corners_px)
+        for j, estimator in enumerate(estimating):
+            rows = np.flatnonzero((flags == Detection.detected) & need[:, k, j])
+            begun = time.perf_counter()
+            cameras, size = believed(estimator, values, scenes)
+            estimates = _estimated(
+                found.corners[rows], cameras.take(rows), size[rows], estimator, rows, failures
+            )
+            measured = _measured(estimates, scenes, rows)
+            measured["estimate"][~need[:, k, j]] = Estimate.not_run
+            measured["flipped"][~need[:, k, j]] = Flipped.not_run
+            seconds["estimation"].append(time.perf_counter() - begun)
+            for name, column in measured.items():
+                out[name].append(column)
+    return CellsResult(out, seconds, row_s, failures)
+
+
+def _full(values: dict[str, Any], count: int) -> NDArray[np.bool_]:
+    """Tell (N,) which scenes are rendered as whole frames: as asked, or on a background image."""
+    def matches(name: str, test: Callable[[Any], bool]) -> NDArray[np.bool_]:
+        column = values[name]
+        listed = column if isinstance(column, list) else [column] * count
+        return np.array([test(value) for value in listed], dtype=bool)
+
+    if isinstance(values["background"], np.ndarray):
+        return matches("window", lambda value: value == "full")
+    return matches("window", lambda value: value == "full") | matches(
+        "background", lambda value: isinstance(value, str)
+    )
+
+
+def visibility_flags(scenes: Scenes) -> NDArray[np.uint8]:
+    """Return not_visible, not_modelled, or not_run for scenes (N,) that must be looked at."""
+    flags = np.full(len(scenes), Detection.not_run, dtype=np.uint8)
+    behind = hidden(scenes)
+    flags[behind] = Detection.not_visible
+    flags[not_modelled(scenes) & ~behind] = Detection.not_modelled
+    open_rows = np.flatnonzero(flags == Detection.not_run)
+    flags[open_rows[outside_frame(scenes, open_rows)]] = Detection.not_visible
+    return flags
+
+
+def search_windows(
+    scenes: Scenes, boxes: NDArray[np.int64], setting: DetectorSetting, full: NDArray[np.bool_]
+) -> NDArray[np.int64]:
+    """Return the windows (N, 4) that a setting searches: a function of scene and setting alone."""
+    cut = windows(boxes, scenes.frame, margin_px(setting))
+    whole = full | (full_frame_reason(setting) is not None)
+    frame = np.concatenate([np.zeros_like(scenes.frame), scenes.frame], axis=1)
+    return np.where(whole[:, None], frame, cut)
+
+
+def search(
+    scenes: Scenes,
+    wanted: NDArray[np.bool_],
+    settings: Sequence[DetectorSetting],
+    full: NDArray[np.bool_],
+    failures: list[Failure],
+) -> tuple[list[Search], float, Floats]:
+    """Render scenes once each and search them with the settings ``wanted`` (N, settings).
+
+    ``full`` (N,) tells which are rendered and searched as whole frames. Returns what each setting
+    gave, the seconds spent on rendering, and the seconds spent on each scene (N,).
+    """
+    boxes = marker_boxes(scenes)
+    cut = [search_windows(scenes, boxes, setting, full) for setting in settings]
+    widest = np.concatenate(
+        [
+            np.min([window[:, :2] for window in cut], axis=0),
+            np.max([window[:, 2:] for window in cut], axis=0),
+        ],
+        axis=1,
+    ).tolist()
+    crops = [window.tolist() for window in cut]
+    detectors = [Detector(setting) for setting in settings]
+    sides = scenes.frame.max(axis=1).tolist()
+    owners: list[list[int]] = [[] for _ in settings]
+    ids: list[list[int]] = [[] for _ in settings]
+    quads: list[list[NDArray[np.float32]]] = [[] for _ in settings]
+    failed: list[list[int]] = [[] for _ in settings]
+    seconds = [0.0] * len(settings)
+    render_s = 0.0
+    row_s = np.zeros(len(scenes))
+    clock = time.perf_counter
+    asked = wanted.tolist()
+    for row in np.flatnonzero(wanted.any(axis=1)).tolist():
+        begun = start = clock()
+        try:
+            left, top, right, bottom = widest[row]
+            image = render(scenes, row, boxes[row], (left, top, right, bottom))
+        except Exception:
+            failures.append(Failure(row, "scene", traceback.format_exc()))
+            for rows in failed:
+                rows.append(row)
+            continue
+        now = clock()
+        render_s += now - start
+        for k, detector in enumerate(detectors):
+            if not asked[row][k]:
+                continue
+            start = now
+            x0, y0, x1, y1 = crops[k][row]
+            try:
+                corners, found, rejected = detector.find(
+                    image[y0 - top : y1 - top, x0 - left : x1 - left],
+                    scenes.dictionary[row],
+                    sides[row],
+                )
+            except Exception:
+                failures.append(Failure(row, "detection", traceback.format_exc()))
+                failed[k].append(row)
+                now = clock()
+                continue
+            if found:
+                owners[k].extend([row] * len(found))
+                ids[k].extend(found)
+                quads[k].extend(corners)
+            if rejected and scenes.marker_id[row] not in found:
+                owners[k].extend([row] * len(rejected))
+                ids[k].extend([REJECTED_ID] * len(rejected))
+                quads[k].extend(rejected)
+            now = clock()
+            seconds[k] += now - start
+        row_s[row] = now - begun
+
+    marker_id = np.array(scenes.marker_id, dtype=np.int64)
+    searches = []
+    for k in range(len(settings)):
+        start = clock()
+        owner = np.array(owners[k], dtype=np.intp)
+        found_px = np.empty((0, 4, 2))
+        if len(owner):
+            found_px = np.concatenate(quads[k]).astype(np.float64) + cut[k][owner, None, :2]
+        flags, found_corners = classify(
+            scenes.corners_px, marker_id, owner, np.array(ids[k], dtype=np.int64), found_px
+        )
+        flags[failed[k]] = Detection.failed
+        searches.append(Search(flags, found_corners, seconds[k] + clock() - start))
+    return searches, render_s, row_s
+
+
+def believed(
+    estimator: Estimator, values: dict[str, Any], scenes: Scenes
+) -> tuple[Cameras, Floats]:
+    """Return cameras and sizes (N,) as the estimator believes them."""
+    view, size = scenes.cameras.view, scenes.size_m
+    lenses, distorted = scenes.cameras.lenses, scenes.cameras.distorted
+    drawn = {name: values[name] for name in values if name.startswith("believed_")}
+
+    def belief(name: str) -> Any:
+        own = getattr(estimator, name)
+        column = drawn.get(name)
+        return column if isinstance(column, np.ndarray) else own
+
+    for k, name in enumerate(("fx_px", "fy_px", "cx_px", "cy_px")):
+        value = belief(f"believed_{name}")
+        if value is not None:
+            view = view.copy() if view is scenes.cameras.view else view
+            view[:, k] = value
+    if belief("believed_size_m") is not None:
+        size = np.array(np.broadcast_to(belief("believed_size_m"), size.shape), dtype=np.float64)
+    if estimator.believed_distortion is not None:
+        packed = pack(estimator.believed_distortion)
+        lenses = np.repeat(packed[None], len(scenes), axis=0)
+        distorted = np.full(len(scenes), bool(packed[:14].any()))
+    return Cameras(view, lenses, distorted), size
+
+
+def _estimated(
+    corners: Floats, cameras: Cameras, size: Floats, estimator: Estimator,
+    rows: NDArray[np.intp], failures: list[Failure],
+) -> Estimates:
+    """Estimate poses (n,); where the batch raises, one by one, so that one costs only itself."""
+    arguments = (estimator.solver, estimator.guarded, estimator.reprojection_limit)
+    try:
+        return estimate(corners, cameras, size, *arguments)
+    except Exception:
+        parts = []
+        for i in range(len(rows)):
+            one = slice(i, i + 1)
+            try:
+                parts.append(estimate(corners[one], cameras.take([i]), size[one], *arguments))
+            except Exception:
+                failures.append(Failure(int(rows[i]), "estimation", traceback.format_exc()))
+                parts.append(Estimates.none(1, Estimate.failed))
+        return Estimates.joined(parts)
+
+
+def _measured(
+    estimates: Estimates, scenes: Scenes, rows: NDArray[np.intp]
+) -> dict[str, NDArray[Any]]:
+    """Return the estimation variables over all N scenes from estimates of ``rows`` (n,)."""
+    count = len(scenes)
+    truth = scenes.rotation[rows]
+    error = pose_error(estimates.rotation, estimates.translation, truth, scenes.translation[rows])
+    other = rotation_difference(estimates.alternative_rotation, truth)
+
+    def spread(column: NDArray[Any], fill: float) -> NDArray[Any]:
+        whole = np.full((count, *column.shape[1:]), fill, dtype=column.dtype)
+        whole[rows] = column
+        return whole
+
+    solved = estimates.status == Estimate.solved
+    flipped = np.where(error.flipped, Flipped.flipped, Flipped.not_flipped)
+    return {
+        "estimate": spread(estimates.status, Estimate.no_detection),
+        "translation_error_m": spread(error.translation_m, np.nan),
+        "rotation_error_rad": spread(error.rotation_rad, np.nan),
+        "rotation_error_deg": spread(np.degrees(error.rotation_angle_rad), np.nan),
+        "normal_error_deg": spread(np.degrees(error.normal_angle_rad), np.nan),
+        "reprojection_error_px": spread(estimates.reprojection_px, np.nan),
+        "alternative_rotation_error_deg": spread(
+            np.degrees(np.linalg.norm(other, axis=1)), np.nan
+        ),
+        "alternative_reprojection_error_px": spread(
+            estimates.alternative_reprojection_px, np.nan
+        ),
+        "flipped": spread(
+            np.where(solved, flipped, Flipped.no_estimate).astype(np.uint8), Flipped.no_estimate
+        ),
+    }
+
+
+def shaped(
+    variable: Variable, pipeline: Pipeline, block: Block, parts: list[NDArray[Any]]
+) -> NDArray[Any]:
+    """Return a variable in the template's dimensions from one array (N, ...) per treatment."""
+    stages = [stage for stage in Stage if Stage.scene < stage <= variable.stage]
+    outer = pipeline.axes_of(Stage.scene)
+    treatment = [axis for stage in stages for axis in pipeline.axes_of(stage)]
+    stacked = np.stack(parts, axis=1).astype(variable.dtype)
+    shaped = stacked.reshape(
+        (*block.shape, *(len(axis) for axis in treatment), *variable.inner_shape)
+    )
+    made = [axis.name for axis in itertools.chain(outer, treatment)] + list(variable.inner)
+    wanted = variable.dimensions(pipeline)
+    return np.ascontiguousarray(shaped.transpose([made.index(name) for name in wanted]))
+

@@ -1,0 +1,1 @@
+"""What is under test: detectors, solvers, error metrics. Nothing here knows of the grid."""

@@ -1,0 +1,240 @@
+"""OpenCV's ArUco detector, on a window of the frame as on the whole of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.model.marker import opencv_dictionary
+from sweep.model.parameter import parameter
+
+REFINEMENTS = {
+    "none": cv2.aruco.CORNER_REFINE_NONE,
+    "subpix": cv2.aruco.CORNER_REFINE_SUBPIX,
+    "contour": cv2.aruco.CORNER_REFINE_CONTOUR,
+    "apriltag": cv2.aruco.CORNER_REFINE_APRILTAG,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorSetting:
+    """Every field of ``cv2.aruco.DetectorParameters``, by OpenCV's own name and default."""
+
+    adaptiveThreshWinSizeMin: int = parameter(
+        3, "smallest window of the adaptive threshold", unit="px", low=3, high=9999
+    )
+    adaptiveThreshWinSizeMax: int = parameter(
+        23, "largest window of the adaptive threshold", unit="px", low=3, high=9999
+    )
+    adaptiveThreshWinSizeStep: int = parameter(
+        10, "step between the windows of the adaptive threshold", unit="px", low=1, high=9999
+    )
+    adaptiveThreshConstant: float = parameter(
+        7.0, "constant of the adaptive threshold", unit="grey level"
+    )
+    minMarkerPerimeterRate: float = parameter(
+        0.03, "smallest perimeter of a candidate, relative to the image's larger side", low=0,
+        open_low=True,
+    )
+    maxMarkerPerimeterRate: float = parameter(
+        4.0, "largest perimeter of a candidate, relative to the image's larger side", low=0,
+        high=10_000, open_low=True,
+    )
+    polygonalApproxAccuracyRate: float = parameter(
+        0.03, "accuracy of the polygonal approximation, relative to the perimeter", low=0,
+        open_low=True,
+    )
+    minCornerDistanceRate: float = parameter(
+        0.05, "smallest distance between corners, relative to the perimeter", low=0
+    )
+    minDistanceToBorder: int = parameter(
+        3, "smallest distance of a corner to the image's border", unit="px", low=0, high=9999
+    )
+    minMarkerDistanceRate: float = parameter(
+        0.125, "smallest distance between markers' corners, relative to the perimeter", low=0
+    )
+    minGroupDistance: float = parameter(
+        0.21, "smallest distance between corners in a group of candidates, relative to the "
+        "perimeter", low=0,
+    )
+    cornerRefinementMethod: str = parameter(
+        "none", "refinement of the corners (apriltag also replaces the search for candidates)",
+        choices=tuple(REFINEMENTS),
+    )
+    cornerRefinementWinSize: int = parameter(
+        5, "largest half window of the sub-pixel refinement", unit="px", low=1, high=9999
+    )
+    relativeCornerRefinmentWinSize: float = parameter(
+        0.3, "half window of the sub-pixel refinement, relative to the module", low=0,
+        open_low=True,
+    )
+    cornerRefinementMaxIterations: int = parameter(
+        30, "most iterations of the corner refinement", low=1, high=100_000
+    )
+    cornerRefinementMinAccuracy: float = parameter(
+        0.1, "step at which the corner refinement stops", unit="px", low=0, open_low=True
+    )
+    markerBorderBits: int = parameter(
+        1, "width of the border that the detector expects", unit="module", low=1, high=10
+    )
+    perspectiveRemovePixelPerCell: int = parameter(
+        4, "pixels that a module is sampled with", unit="px", low=1, high=1000
+    )
+    perspectiveRemoveIgnoredMarginPerCell: float = parameter(
+        0.13, "margin of a module that is not sampled, relative to the module", low=0, high=0.499
+    )
+    maxErroneousBitsInBorderRate: float = parameter(
+        0.35, "largest share of wrong bits in the border", low=0, high=1
+    )
+    minOtsuStdDev: float = parameter(
+        5.0, "smallest standard deviation at which Otsu's threshold is taken",
+        unit="grey level", low=0,
+    )
+    errorCorrectionRate: float = parameter(
+        0.6, "error correction, relative to the dictionary's maximum", low=0, high=1
+    )
+    aprilTagQuadDecimate: float = parameter(
+        0.0, "apriltag: decimation of the image before the search", low=0, high=64
+    )
+    aprilTagQuadSigma: float = parameter(
+        0.0, "apriltag: Gaussian blur (negative: sharpening) before the search", unit="px",
+        low=-100, high=100,
+    )
+    aprilTagMinClusterPixels: int = parameter(
+        5, "apriltag: smallest cluster of edge pixels", unit="px", low=0, high=10**6
+    )
+    aprilTagMaxNmaxima: int = parameter(
+        10, "apriltag: corner candidates looked at in a cluster", low=1, high=1000
+    )
+    aprilTagCriticalRad: float = parameter(
+        0.1745329201221466, "apriltag: edges closer than this to straight or to reversal make no "
+        "corner", unit="radian", low=0, high=3.1416,
+    )
+    aprilTagMaxLineFitMse: float = parameter(
+        10.0, "apriltag: largest mean squared error of a line fit", unit="px²", low=0
+    )
+    aprilTagMinWhiteBlackDiff: int = parameter(
+        5, "apriltag: smallest contrast of a tile", unit="grey level", low=0, high=255
+    )
+    aprilTagDeglitch: int = parameter(
+        0, "apriltag: clean up the threshold (useful in very noisy images)", low=0, high=1
+    )
+    detectInvertedMarker: bool = parameter(False, "also look for white-on-black markers")
+    useAruco3Detection: bool = parameter(
+        False, "the faster search of ArUco 3 (always on the full frame)"
+    )
+    minSideLengthCanonicalImg: int = parameter(
+        32, "ArUco 3: smallest side of a candidate in the canonical image", unit="px", low=1,
+        high=10_000,
+    )
+    minMarkerLengthRatioOriginalImg: float = parameter(
+        0.0, "ArUco 3: smallest marker, relative to the image's larger side", low=0, high=1
+    )
+    validBitIdThreshold: float = parameter(
+        0.49, "share of a module's pixels from which its bit is uncertain", low=0, high=1
+    )
+
+    @classmethod
+    def missing_fields(cls) -> set[str]:
+        """Return the fields that the installed OpenCV does not have."""
+        parameters = cv2.aruco.DetectorParameters()
+        return {f.name for f in dataclasses.fields(cls) if not hasattr(parameters, f.name)}
+
+
+ALIGNMENT_PX = 4
+"""Windows begin and end at multiples of this: the tiles of the apriltag search are 4 px wide."""
+
+SMALLEST_WINDOW_PX = 8
+
+
+def full_frame_reason(setting: DetectorSetting) -> str | None:
+    """Return why a setting cannot search a window in place of the frame; None where it can."""
+    if setting.useAruco3Detection:
+        return "useAruco3Detection scales the image by the frame's size"
+    if setting.cornerRefinementMethod == "apriltag" and setting.aprilTagQuadDecimate > 1:
+        return "aprilTagQuadDecimate resamples the frame"
+    return None
+
+
+def margin_px(setting: DetectorSetting) -> int:
+    """Return how many pixels around the marker can change what the setting finds.
+
+    Half the largest threshold window and the border in which no corner may lie, plus the
+    contour's own pixel and one to spare; the reach of the sub-pixel refinement and of the
+    apriltag search's blur where they are in use. With OpenCV's defaults: 16.
+    """
+    margin = setting.adaptiveThreshWinSizeMax // 2 + setting.minDistanceToBorder + 2
+    if setting.cornerRefinementMethod == "subpix":
+        margin = max(margin, 2 * setting.cornerRefinementWinSize + 3)
+    if setting.cornerRefinementMethod == "apriltag":
+        margin = max(margin, 16 + int(4 * abs(setting.aprilTagQuadSigma)))
+    return margin
+
+
+def windows(
+    boxes: NDArray[np.int64], frame: NDArray[np.int64], margin: int
+) -> NDArray[np.int64]:
+    """Return the windows (N, 4) to search: boxes (N, 4) widened, aligned, clipped at the frame.
+
+    Never below 8 px a side where the frame allows it; a window reaches the frame's edge where
+    the margin does, exactly, since what lies beyond must not be seen.
+    """
+    start = (boxes[:, :2] - margin) // ALIGNMENT_PX * ALIGNMENT_PX
+    stop = -((-boxes[:, 2:] - margin) // ALIGNMENT_PX) * ALIGNMENT_PX
+    start = np.maximum(start, 0)
+    stop = np.maximum(stop, start + SMALLEST_WINDOW_PX)
+    over = stop - np.minimum(stop, frame)
+    start = np.where(
+        (over > 0) & (stop - over - start < SMALLEST_WINDOW_PX),
+        np.maximum(frame - SMALLEST_WINDOW_PX, 0) // ALIGNMENT_PX * ALIGNMENT_PX,
+        start,
+    )
+    return np.concatenate([start, stop - over], axis=1)
+
+
+Found = tuple[Sequence[NDArray[np.float32]], list[int], Sequence[NDArray[np.float32]]]
+"""Corners (1, 4, 2) of what was decoded, its IDs, and corners of what was rejected."""
+
+
+class Detector:
+    """One detector setting in this process; OpenCV's objects do not travel between processes."""
+
+    def __init__(self, setting: DetectorSetting) -> None:
+        self._setting = setting
+        self._parameters = cv2.aruco.DetectorParameters()
+        defaults = DetectorSetting()
+        for field in dataclasses.fields(setting):
+            value = getattr(setting, field.name)
+            if field.name == "cornerRefinementMethod":
+                value = REFINEMENTS[value]
+            elif value == getattr(defaults, field.name):
+                continue
+            setattr(self._parameters, field.name, value)
+        self._detectors: dict[str, cv2.aruco.ArucoDetector] = {}
+
+    def find(self, image: NDArray[np.uint8], dictionary: str, frame_side: int) -> Found:
+        """Search an image (h, w): a window of a frame whose larger side is ``frame_side``.
+
+        The perimeter limits, which OpenCV takes relative to the image that it is given and turns
+        into whole pixels, are passed so that they come to the same number as on the frame.
+        """
+        detector = self._detectors.get(dictionary)
+        if detector is None:
+            detector = cv2.aruco.ArucoDetector(opencv_dictionary(dictionary), self._parameters)
+            self._detectors[dictionary] = detector
+        side = max(image.shape)
+        setting = self._setting
+        low, high = setting.minMarkerPerimeterRate, setting.maxMarkerPerimeterRate
+        if side != frame_side:
+            low = (int(low * frame_side) + 0.5) / side
+            high = (int(high * frame_side) + 0.5) / side
+        self._parameters.minMarkerPerimeterRate = low
+        self._parameters.maxMarkerPerimeterRate = high
+        detector.setDetectorParameters(self._parameters)
+        corners, ids, rejected = detector.detectMarkers(image)
+        return corners, [] if ids is None else ids.ravel().tolist(), rejected

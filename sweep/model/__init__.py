@@ -1,0 +1,1 @@
+"""What is simulated: camera, marker, pose, renderers. Nothing here knows of detectors."""

@@ -1,0 +1,119 @@
+"""The camera: pinhole intrinsics and a lens, and where points in space fall in the image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sweep.model import lens
+from sweep.model.parameter import parameter
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A camera's parameters: in millimetres, or the focal lengths in pixels."""
+
+    width_px: int = parameter(640, "width of the frame", unit="px", low=1, high=100_000)
+    height_px: int = parameter(480, "height of the frame", unit="px", low=1, high=100_000)
+    sensor_width_mm: float = parameter(
+        4.8, "width of the sensor's active area", unit="mm", low=0, open_low=True
+    )
+    sensor_height_mm: float = parameter(
+        3.6, "height of the sensor's active area", unit="mm", low=0, open_low=True
+    )
+    focal_length_mm: float = parameter(
+        4.0, "focal length of the lens", unit="mm", low=0, open_low=True
+    )
+    fx_px: float | None = parameter(
+        None, "focal length along x; stands in place of the three in mm", unit="px", low=0,
+        open_low=True,
+    )
+    fy_px: float | None = parameter(
+        None, "focal length along y (default: fx_px)", unit="px", low=0, open_low=True
+    )
+    cx_px: float | None = parameter(
+        None, "principal point, x (default: (width_px - 1) / 2)", unit="px"
+    )
+    cy_px: float | None = parameter(
+        None, "principal point, y (default: (height_px - 1) / 2)", unit="px"
+    )
+    distortion: tuple[float, ...] = parameter(
+        (), "lens coefficients in OpenCV's order: 0, 4, 5, 8, 12 or 14 numbers"
+    )
+
+
+def intrinsics(
+    width_px: Any,
+    height_px: Any,
+    sensor_width_mm: Any,
+    sensor_height_mm: Any,
+    focal_length_mm: Any,
+    fx_px: Any,
+    fy_px: Any,
+    cx_px: Any,
+    cy_px: Any,
+) -> tuple[Any, Any, Any, Any]:
+    """Return fx, fy, cx, cy in pixels (numbers or arrays, as the arguments of :class:`Camera`)."""
+    if fx_px is None:
+        fx = focal_length_mm / sensor_width_mm * width_px
+        fy = focal_length_mm / sensor_height_mm * height_px
+    else:
+        fx = fx_px
+        fy = fx_px if fy_px is None else fy_px
+    cx = (width_px - 1) / 2 if cx_px is None else cx_px
+    cy = (height_px - 1) / 2 if cy_px is None else cy_px
+    return fx, fy, cx, cy
+
+
+@dataclass(frozen=True, slots=True)
+class Cameras:
+    """N cameras as arrays: ``view`` (N, 4) fx, fy, cx, cy in px; packed ``lenses`` (N, 24).
+
+    ``distorted`` (N,) tells which of them have a lens at all; no lens code runs for the others.
+    """
+
+    view: NDArray[np.float64]
+    lenses: NDArray[np.float64]
+    distorted: NDArray[np.bool_]
+
+    def take(self, rows: ArrayLike) -> Cameras:
+        """Return the cameras of the given rows."""
+        return Cameras(self.view[rows], self.lenses[rows], self.distorted[rows])
+
+    def matrix(self, row: int) -> NDArray[np.float64]:
+        """Return OpenCV's camera matrix (3, 3) of one row."""
+        fx, fy, cx, cy = self.view[row]
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the pixels (N, M, 2) of points (N, M, 3) in metres in the camera frame.
+
+        Points with z <= 0 have no image: NaN.
+        """
+        z = points[..., 2:]
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            flat = np.where(z > 0, points[..., :2] / z, np.nan)
+        if self.distorted.any():
+            rows = np.flatnonzero(self.distorted)
+            flat[rows] = lens.distort_points(flat[rows], self.lenses[rows])
+        return np.asarray(flat * self.view[:, None, :2] + self.view[:, None, 2:])
+
+    def normalise(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return undistorted normalised coordinates (N, M, 2) of pixels (N, M, 2).
+
+        NaN where the lens has no inverse.
+        """
+        flat = np.asarray((pixels - self.view[:, None, 2:]) / self.view[:, None, :2])
+        if self.distorted.any():
+            rows = np.flatnonzero(self.distorted)
+            flat[rows] = lens.undistort_points(flat[rows], self.lenses[rows])
+        return flat
+
+
+def canonical_distortion(coefficients: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the coefficients without trailing zeros: equal lenses have equal tuples."""
+    last = max((i + 1 for i, value in enumerate(coefficients) if value != 0.0), default=0)
+    return tuple(float(value) for value in coefficients[:last])

@@ -1,0 +1,305 @@
+"""The exact grey level of every pixel: analytic area coverage of the marker's projected edges.
+
+The method of font rasterisers (Levien, "Inside the fastest font renderer in the world", 2016):
+each edge adds its signed area and cover to the pixels of its rows, and a running sum along each
+row turns them into covered area. An edge here carries the grey level's jump across it, so one
+pass gives the levels themselves. Errors are those of double precision.
+
+Pixel i covers [i - 0.5, i + 0.5]; inside, coordinates are shifted by 0.5 so that it covers
+[i, i + 1].
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.compiled import compiled
+from sweep.model.lens import distort
+
+CHORD_TOLERANCE_PX = 1e-4
+"""How far a chord of a bent edge may lie from the edge; 0.03 grey levels at the very most."""
+
+ROUNDING_SNAP = 1e-9
+"""Levels this close below a half round up, so that the last bits of a sum never decide."""
+
+
+@compiled
+def _add_in_row(
+    row: NDArray[np.float64], jump: float, xa: float, xb: float, dy: float
+) -> None:
+    """Add a segment from x = xa to xb that descends by dy within one row of pixels."""
+    left, right = (xa, xb) if xa <= xb else (xb, xa)
+    first = int(left)
+    last = int(right)
+    if right == last and last > first:
+        last -= 1
+    if first == last:
+        middle = 0.5 * (xa + xb) - first
+        row[first] += jump * dy * (1.0 - middle)
+        row[first + 1] += jump * dy * middle
+        return
+    slope = dy / (right - left)
+    x = left
+    for column in range(first, last + 1):
+        end = right if column == last else column + 1.0
+        part = slope * (end - x)
+        middle = 0.5 * (x + end) - column
+        row[column] += jump * part * (1.0 - middle)
+        row[column + 1] += jump * part * middle
+        x = end
+
+
+@compiled
+def _add_segment(
+    cover: NDArray[np.float64], jump: float, x0: float, y0: float, x1: float, y1: float
+) -> None:
+    """Add a segment that lies within the box [0, width] x [0, height]."""
+    if not (y0 < y1 or y1 < y0) or x0 != x0 or x1 != x1:
+        return
+    if y0 < y1:
+        sign, xa, ya, xb, yb = 1.0, x0, y0, x1, y1
+    else:
+        sign, xa, ya, xb, yb = -1.0, x1, y1, x0, y0
+    first = int(ya)
+    last = int(yb)
+    if yb == last and last > first:
+        last -= 1
+    if first == last:
+        _add_in_row(cover[first], sign * jump, xa, xb, yb - ya)
+        return
+    slope = (xb - xa) / (yb - ya)
+    low, high = (xa, xb) if xa <= xb else (xb, xa)
+    x, y = xa, ya
+    for line in range(first, last + 1):
+        if line == last:
+            end, x_end = yb, xb
+        else:
+            end = line + 1.0
+            x_end = min(max(xa + (end - ya) * slope, low), high)
+        _add_in_row(cover[line], sign * jump, x, x_end, end - y)
+        x, y = x_end, end
+
+
+@compiled
+def _clip(a: float, b: float, lower: float, upper: float) -> tuple[float, float]:
+    """Narrow the interval [lower, upper] of t to where a + t (b - a) >= 0; empty: lower > upper."""
+    if a >= 0.0 and b >= 0.0:
+        return lower, upper
+    if a < 0.0 and b < 0.0:
+        return 1.0, 0.0
+    t = a / (a - b)
+    if a < 0.0:
+        return max(lower, t), upper
+    return lower, min(upper, t)
+
+
+@compiled
+def _at(
+    t: float, width: float, height: float,
+    x0: float, y0: float, z0: float, x1: float, y1: float, z1: float,
+) -> tuple[float, float]:
+    """Return the pixel at parameter t of a segment in space, clamped into the box."""
+    if t <= 0.0:
+        x, y, z = x0, y0, z0
+    elif t >= 1.0:
+        x, y, z = x1, y1, z1
+    else:
+        x, y, z = x0 + t * (x1 - x0), y0 + t * (y1 - y0), z0 + t * (z1 - z0)
+    return min(max(x / z, 0.0), width), min(max(y / z, 0.0), height)
+
+
+@compiled
+def _add_projected(
+    cover: NDArray[np.float64], jump: float,
+    x0: float, y0: float, z0: float, x1: float, y1: float, z1: float,
+) -> None:
+    """Add the image (x/z, y/z) of a segment in space (z > 0), clipped to the box before division.
+
+    What lies above, below or right of the box adds nothing; what lies left of it covers whole
+    rows, as the same segment moved onto the box's left side does. Clipping in homogeneous
+    coordinates keeps points exact whose images lie far outside.
+    """
+    height, width = cover.shape[0] * 1.0, (cover.shape[1] - 2) * 1.0
+    lower, upper = _clip(y0, y1, 0.0, 1.0)
+    lower, upper = _clip(height * z0 - y0, height * z1 - y1, lower, upper)
+    if lower >= upper:
+        return
+    # Left of the box: on [lower, upper] minus where x >= 0.
+    inner_lower, inner_upper = _clip(x0, x1, lower, upper)
+    if inner_lower >= inner_upper:
+        _, ya = _at(lower, width, height, x0, y0, z0, x1, y1, z1)
+        _, yb = _at(upper, width, height, x0, y0, z0, x1, y1, z1)
+        _add_segment(cover, jump, 0.0, ya, 0.0, yb)
+        return
+    if inner_lower > lower:
+        _, ya = _at(lower, width, height, x0, y0, z0, x1, y1, z1)
+        _, yb = _at(inner_lower, width, height, x0, y0, z0, x1, y1, z1)
+        _add_segment(cover, jump, 0.0, ya, 0.0, yb)
+    if inner_upper < upper:
+        _, ya = _at(inner_upper, width, height, x0, y0, z0, x1, y1, z1)
+        _, yb = _at(upper, width, height, x0, y0, z0, x1, y1, z1)
+        _add_segment(cover, jump, 0.0, ya, 0.0, yb)
+    lower, upper = _clip(width * z0 - x0, width * z1 - x1, inner_lower, inner_upper)
+    if lower >= upper:
+        return
+    xa, ya = _at(lower, width, height, x0, y0, z0, x1, y1, z1)
+    xb, yb = _at(upper, width, height, x0, y0, z0, x1, y1, z1)
+    _add_segment(cover, jump, xa, ya, xb, yb)
+
+
+@compiled
+def _bent(
+    t: float, plane: NDArray[np.float64], lens: NDArray[np.float64], view: NDArray[np.float64],
+    a: float, b: float, c: float, d: float,
+) -> tuple[float, float]:
+    """Return the pixel of the point at parameter t of the module-plane segment (a, b)-(c, d)."""
+    column, line = a + t * (c - a), b + t * (d - b)
+    z = plane[2, 0] * column + plane[2, 1] * line + plane[2, 2]
+    x, y = distort(
+        (plane[0, 0] * column + plane[0, 1] * line + plane[0, 2]) / z,
+        (plane[1, 0] * column + plane[1, 1] * line + plane[1, 2]) / z,
+        lens,
+    )
+    return view[0] * x + view[2], view[1] * y + view[3]
+
+
+@compiled
+def _off_chord(px: float, py: float, x0: float, y0: float, x1: float, y1: float) -> float:
+    """Return the distance of a point from the straight line through two others."""
+    length = math.hypot(x1 - x0, y1 - y0)
+    if length == 0.0:
+        return math.hypot(px - x0, py - y0)
+    return abs((px - x0) * (y1 - y0) - (py - y0) * (x1 - x0)) / length
+
+
+@compiled
+def accumulate(
+    cover: NDArray[np.float64],
+    ends: NDArray[np.float64],
+    sides: NDArray[np.int64],
+    levels: NDArray[np.float64],
+    plane: NDArray[np.float64],
+    view: NDArray[np.float64],
+    lens: NDArray[np.float64],
+    distorted: bool,
+    left: int,
+    top: int,
+) -> None:
+    """Add a marker's edges to ``cover`` (height, width + 2).
+
+    Parameters
+    ----------
+    cover
+        The accumulator of the box whose top left pixel is (``left``, ``top``).
+    ends, sides
+        The marker's edges (E, 4), (E, 2): :class:`sweep.model.marker.Edges`.
+    levels
+        (3,) grey levels of outside, black and white.
+    plane
+        (3, 3) takes module coordinates to the camera frame: (x, y, z) = plane · (column, row, 1).
+    view
+        (4,) fx, fy, cx, cy in pixels.
+    lens
+        (24,) packed lens; read only where ``distorted``.
+    """
+    shift_x, shift_y = view[2] + (0.5 - left), view[3] + (0.5 - top)
+    for e in range(ends.shape[0]):
+        jump = levels[sides[e, 1]] - levels[sides[e, 0]]
+        if jump == 0.0:
+            continue
+        a, b, c, d = ends[e, 0], ends[e, 1], ends[e, 2], ends[e, 3]
+        if not distorted:
+            z0 = plane[2, 0] * a + plane[2, 1] * b + plane[2, 2]
+            z1 = plane[2, 0] * c + plane[2, 1] * d + plane[2, 2]
+            x0 = view[0] * (plane[0, 0] * a + plane[0, 1] * b + plane[0, 2]) + shift_x * z0
+            x1 = view[0] * (plane[0, 0] * c + plane[0, 1] * d + plane[0, 2]) + shift_x * z1
+            y0 = view[1] * (plane[1, 0] * a + plane[1, 1] * b + plane[1, 2]) + shift_y * z0
+            y1 = view[1] * (plane[1, 0] * c + plane[1, 1] * d + plane[1, 2]) + shift_y * z1
+            _add_projected(cover, jump, x0, y0, z0, x1, y1, z1)
+            continue
+        u0, v0 = _bent(0.0, plane, lens, view, a, b, c, d)
+        u1, v1 = _bent(1.0, plane, lens, view, a, b, c, d)
+        off = 0.0
+        for quarter in range(1, 4):
+            u, v = _bent(0.25 * quarter, plane, lens, view, a, b, c, d)
+            off = max(off, _off_chord(u, v, u0, v0, u1, v1))
+        # A chord's distance from a smooth curve falls with the square of the number of chords.
+        chords = min(max(int(math.ceil(math.sqrt(off / CHORD_TOLERANCE_PX))), 1), 4096)
+        x, y = u0 + (0.5 - left), v0 + (0.5 - top)
+        for chord in range(1, chords + 1):
+            u, v = u1, v1
+            if chord < chords:
+                u, v = _bent(chord / chords, plane, lens, view, a, b, c, d)
+            u, v = u + (0.5 - left), v + (0.5 - top)
+            _add_projected(cover, jump, x, y, 1.0, u, v, 1.0)
+            x, y = u, v
+
+
+@compiled
+def sum_levels(
+    cover: NDArray[np.float64], outside: float, levels: NDArray[np.float64]
+) -> None:
+    """Write the running sums of ``cover``, from the level ``outside``, to ``levels``.
+
+    ``cover`` is all zero afterwards, ready for the next scene.
+    """
+    for i in range(levels.shape[0]):
+        level = outside
+        for j in range(levels.shape[1]):
+            level += cover[i, j]
+            cover[i, j] = 0.0
+            levels[i, j] = level
+        cover[i, levels.shape[1] :] = 0.0
+
+
+@compiled
+def sum_grey(cover: NDArray[np.float64], outside: float, grey: NDArray[np.uint8]) -> None:
+    """As :func:`sum_levels`, quantised to 8 bits (round half up) and clipped."""
+    for i in range(grey.shape[0]):
+        level = outside
+        rounded = np.uint8(min(max(level + (0.5 + ROUNDING_SNAP), 0.0), 255.0))
+        for j in range(grey.shape[1]):
+            # Most pixels meet no edge: they repeat their neighbour at the cost of a comparison.
+            if cover[i, j] != 0.0:
+                level += cover[i, j]
+                cover[i, j] = 0.0
+                rounded = np.uint8(min(max(level + (0.5 + ROUNDING_SNAP), 0.0), 255.0))
+            grey[i, j] = rounded
+        cover[i, grey.shape[1] :] = 0.0
+
+
+@compiled
+def draw_grey(
+    image: NDArray[np.uint8],
+    window_left: int,
+    window_top: int,
+    box: NDArray[np.int64],
+    scratch: NDArray[np.float64],
+    ends: NDArray[np.float64],
+    sides: NDArray[np.int64],
+    levels: NDArray[np.float64],
+    plane: NDArray[np.float64],
+    view: NDArray[np.float64],
+    lens: NDArray[np.float64],
+    distorted: NDArray[np.bool_],
+    row: int,
+) -> None:
+    """Draw the marker of scene ``row`` into ``image``, whose top left pixel is given.
+
+    ``scratch`` is a vector of zeros of at least (width + 2) · height of the box (4,), left so.
+    The arrays from ``levels`` on hold all scenes: (N, 3), (N, 3, 3), (N, 4), (N, 24), (N,).
+    """
+    left, top, right, bottom = box[0], box[1], box[2], box[3]
+    width, height = right - left, bottom - top
+    cover = scratch[: height * (width + 2)].reshape(height, width + 2)
+    accumulate(
+        cover, ends, sides, levels[row], plane[row], view[row], lens[row], distorted[row],
+        left, top,
+    )
+    grey = image[
+        top - window_top : bottom - window_top, left - window_left : right - window_left
+    ]
+    sum_grey(cover, levels[row, 0], grey)

@@ -1,0 +1,125 @@
+"""The marker: its bitmap, and the straight edges between its modules."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.model.parameter import parameter
+
+OUTSIDE, BLACK, WHITE = 0, 1, 2
+"""Codes of what lies on a side of an edge."""
+
+
+def dictionary_names() -> tuple[str, ...]:
+    """Return the names of every predefined dictionary of the installed OpenCV, sorted."""
+    return tuple(sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")))
+
+
+@dataclass(frozen=True, slots=True)
+class Marker:
+    """A marker's parameters."""
+
+    dictionary: str = parameter(
+        "DICT_5X5_50", "the marker's dictionary, by OpenCV's name", choices=dictionary_names()
+    )
+    marker_id: int = parameter(0, "the marker's ID in its dictionary", low=0, high=10**6)
+    size_m: float = parameter(
+        0.01, "side of the black square", unit="m", low=0, open_low=True
+    )
+    quiet_zone_modules: float = parameter(
+        1.0, "width of the white surround, in modules", unit="module", low=0, high=100
+    )
+
+
+@lru_cache(maxsize=64)
+def opencv_dictionary(name: str) -> cv2.aruco.Dictionary:
+    """Return a predefined dictionary; built once in each process, for it does not pickle."""
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+
+
+def marker_count(dictionary: str) -> int:
+    """Return how many IDs a dictionary has."""
+    return len(opencv_dictionary(dictionary).bytesList)
+
+
+def module_count(dictionary: str) -> int:
+    """Return the modules along the black square's side: the bits and a border of one each side."""
+    return int(opencv_dictionary(dictionary).markerSize) + 2
+
+
+@lru_cache(maxsize=4096)
+def modules(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
+    """Return the black square's modules (n, n), True where white, top row first."""
+    n = module_count(dictionary)
+    bitmap = cv2.aruco.generateImageMarker(opencv_dictionary(dictionary), marker_id, n)
+    white = np.asarray(bitmap) > 127
+    white.setflags(write=False)
+    return white
+
+
+def marker_corners(size_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the black square's corners (N, 4, 3) in the marker frame: TL, TR, BR, BL."""
+    unit = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
+    return np.asarray(np.asarray(size_m, dtype=np.float64)[:, None, None] * unit)
+
+
+@dataclass(frozen=True, slots=True)
+class Edges:
+    """A marker's edges in module coordinates (column right, row down, origin at the TL corner).
+
+    Attributes
+    ----------
+    ends
+        (E, 4) column and row of the start and of the end.
+    sides
+        (E, 2) codes of what lies on the two sides. The grey level's jump that an edge stands for
+        is ``level[sides[1]] - level[sides[0]]``, signed for an edge that is traversed downwards
+        in the image with ``sides[1]`` at greater x.
+    """
+
+    ends: NDArray[np.float64]
+    sides: NDArray[np.int64]
+
+
+def _runs(line: NDArray[np.int64]) -> list[tuple[int, int, int, int]]:
+    """Return (start, end, before, after) of maximal runs in a line (m, 2) of side codes."""
+    runs = []
+    start = 0
+    for stop in range(1, len(line) + 1):
+        if stop == len(line) or (line[stop] != line[start]).any():
+            before, after = (int(code) for code in line[start])
+            if before != after:
+                runs.append((start, stop, before, after))
+            start = stop
+    return runs
+
+
+@lru_cache(maxsize=8192)
+def edges(dictionary: str, marker_id: int, quiet_zone_modules: float) -> Edges:
+    """Return the maximal straight edges between areas of different colour."""
+    n = module_count(dictionary)
+    surround = OUTSIDE if quiet_zone_modules == 0 else WHITE
+    codes = np.full((n + 2, n + 2), surround, dtype=np.int64)
+    codes[1:-1, 1:-1] = np.where(modules(dictionary, marker_id), WHITE, BLACK)
+    ends: list[tuple[float, float, float, float]] = []
+    sides: list[tuple[int, int]] = []
+    for line in range(n + 1):
+        beside = np.stack([codes[1:-1, line], codes[1:-1, line + 1]], axis=1)
+        for start, stop, left, right in _runs(beside):
+            ends.append((line, start, line, stop))
+            sides.append((left, right))
+        stacked = np.stack([codes[line, 1:-1], codes[line + 1, 1:-1]], axis=1)
+        for start, stop, above, below in _runs(stacked):
+            # A quarter turn takes "down with the right side at greater x" to "right, above".
+            ends.append((start, line, stop, line))
+            sides.append((below, above))
+    if surround == WHITE:
+        a, b = -quiet_zone_modules, n + quiet_zone_modules
+        ends += [(a, a, a, b), (b, a, b, b), (a, a, b, a), (a, b, b, b)]
+        sides += [(OUTSIDE, WHITE), (WHITE, OUTSIDE), (WHITE, OUTSIDE), (OUTSIDE, WHITE)]
+    return Edges(np.array(ends, dtype=np.float64), np.array(sides, dtype=np.int64))

@@ -1,0 +1,49 @@
+"""One parameter of an experiment, declared once: a dataclass field with unit, range and meaning."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class Declaration:
+    """What is said of a parameter where it is declared.
+
+    ``low`` and ``high`` are inclusive unless ``open_low`` excludes the lower end. ``drawable``
+    parameters may be drawn from a distribution per trial.
+    """
+
+    meaning: str
+    unit: str = ""
+    low: float = -math.inf
+    high: float = math.inf
+    open_low: bool = False
+    choices: tuple[str, ...] = ()
+    drawable: bool = False
+
+    def range_text(self) -> str:
+        """Return the allowed values in words, as error messages and the reference print them."""
+        if self.choices:
+            return "one of " + ", ".join(self.choices)
+        low, high = f"{self.low:g}", f"{self.high:g}"
+        if math.isfinite(self.low) and math.isfinite(self.high):
+            return f"above {low} and at most {high}" if self.open_low else f"from {low} to {high}"
+        if math.isfinite(self.low):
+            return f"above {low}" if self.open_low else f"at least {low}"
+        if math.isfinite(self.high):
+            return f"at most {high}"
+        return ""
+
+    def admits(self, number: float) -> bool:
+        """Tell whether a finite number lies in the declared range."""
+        above = number > self.low if self.open_low else number >= self.low
+        return math.isfinite(number) and above and number <= self.high
+
+
+def parameter(default: Any, meaning: str, **declared: Any) -> Any:
+    """Return a dataclass field that carries its :class:`Declaration` (keywords as there)."""
+    declaration = Declaration(meaning, **declared)
+    return dataclasses.field(default=default, metadata={"declaration": declaration})

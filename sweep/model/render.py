@@ -1,0 +1,205 @@
+"""The renderers: ``exact``, ``warp`` and ``supersample-N`` behind one signature."""
+
+from __future__ import annotations
+
+import re
+import threading
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.model import coverage
+from sweep.model.marker import edges, modules
+from sweep.model.scene import WARP_PX_PER_MODULE, Scenes
+from sweep.model.supersample import supersample
+
+Grey = NDArray[np.uint8]
+Box = tuple[int, int, int, int]
+"""Left, top, right, bottom in pixels of the frame; half-open."""
+
+SUPERSAMPLE = re.compile(r"supersample-([1-9][0-9]{0,2})(-jittered)?")
+
+
+def renderer_fault(name: str) -> str | None:
+    """Return what was expected where ``name`` is no renderer, else None."""
+    if name in ("exact", "warp") or SUPERSAMPLE.fullmatch(name):
+        return None
+    return "exact, warp, supersample-N or supersample-N-jittered with N from 1 to 999"
+
+
+@lru_cache(maxsize=16)
+def background_image(path: str) -> Grey:
+    """Return an image file as grey levels (height, width); ValueError where it is none."""
+    try:
+        encoded = np.frombuffer(Path(path).read_bytes(), dtype=np.uint8)
+    except OSError as error:
+        raise ValueError(error.strerror or "unreadable") from error
+    image = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE) if len(encoded) else None
+    if image is None:
+        raise ValueError("not an image that OpenCV can read")
+    grey = np.asarray(image, dtype=np.uint8)
+    grey.setflags(write=False)
+    return grey
+
+
+def quantise(levels: NDArray[np.float64]) -> Grey:
+    """Return grey levels rounded to 8 bits (half up, as :func:`coverage.sum_grey`) and clipped."""
+    shifted = levels + (0.5 + coverage.ROUNDING_SNAP)
+    return np.clip(shifted, 0.0, 255.0).astype(np.uint8)
+
+
+def render(scenes: Scenes, row: int, marker_box: NDArray[np.int64], window: Box) -> Grey:
+    """Return the image of a scene in ``window``, quantised once.
+
+    ``marker_box`` (4,) holds all pixels that the marker may touch; the renderer sees only it, so
+    that the image does not depend on the window.
+    """
+    left, top, right, bottom = window
+    background = scenes.background[row]
+    if isinstance(background, str):
+        image = background_image(background)[top:bottom, left:right].copy()
+    else:
+        image = np.empty((bottom - top, right - left), dtype=np.uint8)
+        image.fill(int(background + (0.5 + coverage.ROUNDING_SNAP)))
+    x0, y0, x1, y1 = marker_box.tolist()
+    if x1 == x0:
+        return image
+    on_image = isinstance(background, str)
+    renderer = scenes.renderer[row]
+    if renderer == "exact" and not on_image:
+        outlines = edges(scenes.dictionary[row], scenes.marker_id[row], scenes.quiet_zone[row])
+        coverage.draw_grey(
+            image, left, top, marker_box, _scratch((x1 - x0 + 2) * (y1 - y0)), outlines.ends,
+            outlines.sides, scenes.levels, scenes.plane, scenes.cameras.view,
+            scenes.cameras.lenses, scenes.cameras.distorted, row,
+        )
+        return image
+    view = image[y0 - top : y1 - top, x0 - left : x1 - left]
+    if renderer == "warp" and not on_image:
+        _warp_grey(scenes, row, (x0, y0, x1, y1), view)
+    else:
+        mean, share = marker_levels(scenes, row, (x0, y0, x1, y1))
+        behind = view.astype(np.float64) if on_image else scenes.levels[row, 0]
+        view[:] = quantise(mean + (1.0 - share) * behind)
+    return image
+
+
+_local = threading.local()
+
+
+def _scratch(size: int) -> NDArray[np.float64]:
+    """Return this thread's accumulator: zeros, at least ``size``; its users leave it zero."""
+    scratch: NDArray[np.float64] | None = getattr(_local, "scratch", None)
+    if scratch is None or len(scratch) < size:
+        scratch = _local.scratch = np.zeros(max(size, 1 << 16))
+    return scratch
+
+
+def marker_levels(
+    scenes: Scenes, row: int, box: Box
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the marker's levels before quantisation, and its share of each pixel of ``box``.
+
+    Both (height, width); where the marker covers a pixel in part, the rest counts as level 0.
+    """
+    renderer = scenes.renderer[row]
+    height, width = box[3] - box[1], box[2] - box[0]
+    mean, share = np.empty((height, width)), np.empty((height, width))
+    if renderer == "exact":
+        levels = np.array([0.0, scenes.levels[row, 1], scenes.levels[row, 2]])
+        coverage.sum_levels(_cover(scenes, row, box, levels), 0.0, mean)
+        coverage.sum_levels(_cover(scenes, row, box, np.array([0.0, 1.0, 1.0])), 0.0, share)
+    elif renderer == "warp":
+        _warp_levels(scenes, row, box, mean, share)
+    else:
+        match = SUPERSAMPLE.fullmatch(renderer)
+        if match is None:
+            raise ValueError(f"renderer = {renderer!r}: expected {renderer_fault(renderer)}")
+        supersample(
+            mean, share, int(match[1]), match[2] is not None,
+            modules(scenes.dictionary[row], scenes.marker_id[row]), scenes.quiet_zone[row],
+            scenes.levels[row], np.linalg.inv(scenes.plane[row]), scenes.cameras.view[row],
+            scenes.cameras.lenses[row], bool(scenes.cameras.distorted[row]), box[0], box[1],
+        )
+    return mean, share
+
+
+def _cover(
+    scenes: Scenes, row: int, box: Box, levels: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the accumulated edges of a scene's marker, (height, width + 2) of ``box``."""
+    cover = np.zeros((box[3] - box[1], box[2] - box[0] + 2))
+    outlines = edges(scenes.dictionary[row], scenes.marker_id[row], scenes.quiet_zone[row])
+    coverage.accumulate(
+        cover, outlines.ends, outlines.sides, levels, scenes.plane[row], scenes.cameras.view[row],
+        scenes.cameras.lenses[row], bool(scenes.cameras.distorted[row]), box[0], box[1],
+    )
+    return cover
+
+
+@lru_cache(maxsize=1024)
+def _bitmap(
+    dictionary: str, marker_id: int, quiet_zone: float, black: float, white: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return a marker's bitmap (side, side) at 10 px a module, and its black square's corners.
+
+    The corners (4, 2) are TL, TR, BR, BL in pixels of the bitmap, whose pixels' edges lie at
+    halves.
+    """
+    pad = round(WARP_PX_PER_MODULE * quiet_zone)
+    square = np.kron(
+        modules(dictionary, marker_id),
+        np.ones((WARP_PX_PER_MODULE, WARP_PX_PER_MODULE), dtype=bool),
+    )
+    bitmap = np.where(np.pad(square, pad, constant_values=True), white, black)
+    near, far = pad - 0.5, pad + len(square) - 0.5
+    corners = np.array([[near, near], [far, near], [far, far], [near, far]], dtype=np.float32)
+    return bitmap.astype(np.float32), corners
+
+
+@lru_cache(maxsize=1024)
+def _grey_bitmap(
+    dictionary: str, marker_id: int, quiet_zone: float, black: float, white: float
+) -> tuple[Grey, NDArray[np.float32]]:
+    """As :func:`_bitmap`, in 8 bits."""
+    bitmap, corners = _bitmap(dictionary, marker_id, quiet_zone, black, white)
+    return quantise(bitmap.astype(np.float64)), corners
+
+
+def _perspective(
+    scenes: Scenes, row: int, box: Box, corners: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """Step 7: the perspective transform (3, 3) of the bitmap to the corners projected in step 6."""
+    target = (scenes.corners_px[row] - box[:2]).astype(np.float32)
+    return np.asarray(cv2.getPerspectiveTransform(corners, target))
+
+
+def _warp_grey(scenes: Scenes, row: int, box: Box, view: Grey) -> None:
+    """The paper's steps 5-8: only the corners are projected, and OpenCV warps the bitmap."""
+    background, black, white = scenes.levels[row].tolist()
+    bitmap, corners = _grey_bitmap(
+        scenes.dictionary[row], scenes.marker_id[row], scenes.quiet_zone[row], black, white
+    )
+    transform = _perspective(scenes, row, box, corners)
+    size = (box[2] - box[0], box[3] - box[1])
+    level = int(background + (0.5 + coverage.ROUNDING_SNAP))
+    view[:] = cv2.warpPerspective(
+        bitmap, transform, size, flags=cv2.INTER_LINEAR, borderValue=(level,)
+    )
+
+
+def _warp_levels(
+    scenes: Scenes, row: int, box: Box, mean: NDArray[np.float64], share: NDArray[np.float64]
+) -> None:
+    """As :func:`_warp_grey`, not quantised, with the marker's share as the warp of ones."""
+    bitmap, corners = _bitmap(
+        scenes.dictionary[row], scenes.marker_id[row], scenes.quiet_zone[row],
+        *scenes.levels[row, 1:].tolist(),
+    )
+    transform = _perspective(scenes, row, box, corners)
+    size = (box[2] - box[0], box[3] - box[1])
+    mean[:] = cv2.warpPerspective(bitmap, transform, size, flags=cv2.INTER_LINEAR)
+    share[:] = cv2.warpPerspective(np.ones_like(bitmap), transform, size, flags=cv2.INTER_LINEAR)

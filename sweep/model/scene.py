@@ -1,0 +1,313 @@
+"""Scenes: cameras, markers and poses put together, and what of them can be seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.model import lens as lens_model
+from sweep.model.camera import Cameras, intrinsics
+from sweep.model.marker import marker_corners, module_count
+from sweep.model.parameter import parameter
+from sweep.model.pose import rotation_of_angles
+
+Floats = NDArray[np.float64]
+
+WARP_PX_PER_MODULE = 10
+"""Resolution of the bitmap that the ``warp`` renderer maps (the paper's)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What surrounds the marker, and how its image is made."""
+
+    renderer: str = parameter(
+        "exact",
+        "exact: area coverage; warp: the paper's, 10 px a module, INTER_LINEAR; supersample-N: "
+        "N x N regular samples a pixel; supersample-N-jittered: at random within their cells",
+    )
+    window: str = parameter(
+        "auto",
+        "auto: render and search what the marker can influence; full: the whole frame",
+        choices=("auto", "full"),
+    )
+    black: float = parameter(
+        0.0, "level of black", unit="grey level", low=0, high=255, drawable=True
+    )
+    white: float = parameter(
+        255.0, "level of white", unit="grey level", low=0, high=255, drawable=True
+    )
+    background: float | str = parameter(
+        0.0,
+        "level beside the marker, or an image file of exactly the frame's size (path relative to "
+        "the pipeline file)",
+        unit="grey level", low=0, high=255, drawable=True,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Scenes:
+    """N scenes as arrays.
+
+    Attributes
+    ----------
+    frame
+        (N, 2) width and height in pixels.
+    dictionary, marker_id, quiet_zone, renderer, background
+        One value a scene.
+    size_m
+        (N,) side of the black square.
+    rotation, translation
+        (N, 3, 3) and (N, 3): the true pose, metres, camera frame.
+    plane
+        (N, 3, 3) takes module coordinates (column, row, 1) to the camera frame.
+    levels
+        (N, 3) grey levels of the background (0 where it is an image), black and white.
+    corners_px, outline_px
+        (N, 4, 2) images of the black square's and of the quiet zone's corners; NaN at z <= 0.
+    """
+
+    cameras: Cameras
+    frame: NDArray[np.int64]
+    dictionary: Sequence[str]
+    marker_id: Sequence[int]
+    quiet_zone: Sequence[float]
+    size_m: Floats
+    rotation: Floats
+    translation: Floats
+    plane: Floats
+    levels: Floats
+    corners_px: Floats
+    outline_px: Floats
+    renderer: Sequence[str]
+    background: Sequence[float | str]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
+    """Return ``count`` scenes from parameter values, each one value for all or one a scene.
+
+    ``values`` has every parameter of camera, marker, pose and scene (``distance_m`` resolved,
+    ``distortion`` canonical) and ``shift_u_px``, ``shift_v_px``: the drawn jitter.
+    """
+    def numbers(name: str) -> Floats:
+        column = np.asarray(values[name], dtype=np.float64)
+        return np.ascontiguousarray(np.broadcast_to(column, (count,)))
+
+    def column(name: str) -> list[Any]:
+        value = values[name]
+        return list(value) if isinstance(value, (list, np.ndarray)) else [value] * count
+
+    camera_names = (
+        "width_px", "height_px", "sensor_width_mm", "sensor_height_mm", "focal_length_mm",
+        "fx_px", "fy_px", "cx_px", "cy_px",
+    )
+    fx, fy, cx, cy = (
+        np.broadcast_to(np.asarray(number, dtype=np.float64), (count,))
+        for number in intrinsics(
+            *(None if values[name] is None else numbers(name) for name in camera_names)
+        )
+    )
+    distortions = column("distortion")
+    cameras = Cameras(
+        np.stack([fx, fy, cx, cy], axis=1),
+        np.stack([lens_model.pack(coefficients) for coefficients in distortions])
+        if count else np.empty((0, lens_model.PACKED)),
+        np.array([len(coefficients) > 0 for coefficients in distortions], dtype=bool),
+    )
+
+    # Step 4: the pose.
+    rotation = rotation_of_angles(
+        *(np.radians(numbers(name)) for name in ("tilt_deg", "azimuth_deg", "roll_deg"))
+    )
+    distance = numbers("distance_m")
+    translation = np.stack(
+        [
+            distance * (np.tan(np.radians(numbers("bearing_x_deg"))) + numbers("shift_u_px") / fx),
+            distance * (np.tan(np.radians(numbers("bearing_y_deg"))) + numbers("shift_v_px") / fy),
+            distance,
+        ],
+        axis=1,
+    )
+
+    # Steps 2, 3, 5, 6: the corners, moved by the pose and projected.
+    size = numbers("size_m")
+    dictionaries, quiet = column("dictionary"), column("quiet_zone_modules")
+    count_of = {name: module_count(name) for name in set(dictionaries)}
+    modules = np.array([count_of[name] for name in dictionaries], dtype=np.float64)
+    half, module = size / 2, size / modules
+    plane = np.empty((count, 3, 3))
+    plane[:, :, 0] = rotation[:, :, 0] * module[:, None]
+    plane[:, :, 1] = -rotation[:, :, 1] * module[:, None]
+    plane[:, :, 2] = (
+        translation - (rotation[:, :, 0] - rotation[:, :, 1]) * half[:, None]
+    )
+    outline_size = size * (1 + 2 * np.asarray(quiet, dtype=np.float64) / modules)
+    corners_px, outline_px = (
+        cameras.project(placed(marker_corners(side), rotation, translation))
+        for side in (size, outline_size)
+    )
+
+    background = column("background")
+    levels = np.stack(
+        [
+            np.array([0.0 if isinstance(b, str) else float(b) for b in background]),
+            numbers("black"),
+            numbers("white"),
+        ],
+        axis=1,
+    )
+    return Scenes(
+        cameras=cameras,
+        frame=np.stack([numbers("width_px"), numbers("height_px")], axis=1).astype(np.int64),
+        dictionary=dictionaries,
+        marker_id=[int(marker_id) for marker_id in column("marker_id")],
+        quiet_zone=[float(width) for width in quiet],
+        size_m=size,
+        rotation=rotation,
+        translation=translation,
+        plane=plane,
+        levels=levels,
+        corners_px=corners_px,
+        outline_px=outline_px,
+        renderer=column("renderer"),
+        background=background,
+    )
+
+
+def placed(points: Floats, rotation: Floats, translation: Floats) -> Floats:
+    """Return marker-frame points (N, M, 3) moved to the camera frame."""
+    return np.asarray(points @ np.swapaxes(rotation, -1, -2) + translation[..., None, :])
+
+
+def _outline(scenes: Scenes, rows: NDArray[np.intp], quiet: bool, per_side: int) -> Floats:
+    """Return points (n, 4 · per_side, 2) along the images of the outline or the black square."""
+    modules = np.array([module_count(scenes.dictionary[row]) for row in rows], dtype=np.float64)
+    margin = np.array([scenes.quiet_zone[row] if quiet else 0.0 for row in rows])
+    low, high = -margin[:, None], (modules + margin)[:, None]
+    t = np.arange(per_side) / per_side
+    ahead, back = low + t * (high - low), high - t * (high - low)
+    columns = np.concatenate([ahead, np.repeat(high, per_side, 1), back,
+                              np.repeat(low, per_side, 1)], axis=1)
+    lines = np.concatenate([np.repeat(low, per_side, 1), ahead,
+                            np.repeat(high, per_side, 1), back], axis=1)
+    flat = np.stack([columns, lines, np.ones_like(columns)], axis=2)
+    return scenes.cameras.take(rows).project(
+        np.ascontiguousarray(flat @ np.swapaxes(scenes.plane[rows], 1, 2))
+    )
+
+
+CHORDS_PER_SIDE = 32
+"""Points at which a bent outline is looked at for its extent: its bulge between them is less
+than 1/1000 of the side's, well inside the 2 px that :func:`marker_boxes` adds under a lens."""
+
+
+def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
+    """Return the boxes (N, 4) left, top, right, bottom (half-open) of pixels a marker may touch.
+
+    Clipped at the frame; empty (all zero) where nothing of the marker is in it.
+    """
+    low, high = scenes.outline_px.min(axis=1), scenes.outline_px.max(axis=1)
+    bent = np.flatnonzero(scenes.cameras.distorted & np.isfinite(low).all(axis=1))
+    if len(bent):
+        points = _outline(scenes, bent, quiet=True, per_side=CHORDS_PER_SIDE)
+        low[bent], high[bent] = points.min(axis=1) - 2, points.max(axis=1) + 2
+    warped = np.flatnonzero([name == "warp" for name in scenes.renderer])
+    if len(warped):
+        # A linear interpolation spreads an edge by half a pixel of the bitmap on either side.
+        modules = np.array([module_count(scenes.dictionary[row]) for row in warped])
+        spread = 1 + (high - low)[warped] / (WARP_PX_PER_MODULE * modules[:, None])
+        low[warped], high[warped] = low[warped] - spread, high[warped] + spread
+    limit = scenes.frame.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        start = np.clip(np.floor(low + 0.5), 0, limit)
+        stop = np.clip(np.ceil(high + 0.5), 0, limit)
+        inside = (stop > start).all(axis=1)
+    boxes = np.concatenate([start, stop], axis=1)
+    return np.where(inside[:, None], boxes, 0.0).astype(np.int64)
+
+
+def areas_px(scenes: Scenes) -> Floats:
+    """Return the projected black square's area (N,) in px², bent edges followed."""
+    points = scenes.corners_px
+    area = _shoelace(points)
+    bent = np.flatnonzero(scenes.cameras.distorted & np.isfinite(area))
+    if len(bent):
+        area[bent] = _shoelace(_outline(scenes, bent, quiet=False, per_side=256))
+    return np.abs(area)
+
+
+def _shoelace(points: Floats) -> Floats:
+    """Return the signed areas (N,) of polygons (N, M, 2)."""
+    local = points - points[:, :1]
+    following = np.roll(local, -1, axis=1)
+    return np.asarray(
+        0.5 * (local[..., 0] * following[..., 1] - local[..., 1] * following[..., 0]).sum(axis=1)
+    )
+
+
+def hidden(scenes: Scenes) -> NDArray[np.bool_]:
+    """Tell (N,) where a marker is seen from behind or edge on, or has a corner at z <= 0.
+
+    The quiet zone's corners count, for the marker is drawn with it.
+    """
+    facing = np.sum(scenes.rotation[:, :, 2] * scenes.translation, axis=1) < 0
+    return np.asarray(~facing | ~np.isfinite(scenes.outline_px).all(axis=(1, 2)))
+
+
+def outside_frame(scenes: Scenes, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Tell (n,) for scenes ``rows`` (n,) where the black square lies wholly outside the frame."""
+    corners, limit = scenes.corners_px[rows], scenes.frame[rows] - 0.5
+    outside = np.zeros(len(rows), dtype=bool)
+    cut = ((corners < -0.5) | (corners > limit[:, None])).any(axis=(1, 2))
+    for i in np.flatnonzero(cut):
+        polygon = corners[i]
+        if scenes.cameras.distorted[rows[i]]:
+            polygon = _outline(scenes, rows[i : i + 1], False, CHORDS_PER_SIDE)[0]
+        outside[i] = not _meets_frame(polygon, limit[i])
+    return outside
+
+
+def _meets_frame(polygon: Floats, limit: Floats) -> bool:
+    """Tell whether a polygon (M, 2) has a part of positive area in [-0.5, limit]."""
+    for axis in (0, 1):
+        for sign, bound in ((1.0, -0.5), (-1.0, -limit[axis])):
+            polygon = _half_plane(polygon, sign * polygon[:, axis] - bound)
+            if len(polygon) < 3:
+                return False
+    return bool(np.abs(_shoelace(polygon[None])[0]) > 0)
+
+
+def _half_plane(polygon: Floats, inside: Floats) -> Floats:
+    """Clip a polygon (M, 2) to where the linear function ``inside`` (M,) is not negative."""
+    kept = []
+    for i in range(len(polygon)):
+        j = (i + 1) % len(polygon)
+        if inside[i] >= 0:
+            kept.append(polygon[i])
+        if (inside[i] >= 0) != (inside[j] >= 0):
+            t = inside[i] / (inside[i] - inside[j])
+            kept.append(polygon[i] + t * (polygon[j] - polygon[i]))
+    return np.array(kept).reshape(-1, 2)
+
+
+def not_modelled(scenes: Scenes) -> NDArray[np.bool_]:
+    """Tell (N,) where the lens model folds on the marker, so that its image has no meaning."""
+    folded = np.zeros(len(scenes), dtype=bool)
+    rows = np.flatnonzero(scenes.cameras.distorted & np.isfinite(scenes.outline_px).all((1, 2)))
+    if len(rows):
+        modules = np.array([module_count(scenes.dictionary[row]) for row in rows])
+        quiet = np.array([scenes.quiet_zone[row] for row in rows])
+        outline = marker_corners(scenes.size_m[rows] * (1 + 2 * quiet / modules))
+        points = placed(outline, scenes.rotation[rows], scenes.translation[rows])
+        folded[rows] = lens_model.folds(
+            np.ascontiguousarray(points[..., :2] / points[..., 2:]),
+            scenes.cameras.lenses[rows],
+        )
+    return folded

@@ -1,0 +1,1 @@
+"""The declared experiment: pipeline file, axes, validation, random streams, dataset template."""

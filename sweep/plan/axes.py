@@ -1,0 +1,232 @@
+"""Axes and distributions: the forms in which a pipeline file gives more than one value."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from sweep.plan.parameters import PARAMETERS, Parameter, Stage
+
+TRIAL = "trial"
+"""The axis of repeated draws; a scene dimension with coordinates 0, 1, 2, ..."""
+
+MOST_VALUES = 10**9
+"""The longest axis (``range`` and ``trial``; they are never written out)."""
+
+MOST_LISTED = 10**7
+"""The longest axis of any other form."""
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """A dimension of the grid: its name and its values, without repeats."""
+
+    name: str
+    values: Sequence[Any]
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    @property
+    def stage(self) -> Stage:
+        """The first stage that the axis touches."""
+        return Stage.scene if self.name == TRIAL else PARAMETERS[self.name].stage
+
+    @property
+    def unit(self) -> str:
+        """The unit of its values; empty where there is none."""
+        return "" if self.name == TRIAL else PARAMETERS[self.name].unit
+
+    @property
+    def meaning(self) -> str:
+        """What the values mean, in words."""
+        return "number of the draw" if self.name == TRIAL else (
+            PARAMETERS[self.name].declaration.meaning
+        )
+
+    def coordinates(self, start: int = 0, stop: int | None = None) -> NDArray[Any]:
+        """Return the values [start, stop) as they label the dataset: numbers, booleans, strings."""
+        part = self.values[start:stop]
+        if isinstance(part, range):
+            return np.arange(part.start, part.stop, part.step, dtype=np.int64)
+        kinds = {type(value) for value in part}
+        if kinds == {bool}:
+            return np.array(part, dtype=bool)
+        if kinds == {int}:
+            return np.array(part, dtype=np.int64)
+        if kinds == {float}:
+            return np.array(part, dtype=np.float64)
+        return np.array([label(value) for value in part], dtype=np.dtypes.StringDType())
+
+
+def label(value: Any) -> str:
+    """Return a value that is no plain number as a coordinate shows it: "[-0.3, 0.1, 0, 0]"."""
+    if isinstance(value, tuple):
+        return "[" + ", ".join(f"{item!r}" for item in value) + "]"
+    return value if isinstance(value, str) else repr(value)
+
+
+@dataclass(frozen=True, slots=True)
+class Distribution:
+    """A parameter that is drawn per trial: ``uniform`` on [a, b] or ``normal`` (mean a, sd b)."""
+
+    kind: str
+    a: float
+    b: float
+
+    def at(self, uniform: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the draws that uniform numbers in (0, 1) stand for (inverse CDF)."""
+        if self.kind == "uniform":
+            return self.a + (self.b - self.a) * uniform
+        return np.asarray(self.a + self.b * ndtri(uniform))
+
+    def __str__(self) -> str:
+        return f"{self.kind}({self.a:.12g},{self.b:.12g})"
+
+
+AXIS_FORMS = {
+    "range": "[start, stop] or [start, stop, step], whole numbers, half-open",
+    "arange": "[start, stop, step], half-open",
+    "linspace": "[first, last, count], both inclusive",
+    "geom": "[first, last, count], both inclusive, above 0",
+    "values": "a list",
+}
+DISTRIBUTION_FORMS = {"uniform": "[a, b] with a < b", "normal": "[mean, sd] with sd > 0"}
+
+
+def nearest(word: str, known: Sequence[str]) -> str:
+    """Return "; did you mean ...?" for the nearest known word, or nothing."""
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def parse_distribution(parameter: Parameter, table: dict[str, Any]) -> Distribution:
+    """Return the distribution that ``{ uniform = [a, b] }`` or the like stands for.
+
+    ValueError with what was expected where it is none.
+    """
+    forms = " or ".join(f"{{ {kind} = {form} }}" for kind, form in DISTRIBUTION_FORMS.items())
+    if len(table) != 1 or next(iter(table)) not in DISTRIBUTION_FORMS:
+        if next(iter(table), None) in AXIS_FORMS:
+            raise ValueError("one value here; more than one goes under [axes]")
+        raise ValueError(f"{parameter.expected()}, or {forms}")
+    kind, ends = next(iter(table.items()))
+    if not parameter.declaration.drawable:
+        drawable = ", ".join(p.name for p in PARAMETERS.values() if p.declaration.drawable)
+        raise ValueError(f"a fixed value; only these can be drawn: {drawable}")
+    if (
+        not isinstance(ends, list) or len(ends) != 2
+        or not all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends)
+        or not all(math.isfinite(end) and abs(end) < 1e300 for end in ends)
+    ):
+        raise ValueError(f"{kind} = {DISTRIBUTION_FORMS[kind]}")
+    a, b = float(ends[0]), float(ends[1])
+    if (kind == "uniform" and not a < b) or (kind == "normal" and not b > 0):
+        raise ValueError(f"{kind} = {DISTRIBUTION_FORMS[kind]}")
+    if kind == "uniform":
+        parameter.check(a)
+        parameter.check(b)
+    elif not parameter.declaration.admits(a):
+        raise ValueError(f"a mean that is {parameter.declaration.range_text()}")
+    return Distribution(kind, a, b)
+
+
+def parse_trial(value: Any) -> Axis:
+    """Return the axis that ``trial = N`` stands for; ValueError where N is no count."""
+    if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= MOST_VALUES:
+        raise ValueError(f"a whole number from 1 to {MOST_VALUES:,}: how many draws")
+    return Axis(TRIAL, range(value))
+
+
+def parse_axis(parameter: Parameter, given: Any) -> Axis:
+    """Return the axis that a list or a table such as ``{ geom = [0.05, 1, 40] }`` stands for.
+
+    ValueError with what was expected where it cannot be one.
+    """
+    forms = ", ".join(AXIS_FORMS)
+    if isinstance(given, list):
+        form, ends = "values", given
+    elif isinstance(given, dict) and len(given) == 1:
+        form, ends = next(iter(given.items()))
+    else:
+        raise ValueError(f"a list, or a table with one of {forms}")
+    if form not in AXIS_FORMS:
+        if form in DISTRIBUTION_FORMS:
+            raise ValueError(f"an axis; a distribution goes under [{parameter.section}]")
+        raise ValueError(f"a list, or a table with one of {forms}{nearest(form, [*AXIS_FORMS])}")
+    if not isinstance(ends, list):
+        raise ValueError(f"{form} = {AXIS_FORMS[form]}")
+    values = ends if form == "values" else _expand(form, ends)
+    if len(values) == 0:
+        raise ValueError("at least one value")
+    if isinstance(values, range):
+        if parameter.types != (int,):
+            values = [float(value) for value in _bounded(values)]
+        else:
+            for end in (values[0], values[-1]):
+                parameter.check(end)
+            return Axis(parameter.name, values)
+    checked = []
+    for value in values:
+        try:
+            checked.append(parameter.check(value))
+        except ValueError as error:
+            raise ValueError(f"{error} (not {value!r})") from None
+    seen: set[Any] = set()
+    for value in checked:
+        if value in seen:
+            raise ValueError(f"each value once ({value!r} is repeated)")
+        seen.add(value)
+    return Axis(parameter.name, tuple(checked))
+
+
+def _bounded(values: range) -> range:
+    if len(values) > MOST_LISTED:
+        raise ValueError(f"at most {MOST_LISTED:,} values")
+    return values
+
+
+def _expand(form: str, ends: list[Any]) -> Sequence[Any]:
+    """Return the values of a generating form."""
+    wanted = ValueError(f"{form} = {AXIS_FORMS[form]}")
+    if not all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends):
+        raise wanted
+    if not all(math.isfinite(end) and abs(end) < 1e300 for end in ends):
+        raise wanted
+    if form == "range":
+        if not all(isinstance(end, int) for end in ends) or len(ends) not in (2, 3):
+            raise wanted
+        if len(ends) == 3 and ends[2] == 0:
+            raise wanted
+        if any(abs(end) > 2**62 for end in ends):
+            raise wanted
+        values = range(*ends)
+        if len(values) > MOST_VALUES:
+            raise ValueError(f"at most {MOST_VALUES:,} values")
+        return values
+    if len(ends) != 3:
+        raise wanted
+    if form == "arange":
+        start, stop, step = (float(end) for end in ends)
+        count = math.ceil((stop - start) / step) if step != 0 else 0
+        if step == 0:
+            raise wanted
+        if count > MOST_LISTED:
+            raise ValueError(f"at most {MOST_LISTED:,} values")
+        return [start + step * i for i in range(max(count, 0))]
+    if not isinstance(ends[2], int) or ends[2] < 1:
+        raise wanted
+    if ends[2] > MOST_LISTED:
+        raise ValueError(f"at most {MOST_LISTED:,} values")
+    if form == "linspace":
+        return list(map(float, np.linspace(ends[0], ends[1], ends[2])))
+    if not (ends[0] > 0 and ends[1] > 0):
+        raise wanted
+    return list(map(float, np.geomspace(ends[0], ends[1], ends[2])))

@@ -1,0 +1,116 @@
+"""Random draws: a function of (seed, quantity, geometry key, trial), and of nothing else.
+
+The geometry key of a cell is the text of its own camera, marker and pose values: canonical
+(``side_px`` as ``distance_m``, a camera in mm as one in pixels), sorted by name, defaults left
+out, numbers rounded to 12 significant digits. Whether a value is fixed or an axis, in which
+order and on which grid, does not matter; nor do renderer, window, levels, detector or estimator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from hashlib import blake2b
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.model.camera import canonical_distortion, intrinsics
+from sweep.plan.axes import Distribution
+from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
+
+_CAMERA = (
+    "width_px", "height_px", "sensor_width_mm", "sensor_height_mm", "focal_length_mm", "fx_px",
+    "fy_px", "cx_px", "cy_px",
+)
+_DEFAULT_VIEW = dict(
+    zip(
+        ("fx_px", "fy_px"),
+        intrinsics(*(PARAMETERS[name].default for name in _CAMERA))[:2],
+        strict=True,
+    )
+)
+_PLAIN = tuple(
+    p.name for p in PARAMETERS.values()
+    if p.section in GEOMETRY_SECTIONS and p.name not in (*_CAMERA, "distortion", "side_px")
+) + ("width_px", "height_px")
+
+
+def _text(value: Any) -> str:
+    """Return a value's canonical text."""
+    if isinstance(value, str):
+        return value.upper()
+    if isinstance(value, tuple):
+        return ",".join(_text(item) for item in canonical_distortion(value))
+    return f"{float(value) + 0.0:.12g}"
+
+
+def _texts(name: str, value: Any, default: Any, count: int) -> list[str]:
+    """Return "name=value" for each scene, empty where the value is the default."""
+    left_out = None if default is None else _text(default)
+    if not isinstance(value, (np.ndarray, list)):
+        text = _text(value)
+        return ["" if text == left_out else f"{name}={text}"] * count
+    known: dict[Any, str] = {}
+    texts = []
+    for item in value.tolist() if isinstance(value, np.ndarray) else value:
+        text = known.get(item)
+        if text is None:
+            text = _text(item)
+            text = known[item] = "" if text == left_out else f"{name}={text}"
+        texts.append(text)
+    return texts
+
+
+def geometry_keys(
+    values: Mapping[str, Any], distributions: Mapping[str, Distribution], count: int
+) -> list[str]:
+    """Return the geometry key of ``count`` scenes.
+
+    ``values`` has every parameter of camera, marker and pose that is not drawn, one value for
+    all scenes or one each, with ``distance_m`` resolved from ``side_px``.
+    """
+    fx, fy, cx, cy = intrinsics(*(values[name] for name in _CAMERA))
+    columns: dict[str, list[str]] = {
+        name: _texts(name, value, default, count)
+        for name, value, default in (
+            ("fx_px", fx, _DEFAULT_VIEW["fx_px"]),
+            ("fy_px", fy, _DEFAULT_VIEW["fy_px"]),
+            ("distortion", values["distortion"], ()),
+        )
+    }
+    for name, value, length in (("cx_px", cx, "width_px"), ("cy_px", cy, "height_px")):
+        if values[name] is not None:
+            columns[name] = [
+                "" if text == middle else text
+                for text, middle in zip(
+                    _texts(name, value, None, count),
+                    _texts(name, (values[length] - 1) / 2, None, count),
+                    strict=True,
+                )
+            ]
+    for name in _PLAIN:
+        if name not in distributions and values.get(name) is not None:
+            columns[name] = _texts(name, values[name], PARAMETERS[name].default, count)
+    for name, distribution in distributions.items():
+        if PARAMETERS[name].section in GEOMETRY_SECTIONS:
+            columns[name] = [f"{name}={distribution}"] * count
+    used = [columns[name] for name in sorted(columns) if any(columns[name])]
+    if not used:
+        return [""] * count
+    return ["|".join(filter(None, parts)) for parts in zip(*used, strict=True)]
+
+
+def uniform(
+    seed: int, quantity: str, keys: Sequence[str], trials: Sequence[int]
+) -> NDArray[np.float64]:
+    """Return one uniform number in (0, 1) for each scene's key and trial (N,).
+
+    The first 53 bits of a BLAKE2b hash; the middle of its cell, so that neither end occurs.
+    """
+    digests = b"".join(
+        blake2b(f"{seed}\n{quantity}\n{key}\n{trial}".encode(), digest_size=8).digest()
+        for key, trial in zip(keys, trials, strict=True)
+    )
+    bits = np.frombuffer(digests, dtype="<u8") >> np.uint64(11)
+    return np.asarray((bits + 0.5) * 2.0**-53)

@@ -1,0 +1,126 @@
+"""Every parameter of every section, gathered from where it is declared."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+import typing
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+from sweep.measure.detector import DetectorSetting
+from sweep.measure.solver import Estimator
+from sweep.model.camera import Camera
+from sweep.model.lens import COUNTS
+from sweep.model.marker import Marker
+from sweep.model.parameter import Declaration
+from sweep.model.pose import Pose
+from sweep.model.render import renderer_fault
+from sweep.model.scene import Scene
+
+
+class Stage(IntEnum):
+    """The stages of the core loop; a parameter binds to the first stage that it touches."""
+
+    scene = 0
+    detection = 1
+    estimation = 2
+
+
+SECTIONS: dict[str, tuple[type, Stage]] = {
+    "camera": (Camera, Stage.scene),
+    "marker": (Marker, Stage.scene),
+    "pose": (Pose, Stage.scene),
+    "scene": (Scene, Stage.scene),
+    "detector": (DetectorSetting, Stage.detection),
+    "estimator": (Estimator, Stage.estimation),
+}
+"""Section of a pipeline file -> the dataclass that declares its parameters, and their stage."""
+
+GEOMETRY_SECTIONS = ("camera", "marker", "pose")
+"""Sections whose values make the geometry key of the random draws."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A parameter: where it is declared, of which type, and what was declared of it."""
+
+    name: str
+    section: str
+    stage: Stage
+    types: tuple[type, ...]
+    default: Any
+    declaration: Declaration
+
+    @property
+    def unit(self) -> str:
+        """The unit; empty where there is none."""
+        return self.declaration.unit
+
+    def expected(self) -> str:
+        """Return in words what a value must be."""
+        if tuple in self.types:
+            counts = ", ".join(str(count) for count in COUNTS[:-1])
+            return f"a list of {counts} or {COUNTS[-1]} finite numbers"
+        words = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
+        kind = " or ".join(words[kind] for kind in self.types)
+        extent = self.declaration.range_text()
+        if self.declaration.choices:
+            return extent
+        return f"{kind} {extent}".strip()
+
+    def check(self, value: Any) -> Any:
+        """Return ``value`` in the parameter's own type; ValueError(expectation) where it is not."""
+        if tuple in self.types and isinstance(value, (list, tuple)):
+            numbers = all(_is_number(item) and math.isfinite(item) for item in value)
+            if numbers and len(value) in COUNTS:
+                return tuple(float(item) for item in value)
+        elif bool in self.types and isinstance(value, bool):
+            return value
+        elif int in self.types and isinstance(value, int) and not isinstance(value, bool):
+            if self.declaration.admits(value):
+                return value
+        elif float in self.types and _is_number(value):
+            if abs(value) < 1e300 and self.declaration.admits(float(value)):
+                return float(value)
+        elif str in self.types and isinstance(value, str):
+            if self.name == "renderer":
+                fault = renderer_fault(value)
+                if fault is None:
+                    return value
+                raise ValueError(fault)
+            if value and (not self.declaration.choices or value in self.declaration.choices):
+                return value
+        raise ValueError(self.expected())
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _gather() -> dict[str, Parameter]:
+    gathered: dict[str, Parameter] = {}
+    for section, (declaring, stage) in SECTIONS.items():
+        hints = typing.get_type_hints(declaring)
+        for field in dataclasses.fields(declaring):
+            if field.name in gathered:
+                raise TypeError(f"parameter {field.name} is declared twice")
+            gathered[field.name] = Parameter(
+                field.name, section, stage, _types(hints[field.name]), field.default,
+                field.metadata["declaration"],
+            )
+    return gathered
+
+
+def _types(hint: Any) -> tuple[type, ...]:
+    """Return the plain types of an annotation: ``float | None`` -> (float,)."""
+    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
+        kinds = [_types(part) for part in typing.get_args(hint) if part is not type(None)]
+        return tuple(kind for group in kinds for kind in group)
+    return (typing.get_origin(hint) or hint,)
+
+
+PARAMETERS: dict[str, Parameter] = _gather()
+"""Every parameter by its name; names are unique over all sections."""

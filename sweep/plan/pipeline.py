@@ -1,0 +1,449 @@
+"""The pipeline: a TOML file read, checked as a whole, and told all its faults at once."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+import tomlkit.exceptions
+
+from sweep.errors import PipelineError
+from sweep.measure.detector import DetectorSetting
+from sweep.model.marker import marker_count
+from sweep.model.render import background_image
+from sweep.plan.axes import (
+    TRIAL,
+    Axis,
+    Distribution,
+    nearest,
+    parse_axis,
+    parse_distribution,
+    parse_trial,
+)
+from sweep.plan.parameters import PARAMETERS, SECTIONS, Stage
+
+MOST_BYTES = 1_000_000
+"""The largest pipeline file that is read."""
+
+MOST_POSES = 10**12
+"""The largest grid."""
+
+HEADER = ("title", "seed")
+
+
+@dataclass(frozen=True, slots=True)
+class Pipeline:
+    """A checked experiment.
+
+    Attributes
+    ----------
+    name
+        What stores are named after: the file's stem.
+    title, seed
+        As the file says; the seed of all random draws.
+    fixed
+        Value of every parameter that is neither an axis nor drawn.
+    distributions
+        What is drawn per trial.
+    axes
+        The grid's dimensions, in the file's order.
+    text
+        The effective TOML text.
+    files
+        Path as written -> SHA-256 of every file that the pipeline refers to.
+    folder
+        Where relative paths start.
+    """
+
+    name: str
+    title: str
+    seed: int
+    fixed: Mapping[str, Any]
+    distributions: Mapping[str, Distribution]
+    axes: tuple[Axis, ...]
+    text: str
+    files: Mapping[str, str]
+    folder: str
+
+    @staticmethod
+    def from_toml(path: str | Path, settings: Sequence[str] = ()) -> Pipeline:
+        """Read a pipeline file; ``settings`` are "key=value" with TOML values, as ``--set`` takes.
+
+        Raises
+        ------
+        PipelineError
+            One line for each fault of the file.
+        """
+        path = Path(path)
+        try:
+            with path.open("rb") as file:
+                encoded = file.read(MOST_BYTES + 1)
+        except OSError as error:
+            raise PipelineError([f"{path}: cannot be read: {error.strerror}"]) from None
+        if len(encoded) > MOST_BYTES:
+            raise PipelineError([f"{path}: expected at most {MOST_BYTES:,} bytes"])
+        try:
+            text = encoded.decode()
+        except UnicodeDecodeError as error:
+            raise PipelineError([f"{path}: expected UTF-8: byte {error.start} is not"]) from None
+        return Pipeline.from_text(
+            text, settings, name=path.stem, source=str(path), folder=path.parent
+        )
+
+    @staticmethod
+    def from_text(
+        text: str,
+        settings: Sequence[str] = (),
+        *,
+        name: str = "pipeline",
+        source: str = "pipeline",
+        folder: str | Path = ".",
+        files: Mapping[str, str] | None = None,
+    ) -> Pipeline:
+        """Read a pipeline from TOML text (arguments as :meth:`from_toml`).
+
+        ``files`` (path as written -> SHA-256) takes the place of looking at the files that the
+        text refers to, as for a store whose files may be elsewhere by now.
+        """
+        if settings:
+            text = with_settings(text, settings, source)
+        try:
+            document = tomllib.loads(text)
+        except (tomllib.TOMLDecodeError, RecursionError) as error:
+            reason = "nested too deeply" if isinstance(error, RecursionError) else error
+            raise PipelineError([f"{source}: not TOML: {reason}"]) from None
+        return _Reader(document, source, Path(folder), files).pipeline(name, text)
+
+    def axis(self, name: str) -> Axis | None:
+        """Return an axis by name."""
+        return next((axis for axis in self.axes if axis.name == name), None)
+
+    def axes_of(self, *stages: Stage) -> tuple[Axis, ...]:
+        """Return the axes that bind to the given stages, in the file's order."""
+        return tuple(axis for axis in self.axes if axis.stage in stages)
+
+    def size(self, *stages: Stage) -> int:
+        """Return the number of grid points over the axes of the given stages."""
+        return math.prod(len(axis) for axis in self.axes_of(*stages))
+
+    @property
+    def random(self) -> bool:
+        """Whether anything is drawn."""
+        return bool(self.distributions) or self.any_value("jitter_px", lambda value: value > 0)
+
+    def values_of(self, name: str) -> Sequence[Any]:
+        """Return all values that a parameter takes on the grid; empty where it is drawn."""
+        axis = self.axis(name)
+        if axis is not None:
+            return axis.values
+        return (self.fixed[name],) if name in self.fixed else ()
+
+    def any_value(self, name: str, condition: Any) -> bool:
+        """Tell whether a parameter takes a value for which ``condition`` holds."""
+        return any(condition(value) for value in self.values_of(name) if value is not None)
+
+
+class _Reader:
+    """Checks one document and gathers its faults."""
+
+    def __init__(
+        self, document: dict[str, Any], source: str, folder: Path,
+        files: Mapping[str, str] | None,
+    ) -> None:
+        self.document = document
+        self.known_files = files
+        self.source = source
+        self.folder = folder
+        self.faults: list[str] = []
+        self.fixed: dict[str, Any] = {}
+        self.distributions: dict[str, Distribution] = {}
+        self.axes: dict[str, Axis] = {}
+        self.given: set[str] = set()
+        self.files: dict[str, str] = {}
+
+    def fault(self, key: str, value: Any, expected: str) -> None:
+        """Note one fault: file, key, value, expectation."""
+        shown = _shown(value)
+        self.faults.append(f"{self.source}: {key} = {shown}: expected {expected}")
+
+    def pipeline(self, name: str, text: str) -> Pipeline:
+        title = self._header("title", "", str, "a string")
+        seed = self._header("seed", 0, int, "a whole number from 0 to 2^63 - 1")
+        if isinstance(seed, int) and not 0 <= seed < 2**63:
+            self.fault("seed", seed, "a whole number from 0 to 2^63 - 1")
+        known = [*HEADER, *SECTIONS, "axes"]
+        for key, value in self.document.items():
+            if key in HEADER:
+                continue
+            if key == "axes" or key in SECTIONS:
+                if not isinstance(value, dict):
+                    self.fault(key, value, f"a table: [{key}]")
+            elif key in PARAMETERS:
+                self.fault(key, value, f"it under [{PARAMETERS[key].section}]")
+            else:
+                what = "a section" if isinstance(value, dict) else "a key"
+                self.faults.append(
+                    f"{self.source}: {key}: unknown; expected {what} of {', '.join(known)}"
+                    f"{nearest(key, known)}"
+                )
+        for section in SECTIONS:
+            self._section(section)
+        self._axes()
+        for parameter in PARAMETERS.values():
+            if parameter.name not in self.given:
+                self.fixed[parameter.name] = parameter.default
+        if not self.faults:
+            self._across()
+        if self.faults:
+            raise PipelineError(self.faults)
+        return Pipeline(
+            name=name, title=title, seed=seed, fixed=self.fixed, distributions=self.distributions,
+            axes=tuple(self.axes.values()), text=text, files=self.files,
+            folder=str(self.folder.resolve()),
+        )
+
+    def _header(self, key: str, default: Any, kind: type, expected: str) -> Any:
+        value = self.document.get(key, default)
+        if not isinstance(value, kind) or isinstance(value, bool):
+            self.fault(key, value, expected)
+            return default
+        return value
+
+    def _section(self, section: str) -> None:
+        table = self.document.get(section, {})
+        if not isinstance(table, dict):
+            return
+        names = [p.name for p in PARAMETERS.values() if p.section == section]
+        for key, value in table.items():
+            where = f"{section}.{key}"
+            if key not in names:
+                elsewhere = PARAMETERS.get(key)
+                hint = (
+                    f"; it belongs under [{elsewhere.section}]" if elsewhere is not None
+                    else "; it belongs under [axes]" if key == TRIAL
+                    else nearest(key, names)
+                )
+                self.faults.append(f"{self.source}: {where}: unknown key{hint}")
+                continue
+            parameter = PARAMETERS[key]
+            self.given.add(key)
+            try:
+                if isinstance(value, dict):
+                    self.distributions[key] = parse_distribution(parameter, value)
+                else:
+                    self.fixed[key] = parameter.check(value)
+            except ValueError as error:
+                self.fault(where, value, str(error))
+
+    def _axes(self) -> None:
+        table = self.document.get("axes", {})
+        if not isinstance(table, dict):
+            return
+        for key, value in table.items():
+            where = f"axes.{key}"
+            try:
+                if key == TRIAL:
+                    self.axes[key] = parse_trial(value)
+                elif key not in PARAMETERS:
+                    known = [*PARAMETERS, TRIAL]
+                    self.faults.append(
+                        f"{self.source}: {where}: unknown parameter{nearest(key, known)}"
+                    )
+                elif key in self.given:
+                    section = PARAMETERS[key].section
+                    self.fault(
+                        where, value, f"it once: {section}.{key} is given too; delete one of them"
+                    )
+                else:
+                    self.given.add(key)
+                    self.axes[key] = parse_axis(PARAMETERS[key], value)
+            except ValueError as error:
+                self.fault(where, value, str(error))
+
+    # What can only be judged with several parameters at hand.
+
+    def _values(self, name: str) -> Sequence[Any]:
+        if name in self.axes:
+            return self.axes[name].values
+        return (self.fixed[name],) if name in self.fixed else ()
+
+    def _given_value(self, name: str) -> Any:
+        """Return what the file says of a parameter, to be quoted."""
+        for section in (*SECTIONS, "axes"):
+            if name in self.document.get(section, {}):
+                return self.document[section][name]
+        return self.fixed.get(name)
+
+    def _across(self) -> None:
+        distance, side = "distance_m" in self.given, "side_px" in self.given
+        if distance and side:
+            self.fault(
+                "side_px", self._given_value("side_px"),
+                "distance_m or side_px, not both; delete one of them",
+            )
+        if not distance and not side:
+            self.faults.append(
+                f"{self.source}: pose: expected distance_m or side_px, fixed or under [axes]"
+            )
+        in_mm = [n for n in ("sensor_width_mm", "sensor_height_mm", "focal_length_mm")
+                 if n in self.given]
+        for name in ("fx_px", "fy_px"):
+            if name in self.given and in_mm:
+                self.fault(
+                    name, self._given_value(name),
+                    f"a camera in pixels or in millimetres, not both; delete it or "
+                    f"{', '.join(in_mm)}",
+                )
+        if "fy_px" in self.given and "fx_px" not in self.given:
+            self.fault("fy_px", self._given_value("fy_px"), "fx_px beside it")
+        self._ids()
+        low, high = "adaptiveThreshWinSizeMin", "adaptiveThreshWinSizeMax"
+        if max(self._values(low)) > min(self._values(high)):
+            self.fault(high, self._given_value(high), f"at least {low}")
+        self._backgrounds()
+        self._detector_fields()
+        trials = len(self.axes[TRIAL]) if TRIAL in self.axes else 1
+        random = self.distributions or max(self._values("jitter_px")) > 0
+        if trials > 1 and not random:
+            self.fault(
+                "axes.trial", trials,
+                "something random to repeat: jitter_px above 0, or a distribution",
+            )
+        poses = math.prod(len(axis) for axis in self.axes.values())
+        if poses > MOST_POSES:
+            self.faults.append(
+                f"{self.source}: axes: {poses:.3g} poses: expected at most {MOST_POSES:.0e}"
+            )
+
+    def _ids(self) -> None:
+        ids = self._values("marker_id")
+        largest = max(ids[0], ids[-1]) if isinstance(ids, range) else max(ids)
+        for dictionary in self._values("dictionary"):
+            count = marker_count(dictionary)
+            if largest >= count:
+                self.fault(
+                    "marker_id", self._given_value("marker_id"),
+                    f"IDs from 0 to {count - 1}, which is what {dictionary} has",
+                )
+
+    def _backgrounds(self) -> None:
+        for value in self._values("background"):
+            if not isinstance(value, str):
+                continue
+            if self.known_files is not None:
+                self.files[value] = self.known_files.get(value, "")
+                continue
+            path = self.folder / value
+            try:
+                image = background_image(str(path.resolve()))
+            except ValueError as error:
+                self.fault("scene.background", value, f"a level or an image file ({error})")
+                continue
+            height, width = image.shape
+            for name, length in (("width_px", width), ("height_px", height)):
+                if set(self._values(name)) != {length}:
+                    self.fault(
+                        "scene.background", value,
+                        f"an image of exactly the frame's size: it is {width} x {height}, but "
+                        f"{name} = {_shown(self._given_value(name))}",
+                    )
+            self.files[value] = hashlib.sha256(path.read_bytes()).hexdigest()
+
+    def _detector_fields(self) -> None:
+        missing = DetectorSetting.missing_fields()
+        for name in self.given & missing:
+            self.fault(
+                f"detector.{name}", self._given_value(name),
+                "a field that the installed OpenCV has",
+            )
+
+
+def _shown(value: Any) -> str:
+    """Return a value as TOML would have it, cut where it is long."""
+    try:
+        text = tomlkit.item(value).as_string()
+    except (ValueError, TypeError, tomlkit.exceptions.TOMLKitError, RecursionError):
+        text = repr(value)
+    text = " ".join(text.split())
+    return text if len(text) <= 120 else text[:117] + "..."
+
+
+_BARE = re.compile(r"[A-Za-z][A-Za-z0-9_.+-]*(/[A-Za-z0-9_.+-]+)*")
+
+
+def with_settings(text: str, settings: Sequence[str], source: str) -> str:
+    """Return pipeline text with "key=value" settings written in.
+
+    A parameter's name needs no section. A list or a table of values makes (or replaces) an axis;
+    a single value or a distribution makes it fixed or drawn. A bare word counts as a string.
+
+    Raises
+    ------
+    PipelineError
+        One line for each setting that is not of that form.
+    """
+    try:
+        document = tomlkit.parse(text)
+    except (tomlkit.exceptions.TOMLKitError, RecursionError) as error:
+        raise PipelineError([f"{source}: not TOML: {error}"]) from None
+    faults = []
+    for setting in settings:
+        key, equals, written = setting.partition("=")
+        key, written = key.strip(), written.strip()
+        name = key.rpartition(".")[2]
+        if not equals or not name:
+            faults.append(f"--set {setting}: expected key=value, such as tilt_deg=45")
+            continue
+        if _BARE.fullmatch(written) and written not in ("true", "false", "inf", "nan"):
+            written = f'"{written}"'
+        try:
+            value = tomllib.loads(f"value = {written}")["value"]
+        except (tomllib.TOMLDecodeError, RecursionError):
+            faults.append(f"--set {setting}: expected a TOML value, such as [0, 45] or 'text'")
+            continue
+        if name in HEADER:
+            document[name] = value
+            continue
+        if name not in PARAMETERS and name != TRIAL:
+            known = [*PARAMETERS, TRIAL, *HEADER]
+            faults.append(f"--set {setting}: unknown parameter{nearest(name, known)}")
+            continue
+        _write(document, name, value)
+    if faults:
+        raise PipelineError(faults)
+    return tomlkit.dumps(document)
+
+
+def _write(document: Any, name: str, value: Any) -> None:
+    """Write one parameter where its value belongs, and take it from where it was."""
+    section = PARAMETERS[name].section if name in PARAMETERS else "axes"
+    many = name == TRIAL or _is_axis(name, value)
+    place, other = ("axes", section) if many else (section, "axes")
+    if other != place and name in document.get(other, {}):
+        del document[other][name]
+    if place not in document:
+        document[place] = tomlkit.table()
+    if isinstance(value, dict):
+        inline = tomlkit.inline_table()
+        inline.update(value)
+        value = inline
+    document[place][name] = value
+
+
+def _is_axis(name: str, value: Any) -> bool:
+    """Tell whether a value given by ``--set`` makes an axis."""
+    if isinstance(value, dict):
+        return not {"uniform", "normal"} & value.keys()
+    if not isinstance(value, list):
+        return False
+    if tuple in PARAMETERS[name].types:
+        return bool(value) and all(isinstance(item, list) for item in value)
+    return True
+

@@ -1,0 +1,107 @@
+"""The dataset template: each variable's name, stage, dimensions, type, units and flags.
+
+The only schema: the kernel fills it, the store is laid out by it, analysis reads by it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+from sweep.measure.flags import Detection, Estimate, Flipped
+from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
+
+XYZ = ("x", "y", "z")
+CORNERS = ("top_left", "top_right", "bottom_right", "bottom_left")
+
+LABELS: dict[str, tuple[str, ...]] = {"corner": CORNERS, "xy": ("x", "y"), "xyz": XYZ}
+"""Coordinates of the dimensions that are no axes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Variable:
+    """One variable of the dataset; ``inner`` are its dimensions beside the axes."""
+
+    name: str
+    stage: Stage
+    dtype: str
+    meaning: str
+    units: str = ""
+    inner: tuple[str, ...] = ()
+    flags: type[IntEnum] | None = field(default=None)
+
+    @property
+    def fill(self) -> float | int:
+        """The value of what was not computed: NaN, or the flag not_run."""
+        return 0 if self.flags is not None else float("nan")
+
+    @property
+    def inner_shape(self) -> tuple[int, ...]:
+        """Lengths of the inner dimensions."""
+        return tuple(len(LABELS[name]) for name in self.inner)
+
+    def dimensions(self, pipeline: Pipeline) -> tuple[str, ...]:
+        """Return the names of its dimensions: the axes of its stage and before, then inner."""
+        stages = [stage for stage in Stage if stage <= self.stage]
+        return tuple(axis.name for axis in pipeline.axes_of(*stages)) + self.inner
+
+    def shape(self, pipeline: Pipeline) -> tuple[int, ...]:
+        """Return the lengths of its dimensions."""
+        stages = [stage for stage in Stage if stage <= self.stage]
+        return tuple(len(axis) for axis in pipeline.axes_of(*stages)) + self.inner_shape
+
+    def attributes(self) -> dict[str, Any]:
+        """Return its attributes, after the CF conventions."""
+        attributes: dict[str, Any] = {"long_name": self.meaning}
+        if self.units:
+            attributes["units"] = self.units
+        if self.flags is not None:
+            attributes["flag_values"] = [int(flag) for flag in self.flags]
+            attributes["flag_meanings"] = " ".join(flag.name for flag in self.flags)
+        return attributes
+
+
+_S, _D, _E = Stage.scene, Stage.detection, Stage.estimation
+
+TEMPLATE: tuple[Variable, ...] = (
+    Variable("true_rvec", _S, "f8", "true rotation vector, marker to camera", "radian", ("xyz",)),
+    Variable("true_tvec_m", _S, "f8", "true position of the marker's centre", "m", ("xyz",)),
+    Variable("marker_area_px", _S, "f8", "area of the projected black square", "px2"),
+    Variable("detection", _D, "u1", "what became of the marker", flags=Detection),
+    Variable("corner_error_px", _D, "f4", "found corner minus true corner", "px",
+             ("corner", "xy")),
+    Variable("estimate", _E, "u1", "what became of the pose", flags=Estimate),
+    Variable("translation_error_m", _E, "f4", "estimated minus true, camera frame", "m",
+             ("xyz",)),
+    Variable("rotation_error_rad", _E, "f4",
+             "rotation vector of estimated times true transposed, camera frame", "radian",
+             ("xyz",)),
+    Variable("rotation_error_deg", _E, "f4", "angle of the rotation error", "degree"),
+    Variable("normal_error_deg", _E, "f4", "angle between true and estimated normal", "degree"),
+    Variable("reprojection_error_px", _E, "f4", "RMS over the corners", "px"),
+    Variable("alternative_rotation_error_deg", _E, "f4",
+             "angle of the rotation error of the other planar solution", "degree"),
+    Variable("alternative_reprojection_error_px", _E, "f4",
+             "RMS over the corners of the other planar solution", "px"),
+    Variable("flipped", _E, "u1", "whether the solution is nearer to the mirror of the truth",
+             flags=Flipped),
+)
+"""Every variable, in the order in which the stages make them."""
+
+
+def bytes_per_block(pipeline: Pipeline, scenes: int) -> int:
+    """Return the uncompressed bytes that ``scenes`` scene cells take in the store."""
+    total = 0
+    inner = {
+        _S: 1,
+        _D: pipeline.size(Stage.detection),
+        _E: pipeline.size(Stage.detection, Stage.estimation),
+    }
+    for variable in TEMPLATE:
+        cells = inner[variable.stage] * int(np.prod(variable.inner_shape, dtype=np.int64))
+        total += cells * np.dtype(variable.dtype).itemsize
+    return total * scenes

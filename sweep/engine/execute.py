@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
-import logging
 import math
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+import uuid
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from distributed import Client, LocalCluster, as_completed
+from distributed import Client, as_completed
 
 from sweep.engine.calibration import block_extents, calibrate
+from sweep.engine.cluster import default_workers, embedded, external
 from sweep.engine.fingerprint import differences
+from sweep.engine.lock import locked, refuse_if_held
+from sweep.engine.reuse import match
 from sweep.engine.store import (
     RunStore,
     committed,
     create_store,
     exists,
     finish,
+    is_remote,
     open_store,
     receipts,
     remove_store,
@@ -41,15 +45,8 @@ WINDOW = 3
 
 CALIBRATION_S = 0.6
 
-WORKER_ENVIRONMENT = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "OPENCV_FOR_THREADS_NUM": "1",
-    "MALLOC_TRIM_THRESHOLD_": "268435456",
-    "MALLOC_MMAP_THRESHOLD_": "268435456",
-}
-"""One thread a worker, and images' memory kept between scenes rather than given back."""
+MOST_FAULTS = 10
+"""Failed blocks after which no more are begun."""
 
 
 @dataclass(slots=True)
@@ -71,16 +68,16 @@ class Summary:
     detected: int
     blocks: int
     computed_blocks: int
+    computed_scenes: int
+    computed_estimates: int
     seconds: float
     crashed: int = 0
     failed: int = 0
 
 
-def default_workers() -> int:
-    """Return how many processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (
-        os.cpu_count() or 1
-    )
+def place(url: str) -> str:
+    """Return where a store is, in words that every process of this machine understands."""
+    return url if is_remote(url) else str(Path(url).absolute())
 
 
 def execute(
@@ -88,6 +85,8 @@ def execute(
     store: str | os.PathLike[str] | None = None,
     *,
     workers: int | None = None,
+    scheduler: str | None = None,
+    reuse: Sequence[str | os.PathLike[str]] = (),
     overwrite: bool = False,
     block_s: float | None = None,
     on_progress: Callable[[Progress], None] | None = None,
@@ -100,6 +99,11 @@ def execute(
         Path of the store; ``runs/NAME.zarr`` where it is not given.
     workers
         Processes of the embedded cluster (default: the processors at hand).
+    scheduler
+        Address of a running Dask scheduler, in place of the embedded cluster. Its workers must
+        reach the store under the same path.
+    reuse
+        Stores whose finished cells are taken where they agree.
     overwrite
         Delete a store that is there.
     block_s
@@ -110,30 +114,37 @@ def execute(
     Raises
     ------
     StoreError
-        Where the store cannot be used as asked.
+        Where the store or the cluster cannot be used as asked.
     RunError
         Where blocks failed; the others are in the store.
     """
     started = time.perf_counter()
     url = os.fspath(store) if store is not None else f"runs/{pipeline.name}.zarr"
-    if workers is None:
-        workers = default_workers()
-    if workers < 1:
+    if workers is not None and workers < 1:
         raise StoreError(f"--workers {workers}: expected at least 1")
     opened = _existing(url, pipeline, overwrite)
     if opened is not None and opened.finished:
-        return _summary(opened, 0, time.perf_counter() - started)
+        return _summary(opened, [], time.perf_counter() - started)
+    sources = [place(os.fspath(old)) for old in reuse]
+    for source in sources:
+        match(pipeline, open_store(source))
     with ThreadPoolExecutor(1) as beside:
         # Compiling and measuring here while the workers' processes come up.
-        measuring = beside.submit(calibrate, pipeline, CALIBRATION_S)
-        with _embedded(workers) as client:
-            calibration = measuring.result()
-            if opened is None:
-                extents = block_extents(pipeline, calibration, workers, block_s)
+        measuring = beside.submit(calibrate, pipeline, CALIBRATION_S) if opened is None else None
+        cluster = embedded(workers or default_workers()) if scheduler is None else (
+            external(scheduler, pipeline)
+        )
+        with cluster as client:
+            threads = sum(client.nthreads().values())
+            if measuring is not None:
+                extents = block_extents(pipeline, measuring.result(), threads, block_s)
                 opened = create_store(url, pipeline, extents)
-            computed = _compute(opened, client, workers, on_progress)
-    finish(opened, _cost(opened))
-    return _summary(open_store(url), computed, time.perf_counter() - started)
+            if opened is None:
+                raise AssertionError(url)
+            with locked(opened):
+                receipts_seen = _compute(opened, client, sources, threads, on_progress)
+                finish(opened, _cost(opened))
+    return _summary(open_store(url), receipts_seen, time.perf_counter() - started)
 
 
 def _existing(url: str, pipeline: Pipeline, overwrite: bool) -> RunStore | None:
@@ -141,6 +152,7 @@ def _existing(url: str, pipeline: Pipeline, overwrite: bool) -> RunStore | None:
     if not exists(url):
         return None
     store = open_store(url, "r+")
+    refuse_if_held(url, store.group.store)
     if overwrite:
         remove_store(url)
         return None
@@ -153,62 +165,51 @@ def _existing(url: str, pipeline: Pipeline, overwrite: bool) -> RunStore | None:
     return store
 
 
-@contextlib.contextmanager
-def _embedded(workers: int) -> Iterator[Client]:
-    """Start a cluster of ``workers`` single-threaded processes on this machine, and end it quietly.
-
-    It listens on the loopback interface only.
-    """
-    quiet = logging.CRITICAL
-    for name in ("distributed", "distributed.nanny", "distributed.worker"):
-        logging.getLogger(name).setLevel(quiet)
-    import dask  # noqa: PLC0415  (configured before the cluster reads it)
-
-    with dask.config.set(
-        {"distributed.nanny.pre-spawn-environ": WORKER_ENVIRONMENT,
-         "distributed.worker.memory.terminate": False}
-    ), LocalCluster(
-        n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1",
-        dashboard_address=None, silence_logs=quiet,
-    ) as cluster, Client(cluster, set_as_default=False) as client:
-        yield client
-
-
 def _compute(
-    store: RunStore, client: Client, workers: int, on_progress: Callable[[Progress], None] | None
-) -> int:
-    """Compute what is not committed, a bounded window at a time; return how many blocks it was."""
+    store: RunStore,
+    client: Client,
+    sources: Sequence[str],
+    threads: int,
+    on_progress: Callable[[Progress], None] | None,
+) -> list[dict[str, int]]:
+    """Compute what is not committed, a bounded window of blocks at a time.
+
+    Returns for each block that was run how many scenes, detections and estimates it computed.
+    """
     done = committed(store)
     todo = (block for block in store.blocks if str(block) not in done)
     progress = Progress(0, store.pipeline.size(Stage.scene), 0)
-    if done:
-        for _, receipt in receipts(store, done):
-            _count(progress, receipt)
+    for _, receipt in receipts(store, done):
+        _count(progress, receipt)
     if on_progress is not None:
         on_progress(progress)
+    url = place(store.url)
 
     def submit(block: Block) -> Any:
         return client.submit(
-            compute_block, store.url, store.run_id, block, pure=False,
-            key=f"block-{block}-{store.run_id}",
+            compute_block, url, store.run_id, block, sources, pure=False,
+            key=f"block-{block}-{uuid.uuid4().hex[:8]}",
         )
 
-    computed = 0
+    computed: list[dict[str, int]] = []
     faults: list[str] = []
-    first = [submit(block) for block in itertools.islice(todo, WINDOW * workers)]
-    flight = as_completed(first, loop=client.loop)
-    del first
+    flight = as_completed(
+        [submit(block) for block in itertools.islice(todo, WINDOW * threads)], loop=client.loop
+    )
     for future in flight:
         if future.status == "finished":
-            computed += 1
-            _count(progress, future.result())
+            receipt = future.result()
+            computed.append(receipt["computed"])
+            _count(progress, receipt)
             if on_progress is not None:
                 on_progress(progress)
         else:
             error = future.exception()
+            if isinstance(error, StoreError):
+                raise error
             faults.append(f"{future.key}: {type(error).__name__}: {error}")
         future.release()
-        following = next(todo, None) if len(faults) < 10 else None
+        following = next(todo, None) if len(faults) < MOST_FAULTS else None
         if following is not None:
             flight.add(submit(following))
     if faults:
@@ -230,6 +231,8 @@ def _cost(store: RunStore) -> xr.Dataset:
     names, scene, detection, estimation = [], [], [], []
     for name, receipt in receipts(store, sorted(committed(store))):
         seconds = receipt["seconds"]
+        if not seconds["scene"]:
+            continue
         names.append(name)
         scene.append(seconds["scene"][0])
         detection.append(seconds["detection"])
@@ -258,7 +261,7 @@ def _cost(store: RunStore) -> xr.Dataset:
     )
 
 
-def _summary(store: RunStore, computed: int, seconds: float) -> Summary:
+def _summary(store: RunStore, computed: Sequence[Mapping[str, int]], seconds: float) -> Summary:
     """Count a finished store by its receipts."""
     detection = np.zeros(len(Detection), dtype=np.int64)
     blocks = 0
@@ -272,7 +275,9 @@ def _summary(store: RunStore, computed: int, seconds: float) -> Summary:
         results=math.prod(len(axis) for axis in store.pipeline.axes),
         detected=int(detection[Detection.detected]),
         blocks=blocks,
-        computed_blocks=computed,
+        computed_blocks=len(computed),
+        computed_scenes=sum(block["scenes"] for block in computed),
+        computed_estimates=sum(block["estimates"] for block in computed),
         seconds=round(seconds, 3),
         crashed=int(detection[Detection.crashed]),
         failed=int(detection[Detection.failed]),

@@ -54,25 +54,29 @@ def differences(ours: Pipeline, theirs: Pipeline, stored: dict[str, Any]) -> lis
     """Return a line for each thing in which a store (``theirs``, ``stored``) does not fit."""
     lines = []
     mine = fingerprint(ours)
-    for key in sorted({*mine, *stored}):
-        if mine.get(key) != stored.get(key):
-            lines.append(f"{key}: the store has {stored.get(key)}, this run {mine.get(key)}")
+    lines += [
+        f"{key}: the store has {stored.get(key)}, this run {mine.get(key)}"
+        for key in sorted({*mine, *stored})
+        if mine.get(key) != stored.get(key)
+    ]
     if [axis.name for axis in ours.axes] != [axis.name for axis in theirs.axes]:
         lines.append(f"axes: the store has {_names(theirs)}, this run {_names(ours)}")
-    for axis in ours.axes:
-        other = theirs.axis(axis.name)
-        if other is not None and not same_values(axis.values, other.values):
-            lines.append(
-                f"axes.{axis.name}: the store has {_values(other.values)}, "
-                f"this run {_values(axis.values)}"
-            )
-    for what in ("fixed", "distributions"):
-        here, there = getattr(ours, what), getattr(theirs, what)
-        for name in sorted({*here, *there}):
-            if ours.axis(name) is None and theirs.axis(name) is None:
-                a, b = there.get(name), here.get(name)
-                if a != b:
-                    lines.append(f"{name}: the store has {a}, this run {b}")
+    lines += [
+        f"axes.{axis.name}: the store has {_values(other.values)}, "
+        f"this run {_values(axis.values)}"
+        for axis in ours.axes
+        if (other := theirs.axis(axis.name)) is not None
+        and not same_values(axis.values, other.values)
+    ]
+    for here, there in (
+        (ours.fixed, theirs.fixed), (ours.distributions, theirs.distributions),
+    ):
+        lines += [
+            f"{name}: the store has {there.get(name)}, this run {here.get(name)}"
+            for name in sorted({*here, *there})
+            if ours.axis(name) is None and theirs.axis(name) is None
+            and there.get(name) != here.get(name)
+        ]
     return lines
 
 

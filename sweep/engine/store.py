@@ -15,7 +15,7 @@ import warnings
 from collections.abc import AsyncIterator, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import xarray as xr
@@ -26,7 +26,6 @@ from zarr.abc.store import Store
 from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.core.buffer import cpu, default_buffer_prototype
 from zarr.core.sync import sync
-from zarr.dtype import VariableLengthUTF8
 
 from sweep.engine.fingerprint import environment, fingerprint
 from sweep.errors import StoreError
@@ -58,12 +57,21 @@ class RunStore:
     @property
     def finished(self) -> bool:
         """Whether every block is committed and the store is closed."""
-        return bool(self.group.attrs.get("sweep", {}).get("finished", False))
+        return bool(self.about["finished"])
 
     @property
     def fingerprint(self) -> dict[str, Any]:
         """The fingerprint of the run that made the store."""
-        return dict(self.group.attrs["sweep"]["fingerprint"])
+        return dict(self.about["fingerprint"])
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What is recorded of the run: format, run id, fingerprint, environment, dates."""
+        return _about(self.group)
+
+
+def _about(group: zarr.Group) -> dict[str, Any]:
+    return dict(cast("dict[str, Any]", group.attrs["sweep"]))
 
 
 def is_remote(url: str) -> bool:
@@ -98,9 +106,9 @@ def open_store(url: str, mode: str = "r") -> RunStore:
         raise StoreError(f"{url}: there is no store; `sweep run` makes one")
     try:
         group = _open_group(url, mode)
-        about = dict(group.attrs["sweep"])
+        about = _about(group)
         pipeline = Pipeline.from_text(
-            group.attrs["pipeline"], name=about["name"], source=f"{url} (its pipeline)",
+            str(group.attrs["pipeline"]), name=about["name"], source=f"{url} (its pipeline)",
             folder=about["folder"], files=about["fingerprint"]["files"],
         )
         if about["format"] != FORMAT:
@@ -205,7 +213,9 @@ def _create_variable(
 
 
 def _write_axis(group: zarr.Group, axis: Axis) -> None:
-    attributes = {"long_name": axis.meaning, **({"units": axis.unit} if axis.unit else {})}
+    attributes: dict[str, Any] = {"long_name": axis.meaning}
+    if axis.unit:
+        attributes["units"] = axis.unit
     first = axis.coordinates(0, 1)
     if isinstance(first.dtype, np.dtypes.StringDType):
         _write_strings(group, axis.name, axis.coordinates().tolist(), attributes)
@@ -221,11 +231,11 @@ def _write_axis(group: zarr.Group, axis: Axis) -> None:
 
 
 def _write_strings(
-    group: zarr.Group, name: str, labels: Iterable[str], attributes: dict[str, str]
+    group: zarr.Group, name: str, labels: Iterable[str], attributes: dict[str, Any]
 ) -> None:
     values = np.array(list(labels), dtype=object)
     array = group.create_array(
-        name, shape=values.shape, chunks=values.shape, dtype=VariableLengthUTF8(),
+        name, shape=values.shape, chunks=values.shape, dtype="string",
         dimension_names=(name,), attributes=attributes,
     )
     array[:] = values
@@ -270,11 +280,9 @@ def write_block(
     store: RunStore, block: Block, values: dict[str, NDArray[Any]], receipt: dict[str, Any]
 ) -> None:
     """Write a block's values, then commit them by its receipt."""
-    # A committed chunk exists even where it is all fill value: a missing one is a deleted one.
-    with zarr.config.set({"array.write_empty_chunks": True}):
-        for variable in TEMPLATE:
-            array = store.group[variable.name]
-            array[region(variable, store.pipeline, block)] = values[variable.name]
+    for variable in TEMPLATE:
+        array = cast("zarr.Array[Any]", store.group[variable.name])
+        array[region(variable, store.pipeline, block)] = values[variable.name]
     put(store.group.store, f"{RECEIPTS}/{block}.json", {"run_id": store.run_id, **receipt})
 
 
@@ -317,7 +325,7 @@ def receipts(store: RunStore, names: Iterable[str]) -> Iterable[tuple[str, dict[
 
 def finish(store: RunStore, cost: xr.Dataset) -> None:
     """Close a complete store: its cost group, the mark, and the metadata in one place."""
-    about = dict(store.group.attrs["sweep"])
+    about = store.about
     about["finished"] = True
     about["finished_at"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     with warnings.catch_warnings():
@@ -338,4 +346,5 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
         Where there is none, or something else.
     """
     store = open_store(os.fspath(url))
-    return xr.open_zarr(store.url, consolidated=store.finished)
+    dataset: xr.Dataset = xr.open_zarr(store.url, consolidated=store.finished)
+    return dataset

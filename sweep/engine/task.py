@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import zarr
+from numpy.typing import NDArray
 
 from sweep.engine.fingerprint import fingerprint
+from sweep.engine.reuse import Source, Taken, match, take
 from sweep.engine.store import RunStore, open_store, write_block
 from sweep.errors import StoreError
-from sweep.kernel import run_block
-from sweep.plan.grid import Block
+from sweep.kernel import CellsResult, run_cells, shaped
+from sweep.measure.flags import Estimate
+from sweep.plan.grid import Block, block_indices
+from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.template import TEMPLATE, Variable
 
 MOST_FAILURES = 20
 """Tracebacks that a receipt holds; beyond, failures are counted by their flags."""
@@ -31,26 +39,96 @@ def _opened(url: str, run_id: str) -> RunStore:
                 f"a worker has {key} {here.get(key)}, the store was begun with {value}; "
                 "install the same version on every machine"
             )
+    # A committed chunk exists even where it is all fill value: a missing one is a deleted one.
+    zarr.config.set({"array.write_empty_chunks": True})
     return store
 
 
-def compute_block(url: str, run_id: str, block: Block) -> dict[str, Any]:
-    """Compute, write and commit one block; return its receipt (also when it is run twice)."""
+@lru_cache(maxsize=16)
+def _source(url: str, run_id: str, old: str) -> Source:
+    """Match an old store to the new grid once in each process."""
+    return match(_opened(url, run_id).pipeline, open_store(old))
+
+
+def compute_block(
+    url: str, run_id: str, block: Block, reuse: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Compute, write and commit one block; return its receipt (also when it is run twice).
+
+    Cells that the stores ``reuse`` have are taken from there.
+    """
     start = time.perf_counter()
     store = _opened(url, run_id)
-    result = run_block(store.pipeline, block)
-    detection = np.bincount(result.values["detection"].ravel())
-    estimate = np.bincount(result.values["estimate"].ravel())
+    pipeline = store.pipeline
+    shape = (len(block), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
+    taken: Taken | None = None
+    need = np.ones(shape, dtype=bool)
+    if reuse:
+        taken = take(pipeline, block, [_source(url, run_id, old) for old in reuse])
+        need = ~taken.have.reshape(shape)
+    # Scenes of which nothing is missing are not even rendered.
+    rows = np.flatnonzero(need.any(axis=(1, 2)))
+    cells = None
+    if len(rows):
+        cells = run_cells(pipeline, [index[rows] for index in block_indices(block)], need[rows])
+    values = {
+        v.name: shaped(v, pipeline, block, _columns(v, cells, rows, pipeline, len(block)))
+        for v in TEMPLATE
+    }
+    if taken is not None:
+        values = {v.name: _merged(v, values, taken) for v in TEMPLATE}
     receipt = {
         "scenes": len(block),
-        "detection": detection.tolist(),
-        "estimate": estimate.tolist(),
-        "seconds": result.seconds,
+        "computed": {
+            "scenes": len(rows),
+            "detections": int(need.any(axis=2).sum()),
+            "estimates": int(need.sum()),
+        },
+        "detection": np.bincount(values["detection"].ravel()).tolist(),
+        "estimate": np.bincount(values["estimate"].ravel()).tolist(),
+        "seconds": cells.seconds if cells is not None else _NO_SECONDS,
         "failures": [
-            {"scene": f.scene, "stage": f.stage, "text": f.text}
-            for f in result.failures[:MOST_FAILURES]
+            {"scene": int(rows[f.scene]), "stage": f.stage, "text": f.text}
+            for f in (cells.failures[:MOST_FAILURES] if cells is not None else [])
         ],
+        "wall_s": time.perf_counter() - start,
+        "written": time.time(),
     }
-    receipt["wall_s"] = time.perf_counter() - start
-    write_block(store, block, result.values, receipt)
+    write_block(store, block, values, receipt)
     return receipt
+
+
+_NO_SECONDS: dict[str, list[float]] = {"scene": [], "detection": [], "estimation": []}
+"""What a block cost of which nothing was computed."""
+
+
+def _columns(
+    variable: Variable, cells: CellsResult | None, rows: NDArray[np.intp], pipeline: Pipeline,
+    count: int,
+) -> list[NDArray[Any]]:
+    """Return a variable's columns (N, ...) per treatment: what ``rows`` gave, fill elsewhere."""
+    if cells is not None and len(rows) == count:
+        return cells.columns[variable.name]
+    stages = [stage for stage in Stage if Stage.scene < stage <= variable.stage]
+    columns = []
+    for k in range(pipeline.size(*stages)):
+        whole = np.full((count, *variable.inner_shape), variable.fill, dtype=variable.dtype)
+        if cells is not None:
+            whole[rows] = cells.columns[variable.name][k]
+        columns.append(whole)
+    return columns
+
+
+def _merged(variable: Variable, computed: dict[str, NDArray[Any]], taken: Taken) -> NDArray[Any]:
+    """Return a variable with what was taken in place of what was not computed.
+
+    Only whole cells are either: the flags of the variable's stage tell which.
+    """
+    new, old = computed[variable.name], taken.values[variable.name]
+    flag = {Stage.detection: "detection", Stage.estimation: "estimate"}.get(variable.stage)
+    if flag is None:
+        missing = np.isnan(new)
+    else:
+        missing = computed[flag] == Estimate.not_run
+        missing = missing.reshape(missing.shape + (1,) * (new.ndim - missing.ndim))
+    return np.where(missing, old, new).astype(variable.dtype)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -236,5 +237,6 @@ class Detector:
         self._parameters.minMarkerPerimeterRate = low
         self._parameters.maxMarkerPerimeterRate = high
         detector.setDetectorParameters(self._parameters)
-        corners, ids, rejected = detector.detectMarkers(image)
+        # OpenCV's stubs know neither the element types nor that 4.x returns ids as (N, 1).
+        corners, ids, rejected = cast("tuple[Any, Any, Any]", detector.detectMarkers(image))
         return corners, [] if ids is None else ids.ravel().tolist(), rejected

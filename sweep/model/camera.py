@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from sweep.model import lens
 from sweep.model.parameter import parameter
@@ -79,7 +79,7 @@ class Cameras:
     lenses: NDArray[np.float64]
     distorted: NDArray[np.bool_]
 
-    def take(self, rows: ArrayLike) -> Cameras:
+    def take(self, rows: NDArray[np.intp]) -> Cameras:
         """Return the cameras of the given rows."""
         return Cameras(self.view[rows], self.lenses[rows], self.distorted[rows])
 

@@ -57,7 +57,7 @@ def _add_segment(
     cover: NDArray[np.float64], jump: float, x0: float, y0: float, x1: float, y1: float
 ) -> None:
     """Add a segment that lies within the box [0, width] x [0, height]."""
-    if not (y0 < y1 or y1 < y0) or x0 != x0 or x1 != x1:
+    if not (y0 < y1 or y1 < y0) or math.isnan(x0) or math.isnan(x1):
         return
     if y0 < y1:
         sign, xa, ya, xb, yb = 1.0, x0, y0, x1, y1
@@ -227,7 +227,7 @@ def accumulate(
             u, v = _bent(0.25 * quarter, plane, lens, view, a, b, c, d)
             off = max(off, _off_chord(u, v, u0, v0, u1, v1))
         # A chord's distance from a smooth curve falls with the square of the number of chords.
-        chords = min(max(int(math.ceil(math.sqrt(off / CHORD_TOLERANCE_PX))), 1), 4096)
+        chords = min(max(math.ceil(math.sqrt(off / CHORD_TOLERANCE_PX)), 1), 4096)
         x, y = u0 + (0.5 - left), v0 + (0.5 - top)
         for chord in range(1, chords + 1):
             u, v = u1, v1

@@ -53,9 +53,9 @@ def fold_radius(coefficients: Sequence[float]) -> float:
         trimmed = polynomial.trim()
         if trimmed.degree() == 0:
             continue
-        for root in trimmed.roots():
+        for root in np.asarray(trimmed.roots(), dtype=np.complex128).tolist():
             if abs(root.imag) <= 1e-9 * max(1.0, abs(root.real)) and root.real > 0:
-                first = min(first, math.sqrt(float(root.real)))
+                first = min(first, math.sqrt(root.real))
     return first
 
 

@@ -178,7 +178,7 @@ def _perspective(
 
 
 def _warp_grey(scenes: Scenes, row: int, box: Box, view: Grey) -> None:
-    """The paper's steps 5-8: only the corners are projected, and OpenCV warps the bitmap."""
+    """Take the paper's steps 5-8: only the corners are projected, and OpenCV warps the bitmap."""
     background, black, white = scenes.levels[row].tolist()
     bitmap, corners = _grey_bitmap(
         scenes.dictionary[row], scenes.marker_id[row], scenes.quiet_zone[row], black, white

@@ -188,8 +188,8 @@ def placed(points: Floats, rotation: Floats, translation: Floats) -> Floats:
 
 def _outline(scenes: Scenes, rows: NDArray[np.intp], quiet: bool, per_side: int) -> Floats:
     """Return points (n, 4 · per_side, 2) along the images of the outline or the black square."""
-    modules = np.array([module_count(scenes.dictionary[row]) for row in rows], dtype=np.float64)
-    margin = np.array([scenes.quiet_zone[row] if quiet else 0.0 for row in rows])
+    modules = np.array([float(module_count(scenes.dictionary[row])) for row in rows.tolist()])
+    margin = np.array([scenes.quiet_zone[row] if quiet else 0.0 for row in rows.tolist()])
     low, high = -margin[:, None], (modules + margin)[:, None]
     t = np.arange(per_side) / per_side
     ahead, back = low + t * (high - low), high - t * (high - low)
@@ -221,7 +221,7 @@ def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
     warped = np.flatnonzero([name == "warp" for name in scenes.renderer])
     if len(warped):
         # A linear interpolation spreads an edge by half a pixel of the bitmap on either side.
-        modules = np.array([module_count(scenes.dictionary[row]) for row in warped])
+        modules = np.array([module_count(scenes.dictionary[row]) for row in warped.tolist()])
         spread = 1 + (high - low)[warped] / (WARP_PX_PER_MODULE * modules[:, None])
         low[warped], high[warped] = low[warped] - spread, high[warped] + spread
     limit = scenes.frame.astype(np.float64)
@@ -302,8 +302,8 @@ def not_modelled(scenes: Scenes) -> NDArray[np.bool_]:
     folded = np.zeros(len(scenes), dtype=bool)
     rows = np.flatnonzero(scenes.cameras.distorted & np.isfinite(scenes.outline_px).all((1, 2)))
     if len(rows):
-        modules = np.array([module_count(scenes.dictionary[row]) for row in rows])
-        quiet = np.array([scenes.quiet_zone[row] for row in rows])
+        modules = np.array([module_count(scenes.dictionary[row]) for row in rows.tolist()])
+        quiet = np.array([scenes.quiet_zone[row] for row in rows.tolist()])
         outline = marker_corners(scenes.size_m[rows] * (1 + 2 * quiet / modules))
         points = placed(outline, scenes.rotation[rows], scenes.translation[rows])
         folded[rows] = lens_model.folds(

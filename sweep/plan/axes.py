@@ -162,7 +162,7 @@ def parse_axis(parameter: Parameter, given: Any) -> Axis:
             raise ValueError(f"an axis; a distribution goes under [{parameter.section}]")
         raise ValueError(f"a list, or a table with one of {forms}{nearest(form, [*AXIS_FORMS])}")
     if not isinstance(ends, list):
-        raise ValueError(f"{form} = {AXIS_FORMS[form]}")
+        raise ValueError(f"{form} = {AXIS_FORMS[form]}")  # noqa: TRY004  (a fault of the file)
     values = ends if form == "values" else _expand(form, ends)
     if len(values) == 0:
         raise ValueError("at least one value")

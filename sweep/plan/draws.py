@@ -30,10 +30,11 @@ _DEFAULT_VIEW = dict(
         strict=True,
     )
 )
-_PLAIN = tuple(
-    p.name for p in PARAMETERS.values()
-    if p.section in GEOMETRY_SECTIONS and p.name not in (*_CAMERA, "distortion", "side_px")
-) + ("width_px", "height_px")
+_PLAIN = (
+    "width_px", "height_px",
+    *(p.name for p in PARAMETERS.values()
+      if p.section in GEOMETRY_SECTIONS and p.name not in (*_CAMERA, "distortion", "side_px")),
+)
 
 
 def _text(value: Any) -> str:
@@ -54,10 +55,12 @@ def _texts(name: str, value: Any, default: Any, count: int) -> list[str]:
     known: dict[Any, str] = {}
     texts = []
     for item in value.tolist() if isinstance(value, np.ndarray) else value:
-        text = known.get(item)
-        if text is None:
+        if item in known:
+            text = known[item]
+        else:
             text = _text(item)
-            text = known[item] = "" if text == left_out else f"{name}={text}"
+            text = "" if text == left_out else f"{name}={text}"
+            known[item] = text
         texts.append(text)
     return texts
 

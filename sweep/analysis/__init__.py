@@ -1,0 +1,1 @@
+"""Dataset in, Dataset out. Nothing here knows of files or Dask clients."""

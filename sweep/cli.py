@@ -1,0 +1,278 @@
+"""The commands; parsing and printing only.
+
+Exit status: 0 done, 1 failed while running or damage found, 2 could not be run as asked,
+130 stopped by Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import math
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from sweep.errors import PipelineError, StoreError, SweepError
+
+if TYPE_CHECKING:
+    from sweep.engine.execute import Progress
+    from sweep.plan.pipeline import Pipeline
+
+# Heavy packages are imported by the commands that need them: `sweep --help` is quick.
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; return its exit status."""
+    parser = _parser()
+    chosen = parser.parse_args(arguments)
+    try:
+        return int(chosen.command(chosen))
+    except (PipelineError, StoreError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    except SweepError as error:
+        print(error, file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("stopped; the same command continues", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="sweep",
+        description="How well will I know the pose? Experiments with fiducial markers.",
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def command(
+        name: str, function: Callable[[argparse.Namespace], int], text: str
+    ) -> argparse.ArgumentParser:
+        added = commands.add_parser(name, help=text, description=text)
+        added.set_defaults(command=function)
+        return added
+
+    run = command("run", _run, "run a pipeline into a store; continue where it stopped")
+    _add_pipeline(run)
+    run.add_argument("--store", metavar="PATH", help="default: runs/NAME.zarr")
+    run.add_argument("--workers", type=int, metavar="N", help="default: the processors at hand")
+    run.add_argument("--scheduler", metavar="ADDRESS", help="a running Dask scheduler")
+    run.add_argument(
+        "--reuse", action="append", default=[], metavar="STORE",
+        help="take finished cells from this store where they agree",
+    )
+    run.add_argument("--overwrite", action="store_true", help="delete a store that is there")
+    run.add_argument("--json", action="store_true", help="print one JSON object")
+
+    plan = command("plan", _plan, "say what would run, and what it would take")
+    _add_pipeline(plan)
+    plan.add_argument("--workers", type=int, metavar="N", help="default: the processors at hand")
+    plan.add_argument("--json", action="store_true", help="print one JSON object")
+
+    show = command("show", _show, "draw one pose's image with what was found in it")
+    _add_pipeline(show)
+    show.add_argument(
+        "--at", default="", metavar="NAME=VALUE,...",
+        help="the pose; axes that are not named take their first value",
+    )
+    show.add_argument("-o", "--output", default="scene.png", metavar="PNG")
+    show.add_argument("--plain", action="store_true", help="the image alone")
+    show.add_argument("--full", action="store_true", help="the whole frame")
+
+    status = command("status", _status, "say how far a store is; also while it is written")
+    status.add_argument("store", metavar="STORE")
+    status.add_argument("--json", action="store_true", help="print one JSON object")
+    return parser
+
+
+def _add_pipeline(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("pipeline", metavar="PIPELINE", help="a TOML file")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
+        help="a TOML value in place of the file's; a list makes an axis",
+    )
+
+
+def _read(chosen: argparse.Namespace) -> Pipeline:
+    from sweep.plan.pipeline import Pipeline  # noqa: PLC0415
+
+    return Pipeline.from_toml(chosen.pipeline, chosen.settings)
+
+
+def _print_json(content: dict[str, Any]) -> None:
+    print(json.dumps(content, indent=2))
+
+
+def _run(chosen: argparse.Namespace) -> int:
+    pipeline = _read(chosen)
+    from sweep.engine.execute import execute  # noqa: PLC0415
+
+    with _Bar() as bar:
+        summary = execute(
+            pipeline, chosen.store, workers=chosen.workers, scheduler=chosen.scheduler,
+            reuse=chosen.reuse, overwrite=chosen.overwrite, on_progress=bar,
+        )
+    if chosen.json:
+        _print_json(dataclasses.asdict(summary))
+        return 0
+    if summary.computed_blocks == 0:
+        print(f"{summary.store} is finished; --overwrite computes it again")
+    rate = summary.poses / summary.seconds if summary.computed_blocks else 0
+    print(
+        f"{summary.poses:,} poses, {summary.results:,} results, {summary.detected:,} detected"
+        + (f", {summary.seconds:.1f} s ({rate:,.0f} poses/s)" if rate else "")
+    )
+    for flag, count in (("crashed", summary.crashed), ("failed", summary.failed)):
+        if count:
+            print(f"{count:,} flagged {flag}")
+    print(f'xarray.open_zarr("{summary.store}")')
+    return 0
+
+
+class _Bar:
+    """A progress bar on standard error, where that is a terminal."""
+
+    def __enter__(self) -> Self:
+        from rich.console import Console  # noqa: PLC0415
+        from rich.progress import (  # noqa: PLC0415
+            BarColumn,
+            Progress,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+
+        console = Console(stderr=True)
+        self._progress = Progress(
+            TextColumn("{task.description}"), BarColumn(),
+            TextColumn("{task.completed:,.0f} of {task.total:,.0f} poses"),
+            TimeElapsedColumn(), TimeRemainingColumn(), console=console,
+            disable=not console.is_terminal, transient=True,
+        )
+        self._progress.start()
+        self._task = self._progress.add_task("starting", total=None)
+        return self
+
+    def __call__(self, progress: Progress) -> None:
+        self._progress.update(
+            self._task, description="running", total=progress.total, completed=progress.done
+        )
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+
+def _plan(chosen: argparse.Namespace) -> int:
+    pipeline = _read(chosen)
+    from sweep.engine.forecast import forecast  # noqa: PLC0415
+    from sweep.plan.parts import parts  # noqa: PLC0415
+
+    expected = forecast(pipeline, chosen.workers)
+    listed = parts(pipeline)
+    if chosen.json:
+        _print_json(
+            {
+                "title": pipeline.title,
+                "dimensions": {axis.name: len(axis) for axis in pipeline.axes},
+                **dataclasses.asdict(expected),
+                "parts": [dataclasses.asdict(part) for part in listed],
+            }
+        )
+        return 0
+    print(pipeline.title or pipeline.name)
+    print("\nDimensions")
+    width = max((len(axis.name) for axis in pipeline.axes), default=0)
+    for axis in pipeline.axes:
+        stage = axis.stage.name
+        shown = f"{axis.values[0]} ... {axis.values[-1]}" if len(axis) > 1 else axis.values[0]
+        print(f"  {axis.name:{width}}  {len(axis):>11,}  {stage:10}  {shown} {axis.unit}".rstrip())
+    print("\nParts")
+    for part in listed:
+        print(f"  {part.name:17} {'on ' if part.active else 'off'}  {part.reason}")
+    print("\nExpected")
+    rows = {
+        "poses": f"{expected.poses:,}",
+        "results": f"{expected.results:,}",
+        "blocks": f"{expected.blocks:,} of {' x '.join(map(str, expected.block)) or '1'} poses",
+        "store": f"{_bytes(expected.bytes)} before compression",
+        "memory": f"{_bytes(expected.worker_bytes)} a worker",
+        "cost": f"{1e3 * expected.pose_s:.3g} ms a pose ({expected.sampled} sampled)",
+        "time": f"{_duration(expected.seconds)} with {expected.workers} workers",
+    }
+    for name, text in rows.items():
+        print(f"  {name:8} {text}")
+    return 0
+
+
+def _bytes(count: int) -> str:
+    units = ("bytes", "kB", "MB", "GB", "TB", "PB")
+    power = min(int(math.log(max(count, 1), 1000)), len(units) - 1)
+    return f"{count / 1000**power:.3g} {units[power]}"
+
+
+def _duration(seconds: float) -> str:
+    for unit, length in (("days", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.1f} {unit}"
+    return f"{seconds:.1f} s"
+
+
+def _show(chosen: argparse.Namespace) -> int:
+    pipeline = _read(chosen)
+    import cv2  # noqa: PLC0415
+
+    from sweep.kernel import look  # noqa: PLC0415
+    from sweep.plan.cell import cell, coordinates_text  # noqa: PLC0415
+    from sweep.report.scene_drawing import draw_scene  # noqa: PLC0415
+
+    one = cell(pipeline, chosen.at)
+    seen = look(one, whole_frame=chosen.full)
+    picture = seen.image if chosen.plain else draw_scene(seen, coordinates_text(pipeline, one))
+    _, encoded = cv2.imencode(".png", picture)
+    path = Path(chosen.output)
+    try:
+        path.write_bytes(encoded.tobytes())
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be written: {error.strerror}") from None
+    print(f"{path}: {seen.detection.name}, {seen.estimate.name}")
+    return 0
+
+
+def _status(chosen: argparse.Namespace) -> int:
+    from sweep.engine.status import status  # noqa: PLC0415
+
+    state = status(chosen.store)
+    if chosen.json:
+        _print_json(dataclasses.asdict(state))
+        return 0
+    if state.finished:
+        what = "finished"
+    elif state.writer is not None:
+        what = f"being written by {state.writer}"
+    else:
+        what = "stopped; `sweep run` continues it"
+    print(f"{state.title}: {what}")
+    print(f"  blocks      {state.blocks_done:,} of {state.blocks:,}")
+    print(f"  poses       {state.poses_done:,} of {state.poses:,}")
+    for name, counts in (("detection", state.detection), ("estimate", state.estimate)):
+        listed = ", ".join(f"{flag} {count:,}" for flag, count in counts.items())
+        print(f"  {name:11} {listed or 'nothing yet'}")
+    if state.poses_per_s is not None:
+        print(f"  rate        {state.poses_per_s:,.0f} poses/s")
+    if state.seconds_left is not None:
+        print(f"  time left   {_duration(state.seconds_left)}")
+    for failure in state.failures:
+        print(f"  failed      {failure}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
+
+

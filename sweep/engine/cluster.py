@@ -1,0 +1,130 @@
+"""Where blocks are computed: an embedded cluster on this machine, or one that is running."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+from collections.abc import Iterator
+from typing import Any
+
+import dask
+from distributed import Client, LocalCluster
+
+from sweep.engine.fingerprint import fingerprint
+from sweep.errors import StoreError
+from sweep.plan.pipeline import Pipeline
+
+ANSWER_S = 10.0
+"""How long a scheduler, and then its first worker, may take to answer."""
+
+WORKER_ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OPENCV_FOR_THREADS_NUM": "1",
+    "MALLOC_TRIM_THRESHOLD_": "268435456",
+    "MALLOC_MMAP_THRESHOLD_": "268435456",
+}
+"""One thread a worker, and images' memory kept between scenes rather than given back."""
+
+QUIET = logging.CRITICAL
+
+
+def default_workers() -> int:
+    """Return how many processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@contextlib.contextmanager
+def embedded(workers: int) -> Iterator[Client]:
+    """Start a cluster of ``workers`` single-threaded processes on this machine; end it quietly.
+
+    It listens on the loopback interface only.
+    """
+    _hush()
+    settings = {
+        "distributed.nanny.pre-spawn-environ": WORKER_ENVIRONMENT,
+        "distributed.worker.memory.terminate": False,
+    }
+    # Ctrl-C reaches every process of the terminal; the workers leave it to the client.
+    before = signal.getsignal(signal.SIGINT) if _in_main_thread() else None
+    if before is not None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with dask.config.set(settings):
+            cluster = LocalCluster(
+                n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1",
+                dashboard_address=None, silence_logs=QUIET,
+            )
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGINT, before)
+    with cluster, Client(cluster, set_as_default=False) as client:
+        yield client
+
+
+def _in_main_thread() -> bool:
+    try:
+        signal.signal(signal.SIGINT, signal.getsignal(signal.SIGINT))
+    except (ValueError, TypeError):
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def external(address: str, pipeline: Pipeline) -> Iterator[Client]:
+    """Connect to a running scheduler whose workers make the same numbers as this process.
+
+    Raises
+    ------
+    StoreError
+        Where it does not answer, has no workers, or a worker has other versions.
+    """
+    _hush()
+    try:
+        client = Client(address, timeout=ANSWER_S, set_as_default=False)
+    except (OSError, TimeoutError, ValueError):
+        raise StoreError(
+            f"--scheduler {address}: no answer within {ANSWER_S:.0f} s; is `dask scheduler` "
+            "running there?"
+        ) from None
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=ANSWER_S)
+        except TimeoutError:
+            raise StoreError(
+                f"--scheduler {address}: no workers; start some with `dask worker {address}`"
+            ) from None
+        _refuse_other_versions(client, address, pipeline)
+        yield client
+
+
+def _refuse_other_versions(client: Client, address: str, pipeline: Pipeline) -> None:
+    mine = fingerprint(pipeline)
+    try:
+        answers: dict[str, dict[str, Any]] = client.run(fingerprint, pipeline)
+    except Exception as error:
+        raise StoreError(
+            f"--scheduler {address}: its workers cannot run sweep: {error}; install it there"
+        ) from None
+    lines = sorted(
+        f"  {worker}: {key} {theirs.get(key)}, here {mine[key]}"
+        for worker, theirs in answers.items()
+        for key in mine
+        if theirs.get(key) != mine[key]
+    )
+    if lines:
+        raise StoreError(
+            f"--scheduler {address}: workers with other versions; install the same everywhere\n"
+            + "\n".join(lines)
+        )
+
+
+def _hush() -> None:
+    """Keep distributed from narrating: what matters is told as errors of this package."""
+    for name in ("distributed", "distributed.nanny", "distributed.worker"):
+        logging.getLogger(name).setLevel(QUIET)

@@ -1,0 +1,96 @@
+"""One writer a store: a lock that a dead client does not hold for ever."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import threading
+import time
+import uuid
+from collections.abc import Iterator
+from typing import Any
+
+from zarr.abc.store import Store
+from zarr.core.sync import sync
+
+from sweep.engine.store import RunStore, get, put
+from sweep.errors import StoreError
+
+KEY = "sweep-lock.json"
+BEAT_S = 5.0
+"""How often a writer says that it lives."""
+
+SILENCE_S = 30.0
+"""After this long without a word a writer on another machine is taken for dead."""
+
+
+@contextlib.contextmanager
+def locked(store: RunStore) -> Iterator[None]:
+    """Hold a store for writing.
+
+    Raises
+    ------
+    StoreError
+        Where another living client holds it.
+    """
+    place = store.group.store
+    refuse_if_held(store.url, place)
+    mine = {"token": uuid.uuid4().hex, "host": socket.gethostname(), "pid": os.getpid()}
+    put(place, KEY, {**mine, "beat": time.time()})
+    held = get(place, KEY)
+    if held is None or held.get("token") != mine["token"]:
+        raise StoreError(_held(store.url, held or {}))
+    done = threading.Event()
+
+    def beat() -> None:
+        while not done.wait(BEAT_S):
+            with contextlib.suppress(OSError):
+                put(place, KEY, {**mine, "beat": time.time()})
+
+    heart = threading.Thread(target=beat, daemon=True, name="store lock")
+    heart.start()
+    try:
+        yield
+    finally:
+        done.set()
+        heart.join()
+        with contextlib.suppress(OSError):
+            sync(place.delete(KEY))
+
+
+def refuse_if_held(url: str, place: Store) -> None:
+    """Raise StoreError where a living client writes the store."""
+    held = holder(place)
+    if held is not None:
+        raise StoreError(_held(url, held))
+
+
+def holder(place: Store) -> dict[str, Any] | None:
+    """Return who holds a store: host and pid; None where nobody living does."""
+    held = get(place, KEY)
+    if held is None:
+        return None
+    if held.get("host") == socket.gethostname():
+        return held if _alive(held.get("pid")) else None
+    silent = time.time() - float(held.get("beat", 0.0))
+    return held if silent < SILENCE_S else None
+
+
+def _alive(pid: Any) -> bool:
+    if not isinstance(pid, int) or pid <= 0:
+        return False
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _held(url: str, held: dict[str, Any]) -> str:
+    return (
+        f"{url}: process {held.get('pid')} on {held.get('host')} is writing it; "
+        "wait for it, or take another --store"
+    )

@@ -1,0 +1,1 @@
+"""Figures and drawn scenes. Nothing here knows how results are made."""

@@ -330,9 +330,9 @@ def _estimated(
     except Exception:
         parts = []
         for i in range(len(rows)):
-            one = slice(i, i + 1)
+            one = np.array([i])
             try:
-                parts.append(estimate(corners[one], cameras.take(np.array([i])), size[one], *arguments))
+                parts.append(estimate(corners[one], cameras.take(one), size[one], *arguments))
             except Exception:
                 failures.append(Failure(int(rows[i]), "estimation", traceback.format_exc()))
                 parts.append(Estimates.none(1, Estimate.failed))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import logging
 import os
 import signal
@@ -10,7 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import dask
-from distributed import Client, LocalCluster
+from distributed import Client, LocalCluster, fire_and_forget
 
 from sweep.engine.fingerprint import fingerprint
 from sweep.errors import StoreError
@@ -64,7 +65,16 @@ def embedded(workers: int) -> Iterator[Client]:
         if before is not None:
             signal.signal(signal.SIGINT, before)
     with cluster, Client(cluster, set_as_default=False) as client:
+        # The workers import their packages while the caller measures.
+        fire_and_forget(
+            [client.submit(_warm, workers=[worker], pure=False) for worker in client.nthreads()]
+        )
         yield client
+
+
+def _warm() -> None:
+    """Import what a block needs."""
+    importlib.import_module("sweep.engine.task")
 
 
 def _in_main_thread() -> bool:

@@ -24,6 +24,7 @@ from sweep.engine.lock import locked, refuse_if_held
 from sweep.engine.reuse import match
 from sweep.engine.store import (
     RunStore,
+    check_place,
     committed,
     create_store,
     exists,
@@ -128,6 +129,8 @@ def execute(
     sources = [place(os.fspath(old)) for old in reuse]
     for source in sources:
         match(pipeline, open_store(source))
+    if opened is None:
+        check_place(url)
     with ThreadPoolExecutor(1) as beside:
         # Compiling and measuring here while the workers' processes come up.
         measuring = beside.submit(calibrate, pipeline, CALIBRATION_S) if opened is None else None
@@ -177,7 +180,7 @@ def _compute(
     Returns for each block that was run how many scenes, detections and estimates it computed.
     """
     done = committed(store)
-    todo = (block for block in store.blocks if str(block) not in done)
+    todo = (store.blocks[k] for k in range(len(store.blocks)) if k not in done)
     progress = Progress(0, store.pipeline.size(Stage.scene), 0)
     for _, receipt in receipts(store, done):
         _count(progress, receipt)
@@ -228,12 +231,12 @@ def _count(progress: Progress, receipt: Mapping[str, Any]) -> None:
 
 def _cost(store: RunStore) -> xr.Dataset:
     """Return the cost group: seconds per stage and treatment for each block."""
-    names, scene, detection, estimation = [], [], [], []
-    for name, receipt in receipts(store, sorted(committed(store))):
+    numbers, scene, detection, estimation = [], [], [], []
+    for number, receipt in receipts(store, committed(store)):
         seconds = receipt["seconds"]
         if not seconds["scene"]:
             continue
-        names.append(name)
+        numbers.append(number)
         scene.append(seconds["scene"][0])
         detection.append(seconds["detection"])
         estimation.append(seconds["estimation"])
@@ -241,7 +244,7 @@ def _cost(store: RunStore) -> xr.Dataset:
     settings = [axis for axis in pipeline.axes if axis.stage is Stage.detection]
     solvers = [axis for axis in pipeline.axes if axis.stage is Stage.estimation]
     both = [*settings, *solvers]
-    count = len(names)
+    count = len(numbers)
 
     def shaped(values: list[Any], axes: list[Any]) -> Any:
         return np.asarray(values, dtype=np.float64).reshape(
@@ -254,9 +257,9 @@ def _cost(store: RunStore) -> xr.Dataset:
             "detection_s": (("block", *(a.name for a in settings)), shaped(detection, settings)),
             "estimation_s": (("block", *(a.name for a in both)), shaped(estimation, both)),
         },
-        coords={axis.name: axis.coordinates().astype(object)
+        coords={"block": numbers, **{axis.name: axis.coordinates().astype(object)
                 if axis.coordinates().dtype.kind == "T" else axis.coordinates()
-                for axis in both},
+                for axis in both}},
         attrs={"long_name": "seconds per stage and treatment for each block"},
     )
 

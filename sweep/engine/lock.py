@@ -14,10 +14,10 @@ from typing import Any
 from zarr.abc.store import Store
 from zarr.core.sync import sync
 
-from sweep.engine.store import RunStore, get, put
+from sweep.engine.store import RECEIPTS, RunStore, get, put
 from sweep.errors import StoreError
 
-KEY = "sweep-lock.json"
+KEY = f"{RECEIPTS}/lock.json"
 BEAT_S = 5.0
 """How often a writer says that it lives."""
 

@@ -10,10 +10,9 @@ import itertools
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 
 from sweep.engine.fingerprint import fingerprint
@@ -41,13 +40,13 @@ class Source:
     pinned
         Old axes that the new grid does not have -> the index of the value that it has fixed.
     done
-        Names of the old store's committed blocks.
+        Numbers of the old store's committed blocks.
     """
 
     store: RunStore
     old_index: dict[str, NDArray[np.int64]]
     pinned: dict[str, int]
-    done: frozenset[str]
+    done: frozenset[int]
 
 
 def _key(value: Any) -> Any:
@@ -230,11 +229,7 @@ def _committed_cells(
     ready = np.zeros([len(index) for index in along], dtype=bool)
     for chosen in itertools.product(*(np.unique(number) for number in numbers)):
         starts = tuple(int(c) * e for c, e in zip(chosen, blocks.extents, strict=True))
-        stops = tuple(
-            min(start + extent, length)
-            for start, extent, length in zip(starts, blocks.extents, blocks.lengths, strict=True)
-        )
-        if str(Block(starts, stops)) in source.done:
+        if blocks.number(Block(starts, starts)) in source.done:
             ready[np.ix_(*(n == c for n, c in zip(numbers, chosen, strict=True)))] = True
     # Old dimensions that are pinned go; new ones that the old store had fixed come, length 1.
     for k in reversed(range(len(names))):
@@ -252,7 +247,7 @@ def _read(
     source: Source, pipeline: Pipeline, variable: Variable, indices: dict[str, NDArray[np.int64]]
 ) -> NDArray[Any]:
     """Read an old variable at ``indices``, in the new grid's dimensions."""
-    array = cast("zarr.Array[Any]", source.store.group[variable.name])
+    array = source.store.array(variable.name)
     names = list(variable.dimensions(source.store.pipeline))
     selection: list[Any] = []
     for name in names:

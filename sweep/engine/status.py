@@ -47,7 +47,7 @@ def status(url: str) -> Status:
     written: list[tuple[float, int]] = []
     failures: list[str] = []
     done = poses = 0
-    for name, receipt in receipts(store, sorted(committed(store))):
+    for number, receipt in receipts(store, committed(store)):
         done += 1
         poses += receipt["scenes"]
         for flags, counts, counter in (
@@ -58,7 +58,7 @@ def status(url: str) -> Status:
                 counter[flag.name] += count
         written.append((receipt["written"], receipt["scenes"]))
         failures += [
-            f"block {name}, scene {failure['scene']}, {failure['stage']}: "
+            f"block {store.blocks[number]}, scene {failure['scene']}, {failure['stage']}: "
             f"{failure['text'].strip().splitlines()[-1]}"
             for failure in receipt["failures"]
         ]

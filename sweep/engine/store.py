@@ -9,16 +9,16 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import tempfile
 import time
 import uuid
 import warnings
 from collections.abc import AsyncIterator, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-import xarray as xr
 import zarr
 import zarr.errors
 from numpy.typing import NDArray
@@ -35,16 +35,19 @@ from sweep.plan.grid import CAMERA, Block, Blocks, scene_axes
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.template import LABELS, TEMPLATE, Variable
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 FORMAT = 1
 """Version of the store's layout."""
 
-RECEIPTS = "sweep-blocks"
-"""Where the receipts of committed blocks lie, beside the arrays."""
+RECEIPTS = "commits/receipt"
+"""Array of the blocks' receipts by number, JSON, a chunk each; empty where not committed."""
 
 COORDINATE_CHUNK = 1 << 20
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class RunStore:
     """An open store: where it is, what it holds, and how its grid is cut."""
 
@@ -53,6 +56,13 @@ class RunStore:
     pipeline: Pipeline
     run_id: str
     blocks: Blocks
+    _arrays: dict[str, zarr.Array[Any]] = field(default_factory=dict, repr=False, compare=False)
+
+    def array(self, name: str) -> zarr.Array[Any]:
+        """Return an array by its path; its metadata is read once."""
+        if name not in self._arrays:
+            self._arrays[name] = cast("zarr.Array[Any]", self.group[name])
+        return self._arrays[name]
 
     @property
     def finished(self) -> bool:
@@ -125,6 +135,24 @@ def open_store(url: str, mode: str = "r") -> RunStore:
         ) from None
 
 
+def check_place(url: str) -> None:
+    """See that a local store can be made at a place, before any work is done for it.
+
+    Raises
+    ------
+    StoreError
+        Where it cannot be written.
+    """
+    if is_remote(url):
+        return
+    try:
+        Path(url).parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=Path(url).parent, prefix=".sweep-"):
+            pass
+    except OSError as error:
+        raise StoreError(f"{url}: cannot be written: {error.strerror or error}") from None
+
+
 def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunStore:
     """Lay out an empty store for a pipeline, its chunks equal to blocks of ``extents``.
 
@@ -135,8 +163,6 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
     """
     run_id = uuid.uuid4().hex
     try:
-        if not is_remote(url):
-            Path(url).parent.mkdir(parents=True, exist_ok=True)
         group = _open_group(url, "w-")
         scene_extent = dict(
             zip((axis.name for axis in scene_axes(pipeline)), extents, strict=True)
@@ -149,6 +175,11 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
         coordinates = _write_distance(group, pipeline)
         for variable in TEMPLATE:
             _create_variable(group, variable, pipeline, scene_extent)
+        lengths = tuple(len(axis) for axis in scene_axes(pipeline))
+        group.create_array(
+            RECEIPTS, shape=(len(Blocks(lengths, extents)),), chunks=(1,), dtype="string",
+            dimension_names=("block",), compressors=None,
+        )
         group.attrs.update(
             {
                 "title": pipeline.title or pipeline.name,
@@ -281,9 +312,11 @@ def write_block(
 ) -> None:
     """Write a block's values, then commit them by its receipt."""
     for variable in TEMPLATE:
-        array = cast("zarr.Array[Any]", store.group[variable.name])
+        array = store.array(variable.name)
         array[region(variable, store.pipeline, block)] = values[variable.name]
-    put(store.group.store, f"{RECEIPTS}/{block}.json", {"run_id": store.run_id, **receipt})
+    number = store.blocks.number(block)
+    content = json.dumps({"run_id": store.run_id, **receipt}, separators=(",", ":"))
+    store.array(RECEIPTS)[number : number + 1] = np.array([content], dtype=object)
 
 
 def put(store: Store, key: str, content: dict[str, Any]) -> None:
@@ -304,23 +337,27 @@ def get(store: Store, key: str) -> dict[str, Any] | None:
     return content if isinstance(content, dict) else None
 
 
-def committed(store: RunStore) -> set[str]:
-    """Return the names of the blocks that are committed."""
-    async def gather(keys: AsyncIterator[str]) -> set[str]:
-        return {key.removesuffix(".json") async for key in keys if key.endswith(".json")}
+def committed(store: RunStore) -> set[int]:
+    """Return the numbers of the blocks that are committed."""
+    async def gather(keys: AsyncIterator[str]) -> set[int]:
+        return {int(key) async for key in keys if key.isdecimal()}
 
     try:
-        return sync(gather(store.group.store.list_dir(RECEIPTS)))
+        return sync(gather(store.group.store.list_dir(f"{RECEIPTS}/c")))
     except FileNotFoundError:
         return set()
 
 
-def receipts(store: RunStore, names: Iterable[str]) -> Iterable[tuple[str, dict[str, Any]]]:
-    """Yield the receipts of committed blocks by name."""
-    for name in names:
-        receipt = get(store.group.store, f"{RECEIPTS}/{name}.json")
-        if receipt is not None:
-            yield name, receipt
+def receipts(
+    store: RunStore, numbers: Iterable[int]
+) -> Iterable[tuple[int, dict[str, Any]]]:
+    """Yield the receipts of committed blocks by number."""
+    ordered = sorted(numbers)
+    for start in range(0, len(ordered), 1000):
+        some = ordered[start : start + 1000]
+        texts = np.asarray(store.array(RECEIPTS).oindex[np.array(some)])
+        for number, text in zip(some, texts.tolist(), strict=True):
+            yield number, json.loads(text)
 
 
 def finish(store: RunStore, cost: xr.Dataset) -> None:
@@ -346,5 +383,7 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
         Where there is none, or something else.
     """
     store = open_store(os.fspath(url))
+    import xarray as xr  # noqa: PLC0415  (slow to import, and workers do without)
+
     dataset: xr.Dataset = xr.open_zarr(store.url, consolidated=store.finished)
     return dataset

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from sweep.plan.parameters import PARAMETERS, Parameter, Stage
 
@@ -85,6 +84,8 @@ class Distribution:
         """Return the draws that uniform numbers in (0, 1) stand for (inverse CDF)."""
         if self.kind == "uniform":
             return self.a + (self.b - self.a) * uniform
+        from scipy.special import ndtri  # noqa: PLC0415  (slow to import, and seldom needed)
+
         return np.asarray(self.a + self.b * ndtri(uniform))
 
     def __str__(self) -> str:

@@ -71,13 +71,27 @@ class Blocks:
         return math.prod(self.counts)
 
     def __iter__(self) -> Iterator[Block]:
-        for index in itertools.product(*(range(count) for count in self.counts)):
-            starts = tuple(i * extent for i, extent in zip(index, self.extents, strict=True))
-            stops = tuple(
-                min(start + extent, length)
-                for start, extent, length in zip(starts, self.extents, self.lengths, strict=True)
-            )
-            yield Block(starts, stops)
+        return (self[number] for number in range(len(self)))
+
+    def __getitem__(self, number: int) -> Block:
+        """Return a block by its number; the last axis counts fastest."""
+        index = []
+        for count in reversed(self.counts):
+            number, position = divmod(number, count)
+            index.append(position)
+        starts = tuple(i * e for i, e in zip(reversed(index), self.extents, strict=True))
+        stops = tuple(
+            min(start + extent, length)
+            for start, extent, length in zip(starts, self.extents, self.lengths, strict=True)
+        )
+        return Block(starts, stops)
+
+    def number(self, block: Block) -> int:
+        """Return the number of a block."""
+        number = 0
+        for start, extent, count in zip(block.starts, self.extents, self.counts, strict=True):
+            number = number * count + start // extent
+        return number
 
 
 def scene_axes(pipeline: Pipeline) -> tuple[Axis, ...]:

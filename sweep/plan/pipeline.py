@@ -13,6 +13,7 @@ from typing import Any
 
 import tomlkit
 import tomlkit.exceptions
+import tomlkit.items
 
 from sweep.errors import PipelineError
 from sweep.measure.detector import DetectorSetting
@@ -199,8 +200,7 @@ class _Reader:
         for parameter in PARAMETERS.values():
             if parameter.name not in self.given:
                 self.fixed[parameter.name] = parameter.default
-        if not self.faults:
-            self._across()
+        self._across()
         if self.faults:
             raise PipelineError(self.faults)
         return Pipeline(
@@ -267,7 +267,7 @@ class _Reader:
             except ValueError as error:
                 self.fault(where, value, str(error))
 
-    # What can only be judged with several parameters at hand.
+    # What can only be judged with several parameters at hand; what is broken is passed over.
 
     def _values(self, name: str) -> Sequence[Any]:
         if name in self.axes:
@@ -305,13 +305,14 @@ class _Reader:
             self.fault("fy_px", self._given_value("fy_px"), "fx_px beside it")
         self._ids()
         low, high = "adaptiveThreshWinSizeMin", "adaptiveThreshWinSizeMax"
-        if max(self._values(low)) > min(self._values(high)):
+        smallest, largest = self._values(low), self._values(high)
+        if smallest and largest and max(smallest) > min(largest):
             self.fault(high, self._given_value(high), f"at least {low}")
         self._backgrounds()
         self._detector_fields()
         trials = len(self.axes[TRIAL]) if TRIAL in self.axes else 1
-        random = self.distributions or max(self._values("jitter_px")) > 0
-        if trials > 1 and not random:
+        jitter = self._values("jitter_px")
+        if trials > 1 and not self.distributions and jitter and max(jitter) == 0:
             self.fault(
                 "axes.trial", trials,
                 "something random to repeat: jitter_px above 0, or a distribution",
@@ -324,6 +325,8 @@ class _Reader:
 
     def _ids(self) -> None:
         ids = self._values("marker_id")
+        if not ids:
+            return
         largest = max(ids[0], ids[-1]) if isinstance(ids, range) else max(ids)
         for dictionary in self._values("dictionary"):
             count = marker_count(dictionary)
@@ -348,7 +351,7 @@ class _Reader:
                 continue
             height, width = image.shape
             for name, length in (("width_px", width), ("height_px", height)):
-                if set(self._values(name)) != {length}:
+                if self._values(name) and set(self._values(name)) != {length}:
                     self.fault(
                         "scene.background", value,
                         f"an image of exactly the frame's size: it is {width} x {height}, but "
@@ -368,11 +371,17 @@ class _Reader:
 def _shown(value: Any) -> str:
     """Return a value as TOML would have it, cut where it is long."""
     try:
-        text = tomlkit.item(value).as_string()
+        text = (_inline(value) if isinstance(value, dict) else tomlkit.item(value)).as_string()
     except (ValueError, TypeError, tomlkit.exceptions.TOMLKitError, RecursionError):
         text = repr(value)
     text = " ".join(text.split())
     return text if len(text) <= 120 else text[:117] + "..."
+
+
+def _inline(table: dict[str, Any]) -> tomlkit.items.InlineTable:
+    inline = tomlkit.inline_table()
+    inline.update(table)
+    return inline
 
 
 _BARE = re.compile(r"[A-Za-z][A-Za-z0-9_.+-]*(/[A-Za-z0-9_.+-]+)*")
@@ -430,11 +439,7 @@ def _write(document: Any, name: str, value: Any) -> None:
         del document[other][name]
     if place not in document:
         document[place] = tomlkit.table()
-    if isinstance(value, dict):
-        inline = tomlkit.inline_table()
-        inline.update(value)
-        value = inline
-    document[place][name] = value
+    document[place][name] = _inline(value) if isinstance(value, dict) else value
 
 
 def _is_axis(name: str, value: Any) -> bool:

@@ -1,0 +1,383 @@
+"""A run: the same numbers however it is run, nothing computed twice, nothing mixed."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+import zarr
+
+import sweep
+from sweep.engine.execute import execute
+from sweep.engine.lock import KEY
+from sweep.engine.store import committed, create_store, open_store, put
+from sweep.engine.task import compute_block
+from sweep.errors import StoreError
+from sweep.kernel import run_block
+from sweep.plan.grid import Block, Blocks, scene_axes
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.template import TEMPLATE
+
+TEXT = """
+title = "A small grid with every kind of axis"
+seed = 5
+[marker]
+size_m = 0.04
+[pose]
+jitter_px = 0.5
+azimuth_deg = { uniform = [0, 360] }
+[scene]
+background = 128
+[axes]
+dictionary = ["DICT_4X4_50", "DICT_5X5_50"]
+distance_m = { geom = [0.2, 1.5, 4] }
+cornerRefinementMethod = ["none", "subpix"]
+tilt_deg = [0, 50]
+solver = ["ippe_square", "iterative"]
+trial = 3
+"""
+
+
+@pytest.fixture(scope="module")
+def pipeline():
+    return Pipeline.from_text(TEXT, name="small")
+
+
+@pytest.fixture(scope="module")
+def undisturbed(pipeline, tmp_path_factory):
+    """The store of one process that computes the whole grid as one block."""
+    url = str(tmp_path_factory.mktemp("undisturbed") / "whole.zarr")
+    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
+    by_hand(url, pipeline, lengths)
+    return url
+
+
+def by_hand(url, pipeline, extents):
+    """Compute a store in this process, without a cluster."""
+    store = create_store(url, pipeline, extents)
+    for block in store.blocks:
+        compute_block(url, store.run_id, block)
+    return store
+
+
+def same(a, b):
+    """Tell whether two stores hold the same decoded values, bit for bit."""
+    with xr.open_zarr(a, consolidated=False) as one, xr.open_zarr(b, consolidated=False) as other:
+        assert set(one.variables) == set(other.variables)
+        for name in one.variables:
+            x, y = one[name].to_numpy(), other[name].to_numpy()
+            if x.dtype.kind == "f":
+                x, y = x.view(f"u{x.itemsize}"), y.view(f"u{y.itemsize}")
+            if not (x == y).all():
+                return False
+    return True
+
+
+def sweep_command(*arguments, **options):
+    """Run the command line in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "sweep.cli", *map(str, arguments)],
+        capture_output=True, text=True, check=False, timeout=300, **options,
+    )
+
+
+@pytest.mark.parametrize("extents", [(1, 1, 1, 1), (2, 3, 1, 2), (1, 4, 2, 3)])
+def test_block_size_changes_no_bit(extents, pipeline, undisturbed, tmp_path):
+    url = str(tmp_path / "cut.zarr")
+    by_hand(url, pipeline, extents)
+    assert same(url, undisturbed)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_number_of_workers_changes_no_bit(workers, pipeline, undisturbed, tmp_path):
+    url = str(tmp_path / "run.zarr")
+    summary = execute(pipeline, url, workers=workers, block_s=0.02)
+    assert same(url, undisturbed)
+    assert summary.poses == summary.computed_scenes == 48
+    assert summary.results == summary.computed_estimates == 192
+    assert open_store(url).finished
+
+
+def test_stopped_run_continues_and_finished_one_is_left_alone(pipeline, undisturbed, tmp_path):
+    url = str(tmp_path / "stopped.zarr")
+    store = create_store(url, pipeline, (1, 2, 1, 3))
+    for block in list(store.blocks)[:3]:
+        compute_block(url, store.run_id, block)
+    assert len(committed(store)) == 3
+    assert not open_store(url).finished
+    summary = execute(pipeline, url, workers=1)
+    assert summary.computed_blocks == len(store.blocks) - 3
+    assert same(url, undisturbed)
+    assert execute(pipeline, url, workers=1).computed_blocks == 0
+
+
+def test_block_computed_twice_is_harmless(pipeline, undisturbed, tmp_path):
+    url = str(tmp_path / "twice.zarr")
+    store = by_hand(url, pipeline, (2, 4, 2, 3))
+    compute_block(url, store.run_id, next(iter(store.blocks)))
+    assert same(url, undisturbed)
+
+
+def test_xarray_opens_a_finished_store_with_labels_units_and_flags(pipeline, tmp_path):
+    dataset = sweep.run(pipeline, tmp_path / "labelled.zarr", workers=2)
+    with xr.open_zarr(tmp_path / "labelled.zarr") as opened:
+        assert opened.identical(dataset)
+    assert list(dataset.detection.dims) == [
+        "dictionary", "distance_m", "cornerRefinementMethod", "tilt_deg", "trial",
+    ]
+    assert dataset.true_tvec_m.dims == ("dictionary", "distance_m", "tilt_deg", "trial", "xyz")
+    assert dataset.distance_m.attrs["units"] == "m"
+    assert dataset.detection.attrs["flag_meanings"].split()[:2] == ["not_run", "detected"]
+    assert dataset.corner.to_numpy().tolist()[0] == "top_left"
+    found = dataset.sel(solver="ippe_square", cornerRefinementMethod="subpix")
+    assert float((found.detection == 1).mean()) > 0.85
+    with xr.open_zarr(tmp_path / "labelled.zarr", group="cost") as cost:
+        assert cost.estimation_s.dims == ("block", "cornerRefinementMethod", "solver")
+        assert float(cost.detection_s.sum()) > 0
+
+
+def test_side_px_gives_the_distance_as_a_coordinate(tmp_path):
+    pipeline = Pipeline.from_text("[axes]\nside_px = [20, 40]\nsize_m = [0.01, 0.02]")
+    dataset = sweep.run(pipeline, tmp_path / "side.zarr", workers=1)
+    assert dataset.distance_m.dims == ("side_px", "size_m")
+    np.testing.assert_allclose(
+        dataset.distance_m.sel(side_px=40, size_m=0.02), 640 * 4 / 4.8 * 0.02 / 40, rtol=1e-15
+    )
+    np.testing.assert_array_equal(dataset.true_tvec_m.sel(xyz="z"), dataset.distance_m)
+
+
+def test_store_of_another_experiment_is_not_continued(pipeline, tmp_path):
+    url = str(tmp_path / "one.zarr")
+    by_hand(url, pipeline, (2, 4, 2, 3))
+    other = Pipeline.from_text(TEXT, ["tilt_deg=[0, 51]", "seed=6", "white=200"], name="small")
+    with pytest.raises(StoreError) as told:
+        execute(other, url)
+    text = str(told.value)
+    assert "seed: the store has 5, this run 6" in text
+    assert "axes.tilt_deg: the store has 0.0, 50.0, this run 0.0, 51.0" in text
+    assert "white: the store has 255.0, this run 200.0" in text
+    assert execute(other, url, workers=1, overwrite=True).poses == 48
+    assert open_store(url).pipeline.seed == 6
+
+
+def test_store_of_other_library_versions_is_not_continued(pipeline, tmp_path):
+    url = str(tmp_path / "old.zarr")
+    create_store(url, pipeline, (2, 4, 2, 3))
+    group = zarr.open_group(url)
+    about = dict(group.attrs["sweep"])
+    about["fingerprint"]["opencv"] = "4.5.0"
+    group.attrs["sweep"] = about
+    with pytest.raises(StoreError, match=r"opencv: the store has 4\.5\.0, this run"):
+        execute(pipeline, url)
+
+
+GROWN = {
+    "front": ["distance_m={values = [0.1, 0.2, 1.5]}"],
+    "middle": ["tilt_deg=[0, 20, 50]"],
+    "end": ["tilt_deg=[0, 50, 60, 70]"],
+    "trial": ["trial=5"],
+    "dictionary": ['dictionary=["DICT_6X6_50", "DICT_5X5_50", "DICT_4X4_50"]'],
+    "solver": ['solver=["p3p", "iterative", "ippe_square"]'],
+    "refinement": ['cornerRefinementMethod=["contour", "subpix"]'],
+    "fixed": ["solver=iterative", "dictionary=DICT_5X5_50"],
+    "new axis": ["background=[128, 60]"],
+}
+
+
+@pytest.mark.parametrize("settings", GROWN.values(), ids=GROWN)
+def test_grown_grid_reuses_what_there_is_bit_for_bit(settings, undisturbed, tmp_path):
+    grown = Pipeline.from_text(TEXT, settings, name="grown")
+    fresh, reusing = str(tmp_path / "fresh.zarr"), str(tmp_path / "reusing.zarr")
+    extents = (1, 2, 1, 2) if len(scene_axes(grown)) == 4 else tuple(
+        1 for _ in scene_axes(grown)
+    )
+    by_hand(fresh, grown, extents)
+    store = create_store(reusing, grown, extents)
+    computed = [
+        compute_block(reusing, store.run_id, block, (undisturbed,))["computed"]
+        for block in store.blocks
+    ]
+    assert same(fresh, reusing)
+    with xr.open_zarr(undisturbed, consolidated=False) as old, xr.open_zarr(
+        reusing, consolidated=False
+    ) as new:
+        shared = 1
+        for name, size in new.estimate.sizes.items():
+            if name in old.estimate.dims:
+                shared *= int(np.isin(new[name].to_numpy(), old[name].to_numpy()).sum())
+            else:
+                shared *= min(size, 1)
+        total = new.estimate.size
+    assert sum(part["estimates"] for part in computed) == total - shared
+
+
+def test_halves_of_a_grid_are_joined(pipeline, undisturbed, tmp_path):
+    halves = []
+    for name, tilts in (("left", "[0]"), ("right", "[50]")):
+        half = Pipeline.from_text(TEXT, [f"tilt_deg={tilts}"], name=name)
+        halves.append(str(tmp_path / f"{name}.zarr"))
+        by_hand(halves[-1], half, (2, 4, 1, 3))
+    joined = str(tmp_path / "joined.zarr")
+    summary = execute(pipeline, joined, workers=1, reuse=halves)
+    assert summary.computed_estimates == 0
+    assert same(joined, undisturbed)
+
+
+def test_nothing_is_reused_from_an_unfinished_block(pipeline, undisturbed, tmp_path):
+    part = str(tmp_path / "part.zarr")
+    store = create_store(part, pipeline, (1, 4, 2, 3))
+    compute_block(part, store.run_id, next(iter(store.blocks)))
+    new = str(tmp_path / "new.zarr")
+    summary = execute(pipeline, new, workers=1, reuse=[part])
+    assert summary.computed_scenes == 24
+    assert same(new, undisturbed)
+
+
+def test_store_that_cannot_be_reused_is_told(pipeline, undisturbed, tmp_path):
+    other = Pipeline.from_text(TEXT, ["seed=9", "tilt_deg=[80]"], name="other")
+    with pytest.raises(StoreError) as told:
+        execute(other, tmp_path / "other.zarr", reuse=[undisturbed])
+    assert "seed: the store has 5, this run 9" in str(told.value)
+    assert "tilt_deg: the store has 0.0, 50.0, this run 80.0" in str(told.value)
+    assert not (tmp_path / "other.zarr").exists()
+
+
+def test_places_that_hold_something_else_are_left_unharmed(pipeline, tmp_path):
+    file = tmp_path / "file.zarr"
+    file.write_text("mine")
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "letter.txt").write_text("mine")
+    foreign = tmp_path / "foreign.zarr"
+    zarr.open_group(str(foreign), mode="w").create_array("x", shape=(2,), dtype="f8")
+    for place in (file, folder, foreign):
+        for overwrite in (False, True):
+            with pytest.raises(StoreError, match="holds something else"):
+                execute(pipeline, place, overwrite=overwrite)
+    assert file.read_text() == (folder / "letter.txt").read_text() == "mine"
+    assert "x" in zarr.open_group(str(foreign), mode="r")
+
+
+def test_an_unwritable_path_is_told_in_a_line(tmp_path):
+    path = tmp_path / "p.toml"
+    path.write_text(TEXT)
+    ran = sweep_command("run", path, "--store", "/proc/none/s.zarr")
+    assert ran.returncode == 2
+    assert ran.stderr.strip() == "/proc/none/s.zarr: cannot be written: No such file or directory"
+    ran = sweep_command("run", path, "--workers", "0")
+    assert (ran.returncode, ran.stderr.strip()) == (2, "--workers 0: expected at least 1")
+
+
+def test_store_in_use_is_refused_and_a_dead_lock_is_not(pipeline, tmp_path):
+    url = str(tmp_path / "held.zarr")
+    store = create_store(url, pipeline, (2, 4, 2, 3))
+    here = {"token": "x", "host": socket.gethostname(), "beat": time.time()}
+    put(store.group.store, KEY, {**here, "pid": os.getpid()})
+    with pytest.raises(StoreError, match=f"process {os.getpid()} on .* is writing it"):
+        execute(pipeline, url)
+    put(store.group.store, KEY, {**here, "host": "elsewhere", "pid": 1})
+    with pytest.raises(StoreError, match="process 1 on elsewhere is writing it"):
+        execute(pipeline, url)
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        pass
+    put(store.group.store, KEY, {**here, "pid": ended.pid})
+    assert execute(pipeline, url, workers=1).computed_blocks == 1
+    assert not (Path(url) / KEY).exists()
+
+
+def test_silent_scheduler_is_given_up(pipeline, tmp_path, monkeypatch):
+    monkeypatch.setattr("sweep.engine.cluster.ANSWER_S", 0.5)
+    with pytest.raises(StoreError, match=r"--scheduler tcp://127\.0\.0\.1:9: no answer within"):
+        execute(pipeline, tmp_path / "none.zarr", scheduler="tcp://127.0.0.1:9")
+    assert not (tmp_path / "none.zarr").exists()
+
+
+def test_json_is_one_object_and_progress_goes_elsewhere(tmp_path):
+    path = tmp_path / "small.toml"
+    path.write_text(TEXT)
+    ran = sweep_command("run", path, "--json", "--workers", "2", cwd=tmp_path)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stderr == ""
+    told = json.loads(ran.stdout)
+    assert told["poses"] == 48
+    assert told["results"] == 192
+    assert told["store"] == "runs/small.zarr"
+    state = json.loads(sweep_command("status", "runs/small.zarr", "--json", cwd=tmp_path).stdout)
+    assert state["finished"]
+    assert state["poses_done"] == 48
+    assert sum(state["detection"].values()) == 96
+    assert sum(state["estimate"].values()) == 192
+
+
+LONG = "[axes]\ntrial = 40000\ndistance_m = [0.05, 0.08]\n[pose]\njitter_px = 0.5\n"
+
+
+def test_interrupted_run_says_how_to_go_on_and_goes_on(tmp_path):
+    path = tmp_path / "long.toml"
+    path.write_text(LONG)
+    command = [sys.executable, "-m", "sweep.cli", "run", str(path), "--workers", "2"]
+    with subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
+    ) as running:
+        receipts = tmp_path / "runs" / "long.zarr" / "commits" / "receipt" / "c"
+        deadline = time.monotonic() + 120
+        while not (receipts.exists() and any(receipts.iterdir())):
+            assert time.monotonic() < deadline
+            assert running.poll() is None
+            time.sleep(0.05)
+        # As a terminal does it: to every process of the group.
+        os.killpg(running.pid, signal.SIGINT)
+        out, err = running.communicate(timeout=60)
+    assert running.returncode == 130, err
+    assert out == ""
+    assert err.strip() == "stopped; the same command continues"
+    store = open_store(str(tmp_path / "runs" / "long.zarr"))
+    done = len(committed(store))
+    assert 0 < done < len(store.blocks)
+    state = json.loads(sweep_command("status", store.url, "--json").stdout)
+    assert state["writer"] is None
+    assert state["blocks_done"] == done
+
+
+def test_running_scheduler_with_two_workers_gives_the_same(pipeline, undisturbed, tmp_path):
+    from distributed import LocalCluster  # noqa: PLC0415
+
+    url = str(tmp_path / "external.zarr")
+    with LocalCluster(
+        n_workers=2, threads_per_worker=2, host="127.0.0.1", dashboard_address=None,
+        silence_logs=50,
+    ) as cluster:
+        summary = execute(pipeline, url, scheduler=cluster.scheduler_address, block_s=0.02)
+    assert summary.computed_scenes == 48
+    assert same(url, undisturbed)
+
+
+def test_template_says_what_the_kernel_makes(pipeline):
+    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
+    result = run_block(pipeline, Block((0,) * len(lengths), lengths))
+    assert list(result.values) == [variable.name for variable in TEMPLATE]
+    for variable in TEMPLATE:
+        values = result.values[variable.name]
+        assert values.shape == variable.shape(pipeline)
+        assert values.dtype == np.dtype(variable.dtype)
+        if variable.flags is not None:
+            assert set(np.unique(values)) <= {int(flag) for flag in variable.flags} - {0}
+
+
+def test_blocks_cover_the_grid_once_and_are_listed_lazily():
+    blocks = Blocks((7, 5), (3, 2))
+    seen = np.zeros((7, 5), dtype=int)
+    for block in blocks:
+        seen[block.starts[0] : block.stops[0], block.starts[1] : block.stops[1]] += 1
+    assert (seen == 1).all()
+    assert len(blocks) == 9
+    huge = Blocks((10**9,), (1,))
+    assert str(next(iter(huge))) == "0-1"

@@ -15,8 +15,8 @@ BROKEN = {
     ),
     "unknown section, nearest named": (
         "[pose]\ndistance_m = 1\n[camra]\nwidth_px = 640",
-        "camra: unknown; expected a section of title, seed, camera, marker, pose, scene, "
-        "detector, estimator, axes; did you mean camera?",
+        ("camra: unknown; expected a section of title, seed, camera, marker, pose, scene, "
+        "detector, estimator, axes; did you mean camera?"),
     ),
     "a key without its section": (
         "tilt_deg = 3\n[pose]\ndistance_m = 1", "tilt_deg = 3: expected it under [pose]",
@@ -60,8 +60,8 @@ BROKEN = {
     ),
     "camera in millimetres and in pixels": (
         "[pose]\ndistance_m = 1\n[camera]\nfx_px = 500\nfocal_length_mm = 4",
-        "fx_px = 500: expected a camera in pixels or in millimetres, not both; delete it or "
-        "focal_length_mm",
+        ("fx_px = 500: expected a camera in pixels or in millimetres, not both; delete it or "
+        "focal_length_mm"),
     ),
     "fy without fx": (
         "[pose]\ndistance_m = 1\n[camera]\nfy_px = 500", "fy_px = 500: expected fx_px beside it",
@@ -75,8 +75,8 @@ BROKEN = {
         "marker_id = 50: expected IDs from 0 to 49, which is what DICT_5X5_50 has",
     ),
     "an ID outside one dictionary of the grid": (
-        '[pose]\ndistance_m = 1\n[axes]\ndictionary = ["DICT_5X5_100", "DICT_4X4_50"]\n'
-        "marker_id = { range = [0, 60] }",
+        ('[pose]\ndistance_m = 1\n[axes]\ndictionary = ["DICT_5X5_100", "DICT_4X4_50"]\n'
+        "marker_id = { range = [0, 60] }"),
         "expected IDs from 0 to 49, which is what DICT_4X4_50 has",
     ),
     "unknown dictionary": (
@@ -117,8 +117,8 @@ BROKEN = {
     ),
     "an unknown form of axis": (
         "[pose]\ndistance_m = 1\n[axes]\ntilt_deg = { linspce = [0, 1, 3] }",
-        "expected a list, or a table with one of range, arange, linspace, geom, values; "
-        "did you mean linspace?",
+        ("expected a list, or a table with one of range, arange, linspace, geom, values; "
+        "did you mean linspace?"),
     ),
     "a geometric axis from 0": (
         "[axes]\ndistance_m = { geom = [0, 1, 3] }",
@@ -175,8 +175,8 @@ BROKEN = {
         'scene.background = "none.png": expected a level or an image file (No such file',
     ),
     "a grid without end": (
-        "[pose]\njitter_px = 1\n[axes]\ndistance_m = { linspace = [1, 2, 10000] }\n"
-        "trial = 1000000000",
+        ("[pose]\njitter_px = 1\n[axes]\ndistance_m = { linspace = [1, 2, 10000] }\n"
+        "trial = 1000000000"),
         "axes: 1e+13 poses: expected at most 1e+12",
     ),
 }

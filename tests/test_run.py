@@ -240,7 +240,7 @@ def test_nothing_is_reused_from_an_unfinished_block(pipeline, undisturbed, tmp_p
     assert same(new, undisturbed)
 
 
-def test_store_that_cannot_be_reused_is_told(pipeline, undisturbed, tmp_path):
+def test_store_that_cannot_be_reused_is_told(undisturbed, tmp_path):
     other = Pipeline.from_text(TEXT, ["seed=9", "tilt_deg=[80]"], name="other")
     with pytest.raises(StoreError) as told:
         execute(other, tmp_path / "other.zarr", reuse=[undisturbed])

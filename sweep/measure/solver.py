@@ -182,7 +182,7 @@ _UNIT_SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-
 
 _Z_OUT = np.array([1.0, -1.0, -1.0])
 
-_CREDIBLE_SHARE = 0.01
+_CREDIBLE_SHARE = 0.05
 """Reprojection errors below this share of the side are taken as they are; wrong solutions lie far
 above it. Beyond it a solution must hold its own against ITERATIVE."""
 

@@ -50,7 +50,8 @@ def fold_radius(coefficients: Sequence[float]) -> float:
     )
     first = math.inf
     for polynomial in (growth, denominator):
-        trimmed = polynomial.trim()
+        # A leading coefficient this small moves no root that matters, but spoils all of them.
+        trimmed = polynomial.trim(1e-13 * float(np.abs(polynomial.coef).max()))
         if trimmed.degree() == 0:
             continue
         for root in np.asarray(trimmed.roots(), dtype=np.complex128).tolist():
@@ -141,21 +142,30 @@ def undistort(xd: float, yd: float, lens: NDArray[np.float64]) -> tuple[float, f
     if radius >= lens[23]:
         shrink = 0.5 * lens[23] / radius
         x, y = x * shrink, y * shrink
+    u, v = distort(x, y, lens)
     for _ in range(60):
-        u, v = distort(x, y, lens)
         a, b, c, d = jacobian(x, y, lens)
         determinant = a * d - b * c
         if not determinant > 0.0:
             return x, y, False
+        miss = math.hypot(xd - u, yd - v)
         dx = ((xd - u) * d - b * (yd - v)) / determinant
         dy = (a * (yd - v) - c * (xd - u)) / determinant
-        x, y = x + dx, y + dy
-        if not math.hypot(x, y) < lens[23]:
-            return x, y, False
         if abs(dx) + abs(dy) <= 4e-16 * (1.0 + abs(x) + abs(y)):
-            return x, y, True
-    u, v = distort(x, y, lens)
-    return x, y, abs(u - xd) + abs(v - yd) <= 1e-12
+            return x + dx, y + dy, True
+        # Near a fold the full step leaps out of the lens' image: shorten it until it helps.
+        halvings = 0
+        while halvings < 40:
+            if math.hypot(x + dx, y + dy) < lens[23]:
+                u, v = distort(x + dx, y + dy, lens)
+                if math.hypot(xd - u, yd - v) < miss or miss < 1e-14:
+                    break
+            dx, dy = 0.5 * dx, 0.5 * dy
+            halvings += 1
+        if halvings == 40:
+            return x, y, miss <= 1e-12
+        x, y = x + dx, y + dy
+    return x, y, math.hypot(xd - u, yd - v) <= 1e-12
 
 
 @compiled

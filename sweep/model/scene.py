@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -220,10 +221,7 @@ def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
         low[bent], high[bent] = points.min(axis=1) - 2, points.max(axis=1) + 2
     warped = np.flatnonzero([name == "warp" for name in scenes.renderer])
     if len(warped):
-        # A linear interpolation spreads an edge by half a pixel of the bitmap on either side.
-        modules = np.array([module_count(scenes.dictionary[row]) for row in warped.tolist()])
-        spread = 1 + (high - low)[warped] / (WARP_PX_PER_MODULE * modules[:, None])
-        low[warped], high[warped] = low[warped] - spread, high[warped] + spread
+        low[warped], high[warped] = _warp_extent(scenes, warped)
     limit = scenes.frame.astype(np.float64)
     with np.errstate(invalid="ignore"):
         start = np.clip(np.floor(low + 0.5), 0, limit)
@@ -231,6 +229,32 @@ def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
         inside = (stop > start).all(axis=1)
     boxes = np.concatenate([start, stop], axis=1)
     return np.where(inside[:, None], boxes, 0.0).astype(np.int64)
+
+
+def _warp_extent(scenes: Scenes, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """Return the least and greatest pixels (n, 2) that the ``warp`` renderer may touch.
+
+    It maps bitmap to image by the homography of the black square's corners, bent ones under a
+    lens, so its quiet zone ends elsewhere than the marker's. Interpolation spreads it by half a
+    pixel of the bitmap. Where the homography's horizon crosses it, it reaches everywhere.
+    """
+    low, high = np.full((len(rows), 2), np.nan), np.full((len(rows), 2), np.nan)
+    for i, row in enumerate(rows.tolist()):
+        corners = scenes.corners_px[row]
+        if not np.isfinite(corners).all():
+            continue
+        n = module_count(scenes.dictionary[row])
+        margin = scenes.quiet_zone[row] + 0.5 / WARP_PX_PER_MODULE
+        square = np.array([[0, 0], [n, 0], [n, n], [0, n]], dtype=np.float32)
+        transform = cv2.getPerspectiveTransform(square, corners.astype(np.float32))
+        outline = square + np.sign(square - n / 2) * margin
+        points = np.column_stack([outline, np.ones(4)]) @ np.asarray(transform).T
+        if (points[:, 2] > 0).all():
+            flat = points[:, :2] / points[:, 2:]
+            low[i], high[i] = flat.min(axis=0) - 1, flat.max(axis=0) + 1
+        else:
+            low[i], high[i] = -0.5, scenes.frame[row] - 0.5
+    return low, high
 
 
 def areas_px(scenes: Scenes) -> Floats:

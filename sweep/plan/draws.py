@@ -104,16 +104,34 @@ def geometry_keys(
     return ["|".join(filter(None, parts)) for parts in zip(*used, strict=True)]
 
 
+def _hash(text: str) -> int:
+    """Return 64 bits of a text's BLAKE2b hash."""
+    return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little")
+
+
+def _mixed(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Return 64-bit numbers mixed so that each bit depends on all (SplitMix64's finaliser).
+
+    Steele, Lea and Flood, "Fast splittable pseudorandom number generators", 2014.
+    """
+    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return bits ^ (bits >> np.uint64(31))
+
+
+_STEP = np.uint64(0x9E3779B97F4A7C15)
+
+
 def uniform(
-    seed: int, quantity: str, keys: Sequence[str], trials: Sequence[int]
+    seed: int, quantity: str, keys: Sequence[str], trials: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """Return one uniform number in (0, 1) for each scene's key and trial (N,).
 
-    The first 53 bits of a BLAKE2b hash; the middle of its cell, so that neither end occurs.
+    The geometry key and (seed, quantity) are hashed by BLAKE2b; trials are steps of SplitMix64
+    from there. 53 bits, the middle of their cell, so that neither end occurs.
     """
-    digests = b"".join(
-        blake2b(f"{seed}\n{quantity}\n{key}\n{trial}".encode(), digest_size=8).digest()
-        for key, trial in zip(keys, trials, strict=True)
-    )
-    bits = np.frombuffer(digests, dtype="<u8") >> np.uint64(11)
-    return np.asarray((bits + 0.5) * 2.0**-53)
+    known = {key: _hash(key) for key in dict.fromkeys(keys)}
+    cells = np.array([known[key] for key in keys], dtype=np.uint64)
+    start = _mixed(cells ^ np.uint64(_hash(f"{seed}\n{quantity}")))
+    bits = _mixed(start + _STEP * (np.asarray(trials).astype(np.uint64) + np.uint64(1)))
+    return np.asarray(((bits >> np.uint64(11)) + 0.5) * 2.0**-53)

@@ -120,11 +120,11 @@ def scene_values(pipeline: Pipeline, indices: Sequence[NDArray[np.intp]]) -> dic
     axes = scene_axes(pipeline)
     count = len(indices[0]) if axes else 1
     values: dict[str, Any] = dict(pipeline.fixed)
-    trials: Sequence[int] = [0] * count
+    trials = np.zeros(count, dtype=np.int64)
     for axis, index in zip(axes, indices, strict=True):
         column = _column(axis, index)
         if axis.name == TRIAL:
-            trials = column.tolist()
+            trials = np.asarray(column, dtype=np.int64)
         else:
             values[axis.name] = column
     distortion = values["distortion"]

@@ -1,0 +1,138 @@
+"""The kernel against a user's good loop, and against the bare calls that it makes.
+
+    python tests/benchmarks/bench_kernel.py
+
+One core, medians of paired runs: ratios within one run, for machines are noisy.
+"""
+
+import statistics
+import time
+
+import cv2
+import numpy as np
+
+from sweep.kernel import _full, run_cells, search_windows, single_thread, visibility_flags
+from sweep.measure.detector import Detector
+from sweep.measure.flags import Detection
+from sweep.model.render import render
+from sweep.model.scene import build_scenes, marker_boxes
+from sweep.plan.grid import detector_settings, scene_values
+from sweep.plan.pipeline import Pipeline
+
+SIZES = ((640, 480), (1920, 1080), (4000, 3000))
+POSES = {640: 400, 1920: 150, 4000: 40}
+REPEATS = 5
+
+GRID = """
+seed = 1
+[camera]
+width_px = {width}
+height_px = {height}
+fx_px = {focal}
+[marker]
+dictionary = "DICT_5X5_50"
+size_m = 0.04
+[pose]
+distance_m = {{ uniform = [0.2, 2.0] }}
+tilt_deg = {{ uniform = [0, 70] }}
+azimuth_deg = {{ uniform = [0, 360] }}
+roll_deg = {{ uniform = [0, 360] }}
+bearing_x_deg = {{ uniform = [-15, 15] }}
+bearing_y_deg = {{ uniform = [-15, 15] }}
+[scene]
+background = 128
+[axes]
+trial = {poses}
+"""
+
+
+def naive_loop(scenes, bitmaps, camera, frame):
+    """A user's good loop: bitmaps cached, one detector, whole frames, plain calls."""
+    detector = cv2.aruco.ArucoDetector(
+        cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50), cv2.aruco.DetectorParameters()
+    )
+    side = 0.04 / 2
+    objects = np.array(
+        [[-side, side, 0], [side, side, 0], [side, -side, 0], [-side, -side, 0]], np.float32
+    )
+    bitmap, source = bitmaps
+    found = 0
+    for rvec, tvec in scenes:
+        corners = cv2.projectPoints(objects, rvec, tvec, camera, None)[0].reshape(4, 2)
+        transform = cv2.getPerspectiveTransform(source, corners.astype(np.float32))
+        image = cv2.warpPerspective(
+            bitmap, transform, frame, flags=cv2.INTER_LINEAR, borderValue=(128,)
+        )
+        quads, ids, _ = detector.detectMarkers(image)
+        if ids is not None:
+            found += 1
+            cv2.solvePnP(objects, quads[0], camera, None, flags=cv2.SOLVEPNP_IPPE_SQUARE)
+    return found
+
+
+def bare_calls(scenes, boxes, cut, rows, setting):
+    """The coverage and detection calls that the kernel makes, and nothing else but their loop."""
+    detector = Detector(setting)
+    side = int(scenes.frame.max())
+    find = detector.find
+    windows = [tuple(window) for window in cut.tolist()]
+    for row in rows:
+        image = render(scenes, row, boxes[row], windows[row])
+        find(image, "DICT_5X5_50", side)
+
+
+def clock(function, *arguments):
+    start = time.perf_counter()
+    function(*arguments)
+    return time.perf_counter() - start
+
+
+def main():
+    single_thread()
+    print("| frame | naive ms a pose | sweep ms a pose | naive / sweep | sweep / bare calls "
+          "| beside them, us a pose |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for width, height in SIZES:
+        poses = POSES[width]
+        focal = 4 / 4.8 * width
+        pipeline = Pipeline.from_text(
+            GRID.format(width=width, height=height, focal=focal, poses=poses)
+        )
+        indices = [np.arange(poses)]
+        values = scene_values(pipeline, indices)
+        scenes = build_scenes(values, poses)
+        setting = detector_settings(pipeline)[0]
+        boxes = marker_boxes(scenes)
+        cut = search_windows(scenes, boxes, setting, _full(values, poses))
+        rows = np.flatnonzero(visibility_flags(scenes) == Detection.not_run).tolist()
+        camera = scenes.cameras.matrix(0)
+        marker = cv2.aruco.generateImageMarker(
+            cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50), 0, 70
+        )
+        bitmap = cv2.copyMakeBorder(marker, 10, 10, 10, 10, cv2.BORDER_CONSTANT, value=255)
+        source = np.array([[9.5, 9.5], [79.5, 9.5], [79.5, 79.5], [9.5, 79.5]], np.float32)
+        posed = [
+            (cv2.Rodrigues(scenes.rotation[row])[0], scenes.translation[row]) for row in rows
+        ]
+        naive, ours, ratios, bare, beside = [], [], [], [], []
+        for repeat in range(REPEATS + 1):
+            a = clock(naive_loop, posed, (bitmap, source), camera, (width, height))
+            b = clock(run_cells, pipeline, indices)
+            result_s = clock(bare_calls, scenes, boxes, cut, rows, setting)
+            solve_s = sum(run_cells(pipeline, indices).seconds["estimation"])
+            if repeat == 0:
+                continue
+            naive.append(1e3 * a / poses)
+            ours.append(1e3 * b / poses)
+            ratios.append(a / b)
+            bare.append(b / (result_s + solve_s))
+            beside.append(1e6 * (b - result_s - solve_s) / poses)
+        median = statistics.median
+        print(
+            f"| {width} x {height} | {median(naive):.2f} | {median(ours):.3f} "
+            f"| {median(ratios):.1f} | {median(bare):.2f} | {median(beside):.0f} |", flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

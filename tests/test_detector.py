@@ -1,0 +1,249 @@
+"""OpenCV's detector is set as asked, sees the right window, and keeps its known conventions."""
+
+import dataclasses
+import json
+
+import cv2
+import numpy as np
+import pytest
+from conftest import lengths
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sweep.kernel import run_block
+from sweep.measure.detector import (
+    ALIGNMENT_PX,
+    REFINEMENTS,
+    SMALLEST_WINDOW_PX,
+    Detector,
+    DetectorSetting,
+    margin_px,
+    windows,
+)
+from sweep.measure.flags import Detection
+from sweep.model.marker import dictionary_names, marker_count, module_count
+from sweep.model.render import render
+from sweep.model.scene import build_scenes, marker_boxes
+from sweep.plan.grid import Block, block_indices, detector_settings, scene_axes, scene_values
+from sweep.plan.pipeline import Pipeline
+
+FIELDS = {field.name: field.default for field in dataclasses.fields(DetectorSetting)}
+
+
+def opencv_fields(parameters):
+    """Return every value that OpenCV's parameters hold, by name."""
+    return {
+        name: getattr(parameters, name) for name in dir(parameters)
+        if not name.startswith("_") and not callable(getattr(parameters, name))
+    }
+
+
+def test_every_field_of_the_installed_opencv_is_declared():
+    assert set(opencv_fields(cv2.aruco.DetectorParameters())) <= set(FIELDS)
+    assert set(FIELDS) - set(opencv_fields(cv2.aruco.DetectorParameters())) == (
+        DetectorSetting.missing_fields()
+    )
+
+
+@pytest.mark.parametrize("name", sorted(set(FIELDS) - DetectorSetting.missing_fields()))
+def test_default_is_opencvs(name):
+    value = opencv_fields(cv2.aruco.DetectorParameters())[name]
+    ours = REFINEMENTS[FIELDS[name]] if name == "cornerRefinementMethod" else FIELDS[name]
+    assert type(ours) is type(value) or isinstance(ours, float)
+    assert ours == pytest.approx(value, rel=1e-7)  # OpenCV holds some of them as float32
+
+
+OTHER = {
+    name: not default if isinstance(default, bool)
+    else default + 2 if isinstance(default, int)
+    else (1.25 * default or 0.25) if isinstance(default, float)
+    else "subpix"
+    for name, default in FIELDS.items()
+    if name not in DetectorSetting.missing_fields()
+} | {"aprilTagDeglitch": 1}
+
+
+@pytest.fixture
+def handed_over(monkeypatch):
+    """Return the list that gets the parameters which OpenCV's detector holds at each call."""
+    handed = []
+
+    class Recording:
+        def __init__(self, *arguments):
+            self._detector = opencv(*arguments)
+
+        def __getattr__(self, name):
+            return getattr(self._detector, name)
+
+        def detectMarkers(self, image):  # noqa: N802
+            handed.append(opencv_fields(self._detector.getDetectorParameters()))
+            return self._detector.detectMarkers(image)
+
+    opencv = cv2.aruco.ArucoDetector
+    monkeypatch.setattr(cv2.aruco, "ArucoDetector", Recording)
+    return handed
+
+
+def expected_of(setting):
+    """Return the values that OpenCV must hold; floats to float32's precision."""
+    return {
+        name: REFINEMENTS[value] if name == "cornerRefinementMethod"
+        else pytest.approx(value, rel=1e-7)
+        for name, value in dataclasses.asdict(setting).items() if name in OTHER
+    }
+
+
+@pytest.mark.parametrize("name", sorted(OTHER))
+def test_field_that_is_set_reaches_opencv_and_no_other_changes(handed_over, name):
+    setting = DetectorSetting(**{name: OTHER[name]})
+    assert getattr(setting, name) != FIELDS[name]
+    Detector(setting).find(np.full((48, 64), 128, dtype=np.uint8), "DICT_4X4_50", 64)
+    assert handed_over == [expected_of(setting)]
+
+
+@pytest.mark.parametrize("refinement", REFINEMENTS)
+def test_every_refinement_reaches_opencv(handed_over, refinement):
+    setting = DetectorSetting(cornerRefinementMethod=refinement)
+    Detector(setting).find(np.full((48, 64), 128, dtype=np.uint8), "DICT_4X4_50", 64)
+    assert handed_over == [expected_of(setting)]
+
+
+def test_every_field_is_read_from_a_pipeline():
+    chosen = {name: value for name, value in OTHER.items() if name != "aprilTagDeglitch"}
+    pipeline = Pipeline.from_text(
+        "[pose]\nside_px = 40\n[detector]\n"
+        + "\n".join(f"{name} = {json.dumps(value)}" for name, value in chosen.items())
+    )
+    assert detector_settings(pipeline) == [DetectorSetting(**chosen)]
+
+
+@given(
+    rates=st.tuples(st.floats(0.001, 0.5), st.floats(0.5, 8.0)),
+    frame_side=st.integers(8, 8000),
+    side=st.integers(8, 500),
+)
+@settings(derandomize=True, deadline=None, max_examples=100)
+def test_perimeter_limits_come_to_the_same_pixels_in_a_window_as_in_the_frame(
+    rates, frame_side, side
+):
+    """OpenCV turns a rate into ``unsigned(rate * max(width, height))`` pixels."""
+    side = min(side, frame_side)
+    detector = Detector(
+        DetectorSetting(minMarkerPerimeterRate=rates[0], maxMarkerPerimeterRate=rates[1])
+    )
+    detector.find(np.full((8, side), 128, dtype=np.uint8), "DICT_4X4_50", frame_side)
+    held = detector._parameters
+    assert int(held.minMarkerPerimeterRate * side) == int(rates[0] * frame_side)
+    assert int(held.maxMarkerPerimeterRate * side) == int(rates[1] * frame_side)
+
+
+# What OpenCV gives for a square from 99.5 to 201.5: the first and the last coordinate.
+CONVENTIONS = {
+    "none": (100.0, 201.0), "contour": (100.0, 201.0), "subpix": (99.56, 201.44),
+    "apriltag": (100.0, 202.0),
+}
+
+
+@pytest.mark.parametrize("refinement", REFINEMENTS)
+def test_corners_of_an_upright_square_follow_opencvs_known_conventions(refinement):
+    image = np.full((300, 320), 255, dtype=np.uint8)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    image[100:202, 100:202] = cv2.aruco.generateImageMarker(dictionary, 1, 102)
+    setting = DetectorSetting(cornerRefinementMethod=refinement)
+    corners, ids, _ = Detector(setting).find(image, "DICT_4X4_50", 320)
+    assert ids == [1]
+    a, b = CONVENTIONS[refinement]
+    # 0.01 px: contour's float32 line fit, and the two digits of subpix' convention.
+    np.testing.assert_allclose(corners[0][0], [[a, a], [b, a], [b, b], [a, b]], atol=0.01)
+
+
+@pytest.mark.parametrize("refinement", REFINEMENTS)
+def test_corner_errors_of_the_dataset_are_found_minus_true_in_those_conventions(refinement):
+    # 102 px about the centre of a frame of 640 x 480: 268.5..370.5 by 188.5..290.5.
+    pipeline = Pipeline.from_text(
+        f'[marker]\ndictionary = "DICT_4X4_50"\n[pose]\nside_px = 102\n'
+        f'[scene]\nbackground = 255\n[detector]\ncornerRefinementMethod = "{refinement}"'
+    )
+    error = run_block(pipeline, Block((), ())).values["corner_error_px"].reshape(4, 2)
+    low, high = CONVENTIONS[refinement][0] - 99.5, CONVENTIONS[refinement][1] - 201.5
+    expected = [[low, low], [high, low], [high, high], [low, high]]
+    np.testing.assert_allclose(error, expected, atol=0.01)  # as above
+
+
+def ids_of(dictionary):
+    """Return the first, a middle and the last ID; the original dictionary's last is symmetric."""
+    count = marker_count(dictionary)
+    return [0, count // 2, count - (2 if dictionary == "DICT_ARUCO_ORIGINAL" else 1)]
+
+
+@pytest.mark.parametrize("dictionary", dictionary_names())
+def test_every_dictionary_is_rendered_and_found_with_its_id_and_rotation(dictionary):
+    # A whole even number of pixels a module: every module's edges lie between pixels.
+    side = module_count(dictionary) * (140 // module_count(dictionary) // 2 * 2)
+    pipeline = Pipeline.from_text(
+        f"[pose]\nside_px = {side}\n[scene]\nbackground = 128\n[axes]\n"
+        f'dictionary = ["{dictionary}"]\nmarker_id = {ids_of(dictionary)}\n'
+        "roll_deg = [0, 90, 180, 270]"
+    )
+    block = Block((0,) * 3, tuple(len(axis) for axis in scene_axes(pipeline)))
+    values = run_block(pipeline, block).values
+    assert (values["detection"] == Detection.detected).all()
+    # Unrefined corners are whole pixels just within the true ones: half a pixel, plus one for
+    # an edge that rounding of the roll's sine moves across a pixel's centre.
+    assert np.abs(values["corner_error_px"]).max() <= 1.5
+
+    scenes = build_scenes(scene_values(pipeline, block_indices(block)), len(block))
+    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    left, top = 320 - side // 2, 240 - side // 2
+    for row, marker_id in enumerate(scenes.marker_id):
+        frame = render(scenes, row, marker_boxes(scenes)[row], (0, 0, 640, 480))
+        square = frame[top : top + side, left : left + side]
+        upright = np.rot90(square, row % 4)  # a positive roll turns clockwise in the image
+        np.testing.assert_array_equal(
+            upright, cv2.aruco.generateImageMarker(known, marker_id, side)
+        )
+
+
+@st.composite
+def boxes_in_frames(draw):
+    width, height = draw(st.integers(1, 5000)), draw(st.integers(1, 5000))
+    x = sorted(draw(st.tuples(st.integers(0, width), st.integers(0, width))))
+    y = sorted(draw(st.tuples(st.integers(0, height), st.integers(0, height))))
+    empty = x[0] == x[1] or y[0] == y[1]
+    box = [0, 0, 0, 0] if empty else [x[0], y[0], x[1], y[1]]
+    return np.array([box]), np.array([[width, height]])
+
+
+@lengths(150, 5000)
+def test_windows_hold_the_box_and_its_margin_and_stay_in_the_frame(count):
+    @settings(derandomize=True, deadline=None, max_examples=count)
+    @given(boxes_in_frames(), st.integers(0, 100))
+    def check(scene, margin):
+        (box,), (frame,) = scene
+        (window,) = windows(box[None], frame[None], margin)
+        start, stop = window[:2], window[2:]
+        assert (start >= 0).all()
+        assert (stop <= frame).all()
+        assert (start <= np.maximum(box[:2] - margin, 0)).all()
+        assert (stop >= np.minimum(box[2:] + margin, frame)).all()
+        assert (start % ALIGNMENT_PX == 0).all()
+        assert ((stop % ALIGNMENT_PX == 0) | (stop == frame)).all()
+        assert (stop - start >= np.minimum(SMALLEST_WINDOW_PX, frame)).all()
+        # And no more than that: what is added is alignment, or reaches the smallest window.
+        smallest = SMALLEST_WINDOW_PX + ALIGNMENT_PX
+        wanted = np.minimum(box[2:] + margin, frame) - np.maximum(box[:2] - margin, 0)
+        assert (stop - start < np.maximum(wanted + 2 * ALIGNMENT_PX, smallest)).all()
+
+    check()
+
+
+def test_margin_is_16_px_by_default_and_covers_what_a_setting_reaches():
+    assert margin_px(DetectorSetting()) == 16
+    for name, value in (("adaptiveThreshWinSizeMax", 61), ("minDistanceToBorder", 20)):
+        assert margin_px(DetectorSetting(**{name: value})) > 16
+    for refinement, wider in (
+        ("subpix", {"cornerRefinementWinSize": 20}), ("apriltag", {"aprilTagQuadSigma": 5.0}),
+        ("apriltag", {"aprilTagQuadSigma": -5.0}),
+    ):
+        narrow = DetectorSetting(cornerRefinementMethod=refinement)
+        assert margin_px(dataclasses.replace(narrow, **wider)) > margin_px(narrow) >= 16

@@ -1,0 +1,285 @@
+"""Every flag is reached by a real scene, and what does not exist is NaN with a flag that says why.
+
+``failed`` and ``crashed`` are for exceptions and dead processes; the engine's tests reach them.
+"""
+
+import cv2
+import numpy as np
+import pytest
+
+from sweep.kernel import run_block
+from sweep.measure.finding import REJECTED_ID, classify
+from sweep.measure.flags import Detection, Estimate, Flipped
+from sweep.plan.grid import Block, scene_axes
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.template import TEMPLATE
+
+PLAIN = """
+seed = 9
+[pose]
+side_px = 60
+[scene]
+background = 128
+"""
+
+
+def run(pipeline):
+    shape = tuple(len(axis) for axis in scene_axes(pipeline))
+    result = run_block(pipeline, Block((0,) * len(shape), shape))
+    assert not result.failures
+    return result.values
+
+
+def flags(*settings, folder="."):
+    """Return the flags of detection over the whole grid, in its order."""
+    return run(Pipeline.from_text(PLAIN, settings, folder=folder))["detection"].ravel().tolist()
+
+
+SCENES = {
+    Detection.detected: {
+        "frontal": [],
+        "tilted": ["tilt_deg=60", "roll_deg=200"],
+        "cut in the quiet zone": ["bearing_x_deg=28"],
+    },
+    Detection.no_candidate: {
+        "too small": ["side_px=4"],
+        "no contrast": ["black=128", "white=128"],
+        "only a corner in the frame": ["bearing_x_deg=32.5"],
+    },
+    Detection.rejected: {
+        "modules too small": ["side_px=10", "bearing_x_deg=1.03"],
+        "grey where the detector wants black": ["side_px=60", "markerBorderBits=3"],
+    },
+    Detection.wrong_id: {
+        # Turned by half a turn, this marker of the original dictionary is itself.
+        "rotation cannot be told": [
+            "dictionary=DICT_ARUCO_ORIGINAL", "marker_id=1023", "roll_deg=180"
+        ],
+    },
+    Detection.not_visible: {
+        "right of the frame": ["bearing_x_deg=40"],
+        "above the frame": ["bearing_y_deg=-35"],
+        "beyond a corner of the frame": ["bearing_x_deg=33", "bearing_y_deg=26.5", "roll_deg=45"],
+        "from behind": ["tilt_deg=120"],
+        "barely from behind": ["tilt_deg=90.01"],
+        "a corner behind the camera": [
+            "side_px=900", "tilt_deg=89", "bearing_y_deg=40", "bearing_x_deg=0"
+        ],
+    },
+    Detection.not_modelled: {
+        # x (1 - r²/2) turns back at r = 0.82, which is 39 degrees from the axis.
+        "the lens folds at the marker": ["distortion=[-0.5, 0, 0, 0]", "bearing_x_deg=45"],
+        "the lens folds within the marker": [
+            "distortion=[-0.5, 0, 0, 0]", "bearing_x_deg=36", "side_px=120"
+        ],
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("expected", "settings"),
+    [
+        pytest.param(flag, settings, id=f"{flag.name}: {name}")
+        for flag, scenes in SCENES.items()
+        for name, settings in scenes.items()
+    ],
+)
+def test_flag_is_reached_by_a_real_scene(expected, settings):
+    assert flags(*settings) == [expected]
+
+
+def test_every_flag_of_detection_has_a_scene():
+    assert {*SCENES, Detection.not_run, Detection.failed, Detection.crashed} == {*Detection}
+
+
+def test_marker_misread_with_much_error_correction_is_a_wrong_id():
+    found = flags(
+        "dictionary=DICT_4X4_1000", "errorCorrectionRate=1.0", "marker_id=[0, 1, 2]",
+        "side_px={linspace=[10, 13, 7]}", "tilt_deg=[40, 60]", "azimuth_deg=[20, 75]",
+        "roll_deg={linspace=[0, 80, 9]}",
+    )
+    counts = np.bincount(found, minlength=6)[1:5]
+    print(f"\ndetected, wrong_id, rejected, no_candidate: {counts}")
+    assert (counts > 0).all()
+
+
+def marker_image(dictionary, marker_id, side):
+    known = cv2.aruco.getPredefinedDictionary(dictionary)
+    return cv2.aruco.generateImageMarker(known, marker_id, side)
+
+
+def written(folder, *markers):
+    """Write a white frame with markers (ID, side, left, top) of DICT_5X5_50 as "clutter.png"."""
+    image = np.full((480, 640), 255, dtype=np.uint8)
+    for marker_id, side, left, top in markers:
+        image[top : top + side, left : left + side] = marker_image(
+            cv2.aruco.DICT_5X5_50, marker_id, side
+        )
+    cv2.imwrite(str(folder / "clutter.png"), image)
+    return "background=clutter.png"
+
+
+def test_clutter_that_decodes_where_the_marker_is_counts_as_a_wrong_id(tmp_path):
+    # ID 5's centre module is white, and so is the surround of the marker that lies on it.
+    around = written(tmp_path, (5, 210, 215, 135))
+    assert flags(around, "side_px=6", "marker_id=7", folder=tmp_path) == [Detection.wrong_id]
+    assert flags("background=255", "side_px=6", "marker_id=7") == [Detection.rejected]
+
+
+FAR_MARKERS = [
+    "side_px=[5, 9, 11, 13, 16, 30]", "tilt_deg=[0, 50]", "azimuth_deg=30", "roll_deg=77"
+]
+
+
+@pytest.mark.parametrize("marker_id", [3, 11], ids=["other ID", "same ID"])
+def test_false_marker_elsewhere_in_the_frame_changes_no_flag(tmp_path, marker_id):
+    alone = flags("background=255", "marker_id=11", *FAR_MARKERS)
+    assert {*alone} >= {Detection.detected, Detection.rejected, Detection.no_candidate}
+    beside = written(tmp_path, (marker_id, 100, 30, 40), (marker_id, 60, 550, 300))
+    assert flags(beside, "marker_id=11", *FAR_MARKERS, folder=tmp_path) == alone
+
+
+MIXED = """
+seed = 10
+[pose]
+azimuth_deg = { uniform = [0, 360] }
+[scene]
+background = 200
+[estimator]
+reprojection_limit = 0.004
+[axes]
+distortion = [[], [-0.5, 0, 0, 0]]
+side_px = [8, 10, 12, 40]
+tilt_deg = [0, 60, 100]
+bearing_x_deg = [0, 29, 31, 36, 45]
+trial = 6
+cornerRefinementMethod = ["none", "subpix", "apriltag"]
+solver = ["ippe_square", "iterative", "sqpnp", "p3p", "epnp"]
+guarded = [true, false]
+"""
+
+def test_every_variable_has_the_shape_of_the_template_even_without_axes():
+    for settings in ([], ["tilt_deg=[0, 30]"], ["solver=['p3p', 'ippe']"]):
+        pipeline = Pipeline.from_text(PLAIN, settings)
+        values = run(pipeline)
+        for variable in TEMPLATE:
+            assert values[variable.name].shape == variable.shape(pipeline), variable.name
+            assert values[variable.name].dtype == variable.dtype, variable.name
+
+
+ERRORS = ("translation_error_m", "rotation_error_rad", "rotation_error_deg", "normal_error_deg",
+          "reprojection_error_px")
+ALTERNATIVES = ("alternative_rotation_error_deg", "alternative_reprojection_error_px")
+
+
+def test_numbers_exist_exactly_where_the_flags_say_so():
+    values = run(Pipeline.from_text(MIXED))
+    assert {Detection(flag).name for flag in np.unique(values["detection"])} >= {
+        "detected", "rejected", "no_candidate", "not_visible", "not_modelled"
+    }
+    assert {*np.unique(values["estimate"])} == {
+        Estimate.solved, Estimate.no_detection, Estimate.solver_failed
+    }
+    assert np.isfinite(values["true_rvec"]).all()
+    assert np.isfinite(values["true_tvec_m"]).all()
+
+    detected = values["detection"] == Detection.detected
+    assert np.isfinite(values["corner_error_px"][detected]).all()
+    assert np.isnan(values["corner_error_px"][~detected]).all()
+    assert (values["estimate"][~detected] == Estimate.no_detection).all()
+    assert (values["estimate"][detected] != Estimate.no_detection).all()
+
+    solved = values["estimate"] == Estimate.solved
+    for name in ERRORS:
+        assert np.isfinite(values[name][solved]).all(), name
+        assert np.isnan(values[name][~solved]).all(), name
+    for name in ALTERNATIVES:
+        assert np.isnan(values[name][~solved]).all(), name
+    first, second = (np.isnan(values[name]) for name in ALTERNATIVES)
+    np.testing.assert_array_equal(first, second)
+    assert not first.all()
+    flipped = values["flipped"]
+    assert np.isin(flipped[solved], [Flipped.flipped, Flipped.not_flipped]).all()
+    assert (flipped[~solved] == Flipped.no_estimate).all()
+
+
+SQUARE = np.array([[100.0, 100.0], [140.0, 100.0], [140.0, 140.0], [100.0, 140.0]])
+
+
+def classified(*found, truth=SQUARE, marker_id=7):
+    """Classify what was found, (ID, corners) each, in one scene."""
+    flag, corners = classify(
+        truth[None],
+        np.array([marker_id]),
+        np.zeros(len(found), dtype=np.intp),
+        np.array([found_id for found_id, _ in found], dtype=np.int64),
+        np.array([quadrilateral for _, quadrilateral in found]).reshape(-1, 4, 2),
+    )
+    return Detection(flag[0]), corners[0]
+
+
+def test_nothing_found_is_no_candidate():
+    flag, corners = classified()
+    assert flag == Detection.no_candidate
+    assert np.isnan(corners).all()
+
+
+def test_right_marker_is_detected_with_its_own_corners():
+    flag, corners = classified((7, SQUARE + 0.5))
+    assert flag == Detection.detected
+    np.testing.assert_array_equal(corners, SQUARE + 0.5)
+
+
+@pytest.mark.parametrize("found_id", [7, 3, REJECTED_ID])
+def test_what_lies_elsewhere_never_counts(found_id):
+    for shift in ([21.0, 0.0], [0.0, -21.0], [300.0, 200.0]):
+        flag, corners = classified((found_id, SQUARE + shift))
+        assert flag == Detection.no_candidate
+        assert np.isnan(corners).all()
+
+
+@pytest.mark.parametrize("turn", [1, 2, 3])
+def test_wrong_rotation_is_a_wrong_id(turn):
+    flag, corners = classified((7, np.roll(SQUARE, turn, axis=0)))
+    assert flag == Detection.wrong_id
+    assert np.isnan(corners).all()
+
+
+def test_other_id_there_is_a_wrong_id_and_outweighs_a_rejected_candidate():
+    assert classified((3, SQUARE))[0] == Detection.wrong_id
+    assert classified((3, SQUARE), (REJECTED_ID, SQUARE))[0] == Detection.wrong_id
+    assert classified((REJECTED_ID, SQUARE), (3, SQUARE))[0] == Detection.wrong_id
+
+
+def test_rejected_candidate_there_is_rejected():
+    assert classified((REJECTED_ID, SQUARE))[0] == Detection.rejected
+    assert classified((REJECTED_ID, SQUARE), (7, SQUARE + 50))[0] == Detection.rejected
+
+
+def test_right_marker_outweighs_everything_else_there():
+    others = [(3, SQUARE), (REJECTED_ID, SQUARE), (7, np.roll(SQUARE, 1, axis=0))]
+    for found in ([(7, SQUARE), *others], [*others, (7, SQUARE)]):
+        assert classified(*found)[0] == Detection.detected
+
+
+def test_of_two_right_ones_the_nearest_counts():
+    near, far = SQUARE - 0.2, SQUARE * 0.9 + 12.5
+    for found in ([(7, near), (7, far)], [(7, far), (7, near)]):
+        np.testing.assert_array_equal(classified(*found)[1], near)
+
+
+def test_truth_may_be_seen_turned_and_tilted():
+    truth = np.array([[120.0, 90.0], [150.0, 118.0], [118.0, 131.0], [95.0, 115.0]])
+    assert classified((7, truth + 0.3), truth=truth)[0] == Detection.detected
+    # In the bounding box, but not in the quadrilateral.
+    assert classified((7, truth * 0.1 + [85, 82]), truth=truth)[0] == Detection.no_candidate
+
+
+def test_scenes_are_told_apart():
+    truth = np.stack([SQUARE, SQUARE, SQUARE + 200])
+    flag, corners = classify(
+        truth, np.array([1, 2, 3]), np.array([2, 0, 0]), np.array([3, 2, REJECTED_ID]),
+        np.stack([SQUARE + 200, SQUARE, SQUARE]),
+    )
+    assert flag.tolist() == [Detection.wrong_id, Detection.no_candidate, Detection.detected]
+    np.testing.assert_array_equal(np.isnan(corners).all(axis=(1, 2)), [True, True, False])

@@ -1,0 +1,113 @@
+"""Memory stays flat and plans stay lazy, whatever the size of the grid."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+import xarray as xr
+
+from sweep.plan.grid import Blocks, scene_axes
+from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
+
+HERE = Path(__file__).parent
+
+GRID = """
+[pose]
+jitter_px = 0.5
+[axes]
+marker_id = { range = [0, 50] }
+distance_m = { linspace = [0.1, 2, 200] }
+trial = %d
+"""
+
+CLIENT = """
+import json, resource, sys
+import synthetic
+synthetic.install()
+from sweep.engine.execute import execute
+from sweep.plan.pipeline import Pipeline
+import sweep.engine.execute as engine
+engine.block_extents = lambda *_: (1, 200, max(int(sys.argv[4]) // 1000, 1))
+summary = execute(Pipeline.from_toml(sys.argv[1]), sys.argv[2], scheduler=sys.argv[3])
+peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+print(json.dumps({"peak": peak, "blocks": summary.blocks, "poses": summary.poses}))
+"""
+
+
+def run_synthetic(folder, trials):
+    """Run a grid of 10,000 x ``trials`` poses on a scheduler process with two workers."""
+    environment = {**os.environ, "PYTHONPATH": str(HERE)}
+    pipeline, store = folder / f"grid{trials}.toml", folder / f"{trials}.zarr"
+    pipeline.write_text(GRID % trials)
+    address = folder / f"address{trials}.json"
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": environment}
+    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
+    with subprocess.Popen(
+        [*dask, "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file",
+         str(address)], **quiet,
+    ) as scheduler:
+        try:
+            deadline = time.monotonic() + 60
+            while not address.exists():
+                assert time.monotonic() < deadline
+                time.sleep(0.1)
+            worker = [
+                sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file",
+                str(address), "--nworkers", "2", "--nthreads", "1", "--no-dashboard",
+                "--preload", "synthetic",
+            ]
+            with subprocess.Popen(worker, **quiet, cwd=folder) as workers:
+                try:
+                    url = json.loads(address.read_text())["address"]
+                    ran = subprocess.run(
+                        [sys.executable, "-c", CLIENT, str(pipeline), str(store), url,
+                         str(trials)],
+                        env=environment, capture_output=True, text=True, check=False,
+                    )
+                    assert ran.returncode == 0, ran.stderr
+                    grown = psutil.Process(scheduler.pid).memory_info().rss
+                    return {**json.loads(ran.stdout), "scheduler": grown, "store": store}
+                finally:
+                    workers.terminate()
+        finally:
+            scheduler.terminate()
+
+
+@pytest.mark.long
+def test_memory_of_client_and_scheduler_does_not_grow_with_the_grid(tmp_path):
+    small = run_synthetic(tmp_path, 10)
+    large = run_synthetic(tmp_path, 1000)
+    assert (small["poses"], large["poses"]) == (10**5, 10**7)
+    files = [path for path in large["store"].rglob("*") if path.is_file()]
+    total = sum(path.stat().st_size for path in files)
+    print(f"\nclient {small['peak'] / 1e6:.0f} MB at 1e5 poses, {large['peak'] / 1e6:.0f} MB at "
+          f"1e7; scheduler {small['scheduler'] / 1e6:.0f} and {large['scheduler'] / 1e6:.0f} MB; "
+          f"{large['blocks']:,} blocks; {len(files) / 1e7:.2g} files and {total / 1e7:.3g} bytes "
+          "a pose")
+    assert large["peak"] < 300e6
+    assert large["peak"] < 1.1 * small["peak"]
+    assert large["scheduler"] < 1.25 * small["scheduler"]
+    # Reading one slice reads its own chunks: one marker of fifty.
+    before = psutil.Process().io_counters().read_chars
+    with xr.open_zarr(large["store"]) as results:
+        results.rotation_error_deg.isel(marker_id=3, trial=slice(0, 1)).to_numpy()
+    read = psutil.Process().io_counters().read_chars - before
+    whole = sum(p.stat().st_size for p in (large["store"] / "rotation_error_deg").rglob("*")
+                if p.is_file())
+    print(f"one slice reads {read / 1e3:.0f} kB of {whole / 1e6:.1f} MB")
+    assert read < whole / 20
+
+
+def test_a_billion_poses_are_planned_lazily():
+    pipeline = Pipeline.from_text(GRID % 100_000)
+    assert pipeline.size(Stage.scene) == 10**9
+    blocks = Blocks(tuple(len(axis) for axis in scene_axes(pipeline)), (1, 200, 20))
+    assert len(blocks) == 250_000
+    assert blocks.number(blocks[249_999]) == 249_999
+    assert str(blocks[249_999]) == "49-50,0-200,99980-100000"

@@ -1,0 +1,239 @@
+"""The guarded solvers are right where the plain calls fail, and no nonsense passes as solved."""
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+from conftest import lengths
+from scipy.spatial.transform import Rotation
+
+from sweep.measure.flags import Estimate
+from sweep.measure.pose_error import pose_error
+from sweep.measure.solver import BOTH_PLANAR_SOLUTIONS, SOLVERS, estimate
+from sweep.model.camera import Cameras
+from sweep.model.lens import pack
+from sweep.plan.parameters import PARAMETERS
+
+RELIABLE = tuple(name for name in SOLVERS if name != "epnp")
+FOCAL_PX = 1600 / 3
+SQUARE = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5, -0.5, 0]])
+LENS = (-0.3, 0.1, 0.0, 0.0)
+
+
+class View:
+    """Poses (N,) over tilt, azimuth and roll at one bearing, and their exact corners."""
+
+    def __init__(self, step_deg, bearing_deg, size_m=1.0, lens=()):
+        tilt, azimuth, roll = np.radians(
+            list(itertools.product(range(0, 90, 15), *[range(0, 360, step_deg)] * 2))
+        ).T
+        axis = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(tilt)], axis=1)
+        rotation = Rotation.from_rotvec(tilt[:, None] * axis) * Rotation.from_rotvec(
+            roll[:, None] * [0.0, 0.0, 1.0]
+        )
+        self.rotation = (rotation * Rotation.from_rotvec([np.pi, 0, 0])).as_matrix()
+        # 8 sides away: 67 px.
+        centre = 8 * size_m * np.array([*np.tan(np.radians(bearing_deg)), 1.0])
+        self.sight = centre / np.linalg.norm(centre)
+        # Within 1 degree of edge on, a marker of this size is a line of 1 px.
+        facing = np.arccos(np.clip(-self.rotation[:, :, 2] @ self.sight, -1, 1)) < np.radians(89)
+        self.rotation = self.rotation[facing]
+        self.translation = np.tile(centre, (len(self.rotation), 1))
+        self.size_m = np.full(len(self.rotation), size_m)
+        self.cameras = cameras(len(self.rotation), lens)
+        self.corners = self.cameras.project(in_space(self.rotation, self.translation, size_m))
+
+    def __len__(self):
+        return len(self.rotation)
+
+    def mirrored(self):
+        """Return the reflection of every pose in the plane across the line of sight."""
+        reflection = np.eye(3) - 2 * np.outer(self.sight, self.sight)
+        return reflection @ self.rotation @ np.diag([1.0, 1.0, -1.0])
+
+    def estimates(self, solver, guarded, corners=None):
+        corners = self.corners if corners is None else corners
+        return estimate(corners, self.cameras, self.size_m, solver, guarded, 0.25)
+
+
+def in_space(rotation, translation, size_m):
+    return np.einsum("nij,kj->nki", rotation, size_m * SQUARE) + translation[:, None]
+
+
+def cameras(count, lens=()):
+    view = np.tile([FOCAL_PX, FOCAL_PX, 319.5, 239.5], (count, 1))
+    return Cameras(view, np.repeat(pack(lens)[None], count, axis=0), np.full(count, bool(lens)))
+
+
+def degrees_between(rotation, other):
+    """Return the angles (N,); infinite where ``rotation`` is NaN."""
+    angle = np.full(len(rotation), np.inf)
+    known = np.isfinite(rotation).all(axis=(1, 2))
+    difference = rotation[known] @ np.swapaxes(other[known], 1, 2)
+    angle[known] = np.degrees(Rotation.from_matrix(difference).magnitude())
+    return angle
+
+
+def wrong(view, estimates):
+    """Tell (N,) which estimates are neither within 0.01 degrees nor the mirror, as exact as it.
+
+    0.01 degrees is 1e-4 of the smallest tilt step and 100 times what iterative solvers leave.
+    """
+    right = degrees_between(estimates.rotation, view.rotation) < 0.01
+    with np.errstate(invalid="ignore"):
+        exact = estimates.reprojection_px < 1e-6  # where the mirror is no worse than the truth
+    mirror = degrees_between(estimates.rotation, view.mirrored()) < 0.01
+    return ~(right | (mirror & exact)) | (estimates.status != Estimate.solved)
+
+
+@lengths(45, 15)
+@pytest.mark.parametrize("bearing", [(0.0, 0.0), (12.0, -9.0)], ids=["on-axis", "off-axis"])
+@pytest.mark.parametrize("size_m", [0.001, 0.01, 1.0, 10.0])
+def test_guarded_solvers_are_right_where_plain_calls_fail(count, bearing, size_m):
+    view = View(count, bearing, size_m)
+    failures = {
+        (solver, guarded): int(wrong(view, view.estimates(solver, guarded)).sum())
+        for solver in RELIABLE
+        for guarded in (True, False)
+    }
+    print(f"\nside {size_m} m, bearing {bearing}: failures in {len(view)} poses, guarded / plain: "
+          + ", ".join(f"{s} {failures[s, True]} / {failures[s, False]}" for s in RELIABLE))
+    assert not any(failures[solver, True] for solver in RELIABLE)
+    # The guard's reason to exist.
+    assert failures["ippe", False] > 0
+    assert failures["ippe_square", False] > 0
+    if size_m == 0.001:
+        assert failures["sqpnp", False] > 0
+
+
+@lengths(45, 15)
+def test_epnp_is_unreliable_and_says_so(count):
+    view = View(count, (0.0, 0.0), 0.1)
+    failed = wrong(view, view.estimates("epnp", guarded=True))
+    print(f"\nepnp: {failed.sum()} of {len(view)} wrong")
+    assert failed.mean() > 0.25
+    assert "epnp is unreliable" in PARAMETERS["solver"].declaration.meaning
+
+
+@lengths(45, 15)
+@pytest.mark.parametrize("bearing", [(0.0, 0.0), (12.0, -9.0)], ids=["on-axis", "off-axis"])
+def test_guarded_solvers_are_right_through_a_lens(count, bearing):
+    view = View(count, bearing, 0.04, LENS)
+    straight = View(count, bearing, 0.04)
+    assert np.abs(view.corners - straight.corners).max() > 0.1  # the lens does something
+    for solver in RELIABLE:
+        assert not wrong(view, view.estimates(solver, guarded=True)).any(), solver
+
+
+@pytest.mark.parametrize("solver", RELIABLE)
+def test_relative_errors_are_the_same_at_millimetres_and_kilometres(solver):
+    noise = np.random.default_rng(8).normal(0, 0.3, (2000, 4, 2))
+    views = [View(60, (12.0, -9.0), size_m) for size_m in (1e-3, 1.0, 1e3)]
+    corners = views[1].corners + noise[: len(views[1])]
+    small, middle, large = (view.estimates(solver, guarded=True, corners=corners)
+                            for view in views)
+    assert (middle.status == Estimate.solved).all()
+    assert degrees_between(middle.rotation, views[1].rotation).max() > 0.05  # noise does something
+    for view, estimates in ((views[0], small), (views[2], large)):
+        np.testing.assert_array_equal(estimates.status, middle.status)
+        size = view.size_m[0]
+        # 1e-6 of the side; solving in units of the side leaves the rounding of the last product.
+        np.testing.assert_allclose(estimates.translation / size, middle.translation, atol=1e-6)
+        np.testing.assert_allclose(estimates.rotation, middle.rotation, atol=1e-6)
+        np.testing.assert_allclose(estimates.reprojection_px, middle.reprojection_px, atol=1e-6)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_other_planar_solution_is_there_for_the_solvers_that_give_both(solver):
+    view = View(37, (12.0, -9.0))  # no multiple of a right angle: the guard needs no fallback
+    estimates = view.estimates(solver, guarded=True)
+    present = np.isfinite(estimates.alternative_rotation).all(axis=(1, 2))
+    assert (present == np.isfinite(estimates.alternative_reprojection_px)).all()
+    assert present.all() if solver in BOTH_PLANAR_SOLUTIONS else not present.any()
+    if solver in BOTH_PLANAR_SOLUTIONS:
+        # Of exact corners, it is the mirror of the truth; 1e-3 degrees covers IPPE's rounding
+        # where the marker squarely faces the camera and both solutions meet.
+        off = degrees_between(estimates.alternative_rotation, view.mirrored())
+        assert off.max() < 1e-3
+        assert (estimates.alternative_reprojection_px >= estimates.reprojection_px - 1e-6).all()
+
+
+@lengths(45, 15)
+@pytest.mark.parametrize("solver", BOTH_PLANAR_SOLUTIONS)
+def test_other_planar_solution_is_seldom_lost_to_the_fallback_on_the_axis(count, solver):
+    view = View(count, (0.0, 0.0))
+    present = np.isfinite(view.estimates(solver, guarded=True).alternative_reprojection_px)
+    tilted = view.rotation[:, 2, 2] > -0.99  # else both solutions are one
+    print(f"\n{solver}: the other solution is missing for {(~present & tilted).sum()} of "
+          f"{tilted.sum()} tilted poses and {(~present & ~tilted).sum()} of {(~tilted).sum()} "
+          "squarely facing ones")
+    assert present[tilted].mean() > 0.95
+
+
+def test_an_estimate_is_flipped_when_it_is_the_mirror():
+    view = View(37, (12.0, -9.0))
+    tilted = degrees_between(view.mirrored(), view.rotation) > 1
+    assert tilted.sum() > 100
+    for rotation, flipped in ((view.rotation, False), (view.mirrored(), True)):
+        error = pose_error(rotation, view.translation, view.rotation, view.translation)
+        assert (error.flipped[tilted] == flipped).all()
+    # OpenCV's own second solution of one whose first is right.
+    row = np.flatnonzero(tilted & ~wrong(view, view.estimates("ippe", guarded=False)))[0]
+    _, rvecs, _, _ = cv2.solvePnPGeneric(
+        SQUARE, view.corners[row], view.cameras.matrix(row), None, flags=cv2.SOLVEPNP_IPPE
+    )
+    second = Rotation.from_rotvec(rvecs[1][:, 0]).as_matrix()[None]
+    one = slice(row, row + 1)
+    assert pose_error(
+        second, view.translation[one], view.rotation[one], view.translation[one]
+    ).flipped.all()
+
+
+def garbage(count):
+    """Return quadrilaterals (n, 4, 2) that no marker gave, by kind."""
+    rng = np.random.default_rng(31)
+    somewhere = rng.uniform(0, 600, (count, 1, 2))
+    kinds = {
+        "random": rng.uniform(-200, 800, (count, 4, 2)),
+        "whole numbers": 300.0 + rng.integers(0, 5, (count, 4, 2)),
+        "collinear": somewhere + rng.uniform(-1, 1, (count, 4, 1)) * rng.uniform(
+            -300, 300, (count, 1, 2)
+        ),
+        "in one row": np.stack([rng.uniform(0, 600, (count, 4)), np.full((count, 4), 9.0)], 2),
+        "identical": np.repeat(somewhere, 4, axis=1),
+        "at the principal point": np.full((count, 4, 2), [319.5, 239.5]),
+        "two identical": np.repeat(rng.uniform(0, 600, (count, 2, 2)), 2, axis=1),
+        "three identical": np.concatenate(
+            [np.repeat(somewhere, 3, axis=1), rng.uniform(0, 600, (count, 1, 2))], axis=1
+        ),
+        "tiny": 320 + rng.uniform(-1e-9, 1e-9, (count, 4, 2)),
+    }
+    # The detector's corners are float32.
+    for largest in (1e5, 1e9, 1e20, 3e38):
+        kinds[f"up to {largest:g}"] = rng.uniform(-largest, largest, (count, 4, 2))
+    return kinds
+
+
+@lengths(8, 150)
+@pytest.mark.parametrize("lens", [(), LENS, (-0.5, 0.0, 0.0, 0.0)], ids=["none", "mild", "folds"])
+@pytest.mark.parametrize("guarded", [True, False], ids=["guarded", "plain"])
+def test_garbage_is_solved_in_front_of_the_camera_or_not_at_all(count, guarded, lens):
+    for (kind, corners), solver in itertools.product(garbage(count).items(), SOLVERS):
+        estimates = estimate(
+            corners, cameras(count, lens), np.full(count, 0.05), solver, guarded, 0.25
+        )
+        solved = estimates.status == Estimate.solved
+        told = f"{solver} on {kind}"
+        assert (solved | (estimates.status == Estimate.solver_failed)).all(), told
+        points = in_space(estimates.rotation, estimates.translation, 0.05)
+        assert np.isfinite(points[solved]).all(), told
+        assert (points[solved][..., 2] > 0).all(), told
+        side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(axis=1)
+        assert (estimates.reprojection_px <= 0.25 * side)[solved].all(), told
+        assert np.isnan(points[~solved]).all(), told
+        assert np.isnan(estimates.reprojection_px[~solved]).all(), told
+        assert np.isnan(estimates.alternative_rotation[~solved]).all(), told
+        # What is solved is a rotation: 1e-12 is a hundred roundings.
+        product = estimates.rotation[solved] @ np.swapaxes(estimates.rotation[solved], 1, 2)
+        np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-12)

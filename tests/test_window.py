@@ -1,0 +1,275 @@
+"""Searching a window around the marker finds what searching the whole frame finds."""
+
+import cv2
+import numpy as np
+import pytest
+from conftest import lengths
+
+from sweep.errors import PipelineError
+from sweep.kernel import run_block, search, search_windows, single_thread, visibility_flags
+from sweep.measure.detector import REFINEMENTS, DetectorSetting, full_frame_reason
+from sweep.measure.flags import Detection
+from sweep.model.marker import opencv_dictionary
+from sweep.model.render import render
+from sweep.model.scene import build_scenes, marker_boxes
+from sweep.plan.grid import Block, detector_settings, scene_axes, scene_values
+from sweep.plan.pipeline import Pipeline
+
+SCENES = """
+seed = 11
+[camera]
+width_px = {width}
+height_px = {height}
+[marker]
+[pose]
+tilt_deg = {{ uniform = [0, 80] }}
+azimuth_deg = {{ uniform = [0, 360] }}
+roll_deg = {{ uniform = [0, 360] }}
+bearing_x_deg = {{ uniform = [-33, 33] }}   # half the field of view is 31 by 24 degrees
+bearing_y_deg = {{ uniform = [-26, 26] }}
+[axes]
+dictionary = ["DICT_4X4_50", "DICT_5X5_50", "DICT_6X6_250", "DICT_APRILTAG_36h11"]
+background = [0, 128, 255]
+marker_id = [3, 17]
+side_px = {{ geom = [6, 400, 24] }}
+trial = 20
+"""
+
+
+def visible_scenes(count, width=640, height=480, settings=()):
+    """Return ``count`` scenes of the grid, each visible at least in part."""
+    pipeline = Pipeline.from_text(SCENES.format(width=width, height=height), settings)
+    shape = tuple(len(axis) for axis in scene_axes(pipeline))
+    order = np.random.default_rng(5).permutation(int(np.prod(shape)))
+
+    def built(cells):
+        indices = list(np.unravel_index(cells, shape))
+        return build_scenes(scene_values(pipeline, indices), len(cells))
+
+    candidates = order[: count * 5 // 4 + 20]
+    seen = np.flatnonzero(visibility_flags(built(candidates)) == Detection.not_run)
+    assert len(seen) >= count
+    return built(candidates[seen[:count]])
+
+
+def both_searches(scenes, setting):
+    """Return what a setting finds in the windows, and in the whole frames."""
+    single_thread()
+    everything = np.ones((len(scenes), 1), dtype=bool)
+    failures = []
+    windowed, framed = (
+        search(scenes, everything, [setting], np.full(len(scenes), full), failures)[0][0]
+        for full in (False, True)
+    )
+    assert not failures
+    return windowed, framed
+
+
+def outcome(detector, image, scenes, row, shift):
+    """Return what a plain OpenCV call makes of the marker of a scene that was moved by shift."""
+    corners, ids, rejected = detector.detectMarkers(image)
+    truth = (scenes.corners_px[row] + shift).astype(np.float32)
+
+    def there(quadrilateral):
+        centre = quadrilateral.reshape(4, 2).mean(axis=0)
+        return cv2.pointPolygonTest(truth, (float(centre[0]), float(centre[1])), False) >= 0
+
+    decoded = [] if ids is None else [
+        marker_id for corner, marker_id in zip(corners, ids.ravel().tolist(), strict=True)
+        if there(corner)
+    ]
+    return tuple(decoded) or ("rejected" if any(map(there, rejected)) else "nothing")
+
+
+def outcomes_elsewhere(scenes, row, setting):
+    """Return the outcomes with the *same pixels* of a window pasted all over the full frame.
+
+    Offsets are multiples of 4 px and others. A window that touches the frame's edge keeps to it.
+    """
+    box = marker_boxes(scenes)
+    window = search_windows(scenes, box, setting, np.zeros(len(scenes), dtype=bool))[row]
+    x0, y0, x1, y1 = window.tolist()
+    pixels = render(scenes, row, box[row], (x0, y0, x1, y1))
+    width, height = scenes.frame[row].tolist()
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = REFINEMENTS[setting.cornerRefinementMethod]
+    detector = cv2.aruco.ArucoDetector(opencv_dictionary(scenes.dictionary[row]), parameters)
+    lefts = [x0] if x0 == 0 or x1 == width else [0, *range(3, width - (x1 - x0), 29), x0]
+    tops = [y0] if y0 == 0 or y1 == height else [0, *range(3, height - (y1 - y0), 29), y0]
+    lefts += [left // 4 * 4 for left in lefts] if len(lefts) > 1 else []
+    tops += [top // 4 * 4 for top in tops] if len(tops) > 1 else []
+    seen = set()
+    for top in sorted(set(tops)):
+        for left in sorted(set(lefts)):
+            image = np.full((height, width), round(scenes.levels[row, 0]), dtype=np.uint8)
+            image[top : top + y1 - y0, left : left + x1 - x0] = pixels
+            seen.add(outcome(detector, image, scenes, row, (left - x0, top - y0)))
+            if len(seen) > 1:
+                return seen
+    return seen
+
+
+def compare(count, width, height, refinement):
+    """Hold window and frame equal for ``count`` poses; print how far the corners differ."""
+    setting = DetectorSetting(cornerRefinementMethod=refinement)
+    scenes = visible_scenes(count, width, height)
+    windowed, framed = both_searches(scenes, setting)
+    exceptions = np.flatnonzero(windowed.flags != framed.flags)
+    both = (windowed.flags == Detection.detected) & (framed.flags == Detection.detected)
+    difference = np.abs(windowed.corners - framed.corners)[both].max(axis=(1, 2))
+    median, high, worst = np.quantile(difference, [0.5, 0.99, 1.0])
+    cut = (scenes.outline_px < -0.5) | (scenes.outline_px > scenes.frame[:, None] - 0.5)
+    print(
+        f"\n{width}x{height} {refinement}: {count} poses, {cut.any(axis=(1, 2)).sum()} cut by "
+        f"the frame, {both.sum()} detected, {len(exceptions)} exceptions; corners differ by "
+        f"median {median:.2g}, 99th percentile {high:.2g}, worst {worst:.2g} px"
+    )
+    assert len(exceptions) <= max(1, 0.001 * count)
+    for row in exceptions:
+        # OpenCV itself is not invariant to where these very pixels lie in the frame.
+        assert len(outcomes_elsewhere(scenes, row, setting)) > 1, (
+            f"pose {row}: {windowed.flags[row]} in the window, {framed.flags[row]} in the frame"
+        )
+    if refinement == "none":
+        assert worst == 0.0
+    elif refinement == "apriltag":
+        # Corners are float32 in the pixels of the image that was searched.
+        assert worst <= np.spacing(np.float32(width))
+    elif refinement == "subpix":
+        # The iteration stops at a step of 0.1 px, and never leaves the half window of 5 px
+        # around its start, which is the same for both: 10 px between any two results.
+        assert high < DetectorSetting().cornerRefinementMinAccuracy
+        assert worst <= 2 * DetectorSetting().cornerRefinementWinSize
+    else:
+        # Lines are fitted in float32 to whole-pixel contours; sums of products of coordinates
+        # lose digits with the square of the distance to the image's corner (0.3 px at 4000).
+        assert worst < 1.0
+
+
+@lengths(250, 10_600)
+@pytest.mark.parametrize("refinement", REFINEMENTS)
+def test_window_finds_what_the_frame_of_640_by_480_holds(count, refinement):
+    compare(count, 640, 480, refinement)
+
+
+@lengths(10, 500)
+@pytest.mark.parametrize("refinement", REFINEMENTS)
+def test_window_finds_what_the_frame_of_1920_by_1080_holds(count, refinement):
+    compare(count, 1920, 1080, refinement)
+
+
+@lengths(4, 500)
+@pytest.mark.parametrize("refinement", REFINEMENTS)
+def test_window_finds_what_the_frame_of_4000_by_3000_holds(count, refinement):
+    compare(count, 4000, 3000, refinement)
+
+
+OTHER_SETTINGS = [
+    {"adaptiveThreshWinSizeMax": 61},
+    {"adaptiveThreshWinSizeMin": 4, "adaptiveThreshWinSizeMax": 24,
+     "adaptiveThreshWinSizeStep": 4},
+    {"adaptiveThreshConstant": 1.0},
+    {"adaptiveThreshConstant": 0.5},
+    {"adaptiveThreshConstant": 0.0},
+    {"adaptiveThreshConstant": -5.0},
+    {"minMarkerPerimeterRate": 0.2},
+    {"minMarkerPerimeterRate": 0.05, "maxMarkerPerimeterRate": 0.125},
+    {"polygonalApproxAccuracyRate": 0.1},
+    {"minDistanceToBorder": 10},
+    {"minDistanceToBorder": 0},
+    {"minMarkerDistanceRate": 0.0},
+    {"minGroupDistance": 2.0},
+    {"markerBorderBits": 2},
+    {"perspectiveRemovePixelPerCell": 10, "validBitIdThreshold": 0.2},
+    {"detectInvertedMarker": True},
+    {"useAruco3Detection": True},
+    {"cornerRefinementMethod": "apriltag", "aprilTagQuadSigma": 2.0},
+    {"cornerRefinementMethod": "apriltag", "aprilTagQuadSigma": -1.0},
+    {"cornerRefinementMethod": "apriltag", "aprilTagQuadDecimate": 2.0},
+    {"cornerRefinementMethod": "apriltag", "aprilTagMinWhiteBlackDiff": 100},
+    {"cornerRefinementMethod": "apriltag", "aprilTagMinClusterPixels": 100},
+    {"cornerRefinementMethod": "apriltag", "minDistanceToBorder": 0},
+]
+
+
+@lengths(24, 500)
+@pytest.mark.parametrize(
+    "given", OTHER_SETTINGS, ids=lambda given: ",".join(f"{k}={v}" for k, v in given.items())
+)
+def test_window_finds_what_the_frame_holds_under_other_settings(count, given):
+    setting = DetectorSetting(**given)
+    scenes = visible_scenes(count)
+    windowed, framed = both_searches(scenes, setting)
+    assert (windowed.flags != framed.flags).sum() <= 0.001 * count
+    both = (windowed.flags == Detection.detected) & (framed.flags == Detection.detected)
+    difference = np.abs(windowed.corners - framed.corners)[both]
+    exact = full_frame_reason(setting) is not None or setting.cornerRefinementMethod == "none"
+    # As above: one float32 ulp of the frame's width for apriltag's corners.
+    assert difference.max(initial=0.0) <= (0.0 if exact else np.spacing(np.float32(640)))
+
+
+@lengths(24, 500)
+@pytest.mark.parametrize("changed", ["quiet_zone_modules=0", "distortion=[-0.3,0.1,0.001,-0.002]"])
+def test_window_finds_what_the_frame_holds_without_quiet_zone_and_through_a_lens(count, changed):
+    scenes = visible_scenes(count, settings=[changed])
+    windowed, framed = both_searches(scenes, DetectorSetting())
+    np.testing.assert_array_equal(windowed.flags, framed.flags)
+    np.testing.assert_array_equal(windowed.corners, framed.corners)
+
+
+PAIRED = """
+seed = 3
+[pose]
+tilt_deg = { uniform = [0, 70] }
+bearing_x_deg = { uniform = [-30, 30] }
+[scene]
+background = 128
+[axes]
+side_px = [15, 40, 120]
+trial = 12
+cornerRefinementMethod = ["none", "subpix", "contour", "apriltag"]
+adaptiveThreshWinSizeMax = [23]
+solver = ["ippe_square", "iterative"]
+"""
+
+
+def test_adding_a_setting_with_a_larger_window_changes_no_other_setting():
+    alone, beside = (
+        run_block(Pipeline.from_text(PAIRED, settings), Block((0, 0), (3, 12))).values
+        for settings in ((), ("adaptiveThreshWinSizeMax=[61, 23]",))
+    )
+    assert (alone["detection"] == Detection.detected).any()
+    for name, expected in alone.items():
+        found = beside[name]
+        if found.shape != expected.shape:
+            found = found[:, :, :, 1:]
+        np.testing.assert_array_equal(found, expected, err_msg=name)
+
+
+@lengths(60, 400)
+def test_deglitching_is_refused_or_does_not_depend_on_the_order_of_scenes(count):
+    """OpenCV's aprilTagDeglitch reads memory that it never wrote, at the image's border."""
+    settings = [f"trial={count}", "cornerRefinementMethod=apriltag", "aprilTagDeglitch=1"]
+    try:
+        pipeline = Pipeline.from_text(PAIRED, settings)
+    except PipelineError:
+        return
+    whole = run_block(pipeline, Block((0, 0), (3, count))).values
+    for trial in reversed(range(count)):
+        part = run_block(pipeline, Block((0, trial), (3, trial + 1))).values
+        for name in ("detection", "corner_error_px"):
+            np.testing.assert_array_equal(part[name][:, 0], whole[name][:, trial], err_msg=name)
+
+
+def test_settings_of_the_grid_are_told_apart_by_their_margins():
+    pipeline = Pipeline.from_text(PAIRED, ["adaptiveThreshWinSizeMax=[23, 61]"])
+    small, large = detector_settings(pipeline)[:2]
+    assert (small.adaptiveThreshWinSizeMax, large.adaptiveThreshWinSizeMax) == (23, 61)
+    scenes = visible_scenes(20)
+    inner, outer = (
+        search_windows(scenes, marker_boxes(scenes), setting, np.zeros(20, dtype=bool))
+        for setting in (small, large)
+    )
+    assert (outer[:, :2] <= inner[:, :2]).all()
+    assert (outer[:, 2:] >= inner[:, 2:]).all()
+    assert (outer != inner).any()

@@ -268,7 +268,7 @@ def search(
                 owners[k].extend([row] * len(found))
                 ids[k].extend(found)
                 quads[k].extend(corners)
-            if rejected and scenes.marker_id[row] not in found:
+            if rejected:
                 owners[k].extend([row] * len(rejected))
                 ids[k].extend([REJECTED_ID] * len(rejected))
                 quads[k].extend(rejected)
@@ -387,7 +387,7 @@ def shaped(
     )
     made = [axis.name for axis in itertools.chain(outer, treatment)] + list(variable.inner)
     wanted = variable.dimensions(pipeline)
-    return np.ascontiguousarray(shaped.transpose([made.index(name) for name in wanted]))
+    return shaped.transpose([made.index(name) for name in wanted]).copy(order="C")
 
 
 

@@ -159,6 +159,8 @@ def full_frame_reason(setting: DetectorSetting) -> str | None:
         return "useAruco3Detection scales the image by the frame's size"
     if setting.cornerRefinementMethod == "apriltag" and setting.aprilTagQuadDecimate > 1:
         return "aprilTagQuadDecimate resamples the frame"
+    if setting.adaptiveThreshConstant < 1:
+        return "adaptiveThreshConstant below 1 turns the plain background into candidates"
     return None
 
 

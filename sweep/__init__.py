@@ -17,10 +17,10 @@ __all__ = ["Pipeline", "PipelineError", "RunError", "StoreError", "SweepError", 
 def run(pipeline: Pipeline, store: str | os.PathLike[str] | None = None, **options: Any) -> Any:
     """Run a pipeline into a store and return its results, an ``xarray.Dataset``, lazily.
 
-    ``options`` are those of :func:`sweep.engine.execute.execute`. Call it under
+    ``options`` are those of :func:`sweep.engine.runner.execute`. Call it under
     ``if __name__ == "__main__":`` in a script: the workers are processes that import it.
     """
-    from sweep.engine.execute import execute  # noqa: PLC0415  (dask is slow to import)
+    from sweep.engine.runner import execute  # noqa: PLC0415  (dask is slow to import)
 
     return open(execute(pipeline, store, **options).store)
 

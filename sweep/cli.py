@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Self
 from sweep.errors import PipelineError, StoreError, SweepError
 
 if TYPE_CHECKING:
-    from sweep.engine.execute import Progress
+    from sweep.engine.runner import Progress
     from sweep.plan.pipeline import Pipeline
 
 # Heavy packages are imported by the commands that need them: `sweep --help` is quick.
@@ -111,7 +111,7 @@ def _print_json(content: dict[str, Any]) -> None:
 
 def _run(chosen: argparse.Namespace) -> int:
     pipeline = _read(chosen)
-    from sweep.engine.execute import execute  # noqa: PLC0415
+    from sweep.engine.runner import execute  # noqa: PLC0415
 
     with _Bar() as bar:
         summary = execute(
@@ -170,8 +170,8 @@ class _Bar:
 
 def _plan(chosen: argparse.Namespace) -> int:
     pipeline = _read(chosen)
-    from sweep.engine.forecast import forecast  # noqa: PLC0415
-    from sweep.plan.parts import parts  # noqa: PLC0415
+    from sweep.engine.forecasting import forecast  # noqa: PLC0415
+    from sweep.plan.activity import parts  # noqa: PLC0415
 
     expected = forecast(pipeline, chosen.workers)
     listed = parts(pipeline)
@@ -228,7 +228,7 @@ def _show(chosen: argparse.Namespace) -> int:
     import cv2  # noqa: PLC0415
 
     from sweep.kernel import look  # noqa: PLC0415
-    from sweep.plan.cell import cell, coordinates_text  # noqa: PLC0415
+    from sweep.plan.one_cell import cell, coordinates_text  # noqa: PLC0415
     from sweep.report.scene_drawing import draw_scene  # noqa: PLC0415
 
     one = cell(pipeline, chosen.at)
@@ -245,7 +245,7 @@ def _show(chosen: argparse.Namespace) -> int:
 
 
 def _status(chosen: argparse.Namespace) -> int:
-    from sweep.engine.status import status  # noqa: PLC0415
+    from sweep.engine.progress import status  # noqa: PLC0415
 
     state = status(chosen.store)
     if chosen.json:

@@ -1,9 +1,9 @@
 """One block of the experiment: the nested stages scene -> image -> detection -> estimate.
 
 The paper's eleven steps (Poroykov et al., 2020) are found by name: steps 1-6 in
-:func:`sweep.model.scene.build_scenes`, 7-8 in :mod:`sweep.model.render`, 9 in
+:func:`sweep.model.scene.build_scenes`, 7-8 in :mod:`sweep.model.renderers`, 9 in
 :mod:`sweep.measure.detector` and :mod:`sweep.measure.solver`, 10 in
-:mod:`sweep.measure.pose_error`; step 11 is the block. A scene is rendered once for all detector
+:mod:`sweep.measure.accuracy`; step 11 is the block. A scene is rendered once for all detector
 settings, and a detection is shared by all estimators.
 """
 
@@ -20,15 +20,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.measure.accuracy import pose_error, rotation_difference
 from sweep.measure.detector import Detector, DetectorSetting, full_frame_reason, margin_px, windows
 from sweep.measure.finding import REJECTED_ID, classify
 from sweep.measure.flags import Detection, Estimate, Flipped
-from sweep.measure.pose_error import pose_error, rotation_difference
 from sweep.measure.solver import Estimates, Estimator, estimate
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.pose import rotation_of_vector, vector_of_rotation
-from sweep.model.render import render
+from sweep.model.renderers import render
 from sweep.model.scene import (
     Scenes,
     areas_px,

@@ -22,7 +22,7 @@ from sweep.measure.detector import (
 )
 from sweep.measure.flags import Detection
 from sweep.model.marker import dictionary_names, marker_count, module_count
-from sweep.model.render import render
+from sweep.model.renderers import render
 from sweep.model.scene import build_scenes, marker_boxes
 from sweep.plan.grid import Block, block_indices, detector_settings, scene_axes, scene_values
 from sweep.plan.pipeline import Pipeline

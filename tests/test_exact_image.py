@@ -12,7 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from sweep.model.camera import Camera
 from sweep.model.marker import Marker
 from sweep.model.pose import Pose
-from sweep.model.render import marker_levels, render
+from sweep.model.renderers import marker_levels, render
 from sweep.model.scene import Scene, build_scenes, marker_boxes
 
 DEFAULTS = {"shift_u_px": 0.0, "shift_v_px": 0.0} | {

@@ -4,9 +4,9 @@ import hashlib
 
 import numpy as np
 
-from sweep.engine.fingerprint import NUMBERS_VERSION
+from sweep.engine.provenance import NUMBERS_VERSION
 from sweep.measure.solver import estimate
-from sweep.model.render import render
+from sweep.model.renderers import render
 from sweep.model.scene import build_scenes, marker_boxes
 from sweep.plan.grid import scene_values
 from sweep.plan.pipeline import Pipeline

@@ -9,7 +9,7 @@ from conftest import lengths
 from scipy.spatial.transform import Rotation
 
 from sweep.kernel import run_block
-from sweep.model.render import render
+from sweep.model.renderers import render
 from sweep.model.scene import build_scenes, marker_boxes
 from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
 from sweep.plan.pipeline import Pipeline

@@ -15,8 +15,8 @@ import xarray as xr
 import zarr
 
 import sweep
-from sweep.engine.execute import execute
 from sweep.engine.lock import KEY
+from sweep.engine.runner import execute
 from sweep.engine.store import committed, create_store, open_store, put
 from sweep.engine.task import compute_block
 from sweep.errors import StoreError

@@ -31,9 +31,9 @@ CLIENT = """
 import json, resource, sys
 import synthetic
 synthetic.install()
-from sweep.engine.execute import execute
+from sweep.engine.runner import execute
 from sweep.plan.pipeline import Pipeline
-import sweep.engine.execute as engine
+import sweep.engine.runner as engine
 engine.block_extents = lambda *_: (1, 200, max(int(sys.argv[4]) // 50, 1))
 summary = execute(Pipeline.from_toml(sys.argv[1]), sys.argv[2], scheduler=sys.argv[3])
 peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

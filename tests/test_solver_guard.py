@@ -8,8 +8,8 @@ import pytest
 from conftest import lengths
 from scipy.spatial.transform import Rotation
 
+from sweep.measure.accuracy import pose_error
 from sweep.measure.flags import Estimate
-from sweep.measure.pose_error import pose_error
 from sweep.measure.solver import BOTH_PLANAR_SOLUTIONS, SOLVERS, estimate
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack

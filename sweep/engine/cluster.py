@@ -13,7 +13,7 @@ from typing import Any
 import dask
 from distributed import Client, LocalCluster, fire_and_forget
 
-from sweep.engine.fingerprint import fingerprint
+from sweep.engine.provenance import fingerprint
 from sweep.errors import StoreError
 from sweep.plan.pipeline import Pipeline
 

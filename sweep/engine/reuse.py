@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.engine.fingerprint import fingerprint
+from sweep.engine.provenance import fingerprint
 from sweep.engine.store import RunStore, committed
 from sweep.errors import StoreError
 from sweep.plan.axes import TRIAL, Axis

@@ -27,7 +27,7 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.core.buffer import cpu, default_buffer_prototype
 from zarr.core.sync import sync
 
-from sweep.engine.fingerprint import environment, fingerprint
+from sweep.engine.provenance import environment, fingerprint
 from sweep.errors import StoreError
 from sweep.model.camera import intrinsics
 from sweep.plan.axes import Axis

@@ -11,7 +11,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from sweep.engine.fingerprint import fingerprint
+from sweep.engine.provenance import fingerprint
 from sweep.engine.reuse import Source, Taken, match, take
 from sweep.engine.store import RunStore, open_store, write_block
 from sweep.errors import StoreError

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,8 +13,8 @@ from numpy.typing import NDArray
 
 from sweep.measure.flags import Estimate
 from sweep.model.camera import Cameras
+from sweep.model.declaration import parameter
 from sweep.model.marker import marker_corners
-from sweep.model.parameter import parameter
 from sweep.model.pose import rotation_of_vector
 from sweep.model.scene import placed
 
@@ -255,9 +256,10 @@ def _solve_turned(
     the marker frame and translations (n, 2, 3) in sides.
     """
     count = len(points)
+    nothing = np.full((3, 1), np.nan)
     order = (np.arange(4) + turns[:, None]) % 4
     turned = np.take_along_axis(points, order[:, :, None], axis=1)
-    rvec, translation = np.full((count, 2, 3), np.nan), np.full((count, 2, 3), np.nan)
+    vectors: list[Any] = []
     both = method in (cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_IPPE_SQUARE)
     for i in range(count):
         try:
@@ -271,13 +273,17 @@ def _solve_turned(
                 )
                 rs, ts = (r,), (t,)
         except cv2.error:
-            continue
-        if found:
-            for k in range(min(len(rs), 2)):
-                rvec[i, k], translation[i, k] = rs[k][:, 0], ts[k][:, 0]
-    rotation = rotation_of_vector(rvec)
+            found = False
+        if not found:
+            vectors += [nothing] * 4
+        elif len(rs) > 1:
+            vectors += [rs[0], rs[1], ts[0], ts[1]]
+        else:
+            vectors += [rs[0], nothing, ts[0], nothing]
+    solved = np.concatenate(vectors).reshape(count, 2, 2, 3) if vectors else np.empty((0, 2, 2, 3))
+    rotation, translation = rotation_of_vector(solved[:, 0]), solved[:, 1]
     c, s = np.array([1.0, 0.0, -1.0, 0.0])[turns], np.array([0.0, 1.0, 0.0, -1.0])[turns]
     back = np.zeros((count, 3, 3))
     back[:, 0, 0], back[:, 0, 1], back[:, 1, 0], back[:, 1, 1] = c, -s, s, c
     back[:, 2, 2] = 1.0
-    return np.asarray(rotation @ (back * _Z_OUT)[:, None]), translation
+    return np.asarray(rotation @ (back * _Z_OUT)[:, None]), translation.copy()

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model import lens
-from sweep.model.parameter import parameter
+from sweep.model.declaration import parameter
 
 
 @dataclass(frozen=True, slots=True)

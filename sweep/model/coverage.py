@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.compiled import compiled
+from sweep.compilation import compiled
 from sweep.model.lens import distort
 
 CHORD_TOLERANCE_PX = 1e-4

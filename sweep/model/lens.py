@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.compiled import compiled
+from sweep.compilation import compiled
 
 COUNTS = (0, 4, 5, 8, 12, 14)
 """Numbers of coefficients that OpenCV's models have."""

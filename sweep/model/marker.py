@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.model.parameter import parameter
+from sweep.model.declaration import parameter
 
 OUTSIDE, BLACK, WHITE = 0, 1, 2
 """Codes of what lies on a side of an edge."""

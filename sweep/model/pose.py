@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.model.parameter import parameter
+from sweep.model.declaration import parameter
 
 Floats = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from sweep.model import lens as lens_model
 from sweep.model.camera import Cameras, intrinsics
+from sweep.model.declaration import parameter
 from sweep.model.marker import marker_corners, module_count
-from sweep.model.parameter import parameter
 from sweep.model.pose import rotation_of_angles
 
 Floats = NDArray[np.float64]
@@ -59,7 +59,7 @@ class Scenes:
     frame
         (N, 2) width and height in pixels.
     dictionary, marker_id, quiet_zone, renderer, background
-        One value a scene.
+        One value a scene; the quiet zone is 0 where the background has its level.
     size_m
         (N,) side of the black square.
     rotation, translation
@@ -139,7 +139,13 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
 
     # Steps 2, 3, 5, 6: the corners, moved by the pose and projected.
     size = numbers("size_m")
-    dictionaries, quiet = column("dictionary"), column("quiet_zone_modules")
+    dictionaries, background = column("dictionary"), column("background")
+    # A quiet zone on a background of its own level cannot be seen: it is not modelled.
+    white = numbers("white").tolist()
+    quiet = [
+        0.0 if background[k] == white[k] else width
+        for k, width in enumerate(column("quiet_zone_modules"))
+    ]
     count_of = {name: module_count(name) for name in set(dictionaries)}
     modules = np.array([count_of[name] for name in dictionaries], dtype=np.float64)
     half, module = size / 2, size / modules
@@ -155,7 +161,6 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
         for side in (size, outline_size)
     )
 
-    background = column("background")
     levels = np.stack(
         [
             np.array([0.0 if isinstance(b, str) else float(b) for b in background]),

@@ -13,11 +13,11 @@ from typing import Any
 from sweep.measure.detector import DetectorSetting
 from sweep.measure.solver import Estimator
 from sweep.model.camera import Camera
+from sweep.model.declaration import Declaration
 from sweep.model.lens import COUNTS
 from sweep.model.marker import Marker
-from sweep.model.parameter import Declaration
 from sweep.model.pose import Pose
-from sweep.model.render import renderer_fault
+from sweep.model.renderers import renderer_fault
 from sweep.model.scene import Scene
 
 

@@ -18,7 +18,7 @@ import tomlkit.items
 from sweep.errors import PipelineError
 from sweep.measure.detector import DetectorSetting
 from sweep.model.marker import marker_count
-from sweep.model.render import background_image
+from sweep.model.renderers import background_image
 from sweep.plan.axes import (
     TRIAL,
     Axis,

@@ -14,13 +14,13 @@ import numpy as np
 from sweep.kernel import _full, run_cells, search_windows, single_thread, visibility_flags
 from sweep.measure.detector import Detector
 from sweep.measure.flags import Detection
-from sweep.model.render import render
+from sweep.model.renderers import render
 from sweep.model.scene import build_scenes, marker_boxes
 from sweep.plan.grid import detector_settings, scene_values
 from sweep.plan.pipeline import Pipeline
 
 SIZES = ((640, 480), (1920, 1080), (4000, 3000))
-POSES = {640: 400, 1920: 150, 4000: 40}
+POSES = {640: 1000, 1920: 400, 4000: 150}
 REPEATS = 5
 
 GRID = """

@@ -12,7 +12,7 @@ import numpy as np
 from sweep.model.camera import Camera
 from sweep.model.marker import Marker
 from sweep.model.pose import Pose
-from sweep.model.render import render
+from sweep.model.renderers import render
 from sweep.model.scene import Scene, build_scenes, marker_boxes
 
 SIDES = (8, 20, 50, 100, 200, 400, 600)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.compiled import compiled
+from sweep.compilation import compiled
 from sweep.model.lens import undistort
 
 

@@ -1,6 +1,6 @@
 """The reference of parameters in Markdown, from where each is declared.
 
->>> python -m sweep.plan.reference        # doctest: +SKIP
+>>> python -m sweep.plan.parameter_reference        # doctest: +SKIP
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sweep.model import coverage
 from sweep.model.marker import edges, modules
 from sweep.model.scene import WARP_PX_PER_MODULE, Scenes
-from sweep.model.supersample import supersample
+from sweep.model.supersampling import supersample
 
 Grey = NDArray[np.uint8]
 Box = tuple[int, int, int, int]
@@ -55,10 +55,11 @@ def render(scenes: Scenes, row: int, marker_box: NDArray[np.int64], window: Box)
     """Return the image of a scene in ``window``, quantised once.
 
     ``marker_box`` (4,) holds all pixels that the marker may touch; the renderer sees only it, so
-    that the image does not depend on the window.
+    that the image does not depend on the window. ValueError where the window does not hold it.
     """
     left, top, right, bottom = window
     background = scenes.background[row]
+    on_image = isinstance(background, str)
     if isinstance(background, str):
         image = background_image(background)[top:bottom, left:right].copy()
     else:
@@ -67,14 +68,16 @@ def render(scenes: Scenes, row: int, marker_box: NDArray[np.int64], window: Box)
     x0, y0, x1, y1 = marker_box.tolist()
     if x1 == x0:
         return image
-    on_image = isinstance(background, str)
+    if x0 < left or y0 < top or x1 > right or y1 > bottom:
+        raise ValueError(f"window {window} does not hold the marker's box {(x0, y0, x1, y1)}")
     renderer = scenes.renderer[row]
     if renderer == "exact" and not on_image:
         outlines = edges(scenes.dictionary[row], scenes.marker_id[row], scenes.quiet_zone[row])
+        cameras = scenes.cameras
         coverage.draw_grey(
             image, left, top, marker_box, _scratch((x1 - x0 + 2) * (y1 - y0)), outlines.ends,
-            outlines.sides, scenes.levels, scenes.plane, scenes.cameras.view,
-            scenes.cameras.lenses, scenes.cameras.distorted, row,
+            outlines.sides, scenes.levels, scenes.plane, cameras.view, cameras.lenses,
+            cameras.distorted, row,
         )
         return image
     view = image[y0 - top : y1 - top, x0 - left : x1 - left]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from sweep.engine.calibration import block_extents, calibrate
 from sweep.engine.cluster import default_workers
-from sweep.engine.execute import CALIBRATION_S
+from sweep.engine.runner import CALIBRATION_S
 from sweep.errors import StoreError
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.parameters import Stage

@@ -19,8 +19,8 @@ from distributed import Client, as_completed
 
 from sweep.engine.calibration import block_extents, calibrate
 from sweep.engine.cluster import default_workers, embedded, external
-from sweep.engine.fingerprint import differences
 from sweep.engine.lock import locked, refuse_if_held
+from sweep.engine.provenance import differences
 from sweep.engine.reuse import match
 from sweep.engine.store import (
     RunStore,

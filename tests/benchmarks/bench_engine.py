@@ -1,0 +1,259 @@
+"""The engine against bare processes, against itself in pieces, and against what one would pick.
+
+    pip install joblib xyzpy
+    python tests/benchmarks/bench_engine.py [SECONDS]
+
+Each part works for about SECONDS (default 60) on all cores; ratios within one run.
+"""
+
+import importlib.util
+import itertools
+import json
+import multiprocessing
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from sweep.engine.calibration import calibrate
+from sweep.engine.cluster import default_workers
+from sweep.engine.forecasting import forecast
+from sweep.engine.runner import execute
+from sweep.kernel import run_block, run_cells
+from sweep.plan.grid import Block, scene_axes
+from sweep.plan.pipeline import Pipeline
+
+GRID = """
+seed = 1
+[marker]
+size_m = 0.04
+[pose]
+jitter_px = 0.5
+[scene]
+background = 128
+[axes]
+marker_id = {{ range = [0, 10] }}
+tilt_deg = [0, 20, 40, 60]
+distance_m = {{ geom = [0.2, 2.0, 20] }}
+trial = {trials}
+"""
+
+SHARED = GRID + """
+cornerRefinementMethod = ["none", "subpix", "contour", "apriltag"]
+solver = ["ippe_square", "ippe", "iterative", "sqpnp", "p3p"]
+"""
+
+
+def grid_for(seconds, workers):
+    """Return a pipeline that keeps ``workers`` busy for about ``seconds``."""
+    one = Pipeline.from_text(GRID.format(trials=2))
+    trials = max(int(seconds * workers / (calibrate(one, 2.0).scene_s * 800)), 2)
+    return Pipeline.from_text(GRID.format(trials=trials)), trials
+
+
+def bare(text, start, stop, seconds, at):
+    """Run the kernel alone on a part of the trials; report scenes and time."""
+    pipeline = Pipeline.from_text(text)
+    axes = scene_axes(pipeline)
+    run_cells(pipeline, [np.zeros(1, dtype=np.intp) for _ in axes])
+    while time.time() < at:
+        time.sleep(0.001)
+    begun = time.perf_counter()
+    done = 0
+    for trial in range(start, stop):
+        lengths = tuple(len(axis) for axis in axes)
+        run_block(pipeline, Block((0, 0, 0, trial), (*lengths[:3], trial + 1)))
+        done += 800
+    seconds.put((done, time.perf_counter() - begun))
+
+
+def two_processes(text, trials, workers):
+    """Return scenes per second of independent processes that run the bare kernel."""
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    cuts = np.linspace(0, trials, workers + 1).astype(int)
+    at = time.time() + 8
+    processes = [
+        context.Process(target=bare, args=(text, int(a), int(b), queue, at))
+        for a, b in itertools.pairwise(cuts)
+    ]
+    for process in processes:
+        process.start()
+    told = [queue.get() for _ in processes]
+    for process in processes:
+        process.join()
+    return sum(done for done, _ in told) / max(spent for _, spent in told)
+
+
+def engine_against_processes(seconds):
+    workers = default_workers()
+    pipeline, trials = grid_for(seconds, workers)
+    expected = forecast(pipeline, workers).seconds
+    rates = []
+    for _ in range(2):
+        bare_rate = two_processes(pipeline.text, trials, workers)
+        with tempfile.TemporaryDirectory() as folder:
+            begun = time.perf_counter()
+            first = []
+            summary = execute(
+                pipeline, f"{folder}/s.zarr", workers=workers,
+                on_progress=lambda p, first=first: first.append((time.perf_counter(), p.done)),
+            )
+            total = time.perf_counter() - begun
+        # Between the first and the last block the engine is at work; the rest is coming and going.
+        (a, done_a), (b, done_b) = first[workers], first[-1]
+        rates.append(
+            (
+                (done_b - done_a) / (b - a) / bare_rate,
+                total / (summary.poses / bare_rate),
+                total - summary.poses / bare_rate,
+                expected / total,
+            )
+        )
+    steady, whole, extra, predicted = (statistics.median(x) for x in zip(*rates, strict=True))
+    print(f"| {workers} workers / {workers} bare processes, while at work | {steady:.2f} |")
+    print(f"| whole run of {total:.0f} s / bare kernel time | {whole:.2f} |")
+    print(f"| start, measuring, shutdown beside that | {extra:.1f} s |")
+    print(f"| predicted / measured time | {predicted:.2f} |", flush=True)
+
+
+def shared_work():
+    """Compare 4 refinements x 5 solvers in one sweep with 20 separate sweeps."""
+    text = SHARED.format(trials=1)
+    together = Pipeline.from_text(text)
+    axes = scene_axes(together)
+    indices = [g.ravel() for g in np.indices([len(axis) for axis in axes])]
+    ratios = []
+    for _ in range(3):
+        begun = time.perf_counter()
+        one = run_cells(together, indices)
+        joint = time.perf_counter() - begun
+        apart = 0.0
+        for k, refinement in enumerate(("none", "subpix", "contour", "apriltag")):
+            for j, solver in enumerate(("ippe_square", "ippe", "iterative", "sqpnp", "p3p")):
+                single = Pipeline.from_text(
+                    text, [f"cornerRefinementMethod={refinement}", f"solver={solver}"]
+                )
+                begun = time.perf_counter()
+                other = run_cells(single, indices)
+                apart += time.perf_counter() - begun
+                for name in ("estimate", "rotation_error_rad", "reprojection_error_px"):
+                    np.testing.assert_array_equal(
+                        one.columns[name][5 * k + j], other.columns[name][0]
+                    )
+        ratios.append(apart / joint)
+    ratio = statistics.median(ratios)
+    print(f"| 20 sweeps / one sweep of 4 refinements x 5 solvers | {ratio:.1f} |", flush=True)
+
+
+# What a user would pick instead, on the same images and work: one call a pose.
+
+OTHERS = {
+    "joblib": """
+from joblib import Parallel, delayed
+rows = Parallel(n_jobs=workers)(delayed(one)(i) for i in range(count))
+""",
+    "dask.delayed, gathered": """
+import dask
+from distributed import Client, LocalCluster
+with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None,
+                  silence_logs=50) as cluster, Client(cluster) as client:
+    rows = dask.compute(*[dask.delayed(one)(i) for i in range(count)])
+""",
+    "xyzpy, its own storage": """
+import xyzpy
+runner = xyzpy.Runner(one_dict, var_names=["detection", "estimate", "rotation_error_deg"])
+harvester = xyzpy.Harvester(runner, data_name=folder + "/x.h5", engine="h5netcdf")
+harvester.harvest_combos({"i": list(range(count))}, parallel=True, num_workers=workers,
+                         verbosity=0)
+rows = [None] * count
+""",
+}
+
+COMMON = """
+import json, resource, sys, time
+import numpy as np
+from bench_engine import one, one_dict, setup
+workers, count, folder = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
+if __name__ == "__main__":
+    begun = time.perf_counter()
+{body}
+    assert len(rows) == count
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(json.dumps([count / (time.perf_counter() - begun), peak]))
+"""
+
+_ONE = {}
+
+
+def setup():
+    if not _ONE:
+        pipeline = Pipeline.from_text(GRID.format(trials=25))
+        _ONE["pipeline"] = pipeline
+        _ONE["shape"] = [len(axis) for axis in pipeline.axes]
+    return _ONE["pipeline"], _ONE["shape"]
+
+
+def one(i):
+    """One pose by number, as a user's function would compute it."""
+    pipeline, shape = setup()
+    indices = [np.array([k], dtype=np.intp) for k in np.unravel_index(i, shape)]
+    columns = run_cells(pipeline, indices).columns
+    return {name: parts[0][0] for name, parts in columns.items()}
+
+
+def one_dict(i):
+    values = one(i)
+    return values["detection"], values["estimate"], values["rotation_error_deg"]
+
+
+def what_one_would_pick():
+    workers, count = default_workers(), 20_000
+    pipeline, _ = setup()
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        begun = time.perf_counter()
+        execute(pipeline, f"{folder}/s.zarr", workers=workers)
+        rate = count / (time.perf_counter() - begun)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        rows.append(("sweep", rate, peak, "Zarr, labelled, resumable"))
+        for name, body in OTHERS.items():
+            package = name.split(",")[0].split(".")[0]
+            if importlib.util.find_spec(package) is None:
+                print(f"{name}: not installed", file=sys.stderr)
+                continue
+            script = Path(folder) / f"{package}_run.py"
+            indented = "\n".join(f"    {line}" for line in body.splitlines())
+            script.write_text(COMMON.format(body=indented))
+            ran = subprocess.run(
+                [sys.executable, str(script), str(workers), str(count), folder],
+                capture_output=True, text=True, check=False,
+                env={"PYTHONPATH": str(Path(__file__).parent), "PATH": "/usr/bin:/bin",
+                     "OPENCV_FOR_THREADS_NUM": "1"},
+            )
+            if ran.returncode:
+                print(f"{name}: {ran.stderr.strip().splitlines()[-1]}", file=sys.stderr)
+                continue
+            other, memory = json.loads(ran.stdout.strip().splitlines()[-1])
+            rows.append((name, other, memory, "xyz" if package == "xyzpy" else "in memory"))
+    print("\n| tool | poses/s, start included | sweep / it | client's peak memory |")
+    print("| --- | --- | --- | --- |")
+    for name, rate, memory, _ in rows:
+        print(f"| {name} | {rate:.0f} | {rows[0][1] / rate:.1f} | {memory:.0f} MB |", flush=True)
+
+
+def main():
+    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0
+    print("| engine | ratio |\n| --- | --- |")
+    shared_work()
+    engine_against_processes(seconds)
+    what_one_would_pick()
+
+
+if __name__ == "__main__":
+    main()

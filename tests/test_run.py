@@ -381,3 +381,41 @@ def test_blocks_cover_the_grid_once_and_are_listed_lazily():
     assert len(blocks) == 9
     huge = Blocks((10**9,), (1,))
     assert str(next(iter(huge))) == "0-1"
+
+
+def test_workers_with_other_versions_are_refused(pipeline, tmp_path, monkeypatch):
+    from distributed import LocalCluster  # noqa: PLC0415
+
+    from sweep.engine import cluster as connecting  # noqa: PLC0415
+    from sweep.engine.provenance import fingerprint  # noqa: PLC0415
+
+    class Elsewhere:
+        def __call__(self, given):
+            return {**fingerprint(given), "opencv": "0.0"}
+
+    monkeypatch.setattr(connecting, "fingerprint", fingerprint)
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None,
+        silence_logs=50,
+    ) as cluster:
+        # The client's versions are the odd ones here; which side differs does not matter.
+        real = connecting._refuse_other_versions
+
+        def refuse(client, address, given):
+            client.run = lambda _, p: {"tcp://worker": Elsewhere()(p)}
+            real(client, address, given)
+
+        monkeypatch.setattr(connecting, "_refuse_other_versions", refuse)
+        with pytest.raises(StoreError, match=r"tcp://worker: opencv 0\.0, here"):
+            execute(pipeline, tmp_path / "other.zarr", scheduler=cluster.scheduler_address)
+    assert not (tmp_path / "other.zarr").exists()
+
+
+def test_workers_refuse_a_store_that_was_begun_with_other_versions(pipeline, tmp_path):
+    url = str(tmp_path / "begun.zarr")
+    store = create_store(url, pipeline, (2, 4, 2, 3))
+    about = store.about
+    about["fingerprint"]["numba"] = "0.1"
+    store.group.attrs["sweep"] = about
+    with pytest.raises(StoreError, match=r"a worker has numba .*, the store was begun with 0\.1"):
+        compute_block(url, store.run_id, next(iter(store.blocks)))

@@ -40,7 +40,7 @@ roll_deg = {{ uniform = [0, 360] }}
 bearing_x_deg = {{ uniform = [-15, 15] }}
 bearing_y_deg = {{ uniform = [-15, 15] }}
 [scene]
-background = 128
+background = 255
 [axes]
 trial = {poses}
 """
@@ -61,7 +61,7 @@ def naive_loop(scenes, bitmaps, camera, frame):
         corners = cv2.projectPoints(objects, rvec, tvec, camera, None)[0].reshape(4, 2)
         transform = cv2.getPerspectiveTransform(source, corners.astype(np.float32))
         image = cv2.warpPerspective(
-            bitmap, transform, frame, flags=cv2.INTER_LINEAR, borderValue=(128,)
+            bitmap, transform, frame, flags=cv2.INTER_LINEAR, borderValue=(255,)
         )
         quads, ids, _ = detector.detectMarkers(image)
         if ids is not None:

@@ -1,0 +1,107 @@
+"""What the README shows is what the project does."""
+
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sweep.cli import main
+from sweep.kernel import look
+from sweep.plan.one_cell import cell
+from sweep.plan.parameter_reference import reference
+from sweep.plan.parameters import PARAMETERS, Stage
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.template import TEMPLATE
+
+TOP = Path(__file__).parent.parent
+README = (TOP / "README.md").read_text()
+
+
+def block_after(marker, language):
+    found = re.search(rf"<!-- {marker} -->\n```{language}\n(.*?)```", README, re.DOTALL)
+    assert found, marker
+    return found[1]
+
+
+def test_reference_of_parameters_is_that_of_the_declarations():
+    assert reference().strip() in README, "python -m sweep.plan.parameter_reference"
+
+
+def test_both_commands_are_one_line_each():
+    for marker in ("run", "test"):
+        assert block_after(marker, "sh").strip().count("\n") == 0
+
+
+def test_every_variable_is_explained():
+    for variable in TEMPLATE:
+        assert f"`{variable.name}`" in README
+
+
+@pytest.mark.parametrize("path", sorted((TOP / "pipelines").glob("*.toml")), ids=lambda p: p.stem)
+def test_every_pipeline_is_sound(path):
+    pipeline = Pipeline.from_toml(path)
+    assert pipeline.title
+    assert pipeline.size(*Stage) > 1
+
+
+def test_pipeline_in_the_readme_is_sound():
+    text = re.search(r"```toml\n(.*?)```", README, re.DOTALL)[1]
+    parsed = tomllib.loads(text)
+    assert set(parsed["axes"]) - {"trial"} <= set(PARAMETERS)
+    assert Pipeline.from_text(text).size(*Stage) == 2 * 4 * 8 * 2 * 5
+
+
+def test_first_analysis_runs_on_the_smoke_pipeline(tmp_path):
+    ran = subprocess.run(
+        [sys.executable, "-m", "sweep.cli", "run", str(TOP / "pipelines" / "smoke.toml")],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert 'xarray.open_zarr("runs/smoke.zarr")' in ran.stdout
+    code = block_after("analysis", "python")
+    assert len(code.strip().splitlines()) == 5
+    shown = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert shown.returncode == 0, shown.stderr
+    assert "tilt_deg" in shown.stdout
+
+
+def test_show_draws_a_scene_or_its_plain_image(tmp_path, capsys):
+    smoke = str(TOP / "pipelines" / "smoke.toml")
+    at = "distance_m=0.3,tilt_deg=45"
+    for options in ([], ["--plain"], ["--full", "--plain"]):
+        assert main(["show", smoke, "--at", at, "-o", str(tmp_path / "a.png"), *options]) == 0
+        assert "detected, solved" in capsys.readouterr().out
+        assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["show", smoke, "--at", "tilt=3"]) == 2
+    assert "unknown parameter; did you mean tilt_deg?" in capsys.readouterr().err
+    assert main(["show", smoke, "--at", "marker_id=99"]) == 2
+    assert "expected an ID from 0 to 49" in capsys.readouterr().err
+    assert main(["show", smoke, "-o", "/proc/none/a.png"]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_a_close_look_is_that_of_the_run():
+    pipeline = Pipeline.from_toml(TOP / "pipelines" / "smoke.toml")
+    windowed = look(cell(pipeline, "distance_m=0.3,trial=2"))
+    framed = look(cell(pipeline, "distance_m=0.3,trial=2"), whole_frame=True)
+    assert framed.image.shape == (480, 640)
+    left, top, right, bottom = windowed.window
+    np.testing.assert_array_equal(framed.image[top:bottom, left:right], windowed.image)
+    np.testing.assert_array_equal(framed.corners, windowed.corners)
+    assert windowed.errors["rotation_error_deg"] > 0
+
+
+def test_plan_says_what_is_active_and_what_it_takes(capsys):
+    smoke = str(TOP / "pipelines" / "smoke.toml")
+    assert main(["plan", smoke, "--set", "distortion=[-0.3, 0.1, 0, 0]"]) == 0
+    told = capsys.readouterr().out
+    assert re.search(r"lens distortion +on", told)
+    assert re.search(r"poses +960", told)
+    assert main(["plan", smoke, "--set", "useAruco3Detection=true"]) == 0
+    assert re.search(r"full frame +on +useAruco3Detection", capsys.readouterr().out)

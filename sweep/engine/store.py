@@ -161,46 +161,60 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
     StoreError
         Where the place cannot be written.
     """
-    run_id = uuid.uuid4().hex
     try:
-        group = _open_group(url, "w-")
-        scene_extent = dict(
-            zip((axis.name for axis in scene_axes(pipeline)), extents, strict=True)
-        )
-        for axis in pipeline.axes:
-            _write_axis(group, axis)
-        used = {name for variable in TEMPLATE for name in variable.inner}
-        for name in sorted(used):
-            _write_strings(group, name, LABELS[name], {})
-        coordinates = _write_distance(group, pipeline)
-        for variable in TEMPLATE:
-            _create_variable(group, variable, pipeline, scene_extent)
-        lengths = tuple(len(axis) for axis in scene_axes(pipeline))
-        group.create_array(
-            RECEIPTS, shape=(len(Blocks(lengths, extents)),), chunks=(1,), dtype="string",
-            dimension_names=("block",), compressors=None,
-        )
-        group.attrs.update(
-            {
-                "title": pipeline.title or pipeline.name,
-                "pipeline": pipeline.text,
-                **({"coordinates": " ".join(coordinates)} if coordinates else {}),
-                "sweep": {
-                    "format": FORMAT,
-                    "name": pipeline.name,
-                    "folder": pipeline.folder,
-                    "run_id": run_id,
-                    "block": list(extents),
-                    "fingerprint": fingerprint(pipeline),
-                    "environment": environment(),
-                    "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-                    "finished": False,
-                },
-            }
-        )
+        if is_remote(url):
+            _lay_out(url, pipeline, extents)
+        else:
+            # Beside its place and then moved there: a kill between leaves no half a store.
+            check_place(url)
+            building = _beside(url, "new")
+            _lay_out(str(building), pipeline, extents)
+            building.rename(url)
     except OSError as error:
         raise StoreError(f"{url}: cannot be written: {error.strerror or error}") from None
     return open_store(url, "r+")
+
+
+def _beside(url: str, ending: str) -> Path:
+    """Return an unused path in the folder of a local store."""
+    return Path(url).with_name(f".{Path(url).name}.{uuid.uuid4().hex[:8]}.{ending}")
+
+
+def _lay_out(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> None:
+    """Write a store's coordinates, its empty arrays, and its attributes last."""
+    group = _open_group(url, "w-")
+    scene_extent = dict(zip((axis.name for axis in scene_axes(pipeline)), extents, strict=True))
+    for axis in pipeline.axes:
+        _write_axis(group, axis)
+    used = {name for variable in TEMPLATE for name in variable.inner}
+    for name in sorted(used):
+        _write_strings(group, name, LABELS[name], {})
+    coordinates = _write_distance(group, pipeline)
+    for variable in TEMPLATE:
+        _create_variable(group, variable, pipeline, scene_extent)
+    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
+    group.create_array(
+        RECEIPTS, shape=(len(Blocks(lengths, extents)),), chunks=(1,), dtype="string",
+        dimension_names=("block",), compressors=None,
+    )
+    group.attrs.update(
+        {
+            "title": pipeline.title or pipeline.name,
+            "pipeline": pipeline.text,
+            **({"coordinates": " ".join(coordinates)} if coordinates else {}),
+            "sweep": {
+                "format": FORMAT,
+                "name": pipeline.name,
+                "folder": pipeline.folder,
+                "run_id": uuid.uuid4().hex,
+                "block": list(extents),
+                "fingerprint": fingerprint(pipeline),
+                "environment": environment(),
+                "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+                "finished": False,
+            },
+        }
+    )
 
 
 def remove_store(url: str) -> None:
@@ -217,7 +231,7 @@ def remove_store(url: str) -> None:
             sync(store.group.store.clear())
             return
         # Out of the way at once, then at leisure: a kill between leaves no half a store.
-        doomed = Path(url).with_name(f".{Path(url).name}.{uuid.uuid4().hex[:8]}.deleted")
+        doomed = _beside(url, "deleted")
         Path(url).rename(doomed)
         shutil.rmtree(doomed, ignore_errors=True)
     except OSError as error:

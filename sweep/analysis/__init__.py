@@ -1,1 +1,0 @@
-"""Dataset in, Dataset out. Nothing here knows of files or Dask clients."""

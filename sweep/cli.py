@@ -227,7 +227,7 @@ def _show(chosen: argparse.Namespace) -> int:
     pipeline = _read(chosen)
     import cv2  # noqa: PLC0415
 
-    from sweep.kernel import look  # noqa: PLC0415
+    from sweep.inspection import look  # noqa: PLC0415
     from sweep.plan.one_cell import cell, coordinates_text  # noqa: PLC0415
     from sweep.report.scene_drawing import draw_scene  # noqa: PLC0415
 

@@ -27,7 +27,7 @@ from sweep.measure.flags import Detection, Estimate, Flipped
 from sweep.measure.solver import Estimates, Estimator, estimate
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
-from sweep.model.pose import rotation_of_vector, vector_of_rotation
+from sweep.model.pose import vector_of_rotation
 from sweep.model.renderers import render
 from sweep.model.scene import (
     Scenes,
@@ -37,7 +37,6 @@ from sweep.model.scene import (
     marker_boxes,
     not_modelled,
     outside_frame,
-    placed,
 )
 from sweep.plan.grid import Block, block_indices, detector_settings, estimators, scene_values
 from sweep.plan.parameters import Stage
@@ -136,7 +135,7 @@ def run_cells(
     geometry_s = time.perf_counter() - start
 
     searches, render_s, row_s = search(
-        scenes, to_search, settings, _full(values, count), failures
+        scenes, to_search, settings, whole_frames(values, count), failures
     )
     seconds: dict[str, list[float]] = {
         "scene": [geometry_s + render_s],
@@ -168,7 +167,7 @@ def run_cells(
     return CellsResult(out, seconds, row_s, failures)
 
 
-def _full(values: dict[str, Any], count: int) -> NDArray[np.bool_]:
+def whole_frames(values: dict[str, Any], count: int) -> NDArray[np.bool_]:
     """Tell (N,) which scenes are rendered as whole frames: as asked, or on a background image."""
     def matches(name: str, test: Callable[[Any], bool]) -> NDArray[np.bool_]:
         column = values[name]
@@ -388,97 +387,3 @@ def shaped(
     made = [axis.name for axis in itertools.chain(outer, treatment)] + list(variable.inner)
     wanted = variable.dimensions(pipeline)
     return shaped.transpose([made.index(name) for name in wanted]).copy(order="C")
-
-
-
-@dataclass(frozen=True, slots=True)
-class Look:
-    """One scene looked at closely, as ``sweep show`` draws it.
-
-    Attributes
-    ----------
-    image
-        (h, w) grey levels of ``window``: left, top, right, bottom in the frame.
-    true_corners
-        (4, 2) px.
-    decoded, rejected
-        What the detector found: (ID, corners (4, 2)) and corners (4, 2), px.
-    detection, estimate
-        What became of it.
-    corners
-        (4, 2) px of the marker where it was detected, else NaN.
-    axes_px
-        (4, 2) images of the origin and of the ends of x, y and z (half a side long) of the
-        estimated pose; NaN where there is none.
-    errors
-        Name -> value of the template's scalar error variables.
-    """
-
-    image: NDArray[np.uint8]
-    window: tuple[int, int, int, int]
-    true_corners: Floats
-    area_px: float
-    decoded: list[tuple[int, Floats]]
-    rejected: list[Floats]
-    detection: Detection
-    estimate: Estimate
-    corners: Floats
-    axes_px: Floats
-    errors: dict[str, float]
-
-
-def look(pipeline: Pipeline, *, whole_frame: bool = False) -> Look:
-    """Return a close look at a pipeline's one scene: every axis but ``trial`` must be fixed."""
-    single_thread()
-    indices = [np.zeros(1, dtype=np.intp) for _ in pipeline.axes_of(Stage.scene)]
-    values = scene_values(pipeline, indices)
-    scenes = build_scenes(values, 1)
-    setting, estimator = detector_settings(pipeline)[0], estimators(pipeline)[0]
-    boxes = marker_boxes(scenes)
-    full = _full(values, 1) | whole_frame
-    result = run_cells(pipeline, indices)
-    if result.failures:
-        raise RuntimeError(result.failures[0].text)
-    visibility = visibility_flags(scenes)
-    unseen = visibility[0] != Detection.not_run
-    left, top, right, bottom = search_windows(scenes, boxes, setting, full | unseen)[0].tolist()
-    drawn = np.zeros_like(boxes[0]) if unseen else boxes[0]
-    image = render(scenes, 0, drawn, (left, top, right, bottom))
-    # Searched in its own window, as in a run, even where the whole frame is shown.
-    searched = search_windows(scenes, boxes, setting, _full(values, 1) | unseen)
-    x0, y0, x1, y1 = searched[0].tolist()
-    found, ids, rejected = Detector(setting).find(
-        image[y0 - top : y1 - top, x0 - left : x1 - left],
-        scenes.dictionary[0],
-        int(scenes.frame[0].max()),
-    )
-    origin = np.array([x0, y0], dtype=np.float64)
-    columns = {name: parts[0][0] for name, parts in result.columns.items()}
-    corners = scenes.corners_px[0] + columns["corner_error_px"]
-    axes_px = np.full((4, 2), np.nan)
-    if columns["estimate"] == Estimate.solved:
-        cameras, size = believed(estimator, values, scenes)
-        vector = columns["rotation_error_rad"]
-        rotation = rotation_of_vector(vector) @ scenes.rotation[0]
-        position = scenes.translation[0] + columns["translation_error_m"]
-        ends = np.concatenate([np.zeros((1, 3)), np.eye(3)]) * size[0] / 2
-        axes_px = cameras.project(placed(ends[None], rotation[None], position[None]))[0]
-    return Look(
-        image=image,
-        window=(left, top, right, bottom),
-        true_corners=scenes.corners_px[0],
-        area_px=float(columns["marker_area_px"]),
-        decoded=[
-            (marker_id, quad[0] + origin) for marker_id, quad in zip(ids, found, strict=True)
-        ],
-        rejected=[quad[0] + origin for quad in rejected],
-        detection=Detection(int(columns["detection"])),
-        estimate=Estimate(int(columns["estimate"])),
-        corners=corners,
-        axes_px=axes_px,
-        errors={
-            v.name: float(np.linalg.norm(columns[v.name]))
-            for v in TEMPLATE
-            if v.flags is None and v.inner in ((), ("xyz",)) and v.stage is Stage.estimation
-        },
-    )

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sweep.cli import main
-from sweep.kernel import look
+from sweep.inspection import look
 from sweep.plan.one_cell import cell
 from sweep.plan.parameter_reference import reference
 from sweep.plan.parameters import PARAMETERS, Stage

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.kernel import Look
+from sweep.inspection import Look
 
 Colour = tuple[int, int, int]
 

@@ -11,7 +11,7 @@ import time
 import cv2
 import numpy as np
 
-from sweep.kernel import _full, run_cells, search_windows, single_thread, visibility_flags
+from sweep.kernel import run_cells, search_windows, single_thread, visibility_flags, whole_frames
 from sweep.measure.detector import Detector
 from sweep.measure.flags import Detection
 from sweep.model.renderers import render
@@ -103,7 +103,7 @@ def main():
         scenes = build_scenes(values, poses)
         setting = detector_settings(pipeline)[0]
         boxes = marker_boxes(scenes)
-        cut = search_windows(scenes, boxes, setting, _full(values, poses))
+        cut = search_windows(scenes, boxes, setting, whole_frames(values, poses))
         rows = np.flatnonzero(visibility_flags(scenes) == Detection.not_run).tolist()
         camera = scenes.cameras.matrix(0)
         marker = cv2.aruco.generateImageMarker(

@@ -1,0 +1,121 @@
+"""One scene looked at closely, as ``sweep show`` draws it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.kernel import (
+    believed,
+    run_cells,
+    search_windows,
+    single_thread,
+    visibility_flags,
+    whole_frames,
+)
+from sweep.measure.detector import Detector
+from sweep.measure.flags import Detection, Estimate
+from sweep.model.pose import rotation_of_vector
+from sweep.model.renderers import render
+from sweep.model.scene import build_scenes, marker_boxes, placed
+from sweep.plan.grid import detector_settings, estimators, scene_values
+from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.template import TEMPLATE
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """One scene looked at closely, as ``sweep show`` draws it.
+
+    Attributes
+    ----------
+    image
+        (h, w) grey levels of ``window``: left, top, right, bottom in the frame.
+    true_corners
+        (4, 2) px.
+    decoded, rejected
+        What the detector found: (ID, corners (4, 2)) and corners (4, 2), px.
+    detection, estimate
+        What became of it.
+    corners
+        (4, 2) px of the marker where it was detected, else NaN.
+    axes_px
+        (4, 2) images of the origin and of the ends of x, y and z (half a side long) of the
+        estimated pose; NaN where there is none.
+    errors
+        Name -> value of the template's scalar error variables.
+    """
+
+    image: NDArray[np.uint8]
+    window: tuple[int, int, int, int]
+    true_corners: Floats
+    area_px: float
+    decoded: list[tuple[int, Floats]]
+    rejected: list[Floats]
+    detection: Detection
+    estimate: Estimate
+    corners: Floats
+    axes_px: Floats
+    errors: dict[str, float]
+
+
+def look(pipeline: Pipeline, *, whole_frame: bool = False) -> Look:
+    """Return a close look at a pipeline's one scene: every axis but ``trial`` must be fixed."""
+    single_thread()
+    indices = [np.zeros(1, dtype=np.intp) for _ in pipeline.axes_of(Stage.scene)]
+    values = scene_values(pipeline, indices)
+    scenes = build_scenes(values, 1)
+    setting, estimator = detector_settings(pipeline)[0], estimators(pipeline)[0]
+    boxes = marker_boxes(scenes)
+    full = whole_frames(values, 1) | whole_frame
+    result = run_cells(pipeline, indices)
+    if result.failures:
+        raise RuntimeError(result.failures[0].text)
+    visibility = visibility_flags(scenes)
+    unseen = visibility[0] != Detection.not_run
+    left, top, right, bottom = search_windows(scenes, boxes, setting, full | unseen)[0].tolist()
+    drawn = np.zeros_like(boxes[0]) if unseen else boxes[0]
+    image = render(scenes, 0, drawn, (left, top, right, bottom))
+    # Searched in its own window, as in a run, even where the whole frame is shown.
+    searched = search_windows(scenes, boxes, setting, whole_frames(values, 1) | unseen)
+    x0, y0, x1, y1 = searched[0].tolist()
+    found, ids, rejected = Detector(setting).find(
+        image[y0 - top : y1 - top, x0 - left : x1 - left],
+        scenes.dictionary[0],
+        int(scenes.frame[0].max()),
+    )
+    origin = np.array([x0, y0], dtype=np.float64)
+    columns = {name: parts[0][0] for name, parts in result.columns.items()}
+    corners = scenes.corners_px[0] + columns["corner_error_px"]
+    axes_px = np.full((4, 2), np.nan)
+    if columns["estimate"] == Estimate.solved:
+        cameras, size = believed(estimator, values, scenes)
+        vector = columns["rotation_error_rad"]
+        rotation = rotation_of_vector(vector) @ scenes.rotation[0]
+        position = scenes.translation[0] + columns["translation_error_m"]
+        ends = np.concatenate([np.zeros((1, 3)), np.eye(3)]) * size[0] / 2
+        axes_px = cameras.project(placed(ends[None], rotation[None], position[None]))[0]
+    return Look(
+        image=image,
+        window=(left, top, right, bottom),
+        true_corners=scenes.corners_px[0],
+        area_px=float(columns["marker_area_px"]),
+        decoded=[
+            (marker_id, quad[0] + origin) for marker_id, quad in zip(ids, found, strict=True)
+        ],
+        rejected=[quad[0] + origin for quad in rejected],
+        detection=Detection(int(columns["detection"])),
+        estimate=Estimate(int(columns["estimate"])),
+        corners=corners,
+        axes_px=axes_px,
+        errors={
+            v.name: float(np.linalg.norm(columns[v.name]))
+            for v in TEMPLATE
+            if v.flags is None and v.inner in ((), ("xyz",)) and v.stage is Stage.estimation
+        },
+    )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.errors import RunError
 from sweep.kernel import (
     believed,
     run_cells,
@@ -75,7 +76,7 @@ def look(pipeline: Pipeline, *, whole_frame: bool = False) -> Look:
     full = whole_frames(values, 1) | whole_frame
     result = run_cells(pipeline, indices)
     if result.failures:
-        raise RuntimeError(result.failures[0].text)
+        raise RunError(result.failures[0].text.strip().splitlines()[-1])
     visibility = visibility_flags(scenes)
     unseen = visibility[0] != Detection.not_run
     left, top, right, bottom = search_windows(scenes, boxes, setting, full | unseen)[0].tolist()

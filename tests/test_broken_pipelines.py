@@ -41,13 +41,13 @@ BROKEN = {
         "camera.width_px = 640.5: expected a whole number from 1 to 100000",
     ),
     "out of range": (
-        "[pose]\ndistance_m = 1\ntilt_deg = 200",
-        "pose.tilt_deg = 200: expected a number from -180 to 180",
+        "[pose]\ndistance_m = 1\ntilt_deg = 500",
+        "pose.tilt_deg = 500: expected a number from -360 to 360",
     ),
     "distance at 0": ("[pose]\ndistance_m = 0", "pose.distance_m = 0: expected a number above 0"),
     "distance below 0 on an axis": (
         "[axes]\ndistance_m = [1, -1]",
-        "axes.distance_m = [1, -1]: expected a number above 0 (not -1)",
+        "axes.distance_m = [1, -1]: expected a number above 0 and at most 1e+12 (not -1)",
     ),
     "not finite": ("[pose]\ndistance_m = inf", "pose.distance_m = inf: expected a number above 0"),
     "not a number": ("[pose]\ndistance_m = nan", "pose.distance_m = nan: expected a number"),
@@ -153,7 +153,7 @@ BROKEN = {
     ),
     "a distribution beyond the range": (
         "[pose]\ndistance_m = 1\ntilt_deg = { uniform = [0, 400] }",
-        "pose.tilt_deg = {uniform = [0, 400]}: expected a number from -180 to 180",
+        "pose.tilt_deg = {uniform = [0, 400]}: expected a number from -360 to 360",
     ),
     "a distribution under axes": (
         "[pose]\ndistance_m = 1\n[axes]\ntilt_deg = { normal = [0, 4] }",
@@ -162,6 +162,27 @@ BROKEN = {
     "an axis under its section": (
         "[pose]\ndistance_m = { geom = [0.1, 1, 4] }",
         "expected one value here; more than one goes under [axes]",
+    ),
+    "a normal whose draws leave the range": (
+        "[pose]\ndistance_m = { normal = [0.05, 0.05] }",
+        "expected mean - 8.3 sd and mean + 8.3 sd above 0 and at most 1e+12",
+    ),
+    "a number of 400 digits": (
+        "[pose]\ndistance_m = 1\n[marker]\nmarker_id = 1" + "0" * 400,
+        "expected a whole number from 0 to 1e+06",
+    ),
+    "a step too small to count": (
+        "[axes]\ndistance_m = { arange = [0.1, 1e299, 1e-200] }",
+        "expected at most 10,000,000 values",
+    ),
+    "a whole frame too large to hold": (
+        ('[pose]\ndistance_m = 1\n[scene]\nwindow = "full"\n[camera]\nwidth_px = 100000\n'
+        "height_px = 100000"),
+        "expected auto, for a frame of more than 500,000,000 pixels",
+    ),
+    "a section that is no table, beside others": (
+        "pose = 3\n[axes]\ndistance_m = [1]\nfy_px = [1]\ntrial = 4",
+        "pose = 3: expected a table: [pose]",
     ),
     "a negative seed": (
         "seed = -1\n[pose]\ndistance_m = 1", "seed = -1: expected a whole number from 0",
@@ -239,6 +260,8 @@ def test_a_background_of_another_size_or_no_image_is_told(tmp_path, capsys):
         ("tilt_deg", "expected key=value"),
         ("tilt=3", "unknown parameter; did you mean"),
         ("tilt_deg=[0, 1", "expected a TOML value"),
+        ("camera.tilt_deg=3", "expected tilt_deg or pose.tilt_deg"),
+        ("tilt_deg=3\nseed=4", "expected a TOML value"),
         ("solver=best", 'estimator.solver = "best": expected one of'),
     ],
 )

@@ -185,7 +185,7 @@ def drawn_poses(count, seed, sides, max_tilt, **given):
             "side_px": float(np.exp(rng.uniform(*np.log(sides)))),
             "tilt_deg": rng.uniform(0, max_tilt), "azimuth_deg": rng.uniform(0, 360),
             "roll_deg": rng.uniform(0, 360), "black": float(rng.integers(60)),
-            "white": float(rng.integers(180, 256)), "background": float(rng.integers(256)),
+            "white": float(rng.integers(180, 256)), "background": float(rng.integers(180)),
         } | given)
         offset = (where - [(width - 1) / 2, (height - 1) / 2]) / value["fx_px"]
         value["bearing_x_deg"], value["bearing_y_deg"] = np.degrees(np.arctan(offset)).tolist()

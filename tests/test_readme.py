@@ -81,7 +81,7 @@ def test_show_draws_a_scene_or_its_plain_image(tmp_path, capsys):
     assert main(["show", smoke, "--at", "tilt=3"]) == 2
     assert "unknown parameter; did you mean tilt_deg?" in capsys.readouterr().err
     assert main(["show", smoke, "--at", "marker_id=99"]) == 2
-    assert "expected an ID from 0 to 49" in capsys.readouterr().err
+    assert "expected IDs from 0 to 49" in capsys.readouterr().err
     assert main(["show", smoke, "-o", "/proc/none/a.png"]) == 2
     assert "cannot be written" in capsys.readouterr().err
 

@@ -17,7 +17,7 @@ import zarr
 import sweep
 from sweep.engine.lock import KEY
 from sweep.engine.runner import execute
-from sweep.engine.store import committed, create_store, open_store, put
+from sweep.engine.store import committed, create_store, open_store, put, remove_store
 from sweep.engine.task import compute_block
 from sweep.errors import StoreError
 from sweep.kernel import run_block
@@ -419,3 +419,93 @@ def test_workers_refuse_a_store_that_was_begun_with_other_versions(pipeline, tmp
     store.group.attrs["sweep"] = about
     with pytest.raises(StoreError, match=r"a worker has numba .*, the store was begun with 0\.1"):
         compute_block(url, store.run_id, next(iter(store.blocks)))
+
+
+def test_nothing_is_overwritten_by_a_run_that_cannot_be(pipeline, tmp_path):
+    url = str(tmp_path / "kept.zarr")
+    by_hand(url, pipeline, (2, 4, 2, 3))
+    for options in (
+        {"reuse": [url]}, {"reuse": [str(tmp_path / "none.zarr")]}, {"scheduler": "nowhere"},
+    ):
+        with pytest.raises(StoreError):
+            execute(pipeline, url, overwrite=True, **options)
+        assert len(committed(open_store(url))) == 1
+
+
+def test_task_of_a_replaced_store_writes_nothing(pipeline, tmp_path):
+    url = str(tmp_path / "replaced.zarr")
+    old = create_store(url, pipeline, (2, 4, 2, 3))
+    block = next(iter(old.blocks))
+    compute_block(url, old.run_id, block)
+    remove_store(url)
+    new = create_store(url, Pipeline.from_text(TEXT, ["seed=8"], name="other"), (2, 4, 2, 3))
+    with pytest.raises(StoreError, match="replaced by another run"):
+        compute_block(url, old.run_id, block)
+    assert committed(new) == set()
+
+
+def test_damaged_receipts_are_told(pipeline, tmp_path):
+    url = tmp_path / "damaged.zarr"
+    by_hand(str(url), pipeline, (2, 4, 2, 3))
+    for path in (url / "commits" / "receipt" / "c").iterdir():
+        path.write_bytes(b"garbage")
+    ran = sweep_command("status", url)
+    assert ran.returncode == 2
+    assert "damaged receipts among blocks 0 to 0" in ran.stderr
+    assert "Traceback" not in ran.stderr
+
+
+REUSED_WITHOUT_SCENE_AXES = """
+[pose]
+distance_m = 0.2
+[axes]
+solver = [%s]
+"""
+
+
+def test_cells_of_a_grid_without_scene_axes_are_reused(tmp_path):
+    old, new = str(tmp_path / "old.zarr"), str(tmp_path / "new.zarr")
+    by_hand(old, Pipeline.from_text(REUSED_WITHOUT_SCENE_AXES % '"p3p"'), ())
+    grown = Pipeline.from_text(REUSED_WITHOUT_SCENE_AXES % '"p3p", "ippe"')
+    store = create_store(new, grown, ())
+    receipt = compute_block(new, store.run_id, next(iter(store.blocks)), (old,))
+    assert receipt["computed"]["estimates"] == 1
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[pose]\nside_px = 40\n[axes]\ncy_px = [200, 240]",
+        "[axes]\nside_px = [40, 50]\nheight_px = [480, 500]",
+        (
+            "[pose]\ndistance_m = 0.2\n[axes]\nguarded = [true, false]\n"
+            "distortion = [[], [0.1, 0, 0, 0]]"
+        ),
+        "[pose]\ndistance_m = 0.2",
+    ],
+)
+def test_every_kind_of_axis_gives_a_store_that_opens(text, tmp_path):
+    url = str(tmp_path / "kinds.zarr")
+    pipeline = Pipeline.from_text(text)
+    by_hand(url, pipeline, tuple(len(axis) for axis in scene_axes(pipeline)))
+    with sweep.open(url) as results:
+        assert (results.detection.to_numpy() == 1).all()
+
+
+def test_background_axis_of_levels_and_images(tmp_path):
+    import cv2  # noqa: PLC0415
+
+    cv2.imwrite(str(tmp_path / "grey.png"), np.full((480, 640), 90, np.uint8))
+    pipeline = Pipeline.from_text(
+        '[pose]\ndistance_m = 0.05\n[axes]\nbackground = [90, "grey.png"]', folder=tmp_path
+    )
+    url = str(tmp_path / "mixed.zarr")
+    by_hand(url, pipeline, (2,))
+    with sweep.open(url) as results:
+        assert results.background.to_numpy().tolist() == ["90.0", "grey.png"]
+        level, image = results.isel(background=0), results.isel(background=1)
+        np.testing.assert_array_equal(level.corner_error_px, image.corner_error_px)
+    cv2.imwrite(str(tmp_path / "grey.png"), np.full((480, 640), 91, np.uint8))
+    other = create_store(str(tmp_path / "again.zarr"), pipeline, (2,))
+    with pytest.raises(StoreError, match=r"grey\.png: not in .* as it was when the run began"):
+        compute_block(other.url, other.run_id, next(iter(other.blocks)))

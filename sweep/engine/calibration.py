@@ -19,6 +19,8 @@ from sweep.plan.template import bytes_per_block
 BATCH = 24
 """Scenes measured at a time."""
 
+MOST_BATCHES = 40
+
 BLOCK_S = 2.0
 """Work in a block: a task costs the scheduler about 1.6 ms, a lost block costs its work."""
 
@@ -78,7 +80,7 @@ def calibrate(pipeline: Pipeline, budget_s: float) -> Calibration:
         picks.append(indices)
         batch_s.append(spent / count)
         used = time.perf_counter() - started
-        if used >= budget_s or len(rows) * BATCH >= 40 * BATCH:
+        if used >= budget_s or len(rows) >= MOST_BATCHES:
             break
     cost = np.concatenate(rows)
     unevenness = []
@@ -118,8 +120,7 @@ def block_extents(
     target = max(target, 1)
     order = sorted(
         range(len(axes)),
-        key=lambda k: (calibration.unevenness[k] > UNEVEN, calibration.unevenness[k], k)
-        if calibration.unevenness[k] > UNEVEN else (False, 0.0, k),
+        key=lambda k: (max(calibration.unevenness[k] - UNEVEN, 0.0), k),
         reverse=True,
     )
     extents = [1] * len(axes)

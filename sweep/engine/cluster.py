@@ -95,6 +95,8 @@ def external(address: str, pipeline: Pipeline) -> Iterator[Client]:
         Where it does not answer, has no workers, or a worker has other versions.
     """
     _hush()
+    if "://" not in address:
+        raise StoreError(f"--scheduler {address}: expected an address such as tcp://host:8786")
     try:
         client = Client(address, timeout=ANSWER_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError):

@@ -22,7 +22,7 @@ BEAT_S = 5.0
 """How often a writer says that it lives."""
 
 SILENCE_S = 30.0
-"""After this long without a word a writer on another machine is taken for dead."""
+"""After this long without a word a writer is taken for dead."""
 
 
 @contextlib.contextmanager
@@ -46,6 +46,9 @@ def locked(store: RunStore) -> Iterator[None]:
     def beat() -> None:
         while not done.wait(BEAT_S):
             with contextlib.suppress(OSError):
+                now = get(place, KEY)
+                if now is not None and now.get("token") != mine["token"]:
+                    return  # taken over while this process slept
                 put(place, KEY, {**mine, "beat": time.time()})
 
     heart = threading.Thread(target=beat, daemon=True, name="store lock")
@@ -71,9 +74,11 @@ def holder(place: Store) -> dict[str, Any] | None:
     held = get(place, KEY)
     if held is None:
         return None
-    if held.get("host") == socket.gethostname():
-        return held if _alive(held.get("pid")) else None
-    silent = time.time() - float(held.get("beat", 0.0))
+    # Either sign of death will do: a number is soon another process', and clocks differ.
+    if held.get("host") == socket.gethostname() and not _alive(held.get("pid")):
+        return None
+    beat = held.get("beat")
+    silent = time.time() - (beat if isinstance(beat, (int, float)) else 0.0)
     return held if silent < SILENCE_S else None
 
 

@@ -69,7 +69,7 @@ def status(url: str) -> Status:
         store=url,
         title=store.pipeline.title or store.pipeline.name,
         finished=store.finished,
-        writer=f"process {held['pid']} on {held['host']}" if held else None,
+        writer=f"process {held.get('pid')} on {held.get('host')}" if held else None,
         blocks=len(store.blocks),
         blocks_done=done,
         poses=total,

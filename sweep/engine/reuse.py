@@ -49,12 +49,6 @@ class Source:
     done: frozenset[int]
 
 
-def _key(value: Any) -> Any:
-    """Return a value such that equal values of either kind of number are equal keys."""
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    return float(value) if number else value
-
-
 def match(pipeline: Pipeline, store: RunStore) -> Source:
     """Find a new grid's cells in an old store.
 
@@ -114,8 +108,11 @@ def _indices(wanted: Sequence[Any], there: Sequence[Any]) -> NDArray[np.int64]:
         values = np.arange(wanted.start, wanted.stop, wanted.step, dtype=np.int64)
         index, off = np.divmod(values - low, step)
         return np.where((off == 0) & (index >= 0) & (index < len(there)), index, ABSENT)
-    known = {_key(value): i for i, value in enumerate(there)}
-    return np.array([known.get(_key(value), ABSENT) for value in wanted], dtype=np.int64)
+    if isinstance(there, range):
+        found = [there.index(value) if value in there else ABSENT for value in wanted]
+        return np.array(found, dtype=np.int64)
+    known = {value: i for i, value in enumerate(there)}
+    return np.array([known.get(value, ABSENT) for value in wanted], dtype=np.int64)
 
 
 def _some(values: Sequence[Any]) -> str:
@@ -200,7 +197,7 @@ def _take_from(
         kept = [name for name in order if name in names]
         chosen = np.transpose(chosen, [kept.index(name) for name in names])
         target = values[variable.name]
-        grid = np.ix_(*(places[name] for name in names)) if names else ()
+        grid = np.ix_(*(places[name] for name in names)) if names else ...
         part = target[grid]
         part[chosen] = old[variable.name][chosen]
         target[grid] = part

@@ -36,7 +36,7 @@ from sweep.engine.store import (
 )
 from sweep.engine.task import compute_block
 from sweep.errors import RunError, StoreError
-from sweep.measure.flags import Detection
+from sweep.measure.flags import Detection, Estimate
 from sweep.plan.grid import Block
 from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline
@@ -125,9 +125,17 @@ def execute(
         raise StoreError(f"--workers {workers}: expected at least 1")
     opened = _existing(url, pipeline, overwrite)
     if opened is not None and opened.finished:
+        done = len(committed(opened))
+        if done != len(opened.blocks):
+            raise StoreError(
+                f"{url}: damaged: finished, but {done} of {len(opened.blocks)} blocks are there; "
+                "--overwrite computes it again"
+            )
         return _summary(opened, [], time.perf_counter() - started)
     sources = [place(os.fspath(old)) for old in reuse]
     for source in sources:
+        if source == place(url):
+            raise StoreError(f"--reuse {source}: it is the store that is written; name another")
         match(pipeline, open_store(source))
     if opened is None:
         check_place(url)
@@ -138,14 +146,16 @@ def execute(
             external(scheduler, pipeline)
         )
         with cluster as client:
-            threads = sum(client.nthreads().values())
             if measuring is not None:
+                threads = sum(client.nthreads().values())
                 extents = block_extents(pipeline, measuring.result(), threads, block_s)
+                if exists(url):
+                    remove_store(url)
                 opened = create_store(url, pipeline, extents)
             if opened is None:
                 raise AssertionError(url)
             with locked(opened):
-                receipts_seen = _compute(opened, client, sources, threads, on_progress)
+                receipts_seen = _compute(opened, client, sources, on_progress)
                 finish(opened, _cost(opened))
     return _summary(open_store(url), receipts_seen, time.perf_counter() - started)
 
@@ -157,7 +167,7 @@ def _existing(url: str, pipeline: Pipeline, overwrite: bool) -> RunStore | None:
     store = open_store(url, "r+")
     refuse_if_held(url, store.group.store)
     if overwrite:
-        remove_store(url)
+        # It goes when all else has been seen to work, just before the new one is made.
         return None
     lines = differences(pipeline, store.pipeline, store.fingerprint)
     if lines:
@@ -172,7 +182,6 @@ def _compute(
     store: RunStore,
     client: Client,
     sources: Sequence[str],
-    threads: int,
     on_progress: Callable[[Progress], None] | None,
 ) -> list[dict[str, int]]:
     """Compute what is not committed, a bounded window of blocks at a time.
@@ -196,8 +205,9 @@ def _compute(
 
     computed: list[dict[str, int]] = []
     faults: list[str] = []
+    room = _Room(client)
     flight = as_completed(
-        [submit(block) for block in itertools.islice(todo, WINDOW * threads)], loop=client.loop
+        [submit(block) for block in itertools.islice(todo, room())], loop=client.loop
     )
     for future in flight:
         if future.status == "finished":
@@ -212,15 +222,30 @@ def _compute(
                 raise error
             faults.append(f"{future.key}: {type(error).__name__}: {error}")
         future.release()
-        following = next(todo, None) if len(faults) < MOST_FAULTS else None
-        if following is not None:
-            flight.add(submit(following))
+        if len(faults) < MOST_FAULTS:
+            for block in itertools.islice(todo, max(room() - flight.count(), 0)):
+                flight.add(submit(block))
     if faults:
         raise RunError(
             f"{store.url}: {len(faults)} blocks failed; run again to continue\n"
             + "\n".join(f"  {fault}" for fault in faults)
         )
     return computed
+
+
+class _Room:
+    """How many blocks may be in flight: it grows and shrinks with the cluster."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._asked = 0.0
+        self._blocks = 0
+
+    def __call__(self) -> int:
+        if time.monotonic() > self._asked + 1.0:
+            self._blocks = WINDOW * max(sum(self._client.nthreads().values()), 1)
+            self._asked = time.monotonic()
+        return self._blocks
 
 
 def _count(progress: Progress, receipt: Mapping[str, Any]) -> None:
@@ -267,10 +292,11 @@ def _cost(store: RunStore) -> xr.Dataset:
 def _summary(store: RunStore, computed: Sequence[Mapping[str, int]], seconds: float) -> Summary:
     """Count a finished store by its receipts."""
     detection = np.zeros(len(Detection), dtype=np.int64)
+    estimate = np.zeros(len(Estimate), dtype=np.int64)
     blocks = 0
     for _, receipt in receipts(store, committed(store)):
-        counts = receipt["detection"]
-        detection[: len(counts)] += counts
+        for total, counts in ((detection, receipt["detection"]), (estimate, receipt["estimate"])):
+            total[: len(counts)] += counts
         blocks += 1
     return Summary(
         store=store.url,
@@ -282,6 +308,6 @@ def _summary(store: RunStore, computed: Sequence[Mapping[str, int]], seconds: fl
         computed_scenes=sum(block["scenes"] for block in computed),
         computed_estimates=sum(block["estimates"] for block in computed),
         seconds=round(seconds, 3),
-        crashed=int(detection[Detection.crashed]),
-        failed=int(detection[Detection.failed]),
+        crashed=int(detection[Detection.crashed] + estimate[Estimate.crashed]),
+        failed=int(detection[Detection.failed] + estimate[Estimate.failed]),
     )

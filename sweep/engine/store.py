@@ -29,9 +29,9 @@ from zarr.core.sync import sync
 
 from sweep.engine.provenance import environment, fingerprint
 from sweep.errors import StoreError
-from sweep.model.camera import intrinsics
+from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.plan.axes import Axis
-from sweep.plan.grid import CAMERA, Block, Blocks, scene_axes
+from sweep.plan.grid import Block, Blocks, scene_axes
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.template import LABELS, TEMPLATE, Variable
 
@@ -43,6 +43,9 @@ FORMAT = 1
 
 RECEIPTS = "commits/receipt"
 """Array of the blocks' receipts by number, JSON, a chunk each; empty where not committed."""
+
+REQUIRED = {"scenes", "detection", "estimate", "seconds", "failures", "written"}
+"""What every receipt holds."""
 
 COORDINATE_CHUNK = 1 << 20
 
@@ -101,6 +104,8 @@ def exists(url: str) -> bool:
         _open_group(url, "r")
     except (FileNotFoundError, zarr.errors.GroupNotFoundError):
         return False
+    except (ImportError, ValueError, OSError) as error:
+        raise StoreError(f"{url}: cannot be reached: {error}") from None
     return True
 
 
@@ -123,9 +128,10 @@ def open_store(url: str, mode: str = "r") -> RunStore:
         )
         if about["format"] != FORMAT:
             raise StoreError(f"{url}: store format {about['format']}, expected {FORMAT}")
-        blocks = Blocks(
-            tuple(len(axis) for axis in scene_axes(pipeline)), tuple(about["block"])
-        )
+        lengths, extents = tuple(len(a) for a in scene_axes(pipeline)), tuple(about["block"])
+        if len(extents) != len(lengths) or not all(extent >= 1 for extent in extents):
+            raise ValueError(extents)
+        blocks = Blocks(lengths, extents)
         return RunStore(url, group, pipeline, about["run_id"], blocks)
     except (KeyError, TypeError, ValueError, OSError, zarr.errors.BaseZarrError) as error:
         if isinstance(error, PermissionError):
@@ -168,8 +174,11 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
             # Beside its place and then moved there: a kill between leaves no half a store.
             check_place(url)
             building = _beside(url, "new")
-            _lay_out(str(building), pipeline, extents)
-            building.rename(url)
+            try:
+                _lay_out(str(building), pipeline, extents)
+                building.rename(url)
+            finally:
+                shutil.rmtree(building, ignore_errors=True)
     except OSError as error:
         raise StoreError(f"{url}: cannot be written: {error.strerror or error}") from None
     return open_store(url, "r+")
@@ -195,7 +204,7 @@ def _lay_out(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> None:
     lengths = tuple(len(axis) for axis in scene_axes(pipeline))
     group.create_array(
         RECEIPTS, shape=(len(Blocks(lengths, extents)),), chunks=(1,), dtype="string",
-        dimension_names=("block",), compressors=None,
+        dimension_names=("block",), compressors=_codecs(),
     )
     group.attrs.update(
         {
@@ -261,13 +270,12 @@ def _write_axis(group: zarr.Group, axis: Axis) -> None:
     attributes: dict[str, Any] = {"long_name": axis.meaning}
     if axis.unit:
         attributes["units"] = axis.unit
-    first = axis.coordinates(0, 1)
-    if isinstance(first.dtype, np.dtypes.StringDType):
+    if axis.labelled:
         _write_strings(group, axis.name, axis.coordinates().tolist(), attributes)
         return
     chunk = min(len(axis), COORDINATE_CHUNK)
     array = group.create_array(
-        axis.name, shape=(len(axis),), chunks=(chunk,), dtype=first.dtype,
+        axis.name, shape=(len(axis),), chunks=(chunk,), dtype=axis.coordinates(0, 1).dtype,
         dimension_names=(axis.name,), compressors=_codecs(), attributes=attributes,
     )
     for start in range(0, len(axis), chunk):
@@ -291,15 +299,18 @@ def _write_distance(group: zarr.Group, pipeline: Pipeline) -> list[str]:
     sides = pipeline.values_of("side_px")
     if not sides or sides[0] is None:
         return []
-    names = (*CAMERA, "size_m", "side_px")
+    names = (*VIEW_PARAMETERS, "size_m", "side_px")
     axes = [axis for axis in scene_axes(pipeline) if axis.name in names]
     grids = np.meshgrid(
         *(np.array(axis.values, dtype=np.float64) for axis in axes), indexing="ij", sparse=True
     )
     values = {**{name: pipeline.fixed.get(name) for name in names},
               **{axis.name: grid for axis, grid in zip(axes, grids, strict=True)}}
-    fx = intrinsics(*(values[name] for name in CAMERA))[0]
-    distance = np.asarray(fx * values["size_m"] / values["side_px"], dtype=np.float64)
+    fx = intrinsics(*(values[name] for name in VIEW_PARAMETERS))[0]
+    distance = np.broadcast_to(
+        np.asarray(fx * values["size_m"] / values["side_px"], dtype=np.float64),
+        tuple(len(axis) for axis in axes),
+    )
     array = group.create_array(
         "distance_m", shape=distance.shape, chunks=distance.shape, dtype="f8",
         dimension_names=tuple(axis.name for axis in axes),
@@ -325,12 +336,24 @@ def write_block(
     store: RunStore, block: Block, values: dict[str, NDArray[Any]], receipt: dict[str, Any]
 ) -> None:
     """Write a block's values, then commit them by its receipt."""
+    _see_that_it_is_ours(store)
     for variable in TEMPLATE:
         array = store.array(variable.name)
         array[region(variable, store.pipeline, block)] = values[variable.name]
+    _see_that_it_is_ours(store)
     number = store.blocks.number(block)
     content = json.dumps({"run_id": store.run_id, **receipt}, separators=(",", ":"))
     store.array(RECEIPTS)[number : number + 1] = np.array([content], dtype=object)
+
+
+def _see_that_it_is_ours(store: RunStore) -> None:
+    """Raise StoreError where another run has replaced the store since it was opened."""
+    try:
+        run_id = _about(_open_group(store.url, "r"))["run_id"]
+    except (KeyError, FileNotFoundError):
+        run_id = None
+    if run_id != store.run_id:
+        raise StoreError(f"{store.url}: replaced by another run while this one was going on")
 
 
 def put(store: Store, key: str, content: dict[str, Any]) -> None:
@@ -369,9 +392,17 @@ def receipts(
     ordered = sorted(numbers)
     for start in range(0, len(ordered), 1000):
         some = ordered[start : start + 1000]
-        texts = np.asarray(store.array(RECEIPTS).oindex[np.array(some)])
-        for number, text in zip(some, texts.tolist(), strict=True):
-            yield number, json.loads(text)
+        try:
+            texts = np.asarray(store.array(RECEIPTS).oindex[np.array(some)]).tolist()
+            contents = [json.loads(text) for text in texts]
+            if not all(content.keys() >= REQUIRED for content in contents):
+                raise ValueError("incomplete")
+        except (ValueError, AttributeError, KeyError) as error:
+            raise StoreError(
+                f"{store.url}: damaged receipts among blocks {some[0]} to {some[-1]} ({error}); "
+                "--overwrite computes the store again"
+            ) from None
+        yield from zip(some, contents, strict=True)
 
 
 def finish(store: RunStore, cost: xr.Dataset) -> None:
@@ -399,5 +430,5 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
     store = open_store(os.fspath(url))
     import xarray as xr  # noqa: PLC0415  (slow to import, and workers do without)
 
-    dataset: xr.Dataset = xr.open_zarr(store.url, consolidated=store.finished)
+    dataset: xr.Dataset = xr.open_zarr(store.url, consolidated=False)
     return dataset

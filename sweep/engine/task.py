@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,9 @@ from sweep.engine.reuse import Source, Taken, match, take
 from sweep.engine.store import RunStore, open_store, write_block
 from sweep.errors import StoreError
 from sweep.kernel import CellsResult, run_cells, shaped
-from sweep.measure.flags import Estimate
 from sweep.plan.grid import Block, block_indices
 from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
+from sweep.plan.pipeline import Pipeline, file_digest
 from sweep.plan.template import TEMPLATE, Variable
 
 MOST_FAILURES = 20
@@ -38,6 +38,12 @@ def _opened(url: str, run_id: str) -> RunStore:
             raise StoreError(
                 f"a worker has {key} {here.get(key)}, the store was begun with {value}; "
                 "install the same version on every machine"
+            )
+    for path, digest in there["files"].items():
+        if file_digest(Path(store.pipeline.folder) / path) != digest:
+            raise StoreError(
+                f"{path}: not in {store.pipeline.folder} on a worker as it was when the run began; "
+                "every machine needs the same file there"
             )
     # A committed chunk exists even where it is all fill value: a missing one is a deleted one.
     zarr.config.set({"array.write_empty_chunks": True})
@@ -129,6 +135,6 @@ def _merged(variable: Variable, computed: dict[str, NDArray[Any]], taken: Taken)
     if flag is None:
         missing = np.isnan(new)
     else:
-        missing = computed[flag] == Estimate.not_run
+        missing = computed[flag] == 0
         missing = missing.reshape(missing.shape + (1,) * (new.ndim - missing.ndim))
     return np.where(missing, old, new).astype(variable.dtype)

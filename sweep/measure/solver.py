@@ -30,9 +30,6 @@ SOLVERS = {
     "epnp": cv2.SOLVEPNP_EPNP,
 }
 
-BOTH_PLANAR_SOLUTIONS = ("ippe", "ippe_square")
-"""Solvers that return both solutions of a plane's pose."""
-
 BELIEVED = "as the estimator believes it (default: the truth)"
 
 
@@ -48,7 +45,7 @@ class Estimator:
     )
     guarded: bool = parameter(
         True, "true: called where the solver is stable, checked, and replaced by iterative where "
-        "it fails; false: the plain cv2.solvePnP call",
+        "it fails; false: the plain cv2.solvePnP call (epnp is always called plainly)",
     )
     reprojection_limit: float = parameter(
         0.25, "a solution whose RMS reprojection error is above this share of the found side is "

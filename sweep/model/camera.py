@@ -45,6 +45,13 @@ class Camera:
     )
 
 
+VIEW_PARAMETERS = (
+    "width_px", "height_px", "sensor_width_mm", "sensor_height_mm", "focal_length_mm", "fx_px",
+    "fy_px", "cx_px", "cy_px",
+)
+"""The arguments of :func:`intrinsics`, in order."""
+
+
 def intrinsics(
     width_px: Any,
     height_px: Any,

@@ -29,7 +29,7 @@ class Marker:
     )
     marker_id: int = parameter(0, "the marker's ID in its dictionary", low=0, high=10**6)
     size_m: float = parameter(
-        0.01, "side of the black square", unit="m", low=0, open_low=True
+        0.01, "side of the black square", unit="m", low=1e-9, high=1e9
     )
     quiet_zone_modules: float = parameter(
         1.0, "width of the white surround, in modules", unit="module", low=0, high=100

@@ -22,7 +22,7 @@ class Pose:
 
     distance_m: float | None = parameter(
         None, "depth of the marker's centre along the optical axis", unit="m", low=0,
-        open_low=True, drawable=True,
+        high=1e12, open_low=True, drawable=True,
     )
     side_px: float | None = parameter(
         None,
@@ -30,8 +30,8 @@ class Pose:
         unit="px", low=0, open_low=True, drawable=True,
     )
     tilt_deg: float = parameter(
-        0.0, "angle between the marker's plane and the image plane", unit="degree", low=-180,
-        high=180, drawable=True,
+        0.0, "angle between the marker's plane and the image plane", unit="degree", low=-360,
+        high=360, drawable=True,
     )
     azimuth_deg: float = parameter(
         0.0, "direction of the axis of the tilt, in the image plane", unit="degree", low=-360,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model import lens as lens_model
-from sweep.model.camera import Cameras, intrinsics
+from sweep.model.camera import VIEW_PARAMETERS, Cameras, intrinsics
 from sweep.model.declaration import parameter
 from sweep.model.marker import marker_corners, module_count
 from sweep.model.pose import rotation_of_angles
@@ -105,14 +105,10 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
         value = values[name]
         return list(value) if isinstance(value, (list, np.ndarray)) else [value] * count
 
-    camera_names = (
-        "width_px", "height_px", "sensor_width_mm", "sensor_height_mm", "focal_length_mm",
-        "fx_px", "fy_px", "cx_px", "cy_px",
-    )
     fx, fy, cx, cy = (
         np.broadcast_to(np.asarray(number, dtype=np.float64), (count,))
         for number in intrinsics(
-            *(None if values[name] is None else numbers(name) for name in camera_names)
+            *(None if values[name] is None else numbers(name) for name in VIEW_PARAMETERS)
         )
     )
     distortions = column("distortion")
@@ -276,9 +272,9 @@ def _shoelace(points: Floats) -> Floats:
     """Return the signed areas (N,) of polygons (N, M, 2)."""
     local = points - points[:, :1]
     following = np.roll(local, -1, axis=1)
-    return np.asarray(
-        0.5 * (local[..., 0] * following[..., 1] - local[..., 1] * following[..., 0]).sum(axis=1)
-    )
+    with np.errstate(over="ignore", invalid="ignore"):
+        doubled = local[..., 0] * following[..., 1] - local[..., 1] * following[..., 0]
+        return np.asarray(0.5 * doubled.sum(axis=1))
 
 
 def hidden(scenes: Scenes) -> NDArray[np.bool_]:

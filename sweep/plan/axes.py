@@ -50,19 +50,21 @@ class Axis:
             PARAMETERS[self.name].declaration.meaning
         )
 
+    @property
+    def labelled(self) -> bool:
+        """Whether its values are shown as strings: not all are numbers, or all booleans."""
+        if isinstance(self.values, range):
+            return False
+        return {type(value) for value in self.values} not in ({bool}, {int}, {float})
+
     def coordinates(self, start: int = 0, stop: int | None = None) -> NDArray[Any]:
         """Return the values [start, stop) as they label the dataset: numbers, booleans, strings."""
         part = self.values[start:stop]
         if isinstance(part, range):
             return np.arange(part.start, part.stop, part.step, dtype=np.int64)
-        kinds = {type(value) for value in part}
-        if kinds == {bool}:
-            return np.array(part, dtype=bool)
-        if kinds == {int}:
-            return np.array(part, dtype=np.int64)
-        if kinds == {float}:
-            return np.array(part, dtype=np.float64)
-        return np.array([label(value) for value in part], dtype=np.dtypes.StringDType())
+        if self.labelled:
+            return np.array([label(value) for value in part], dtype=np.dtypes.StringDType())
+        return np.array(part, dtype=type(self.values[0]))
 
 
 def label(value: Any) -> str:
@@ -91,6 +93,9 @@ class Distribution:
     def __str__(self) -> str:
         return f"{self.kind}({self.a:.12g},{self.b:.12g})"
 
+
+WIDEST_SD = 8.3
+"""How far from its mean, in standard deviations, a normal draw of 53 bits can lie."""
 
 AXIS_FORMS = {
     "range": "[start, stop] or [start, stop, step], whole numbers, half-open",
@@ -126,7 +131,7 @@ def parse_distribution(parameter: Parameter, table: dict[str, Any]) -> Distribut
     if (
         not isinstance(ends, list) or len(ends) != 2
         or not all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends)
-        or not all(math.isfinite(end) and abs(end) < 1e300 for end in ends)
+        or not all(abs(end) < 1e300 for end in ends)
     ):
         raise ValueError(f"{kind} = {DISTRIBUTION_FORMS[kind]}")
     a, b = float(ends[0]), float(ends[1])
@@ -135,8 +140,9 @@ def parse_distribution(parameter: Parameter, table: dict[str, Any]) -> Distribut
     if kind == "uniform":
         parameter.check(a)
         parameter.check(b)
-    elif not parameter.declaration.admits(a):
-        raise ValueError(f"a mean that is {parameter.declaration.range_text()}")
+    elif not all(parameter.declaration.admits(a + side * WIDEST_SD * b) for side in (-1, 1)):
+        extent = parameter.declaration.range_text()
+        raise ValueError(f"mean - {WIDEST_SD} sd and mean + {WIDEST_SD} sd {extent}")
     return Distribution(kind, a, b)
 
 
@@ -200,7 +206,7 @@ def _expand(form: str, ends: list[Any]) -> Sequence[Any]:
     wanted = ValueError(f"{form} = {AXIS_FORMS[form]}")
     if not all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends):
         raise wanted
-    if not all(math.isfinite(end) and abs(end) < 1e300 for end in ends):
+    if not all(abs(end) < 1e300 for end in ends):
         raise wanted
     if form == "range":
         if not all(isinstance(end, int) for end in ends) or len(ends) not in (2, 3):
@@ -217,12 +223,16 @@ def _expand(form: str, ends: list[Any]) -> Sequence[Any]:
         raise wanted
     if form == "arange":
         start, stop, step = (float(end) for end in ends)
-        count = math.ceil((stop - start) / step) if step != 0 else 0
         if step == 0:
             raise wanted
-        if count > MOST_LISTED:
+        steps = (stop - start) / step
+        if steps > MOST_LISTED:
             raise ValueError(f"at most {MOST_LISTED:,} values")
-        return [start + step * i for i in range(max(count, 0))]
+        # Half-open also where the last step falls short of the stop by rounding alone.
+        count = math.ceil(steps - 1e-9) if steps > 0 else 0
+        if all(isinstance(end, int) for end in ends):
+            return range(*ends)
+        return [start + step * i for i in range(count)]
     if not isinstance(ends[2], int) or ends[2] < 1:
         raise wanted
     if ends[2] > MOST_LISTED:

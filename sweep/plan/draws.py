@@ -15,25 +15,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.model.camera import canonical_distortion, intrinsics
+from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion, intrinsics
 from sweep.plan.axes import Distribution
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
 
-_CAMERA = (
-    "width_px", "height_px", "sensor_width_mm", "sensor_height_mm", "focal_length_mm", "fx_px",
-    "fy_px", "cx_px", "cy_px",
-)
 _DEFAULT_VIEW = dict(
     zip(
         ("fx_px", "fy_px"),
-        intrinsics(*(PARAMETERS[name].default for name in _CAMERA))[:2],
+        intrinsics(*(PARAMETERS[name].default for name in VIEW_PARAMETERS))[:2],
         strict=True,
     )
 )
 _PLAIN = (
     "width_px", "height_px",
     *(p.name for p in PARAMETERS.values()
-      if p.section in GEOMETRY_SECTIONS and p.name not in (*_CAMERA, "distortion", "side_px")),
+      if p.section in GEOMETRY_SECTIONS
+      and p.name not in (*VIEW_PARAMETERS, "distortion", "side_px")),
 )
 
 
@@ -73,7 +70,7 @@ def geometry_keys(
     ``values`` has every parameter of camera, marker and pose that is not drawn, one value for
     all scenes or one each, with ``distance_m`` resolved from ``side_px``.
     """
-    fx, fy, cx, cy = intrinsics(*(values[name] for name in _CAMERA))
+    fx, fy, cx, cy = intrinsics(*(values[name] for name in VIEW_PARAMETERS))
     columns: dict[str, list[str]] = {
         name: _texts(name, value, default, count)
         for name, value, default in (

@@ -14,16 +14,11 @@ from numpy.typing import NDArray
 
 from sweep.measure.detector import DetectorSetting
 from sweep.measure.solver import Estimator
-from sweep.model.camera import canonical_distortion, intrinsics
+from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion, intrinsics
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.draws import geometry_keys, uniform
 from sweep.plan.parameters import PARAMETERS, Stage
 from sweep.plan.pipeline import Pipeline
-
-CAMERA = (
-    "width_px", "height_px", "sensor_width_mm", "sensor_height_mm", "focal_length_mm", "fx_px",
-    "fy_px", "cx_px", "cy_px",
-)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -165,7 +160,7 @@ def _absolute(pipeline: Pipeline, value: Any) -> Any:
 def _resolve_distance(values: dict[str, Any]) -> None:
     """Turn ``side_px`` into ``distance_m``: fx · size / side."""
     if values.get("side_px") is not None:
-        fx = intrinsics(*(values[name] for name in CAMERA))[0]
+        fx = intrinsics(*(values[name] for name in VIEW_PARAMETERS))[0]
         values["distance_m"] = fx * values["size_m"] / values["side_px"]
 
 

@@ -8,10 +8,9 @@ import tomllib
 from typing import Any
 
 from sweep.errors import PipelineError
-from sweep.model.marker import marker_count
 from sweep.plan.axes import TRIAL, Axis, nearest
 from sweep.plan.parameters import PARAMETERS
-from sweep.plan.pipeline import Pipeline
+from sweep.plan.pipeline import Pipeline, fixed_at
 
 _SEPARATOR = re.compile(r",(?![^\[]*\])")
 
@@ -28,6 +27,7 @@ def cell(pipeline: Pipeline, at: str) -> Pipeline:
     """
     faults: list[str] = []
     chosen: dict[str, Any] = {axis.name: axis.values[0] for axis in pipeline.axes}
+    named: set[str] = set()
     for part in filter(None, _SEPARATOR.split(at)):
         name, equals, written = (piece.strip() for piece in part.partition("="))
         if not equals or not written:
@@ -36,32 +36,21 @@ def cell(pipeline: Pipeline, at: str) -> Pipeline:
             known = [*PARAMETERS, TRIAL]
             faults.append(f"--at {part}: unknown parameter{nearest(name, known)}")
         else:
+            if name in named:
+                faults.append(f"--at {part}: {name} is given twice")
+            named.add(name)
             try:
                 chosen[name] = _value(name, written)
             except ValueError as error:
                 faults.append(f"--at {part}: expected {error}")
-    if not faults:
-        values = {**pipeline.fixed, **chosen}
-        count = marker_count(values["dictionary"])
-        if values["marker_id"] >= count:
-            faults.append(
-                f"--at marker_id={values['marker_id']}: expected an ID from 0 to {count - 1}, "
-                f"which is what {values['dictionary']} has"
-            )
     if faults:
         raise PipelineError(faults)
     trial = chosen.pop(TRIAL, 0)
-    fixed = {**pipeline.fixed, **chosen}
-    # distance_m and side_px stand in each other's place.
+    axes = (Axis(TRIAL, range(trial, trial + 1)),)
     for name, other in (("distance_m", "side_px"), ("side_px", "distance_m")):
-        if name in chosen and pipeline.axis(name) is None:
-            fixed[other] = None
-    return dataclasses.replace(
-        pipeline,
-        fixed=fixed,
-        distributions={k: v for k, v in pipeline.distributions.items() if k not in chosen},
-        axes=(Axis(TRIAL, range(trial, trial + 1)),),
-    )
+        if name in named and other not in named:
+            chosen.pop(other, None)
+    return dataclasses.replace(fixed_at(pipeline, chosen), axes=axes)
 
 
 def _value(name: str, written: str) -> Any:

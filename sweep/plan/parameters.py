@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import types
 import typing
 from dataclasses import dataclass
@@ -74,7 +73,7 @@ class Parameter:
     def check(self, value: Any) -> Any:
         """Return ``value`` in the parameter's own type; ValueError(expectation) where it is not."""
         if tuple in self.types and isinstance(value, (list, tuple)):
-            numbers = all(_is_number(item) and math.isfinite(item) for item in value)
+            numbers = all(_is_number(item) and abs(item) < 1e300 for item in value)
             if numbers and len(value) in COUNTS:
                 return tuple(float(item) for item in value)
         elif bool in self.types and isinstance(value, bool):

@@ -36,6 +36,9 @@ MOST_BYTES = 1_000_000
 MOST_POSES = 10**12
 """The largest grid."""
 
+MOST_PIXELS = 500_000_000
+"""The largest frame that is rendered whole."""
+
 HEADER = ("title", "seed")
 
 
@@ -133,11 +136,6 @@ class Pipeline:
     def size(self, *stages: Stage) -> int:
         """Return the number of grid points over the axes of the given stages."""
         return math.prod(len(axis) for axis in self.axes_of(*stages))
-
-    @property
-    def random(self) -> bool:
-        """Whether anything is drawn."""
-        return bool(self.distributions) or self.any_value("jitter_px", lambda value: value > 0)
 
     def values_of(self, name: str) -> Sequence[Any]:
         """Return all values that a parameter takes on the grid; empty where it is drawn."""
@@ -277,8 +275,9 @@ class _Reader:
     def _given_value(self, name: str) -> Any:
         """Return what the file says of a parameter, to be quoted."""
         for section in (*SECTIONS, "axes"):
-            if name in self.document.get(section, {}):
-                return self.document[section][name]
+            table = self.document.get(section)
+            if isinstance(table, dict) and name in table:
+                return table[name]
         return self.fixed.get(name)
 
     def _across(self) -> None:
@@ -318,6 +317,12 @@ class _Reader:
                 "something random to repeat: jitter_px above 0, or a distribution",
             )
         poses = math.prod(len(axis) for axis in self.axes.values())
+        frame = max(self._values("width_px") or (0,)) * max(self._values("height_px") or (0,))
+        if frame > MOST_PIXELS and "full" in self._values("window"):
+            self.fault(
+                "scene.window", self._given_value("window"),
+                f"auto, for a frame of more than {MOST_PIXELS:,} pixels",
+            )
         if poses > MOST_POSES:
             self.faults.append(
                 f"{self.source}: axes: {poses:.3g} poses: expected at most {MOST_POSES:.0e}"
@@ -357,7 +362,7 @@ class _Reader:
                         f"an image of exactly the frame's size: it is {width} x {height}, but "
                         f"{name} = {_shown(self._given_value(name))}",
                     )
-            self.files[value] = hashlib.sha256(path.read_bytes()).hexdigest()
+            self.files[value] = file_digest(path) or ""
 
     def _detector_fields(self) -> None:
         missing = DetectorSetting.missing_fields()
@@ -366,6 +371,14 @@ class _Reader:
                 f"detector.{name}", self._given_value(name),
                 "a field that the installed OpenCV has",
             )
+
+
+def file_digest(path: Path) -> str | None:
+    """Return a file's SHA-256; None where it cannot be read."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return None
 
 
 def _shown(value: Any) -> str:
@@ -387,6 +400,27 @@ def _inline(table: dict[str, Any]) -> tomlkit.items.InlineTable:
 _BARE = re.compile(r"[A-Za-z][A-Za-z0-9_.+-]*(/[A-Za-z0-9_.+-]+)*")
 
 
+def fixed_at(pipeline: Pipeline, chosen: Mapping[str, Any]) -> Pipeline:
+    """Return a pipeline with parameters fixed at chosen values, checked as a file would be.
+
+    ``trial`` goes; where ``distance_m`` or ``side_px`` is chosen, the other does.
+    """
+    document = tomlkit.parse(pipeline.text)
+    dropped = {TRIAL}
+    for name, other in (("distance_m", "side_px"), ("side_px", "distance_m")):
+        if name in chosen and other not in chosen:
+            dropped.add(other)
+    for table in document.values():
+        if isinstance(table, dict):
+            for name in dropped & table.keys():
+                del table[name]
+    for name, value in chosen.items():
+        _write(document, name, list(value) if isinstance(value, tuple) else value)
+    return Pipeline.from_text(
+        tomlkit.dumps(document), name=pipeline.name, source="--at", folder=pipeline.folder
+    )
+
+
 def with_settings(text: str, settings: Sequence[str], source: str) -> str:
     """Return pipeline text with "key=value" settings written in.
 
@@ -406,14 +440,17 @@ def with_settings(text: str, settings: Sequence[str], source: str) -> str:
     for setting in settings:
         key, equals, written = setting.partition("=")
         key, written = key.strip(), written.strip()
-        name = key.rpartition(".")[2]
+        section, _, name = key.rpartition(".")
         if not equals or not name:
             faults.append(f"--set {setting}: expected key=value, such as tilt_deg=45")
             continue
         if _BARE.fullmatch(written) and written not in ("true", "false", "inf", "nan"):
             written = f'"{written}"'
         try:
-            value = tomllib.loads(f"value = {written}")["value"]
+            parsed = tomllib.loads(f"value = {written}")
+            value = parsed.pop("value")
+            if parsed:
+                raise tomllib.TOMLDecodeError
         except (tomllib.TOMLDecodeError, RecursionError):
             faults.append(f"--set {setting}: expected a TOML value, such as [0, 45] or 'text'")
             continue
@@ -424,6 +461,12 @@ def with_settings(text: str, settings: Sequence[str], source: str) -> str:
             known = [*PARAMETERS, TRIAL, *HEADER]
             faults.append(f"--set {setting}: unknown parameter{nearest(name, known)}")
             continue
+        home = "axes" if name == TRIAL else PARAMETERS[name].section
+        if section not in ("", home, "axes"):
+            faults.append(f"--set {setting}: expected {name} or {home}.{name}")
+            continue
+        if not all(isinstance(document.get(table, {}), dict) for table in (home, "axes")):
+            continue  # told when the text is read
         _write(document, name, value)
     if faults:
         raise PipelineError(faults)

@@ -151,17 +151,18 @@ class _Bar:
         console = Console(stderr=True)
         self._progress = Progress(
             TextColumn("{task.description}"), BarColumn(),
-            TextColumn("{task.completed:,.0f} of {task.total:,.0f} poses"),
+            TextColumn("{task.fields[count]}"),
             TimeElapsedColumn(), TimeRemainingColumn(), console=console,
             disable=not console.is_terminal, transient=True,
         )
         self._progress.start()
-        self._task = self._progress.add_task("starting", total=None)
+        self._task = self._progress.add_task("starting", total=None, count="")
         return self
 
     def __call__(self, progress: Progress) -> None:
         self._progress.update(
-            self._task, description="running", total=progress.total, completed=progress.done
+            self._task, description="running", total=progress.total, completed=progress.done,
+            count=f"{progress.done:,} of {progress.total:,} poses",
         )
 
     def __exit__(self, *_: object) -> None:

@@ -1,7 +1,9 @@
 """A run: the same numbers however it is run, nothing computed twice, nothing mixed."""
 
+import contextlib
 import json
 import os
+import pty
 import signal
 import socket
 import subprocess
@@ -509,3 +511,23 @@ def test_background_axis_of_levels_and_images(tmp_path):
     other = create_store(str(tmp_path / "again.zarr"), pipeline, (2,))
     with pytest.raises(StoreError, match=r"grey\.png: not in .* as it was when the run began"):
         compute_block(other.url, other.run_id, next(iter(other.blocks)))
+
+
+def test_progress_is_shown_on_a_terminal(tmp_path):
+    path = tmp_path / "small.toml"
+    path.write_text(TEXT)
+    ours, theirs = pty.openpty()
+    with subprocess.Popen(
+        [sys.executable, "-m", "sweep.cli", "run", str(path), "--workers", "1"],
+        cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=theirs,
+        env={**os.environ, "TERM": "xterm", "COLUMNS": "100"},
+    ) as running:
+        os.close(theirs)
+        shown = b""
+        with contextlib.suppress(OSError):  # the terminal's other end closes with the process
+            while part := os.read(ours, 65536):
+                shown += part
+    os.close(ours)
+    assert running.returncode == 0, shown
+    assert b"of 48 poses" in shown
+    assert b"Traceback" not in shown

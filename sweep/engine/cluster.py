@@ -59,7 +59,8 @@ def embedded(workers: int) -> Iterator[Client]:
         with dask.config.set(settings):
             cluster = LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1",
-                dashboard_address=None, silence_logs=QUIET,
+                dashboard_address="127.0.0.1:0", silence_logs=QUIET,
+                scheduler_kwargs={"dashboard": False},
             )
     finally:
         if before is not None:

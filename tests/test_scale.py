@@ -28,7 +28,7 @@ trial = %d
 """
 
 CLIENT = """
-import json, resource, sys
+import json, sys
 import synthetic
 synthetic.install()
 from sweep.engine.runner import execute
@@ -36,7 +36,9 @@ from sweep.plan.pipeline import Pipeline
 import sweep.engine.runner as engine
 engine.block_extents = lambda *_: (1, 200, max(int(sys.argv[4]) // 50, 1))
 summary = execute(Pipeline.from_toml(sys.argv[1]), sys.argv[2], scheduler=sys.argv[3])
-peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+# Not ru_maxrss, which begins at the parent's size.
+status = dict(line.split(":", 1) for line in open("/proc/self/status"))
+peak = int(status["VmHWM"].split()[0]) * 1024
 print(json.dumps({"peak": peak, "blocks": summary.blocks, "poses": summary.poses}))
 """
 

@@ -149,7 +149,7 @@ def execute(
             if measuring is not None:
                 threads = sum(client.nthreads().values())
                 extents = block_extents(pipeline, measuring.result(), threads, block_s)
-                if exists(url):
+                if overwrite and exists(url):
                     remove_store(url)
                 opened = create_store(url, pipeline, extents)
             if opened is None:

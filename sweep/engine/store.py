@@ -29,9 +29,9 @@ from zarr.core.sync import sync
 
 from sweep.engine.provenance import environment, fingerprint
 from sweep.errors import StoreError
-from sweep.model.camera import VIEW_PARAMETERS, intrinsics
+from sweep.model.camera import VIEW_PARAMETERS
 from sweep.plan.axes import Axis
-from sweep.plan.grid import Block, Blocks, scene_axes
+from sweep.plan.grid import Block, Blocks, resolve_distance, scene_axes
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.template import LABELS, TEMPLATE, Variable
 
@@ -306,10 +306,9 @@ def _write_distance(group: zarr.Group, pipeline: Pipeline) -> list[str]:
     )
     values = {**{name: pipeline.fixed.get(name) for name in names},
               **{axis.name: grid for axis, grid in zip(axes, grids, strict=True)}}
-    fx = intrinsics(*(values[name] for name in VIEW_PARAMETERS))[0]
+    resolve_distance(values)
     distance = np.broadcast_to(
-        np.asarray(fx * values["size_m"] / values["side_px"], dtype=np.float64),
-        tuple(len(axis) for axis in axes),
+        np.asarray(values["distance_m"], dtype=np.float64), tuple(len(axis) for axis in axes)
     )
     array = group.create_array(
         "distance_m", shape=distance.shape, chunks=distance.shape, dtype="f8",

@@ -134,7 +134,7 @@ def scene_values(pipeline: Pipeline, indices: Sequence[NDArray[np.intp]]) -> dic
     )
     drawn = pipeline.distributions
     if "distance_m" not in drawn and "side_px" not in drawn:
-        _resolve_distance(values)
+        resolve_distance(values)
     jitter = np.asarray(values["jitter_px"], dtype=np.float64)
     values["shift_u_px"] = values["shift_v_px"] = 0.0
     if not drawn and not (jitter > 0).any():
@@ -143,7 +143,7 @@ def scene_values(pipeline: Pipeline, indices: Sequence[NDArray[np.intp]]) -> dic
     for name, distribution in drawn.items():
         values[name] = distribution.at(uniform(pipeline.seed, name, keys, trials))
     if "side_px" in drawn:
-        _resolve_distance(values)
+        resolve_distance(values)
     if (jitter > 0).any():
         for name in ("shift_u_px", "shift_v_px"):
             draw = uniform(pipeline.seed, name, keys, trials)
@@ -157,7 +157,7 @@ def _absolute(pipeline: Pipeline, value: Any) -> Any:
     return str((Path(pipeline.folder) / value).resolve())
 
 
-def _resolve_distance(values: dict[str, Any]) -> None:
+def resolve_distance(values: dict[str, Any]) -> None:
     """Turn ``side_px`` into ``distance_m``: fx · size / side."""
     if values.get("side_px") is not None:
         fx = intrinsics(*(values[name] for name in VIEW_PARAMETERS))[0]

@@ -18,9 +18,9 @@ from sweep.kernel import (
 )
 from sweep.measure.detector import Detector
 from sweep.measure.flags import Detection, Estimate
-from sweep.model.pose import rotation_of_vector
+from sweep.model.pose import placed, rotation_of_vector
 from sweep.model.renderers import render
-from sweep.model.scene import build_scenes, marker_boxes, placed
+from sweep.model.scene import build_scenes, marker_boxes
 from sweep.plan.grid import detector_settings, estimators, scene_values
 from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline
@@ -107,7 +107,8 @@ def look(pipeline: Pipeline, *, whole_frame: bool = False) -> Look:
         true_corners=scenes.corners_px[0],
         area_px=float(columns["marker_area_px"]),
         decoded=[
-            (marker_id, quad[0] + origin) for marker_id, quad in zip(ids, found, strict=True)
+            (int(marker_id), quad[0] + origin)
+            for marker_id, quad in zip(() if ids is None else ids.ravel(), found, strict=True)
         ],
         rejected=[quad[0] + origin for quad in rejected],
         detection=Detection(int(columns["detection"])),

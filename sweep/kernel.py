@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,14 +21,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.measure.accuracy import pose_error, rotation_difference
-from sweep.measure.detector import Detector, DetectorSetting, full_frame_reason, margin_px, windows
-from sweep.measure.finding import REJECTED_ID, classify
+from sweep.measure.detector import (
+    Detector,
+    DetectorSetting,
+    Found,
+    full_frame_reason,
+    margin_px,
+    windows,
+)
+from sweep.measure.finding import classify
 from sweep.measure.flags import Detection, Estimate, Flipped
 from sweep.measure.solver import Estimates, Estimator, estimate
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.pose import vector_of_rotation
-from sweep.model.renderers import render
+from sweep.model.renderers import Grey, render_all
 from sweep.model.scene import (
     Scenes,
     areas_px,
@@ -169,16 +176,14 @@ def run_cells(
 
 def whole_frames(values: dict[str, Any], count: int) -> NDArray[np.bool_]:
     """Tell (N,) which scenes are rendered as whole frames: as asked, or on a background image."""
-    def matches(name: str, test: Callable[[Any], bool]) -> NDArray[np.bool_]:
-        column = values[name]
-        listed = column if isinstance(column, list) else [column] * count
-        return np.array([test(value) for value in listed], dtype=bool)
-
-    if isinstance(values["background"], np.ndarray):
-        return matches("window", lambda value: value == "full")
-    return matches("window", lambda value: value == "full") | matches(
-        "background", lambda value: isinstance(value, str)
-    )
+    whole = np.zeros(count, dtype=bool)
+    for name, test in (
+        ("window", lambda value: value == "full"),
+        ("background", lambda value: isinstance(value, str)),
+    ):
+        given = values[name]
+        whole |= [test(value) for value in given] if isinstance(given, list) else test(given)
+    return whole
 
 
 def visibility_flags(scenes: Scenes) -> NDArray[np.uint8]:
@@ -222,73 +227,102 @@ def search(
             np.max([window[:, 2:] for window in cut], axis=0),
         ],
         axis=1,
-    ).tolist()
-    crops = [window.tolist() for window in cut]
-    detectors = [Detector(setting) for setting in settings]
-    sides = scenes.frame.max(axis=1).tolist()
-    owners: list[list[int]] = [[] for _ in settings]
-    ids: list[list[int]] = [[] for _ in settings]
-    quads: list[list[NDArray[np.float32]]] = [[] for _ in settings]
-    failed: list[list[int]] = [[] for _ in settings]
-    seconds = [0.0] * len(settings)
+    )
+    # Where a setting's windows are those that are rendered, nothing is cut out of them.
+    crops = [
+        None if (window == widest).all() else (window - np.tile(widest[:, :2], 2)).tolist()
+        for window in cut
+    ]
+    hits = [_Hits(Detector(setting).find) for setting in settings]
+    dictionary, sides = scenes.dictionary, scenes.frame.max(axis=1).tolist()
     render_s = 0.0
-    row_s = np.zeros(len(scenes))
+    row_s = [0.0] * len(scenes)
     clock = time.perf_counter
-    asked = wanted.tolist()
-    for row in np.flatnonzero(wanted.any(axis=1)).tolist():
-        begun = start = clock()
-        try:
-            left, top, right, bottom = widest[row]
-            image = render(scenes, row, boxes[row], (left, top, right, bottom))
-        except Exception:
-            failures.append(Failure(row, "scene", traceback.format_exc()))
-            for rows in failed:
-                rows.append(row)
-            continue
+    asked = wanted.T.tolist()
+    for rows in _chunks(np.flatnonzero(wanted.any(axis=1)), widest):
+        begun = clock()
+        images = _rendered(scenes, rows, boxes, widest, failures)
         now = clock()
-        render_s += now - start
-        for k, detector in enumerate(detectors):
-            if not asked[row][k]:
-                continue
-            start = now
-            x0, y0, x1, y1 = crops[k][row]
-            try:
-                corners, found, rejected = detector.find(
-                    image[y0 - top : y1 - top, x0 - left : x1 - left],
-                    scenes.dictionary[row],
-                    sides[row],
-                )
-            except Exception:
-                failures.append(Failure(row, "detection", traceback.format_exc()))
-                failed[k].append(row)
+        render_s += now - begun
+        for row in rows.tolist():
+            row_s[row] = (now - begun) / len(rows)
+        for hit, crop, ask in zip(hits, crops, asked, strict=True):
+            find, keep = hit.find, hit.found.append
+            begun = now = clock()
+            for row, image in zip(rows.tolist(), images, strict=True):
+                if not ask[row]:
+                    continue
+                start = now
+                if image is None:
+                    hit.failed.append(row)
+                    continue
+                seen = image
+                if crop is not None:
+                    x0, y0, x1, y1 = crop[row]
+                    seen = image[y0:y1, x0:x1]
+                try:
+                    keep((row, *find(seen, dictionary[row], sides[row])))
+                except Exception:
+                    failures.append(Failure(row, "detection", traceback.format_exc()))
+                    hit.failed.append(row)
                 now = clock()
-                continue
-            if found:
-                owners[k].extend([row] * len(found))
-                ids[k].extend(found)
-                quads[k].extend(corners)
-            if rejected:
-                owners[k].extend([row] * len(rejected))
-                ids[k].extend([REJECTED_ID] * len(rejected))
-                quads[k].extend(rejected)
-            now = clock()
-            seconds[k] += now - start
-        row_s[row] = now - begun
+                row_s[row] += now - start
+            hit.seconds += now - begun
 
-    marker_id = np.array(scenes.marker_id, dtype=np.int64)
     searches = []
-    for k in range(len(settings)):
+    marker_id = np.array(scenes.marker_id, dtype=np.int64)
+    for hit, window in zip(hits, cut, strict=True):
         start = clock()
-        owner = np.array(owners[k], dtype=np.intp)
-        found_px = np.empty((0, 4, 2))
-        if len(owner):
-            found_px = np.concatenate(quads[k]).astype(np.float64) + cut[k][owner, None, :2]
         flags, found_corners = classify(
-            scenes.corners_px, marker_id, owner, np.array(ids[k], dtype=np.int64), found_px
+            scenes.corners_px, marker_id, hit.found, window[:, :2].astype(np.float64)
         )
-        flags[failed[k]] = Detection.failed
-        searches.append(Search(flags, found_corners, seconds[k] + clock() - start))
-    return searches, render_s, row_s
+        flags[hit.failed] = Detection.failed
+        searches.append(Search(flags, found_corners, hit.seconds + clock() - start))
+    return searches, render_s, np.array(row_s)
+
+
+@dataclass(slots=True)
+class _Hits:
+    """How one setting searches, what it found so far, and the rows for which it raised."""
+
+    find: Callable[[Grey, str, int], Found]
+    found: list[tuple[int, *Found]] = field(default_factory=list)
+    failed: list[int] = field(default_factory=list)
+    seconds: float = 0.0
+
+
+CHUNK_PX = 1 << 22
+"""Pixels that are rendered, in one call, before they are searched: a few MB of memory."""
+
+
+def _chunks(
+    rows: NDArray[np.intp], windows: NDArray[np.int64]
+) -> Iterator[NDArray[np.intp]]:
+    """Cut rows into runs whose windows have about ``CHUNK_PX`` pixels, at least one each."""
+    if not len(rows):
+        return
+    size = windows[rows, 2:] - windows[rows, :2]
+    number = np.cumsum(size[:, 0] * size[:, 1]) // CHUNK_PX
+    yield from np.split(rows, np.flatnonzero(np.diff(number)) + 1)
+
+
+def _rendered(
+    scenes: Scenes, rows: NDArray[np.intp], boxes: NDArray[np.int64],
+    windows: NDArray[np.int64], failures: list[Failure],
+) -> Sequence[Grey | None]:
+    """Return the images of ``rows`` in their windows; None where rendering raised."""
+    try:
+        return render_all(scenes, rows, boxes[rows], windows[rows])
+    except Exception:
+        images: list[Grey | None] = []
+        for row in rows.tolist():
+            one = np.array([row])
+            try:
+                images += render_all(scenes, one, boxes[one], windows[one])
+            except Exception:
+                failures.append(Failure(row, "scene", traceback.format_exc()))
+                images.append(None)
+        return images
 
 
 def believed(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sweep.kernel import run_block
-from sweep.measure.finding import REJECTED_ID, classify
+from sweep.measure.finding import classify
 from sweep.measure.flags import Detection, Estimate, Flipped
 from sweep.plan.grid import Block, scene_axes
 from sweep.plan.pipeline import Pipeline
@@ -206,14 +206,27 @@ def test_numbers_exist_exactly_where_the_flags_say_so():
 SQUARE = np.array([[100.0, 100.0], [140.0, 100.0], [140.0, 140.0], [100.0, 140.0]])
 
 
+REJECTED_ID = None
+ORIGIN = np.array([[8.0, 16.0], [0.0, 0.0], [4.0, 400.0]])
+"""Top left pixels of windows; what is found is relative to them."""
+
+
+def search_result(row, *found):
+    """Return what a search of scene ``row`` gives, from (ID, corners in the frame) each."""
+    def quads(wanted):
+        return tuple(
+            np.float32(quad - ORIGIN[row])[None]
+            for found_id, quad in found if (found_id is not None) == wanted
+        )
+
+    ids = [found_id for found_id, _ in found if found_id is not None]
+    return row, quads(True), np.array(ids, dtype=np.int32) if ids else None, quads(False)
+
+
 def classified(*found, truth=SQUARE, marker_id=7):
     """Classify what was found, (ID, corners) each, in one scene."""
     flag, corners = classify(
-        truth[None],
-        np.array([marker_id]),
-        np.zeros(len(found), dtype=np.intp),
-        np.array([found_id for found_id, _ in found], dtype=np.int64),
-        np.array([quadrilateral for _, quadrilateral in found]).reshape(-1, 4, 2),
+        truth[None], np.array([marker_id]), [search_result(0, *found)], ORIGIN[:1]
     )
     return Detection(flag[0]), corners[0]
 
@@ -265,7 +278,7 @@ def test_right_marker_outweighs_everything_else_there():
 def test_of_two_right_ones_the_nearest_counts():
     near, far = SQUARE - 0.2, SQUARE * 0.9 + 12.5
     for found in ([(7, near), (7, far)], [(7, far), (7, near)]):
-        np.testing.assert_array_equal(classified(*found)[1], near)
+        np.testing.assert_allclose(classified(*found)[1], near, rtol=0, atol=1e-5)
 
 
 def test_truth_may_be_seen_turned_and_tilted():
@@ -277,9 +290,9 @@ def test_truth_may_be_seen_turned_and_tilted():
 
 def test_scenes_are_told_apart():
     truth = np.stack([SQUARE, SQUARE, SQUARE + 200])
-    flag, corners = classify(
-        truth, np.array([1, 2, 3]), np.array([2, 0, 0]), np.array([3, 2, REJECTED_ID]),
-        np.stack([SQUARE + 200, SQUARE, SQUARE]),
-    )
+    found = [
+        search_result(2, (3, SQUARE + 200)), search_result(0, (2, SQUARE), (REJECTED_ID, SQUARE)),
+    ]
+    flag, corners = classify(truth, np.array([1, 2, 3]), found, ORIGIN)
     assert flag.tolist() == [Detection.wrong_id, Detection.no_candidate, Detection.detected]
     np.testing.assert_array_equal(np.isnan(corners).all(axis=(1, 2)), [True, True, False])

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 import cv2
 import numpy as np
@@ -202,8 +202,14 @@ def windows(
     return np.concatenate([start, stop - over], axis=1)
 
 
-Found = tuple[Sequence[NDArray[np.float32]], list[int], Sequence[NDArray[np.float32]]]
-"""Corners (1, 4, 2) of what was decoded, its IDs, and corners of what was rejected."""
+Found = tuple[
+    Sequence[NDArray[np.float32]], NDArray[np.int32] | None, Sequence[NDArray[np.float32]]
+]
+"""Corners (1, 4, 2) each of n markers that were decoded; their IDs, (n,) in OpenCV 5 and (n, 1)
+in 4, None where n is 0; and corners of what was rejected."""
+
+
+Search = Callable[[NDArray[np.uint8]], Found]
 
 
 class Detector:
@@ -220,33 +226,27 @@ class Detector:
             elif value == getattr(defaults, field.name):
                 continue
             setattr(self._parameters, field.name, value)
-        self._detectors: dict[str, cv2.aruco.ArucoDetector] = {}
-        self._limits: dict[tuple[int, int], tuple[float, float]] = {}
+        self._searches: dict[tuple[str, int, int], Search] = {}
 
     def find(self, image: NDArray[np.uint8], dictionary: str, frame_side: int) -> Found:
-        """Search an image (h, w): a window of a frame whose larger side is ``frame_side``.
+        """Search an image (h, w): a window of a frame whose larger side is ``frame_side``."""
+        key = dictionary, max(image.shape), frame_side
+        return (self._searches.get(key) or self._search(*key))(image)
+
+    def _search(self, dictionary: str, side: int, frame_side: int) -> Search:
+        """Return OpenCV's search for images whose larger side is ``side``; one a size is kept.
 
         The perimeter limits, which OpenCV takes relative to the image that it is given and turns
         into whole pixels, are passed so that they come to the same number as on the frame.
         """
-        detector = self._detectors.get(dictionary)
-        if detector is None:
-            detector = cv2.aruco.ArucoDetector(opencv_dictionary(dictionary), self._parameters)
-            self._detectors[dictionary] = detector
-        side = max(image.shape)
-        limits = self._limits.get((side, frame_side)) or self._limit(side, frame_side)
-        parameters = self._parameters
-        parameters.minMarkerPerimeterRate, parameters.maxMarkerPerimeterRate = limits
-        detector.setDetectorParameters(parameters)
-        # OpenCV's stubs know neither the element types nor that 4.x returns ids as (N, 1).
-        corners, ids, rejected = cast("tuple[Any, Any, Any]", detector.detectMarkers(image))
-        return corners, [] if ids is None else ids.ravel().tolist(), rejected
-
-    def _limit(self, side: int, frame_side: int) -> tuple[float, float]:
-        """Return the perimeter limits for an image whose larger side is ``side``."""
         low, high = self._setting.minMarkerPerimeterRate, self._setting.maxMarkerPerimeterRate
         if side != frame_side:
             low = (int(low * frame_side) + 0.5) / side
             high = (int(high * frame_side) + 0.5) / side
-        self._limits[side, frame_side] = low, high
-        return low, high
+        parameters = self._parameters
+        parameters.minMarkerPerimeterRate, parameters.maxMarkerPerimeterRate = low, high
+        detector = cv2.aruco.ArucoDetector(opencv_dictionary(dictionary), parameters)
+        # OpenCV's stubs know neither the element types nor that there may be no ids.
+        search = cast("Search", detector.detectMarkers)
+        self._searches[dictionary, side, frame_side] = search
+        return search

@@ -15,8 +15,7 @@ from sweep.measure.flags import Estimate
 from sweep.model.camera import Cameras
 from sweep.model.declaration import parameter
 from sweep.model.marker import marker_corners
-from sweep.model.pose import rotation_of_vector
-from sweep.model.scene import placed
+from sweep.model.pose import placed, rotation_of_vector
 
 Floats = NDArray[np.float64]
 
@@ -258,16 +257,14 @@ def _solve_turned(
     turned = np.take_along_axis(points, order[:, :, None], axis=1)
     vectors: list[Any] = []
     both = method in (cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_IPPE_SQUARE)
-    for i in range(count):
+    for pixels, matrix in zip(turned, matrices, strict=True):
         try:
             if both:
                 found, rs, ts, _ = cv2.solvePnPGeneric(
-                    _UNIT_SQUARE, turned[i], matrices[i], None, flags=method
+                    _UNIT_SQUARE, pixels, matrix, None, flags=method
                 )
             else:
-                found, r, t = cv2.solvePnP(
-                    _UNIT_SQUARE, turned[i], matrices[i], None, flags=method
-                )
+                found, r, t = cv2.solvePnP(_UNIT_SQUARE, pixels, matrix, None, flags=method)
                 rs, ts = (r,), (t,)
         except cv2.error:
             found = False

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.compilation import compiled
 from sweep.model import lens
 from sweep.model.declaration import parameter
 
@@ -100,13 +102,7 @@ class Cameras:
 
         Points with z <= 0 have no image: NaN.
         """
-        z = points[..., 2:]
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            flat = np.where(z > 0, points[..., :2] / z, np.nan)
-        if self.distorted.any():
-            rows = np.flatnonzero(self.distorted)
-            flat[rows] = lens.distort_points(flat[rows], self.lenses[rows])
-        return np.asarray(flat * self.view[:, None, :2] + self.view[:, None, 2:])
+        return _project(np.ascontiguousarray(points), self.view, self.lenses, self.distorted)
 
     def normalise(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return undistorted normalised coordinates (N, M, 2) of pixels (N, M, 2).
@@ -118,6 +114,26 @@ class Cameras:
             rows = np.flatnonzero(self.distorted)
             flat[rows] = lens.undistort_points(flat[rows], self.lenses[rows])
         return flat
+
+
+@compiled
+def _project(
+    points: NDArray[np.float64], view: NDArray[np.float64], lenses: NDArray[np.float64],
+    distorted: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """As :meth:`Cameras.project`."""
+    pixels = np.empty((points.shape[0], points.shape[1], 2))
+    for i in range(points.shape[0]):
+        for j in range(points.shape[1]):
+            z = points[i, j, 2]
+            x, y = math.nan, math.nan
+            if z > 0:
+                x, y = points[i, j, 0] / z, points[i, j, 1] / z
+                if distorted[i]:
+                    x, y = lens.distort(x, y, lenses[i])
+            pixels[i, j, 0] = view[i, 0] * x + view[i, 2]
+            pixels[i, j, 1] = view[i, 1] * y + view[i, 3]
+    return pixels
 
 
 def canonical_distortion(coefficients: tuple[float, ...]) -> tuple[float, ...]:

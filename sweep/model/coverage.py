@@ -272,34 +272,57 @@ def sum_grey(cover: NDArray[np.float64], outside: float, grey: NDArray[np.uint8]
 
 
 @compiled
-def draw_grey(
-    image: NDArray[np.uint8],
-    window_left: int,
-    window_top: int,
-    box: NDArray[np.int64],
+def draw_greys(
+    images: NDArray[np.uint8],
+    starts: NDArray[np.int64],
+    windows: NDArray[np.int64],
+    boxes: NDArray[np.int64],
     scratch: NDArray[np.float64],
     ends: NDArray[np.float64],
     sides: NDArray[np.int64],
+    spans: NDArray[np.int64],
+    marker: NDArray[np.int64],
     levels: NDArray[np.float64],
     plane: NDArray[np.float64],
     view: NDArray[np.float64],
-    lens: NDArray[np.float64],
+    lenses: NDArray[np.float64],
     distorted: NDArray[np.bool_],
-    row: int,
+    rows: NDArray[np.int64],
 ) -> None:
-    """Draw the marker of scene ``row`` into ``image``, whose top left pixel is given.
+    """Draw scenes ``rows`` (n,) into their windows, one after another in the vector ``images``.
 
-    ``scratch`` is a vector of zeros of at least (width + 2) · height of the box (4,), left so.
-    The arrays from ``levels`` on hold all scenes: (N, 3), (N, 3, 3), (N, 4), (N, 24), (N,).
+    Parameters
+    ----------
+    images, starts
+        The pixels of all windows, and (n,) where each window's begin.
+    windows, boxes
+        (n, 4) left, top, right, bottom of the windows and of what the markers may touch.
+    scratch
+        A vector of zeros of at least (width + 2) · height of the largest box, left so.
+    ends, sides, spans, marker
+        The edges of all markers, (K, 2) where each marker's begin and end, and (N,) which
+        marker a scene has.
+    levels, plane, view, lenses, distorted
+        Of all scenes: (N, 3), (N, 3, 3), (N, 4), (N, 24), (N,); as :func:`accumulate`.
     """
-    left, top, right, bottom = box[0], box[1], box[2], box[3]
-    width, height = right - left, bottom - top
-    cover = scratch[: height * (width + 2)].reshape(height, width + 2)
-    accumulate(
-        cover, ends, sides, levels[row], plane[row], view[row], lens[row], distorted[row],
-        left, top,
-    )
-    grey = image[
-        top - window_top : bottom - window_top, left - window_left : right - window_left
-    ]
-    sum_grey(cover, levels[row, 0], grey)
+    for i in range(rows.shape[0]):
+        row = rows[i]
+        width, height = windows[i, 2] - windows[i, 0], windows[i, 3] - windows[i, 1]
+        image = images[starts[i] : starts[i] + width * height]
+        image[:] = np.uint8(levels[row, 0] + (0.5 + ROUNDING_SNAP))
+        left, top, right, bottom = boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3]
+        if left == right:
+            continue
+        cover = scratch[: (bottom - top) * (right - left + 2)].reshape(
+            bottom - top, right - left + 2
+        )
+        first, last = spans[marker[row], 0], spans[marker[row], 1]
+        accumulate(
+            cover, ends[first:last], sides[first:last], levels[row], plane[row], view[row],
+            lenses[row], distorted[row], left, top,
+        )
+        grey = image.reshape(height, width)[
+            top - windows[i, 1] : bottom - windows[i, 1],
+            left - windows[i, 0] : right - windows[i, 0],
+        ]
+        sum_grey(cover, levels[row, 0], grey)

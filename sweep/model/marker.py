@@ -123,3 +123,20 @@ def edges(dictionary: str, marker_id: int, quiet_zone_modules: float) -> Edges:
         ends += [(a, a, a, b), (b, a, b, b), (a, a, b, a), (a, b, b, b)]
         sides += [(OUTSIDE, WHITE), (WHITE, OUTSIDE), (WHITE, OUTSIDE), (OUTSIDE, WHITE)]
     return Edges(np.array(ends, dtype=np.float64), np.array(sides, dtype=np.int64))
+
+
+MarkerKey = tuple[str, int, float]
+"""Dictionary, ID and quiet zone in modules: what decides a marker's edges."""
+
+
+@lru_cache(maxsize=64)
+def edge_table(markers: tuple[MarkerKey, ...]) -> tuple[Edges, NDArray[np.int64]]:
+    """Return the edges of K markers in one table, and (K, 2) where each one's begin and end."""
+    each = [edges(*marker) for marker in markers]
+    stops = np.cumsum([len(outline.ends) for outline in each])
+    starts = np.concatenate([[0], stops[:-1]])
+    table = Edges(
+        np.concatenate([outline.ends for outline in each]),
+        np.concatenate([outline.sides for outline in each]),
+    )
+    return table, np.stack([starts, stops], axis=1).astype(np.int64)

@@ -5,12 +5,14 @@ Camera frame: x right, y down, z forward. Marker frame: x right, y up, z out tow
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.compilation import compiled
 from sweep.model.declaration import parameter
 
 Floats = NDArray[np.float64]
@@ -86,16 +88,8 @@ def rotation_of_angles(tilt: Any, azimuth: Any, roll: Any) -> Floats:
 
 def rotation_of_vector(rvec: Floats) -> Floats:
     """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3) (Rodrigues)."""
-    angle = np.linalg.norm(rvec, axis=-1)[..., None, None]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        sine = np.where(angle > 0, np.sin(angle) / angle, 1.0)
-        versine = np.where(angle > 0, 2 * np.sin(angle / 2) ** 2 / angle**2, 0.5)
-    cross = np.zeros((*rvec.shape, 3))
-    x, y, z = rvec[..., 0], rvec[..., 1], rvec[..., 2]
-    cross[..., 0, 1], cross[..., 1, 0] = -z, z
-    cross[..., 0, 2], cross[..., 2, 0] = y, -y
-    cross[..., 1, 2], cross[..., 2, 1] = -x, x
-    return np.asarray(np.eye(3) + sine * cross + versine * (cross @ cross))
+    vectors = np.ascontiguousarray(rvec, dtype=np.float64).reshape(-1, 3)
+    return _rotations(vectors).reshape(*rvec.shape, 3)
 
 
 def vector_of_rotation(rotation: Floats) -> Floats:
@@ -104,34 +98,77 @@ def vector_of_rotation(rotation: Floats) -> Floats:
     Through the unit quaternion by its largest component (Shepperd 1978) and atan2, so that
     neither angles near 0 nor near π lose digits; ``cv2.Rodrigues`` returns 0 below 1e-5 rad.
     """
-    r = rotation
-    trace = r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2]
-    scores = np.stack([r[..., 0, 0], r[..., 1, 1], r[..., 2, 2], trace], axis=-1)
-    wx = r[..., 2, 1] - r[..., 1, 2]
-    wy = r[..., 0, 2] - r[..., 2, 0]
-    wz = r[..., 1, 0] - r[..., 0, 1]
-    xy = r[..., 0, 1] + r[..., 1, 0]
-    xz = r[..., 0, 2] + r[..., 2, 0]
-    yz = r[..., 1, 2] + r[..., 2, 1]
-    # Rows: four times one quaternion component, times (x, y, z, w).
-    products = np.stack(
-        [
-            np.stack([1 + 2 * r[..., 0, 0] - trace, xy, xz, wx], axis=-1),
-            np.stack([xy, 1 + 2 * r[..., 1, 1] - trace, yz, wy], axis=-1),
-            np.stack([xz, yz, 1 + 2 * r[..., 2, 2] - trace, wz], axis=-1),
-            np.stack([wx, wy, wz, 1 + trace], axis=-1),
-        ],
-        axis=-2,
+    matrices = np.ascontiguousarray(rotation, dtype=np.float64).reshape(-1, 3, 3)
+    return _vectors(matrices).reshape(rotation.shape[:-1])
+
+
+@compiled
+def _rotations(rvec: Floats) -> Floats:
+    """As :func:`rotation_of_vector`, (N, 3) to (N, 3, 3)."""
+    rotation = np.empty((len(rvec), 3, 3))
+    for i in range(len(rvec)):
+        x, y, z = rvec[i, 0], rvec[i, 1], rvec[i, 2]
+        angle = math.sqrt(x * x + y * y + z * z)
+        sine, versine = 1.0, 0.5
+        if not angle <= 0.0:
+            half = math.sin(angle / 2) / angle
+            sine, versine = math.sin(angle) / angle, 2 * half * half
+        rotation[i, 0, 0] = 1.0 - versine * (y * y + z * z)
+        rotation[i, 1, 1] = 1.0 - versine * (x * x + z * z)
+        rotation[i, 2, 2] = 1.0 - versine * (x * x + y * y)
+        xy, xz, yz = versine * x * y, versine * x * z, versine * y * z
+        rotation[i, 0, 1], rotation[i, 1, 0] = xy - sine * z, xy + sine * z
+        rotation[i, 2, 0], rotation[i, 0, 2] = xz - sine * y, xz + sine * y
+        rotation[i, 1, 2], rotation[i, 2, 1] = yz - sine * x, yz + sine * x
+    return rotation
+
+
+@compiled
+def _vectors(rotation: Floats) -> Floats:
+    """As :func:`vector_of_rotation`, (N, 3, 3) to (N, 3)."""
+    rvec = np.empty((len(rotation), 3))
+    for i in range(len(rotation)):
+        r = rotation[i]
+        a, b, c = r[0, 0], r[1, 1], r[2, 2]
+        trace = a + b + c
+        wx, wy, wz = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+        xy, xz, yz = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
+        # Four times the largest of the quaternion's components, times (x, y, z, w).
+        if trace >= a and trace >= b and trace >= c:
+            x, y, z, w = wx, wy, wz, 1 + trace
+        elif a >= b and a >= c:
+            x, y, z, w = 1 + 2 * a - trace, xy, xz, wx
+        elif b >= c:
+            x, y, z, w = xy, 1 + 2 * b - trace, yz, wy
+        else:
+            x, y, z, w = xz, yz, 1 + 2 * c - trace, wz
+        if w < 0:
+            x, y, z, w = -x, -y, -z, -w
+        length = math.sqrt(x * x + y * y + z * z)
+        scale = 2 * math.atan2(length, w) / length if length != 0.0 else 0.0
+        rvec[i, 0], rvec[i, 1], rvec[i, 2] = x * scale, y * scale, z * scale
+    return rvec
+
+
+def placed(points: Floats, rotation: Floats, translation: Floats) -> Floats:
+    """Return marker-frame points (N, M, 3) moved to the camera frame by poses (N, 3, 3), (N, 3)."""
+    return _placed(
+        np.ascontiguousarray(points), np.ascontiguousarray(rotation),
+        np.ascontiguousarray(translation),
     )
-    largest = np.argmax(np.nan_to_num(scores, nan=-9.0), axis=-1)
-    quaternion = np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
-    quaternion = np.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
-    axis, w = quaternion[..., :3], quaternion[..., 3]
-    length = np.linalg.norm(axis, axis=-1)
-    half = np.arctan2(length, w)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        scale = np.where(length > 0, 2 * half / length, 0.0)
-    return np.asarray(axis * scale[..., None])
+
+
+@compiled
+def _placed(points: Floats, rotation: Floats, translation: Floats) -> Floats:
+    moved = np.empty_like(points)
+    for i in range(points.shape[0]):
+        for j in range(points.shape[1]):
+            x, y, z = points[i, j, 0], points[i, j, 1], points[i, j, 2]
+            for k in range(3):
+                moved[i, j, k] = (
+                    rotation[i, k, 0] * x + rotation[i, k, 1] * y + rotation[i, k, 2] * z
+                ) + translation[i, k]
+    return moved
 
 
 def angle_between(a: Floats, b: Floats) -> Floats:

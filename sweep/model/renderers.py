@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model import coverage
-from sweep.model.marker import edges, modules
+from sweep.model.marker import edge_table, edges, modules
 from sweep.model.scene import WARP_PX_PER_MODULE, Scenes
 from sweep.model.supersampling import supersample
 
@@ -52,11 +53,35 @@ def quantise(levels: NDArray[np.float64]) -> Grey:
 
 
 def render(scenes: Scenes, row: int, marker_box: NDArray[np.int64], window: Box) -> Grey:
-    """Return the image of a scene in ``window``, quantised once.
+    """Return the image of one scene; as :func:`render_all`."""
+    return render_all(scenes, np.array([row]), marker_box[None], np.array([window]))[0]
 
-    ``marker_box`` (4,) holds all pixels that the marker may touch; the renderer sees only it, so
-    that the image does not depend on the window. ValueError where the window does not hold it.
+
+def render_all(
+    scenes: Scenes, rows: NDArray[np.intp], boxes: NDArray[np.int64], windows: NDArray[np.int64]
+) -> list[Grey]:
+    """Return the images of scenes ``rows`` (n,) in their ``windows`` (n, 4), quantised once.
+
+    ``boxes`` (n, 4) hold all pixels that the markers may touch; the renderer sees only them, so
+    that no image depends on its window. ValueError where a window does not hold its box.
     """
+    lost = ((boxes[:, :2] < windows[:, :2]) | (boxes[:, 2:] > windows[:, 2:])).any(axis=1)
+    lost &= boxes[:, 2] > boxes[:, 0]
+    if lost.any():
+        window, box = windows[lost][0].tolist(), boxes[lost][0].tolist()
+        raise ValueError(f"window {window} does not hold the marker's box {box}")
+    plain = scenes.plain[rows]
+    if plain.all():
+        return _draw(scenes, rows, boxes, windows)
+    return [
+        _draw(scenes, rows[i : i + 1], boxes[i : i + 1], windows[i : i + 1])[0] if plain[i]
+        else _compose(scenes, int(rows[i]), boxes[i].tolist(), windows[i].tolist())
+        for i in range(len(rows))
+    ]
+
+
+def _compose(scenes: Scenes, row: int, box: Sequence[int], window: Sequence[int]) -> Grey:
+    """Return the image of a scene that is not drawn by :func:`_draw`: any renderer, any ground."""
     left, top, right, bottom = window
     background = scenes.background[row]
     on_image = isinstance(background, str)
@@ -65,29 +90,40 @@ def render(scenes: Scenes, row: int, marker_box: NDArray[np.int64], window: Box)
     else:
         image = np.empty((bottom - top, right - left), dtype=np.uint8)
         image.fill(int(background + (0.5 + coverage.ROUNDING_SNAP)))
-    x0, y0, x1, y1 = marker_box.tolist()
+    x0, y0, x1, y1 = box
     if x1 == x0:
         return image
-    if x0 < left or y0 < top or x1 > right or y1 > bottom:
-        raise ValueError(f"window {window} does not hold the marker's box {(x0, y0, x1, y1)}")
-    renderer = scenes.renderer[row]
-    if renderer == "exact" and not on_image:
-        outlines = edges(scenes.dictionary[row], scenes.marker_id[row], scenes.quiet_zone[row])
-        cameras = scenes.cameras
-        coverage.draw_grey(
-            image, left, top, marker_box, _scratch((x1 - x0 + 2) * (y1 - y0)), outlines.ends,
-            outlines.sides, scenes.levels, scenes.plane, cameras.view, cameras.lenses,
-            cameras.distorted, row,
-        )
-        return image
     view = image[y0 - top : y1 - top, x0 - left : x1 - left]
-    if renderer == "warp" and not on_image:
+    if scenes.renderer[row] == "warp" and not on_image:
         _warp_grey(scenes, row, (x0, y0, x1, y1), view)
     else:
         mean, share = marker_levels(scenes, row, (x0, y0, x1, y1))
         behind = view.astype(np.float64) if on_image else scenes.levels[row, 0]
         view[:] = quantise(mean + (1.0 - share) * behind)
     return image
+
+
+def _draw(
+    scenes: Scenes, rows: NDArray[np.intp], boxes: NDArray[np.int64], windows: NDArray[np.int64]
+) -> list[Grey]:
+    """Return the exact images on a plain background, all in one call: the common, fast case."""
+    size = windows[:, 2:] - windows[:, :2]
+    stops = np.cumsum(size[:, 0] * size[:, 1])
+    starts = stops - size[:, 0] * size[:, 1]
+    images = np.empty(stops[-1], dtype=np.uint8)
+    box = boxes[:, 2:] - boxes[:, :2]
+    scratch = _scratch(int(((box[:, 0] + 2) * box[:, 1]).max()))
+    table, spans = edge_table(scenes.markers)
+    cameras = scenes.cameras
+    coverage.draw_greys(
+        images, starts, windows, boxes, scratch, table.ends, table.sides, spans, scenes.marker,
+        scenes.levels, scenes.plane, cameras.view, cameras.lenses, cameras.distorted, rows,
+    )
+    heights = size[:, 1].tolist()
+    return [
+        images[start:stop].reshape(height, -1)
+        for start, stop, height in zip(starts.tolist(), stops.tolist(), heights, strict=True)
+    ]
 
 
 _local = threading.local()
@@ -135,7 +171,7 @@ def _cover(
 ) -> NDArray[np.float64]:
     """Return the accumulated edges of a scene's marker, (height, width + 2) of ``box``."""
     cover = np.zeros((box[3] - box[1], box[2] - box[0] + 2))
-    outlines = edges(scenes.dictionary[row], scenes.marker_id[row], scenes.quiet_zone[row])
+    outlines = edges(scenes.dictionary[row], scenes.marker_id[row], float(scenes.quiet_zone[row]))
     coverage.accumulate(
         cover, outlines.ends, outlines.sides, levels, scenes.plane[row], scenes.cameras.view[row],
         scenes.cameras.lenses[row], bool(scenes.cameras.distorted[row]), box[0], box[1],
@@ -184,7 +220,7 @@ def _warp_grey(scenes: Scenes, row: int, box: Box, view: Grey) -> None:
     """Take the paper's steps 5-8: only the corners are projected, and OpenCV warps the bitmap."""
     background, black, white = scenes.levels[row].tolist()
     bitmap, corners = _grey_bitmap(
-        scenes.dictionary[row], scenes.marker_id[row], scenes.quiet_zone[row], black, white
+        scenes.dictionary[row], scenes.marker_id[row], float(scenes.quiet_zone[row]), black, white
     )
     transform = _perspective(scenes, row, box, corners)
     size = (box[2] - box[0], box[3] - box[1])

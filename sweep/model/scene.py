@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -13,10 +14,11 @@ from numpy.typing import NDArray
 from sweep.model import lens as lens_model
 from sweep.model.camera import VIEW_PARAMETERS, Cameras, intrinsics
 from sweep.model.declaration import parameter
-from sweep.model.marker import marker_corners, module_count
-from sweep.model.pose import rotation_of_angles
+from sweep.model.marker import MarkerKey, marker_corners, module_count
+from sweep.model.pose import placed, rotation_of_angles
 
 Floats = NDArray[np.float64]
+Key = TypeVar("Key")
 
 WARP_PX_PER_MODULE = 10
 """Resolution of the bitmap that the ``warp`` renderer maps (the paper's)."""
@@ -59,7 +61,11 @@ class Scenes:
     frame
         (N, 2) width and height in pixels.
     dictionary, marker_id, quiet_zone, renderer, background
-        One value a scene; the quiet zone is 0 where the background has its level.
+        One value for each scene; the quiet zone is 0 where the background has its level.
+    markers, marker
+        The distinct markers (dictionary, ID, quiet zone), and (N,) which one a scene has.
+    modules
+        (N,) modules along the black square's side.
     size_m
         (N,) side of the black square.
     rotation, translation
@@ -68,6 +74,8 @@ class Scenes:
         (N, 3, 3) takes module coordinates (column, row, 1) to the camera frame.
     levels
         (N, 3) grey levels of the background (0 where it is an image), black and white.
+    plain
+        (N,) whether the image is an exact one on a background of one level.
     corners_px, outline_px
         (N, 4, 2) images of the black square's and of the quiet zone's corners; NaN at z <= 0.
     """
@@ -76,7 +84,10 @@ class Scenes:
     frame: NDArray[np.int64]
     dictionary: Sequence[str]
     marker_id: Sequence[int]
-    quiet_zone: Sequence[float]
+    quiet_zone: Floats
+    markers: tuple[MarkerKey, ...]
+    marker: NDArray[np.int64]
+    modules: Floats
     size_m: Floats
     rotation: Floats
     translation: Floats
@@ -86,6 +97,7 @@ class Scenes:
     outline_px: Floats
     renderer: Sequence[str]
     background: Sequence[float | str]
+    plain: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -101,9 +113,16 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
         column = np.asarray(values[name], dtype=np.float64)
         return np.ascontiguousarray(np.broadcast_to(column, (count,)))
 
-    def column(name: str) -> list[Any]:
-        value = values[name]
-        return list(value) if isinstance(value, (list, np.ndarray)) else [value] * count
+    def mapped(function: Callable[..., Any], *names: str) -> list[Any]:
+        """Return a function of some values for each scene, called once where all are the same."""
+        given = [values[name] for name in names]
+        if not any(isinstance(value, (list, np.ndarray)) for value in given):
+            return [function(*given)] * count
+        each = [
+            value if isinstance(value, (list, np.ndarray)) else itertools.repeat(value)
+            for value in given
+        ]
+        return [function(*row) for row in itertools.islice(zip(*each, strict=False), count)]
 
     fx, fy, cx, cy = (
         np.broadcast_to(np.asarray(number, dtype=np.float64), (count,))
@@ -111,12 +130,11 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
             *(None if values[name] is None else numbers(name) for name in VIEW_PARAMETERS)
         )
     )
-    distortions = column("distortion")
+    lenses, lens = distinct(mapped(tuple, "distortion"))
     cameras = Cameras(
         np.stack([fx, fy, cx, cy], axis=1),
-        np.stack([lens_model.pack(coefficients) for coefficients in distortions])
-        if count else np.empty((0, lens_model.PACKED)),
-        np.array([len(coefficients) > 0 for coefficients in distortions], dtype=bool),
+        np.array([lens_model.pack(coefficients) for coefficients in lenses])[lens],
+        np.array([len(coefficients) > 0 for coefficients in lenses], dtype=bool)[lens],
     )
 
     # Step 4: the pose.
@@ -135,15 +153,16 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
 
     # Steps 2, 3, 5, 6: the corners, moved by the pose and projected.
     size = numbers("size_m")
-    dictionaries, background = column("dictionary"), column("background")
     # A quiet zone on a background of its own level cannot be seen: it is not modelled.
-    white = numbers("white").tolist()
-    quiet = [
-        0.0 if background[k] == white[k] else width
-        for k, width in enumerate(column("quiet_zone_modules"))
-    ]
-    count_of = {name: module_count(name) for name in set(dictionaries)}
-    modules = np.array([count_of[name] for name in dictionaries], dtype=np.float64)
+    keys = mapped(
+        lambda dictionary, marker_id, width, white, background: (
+            dictionary, int(marker_id), 0.0 if background == white else float(width)
+        ),
+        "dictionary", "marker_id", "quiet_zone_modules", "white", "background",
+    )
+    markers, marker = distinct(keys)
+    modules = np.array([module_count(key[0]) for key in markers], dtype=np.float64)[marker]
+    quiet = np.array([key[2] for key in markers])[marker]
     half, module = size / 2, size / modules
     plane = np.empty((count, 3, 3))
     plane[:, :, 0] = rotation[:, :, 0] * module[:, None]
@@ -151,7 +170,7 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
     plane[:, :, 2] = (
         translation - (rotation[:, :, 0] - rotation[:, :, 1]) * half[:, None]
     )
-    outline_size = size * (1 + 2 * np.asarray(quiet, dtype=np.float64) / modules)
+    outline_size = size * (1 + 2 * quiet / modules)
     corners_px, outline_px = (
         cameras.project(placed(marker_corners(side), rotation, translation))
         for side in (size, outline_size)
@@ -159,7 +178,7 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
 
     levels = np.stack(
         [
-            np.array([0.0 if isinstance(b, str) else float(b) for b in background]),
+            np.array(mapped(lambda b: 0.0 if isinstance(b, str) else float(b), "background")),
             numbers("black"),
             numbers("white"),
         ],
@@ -168,9 +187,12 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
     return Scenes(
         cameras=cameras,
         frame=np.stack([numbers("width_px"), numbers("height_px")], axis=1).astype(np.int64),
-        dictionary=dictionaries,
-        marker_id=[int(marker_id) for marker_id in column("marker_id")],
-        quiet_zone=[float(width) for width in quiet],
+        dictionary=[key[0] for key in keys],
+        marker_id=[key[1] for key in keys],
+        quiet_zone=quiet,
+        markers=markers,
+        marker=marker,
+        modules=modules,
         size_m=size,
         rotation=rotation,
         translation=translation,
@@ -178,20 +200,26 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
         levels=levels,
         corners_px=corners_px,
         outline_px=outline_px,
-        renderer=column("renderer"),
-        background=background,
+        renderer=mapped(str, "renderer"),
+        background=mapped(lambda level: level, "background"),
+        plain=np.array(
+            mapped(lambda name, level: name == "exact" and not isinstance(level, str),
+                   "renderer", "background"), dtype=bool,
+        ),
     )
 
 
-def placed(points: Floats, rotation: Floats, translation: Floats) -> Floats:
-    """Return marker-frame points (N, M, 3) moved to the camera frame."""
-    return np.asarray(points @ np.swapaxes(rotation, -1, -2) + translation[..., None, :])
+def distinct(keys: Sequence[Key]) -> tuple[tuple[Key, ...], NDArray[np.int64]]:
+    """Return the distinct ones of N keys in order of appearance, and (N,) which one each is."""
+    number: dict[Key, int] = {}
+    index = [number.setdefault(key, len(number)) for key in keys]
+    return tuple(number), np.array(index, dtype=np.int64)
 
 
 def _outline(scenes: Scenes, rows: NDArray[np.intp], quiet: bool, per_side: int) -> Floats:
     """Return points (n, 4 · per_side, 2) along the images of the outline or the black square."""
-    modules = np.array([float(module_count(scenes.dictionary[row])) for row in rows.tolist()])
-    margin = np.array([scenes.quiet_zone[row] if quiet else 0.0 for row in rows.tolist()])
+    modules = scenes.modules[rows]
+    margin = scenes.quiet_zone[rows] if quiet else np.zeros(len(rows))
     low, high = -margin[:, None], (modules + margin)[:, None]
     t = np.arange(per_side) / per_side
     ahead, back = low + t * (high - low), high - t * (high - low)
@@ -244,7 +272,7 @@ def _warp_extent(scenes: Scenes, rows: NDArray[np.intp]) -> tuple[Floats, Floats
         corners = scenes.corners_px[row]
         if not np.isfinite(corners).all():
             continue
-        n = module_count(scenes.dictionary[row])
+        n = scenes.modules[row]
         margin = scenes.quiet_zone[row] + 0.5 / WARP_PX_PER_MODULE
         square = np.array([[0, 0], [n, 0], [n, n], [0, n]], dtype=np.float32)
         transform = cv2.getPerspectiveTransform(square, corners.astype(np.float32))
@@ -327,9 +355,8 @@ def not_modelled(scenes: Scenes) -> NDArray[np.bool_]:
     folded = np.zeros(len(scenes), dtype=bool)
     rows = np.flatnonzero(scenes.cameras.distorted & np.isfinite(scenes.outline_px).all((1, 2)))
     if len(rows):
-        modules = np.array([module_count(scenes.dictionary[row]) for row in rows.tolist()])
-        quiet = np.array([scenes.quiet_zone[row] for row in rows.tolist()])
-        outline = marker_corners(scenes.size_m[rows] * (1 + 2 * quiet / modules))
+        widened = 1 + 2 * scenes.quiet_zone[rows] / scenes.modules[rows]
+        outline = marker_corners(scenes.size_m[rows] * widened)
         points = placed(outline, scenes.rotation[rows], scenes.translation[rows])
         folded[rows] = lens_model.folds(
             np.ascontiguousarray(points[..., :2] / points[..., 2:]),

@@ -1,0 +1,140 @@
+"""Mean and variance of values that arrive in chunks, accurate to the last digits of a double.
+
+The values themselves are taken as exact: at an offset of 1e9 doubles are 1.2e-7 apart, and what
+is meant is the variance of the doubles that are there.
+
+Chan, Golub and LeVeque, "Updating formulae and a pairwise algorithm for computing sample
+variances", Stanford STAN-CS-79-773, 1979, and "Algorithms for computing the sample variance:
+analysis and recommendations", The American Statistician 37(3), 1983.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.lib.array_utils import normalize_axis_tuple
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moments:
+    """Count, mean and sum of squared deviations of many series at once.
+
+    All arrays have one shape, an element a series; ``mean`` and ``m2`` are in the unit of the
+    values and its square. Arithmetic overflow never warns, it shows in the result:
+
+    - No value: count 0, mean NaN, m2 0, variance NaN.
+    - An infinite value: the mean is that infinity (NaN if both signs occur), m2 NaN.
+    - Deviations above about 1e154 (their squares overflow): m2 infinite, the mean is right.
+      A sum of values above 1.8e308: mean and m2 are not finite.
+    - Deviations below about 1e-154 (their squares are denormal) lose digits of m2; below 1e-162
+      it is 0. The mean is right.
+
+    Raises ``ValueError`` if the shapes differ.
+
+    >>> both = merged(Moments.of([1.0, 2.0], axis=0), Moments.of([6.0, np.nan], axis=0))
+    >>> int(both.count), float(both.mean), float(both.variance)
+    (3, 3.0, 7.0)
+    """
+
+    count: Integers  # values that are not NaN
+    mean: Floats  # the double nearest to the mean
+    mean_tail: Floats  # what the rounding of the mean left over: mean + mean_tail is the mean
+    m2: Floats  # sum of the squared deviations from the mean
+
+    def __post_init__(self) -> None:
+        for name, dtype in (("count", np.int64), ("mean", np.float64),
+                            ("mean_tail", np.float64), ("m2", np.float64)):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=dtype))
+        shapes = {array.shape for array in (self.count, self.mean, self.mean_tail, self.m2)}
+        if len(shapes) > 1:
+            raise ValueError(f"count, mean, mean_tail and m2 must have one shape, not {shapes}")
+
+    @classmethod
+    def of(cls, values: ArrayLike, axis: int | tuple[int, ...] | None = None) -> Self:
+        """Return the moments of ``values`` over ``axis`` (all axes by default), without the NaN.
+
+        The corrected two-pass algorithm of Chan, Golub and LeVeque (1983), with the correction
+        taken from each deviation instead of from their sum of squares: so m2 is never negative,
+        and exactly 0 for equal values. Raises ``AxisError``, a
+        ``ValueError``, for an axis that is not there.
+        """
+        values = np.asarray(values, dtype=np.float64)
+        over = normalize_axis_tuple(range(values.ndim) if axis is None else axis, values.ndim)
+        kept = [dimension for dimension in range(values.ndim) if dimension not in over]
+        size = math.prod(values.shape[dimension] for dimension in over)
+        rows = values.transpose(*kept, *over)
+        # NumPy sums pairwise along the last axis in memory only: the error then grows with log n.
+        rows = np.ascontiguousarray(rows.reshape(*rows.shape[: len(kept)], size))
+        present = ~np.isnan(rows)
+        count = present.sum(axis=-1)
+        with np.errstate(all="ignore"):
+            n = np.maximum(count, 1)
+            centre = np.where(present, rows, 0.0).sum(axis=-1) / n
+            deviations = np.where(present, rows - centre[..., None], 0.0)
+            correction = deviations.sum(axis=-1) / n
+            deviations = np.where(present, deviations - correction[..., None], 0.0)
+            m2 = (deviations * deviations).sum(axis=-1)
+            mean, tail = _two_sum(centre, np.where(np.isfinite(centre), correction, 0.0))
+        empty = count == 0
+        return cls(count, np.where(empty, np.nan, mean), np.where(empty, 0.0, tail), m2)
+
+    @property
+    def variance(self) -> Floats:
+        """Unbiased variance (ddof = 1); NaN where there are fewer than two values."""
+        degrees = np.where(self.count < 2, np.nan, self.count - 1.0)
+        return np.asarray(self.m2 / degrees)
+
+    @property
+    def standard_deviation(self) -> Floats:
+        """Square root of ``variance``, in the unit of the values."""
+        return np.asarray(np.sqrt(self.variance))
+
+    @property
+    def standard_error(self) -> Floats:
+        """Standard deviation of the mean of independent values."""
+        return np.asarray(np.sqrt(self.variance / np.maximum(self.count, 1)))
+
+
+def merged(a: Moments, b: Moments) -> Moments:
+    """Return the moments of the values of ``a`` and ``b`` together; both of one shape.
+
+    The pairwise formula of Chan, Golub and LeVeque (1979, 1983). Theirs sees the means rounded to
+    doubles, which can cost the whole variance at an offset of 1e9 and a spread of 1e-3; here the
+    mean keeps its tail. Empty moments change nothing. NaN and infinity as in `Moments`. Raises
+    ``ValueError`` if the shapes differ.
+    """
+    if a.mean.shape != b.mean.shape:
+        raise ValueError(f"merge moments of one shape, not of {a.mean.shape} and {b.mean.shape}")
+    swapped = b.count > a.count
+
+    def larger_and_smaller(of_a: Any, of_b: Any) -> tuple[Any, Any]:
+        return np.where(swapped, of_b, of_a), np.where(swapped, of_a, of_b)
+
+    larger, smaller = larger_and_smaller(a.count, b.count)
+    mean, other_mean = larger_and_smaller(a.mean, b.mean)
+    tail, other_tail = larger_and_smaller(a.mean_tail, b.mean_tail)
+    with np.errstate(all="ignore"):
+        share = smaller / np.maximum(larger + smaller, 1)
+        gap = np.where(smaller == 0, 0.0, (other_mean - mean) + (other_tail - tail))
+        total, rest = _two_sum(mean, gap * share)
+        total, rest = _two_sum(total, rest + tail)
+        # A gap that is not finite: of infinite means, or of means above 9e307.
+        weighted = mean * (1.0 - share) + other_mean * share
+        total = np.where(np.isfinite(gap), total, weighted)
+        m2 = a.m2 + b.m2 + gap * (gap * share) * larger
+    return Moments(larger + smaller, total, rest, m2)
+
+
+def _two_sum(a: Any, b: Any) -> tuple[Any, Any]:
+    """Return a + b rounded and the rounding's error, exactly (Knuth 1969); 0 if not finite."""
+    total = a + b
+    of_b = total - a
+    error = (a - (total - of_b)) + (b - of_b)
+    return total, np.where(np.isfinite(total), error, 0.0)

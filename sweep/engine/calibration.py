@@ -71,12 +71,14 @@ def calibrate(pipeline: Pipeline, budget_s: float) -> Calibration:
     started = time.perf_counter()
     while True:
         indices = _sample(axes, generator, BATCH)
-        begun = time.perf_counter()
+        begun, working = time.perf_counter(), time.thread_time()
         result = run_cells(pipeline, indices)
-        spent = time.perf_counter() - begun
+        # This thread's own time: the workers' processes come up meanwhile, and use the processors.
+        spent = time.thread_time() - working
+        own = result.row_seconds * (spent / (time.perf_counter() - begun))
         # What is not counted by scene (solving, projecting) is spread evenly over the batch.
-        count = len(result.row_seconds)
-        rows.append(result.row_seconds + (spent - result.row_seconds.sum()) / count)
+        count = len(own)
+        rows.append(own + (spent - own.sum()) / count)
         picks.append(indices)
         batch_s.append(spent / count)
         used = time.perf_counter() - started

@@ -18,9 +18,10 @@ from sweep.kernel import (
 )
 from sweep.measure.detector import Detector
 from sweep.measure.flags import Detection, Estimate
+from sweep.model.extent import marker_boxes
 from sweep.model.pose import placed, rotation_of_vector
 from sweep.model.renderers import render
-from sweep.model.scene import build_scenes, marker_boxes
+from sweep.model.scene import build_scenes
 from sweep.plan.grid import detector_settings, estimators, scene_values
 from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline

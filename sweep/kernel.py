@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from sweep.measure.accuracy import pose_error, rotation_difference
 from sweep.measure.detector import (
+    NOISE_MARGIN_PX,
     Detector,
     DetectorSetting,
     Found,
@@ -33,18 +34,17 @@ from sweep.measure.finding import classify
 from sweep.measure.flags import Detection, Estimate, Flipped
 from sweep.measure.solver import Estimates, Estimator, estimate
 from sweep.model.camera import Cameras
-from sweep.model.lens import pack
-from sweep.model.pose import vector_of_rotation
-from sweep.model.renderers import Grey, render_all
-from sweep.model.scene import (
-    Scenes,
+from sweep.model.extent import (
     areas_px,
-    build_scenes,
     hidden,
     marker_boxes,
     not_modelled,
     outside_frame,
 )
+from sweep.model.lens import pack
+from sweep.model.pose import vector_of_rotation
+from sweep.model.renderers import Grey, render_all
+from sweep.model.scene import Scenes, build_scenes
 from sweep.plan.grid import Block, block_indices, detector_settings, estimators, scene_values
 from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline
@@ -201,7 +201,8 @@ def search_windows(
     scenes: Scenes, boxes: NDArray[np.int64], setting: DetectorSetting, full: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
     """Return the windows (N, 4) that a setting searches: a function of scene and setting alone."""
-    cut = windows(boxes, scenes.frame, margin_px(setting))
+    margin = margin_px(setting) + NOISE_MARGIN_PX * scenes.noisy[:, None].astype(np.int64)
+    cut = windows(boxes, scenes.frame, margin)
     whole = full | (full_frame_reason(setting) is not None)
     frame = np.concatenate([np.zeros_like(scenes.frame), scenes.frame], axis=1)
     return np.where(whole[:, None], frame, cut)

@@ -21,9 +21,10 @@ from sweep.measure.detector import (
     windows,
 )
 from sweep.measure.flags import Detection
+from sweep.model.extent import marker_boxes
 from sweep.model.marker import dictionary_names, marker_count, module_count
 from sweep.model.renderers import render
-from sweep.model.scene import build_scenes, marker_boxes
+from sweep.model.scene import build_scenes
 from sweep.plan.grid import Block, block_indices, detector_settings, scene_axes, scene_values
 from sweep.plan.pipeline import Pipeline
 
@@ -220,7 +221,7 @@ def test_windows_hold_the_box_and_its_margin_and_stay_in_the_frame(count):
     @given(boxes_in_frames(), st.integers(0, 100))
     def check(scene, margin):
         (box,), (frame,) = scene
-        (window,) = windows(box[None], frame[None], margin)
+        (window,) = windows(box[None], frame[None], np.array([[margin]]))
         start, stop = window[:2], window[2:]
         assert (start >= 0).all()
         assert (stop <= frame).all()

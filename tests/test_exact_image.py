@@ -13,7 +13,8 @@ from sweep.model.camera import Camera
 from sweep.model.marker import Marker
 from sweep.model.pose import Pose
 from sweep.model.renderers import marker_levels, render
-from sweep.model.scene import Scene, build_scenes, marker_boxes
+from sweep.model.extent import marker_boxes
+from sweep.model.scene import Scene, build_scenes
 
 DEFAULTS = {"shift_u_px": 0.0, "shift_v_px": 0.0} | {
     field.name: field.default

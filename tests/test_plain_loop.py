@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from sweep.kernel import run_block
 from sweep.model.renderers import render
-from sweep.model.scene import build_scenes, marker_boxes
+from sweep.model.extent import marker_boxes
+from sweep.model.scene import build_scenes
 from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
 from sweep.plan.pipeline import Pipeline
 

@@ -20,7 +20,8 @@ from sweep.model.pose import (
     rotation_of_vector,
     vector_of_rotation,
 )
-from sweep.model.scene import Scene, areas_px, build_scenes
+from sweep.model.extent import areas_px
+from sweep.model.scene import Scene, build_scenes
 
 DEFAULTS = {"shift_u_px": 0.0, "shift_v_px": 0.0} | {
     field.name: field.default

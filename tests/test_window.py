@@ -11,7 +11,8 @@ from sweep.measure.detector import REFINEMENTS, DetectorSetting, full_frame_reas
 from sweep.measure.flags import Detection
 from sweep.model.marker import opencv_dictionary
 from sweep.model.renderers import render
-from sweep.model.scene import build_scenes, marker_boxes
+from sweep.model.extent import marker_boxes
+from sweep.model.scene import build_scenes
 from sweep.plan.grid import Block, detector_settings, scene_axes, scene_values
 from sweep.plan.pipeline import Pipeline
 

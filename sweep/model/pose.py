@@ -173,26 +173,19 @@ def _placed(points: Floats, rotation: Floats, translation: Floats) -> Floats:
 
 def angle_between(a: Floats, b: Floats) -> Floats:
     """Return the angle (...,) in radians between vectors (..., 3), by atan2, never acos."""
-    return np.asarray(
-        np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))
-    )
+    cosine = np.sum(a * b, axis=-1)
+    # a x b = a x (b - a), whose digits do not cancel where the vectors are alike.
+    other = np.where(cosine[..., None] > 0, b - a, b)
+    return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, other), axis=-1), cosine))
 
 
 def mirrored(rotation: Floats, translation: Floats) -> Floats:
     """Return the rotations (N, 3, 3) of the second planar solution of exact corners.
 
-    With Q the smallest rotation that takes the z axis to the line of sight, the first-order
-    image of the marker's centre fixes Qᵀ·R up to the sign of its third row's and column's
-    off-diagonal entries (Collins and Bartoli, "Infinitesimal plane-based pose estimation", 2014,
-    section 3), so the other solution is Q·S·Qᵀ·R·S with S = diag(1, 1, -1).
+    The first-order image of the marker's centre fixes the pose up to the sign of its tilt against
+    the line of sight s (Collins and Bartoli, "Infinitesimal plane-based pose estimation", 2014,
+    section 3): the other solution is (1 - 2 s sᵀ) · R · diag(1, 1, -1).
     """
     sight = translation / np.linalg.norm(translation, axis=-1, keepdims=True)
-    x, y, z = sight[:, 0], sight[:, 1], sight[:, 2]
-    q = np.empty_like(rotation)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        k = 1 / (1 + z)
-        q[:, 0, 0], q[:, 0, 1], q[:, 0, 2] = 1 - k * x * x, -k * x * y, x
-        q[:, 1, 0], q[:, 1, 1], q[:, 1, 2] = -k * x * y, 1 - k * y * y, y
-        q[:, 2, 0], q[:, 2, 1], q[:, 2, 2] = -x, -y, z
-        sign = np.array([1.0, 1.0, -1.0])
-        return np.asarray((q * sign) @ np.swapaxes(q, 1, 2) @ rotation * sign)
+    swapped = rotation * np.array([1.0, 1.0, -1.0])
+    return np.asarray(swapped - 2 * sight[:, :, None] * (sight[:, None, :] @ swapped))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import threading
 from collections.abc import Sequence
@@ -13,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model import coverage
+from sweep.model.exposure import marker_exposure
+from sweep.model.extent import WARP_PX_PER_MODULE
 from sweep.model.marker import edge_table, edges, modules
-from sweep.model.scene import WARP_PX_PER_MODULE, Scenes
+from sweep.model.scene import Box, Scenes
+from sweep.model.sensor import illuminate, read_out
 from sweep.model.supersampling import supersample
 
 Grey = NDArray[np.uint8]
-Box = tuple[int, int, int, int]
-"""Left, top, right, bottom in pixels of the frame; half-open."""
 
 SUPERSAMPLE = re.compile(r"supersample-([1-9][0-9]{0,2})(-jittered)?")
 
@@ -83,23 +85,63 @@ def render_all(
 def _compose(scenes: Scenes, row: int, box: Sequence[int], window: Sequence[int]) -> Grey:
     """Return the image of a scene that is not drawn by :func:`_draw`: any renderer, any ground."""
     left, top, right, bottom = window
+    x0, y0, x1, y1 = box
+    inner = np.s_[y0 - top : y1 - top, x0 - left : x1 - left]
     background = scenes.background[row]
-    on_image = isinstance(background, str)
     if isinstance(background, str):
         image = background_image(background)[top:bottom, left:right].copy()
     else:
-        image = np.empty((bottom - top, right - left), dtype=np.uint8)
-        image.fill(int(background + (0.5 + coverage.ROUNDING_SNAP)))
-    x0, y0, x1, y1 = box
-    if x1 == x0:
-        return image
-    view = image[y0 - top : y1 - top, x0 - left : x1 - left]
-    if scenes.renderer[row] == "warp" and not on_image:
-        _warp_grey(scenes, row, (x0, y0, x1, y1), view)
+        image = np.full((bottom - top, right - left), quantise(np.array(background)))
+    if scenes.affected[row]:
+        behind = image if isinstance(background, str) else float(background)
+        levels = np.empty(image.shape)
+        levels[:] = behind
+        if x1 > x0:
+            levels[inner] = _exposed(scenes, row, (x0, y0, x1, y1), levels[inner])
+        return _sensed(scenes, row, levels, left, top)
+    if x1 > x0:
+        if scenes.renderer[row] == "warp" and not isinstance(background, str):
+            _warp_grey(scenes, row, (x0, y0, x1, y1), image[inner])
+        else:
+            mean, share = marker_levels(scenes, row, (x0, y0, x1, y1))
+            behind = image[inner] if isinstance(background, str) else background
+            image[inner] = quantise(mean + (1.0 - share) * behind)
+    return image
+
+
+def _exposed(
+    scenes: Scenes, row: int, box: Box, behind: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the levels of ``box`` in front of those ``behind`` (both (h, w)), with the effects."""
+    if scenes.renderer[row] != "exact":
+        mean, share = marker_levels(scenes, row, box)
     else:
-        mean, share = marker_levels(scenes, row, (x0, y0, x1, y1))
-        behind = view.astype(np.float64) if on_image else scenes.levels[row, 0]
-        view[:] = quantise(mean + (1.0 - share) * behind)
+        _, black, white = scenes.levels[row].tolist()
+        sheet = scenes.effect(row)["occluder"]
+        if not isinstance(scenes.background[row], str):
+            areas = np.array([scenes.levels[row, 0], black, white, sheet])
+            return marker_exposure(scenes, row, box, areas)
+        mean = marker_exposure(scenes, row, box, np.array([0.0, black, white, sheet]))
+        share = marker_exposure(scenes, row, box, np.array([0.0, 1.0, 1.0, 1.0]))
+    return np.asarray(mean + (1.0 - share) * behind)
+
+
+def _sensed(scenes: Scenes, row: int, levels: NDArray[np.float64], left: int, top: int) -> Grey:
+    """Return what the sensor makes of levels (h, w), whose top left pixel is given."""
+    effect = scenes.effect(row)
+    width, height = scenes.frame[row].tolist()
+    slope = effect["illumination_gradient"] / width
+    if slope != 0 or effect["vignetting"] > 0:
+        turn = math.radians(effect["illumination_deg"])
+        illuminate(
+            levels, left, top, slope * math.cos(turn), slope * math.sin(turn), (width - 1) / 2,
+            (height - 1) / 2, scenes.cameras.view[row], effect["vignetting"],
+        )
+    image = np.empty(levels.shape, dtype=np.uint8)
+    read_out(
+        levels, left, top, scenes.noise_key[row], effect["full_well_e"], effect["read_noise_e"],
+        effect["gain"], effect["noise_grey"], int(effect["bit_depth"]), image,
+    )
     return image
 
 
@@ -174,7 +216,7 @@ def _cover(
     outlines = edges(scenes.dictionary[row], scenes.marker_id[row], float(scenes.quiet_zone[row]))
     coverage.accumulate(
         cover, outlines.ends, outlines.sides, levels, scenes.plane[row], scenes.cameras.view[row],
-        scenes.cameras.lenses[row], bool(scenes.cameras.distorted[row]), box[0], box[1],
+        scenes.cameras.lenses[row], bool(scenes.cameras.distorted[row]), box[0], box[1], 0.0,
     )
     return cover
 

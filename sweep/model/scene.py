@@ -1,28 +1,27 @@
-"""Scenes: cameras, markers and poses put together, and what of them can be seen."""
+"""Scenes: cameras, markers, poses and effects put together."""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model import lens as lens_model
 from sweep.model.camera import VIEW_PARAMETERS, Cameras, intrinsics
 from sweep.model.declaration import parameter
+from sweep.model.effects import SWITCHES, VELOCITIES, Effects, is_on
 from sweep.model.marker import MarkerKey, marker_corners, module_count
 from sweep.model.pose import placed, rotation_of_angles
 
 Floats = NDArray[np.float64]
 Key = TypeVar("Key")
-
-WARP_PX_PER_MODULE = 10
-"""Resolution of the bitmap that the ``warp`` renderer maps (the paper's)."""
-
+Box = tuple[int, int, int, int]
+"""Left, top, right, bottom in pixels of the frame; half-open."""
 
 @dataclass(frozen=True, slots=True)
 class Scene:
@@ -75,7 +74,10 @@ class Scenes:
     levels
         (N, 3) grey levels of the background (0 where it is an image), black and white.
     plain
-        (N,) whether the image is an exact one on a background of one level.
+        (N,) whether the image is an exact one on a background of one level, without effects.
+    effects, affected, noise_key
+        (N,) each: every parameter of :class:`Effects`, NaN for none (``effects`` is None where
+        none is active in any of the scenes), whether one is active, and the key of the noise.
     corners_px, outline_px
         (N, 4, 2) images of the black square's and of the quiet zone's corners; NaN at z <= 0.
     """
@@ -98,9 +100,34 @@ class Scenes:
     renderer: Sequence[str]
     background: Sequence[float | str]
     plain: NDArray[np.bool_]
+    effects: Mapping[str, Floats] | None
+    affected: NDArray[np.bool_]
+    noise_key: NDArray[np.uint64]
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    @property
+    def noisy(self) -> NDArray[np.bool_]:
+        """Whether a scene's pixels have noise, (N,)."""
+        if self.effects is None:
+            return self.affected
+        return (self.effects["noise_grey"] > 0) | ~np.isnan(self.effects["full_well_e"])
+
+    def effect(self, row: int) -> dict[str, float]:
+        """Return the effects' parameters of one scene."""
+        if self.effects is None:
+            raise ValueError("no effect is active")
+        return {name: float(column[row]) for name, column in self.effects.items()}
+
+    def motion(self, row: int) -> tuple[float, float, Floats] | None:
+        """Return exposure and row time in s and the velocity (6,), m/s and rad/s; None at rest."""
+        effect = self.effect(row)
+        velocity = np.array([effect[name] for name in VELOCITIES])
+        velocity[3:] = np.radians(velocity[3:])
+        if not velocity.any() or effect["exposure_s"] == effect["row_time_s"] == 0.0:
+            return None
+        return effect["exposure_s"], effect["row_time_s"], velocity
 
 
 def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
@@ -110,7 +137,7 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
     ``distortion`` canonical) and ``shift_u_px``, ``shift_v_px``: the drawn jitter.
     """
     def numbers(name: str) -> Floats:
-        column = np.asarray(values[name], dtype=np.float64)
+        column = np.asarray(values[name], dtype=np.float64)  # None becomes NaN
         return np.ascontiguousarray(np.broadcast_to(column, (count,)))
 
     def mapped(function: Callable[..., Any], *names: str) -> list[Any]:
@@ -184,6 +211,18 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
         ],
         axis=1,
     )
+    effects, affected = None, np.zeros(count, dtype=bool)
+    if any(is_on(name, values.get(name, off)) for name, off in SWITCHES.items()):
+        effects = {
+            field.name: numbers(field.name) for field in dataclasses.fields(Effects)
+        }
+        for name, off in SWITCHES.items():
+            column = effects[name]
+            affected |= ~np.isnan(column) if off is None else column != off
+    plain = np.array(
+        mapped(lambda name, level: name == "exact" and not isinstance(level, str),
+               "renderer", "background"), dtype=bool,
+    )
     return Scenes(
         cameras=cameras,
         frame=np.stack([numbers("width_px"), numbers("height_px")], axis=1).astype(np.int64),
@@ -202,10 +241,10 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
         outline_px=outline_px,
         renderer=mapped(str, "renderer"),
         background=mapped(lambda level: level, "background"),
-        plain=np.array(
-            mapped(lambda name, level: name == "exact" and not isinstance(level, str),
-                   "renderer", "background"), dtype=bool,
-        ),
+        plain=plain & ~affected,
+        effects=effects,
+        affected=affected,
+        noise_key=values.get("noise_key", np.zeros(count, dtype=np.uint64)),
     )
 
 
@@ -214,152 +253,3 @@ def distinct(keys: Sequence[Key]) -> tuple[tuple[Key, ...], NDArray[np.int64]]:
     number: dict[Key, int] = {}
     index = [number.setdefault(key, len(number)) for key in keys]
     return tuple(number), np.array(index, dtype=np.int64)
-
-
-def _outline(scenes: Scenes, rows: NDArray[np.intp], quiet: bool, per_side: int) -> Floats:
-    """Return points (n, 4 · per_side, 2) along the images of the outline or the black square."""
-    modules = scenes.modules[rows]
-    margin = scenes.quiet_zone[rows] if quiet else np.zeros(len(rows))
-    low, high = -margin[:, None], (modules + margin)[:, None]
-    t = np.arange(per_side) / per_side
-    ahead, back = low + t * (high - low), high - t * (high - low)
-    columns = np.concatenate([ahead, np.repeat(high, per_side, 1), back,
-                              np.repeat(low, per_side, 1)], axis=1)
-    lines = np.concatenate([np.repeat(low, per_side, 1), ahead,
-                            np.repeat(high, per_side, 1), back], axis=1)
-    flat = np.stack([columns, lines, np.ones_like(columns)], axis=2)
-    return scenes.cameras.take(rows).project(
-        np.ascontiguousarray(flat @ np.swapaxes(scenes.plane[rows], 1, 2))
-    )
-
-
-CHORDS_PER_SIDE = 32
-"""Points at which a bent outline is looked at for its extent: its bulge between them is less
-than 1/1000 of the side's, well inside the 2 px that :func:`marker_boxes` adds under a lens."""
-
-
-def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
-    """Return the boxes (N, 4) left, top, right, bottom (half-open) of pixels a marker may touch.
-
-    Clipped at the frame; empty (all zero) where nothing of the marker is in it.
-    """
-    low, high = scenes.outline_px.min(axis=1), scenes.outline_px.max(axis=1)
-    bent = np.flatnonzero(scenes.cameras.distorted & np.isfinite(low).all(axis=1))
-    if len(bent):
-        points = _outline(scenes, bent, quiet=True, per_side=CHORDS_PER_SIDE)
-        low[bent], high[bent] = points.min(axis=1) - 2, points.max(axis=1) + 2
-    warped = np.flatnonzero([name == "warp" for name in scenes.renderer])
-    if len(warped):
-        low[warped], high[warped] = _warp_extent(scenes, warped)
-    limit = scenes.frame.astype(np.float64)
-    with np.errstate(invalid="ignore"):
-        start = np.clip(np.floor(low + 0.5), 0, limit)
-        stop = np.clip(np.ceil(high + 0.5), 0, limit)
-        inside = (stop > start).all(axis=1)
-    boxes = np.concatenate([start, stop], axis=1)
-    return np.where(inside[:, None], boxes, 0.0).astype(np.int64)
-
-
-def _warp_extent(scenes: Scenes, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Return the least and greatest pixels (n, 2) that the ``warp`` renderer may touch.
-
-    It maps bitmap to image by the homography of the black square's corners, bent ones under a
-    lens, so its quiet zone ends elsewhere than the marker's. Interpolation spreads it by half a
-    pixel of the bitmap. Where the homography's horizon crosses it, it reaches everywhere.
-    """
-    low, high = np.full((len(rows), 2), np.nan), np.full((len(rows), 2), np.nan)
-    for i, row in enumerate(rows.tolist()):
-        corners = scenes.corners_px[row]
-        if not np.isfinite(corners).all():
-            continue
-        n = scenes.modules[row]
-        margin = scenes.quiet_zone[row] + 0.5 / WARP_PX_PER_MODULE
-        square = np.array([[0, 0], [n, 0], [n, n], [0, n]], dtype=np.float32)
-        transform = cv2.getPerspectiveTransform(square, corners.astype(np.float32))
-        outline = square + np.sign(square - n / 2) * margin
-        points = np.column_stack([outline, np.ones(4)]) @ np.asarray(transform).T
-        if (points[:, 2] > 0).all():
-            flat = points[:, :2] / points[:, 2:]
-            low[i], high[i] = flat.min(axis=0) - 1, flat.max(axis=0) + 1
-        else:
-            low[i], high[i] = -0.5, scenes.frame[row] - 0.5
-    return low, high
-
-
-def areas_px(scenes: Scenes) -> Floats:
-    """Return the projected black square's area (N,) in px², bent edges followed."""
-    points = scenes.corners_px
-    area = _shoelace(points)
-    bent = np.flatnonzero(scenes.cameras.distorted & np.isfinite(area))
-    if len(bent):
-        area[bent] = _shoelace(_outline(scenes, bent, quiet=False, per_side=256))
-    return np.abs(area)
-
-
-def _shoelace(points: Floats) -> Floats:
-    """Return the signed areas (N,) of polygons (N, M, 2)."""
-    local = points - points[:, :1]
-    following = np.roll(local, -1, axis=1)
-    with np.errstate(over="ignore", invalid="ignore"):
-        doubled = local[..., 0] * following[..., 1] - local[..., 1] * following[..., 0]
-        return np.asarray(0.5 * doubled.sum(axis=1))
-
-
-def hidden(scenes: Scenes) -> NDArray[np.bool_]:
-    """Tell (N,) where a marker is seen from behind or edge on, or has a corner at z <= 0.
-
-    The quiet zone's corners count, for the marker is drawn with it.
-    """
-    facing = np.sum(scenes.rotation[:, :, 2] * scenes.translation, axis=1) < 0
-    return np.asarray(~facing | ~np.isfinite(scenes.outline_px).all(axis=(1, 2)))
-
-
-def outside_frame(scenes: Scenes, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Tell (n,) for scenes ``rows`` (n,) where the black square lies wholly outside the frame."""
-    corners, limit = scenes.corners_px[rows], scenes.frame[rows] - 0.5
-    outside = np.zeros(len(rows), dtype=bool)
-    cut = ((corners < -0.5) | (corners > limit[:, None])).any(axis=(1, 2))
-    for i in np.flatnonzero(cut):
-        polygon = corners[i]
-        if scenes.cameras.distorted[rows[i]]:
-            polygon = _outline(scenes, rows[i : i + 1], False, CHORDS_PER_SIDE)[0]
-        outside[i] = not _meets_frame(polygon, limit[i])
-    return outside
-
-
-def _meets_frame(polygon: Floats, limit: Floats) -> bool:
-    """Tell whether a polygon (M, 2) has a part of positive area in [-0.5, limit]."""
-    for axis in (0, 1):
-        for sign, bound in ((1.0, -0.5), (-1.0, -limit[axis])):
-            polygon = _half_plane(polygon, sign * polygon[:, axis] - bound)
-            if len(polygon) < 3:
-                return False
-    return bool(np.abs(_shoelace(polygon[None])[0]) > 0)
-
-
-def _half_plane(polygon: Floats, inside: Floats) -> Floats:
-    """Clip a polygon (M, 2) to where the linear function ``inside`` (M,) is not negative."""
-    kept = []
-    for i in range(len(polygon)):
-        j = (i + 1) % len(polygon)
-        if inside[i] >= 0:
-            kept.append(polygon[i])
-        if (inside[i] >= 0) != (inside[j] >= 0):
-            t = inside[i] / (inside[i] - inside[j])
-            kept.append(polygon[i] + t * (polygon[j] - polygon[i]))
-    return np.array(kept).reshape(-1, 2)
-
-
-def not_modelled(scenes: Scenes) -> NDArray[np.bool_]:
-    """Tell (N,) where the lens model folds on the marker, so that its image has no meaning."""
-    folded = np.zeros(len(scenes), dtype=bool)
-    rows = np.flatnonzero(scenes.cameras.distorted & np.isfinite(scenes.outline_px).all((1, 2)))
-    if len(rows):
-        widened = 1 + 2 * scenes.quiet_zone[rows] / scenes.modules[rows]
-        outline = marker_corners(scenes.size_m[rows] * widened)
-        points = placed(outline, scenes.rotation[rows], scenes.translation[rows])
-        folded[rows] = lens_model.folds(
-            np.ascontiguousarray(points[..., :2] / points[..., 2:]),
-            scenes.cameras.lenses[rows],
-        )
-    return folded

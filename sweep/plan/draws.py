@@ -126,6 +126,12 @@ def uniform(
     (seed, quantity) is hashed by BLAKE2b, as the keys are; trials are steps of SplitMix64 from
     there. 53 bits, the middle of their cell, so that neither end occurs.
     """
+    return np.asarray(((bits(seed, quantity, keys, trials) >> np.uint64(11)) + 0.5) * 2.0**-53)
+
+
+def bits(
+    seed: int, quantity: str, keys: NDArray[np.uint64], trials: NDArray[np.int64]
+) -> NDArray[np.uint64]:
+    """Return 64 random bits for each scene, as :func:`uniform`."""
     start = _mixed(keys ^ _hash(f"{seed}\n{quantity}"))
-    bits = _mixed(start + _STEP * (np.asarray(trials).astype(np.uint64) + np.uint64(1)))
-    return np.asarray(((bits >> np.uint64(11)) + 0.5) * 2.0**-53)
+    return _mixed(start + _STEP * (np.asarray(trials).astype(np.uint64) + np.uint64(1)))

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from sweep.measure.detector import DetectorSetting
 from sweep.measure.solver import Estimator
 from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion, intrinsics
+from sweep.model.effects import RANDOM, is_on
 from sweep.plan.axes import TRIAL, Axis
-from sweep.plan.draws import geometry_keys, uniform
+from sweep.plan.draws import bits, geometry_keys, uniform
 from sweep.plan.parameters import PARAMETERS, Stage
 from sweep.plan.pipeline import Pipeline
 
@@ -137,7 +138,8 @@ def scene_values(pipeline: Pipeline, indices: Sequence[NDArray[np.intp]]) -> dic
         resolve_distance(values)
     jitter = np.asarray(values["jitter_px"], dtype=np.float64)
     values["shift_u_px"] = values["shift_v_px"] = 0.0
-    if not drawn and not (jitter > 0).any():
+    noisy = any(name in drawn or is_on(name, values[name]) for name in RANDOM)
+    if not drawn and not noisy and not (jitter > 0).any():
         return values
     keys = geometry_keys(values, drawn, count)
     for name, distribution in drawn.items():
@@ -148,6 +150,8 @@ def scene_values(pipeline: Pipeline, indices: Sequence[NDArray[np.intp]]) -> dic
         for name in ("shift_u_px", "shift_v_px"):
             draw = uniform(pipeline.seed, name, keys, trials)
             values[name] = jitter * (2 * draw - 1)
+    if noisy:
+        values["noise_key"] = bits(pipeline.seed, "noise", keys, trials)
     return values
 
 

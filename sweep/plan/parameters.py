@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import types
 import typing
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from sweep.measure.detector import DetectorSetting
 from sweep.measure.solver import Estimator
 from sweep.model.camera import Camera
 from sweep.model.declaration import Declaration
+from sweep.model.effects import Effects
 from sweep.model.lens import COUNTS
 from sweep.model.marker import Marker
 from sweep.model.pose import Pose
@@ -28,15 +30,15 @@ class Stage(IntEnum):
     estimation = 2
 
 
-SECTIONS: dict[str, tuple[type, Stage]] = {
-    "camera": (Camera, Stage.scene),
-    "marker": (Marker, Stage.scene),
-    "pose": (Pose, Stage.scene),
-    "scene": (Scene, Stage.scene),
-    "detector": (DetectorSetting, Stage.detection),
-    "estimator": (Estimator, Stage.estimation),
+SECTIONS: dict[str, tuple[tuple[type, ...], Stage]] = {
+    "camera": ((Camera,), Stage.scene),
+    "marker": ((Marker,), Stage.scene),
+    "pose": ((Pose,), Stage.scene),
+    "scene": ((Scene, Effects), Stage.scene),
+    "detector": ((DetectorSetting,), Stage.detection),
+    "estimator": ((Estimator,), Stage.estimation),
 }
-"""Section of a pipeline file -> the dataclass that declares its parameters, and their stage."""
+"""Section of a pipeline file -> the dataclasses that declare its parameters, and their stage."""
 
 GEOMETRY_SECTIONS = ("camera", "marker", "pose")
 """Sections whose values make the geometry key of the random draws."""
@@ -102,8 +104,8 @@ def _is_number(value: Any) -> bool:
 def _gather() -> dict[str, Parameter]:
     gathered: dict[str, Parameter] = {}
     for section, (declaring, stage) in SECTIONS.items():
-        hints = typing.get_type_hints(declaring)
-        for field in dataclasses.fields(declaring):
+        hints = {name: hint for each in declaring for name, hint in typing.get_type_hints(each).items()}
+        for field in itertools.chain(*(dataclasses.fields(each) for each in declaring)):
             if field.name in gathered:
                 raise TypeError(f"parameter {field.name} is declared twice")
             gathered[field.name] = Parameter(

@@ -17,6 +17,7 @@ import tomlkit.items
 
 from sweep.errors import PipelineError
 from sweep.measure.detector import DetectorSetting
+from sweep.model.effects import GEOMETRIC, RANDOM, VELOCITIES, is_on
 from sweep.model.marker import marker_count
 from sweep.model.renderers import background_image
 from sweep.plan.axes import (
@@ -303,6 +304,7 @@ class _Reader:
         if "fy_px" in self.given and "fx_px" not in self.given:
             self.fault("fy_px", self._given_value("fy_px"), "fx_px beside it")
         self._ids()
+        self._effects()
         low, high = "adaptiveThreshWinSizeMin", "adaptiveThreshWinSizeMax"
         smallest, largest = self._values(low), self._values(high)
         if smallest and largest and max(smallest) > min(largest):
@@ -311,10 +313,11 @@ class _Reader:
         self._detector_fields()
         trials = len(self.axes[TRIAL]) if TRIAL in self.axes else 1
         jitter = self._values("jitter_px")
-        if trials > 1 and not self.distributions and jitter and max(jitter) == 0:
+        noisy = any(self._is_on(name) for name in RANDOM)
+        if trials > 1 and not self.distributions and jitter and max(jitter) == 0 and not noisy:
             self.fault(
                 "axes.trial", trials,
-                "something random to repeat: jitter_px above 0, or a distribution",
+                "something random to repeat: jitter_px above 0, noise, or a distribution",
             )
         poses = math.prod(len(axis) for axis in self.axes.values())
         frame = max(self._values("width_px") or (0,)) * max(self._values("height_px") or (0,))
@@ -339,6 +342,46 @@ class _Reader:
                 self.fault(
                     "marker_id", self._given_value("marker_id"),
                     f"IDs from 0 to {count - 1}, which is what {dictionary} has",
+                )
+
+    def _is_on(self, name: str) -> bool:
+        """Tell whether an effect's switch has other than its neutral value somewhere."""
+        return name in self.distributions or any(
+            is_on(name, value) for value in self._values(name)
+        )
+
+    def _effects(self) -> None:
+        """Judge the effects that need one another, and a renderer that has them."""
+        moving = [
+            name for name in VELOCITIES
+            if name in self.distributions or any(self._values(name))
+        ]
+        timed = [name for name in ("exposure_s", "row_time_s") if self._is_on(name)]
+        for name in timed:
+            if not moving:
+                self.fault(
+                    f"scene.{name}", self._given_value(name),
+                    f"a velocity beside it: {', '.join(VELOCITIES)}",
+                )
+        for name in moving:
+            if not timed:
+                self.fault(
+                    f"scene.{name}", self._given_value(name), "exposure_s or row_time_s beside it"
+                )
+        for name, other in (
+            ("aperture_mm", "focus_distance_m"), ("focus_distance_m", "aperture_mm"),
+            ("read_noise_e", "full_well_e"),
+        ):
+            off = PARAMETERS[name].default
+            given = name in self.distributions or any(v != off for v in self._values(name))
+            if given and other not in self.given:
+                self.fault(f"scene.{name}", self._given_value(name), f"{other} beside it")
+        others = [name for name in self._values("renderer") if name != "exact"]
+        for name in GEOMETRIC:
+            if others and self._is_on(name):
+                self.fault(
+                    f"scene.{name}", self._given_value(name),
+                    f"renderer = exact; {others[0]} does not have it",
                 )
 
     def _backgrounds(self) -> None:

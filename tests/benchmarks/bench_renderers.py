@@ -13,7 +13,8 @@ from sweep.model.camera import Camera
 from sweep.model.marker import Marker
 from sweep.model.pose import Pose
 from sweep.model.renderers import render
-from sweep.model.scene import Scene, build_scenes, marker_boxes
+from sweep.model.extent import marker_boxes
+from sweep.model.scene import Scene, build_scenes
 
 SIDES = (8, 20, 50, 100, 200, 400, 600)
 LENSES = ((), (-0.3, 0.1, 0.0, 0.0))

@@ -1,0 +1,261 @@
+"""Where in the image the markers of scenes are, and whether they can be seen at all."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.model import lens as lens_model
+from sweep.model.coverage import REACH
+from sweep.model.marker import marker_corners
+from sweep.model.motion import moved, row_times
+from sweep.model.pose import placed
+from sweep.model.scene import Box, Scenes
+
+Floats = NDArray[np.float64]
+
+WARP_PX_PER_MODULE = 10
+"""Resolution of the bitmap that the ``warp`` renderer maps (the paper's)."""
+
+
+def _outline(scenes: Scenes, rows: NDArray[np.intp], quiet: bool, per_side: int) -> Floats:
+    """Return points (n, 4 · per_side, 2) along the images of the outline or the black square."""
+    modules = scenes.modules[rows]
+    margin = scenes.quiet_zone[rows] if quiet else np.zeros(len(rows))
+    low, high = -margin[:, None], (modules + margin)[:, None]
+    t = np.arange(per_side) / per_side
+    ahead, back = low + t * (high - low), high - t * (high - low)
+    columns = np.concatenate([ahead, np.repeat(high, per_side, 1), back,
+                              np.repeat(low, per_side, 1)], axis=1)
+    lines = np.concatenate([np.repeat(low, per_side, 1), ahead,
+                            np.repeat(high, per_side, 1), back], axis=1)
+    flat = np.stack([columns, lines, np.ones_like(columns)], axis=2)
+    return scenes.cameras.take(rows).project(
+        np.ascontiguousarray(flat @ np.swapaxes(scenes.plane[rows], 1, 2))
+    )
+
+
+CHORDS_PER_SIDE = 32
+"""Points at which a bent outline is looked at for its extent: its bulge between them is less
+than 1/1000 of the side's, well inside the 2 px that :func:`marker_boxes` adds under a lens."""
+
+
+def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
+    """Return the boxes (N, 4) left, top, right, bottom (half-open) of pixels a marker may touch.
+
+    Clipped at the frame; empty (all zero) where nothing of the marker is in it.
+    """
+    low, high = scenes.outline_px.min(axis=1), scenes.outline_px.max(axis=1)
+    bent = np.flatnonzero(scenes.cameras.distorted & np.isfinite(low).all(axis=1))
+    if len(bent):
+        points = _outline(scenes, bent, quiet=True, per_side=CHORDS_PER_SIDE)
+        low[bent], high[bent] = points.min(axis=1) - 2, points.max(axis=1) + 2
+    warped = np.flatnonzero([name == "warp" for name in scenes.renderer])
+    if len(warped):
+        low[warped], high[warped] = _warp_extent(scenes, warped)
+    for row in np.flatnonzero(scenes.affected & np.isfinite(low).all(axis=1)).tolist():
+        low[row], high[row] = _exposed_extent(scenes, row, low[row], high[row])
+    limit = scenes.frame.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        start = np.clip(np.floor(low + 0.5), 0, limit)
+        stop = np.clip(np.ceil(high + 0.5), 0, limit)
+        inside = (stop > start).all(axis=1)
+    boxes = np.concatenate([start, stop], axis=1)
+    return np.where(inside[:, None], boxes, 0.0).astype(np.int64)
+
+
+def _warp_extent(scenes: Scenes, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """Return the least and greatest pixels (n, 2) that the ``warp`` renderer may touch.
+
+    It maps bitmap to image by the homography of the black square's corners, bent ones under a
+    lens, so its quiet zone ends elsewhere than the marker's. Interpolation spreads it by half a
+    pixel of the bitmap. Where the homography's horizon crosses it, it reaches everywhere.
+    """
+    low, high = np.full((len(rows), 2), np.nan), np.full((len(rows), 2), np.nan)
+    for i, row in enumerate(rows.tolist()):
+        corners = scenes.corners_px[row]
+        if not np.isfinite(corners).all():
+            continue
+        n = scenes.modules[row]
+        margin = scenes.quiet_zone[row] + 0.5 / WARP_PX_PER_MODULE
+        square = np.array([[0, 0], [n, 0], [n, n], [0, n]], dtype=np.float32)
+        transform = cv2.getPerspectiveTransform(square, corners.astype(np.float32))
+        outline = square + np.sign(square - n / 2) * margin
+        points = np.column_stack([outline, np.ones(4)]) @ np.asarray(transform).T
+        if (points[:, 2] > 0).all():
+            flat = points[:, :2] / points[:, 2:]
+            low[i], high[i] = flat.min(axis=0) - 1, flat.max(axis=0) + 1
+        else:
+            low[i], high[i] = -0.5, scenes.frame[row] - 0.5
+    return low, high
+
+
+INSTANTS = 33
+"""Instants at which a moving marker is looked at for its extent; a step is added all around."""
+
+
+def _tracks(scenes: Scenes, row: int, begin: float, end: float) -> Floats:
+    """Return the images (INSTANTS, M, 2) of a moving outline from ``begin`` to ``end`` in s."""
+    motion = scenes.motion(row)
+    velocity = np.zeros(6) if motion is None else motion[2]
+    low, high = -scenes.quiet_zone[row], scenes.modules[row] + scenes.quiet_zone[row]
+    t = np.arange(CHORDS_PER_SIDE if scenes.cameras.distorted[row] else 1)
+    ahead = low + t / len(t) * (high - low)
+    back, start, stop = low + high - ahead, np.full(len(t), low), np.full(len(t), high)
+    flat = np.stack(
+        [
+            np.concatenate([ahead, stop, back, start]), np.concatenate([start, ahead, stop, back]),
+            np.ones(4 * len(t)),
+        ],
+        axis=1,
+    )
+    planes = [
+        moved(scenes.plane[row], scenes.translation[row], velocity, instant)
+        for instant in np.linspace(begin, end, INSTANTS).tolist()
+    ]
+    points = np.stack([flat @ plane.T for plane in planes])
+    return scenes.cameras.take(np.full(INSTANTS, row)).project(points)
+
+
+def _exposed_extent(
+    scenes: Scenes, row: int, low: Floats, high: Floats
+) -> tuple[Floats, Floats]:
+    """Return the extent, from ``low`` to ``high`` (2,) at rest, under motion and blur.
+
+    NaN where the marker comes behind the camera while its rows are exposed. Which rows it is on
+    depends on when they are exposed, and that on which they are: rows are added until none is
+    missing.
+    """
+    motion = scenes.motion(row)
+    if motion is not None:
+        height = int(scenes.frame[row, 1])
+        top = min(max(math.floor(low[1]), 0), height - 1)
+        bottom = min(max(math.ceil(high[1]) + 1, top + 1), height)
+        while True:
+            tracks = _tracks(scenes, row, *row_times(top, bottom, height, motion[0], motion[1]))
+            step = np.abs(np.diff(tracks, axis=0)).max(axis=(0, 1))
+            low, high = tracks.min(axis=(0, 1)) - step - 1, tracks.max(axis=(0, 1)) + step + 1
+            if motion[1] == 0.0 or not np.isfinite(step).all():
+                break
+            first = max(min(top, math.floor(max(low[1], 0.0))), 0)
+            last = min(max(bottom, math.ceil(min(high[1], height))), height)
+            if (first, last) == (top, bottom):
+                break
+            top, bottom = first, last
+    reach = _largest_spread_px(scenes, row) * REACH
+    return (low - reach - 1, high + reach + 1) if reach > 0 else (low, high)
+
+
+def _largest_spread_px(scenes: Scenes, row: int) -> float:
+    """Return the largest point spread on the marker, at one of its outline's corners."""
+    effect = scenes.effect(row)
+    if math.isnan(effect["aperture_mm"]):
+        return effect["blur_px"]
+    low, high = -scenes.quiet_zone[row], scenes.modules[row] + scenes.quiet_zone[row]
+    corners = np.array([[low, low, 1], [low, high, 1], [high, low, 1], [high, high, 1]])
+    depth = corners @ scenes.plane[row][2]
+    widest = np.abs(1 / effect["focus_distance_m"] - 1 / depth).max()
+    aperture_px = scenes.cameras.view[row, 0] * effect["aperture_mm"] * 1e-3
+    return math.hypot(effect["blur_px"], aperture_px * float(widest) / 4)
+
+
+def path_px(scenes: Scenes, row: int, box: Box) -> float:
+    """Return how far a corner of a moving marker's outline travels while a row is exposed."""
+    motion = scenes.motion(row)
+    if motion is None or motion[0] == 0.0:
+        return 0.0
+    longest = 0.0
+    for line in (box[1], (box[1] + box[3]) // 2, box[3] - 1):
+        times = row_times(line, line + 1, int(scenes.frame[row, 1]), motion[0], motion[1])
+        steps = np.diff(_tracks(scenes, row, *times), axis=0)
+        longest = max(longest, float(np.hypot(steps[..., 0], steps[..., 1]).sum(axis=0).max()))
+    return longest
+
+
+def areas_px(scenes: Scenes) -> Floats:
+    """Return the projected black square's area (N,) in px², bent edges followed."""
+    points = scenes.corners_px
+    area = _shoelace(points)
+    bent = np.flatnonzero(scenes.cameras.distorted & np.isfinite(area))
+    if len(bent):
+        area[bent] = _shoelace(_outline(scenes, bent, quiet=False, per_side=256))
+    return np.abs(area)
+
+
+def _shoelace(points: Floats) -> Floats:
+    """Return the signed areas (N,) of polygons (N, M, 2)."""
+    local = points - points[:, :1]
+    following = np.roll(local, -1, axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        doubled = local[..., 0] * following[..., 1] - local[..., 1] * following[..., 0]
+        return np.asarray(0.5 * doubled.sum(axis=1))
+
+
+def hidden(scenes: Scenes) -> NDArray[np.bool_]:
+    """Tell (N,) where a marker is seen from behind or edge on, or has a corner at z <= 0.
+
+    The quiet zone's corners count, for the marker is drawn with it.
+    """
+    facing = np.sum(scenes.rotation[:, :, 2] * scenes.translation, axis=1) < 0
+    return np.asarray(~facing | ~np.isfinite(scenes.outline_px).all(axis=(1, 2)))
+
+
+def outside_frame(scenes: Scenes, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Tell (n,) for scenes ``rows`` (n,) where the black square lies wholly outside the frame."""
+    corners, limit = scenes.corners_px[rows], scenes.frame[rows] - 0.5
+    outside = np.zeros(len(rows), dtype=bool)
+    cut = ((corners < -0.5) | (corners > limit[:, None])).any(axis=(1, 2))
+    for i in np.flatnonzero(cut):
+        polygon = corners[i]
+        if scenes.cameras.distorted[rows[i]]:
+            polygon = _outline(scenes, rows[i : i + 1], False, CHORDS_PER_SIDE)[0]
+        outside[i] = not _meets_frame(polygon, limit[i])
+    return outside
+
+
+def _meets_frame(polygon: Floats, limit: Floats) -> bool:
+    """Tell whether a polygon (M, 2) has a part of positive area in [-0.5, limit]."""
+    for axis in (0, 1):
+        for sign, bound in ((1.0, -0.5), (-1.0, -limit[axis])):
+            polygon = _half_plane(polygon, sign * polygon[:, axis] - bound)
+            if len(polygon) < 3:
+                return False
+    return bool(np.abs(_shoelace(polygon[None])[0]) > 0)
+
+
+def _half_plane(polygon: Floats, inside: Floats) -> Floats:
+    """Clip a polygon (M, 2) to where the linear function ``inside`` (M,) is not negative."""
+    kept = []
+    for i in range(len(polygon)):
+        j = (i + 1) % len(polygon)
+        if inside[i] >= 0:
+            kept.append(polygon[i])
+        if (inside[i] >= 0) != (inside[j] >= 0):
+            t = inside[i] / (inside[i] - inside[j])
+            kept.append(polygon[i] + t * (polygon[j] - polygon[i]))
+    return np.array(kept).reshape(-1, 2)
+
+
+def not_modelled(scenes: Scenes) -> NDArray[np.bool_]:
+    """Tell (N,) where the image has no meaning.
+
+    The lens model folds on the marker, or the marker comes behind the camera in the exposure.
+    """
+    folded = np.zeros(len(scenes), dtype=bool)
+    for row in np.flatnonzero(scenes.affected).tolist():
+        low, high = scenes.outline_px[row].min(axis=0), scenes.outline_px[row].max(axis=0)
+        if np.isfinite(low).all() and scenes.motion(row) is not None:
+            folded[row] = not np.isfinite(_exposed_extent(scenes, row, low, high)).all()
+    rows = np.flatnonzero(scenes.cameras.distorted & np.isfinite(scenes.outline_px).all((1, 2)))
+    if len(rows):
+        widened = 1 + 2 * scenes.quiet_zone[rows] / scenes.modules[rows]
+        outline = marker_corners(scenes.size_m[rows] * widened)
+        points = placed(outline, scenes.rotation[rows], scenes.translation[rows])
+        folded[rows] = lens_model.folds(
+            np.ascontiguousarray(points[..., :2] / points[..., 2:]),
+            scenes.cameras.lenses[rows],
+        )
+    return folded

@@ -171,18 +171,22 @@ class _Bar:
 
 def _plan(chosen: argparse.Namespace) -> int:
     pipeline = _read(chosen)
-    from sweep.engine.forecasting import forecast  # noqa: PLC0415
+    from sweep.engine.forecasting import effect_costs, forecast  # noqa: PLC0415
     from sweep.plan.activity import parts  # noqa: PLC0415
 
     expected = forecast(pipeline, chosen.workers)
     listed = parts(pipeline)
+    costs = effect_costs(pipeline, [part.switch for part in listed if part.switch and part.active])
     if chosen.json:
         _print_json(
             {
                 "title": pipeline.title,
                 "dimensions": {axis.name: len(axis) for axis in pipeline.axes},
                 **dataclasses.asdict(expected),
-                "parts": [dataclasses.asdict(part) for part in listed],
+                "parts": [
+                    {**dataclasses.asdict(part), "pose_s": costs.get(part.switch)}
+                    for part in listed
+                ],
             }
         )
         return 0
@@ -195,7 +199,8 @@ def _plan(chosen: argparse.Namespace) -> int:
         print(f"  {axis.name:{width}}  {len(axis):>11,}  {stage:10}  {shown} {axis.unit}".rstrip())
     print("\nParts")
     for part in listed:
-        print(f"  {part.name:17} {'on ' if part.active else 'off'}  {part.reason}")
+        cost = f"; {costs[part.switch] * 1e3:.3g} ms a pose" if part.switch in costs else ""
+        print(f"  {part.name:17} {'on ' if part.active else 'off'}  {part.reason}{cost}")
     print("\nExpected")
     rows = {
         "poses": f"{expected.poses:,}",

@@ -175,8 +175,8 @@ def _add_left(
 ) -> None:
     """Add a segment from y = ya to yb so far left of the box that it covers rows whole."""
     reach = REACH * sigma + 1.0
-    first = max(int(math.floor(min(ya, yb) - reach)), 0)
-    last = min(int(math.floor(max(ya, yb) + reach)), cover.shape[0] - 1)
+    first = max(math.floor(min(ya, yb) - reach), 0)
+    last = min(math.floor(max(ya, yb) + reach), cover.shape[0] - 1)
     for i in range(first, last + 1):
         low, high = ya - i, yb - i
         share = _below_sum(high, sigma) - _below_sum(high - 1.0, sigma)
@@ -229,7 +229,7 @@ def _add_spread(
     reach = REACH * sigma + 0.5
     height, width = cover.shape[0], cover.shape[1] - 2
     length = math.hypot(xb - xa, yb - ya)
-    panels = int(math.ceil(length / max(1.5 * sigma, _SHORTEST_PANEL_PX)))
+    panels = math.ceil(length / max(1.5 * sigma, _SHORTEST_PANEL_PX))
     dy = (yb - ya) / panels
     steps = np.empty(2 * int(reach) + 6)
     for panel in range(panels):
@@ -238,8 +238,8 @@ def _add_spread(
             weight = (0.2777777777777778, 0.4444444444444444, 0.2777777777777778)[node]
             t = (panel + offset) / panels
             x, y = xa + t * (xb - xa), ya + t * (yb - ya)
-            first = max(int(math.floor(x - reach)), 0)
-            last = min(int(math.floor(x + reach)) + 1, width - 1)
+            first = max(math.floor(x - reach), 0)
+            last = min(math.floor(x + reach) + 1, width - 1)
             if first > last:
                 continue
             # P at the columns' centres, as steps from one to the next.
@@ -250,8 +250,8 @@ def _add_spread(
                 steps[j - first] = above - below - before
                 before = above - below
                 below = above
-            top = max(int(math.floor(y - reach)), 0)
-            bottom = min(int(math.floor(y + reach)) + 1, height - 1)
+            top = max(math.floor(y - reach), 0)
+            bottom = min(math.floor(y + reach) + 1, height - 1)
             below = _below(top - y, sigma)
             for i in range(top, bottom + 1):
                 above = _below(i + 1.0 - y, sigma)

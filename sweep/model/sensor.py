@@ -124,4 +124,6 @@ def read_out(
                 level += noise * _normal(pixel, 2)
             counts = math.floor(level * (most / 255.0) + (0.5 + ROUNDING_SNAP))
             counts = min(max(counts, 0.0), most)
-            image[i, j] = np.uint8(counts if bits == 8 else math.floor(counts * (255.0 / most) + 0.5))
+            if bits != 8:
+                counts = math.floor(counts * (255.0 / most) + 0.5)
+            image[i, j] = np.uint8(counts)

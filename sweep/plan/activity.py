@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sweep.measure.detector import full_frame_reason, margin_px
+from sweep.measure.detector import NOISE_MARGIN_PX, full_frame_reason, margin_px
 from sweep.model.camera import canonical_distortion
+from sweep.model.effects import RANDOM, SWITCHES, is_on
 from sweep.plan.grid import detector_settings
 from sweep.plan.parameters import PARAMETERS
 from sweep.plan.pipeline import Pipeline
@@ -13,11 +14,43 @@ from sweep.plan.pipeline import Pipeline
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A part of the work: what it is, whether it runs, and the reason."""
+    """A part of the work: what it is, whether it runs, and the reason.
+
+    ``switch`` is the parameter that switches an effect on.
+    """
 
     name: str
     active: bool
     reason: str
+    switch: str = ""
+
+
+EFFECTS = {
+    "occlusion": "occlusion",
+    "illumination_gradient": "uneven light",
+    "exposure_s": "motion blur",
+    "row_time_s": "rolling shutter",
+    "blur_px": "optical blur",
+    "aperture_mm": "defocus",
+    "vignetting": "vignetting",
+    "full_well_e": "shot noise",
+    "gain": "gain",
+    "noise_grey": "grey noise",
+    "bit_depth": "bit depth",
+}
+"""Switch of an effect -> its name, in physical order."""
+
+
+def _effect(pipeline: Pipeline, name: str, switch: str) -> Part:
+    off = "not given" if SWITCHES[switch] is None else f"{SWITCHES[switch]:g}"
+    if switch in pipeline.distributions:
+        return Part(name, True, f"{switch} is drawn: {pipeline.distributions[switch]}", switch)
+    values = [value for value in pipeline.values_of(switch) if is_on(switch, value)]
+    if not values:
+        return Part(name, False, f"{switch} is {off}", switch)
+    low, high = min(values), max(values)
+    extent = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+    return Part(name, True, f"{switch} is {extent}", switch)
 
 
 def parts(pipeline: Pipeline) -> list[Part]:
@@ -26,6 +59,10 @@ def parts(pipeline: Pipeline) -> list[Part]:
     draws = [*pipeline.distributions]
     if pipeline.any_value("jitter_px", lambda value: value > 0):
         draws.append("jitter_px")
+    draws += [
+        name for name in RANDOM
+        if name not in draws and pipeline.any_value(name, lambda value: value > 0)
+    ]
     renderers = sorted(set(pipeline.values_of("renderer")))
     image = pipeline.any_value("background", lambda value: isinstance(value, str))
     asked = pipeline.any_value("window", lambda value: value == "full")
@@ -35,6 +72,8 @@ def parts(pipeline: Pipeline) -> list[Part]:
         whole.append("the background is an image: clutter near the marker may change what is found")
     if asked:
         whole.append('window = "full"')
+    random = any(name in draws for name in RANDOM)
+    noise = f", and {NOISE_MARGIN_PX} more for noise" if random else ""
     margins = sorted({margin_px(setting) for setting in settings})
     guarded = pipeline.any_value("guarded", bool)
     beliefs = [
@@ -47,11 +86,12 @@ def parts(pipeline: Pipeline) -> list[Part]:
         Part("background image", image, "background names a file" if image else "a level"),
         Part(
             "window", not (asked or image),
-            f"{', '.join(str(m) for m in margins)} px around what the marker can influence"
+            f"{', '.join(str(m) for m in margins)} px around what the marker can influence{noise}"
             if not (asked or image) else "the full frame",
         ),
         Part("full frame", bool(whole), "; ".join(whole) if whole else "no setting needs it"),
         Part("renderer", True, ", ".join(renderers)),
+        *(_effect(pipeline, name, switch) for switch, name in EFFECTS.items()),
         Part(
             "solver guard", guarded,
             "guarded = true" if guarded else "guarded = false: plain cv2.solvePnP",

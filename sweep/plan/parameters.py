@@ -104,7 +104,9 @@ def _is_number(value: Any) -> bool:
 def _gather() -> dict[str, Parameter]:
     gathered: dict[str, Parameter] = {}
     for section, (declaring, stage) in SECTIONS.items():
-        hints = {name: hint for each in declaring for name, hint in typing.get_type_hints(each).items()}
+        hints: dict[str, Any] = {}
+        for each in declaring:
+            hints |= typing.get_type_hints(each)
         for field in itertools.chain(*(dataclasses.fields(each) for each in declaring)):
             if field.name in gathered:
                 raise TypeError(f"parameter {field.name} is declared twice")

@@ -345,10 +345,9 @@ class _Reader:
                 )
 
     def _is_on(self, name: str) -> bool:
-        """Tell whether an effect's switch has other than its neutral value somewhere."""
-        return name in self.distributions or any(
-            is_on(name, value) for value in self._values(name)
-        )
+        """Tell whether an effect's switch has, or was meant to have, any but its neutral value."""
+        values = self._values(name)
+        return any(is_on(name, value) for value in values) if values else name in self.given
 
     def _effects(self) -> None:
         """Judge the effects that need one another, and a renderer that has them."""

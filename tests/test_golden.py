@@ -36,24 +36,62 @@ distance_m = [0.12, 0.4, 1.1]
 trial = 2
 """
 
-# Version of the numbers -> digest of the draws and poses, of the images, and of the solved poses.
+EFFECTS = """
+seed = 7
+[camera]
+width_px = 160
+height_px = 120
+[pose]
+side_px = 45
+tilt_deg = 40
+roll_deg = 20
+[scene]
+black = 40
+white = 220
+background = 120
+focus_distance_m = 0.1
+velocity_x_m_s = 0.5
+rotation_z_deg_s = 90
+row_time_s = 1e-5
+[axes]
+occlusion = [0, 0.2]
+blur_px = [0, 0.7]
+aperture_mm = [1e-9, 2]
+exposure_s = [0, 0.01]
+illumination_gradient = [0, 0.4]
+full_well_e = [50, 10000]
+noise_grey = [0, 3]
+bit_depth = [8, 12]
+"""
+
+# Version of the numbers -> digest of the draws and poses, of the images, of the solved poses, and
+# of images with all effects.
 # Independent of OpenCV's version: it makes neither images nor, to 1e-6, noise-free poses.
-GOLDEN = {1: ("444ab255354eab6c", "d3a2eb2642834a07", "762609d8f161cf15")}
+GOLDEN = {
+    2: ("444ab255354eab6c", "d3a2eb2642834a07", "762609d8f161cf15", "4382c9465b17dd99"),
+}
 
 
 def digest(array):
     return hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()[:16]
 
 
-def test_numbers_change_only_with_their_version():
-    pipeline = Pipeline.from_text(TEXT)
+def drawn(text):
+    """Return a pipeline's scenes and the digest of their images."""
+    pipeline = Pipeline.from_text(text)
     shape = [len(axis) for axis in pipeline.axes]
     indices = [grid.ravel() for grid in np.indices(shape)]
     scenes = build_scenes(scene_values(pipeline, indices), len(indices[0]))
     boxes = marker_boxes(scenes)
     images = hashlib.sha256()
     for row in range(len(scenes)):
-        images.update(render(scenes, row, boxes[row], (0, 0, 320, 240)).tobytes())
+        frame = (0, 0, *scenes.frame[row].tolist())
+        images.update(render(scenes, row, boxes[row], frame).tobytes())
+    return scenes, images.hexdigest()[:16]
+
+
+def test_numbers_change_only_with_their_version():
+    scenes, images = drawn(TEXT)
     poses = np.concatenate([scenes.rotation.reshape(-1, 9), scenes.translation], axis=1)
     # Adding a half-way offset keeps values that are exact in decimals off the rounding's edge.
     posed = np.floor(poses * 1e9 + 0.3).astype(np.int64)
@@ -62,6 +100,6 @@ def test_numbers_change_only_with_their_version():
     )
     estimated = np.floor(solved.translation * 1e6 + 0.3).astype(np.int64)
     made = (
-        digest(posed), images.hexdigest()[:16], digest(estimated)
+        digest(posed), images, digest(estimated), drawn(EFFECTS)[1]
     )
     assert made == GOLDEN[NUMBERS_VERSION], made

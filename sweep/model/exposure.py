@@ -132,7 +132,7 @@ def _spreads(scenes: Scenes, row: int, box: Box) -> tuple[list[float], bool]:
         return [(low + high) / 2], False
     spreads = [0.0] if low < SHARPEST_PX else []
     low, high = max(low, SHARPEST_PX), max(high, SHARPEST_PX)
-    count = max(math.ceil(math.log(high / low) / math.log(SPREAD_RATIO)) + 1, 2)
+    count = math.ceil(math.log(high / low) / math.log(SPREAD_RATIO)) + 1
     return spreads + np.geomspace(low, high, count).tolist(), True
 
 

@@ -1,0 +1,719 @@
+"""What the estimator believes: a calibration error moves the pose as the closed forms say.
+
+Of the true camera K (f, c), size s and pose the corners are x = K·p; an estimator that believes K'
+and s' solves for K'⁻¹·x, the normalised coordinates as it sees them. Written with primes, what it
+then finds:
+
+1. *Size.* Scaling the square and the translation by the same number changes no image, so s' gives
+   t' = t·s'/s, R' = R: exactly, for any pose and any corners.
+2. *Marker parallel to the image plane, fx'/fx = fy'/fy.* Its image is a square; as seen by K' it
+   is scaled by f/f' and shifted by (c - c')/f', still a square parallel to the plane. So exactly
+   R' = R, z' = z·(f'/f)(s'/s), x' = x·s'/s + z'·(c - c')/f'. With one error at a time: the
+   distance grows as the focal length, and a principal point that is d px off moves the marker
+   sideways by -z·d/f.
+3. *Radial lens, same marker, centred on the axis.* All corners lie at one radius r = s/(z·√2),
+   which a lens turns into r·L(r²); the believed lens L' turns that into r' with r'·L'(r'²) =
+   r·L(r²). The image stays a square: z' = z·r/r', which is z/L(r²) where no lens is believed.
+4. *Tangential lens, same marker, none believed*, to first order in p1, p2. Let h = s/(2z), so that
+   the corners of an upright marker are at x = ±h, y = ±h. p2 adds 4·p2·h² to x and 2·p2·x·y to y:
+   all corners go to the right, and the right side grows by the share 2·p2·h, the left side shrinks
+   by as much. A turn of the marker by θ about y, which brings its right side nearer, makes the
+   sides grow and shrink by θ·h and all corners go to the right by θ·h². So θ = 2·p2, and what is
+   left of the shift is the translation x' = z·2·p2·h² = p2·s²/(2z). p1 does the same along y, where
+   the turn that brings the lower side nearer is one about -x.
+5. *fx alone wrong by the factor 1 + e*, marker as in 3: its image is a rectangle, which no pose of
+   a square has. Least squares spread the error over both directions: z' = z·(1 + e/2), no rotation.
+   IPPE takes the homography's Jacobian at the centre for exact, and a rectangle for a tilted
+   square: cos θ' is the sides' ratio, a tilt of √(2|e|), and z' = z·min(1, 1 + e), so that errors
+   that are 0 on average make distances too short on average.
+6. *Small tilted marker, principal point d px off.* In the limit s/z -> 0 the picture is shifted,
+   which is what a turn of the camera by d/f does: the whole pose turns by -d/f. (For the marker
+   of 2 it does not: how far a marker that squarely faces the image plane is turned shows in its
+   perspective only, which a turn of the camera changes and a shift does not.)
+"""
+
+import itertools
+
+import numpy as np
+import pytest
+from conftest import lengths
+from scipy import stats
+
+from sweep.kernel import believed, run_block
+from sweep.measure.accuracy import pose_error
+from sweep.measure.flags import Detection, Estimate
+from sweep.measure.solver import SOLVERS, estimate
+from sweep.model.scene import build_scenes
+from sweep.plan.grid import Block, block_indices, estimators, scene_axes, scene_values
+from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.template import TEMPLATE
+
+GUARDED = tuple(name for name in SOLVERS if name != "epnp")  # epnp cannot be guarded
+LEAST_SQUARES = ("iterative", "sqpnp")
+IPPE = ("ippe", "ippe_square")
+
+TRANSLATION = 1e-5
+ROTATION_RAD = 2e-5
+"""What solvers leave of exact corners, translations relative to the distance: ITERATIVE stops when
+its steps are small (measured 1e-7 and 1e-6 rad, far from the axis 3e-6 and 5e-6 rad), the others
+leave 1e-9 and 5e-8 rad, but where they fail the guard takes ITERATIVE's solution. What is tested
+below are effects of 1e-2 and more."""
+
+
+def whole(pipeline):
+    shape = tuple(len(axis) for axis in scene_axes(pipeline))
+    return Block((0,) * len(shape), shape)
+
+
+def run(text, settings=()):
+    """Return the values of a pipeline's whole grid."""
+    pipeline = Pipeline.from_text(text, settings)
+    result = run_block(pipeline, whole(pipeline))
+    assert not result.failures
+    return result.values
+
+
+class Estimated:
+    """Estimates from *exact* corners (plus ``noise`` px), one after the other by estimator.
+
+    By the kernel's own stages but for image and detection.
+    """
+
+    def __init__(self, text, settings=(), noise=0.0):
+        pipeline = Pipeline.from_text(text, settings)
+        block = whole(pipeline)
+        self.values = scene_values(pipeline, block_indices(block))
+        self.scenes = build_scenes(self.values, len(block))
+        self.estimators = estimators(pipeline)
+        shifts = np.random.default_rng(6).normal(size=self.scenes.corners_px.shape)
+        corners = self.scenes.corners_px + noise * shifts
+        self.estimates, self.errors = [], []
+        for one in self.estimators:
+            cameras, size_m = believed(one, self.values, self.scenes)
+            found = estimate(
+                corners, cameras, size_m, one.solver, one.guarded, one.reprojection_limit
+            )
+            self.estimates.append(found)
+            self.errors.append(pose_error(
+                found.rotation, found.translation, self.scenes.rotation, self.scenes.translation
+            ))
+
+    def __iter__(self):
+        return zip(self.estimators, self.estimates, self.errors, strict=True)
+
+
+def assert_translation(found, expected, told, tolerance=TRANSLATION):
+    """Hold translations (N, 3) to a share of the expected distance."""
+    miss = np.abs(found - expected).max(axis=1) / expected[:, 2]
+    assert miss.max() < tolerance, f"{told}: {miss.max():.2g}"
+
+
+# 1. Size.
+
+ANYWHERE = f"""
+seed = 1
+[marker]
+size_m = 0.1
+[camera]
+fx_px = 600
+fy_px = 550
+distortion = [-0.2, 0.05, 0.001, -0.002]
+[pose]
+distance_m = {{ uniform = [0.3, 3] }}
+tilt_deg = {{ uniform = [0, 70] }}
+azimuth_deg = {{ uniform = [0, 360] }}
+roll_deg = {{ uniform = [0, 360] }}
+bearing_x_deg = {{ uniform = [-15, 15] }}
+bearing_y_deg = {{ uniform = [-15, 15] }}
+[axes]
+trial = 20
+solver = {list(GUARDED)}
+"""
+
+
+@lengths(20, 1000)
+@pytest.mark.parametrize("noise", [0.0, 0.3], ids=["exact corners", "noisy corners"])
+def test_wrong_size_scales_the_translation_and_leaves_the_rotation_alone(count, noise):
+    sizes = [0.001, 0.05, 0.0999, 0.101, 7.0]
+    text = ANYWHERE.replace("trial = 20", f"trial = {count}")
+    truths = Estimated(text, noise=noise)
+    wrong = Estimated(text, [f"believed_size_m={sizes}"], noise)
+    for (truth, right, _), at in zip(truths, range(len(GUARDED)), strict=True):
+        assert (right.status == Estimate.solved).all()
+        for k, size in enumerate(sizes):
+            estimator = wrong.estimators[at * len(sizes) + k]
+            found = wrong.estimates[at * len(sizes) + k]
+            assert (estimator.solver, estimator.believed_size_m) == (truth.solver, size)
+            np.testing.assert_array_equal(found.status, right.status)
+            # Solved in units of the side: the same bits.
+            np.testing.assert_array_equal(found.rotation, right.rotation)
+            np.testing.assert_array_equal(found.alternative_rotation, right.alternative_rotation)
+            # One rounding in each product, two in the quotient.
+            np.testing.assert_allclose(
+                found.translation, right.translation * (size / 0.1), rtol=1e-15, atol=0
+            )
+
+
+# 2. Camera and size, of a marker parallel to the image plane.
+
+PARALLEL = f"""
+[marker]
+size_m = 0.1
+[camera]
+fx_px = 600
+fy_px = 550
+[pose]
+azimuth_deg = 20
+[axes]
+bearing_x_deg = [0, 12]
+bearing_y_deg = [0, -9]
+roll_deg = [0, 30, 45, 100, 180, 275]
+distance_m = [0.3, 2.0]
+solver = {list(GUARDED)}
+"""
+
+
+def parallel_law(scenes, fx, fy, cx, cy, size):
+    """Return the translations (N, 3) of law 2 from what is believed, each a number or (N,)."""
+    view = scenes.cameras.view
+    np.testing.assert_allclose(fx / view[:, 0], fy / view[:, 1], rtol=1e-14)
+    scale = size / scenes.size_m
+    z = scenes.translation[:, 2] * (fx / view[:, 0]) * scale
+    return np.stack([
+        scenes.translation[:, 0] * scale + z * (view[:, 2] - cx) / fx,
+        scenes.translation[:, 1] * scale + z * (view[:, 3] - cy) / fy,
+        z,
+    ], axis=1)
+
+
+def assert_parallel_law(estimated):
+    for estimator, found, error in estimated:
+        view = estimated.scenes.cameras.view.T
+        beliefs = [
+            truth if belief is None else belief
+            for truth, belief in zip((*view, estimated.scenes.size_m), (
+                estimator.believed_fx_px, estimator.believed_fy_px, estimator.believed_cx_px,
+                estimator.believed_cy_px, estimator.believed_size_m,
+            ), strict=True)
+        ]
+        assert (found.status == Estimate.solved).all(), estimator
+        assert_translation(
+            found.translation, parallel_law(estimated.scenes, *beliefs), estimator
+        )
+        assert error.rotation_angle_rad.max() < ROTATION_RAD, estimator
+
+
+@pytest.mark.parametrize("error", [-0.2, -1e-2, 1e-2, 0.5])
+def test_wrong_focal_length_scales_the_distance_and_moves_nothing_sideways(error):
+    estimated = Estimated(PARALLEL, [f"believed_fx_px={600 * (1 + error)!r}",
+                                     f"believed_fy_px={550 * (1 + error)!r}"])
+    assert_parallel_law(estimated)
+    for _, found, _ in estimated:
+        assert_translation(
+            found.translation, estimated.scenes.translation * [1, 1, 1 + error], error
+        )
+
+
+@pytest.mark.parametrize("off_px", [-200.0, -0.5, 0.5, 30.0])
+def test_wrong_principal_point_moves_a_parallel_marker_sideways_and_does_not_turn_it(off_px):
+    estimated = Estimated(
+        PARALLEL, [f"believed_cx_px={319.5 + off_px}", f"believed_cy_px={239.5 - 2 * off_px}"]
+    )
+    assert_parallel_law(estimated)
+    z = estimated.scenes.translation[:, 2:]
+    for _, found, _ in estimated:
+        shifted = estimated.scenes.translation - z * [off_px / 600, -2 * off_px / 550, 0]
+        assert_translation(found.translation, shifted, off_px)
+
+
+@lengths(3, 100)
+def test_all_beliefs_together_follow_the_law_of_a_parallel_marker(count):
+    rng = np.random.default_rng(7)
+    for _ in range(count):
+        focal, size = np.exp(rng.uniform(-0.3, 0.3, 2)).tolist()
+        cx, cy = (np.array([319.5, 239.5]) + rng.uniform(-100, 100, 2)).tolist()
+        assert_parallel_law(Estimated(PARALLEL, [
+            f"believed_fx_px={600 * focal!r}", f"believed_fy_px={550 * focal!r}",
+            f"believed_cx_px={cx!r}", f"believed_cy_px={cy!r}", f"believed_size_m={0.1 * size!r}",
+        ]))
+
+
+def test_axes_of_beliefs_give_what_each_value_gives_on_its_own():
+    axes = {"believed_cx_px": [300.0, 319.5, 330.25], "believed_size_m": [0.09, 0.11]}
+    estimated = Estimated(PARALLEL, [f"{name}={values}" for name, values in axes.items()])
+    assert len(estimated.estimators) == len(GUARDED) * 6
+    assert_parallel_law(estimated)
+    results = {
+        (one.believed_cx_px, one.believed_size_m, one.solver): found
+        for one, found, _ in estimated
+    }
+    for cx, size in itertools.product(*axes.values()):
+        alone = Estimated(PARALLEL, [f"believed_cx_px={cx}", f"believed_size_m={size}"])
+        for one, found, _ in alone:
+            beside = results[cx, size, one.solver]
+            np.testing.assert_array_equal(found.translation, beside.translation)
+            np.testing.assert_array_equal(found.rotation, beside.rotation)
+
+
+# 3 and 4. Lenses.
+
+CENTRED = f"""
+[marker]
+size_m = 0.1
+[camera]
+fx_px = 600
+[axes]
+roll_deg = [20, 30, 45, 100]
+solver = {list(GUARDED)}
+"""
+
+
+def radial(lens, r):
+    """Return L(r²) of OpenCV's radial terms k1, k2, p1, p2, k3, k4, k5, k6."""
+    k = [*lens, *[0.0] * (8 - len(lens))]
+    s = r * r
+    return (1 + s * (k[0] + s * (k[1] + s * k[4]))) / (1 + s * (k[5] + s * (k[6] + s * k[7])))
+
+
+RADIAL = {
+    "k1": [-0.25, 0.0, 0.0, 0.0],
+    "k1 to k3": [-0.3, 0.1, 0.0, 0.0, 0.05],
+    "k1 to k6": [0.2, 0.02, 0.0, 0.0, 0.01, 0.1, -0.03, 0.004],
+}
+
+
+@pytest.mark.parametrize("lens", RADIAL.values(), ids=RADIAL)
+def test_lens_that_is_not_believed_scales_the_distance_of_a_centred_marker(lens):
+    radius = 0.1 / np.sqrt(2) / 0.2
+    estimated = Estimated(
+        CENTRED, ["distance_m=0.2", f"distortion={lens}", "believed_distortion=[]"]
+    )
+    for estimator, found, error in estimated:
+        expected = np.tile([0, 0, 0.2 / radial(lens, radius)], (4, 1))
+        assert abs(expected[0, 2] / 0.2 - 1) > 0.01
+        assert_translation(found.translation, expected, estimator)
+        assert error.rotation_angle_rad.max() < ROTATION_RAD, estimator
+
+
+@pytest.mark.parametrize("lens", RADIAL.values(), ids=RADIAL)
+def test_lens_that_is_believed_only_scales_it_the_other_way(lens):
+    """The radius r' within the believed lens is chosen, and the marker put where it comes to it."""
+    inside = 0.35
+    radius = inside * radial(lens, inside)
+    distance = float(0.1 / np.sqrt(2) / radius)
+    estimated = Estimated(CENTRED, [f"distance_m={distance!r}", f"believed_distortion={lens}"])
+    for estimator, found, error in estimated:
+        expected = np.tile([0, 0, distance * radius / inside], (4, 1))
+        assert_translation(found.translation, expected, estimator)
+        assert error.rotation_angle_rad.max() < ROTATION_RAD, estimator
+
+
+def test_wrong_lens_scales_the_distance_by_the_ratio_of_the_radii():
+    """Both have k1; the believed one is chosen so that its inverse has the radius 0.3."""
+    radius, inside = float(0.1 / np.sqrt(2) / 0.2), 0.3
+    true_k1 = -0.25
+    believed_k1 = (radius * (1 + true_k1 * radius**2) / inside - 1) / inside**2
+    estimated = Estimated(CENTRED, [
+        "distance_m=0.2", f"distortion=[{true_k1}, 0, 0, 0]",
+        f"believed_distortion=[[{true_k1}, 0, 0, 0], [{believed_k1!r}, 0, 0, 0]]",
+    ])
+    for estimator, found, error in estimated:
+        right = estimator.believed_distortion[0] == true_k1
+        expected = np.tile([0, 0, 0.2 * (1.0 if right else radius / inside)], (4, 1))
+        assert_translation(found.translation, expected, estimator)
+        assert error.rotation_angle_rad.max() < ROTATION_RAD, estimator
+
+
+@pytest.mark.parametrize("distance", [0.15, 0.3])
+@pytest.mark.parametrize("lens", [(1e-4, 0.0), (0.0, 1e-4), (1e-4, -2e-4)], ids=str)
+def test_tangential_lens_that_is_not_believed_turns_and_shifts_the_marker(lens, distance):
+    """Law 4, of the solvers that look at the whole quadrilateral; the second order is 1e-3 of it.
+
+    IPPE looks at the Jacobian at the image of the marker's centre. To first order the keystone
+    leaves it that of an untilted marker but moves that point by 2·p·h²: what it sees is not
+    tilted, or tilted by twice the angle of the line of sight there, 4·p·h² (its mirror).
+    """
+    p1, p2 = lens
+    estimated = Estimated(CENTRED, [
+        "roll_deg=[0, 30, 45, 100]", f"distance_m={distance}", f"distortion=[0, 0, {p1}, {p2}]",
+        "believed_distortion=[]",
+    ])
+    strength = np.hypot(p1, p2)
+    shift = 0.1**2 / (2 * distance)
+    for estimator, found, error in estimated:
+        turn = np.array([-2 * p1, 2 * p2, 0])
+        if estimator.solver in IPPE:
+            if 0.0 in lens:
+                np.testing.assert_allclose(
+                    error.rotation_rad[0], turn * 2 * (0.05 / distance) ** 2,
+                    atol=5e-3 * strength,
+                )
+            continue
+        np.testing.assert_allclose(
+            error.rotation_rad, np.tile(turn, (4, 1)), atol=5e-3 * strength, err_msg=str(estimator)
+        )
+        moved = found.translation - estimated.scenes.translation
+        # Along z by the second order only.
+        np.testing.assert_allclose(
+            moved, np.tile([p2 * shift, p1 * shift, 0], (4, 1)), atol=2e-2 * strength * shift,
+            err_msg=str(estimator),
+        )
+
+
+# 5. Pixels that are believed to have another shape.
+
+@pytest.mark.parametrize("distance", [0.12, 0.3])
+@pytest.mark.parametrize("error", [-1e-2, -1e-4, 1e-4, 1e-2])
+def test_wrong_fx_alone_is_shared_by_least_squares_and_tilts_what_ippe_sees(error, distance):
+    estimated = Estimated(
+        CENTRED, [f"distance_m={distance}", f"believed_fx_px={600 * (1 + error)!r}"]
+    )
+    ratio = min(1 + error, 1 / (1 + error))
+    for estimator, found, miss in estimated:
+        assert (found.status == Estimate.solved).all()
+        if estimator.solver in LEAST_SQUARES:
+            # To first order: the rest is at most error².
+            expected = np.tile([0, 0, distance * (1 + error / 2)], (4, 1))
+            assert_translation(found.translation, expected, estimator, error**2 + TRANSLATION)
+            assert miss.rotation_angle_rad.max() < ROTATION_RAD, estimator
+        if estimator.solver in IPPE:
+            assert np.isfinite(found.alternative_reprojection_px).all()  # IPPE's, not the guard's
+            np.testing.assert_allclose(
+                miss.rotation_angle_rad, np.arccos(ratio), atol=ROTATION_RAD
+            )
+            np.testing.assert_allclose(
+                found.translation[:, 2], distance * min(1, 1 + error), rtol=1e-9
+            )
+
+
+# 6. Tilted markers.
+
+TILTED = f"""
+[marker]
+size_m = 0.1
+[camera]
+fx_px = 600
+[axes]
+tilt_deg = [30, 60]
+azimuth_deg = [0, 50, 90, 200]
+roll_deg = [0, 70]
+solver = {list(GUARDED)}
+"""
+
+
+def first_order(scenes):
+    """Return what (N,) the perspective of a tilted marker may add to law 6, as a share of it.
+
+    The image's mismatch is a share (s/z)² of the calibration error, and a turn of the marker shows
+    in it with s/z·sin(tilt).
+    """
+    tilt = np.arccos(-scenes.rotation[:, 2, 2])
+    return scenes.size_m / scenes.translation[:, 2] / np.sin(tilt)
+
+
+@pytest.mark.parametrize("distance", [1, 10])
+@pytest.mark.parametrize("off_px", [-1.0, 0.5])
+def test_wrong_principal_point_turns_the_whole_pose_of_a_small_tilted_marker(off_px, distance):
+    estimated = Estimated(
+        TILTED, [f"distance_m={distance}", f"believed_cx_px={319.5 + off_px}"]
+    )
+    angle = off_px / 600
+    # Beside the perspective: the second order of the angle.
+    allowed = abs(angle) * (first_order(estimated.scenes) + 2 * abs(angle))
+    for estimator, found, error in estimated:
+        turned = np.linalg.norm(error.rotation_rad - [0, -angle, 0], axis=1)
+        assert (turned < allowed + ROTATION_RAD).all(), estimator
+        moved = (found.translation - estimated.scenes.translation) / distance
+        astray = np.linalg.norm(moved - [-angle, 0, 0], axis=1)
+        assert (astray < allowed + TRANSLATION).all(), estimator
+
+
+@pytest.mark.parametrize("distance", [1, 10])
+@pytest.mark.parametrize("error", [-0.03, 0.01])
+def test_wrong_focal_length_hardly_turns_a_small_tilted_marker(error, distance):
+    """The homography is scaled along x and y: its Jacobian, all that IPPE looks at, by a factor.
+
+    So IPPE's rotation is exact at any distance, and the other solvers' to first order.
+    """
+    estimated = Estimated(TILTED, [f"distance_m={distance}", *(
+        f"believed_f{axis}_px={600 * (1 + error)!r}" for axis in "xy"
+    )])
+    allowed = abs(error) * first_order(estimated.scenes)
+    for estimator, found, miss in estimated:
+        exact = estimator.solver in IPPE
+        assert (miss.rotation_angle_rad < (0 if exact else allowed) + ROTATION_RAD).all()
+        astray = np.abs(found.translation / distance - [0, 0, 1 + error]).max(axis=1)
+        assert (astray < allowed + TRANSLATION).all(), estimator
+
+
+# As distributions.
+
+DRAWN = f"""
+seed = 20
+[marker]
+size_m = 0.1
+[camera]
+fx_px = 600
+[pose]
+distance_m = 0.25
+roll_deg = 20
+[axes]
+trial = 100
+solver = {list(GUARDED)}
+"""
+LUCK = 1e-6
+
+
+def assert_spread(sample, deviation):
+    """Hold a sample (N,) to be normal with mean 0; a right one fails by chance once in a million.
+
+    Its mean has the deviation / √N, and N - 1 times its variance is chi-squared.
+    """
+    n = len(sample)
+    variance = np.var(sample, ddof=1) / deviation**2
+    low, high = stats.chi2.ppf([LUCK / 4, 1 - LUCK / 4], n - 1) / (n - 1)
+    print(f"\n{n} draws: spread {np.sqrt(variance):.4f} of the expected one, "
+          f"allowed {np.sqrt(low):.4f} to {np.sqrt(high):.4f}")
+    assert low < variance < high
+    assert abs(sample.mean()) < stats.norm.isf(LUCK / 4) * deviation / np.sqrt(n)
+
+
+@lengths(600, 5000)
+def test_spread_of_the_size_is_that_of_the_distance(count):
+    estimated = Estimated(
+        DRAWN, [f"trial={count}", "believed_size_m={normal=[0.1, 0.002]}"]
+    )
+    drawn = estimated.values["believed_size_m"]
+    for estimator, found, _ in estimated:
+        expected = estimated.scenes.translation * (drawn / 0.1)[:, None]
+        assert_translation(found.translation, expected, estimator)
+        assert_spread(found.translation[:, 2] - 0.25, 0.25 * 0.002 / 0.1)
+
+
+@lengths(100, 5000)
+def test_spread_of_the_principal_point_is_that_of_the_marker_sideways(count):
+    estimated = Estimated(DRAWN, [
+        f"trial={count}", "believed_cx_px={normal=[319.5, 2]}", "believed_cy_px={normal=[239.5, 5]}"
+    ])
+    for estimator, found, error in estimated:
+        expected = parallel_law(
+            estimated.scenes, 600, 600, estimated.values["believed_cx_px"],
+            estimated.values["believed_cy_px"], 0.1,
+        )
+        assert_translation(found.translation, expected, estimator)
+        assert error.rotation_angle_rad.max() < ROTATION_RAD, estimator
+        assert_spread(found.translation[:, 0], 0.25 * 2 / 600)
+        assert_spread(found.translation[:, 1], 0.25 * 5 / 600)
+        # Two quantities, two streams.
+        correlation = np.corrcoef(found.translation[:, 0], found.translation[:, 1])[0, 1]
+        assert abs(correlation) < stats.norm.isf(LUCK / 2) / np.sqrt(count)
+
+
+@lengths(100, 5000)
+def test_spread_of_the_focal_lengths_is_that_of_the_distance(count):
+    """fx' and fy' are drawn on their own, and law 5 takes their mean: z·sd/f over √2.
+
+    Of IPPE the smaller counts, so that its distances are too short on average: by z·sd/(f·√π), the
+    mean of the smaller of two normal numbers.
+    """
+    deviation = 600 * 1e-3
+    estimated = Estimated(DRAWN, [f"trial={count}", *(
+        f"believed_f{axis}_px={{normal=[600, {deviation}]}}" for axis in "xy"
+    )])
+    x, y = (estimated.values[f"believed_f{axis}_px"] / 600 - 1 for axis in "xy")
+    for estimator, found, _ in estimated:
+        z = found.translation[:, 2] / 0.25 - 1
+        if estimator.solver in LEAST_SQUARES:
+            # 5 deviations, squared: what is beyond the first order.
+            np.testing.assert_allclose(z, (x + y) / 2, atol=2 * (5e-3) ** 2)
+            assert_spread(z, 1e-3 / np.sqrt(2))
+        if estimator.solver in IPPE:
+            np.testing.assert_allclose(z, np.minimum(x, y), atol=TRANSLATION)
+            # The variance of the smaller of two is 1 - 1/π; the sum of many is nearly normal.
+            bound = stats.norm.isf(LUCK / 2) * 1e-3 * np.sqrt((1 - 1 / np.pi) / count)
+            assert abs(z.mean() + 1e-3 / np.sqrt(np.pi)) < bound
+
+
+def test_drawn_beliefs_are_the_same_for_all_solvers_and_independent_of_one_another():
+    drawn = ["believed_cx_px={normal=[319.5, 2]}", "believed_size_m={uniform=[0.09, 0.11]}"]
+    both = Estimated(DRAWN, drawn)
+    first = both.estimates[0].translation
+    assert len(np.unique(first[:, 2])) == len(first)
+    for _, found, _ in both:
+        assert_translation(found.translation, first, "as the first solver", 2 * TRANSLATION)
+    for one in drawn:
+        name = one.split("=")[0]
+        np.testing.assert_array_equal(
+            Estimated(DRAWN, [one]).values[name], both.values[name]
+        )
+
+
+# Through images and detections.
+
+SEEN = """
+seed = 5
+[marker]
+size_m = 0.1
+[camera]
+fx_px = 600
+[pose]
+side_px = 300
+jitter_px = 0.5
+[scene]
+background = 128
+[detector]
+cornerRefinementMethod = "subpix"
+[axes]
+"""
+
+
+def translations(values):
+    """Return estimated translations over a grid, the truth repeated for every treatment."""
+    error = values["translation_error_m"].astype(np.float64)
+    truth = values["true_tvec_m"]
+    between = error.ndim - truth.ndim
+    return error + truth.reshape(truth.shape[:-1] + (1,) * between + (3,)), truth
+
+
+@lengths(2, 20)
+def test_beliefs_move_detected_markers_as_they_move_exact_ones(count):
+    """Markers of 300 px that squarely face the image plane, with sub-pixel corners off by 0.2 px.
+
+    Size and principal point: measured 1e-5 of the distance between the move and the law; 2.5e-3
+    sideways for IPPE, which by law 5 takes corners that are 0.08 px from a square for a tilt of
+    1.3 degrees one way or the other (all other solvers: 0.04 degrees). From the truth 8e-4, by the
+    corners' errors of 0.18 of 300 px; sideways for IPPE 2e-3.
+    """
+    axes = f"trial = {count}\nsolver = {list(GUARDED)}\n"
+    plain, truth = translations(run(SEEN + axes))
+    sizes, centres, focal = [0.09, 0.1, 0.12], [309.5, 319.5, 322.5], [594.0, 600.0, 612.0]
+
+    grid = run(SEEN + axes + f"believed_size_m = {sizes}\nbelieved_cx_px = {centres}\n")
+    assert (grid["detection"] == Detection.detected).all()
+    assert (grid["estimate"] == Estimate.solved).all()
+    found, _ = translations(grid)
+    assert found.shape == (count, len(GUARDED), 3, 3, 3)
+    tilted = np.array([solver in IPPE for solver in GUARDED])[:, None]
+    for (i, size), (j, centre) in itertools.product(enumerate(sizes), enumerate(centres)):
+        for start, allowed in ((plain, 5e-5), (truth[:, None], 2e-3)):
+            shifted = start - start[..., 2:] * [(centre - 319.5) / 600, 0, 0]
+            astray = np.abs(found[:, :, i, j] - size / 0.1 * shifted) / truth[:, None, 2:]
+            assert (astray < np.where(tilted, 5e-3, allowed)).all(), (size, centre)
+
+    grid = run(SEEN + axes + f"believed_fx_px = {focal}\nbelieved_fy_px = {focal}\n")
+    found, _ = translations(grid)
+    for (i, fx), (j, fy) in itertools.product(enumerate(focal), enumerate(focal)):
+        ratio = found[:, :, i, j, 2] / plain[..., 2] - 1
+        for k, solver in enumerate(GUARDED):
+            if i == j:
+                # A scaled image is a scaled pose; errors are float32.
+                np.testing.assert_allclose(ratio[:, k], fx / 600 - 1, atol=1e-6)
+            elif solver in LEAST_SQUARES:
+                np.testing.assert_allclose(ratio[:, k], (fx + fy) / 1200 - 1, atol=1e-3)
+            elif solver in IPPE:
+                np.testing.assert_allclose(ratio[:, k], min(fx, fy) / 600 - 1, atol=1e-3)
+
+
+@lengths(40, 400)
+def test_drawn_size_spreads_the_distance_of_detected_markers(count):
+    axes = f"trial = {count}\nsolver = {list(GUARDED)}\n"
+    plain, _ = translations(run(SEEN.replace("side_px = 300", "side_px = 60") + axes))
+    drawn, truth = translations(run(
+        SEEN.replace("side_px = 300", "side_px = 60") + axes
+        + "[estimator]\nbelieved_size_m = { normal = [0.1, 0.002] }\n"
+    ))
+    ratio = drawn / plain
+    # One draw a trial for all solvers and all coordinates; errors are float32: 6e-8 of 1 m.
+    z = ratio[:, :1, 2:]
+    np.testing.assert_allclose(ratio[..., 2:], np.broadcast_to(z, ratio[..., 2:].shape), rtol=1e-6)
+    np.testing.assert_allclose(drawn, plain * z, atol=1e-6 * truth[:, 2].max())
+    assert_spread(z.ravel() - 1, 0.02)
+
+
+# What beliefs must not touch.
+
+EVERYTHING = """
+seed = 13
+[camera]
+fx_px = 610.1
+fy_px = 598.7
+cx_px = 333.3
+distortion = [-0.11, 0.02, 0.001, -0.0007]
+[marker]
+size_m = 0.0731
+[pose]
+side_px = 45
+jitter_px = 0.5
+tilt_deg = { uniform = [0, 60] }
+azimuth_deg = { normal = [0, 40] }
+[scene]
+background = 90
+[axes]
+bearing_x_deg = [0, 21]
+trial = 8
+cornerRefinementMethod = ["none", "subpix"]
+solver = ["ippe_square", "ippe", "iterative", "sqpnp", "p3p", "ap3p", "epnp"]
+guarded = [true, false]
+"""
+TRUTH = {
+    "believed_fx_px": "610.1", "believed_fy_px": "598.7", "believed_cx_px": "333.3",
+    "believed_cy_px": "239.5", "believed_size_m": "0.0731",
+    "believed_distortion": "[-0.11, 0.02, 0.001, -0.0007, 0.0]",
+}
+
+
+@pytest.fixture(scope="module")
+def unset():
+    return run(EVERYTHING)
+
+
+@pytest.mark.parametrize("belief", [*TRUTH, "all"])
+def test_believing_the_truth_gives_the_bits_of_believing_nothing(belief, unset):
+    names = TRUTH if belief == "all" else [belief]
+    believing = run(EVERYTHING, [f"{name}={TRUTH[name]}" for name in names])
+    assert (unset["estimate"] == Estimate.solved).any()
+    for name, expected in unset.items():
+        np.testing.assert_array_equal(believing[name], expected, err_msg=name)
+
+
+def test_unset_beliefs_follow_the_truth_from_scene_to_scene():
+    cameras = EVERYTHING.replace("fx_px = 610.1\n", "").replace("fy_px = 598.7\n", "").replace(
+        "size_m = 0.0731\n", ""
+    )
+    axes = ["fx_px=[500.0, 610.1]", "size_m=[0.05, 0.0731]"]
+    axes.append("trial=3")
+    following = run(cameras, axes)
+    believing = run(cameras, [*axes, "believed_fx_px=610.1", "believed_fy_px=610.1",
+                              "believed_size_m=0.0731"])
+    # The axes of settings are the last ones, but for x, y, z.
+    for at, same in ((0, False), (1, True)):
+        ours, theirs = (
+            grid["translation_error_m"][..., at, at, :] for grid in (following, believing)
+        )
+        assert np.array_equal(ours, theirs, equal_nan=True) == same
+
+
+BELIEFS = {
+    "values": ["believed_fx_px=700", "believed_cy_px=250", "believed_distortion=[]",
+               "believed_size_m=0.08"],
+    "axes": ["believed_size_m={geom=[0.01, 1, 2]}",
+             "believed_distortion=[[], [-0.3, 0.1, 0, 0]]"],
+    "distributions": ["believed_fx_px={normal=[610, 3]}", "believed_fy_px={uniform=[500, 700]}",
+                      "believed_cx_px={normal=[333, 2]}", "believed_cy_px={uniform=[230, 250]}",
+                      "believed_size_m={normal=[0.07, 0.001]}"],
+}
+
+
+@pytest.mark.parametrize("settings", BELIEFS.values(), ids=BELIEFS)
+def test_beliefs_change_no_draw_no_image_and_no_detection(settings, unset):
+    believing = run(EVERYTHING, settings)
+    seen = [variable.name for variable in TEMPLATE if variable.stage < Stage.estimation]
+    assert set(seen) >= {"true_rvec", "true_tvec_m", "detection", "corner_error_px"}
+    assert (unset["detection"] == Detection.detected).any()
+    for name in seen:
+        np.testing.assert_array_equal(believing[name], unset[name], err_msg=name)
+    different = believing["translation_error_m"]
+    assert different.shape != unset["translation_error_m"].shape or not np.array_equal(
+        different, unset["translation_error_m"], equal_nan=True
+    )

@@ -1,0 +1,223 @@
+"""At the extremes nothing untold passes as detected or solved, and each regime does as it says.
+
+The regimes are the files of pipelines/extremes; ``python tests/benchmarks/extremes.py`` prints
+what every refinement and solver does there.
+"""
+
+import os
+
+import numpy as np
+import pytest
+from benchmarks.extremes import (
+    FILES,
+    REFINEMENTS,
+    SOLVERS,
+    all_that_is_printed,
+    broken_promises,
+    measured,
+)
+from conftest import lengths
+
+from sweep.kernel import Failure
+from sweep.measure.flags import Detection, Estimate, Flipped
+from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
+
+PATHS = {path.stem: path for path in FILES}
+MOST_SCENES = 300
+SUBPIX = "cornerRefinementMethod=subpix"
+
+
+def regime(name, *settings):
+    """Return what all scenes of a regime gave, checked, with settings as ``--set`` takes them."""
+    result = measured(Pipeline.from_toml(PATHS[name], settings))
+    assert broken_promises(result) == []
+    return result
+
+
+def along(result, variable, axis):
+    """Return a variable's values with one of the axes first, the others flat: (n, ...)."""
+    pipeline = result.pipeline
+    axes = [a for stage in (Stage.detection, Stage.estimation, Stage.scene)
+            for a in pipeline.axes_of(stage)]
+    values = result.values[variable].reshape([len(a) for a in axes])
+    place = [a.name for a in axes].index(axis)
+    return np.moveaxis(values, place, 0).reshape(len(axes[place]), -1)
+
+
+@lengths(8, MOST_SCENES)
+@pytest.mark.parametrize("name", PATHS)
+def test_all_that_is_detected_or_solved_is_finite_and_nothing_is_raised_or_printed(name, count):
+    assert broken_promises(measured(Pipeline.from_toml(PATHS[name]), count)) == []
+
+
+@pytest.mark.parametrize("name", PATHS)
+def test_every_regime_is_small_and_has_every_refinement_and_every_solver(name):
+    pipeline = Pipeline.from_toml(PATHS[name])
+    assert pipeline.title
+    assert pipeline.size(Stage.scene) <= MOST_SCENES
+    assert pipeline.values_of("cornerRefinementMethod") == REFINEMENTS
+    assert pipeline.values_of("solver") == SOLVERS
+
+
+@pytest.mark.parametrize("nonsense", [np.nan, np.inf])
+@pytest.mark.parametrize(
+    "variable", ["true_tvec_m", "corner_error_px", "rotation_error_rad", "reprojection_error_px"]
+)
+def test_a_number_that_is_not_finite_would_be_told(variable, nonsense):
+    result = measured(Pipeline.from_toml(PATHS["tilt_zero"]), 1)
+    assert broken_promises(result) == []
+    result.values[variable].flat[0] = nonsense
+    assert broken_promises(result)
+
+
+def test_what_is_printed_or_raised_would_be_told():
+    result = measured(Pipeline.from_toml(PATHS["zero_contrast"]), 1)
+    with all_that_is_printed() as lines:
+        os.write(2, b"a warning of a library\n")
+        print("one of Python")
+    assert lines == ["a warning of a library", "one of Python"]
+    result.printed = lines
+    result.failures.append(Failure(0, "detection", "Traceback\nValueError: why"))
+    assert len(broken_promises(result)) == 3
+
+
+FLAGS = {
+    "tilt_zero": [([], "detected")],
+    "tilt_grazing": [
+        (["bearing_y_deg=0", "tilt_deg=[89.9, 89.99]"], "no_candidate"),
+        (["bearing_y_deg=10", "azimuth_deg=0", "tilt_deg=[85, 89.99]"], "not_visible"),
+        (["bearing_y_deg=-10", "azimuth_deg=0", "tilt_deg=[80, 89.99]", "side_px=150"],
+         "detected"),
+    ],
+    "side_tiny": [(["side_px=4"], "no_candidate")],
+    "side_huge": [
+        (["side_px=400", "bearing_x_deg=0", "tilt_deg=0", "roll_deg=0"], "detected"),
+        (["side_px=[5000, 1e5, 1e8]", "tilt_deg=0"], "no_candidate"),
+        (["side_px=[5000, 1e5, 1e8]", "tilt_deg=30"], "not_visible"),
+    ],
+    "corner_outside": [
+        (["cx_px={linspace=[62.2, 70.2, 5]}"], "rejected no_candidate"),
+        (["cx_px={linspace=[74.2, 82.2, 5]}"], "detected"),
+    ],
+    "corner_behind": [
+        (["side_px=100", "tilt_deg=0"], "detected"),
+        (["side_px=400", "tilt_deg=[60, 70, 80]"], "not_visible"),
+    ],
+    "scale": [(["size_m=[0.001, 1000]", "guarded=true"], "detected")],
+    "focal_length": [
+        (["fx_px=10", "tilt_deg=60"], "not_visible"),
+        (["fx_px=[1e3, 1e5]", "side_px=80"], "detected"),
+    ],
+    "principal_point": [
+        (["cx_px=-5000", "bearing_x_deg=0"], "not_visible"),
+        (["cx_px=-50000", "bearing_x_deg=89.316848753", "tilt_deg=0"], "detected"),
+    ],
+    "lens_fold": [
+        (["bearing_x_deg=85"], "not_modelled"),
+        (["distortion=[-0.5, 0, 0, 0]", "bearing_x_deg=[40, 45, 60]"], "not_modelled"),
+        (["distortion=[-0.5, 0, 0, 0]", "bearing_x_deg=[0, 20]", "bearing_y_deg=0"], "detected"),
+        # Sideways: without its fold at -29 degrees it would be drawn in the frame.
+        (["distortion=[0, 0, 0.3, 0]", "bearing_x_deg=0", "bearing_y_deg=-35"], "not_modelled"),
+    ],
+    "lens_believed": [(["bearing_x_deg=0"], "detected")],
+    "half_turn": [(["bearing_x_deg=0", "guarded=true"], "detected")],
+    "planar_ambiguity": [(["side_px=60"], "detected")],
+    "noise": [
+        (["noise_grey=0", "side_px=60"], "detected"),
+        (["noise_grey=1000", "side_px=60"], "rejected no_candidate"),
+    ],
+    "saturated": [
+        (["gain=[1, 2, 4]", "side_px=60"], "detected"),
+        (["gain=[0.01, 10, 1e4]"], "no_candidate"),
+    ],
+    "inverted": [
+        (["detectInvertedMarker=false", "side_px=80"], "rejected"),
+        (["detectInvertedMarker=true", "side_px=80", SUBPIX], "detected"),
+    ],
+    "zero_contrast": [([], "no_candidate")],
+    "frame_tiny": [([], "no_candidate not_visible")],
+    "frame_wide": [
+        (["height_px=8"], "no_candidate"),
+        (["height_px=300", "side_px=280", "bearing_x_deg=[0, 30, 44]"], "detected"),
+        (["side_px=30", SUBPIX], "no_candidate"),
+    ],
+}
+"""Regime -> settings, and all the flags that its searches then give."""
+
+
+def test_every_regime_has_its_flags():
+    assert FLAGS.keys() == PATHS.keys()
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "expected"),
+    [pytest.param(name, settings, expected, id=" ".join([name, *settings]))
+     for name, cases in FLAGS.items() for settings, expected in cases],
+)
+def test_regime_is_flagged_as_expected(name, settings, expected):
+    flags = np.unique(regime(name, "solver=ippe_square", *settings).values["detection"])
+    assert {Detection(flag).name for flag in flags} == {*expected.split()}
+
+
+def relative_errors(result):
+    """Return translation error / distance and rotation error (sizes, n, 3) of a scale pipeline."""
+    sizes = len(result.pipeline.axis("size_m"))
+    distance = np.linalg.norm(result.values["true_tvec_m"], axis=1)[:, None]
+    errors = (result.values["translation_error_m"].astype(np.float64) / distance,
+              result.values["rotation_error_rad"].astype(np.float64))
+    settings, solvers, scenes, _ = errors[0].shape
+    for error in errors:
+        by_size = error.reshape(settings, solvers, sizes, scenes // sizes, 3)
+        yield by_size.transpose(2, 1, 0, 3, 4).reshape(sizes, solvers, -1, 3)
+
+
+def test_the_same_image_in_millimetres_and_kilometres_gives_the_same_relative_errors():
+    result = regime("scale", "guarded=true")
+    assert result.pipeline.axes_of(Stage.scene)[0].name == "size_m"
+    assert result.pipeline.values_of("size_m")[::3] == (1e-3, 1e3)
+    assert (result.values["estimate"] == Estimate.solved).all()
+    for what, error in zip(("translation", "rotation"), relative_errors(result), strict=True):
+        assert np.abs(error).max() > 1e-3  # there is something to compare
+        apart = np.abs(error - error[:1]).max(axis=(0, 2, 3))
+        print(f"\n{what} errors are apart by at most "
+              + ", ".join(f"{s} {a:.1e}" for s, a in zip(SOLVERS, apart, strict=True)))
+        assert (apart <= 1e-6).all()
+
+
+@pytest.mark.parametrize("name", ["tilt_zero", "half_turn"])
+def test_guarded_solvers_do_not_notice_where_a_rotation_has_two_vectors(name):
+    result = regime(name, "guarded=true", SUBPIX)
+    assert (result.values["estimate"] == Estimate.solved).all()
+    # Corners of sub-pixel refinement are off by up to 0.3 px of 60.
+    assert result.values["rotation_error_deg"].max() < 1.0
+    plain = regime(name, "guarded=false", "solver=['ippe', 'ippe_square']", SUBPIX)
+    assert (plain.values["estimate"] == Estimate.solver_failed).any()
+
+
+def test_of_a_pair_on_the_planar_ambiguity_one_is_flipped_and_neither_is_anything_else():
+    result = regime("planar_ambiguity", "fx_px=50000", "side_px=[30, 60]", SUBPIX)
+    assert (result.values["estimate"] == Estimate.solved).all()
+    flipped = along(result, "flipped", "solver") == Flipped.flipped
+    print(f"\nflipped: {dict(zip(SOLVERS, flipped.mean(axis=1).round(2).tolist(), strict=True))}")
+    assert (np.abs(flipped.mean(axis=1) - 0.5) < 0.15).all()
+    both = [result.values[name][:, :2] for name in
+            ("rotation_error_deg", "alternative_rotation_error_deg")]
+    assert np.fmin(*both).max() < 10.0
+    near = regime("planar_ambiguity", "fx_px=500", "side_px=60", "tilt_deg=[20, 50]", SUBPIX)
+    assert (near.values["flipped"] == Flipped.not_flipped).all()
+
+
+def test_corners_outside_the_image_of_the_believed_lens_are_not_solved():
+    for bearing, expected in (("[0, 5, 10, 15]", {Estimate.solved}),
+                              ("[22, 25]", {Estimate.solver_failed})):
+        result = regime("lens_believed", f"bearing_x_deg={bearing}", SUBPIX)
+        assert {*np.unique(result.values["estimate"])} == expected
+
+
+def test_poses_at_the_edge_of_a_wide_frame_are_as_good_as_in_its_middle():
+    result = regime("frame_wide", "height_px=2000", "side_px=280", "bearing_x_deg=[0, 44]", SUBPIX)
+    worst = along(result, "rotation_error_deg", "bearing_x_deg").max(axis=1)
+    print("\nworst rotation error in the middle and at the edge: "
+          f"{worst[0]:.3f} and {worst[1]:.3f} degrees")
+    assert (worst < 0.2).all()

@@ -1,0 +1,639 @@
+"""Where OpenCV is unstable: how often it fails, that the guard does not, and that it is needed.
+
+Every check is a function of the routine under test. Ours passes it; OpenCV's own, put in the
+guard's place, must fail it, so a check that has become toothless is a failure too. With ``-s``
+the counts are printed. Where the guards sit, and who else tests them:
+
+- rotation vectors: ``model/pose.py`` (digits: ``test_projection.py``);
+- projection: ``Cameras.project``, which the flag ``not_visible`` is taken from;
+- lens inverse, solvers: ``measure/solver.py`` (``test_solver_guard.py`` has IPPE at half turns,
+  SQPNP at absolute lengths of 1 mm, and what becomes of garbage);
+- reach of the sub-pixel refinement: ``margin_px`` in ``measure/detector.py``.
+"""
+
+import ast
+import itertools
+from pathlib import Path
+
+import cv2
+import mpmath
+import numpy as np
+import pytest
+from conftest import lengths
+from mpmath import mp, mpf
+
+import sweep
+from sweep import kernel
+from sweep.kernel import run_block, search, visibility_flags
+from sweep.measure import accuracy
+from sweep.measure.accuracy import pose_error
+from sweep.measure.detector import DetectorSetting, margin_px
+from sweep.measure.flags import Detection, Estimate
+from sweep.measure.solver import SOLVERS, estimate
+from sweep.model.camera import Cameras
+from sweep.model.lens import pack
+from sweep.model.pose import rotation_of_vector, vector_of_rotation
+from sweep.model.scene import build_scenes
+from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
+from sweep.plan.pipeline import Pipeline
+
+FOCAL_PX = 1600 / 3
+SQUARE = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5, -0.5, 0]])
+RELIABLE = tuple(name for name in SOLVERS if name != "epnp")
+
+
+def whole(pipeline):
+    shape = tuple(len(axis) for axis in scene_axes(pipeline))
+    return Block((0,) * len(shape), shape)
+
+
+def scenes_of(pipeline):
+    block = whole(pipeline)
+    return build_scenes(scene_values(pipeline, block_indices(block)), len(block))
+
+
+def cameras(count, lens=()):
+    view = np.tile([FOCAL_PX, FOCAL_PX, 319.5, 239.5], (count, 1))
+    return Cameras(view, np.repeat(pack(lens)[None], count, axis=0), np.full(count, bool(lens)))
+
+
+# The guards sit in one place.
+
+PLACES = {
+    "solvePnP": {"measure/solver.py"},
+    "solvePnPGeneric": {"measure/solver.py"},
+    "Rodrigues": set(),
+    "projectPoints": set(),
+    "undistortPoints": set(),
+    "cornerSubPix": set(),
+    "drawFrameAxes": set(),  # projects
+    "solvePnPRansac": set(),
+    "estimatePoseSingleMarkers": set(),
+}
+
+
+def test_unstable_routines_are_called_where_they_are_guarded_and_nowhere_else():
+    root = Path(sweep.__file__).parent
+    found = {routine: set() for routine in PLACES}
+    for path in root.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Attribute) and node.attr in PLACES:
+                found[node.attr].add(path.relative_to(root).as_posix())
+    assert found == PLACES
+
+
+# Rotation vectors: cv2.Rodrigues calls every angle below 1e-5 rad none, and every one within
+# 1e-5 rad of a half turn a half turn.
+
+NEAR = (1e-12, 1e-10, 1e-8, 1e-7, 1e-6, 5e-6, 1e-4, 1e-2)
+
+
+def rotation_about(axis, angle):
+    """Return Rodrigues' formula in fifty digits."""
+    x, y, z = axis
+    c, s = mp.cos(angle), mp.sin(angle)
+    v = 1 - c
+    return mpmath.matrix([[c + v * x * x, v * x * y - s * z, v * x * z + s * y],
+                          [v * x * y + s * z, c + v * y * y, v * y * z - s * x],
+                          [v * x * z - s * y, v * y * z + s * x, c + v * z * z]])
+
+
+def rotations(count, near_half_turn):
+    """Yield angles, rotation vectors and their matrices, both rounded once from fifty digits."""
+    rng = np.random.default_rng(41)
+    with mp.workdps(50):
+        for power, direction in itertools.product(NEAR, rng.normal(size=(count, 3))):
+            axis = mpmath.matrix(direction.tolist())
+            axis /= mp.norm(axis)
+            angle = mp.pi - mpf(power) if near_half_turn else mpf(power)
+            vector = np.array((angle * axis).tolist(), dtype=np.float64)[:, 0]
+            yield float(angle), vector, np.array(
+                rotation_about(axis, angle).tolist(), dtype=np.float64
+            )
+
+
+def opencv_vector(matrix):
+    return cv2.Rodrigues(matrix)[0][:, 0]
+
+
+def check_vectors(routine, count, near_half_turn):
+    """Hold a logarithm to 1e-12 of the angle: a thousand times what rounding the matrix costs."""
+    errors = np.array([
+        np.linalg.norm(routine(matrix) - vector) / angle
+        for angle, vector, matrix in rotations(count, near_half_turn)
+    ])
+    print(f"\n{routine.__name__} near {'π' if near_half_turn else '0'}: "
+          f"{(errors > 1e-12).sum()} of {len(errors)} off by more than 1e-12 of the angle, "
+          f"{(errors > 0.9).sum()} by all of it; worst {errors.max():.1e}")
+    assert errors.max() < 1e-12
+    return errors
+
+
+@lengths(6, 300)
+@pytest.mark.parametrize("near_half_turn", [False, True], ids=["near 0", "near π"])
+def test_rotation_vector_is_right_where_opencv_loses_it(count, near_half_turn):
+    """Measured on 2,400 rotations at each end, 1e-12 to 1e-2 rad from it.
+
+    cv2.Rodrigues is off by more than 1e-12 of the angle for 2,265 near 0: for all 1,800 below 1e-5
+    rad by the whole of it, since it returns 0. Near π for 1,662: it takes what is within 1e-5 rad
+    for a half turn, of which either sign is right, and so turns 858 vectors round. Ours is off by
+    4e-16 of the angle at most.
+    """
+    check_vectors(vector_of_rotation, count, near_half_turn)
+    with pytest.raises(AssertionError):
+        check_vectors(opencv_vector, count, near_half_turn)
+
+
+def check_rotation_errors(count):
+    """Measure known rotation errors as the kernel does; float32 keeps 6e-8 of them."""
+    turns, reported = [], []
+    truth = rotation_of_vector(np.array([2.1, -1.9, 0.4]))
+    for angle, _, matrix in rotations(count, near_half_turn=False):
+        one = pose_error((matrix @ truth)[None], np.ones((1, 3)), truth[None], np.ones((1, 3)))
+        turns.append(angle)
+        reported.append(one.rotation_angle_rad[0])
+    turns, reported = np.array(turns), np.array(reported)
+    print(f"\nrotation errors reported as none: {(reported == 0).sum()} of {len(turns)}")
+    # Two matrices of doubles tell rotations apart to 1e-15 rad.
+    np.testing.assert_allclose(reported, turns, rtol=6e-8, atol=2e-15)
+
+
+@lengths(6, 100)
+def test_small_rotation_errors_are_not_reported_as_none(count, monkeypatch):
+    """With cv2.Rodrigues, all 600 errors of less than 1e-5 rad (0.0006°) are reported as 0."""
+    check_rotation_errors(count)
+    monkeypatch.setattr(
+        accuracy, "vector_of_rotation", lambda many: np.array([opencv_vector(m) for m in many])
+    )
+    with pytest.raises(AssertionError):
+        check_rotation_errors(count)
+
+
+def test_rotation_that_is_not_a_number_has_no_vector():
+    """cv2.Rodrigues gives it the vector 0: a failed pose would be a perfect one."""
+    nothing = np.full((3, 3), np.nan)
+    assert (opencv_vector(nothing) == 0).all()
+    assert np.isnan(vector_of_rotation(nothing)).all()
+    error = pose_error(nothing[None], np.ones((1, 3)), np.eye(3)[None], np.ones((1, 3)))
+    assert np.isnan(error.rotation_angle_rad).all()
+
+
+def check_matrices(routine):
+    """Hold the off-diagonal entries of tiny rotations to 1e-12 of them."""
+    lost = 0
+    for angle in 10.0 ** -np.arange(1.0, 31.0):
+        matrix = routine(np.array([angle, 0.0, 0.0]))
+        lost += not abs(matrix[2, 1] - np.sin(angle)) <= 1e-12 * angle
+    print(f"\n{getattr(routine, '__name__', routine)}: {lost} of 30 tiny rotations lost")
+    assert lost == 0
+
+
+def test_tiny_rotation_vectors_keep_their_matrix():
+    """cv2.Rodrigues loses the 15 of 30 angles that lie below 2e-16 rad."""
+    check_matrices(rotation_of_vector)
+    with pytest.raises(AssertionError):
+        check_matrices(lambda vector: cv2.Rodrigues(vector)[0])
+
+
+# Projection: cv2.projectPoints divides by z whatever its sign.
+
+def opencv_project(self, points):
+    """As :meth:`Cameras.project`, by OpenCV."""
+    pixels = np.empty((*points.shape[:2], 2))
+    for i in range(len(points)):
+        lens = self.lenses[i, :14] if self.distorted[i] else None
+        pixels[i] = cv2.projectPoints(
+            points[i], np.zeros(3), np.zeros(3), self.matrix(i), lens
+        )[0][:, 0]
+    return pixels
+
+
+def check_projection(project, count):
+    """Hold points behind the camera or in its plane to have no image, and others to have one."""
+    rng = np.random.default_rng(42)
+    points = rng.normal(size=(count, 4, 3)) * [0.5, 0.5, 1.0]
+    points[:, 0, 2] = rng.choice([0.0, -0.0, -1e-12, -1e9], count)
+    for lens in ((), (-0.3, 0.1, 0.0, 0.0)):
+        pixels = project(cameras(count, lens), points)
+        finite = np.isfinite(pixels).all(axis=2)
+        behind = ~(points[..., 2] > 0)
+        framed = finite & (pixels > -0.5).all(axis=2) & (pixels < [639.5, 479.5]).all(axis=2)
+        print(f"\n{project.__name__}: {(finite & behind).sum()} of {behind.sum()} points behind "
+              f"the camera have an image, {(framed & behind).sum()} of them in the frame")
+        assert finite[~behind].all()
+        assert not finite[behind].any()
+
+
+@lengths(100, 10_000)
+def test_points_behind_the_camera_have_no_image(count):
+    """cv2.projectPoints gives all of 25,057 a finite one, and 9,959 of them one in the frame."""
+    check_projection(Cameras.project, count)
+    with pytest.raises(AssertionError):
+        check_projection(opencv_project, count)
+
+
+AROUND_THE_CAMERA = """
+seed = 7
+[pose]
+azimuth_deg = { uniform = [0, 360] }
+roll_deg = { uniform = [0, 360] }
+[scene]
+background = 128
+[axes]
+side_px = [300, 600, 1000, 2000, 5000]
+tilt_deg = [0, 30, 60, 80, 85, 89]
+bearing_x_deg = [0, 25]
+bearing_y_deg = [0, -20, 60]
+trial = 3
+"""
+
+
+def check_visibility(scenes):
+    """Hold markers that reach behind the camera to be flagged; return which (N,) those are."""
+    corners = np.einsum(
+        "nij,nkj->nki", scenes.rotation, scenes.size_m[:, None, None] * SQUARE
+    ) + scenes.translation[:, None]
+    behind = (corners[..., 2] <= 0).any(axis=1)
+    missed = behind & (visibility_flags(scenes) != Detection.not_visible)
+    print(f"\n{behind.sum()} of {len(scenes)} markers reach behind the camera; "
+          f"{missed.sum()} of them would be looked for")
+    assert behind.sum() > 100
+    assert not missed.any()
+    return behind
+
+
+def test_marker_that_reaches_behind_the_camera_is_not_visible(monkeypatch):
+    """With cv2.projectPoints, 144 of 238 such markers would be drawn and looked for."""
+    pipeline = Pipeline.from_text(AROUND_THE_CAMERA)
+    behind = check_visibility(scenes_of(pipeline))
+    some = Pipeline.from_text(AROUND_THE_CAMERA, ["side_px=[1000, 2000]", "trial=1"])
+    result = run_block(some, whole(some))
+    assert not result.failures
+    unseen = result.values["detection"] == Detection.not_visible
+    assert unseen.sum() > 20
+    assert (result.values["estimate"][unseen] == Estimate.no_detection).all()
+    assert np.isnan(result.values["translation_error_m"][unseen]).all()
+    monkeypatch.setattr(Cameras, "project", opencv_project)
+    with pytest.raises(AssertionError):
+        check_visibility(scenes_of(pipeline))
+    assert behind.any()
+
+
+# Solvers: OpenCV's success flag says nothing of what was solved.
+
+def worthless_corners(count):
+    """Return quadrilaterals (n, 4, 2) that no marker gave, by kind."""
+    rng = np.random.default_rng(43)
+    at = rng.uniform(0, 600, (count, 1, 2))
+    anywhere = rng.uniform(0, 600, (count, 4, 2))
+    kinds = {
+        "random": rng.uniform(-200, 800, (count, 4, 2)),
+        "crossed": (at + 80 * SQUARE[:, :2] + rng.normal(0, 3, (count, 4, 2)))[:, [0, 2, 1, 3]],
+        "collinear": at + rng.uniform(-1, 1, (count, 4, 1)) * rng.uniform(-300, 300, (count, 1, 2)),
+        "identical": np.repeat(at, 4, axis=1),
+        "two identical": np.repeat(anywhere[:, :2], 2, axis=1),
+        "three identical": np.concatenate([np.repeat(at, 3, axis=1), anywhere[:, :1]], axis=1),
+        "huge": rng.uniform(-1e20, 1e20, (count, 4, 2)),
+        "NaN": np.full((count, 4, 2), np.nan),
+        "one NaN": anywhere.copy(),
+        "one infinite": anywhere.copy(),
+    }
+    kinds["one NaN"][:, 1, 0] = np.nan
+    kinds["one infinite"][:, 2, 1] = np.inf
+    return {kind: np.ascontiguousarray(corners) for kind, corners in kinds.items()}
+
+
+def opencv_solve(corners, solver):
+    """Return success (n,), rotations and translations as OpenCV gives them."""
+    view = cameras(1).matrix(0)
+    solved = np.zeros(len(corners), dtype=bool)
+    vectors, translation = np.zeros((len(corners), 3)), np.zeros((len(corners), 3))
+    for i, quad in enumerate(corners):
+        try:
+            solved[i], vector, centre = cv2.solvePnP(
+                0.05 * SQUARE, quad, view, None, flags=SOLVERS[solver]
+            )
+        except cv2.error:
+            continue
+        if solved[i]:
+            vectors[i], translation[i] = vector[:, 0], centre[:, 0]
+    return solved, rotation_of_vector(vectors), translation
+
+
+def our_solve(guarded):
+    def solve(corners, solver):
+        count = len(corners)
+        estimates = estimate(
+            corners, cameras(count), np.full(count, 0.05), solver, guarded, 0.25
+        )
+        solved = estimates.status == Estimate.solved
+        assert (estimates.status[~solved] == Estimate.solver_failed).all()
+        return solved, estimates.rotation, estimates.translation
+
+    return solve
+
+
+def defects(corners, solved, rotation, translation):
+    """Return how many solved poses are not finite, behind the camera, or do not reproject."""
+    points = 0.05 * np.einsum("nij,kj->nki", rotation, SQUARE) + translation[:, None]
+    with np.errstate(all="ignore"):
+        finite = np.isfinite(points).all(axis=(1, 2))
+        before = (points[..., 2] > 0).all(axis=1)
+        pixels = points[..., :2] / points[..., 2:] * FOCAL_PX + [319.5, 239.5]
+        rms = np.sqrt(((pixels - corners) ** 2).sum(axis=2).mean(axis=1))
+        side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(axis=1)
+        fits = rms <= 0.2500001 * side  # the default limit, and the rounding of this check
+    return np.array([(solved & ~finite).sum(), (solved & finite & ~before).sum(),
+                     (solved & finite & before & ~fits).sum()])
+
+
+def check_solutions(solve, solver, corners_by_kind):
+    """Hold what passes as solved to be finite, before the camera, and where the corners are."""
+    counts = {
+        kind: defects(corners, *solve(corners, solver))
+        for kind, corners in corners_by_kind.items()
+    }
+    for kind, found in {**counts, "all": sum(counts.values())}.items():
+        if found.any():
+            print(f"  {kind}: {found[0]} not finite, {found[1]} behind the camera, "
+                  f"{found[2]} elsewhere")
+    assert not sum(counts.values()).any()
+
+
+@lengths(10, 500)
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_no_worthless_solution_passes_as_solved(count, solver):
+    """Of 10 kinds of 500 quadrilaterals that no marker gave, OpenCV calls a success
+
+    =========== ========== ======================== ========= ==============
+    solver      not finite    not before the camera elsewhere in all of 5000
+    =========== ========== ======================== ========= ==============
+    ippe             2,783                    1,351       297          4,431
+    ippe_square      1,715                    1,107       144          2,966
+    iterative            0                    2,916     1,068          3,984
+    sqpnp                0                      773     1,745          2,518
+    p3p              2,213                      118     1,955          4,286
+    ap3p                49                      998       915          1,962
+    epnp             1,500                    1,509     1,981          4,990
+    =========== ========== ======================== ========= ==============
+
+    No detector gives such corners on purpose, but nothing after the solver would notice.
+    """
+    kinds = worthless_corners(count)
+    print(f"\n{solver}, guarded and plain:")
+    for guarded in (True, False):
+        check_solutions(our_solve(guarded), solver, kinds)
+    print("OpenCV's success=True:")
+    with pytest.raises(AssertionError):
+        check_solutions(opencv_solve, solver, kinds)
+
+
+FAULTS = {
+    "NaN rotation": (np.full((3, 1), np.nan), [[0.0], [0.0], [1.0]]),
+    "NaN translation": (np.zeros((3, 1)), [[0.0], [np.nan], [1.0]]),
+    "infinite translation": (np.zeros((3, 1)), [[0.0], [0.0], [np.inf]]),
+    "behind the camera": (np.zeros((3, 1)), [[0.0], [0.0], [-1.0]]),
+    "in the camera's plane": (np.zeros((3, 1)), np.zeros((3, 1))),
+    "a corner behind the camera": ([[0.0], [1.5], [0.0]], [[0.0], [0.0], [0.4]]),
+    "elsewhere": (np.zeros((3, 1)), [[5.0], [0.0], [1.0]]),
+    "huge": (np.full((3, 1), 1e300), np.full((3, 1), 1e300)),
+}
+
+
+@pytest.mark.parametrize("fault", [*FAULTS, "raises", "no solution"])
+@pytest.mark.parametrize("guarded", [True, False], ids=["guarded", "plain"])
+def test_solver_that_returns_nonsense_has_failed(fault, guarded, monkeypatch):
+    """Whatever OpenCV returns, and says of it: no pose passes that does not explain the corners."""
+    def faulty(*_, **__):
+        if fault == "raises":
+            raise cv2.error("injected")
+        vector, centre = map(np.array, FAULTS.get(fault, (np.zeros((3, 1)), np.ones((3, 1)))))
+        return fault != "no solution", vector, centre
+
+    def faulty_generic(*_, **__):
+        found, vector, centre = faulty()
+        return found, (vector, vector), (centre, centre), np.zeros((2, 1))
+
+    corners = np.tile([300.0, 200.0] + 80 * SQUARE[:, :2] * [1, -1], (3, 1, 1))
+    solve = our_solve(guarded)
+    for solver in RELIABLE:
+        assert solve(corners, solver)[0].all(), solver
+    monkeypatch.setattr(cv2, "solvePnP", faulty)
+    monkeypatch.setattr(cv2, "solvePnPGeneric", faulty_generic)
+    for solver in SOLVERS:
+        solved, rotation, translation = solve(corners, solver)
+        assert not solved.any(), solver
+        assert np.isnan(rotation).all(), solver
+        assert np.isnan(translation).all(), solver
+
+
+# The lens' inverse: OpenCV stops after five iterations of a fixed point, converged or not.
+
+LENSES = {
+    "barrel": (-0.3, 0.1, 0.0, 0.0),
+    "pincushion": (0.3, 0.0, 0.0, 0.0),
+    "decentred": (-0.35, 0.12, 0.001, -0.001),
+}
+THROUGH_A_LENS = """
+seed = 3
+[marker]
+size_m = 0.1
+[camera]
+fx_px = 600
+width_px = 1280
+height_px = 960
+distortion = {lens}
+[pose]
+distance_m = 1.0
+tilt_deg = {{ uniform = [10, 60] }}
+azimuth_deg = {{ uniform = [0, 360] }}
+roll_deg = 20
+bearing_x_deg = {{ uniform = [-40, 40] }}
+bearing_y_deg = {{ uniform = [-30, 30] }}
+[axes]
+trial = {count}
+"""
+
+
+def check_lens(solver, guarded, scenes):
+    """Hold poses from exact corners to 0.01 degrees: 100 times what iterative solvers leave."""
+    estimates = estimate(
+        scenes.corners_px, scenes.cameras, scenes.size_m, solver, guarded, 0.25
+    )
+    angle = np.degrees(pose_error(
+        estimates.rotation, estimates.translation, scenes.rotation, scenes.translation
+    ).rotation_angle_rad)[visibility_flags(scenes) == Detection.not_run]
+    print(f"\n{solver}, {'guarded' if guarded else 'plain'}: {(~(angle < 0.01)).sum()} of "
+          f"{len(angle)} off by more than 0.01 degrees, by up to {np.nanmax(angle):.2g}")
+    assert (angle < 0.01).all()
+
+
+@lengths(40, 1000)
+@pytest.mark.parametrize("solver", [name for name in RELIABLE if name != "iterative"])
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+def test_lens_is_inverted_to_the_end_where_opencv_stops_early(count, lens, solver):
+    """Plain calls are wrong for 36 (barrel), 43 (pincushion) and 44 % (decentred) of 990 poses.
+
+    IPPE by up to 0.9, 23 and 1.2 degrees, the others by up to half a turn where a wrong corner
+    makes them take the other solution; ITERATIVE, which only starts from the inverse, for none.
+    Tilts from 10 degrees and a roll of 20, where the solvers themselves are stable in any frame.
+    """
+    scenes = scenes_of(Pipeline.from_text(THROUGH_A_LENS.format(lens=list(lens), count=count)))
+    check_lens(solver, True, scenes)
+    with pytest.raises(AssertionError):
+        check_lens(solver, False, scenes)
+
+
+# Sub-pixel refinement is what is measured, so it is not guarded; what is said of it is held.
+
+SMALL_AND_TILTED = """
+seed = 7
+[pose]
+azimuth_deg = {{ uniform = [0, 360] }}
+roll_deg = {{ uniform = [0, 360] }}
+bearing_x_deg = {{ uniform = [-20, 20] }}
+bearing_y_deg = {{ uniform = [-15, 15] }}
+[scene]
+background = 255
+[axes]
+side_px = [12, 16, 20, 24, 32, 40, 64]
+tilt_deg = [0, 40, 60, 70, 75, 80]
+trial = {count}
+"""
+
+
+def searched(scenes, full=False, **setting):
+    """Return what a detector setting finds in all scenes."""
+    count, failures = len(scenes), []
+    found = search(
+        scenes, np.ones((count, 1), dtype=bool), [DetectorSetting(**setting)],
+        np.full(count, full), failures,
+    )[0][0]
+    assert not failures
+    return found
+
+
+def half_windows(corners, modules, share=0.3, largest=5):
+    """Return OpenCV's half windows (N,) px: a share of the unrefined marker's mean module."""
+    side = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).mean(axis=1)
+    return np.clip(np.round(share * side / modules), 1, largest)
+
+
+def check_refined(start, refined, modules):
+    """Hold refined corners to lie within 0.3 modules (at least 1 px) of where they started."""
+    rows = start.flags == Detection.detected
+    moved = np.abs(refined.corners - start.corners)[rows].max(axis=2)
+    limit = half_windows(start.corners[rows], modules[rows])[:, None]
+    beyond = moved > limit * (1 + 1e-6)  # float32
+    print(f"\n{beyond.sum()} of {moved.size} corners moved beyond the half window")
+    assert not beyond.any()
+
+
+@lengths(5, 250)
+def test_refined_corners_stay_near_their_start_and_change_no_flag(count):
+    """Measured on 27,004 corners of 6,751 detected markers of 12 to 64 px, tilted 0 to 80 degrees.
+
+    Median move 0.55 px, worst 2.3; no flag changes. The median error falls from 0.61 to 0.39 px,
+    but refinement makes 28 % of the corners worse, by up to 2.0 px (the worst error grows from 4.7
+    to 6.2 px), and 6 % wanted to leave their window and were put back. What bounds the move is
+    OpenCV's own rule that the half window is 0.3 modules: with 5 px at any size 13 % of the
+    corners move farther.
+    """
+    scenes = scenes_of(Pipeline.from_text(SMALL_AND_TILTED.format(count=count)))
+    start = searched(scenes)
+    refined = searched(scenes, cornerRefinementMethod="subpix")
+    rows = start.flags == Detection.detected
+    np.testing.assert_array_equal(refined.flags, start.flags)
+    assert np.isfinite(refined.corners[rows]).all()
+    assert np.isnan(refined.corners[~rows]).all()
+    for truth, found in zip(scenes.corners_px[rows], refined.corners[rows], strict=True):
+        centre = found.mean(axis=0)
+        assert cv2.pointPolygonTest(truth.astype(np.float32), tuple(centre), True) > -1e-3
+    moved = np.linalg.norm(refined.corners - start.corners, axis=2)[rows]
+    before, after = (
+        np.linalg.norm(found.corners - scenes.corners_px, axis=2)[rows]
+        for found in (start, refined)
+    )
+    worse = after - before
+    print(f"\n{moved.size} corners: moved by median {np.median(moved):.2f}, at most "
+          f"{moved.max():.2f} px; {(moved < 1e-6).mean():.1%} not at all; "
+          f"{(worse > 1e-6).mean():.1%} made worse, by up to {worse.max():.2f} px; error median "
+          f"{np.median(before):.2f} -> {np.median(after):.2f}, worst {before.max():.2f} -> "
+          f"{after.max():.2f} px")
+    check_refined(start, refined, scenes.modules)
+    wide = searched(
+        scenes, cornerRefinementMethod="subpix", relativeCornerRefinmentWinSize=100.0
+    )
+    with pytest.raises(AssertionError):
+        check_refined(start, wide, scenes.modules)
+
+
+@lengths(5, 250)
+def test_refined_corners_in_window_and_frame_differ_in_small_modules_only(count):
+    """The same pixels at other float32 coordinates: of 27,000 corners 50 differ by over 0.001 px.
+
+    29 of them by more than 0.1 px (at most 1.45): the iteration stops one step earlier or later,
+    or, in 22 cases, one of the two leaves its window and is put back. All have half windows of 1
+    or 2 px; where the module is larger, nothing differs by more than rounding.
+    """
+    scenes = scenes_of(Pipeline.from_text(SMALL_AND_TILTED.format(count=count)))
+    start = searched(scenes)
+    window, frame = (
+        searched(scenes, full, cornerRefinementMethod="subpix") for full in (False, True)
+    )
+    rows = (window.flags == Detection.detected) & (frame.flags == Detection.detected)
+    # OpenCV finds candidates not quite alike wherever the same pixels lie: test_window.py.
+    assert (window.flags != frame.flags).sum() <= max(1, 1e-3 * len(scenes))
+    limit = half_windows(start.corners[rows], scenes.modules[rows])[:, None]
+    differs = np.abs(window.corners - frame.corners)[rows].max(axis=2)
+    print(f"\n{differs.size} corners: {(differs > 1e-3).sum()} differ by more than 0.001, "
+          f"{(differs > 0.1).sum()} by more than 0.1, at most {differs.max():.2g} px; half windows "
+          f"of the former: {np.unique(np.where(differs > 1e-3, limit, 0))[1:]}")
+    assert (differs <= 2 * limit).all()
+    assert (differs > 1e-3).mean() < 0.01
+    # 1e-3 px is the rounding of coordinates of 640 px in float32, 6e-5, a few times over.
+    assert differs[(limit > 2)[:, 0]].max(initial=0.0) < 1e-3
+
+
+WIDE_REFINEMENT = {
+    "cornerRefinementMethod": "subpix", "cornerRefinementWinSize": 40,
+    "relativeCornerRefinmentWinSize": 100.0,
+}
+MARGINS = """
+seed = 7
+[pose]
+tilt_deg = {{ uniform = [0, 70] }}
+azimuth_deg = {{ uniform = [0, 360] }}
+roll_deg = {{ uniform = [0, 360] }}
+[marker]
+quiet_zone_modules = 0.25
+[axes]
+background = [255, 128]
+side_px = [30, 60, 120]
+trial = {count}
+"""
+
+
+def check_margin(scenes, framed, margin, monkeypatch):
+    """Hold a wide refinement to work in the windows of a margin as it does in the frame."""
+    with monkeypatch.context() as patched:
+        patched.setattr(kernel, "margin_px", margin)
+        failures = []
+        found = search(
+            scenes, np.ones((len(scenes), 1), dtype=bool), [DetectorSetting(**WIDE_REFINEMENT)],
+            np.zeros(len(scenes), dtype=bool), failures,
+        )[0][0]
+    print(f"\n{len(failures)} of {len(scenes)} searches raised, "
+          f"{(found.flags != framed.flags).sum()} flags differ from the frame's")
+    assert not failures
+    np.testing.assert_array_equal(found.flags, framed.flags)
+
+
+@lengths(6, 100)
+def test_window_leaves_room_for_the_refinement(count, monkeypatch):
+    """cornerSubPix refuses images narrower than its window: with the usual 16 px, for 40 %."""
+    scenes = scenes_of(Pipeline.from_text(MARGINS.format(count=count)))
+    framed = searched(scenes, full=True, **WIDE_REFINEMENT)
+    check_margin(scenes, framed, margin_px, monkeypatch)
+    with pytest.raises(AssertionError):
+        check_margin(scenes, framed, lambda _: 16, monkeypatch)

@@ -21,26 +21,26 @@ class Camera:
     width_px: int = parameter(640, "width of the frame", unit="px", low=1, high=100_000)
     height_px: int = parameter(480, "height of the frame", unit="px", low=1, high=100_000)
     sensor_width_mm: float = parameter(
-        4.8, "width of the sensor's active area", unit="mm", low=0, open_low=True
+        4.8, "width of the sensor's active area", unit="mm", low=1e-6, high=1e6
     )
     sensor_height_mm: float = parameter(
-        3.6, "height of the sensor's active area", unit="mm", low=0, open_low=True
+        3.6, "height of the sensor's active area", unit="mm", low=1e-6, high=1e6
     )
     focal_length_mm: float = parameter(
-        4.0, "focal length of the lens", unit="mm", low=0, open_low=True
+        4.0, "focal length of the lens", unit="mm", low=1e-6, high=1e6
     )
     fx_px: float | None = parameter(
-        None, "focal length along x; stands in place of the three in mm", unit="px", low=0,
-        open_low=True,
+        None, "focal length along x; stands in place of the three in mm", unit="px", low=1e-3,
+        high=1e9,
     )
     fy_px: float | None = parameter(
-        None, "focal length along y (default: fx_px)", unit="px", low=0, open_low=True
+        None, "focal length along y (default: fx_px)", unit="px", low=1e-3, high=1e9
     )
     cx_px: float | None = parameter(
-        None, "principal point, x (default: (width_px - 1) / 2)", unit="px"
+        None, "principal point, x (default: (width_px - 1) / 2)", unit="px", low=-1e9, high=1e9
     )
     cy_px: float | None = parameter(
-        None, "principal point, y (default: (height_px - 1) / 2)", unit="px"
+        None, "principal point, y (default: (height_px - 1) / 2)", unit="px", low=-1e9, high=1e9
     )
     distortion: tuple[float, ...] = parameter(
         (), "lens coefficients in OpenCV's order: 0, 4, 5, 8, 12 or 14 numbers"

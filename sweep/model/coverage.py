@@ -231,7 +231,7 @@ def _add_spread(
     length = math.hypot(xb - xa, yb - ya)
     panels = math.ceil(length / max(1.5 * sigma, _SHORTEST_PANEL_PX))
     dy = (yb - ya) / panels
-    steps = np.empty(2 * int(reach) + 6)
+    steps = np.empty(width)
     for panel in range(panels):
         for node in range(3):
             offset = (0.1127016653792583, 0.5, 0.8872983346207417)[node]

@@ -52,7 +52,7 @@ def marker_exposure(scenes: Scenes, row: int, box: Box, levels: Floats) -> Float
     exposure_s, row_time_s, velocity = (0.0, 0.0, np.zeros(6)) if motion is None else motion
     for image, sigma in zip(images, spread, strict=True):
         panel = max(SHARP_PANEL_PX, 1.5 * sigma)
-        panels = min(max(math.ceil(path / panel), 2), MOST_PANELS) if path > 0 else 0
+        panels = min(max(math.ceil(path / panel), 1), MOST_PANELS) if path > 0 else 0
         _expose(
             cover, outlines.ends, outlines.sides, levels, plane, scenes.translation[row],
             scenes.cameras.view[row], scenes.cameras.lenses[row],

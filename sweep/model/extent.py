@@ -194,12 +194,18 @@ def _shoelace(points: Floats) -> Floats:
         return np.asarray(0.5 * doubled.sum(axis=1))
 
 
+EDGE_ON = 1e-12
+"""Sine of the angle to the line of sight at which a marker is seen edge on."""
+
+
 def hidden(scenes: Scenes) -> NDArray[np.bool_]:
     """Tell (N,) where a marker is seen from behind or edge on, or has a corner at z <= 0.
 
     The quiet zone's corners count, for the marker is drawn with it.
     """
-    facing = np.sum(scenes.rotation[:, :, 2] * scenes.translation, axis=1) < 0
+    towards = np.sum(scenes.rotation[:, :, 2] * scenes.translation, axis=1)
+    # A tilt of 90° is not quite one in double precision.
+    facing = towards < -EDGE_ON * np.linalg.norm(scenes.translation, axis=1)
     return np.asarray(~facing | ~np.isfinite(scenes.outline_px).all(axis=(1, 2)))
 
 

@@ -176,7 +176,8 @@ def _plan(chosen: argparse.Namespace) -> int:
 
     expected = forecast(pipeline, chosen.workers)
     listed = parts(pipeline)
-    costs = effect_costs(pipeline, [part.switch for part in listed if part.switch and part.active])
+    switches = [part.switch for part in listed if part.switch and part.active]
+    costs = effect_costs(pipeline, switches, expected.pose_s)
     if chosen.json:
         _print_json(
             {

@@ -2,12 +2,34 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from hashlib import sha256
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def _keep_compiled_code_by_content() -> None:
+    """Cache compiled code under the digest of all source that is compiled.
+
+    Numba itself looks at a function's own file only, and would go on using what it compiled
+    from an older version of a function in another file.
+    """
+    package = Path(__file__).parent
+    digest = sha256()
+    for path in sorted((package / "model").glob("*.py")):
+        digest.update(path.read_bytes())
+    config: Any = numba.config
+    kept = Path(config.CACHE_DIR or package / "__pycache__")
+    if os.access(kept if kept.exists() else kept.parent, os.W_OK):
+        config.CACHE_DIR = str(kept / f"compiled-{digest.hexdigest()[:16]}")
+
+
+_keep_compiled_code_by_content()
 
 
 def compiled(function: Function) -> Function:

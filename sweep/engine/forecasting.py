@@ -24,6 +24,7 @@ from sweep.plan.pipeline import Pipeline
 from sweep.plan.template import bytes_per_block
 
 EFFECT_SCENES = 24
+"""Scenes at most that an effect is measured on."""
 
 START_S = 3.0
 """Seconds that a run takes beside its blocks: processes start and end, packages are imported."""
@@ -45,24 +46,25 @@ class Forecast:
     seconds: float
 
 
-EFFECT_S = 0.4
-"""Seconds of measuring for each effect."""
+EFFECT_S = 0.6
+"""Seconds of measuring for each effect, at least."""
 
 
-def effect_costs(pipeline: Pipeline, switches: Sequence[str]) -> dict[str, float]:
+def effect_costs(
+    pipeline: Pipeline, switches: Sequence[str], pose_s: float
+) -> dict[str, float]:
     """Return what each effect adds to a pose, in seconds: with it against without it, paired.
 
     On a seeded sample of scenes, all other parameters as they are; medians of repeated pairs.
+    ``pose_s`` is what a pose takes, all in all.
     """
     axes = scene_axes(pipeline)
     generator = np.random.Generator(np.random.PCG64(1))
-    indices = [generator.integers(0, len(axis), EFFECT_SCENES).astype(np.intp) for axis in axes]
-    count = EFFECT_SCENES if axes else 1
+    count = min(max(int(EFFECT_S / (6 * pose_s)), 2), EFFECT_SCENES) if axes else 1
+    indices = [generator.integers(0, len(axis), count).astype(np.intp) for axis in axes]
     costs = {}
     for switch in switches:
         pair = pipeline, _without(pipeline, switch)
-        for variant in pair:
-            run_cells(variant, indices)
         differences: list[float] = []
         begun = time.perf_counter()
         while len(differences) < 3 or time.perf_counter() - begun < EFFECT_S:

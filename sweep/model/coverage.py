@@ -15,6 +15,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from sweep.compilation import compiled
 from sweep.model.lens import distort
@@ -156,17 +157,36 @@ REACH = 5.0
 _SHORTEST_PANEL_PX = 0.015
 
 
+_STEPS = 256
+_AT = np.arange(-6 * _STEPS, 6 * _STEPS + 2) / _STEPS
+_BELOW = ndtr(_AT)
+_BELOW_SUM = _AT * ndtr(_AT) + np.exp(-0.5 * _AT**2) / math.sqrt(2.0 * math.pi)
+"""The normal distribution's integral, and the integral of that, in steps of 1/256 standard
+deviations: interpolated linearly they are right to 8e-7."""
+
+
 @compiled
 def _below(t: float, sigma: float) -> float:
     """Return the share of the point spread, a Gaussian, that lies below t."""
-    return 0.5 * math.erfc(-t / (math.sqrt(2.0) * sigma))
+    at = (t / sigma + 6.0) * _STEPS
+    if at <= 0.0:
+        return 0.0
+    if at >= 12.0 * _STEPS:
+        return 1.0
+    k = int(at)
+    return float(_BELOW[k] + (at - k) * (_BELOW[k + 1] - _BELOW[k]))
 
 
 @compiled
 def _below_sum(t: float, sigma: float) -> float:
     """Return the integral of :func:`_below` up to t."""
-    density = math.exp(-0.5 * (t / sigma) ** 2) / math.sqrt(2.0 * math.pi)
-    return t * _below(t, sigma) + sigma * density
+    at = (t / sigma + 6.0) * _STEPS
+    if at <= 0.0:
+        return 0.0
+    if at >= 12.0 * _STEPS:
+        return t
+    k = int(at)
+    return float(sigma * (_BELOW_SUM[k] + (at - k) * (_BELOW_SUM[k + 1] - _BELOW_SUM[k])))
 
 
 @compiled

@@ -10,10 +10,10 @@ from conftest import lengths
 from numpy.lib.stride_tricks import sliding_window_view
 
 from sweep.model.camera import Camera
+from sweep.model.extent import marker_boxes
 from sweep.model.marker import Marker
 from sweep.model.pose import Pose
 from sweep.model.renderers import marker_levels, render
-from sweep.model.extent import marker_boxes
 from sweep.model.scene import Scene, build_scenes
 
 DEFAULTS = {"shift_u_px": 0.0, "shift_v_px": 0.0} | {

@@ -9,8 +9,8 @@ from conftest import lengths
 from scipy.spatial.transform import Rotation
 
 from sweep.kernel import run_block
-from sweep.model.renderers import render
 from sweep.model.extent import marker_boxes
+from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
 from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
 from sweep.plan.pipeline import Pipeline

@@ -11,6 +11,7 @@ from mpmath import mp, mpf
 
 from sweep.model import lens
 from sweep.model.camera import Camera
+from sweep.model.extent import areas_px
 from sweep.model.marker import Marker
 from sweep.model.pose import (
     Pose,
@@ -20,7 +21,6 @@ from sweep.model.pose import (
     rotation_of_vector,
     vector_of_rotation,
 )
-from sweep.model.extent import areas_px
 from sweep.model.scene import Scene, build_scenes
 
 DEFAULTS = {"shift_u_px": 0.0, "shift_v_px": 0.0} | {

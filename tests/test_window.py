@@ -9,9 +9,9 @@ from sweep.errors import PipelineError
 from sweep.kernel import run_block, search, search_windows, single_thread, visibility_flags
 from sweep.measure.detector import REFINEMENTS, DetectorSetting, full_frame_reason
 from sweep.measure.flags import Detection
+from sweep.model.extent import marker_boxes
 from sweep.model.marker import opencv_dictionary
 from sweep.model.renderers import render
-from sweep.model.extent import marker_boxes
 from sweep.model.scene import build_scenes
 from sweep.plan.grid import Block, detector_settings, scene_axes, scene_values
 from sweep.plan.pipeline import Pipeline

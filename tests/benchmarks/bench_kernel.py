@@ -16,8 +16,8 @@ from sweep.kernel import run_cells, search_windows, single_thread, visibility_fl
 from sweep.measure.detector import Detector
 from sweep.measure.flags import Detection
 from sweep.model import coverage
-from sweep.model.renderers import render_all
 from sweep.model.extent import marker_boxes
+from sweep.model.renderers import render_all
 from sweep.model.scene import build_scenes
 from sweep.plan.grid import detector_settings, scene_values
 from sweep.plan.pipeline import Pipeline

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 
 from sweep.model.camera import Camera
+from sweep.model.extent import marker_boxes
 from sweep.model.marker import Marker
 from sweep.model.pose import Pose
 from sweep.model.renderers import render
-from sweep.model.extent import marker_boxes
 from sweep.model.scene import Scene, build_scenes
 
 SIDES = (8, 20, 50, 100, 200, 400, 600)

@@ -95,7 +95,7 @@ def engine_against_processes(seconds):
     pipeline, trials = grid_for(seconds, workers)
     expected = forecast(pipeline, workers).seconds
     rates = []
-    for _ in range(2):
+    for _ in range(3):
         bare_rate = two_processes(pipeline.text, trials, workers)
         with tempfile.TemporaryDirectory() as folder:
             begun = time.perf_counter()
@@ -105,8 +105,8 @@ def engine_against_processes(seconds):
                 on_progress=lambda p, first=first: first.append((time.perf_counter(), p.done)),
             )
             total = time.perf_counter() - begun
-        # Between the first and the last block the engine is at work; the rest is coming and going.
-        (a, done_a), (b, done_b) = first[workers], first[-1]
+        # Between a block of each worker's and the last of all, none is coming or going.
+        (a, done_a), (b, done_b) = first[workers], first[-1 - workers]
         rates.append(
             (
                 (done_b - done_a) / (b - a) / bare_rate,

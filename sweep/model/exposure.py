@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.model import coverage
-from sweep.model.extent import path_px
+from sweep.model.extent import corner_depths, path_px
 from sweep.model.marker import edges, occluded_edges
 from sweep.model.motion import moved
 from sweep.model.scene import Box, Scenes
@@ -20,11 +20,14 @@ SHARP_PANEL_PX = 3 / 16
 """Path of a corner between groups of three instants: kinks of the mean over the exposure then
 cost at most 0.12 grey levels."""
 
-MOST_PANELS = 4096
+MOST_PANELS = 4093
+MOST_ROW_PANELS = 509
+"""Most panels of an exposure, and of each row's; primes, so that no turn falls in with them."""
 
 SHARPEST_PX = 0.05
-"""Least point spread that is computed where defocus varies; between it and none the image is
-interpolated, at a cost of at most 0.8 grey levels in single pixels."""
+"""Least point spread that is computed where defocus varies (a quarter of it where it does not);
+between it and none the image is interpolated, at a cost of at most 0.8 (0.2) grey levels in
+single pixels."""
 
 SPREAD_RATIO = 1.4
 """Ratio of neighbouring point spreads where defocus varies; cubic interpolation in their
@@ -46,15 +49,16 @@ def marker_exposure(scenes: Scenes, row: int, box: Box, levels: Floats) -> Float
     plane = scenes.plane[row]
     spread, varies = _spreads(scenes, row, box)
     path = path_px(scenes, row, box)
+    bounds = np.array([-scenes.quiet_zone[row], scenes.modules[row] + scenes.quiet_zone[row]])
     shape = (len(spread), box[3] - box[1], box[2] - box[0])
     images = np.empty(shape)
     cover = np.zeros((shape[1], shape[2] + 2))
     exposure_s, row_time_s, velocity = (0.0, 0.0, np.zeros(6)) if motion is None else motion
     for image, sigma in zip(images, spread, strict=True):
         panel = max(SHARP_PANEL_PX, 1.5 * sigma)
-        panels = min(max(math.ceil(path / panel), 1), MOST_PANELS) if path > 0 else 0
+        panels = math.ceil(min(path / panel, MOST_PANELS if row_time_s == 0 else MOST_ROW_PANELS))
         _expose(
-            cover, outlines.ends, outlines.sides, levels, plane, scenes.translation[row],
+            cover, bounds, outlines.ends, outlines.sides, levels, plane, scenes.translation[row],
             scenes.cameras.view[row], scenes.cameras.lenses[row],
             bool(scenes.cameras.distorted[row]), box[0], box[1], sigma, velocity, exposure_s,
             panels, row_time_s, (scenes.frame[row, 1] - 1) / 2,
@@ -67,7 +71,7 @@ def marker_exposure(scenes: Scenes, row: int, box: Box, levels: Floats) -> Float
 
 @compiled
 def _expose(
-    cover: Floats, ends: Floats, sides: NDArray[np.int64], levels: Floats, plane: Floats,
+    cover: Floats, bounds: Floats, ends: Floats, sides: NDArray[np.int64], levels: Floats, plane: Floats,
     translation: Floats, view: Floats, lens: Floats, distorted: bool, left: int, top: int,
     sigma: float, velocity: Floats, exposure_s: float, panels: int, row_time_s: float,
     middle_row: float,
@@ -81,22 +85,30 @@ def _expose(
     for group in range(groups):
         rows = cover[group : group + 1] if row_time_s > 0.0 else cover
         begin = row_time_s * (top + group - middle_row)
-        if panels == 0:
-            placed = moved(plane, translation, velocity, begin) if begin != 0.0 else plane
-            coverage.accumulate(
-                rows, ends, sides, levels, placed, view, lens, distorted, left, top + group, sigma
-            )
-            continue
-        for panel in range(panels):
-            for node in range(3):
+        for panel in range(max(panels, 1)):
+            for node in range(3 if panels > 0 else 1):
                 offset = (0.1127016653792583, 0.5, 0.8872983346207417)[node]
                 weight = (0.2777777777777778, 0.4444444444444444, 0.2777777777777778)[node]
-                instant = begin + exposure_s * ((panel + offset) / panels - 0.5)
+                if panels == 0:
+                    offset, weight = 0.5, 1.0
+                instant = begin + exposure_s * ((panel + offset) / max(panels, 1) - 0.5)
+                placed = moved(plane, translation, velocity, instant) if instant != 0.0 else plane
+                if not _in_front(placed, bounds):
+                    continue
                 coverage.accumulate(
-                    rows, ends, sides, levels * (weight / panels),
-                    moved(plane, translation, velocity, instant), view, lens, distorted, left,
-                    top + group, sigma,
+                    rows, ends, sides, levels * (weight / max(panels, 1)), placed, view, lens,
+                    distorted, left, top + group, sigma,
                 )
+
+
+@compiled
+def _in_front(plane: Floats, bounds: Floats) -> bool:
+    """Tell whether all corners of a marker, columns and rows at both bounds, have z > 0."""
+    for a in range(2):
+        for b in range(2):
+            if not plane[2, 0] * bounds[a] + plane[2, 1] * bounds[b] + plane[2, 2] > 0.0:
+                return False
+    return True
 
 
 def defocus_px(scenes: Scenes, row: int, box: Box) -> Floats:
@@ -118,8 +130,9 @@ def defocus_px(scenes: Scenes, row: int, box: Box) -> Floats:
     inverse = (normal[0] * x + normal[1] * y[:, None] + normal[2]) / (
         normal @ scenes.translation[row]
     )
-    # Beyond the plane's horizon there is no marker to be blurred.
-    inverse = np.maximum(inverse, 0.0)
+    # Beyond the marker its plane may come near the camera, or end: there is nothing to be blurred.
+    depth = corner_depths(scenes, row)
+    inverse = np.clip(inverse, 1 / depth.max(), 1 / depth.min())
     diameter = fx * effect["aperture_mm"] * 1e-3 * (1 / effect["focus_distance_m"] - inverse)
     return np.asarray(np.hypot(blur, diameter / 4))
 
@@ -128,8 +141,11 @@ def _spreads(scenes: Scenes, row: int, box: Box) -> tuple[list[float], bool]:
     """Return the point spreads to be computed, in order, and whether they vary over the box."""
     over = defocus_px(scenes, row, box)
     low, high = float(over.min()), float(over.max())
-    if high <= low * 1.001:
+    even = high <= low * 1.001
+    if even and (high == 0.0 or low >= SHARPEST_PX / 4):
         return [(low + high) / 2], False
+    if even:
+        return [0.0, SHARPEST_PX / 4], True
     spreads = [0.0] if low < SHARPEST_PX else []
     low, high = max(low, SHARPEST_PX), max(high, SHARPEST_PX)
     count = math.ceil(math.log(high / low) / math.log(SPREAD_RATIO)) + 1

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sweep.model import lens as lens_model
 from sweep.model.coverage import REACH
 from sweep.model.marker import marker_corners
-from sweep.model.motion import moved, row_times
+from sweep.model.motion import MEANINGLESS, UNSEEN, row_times, track
 from sweep.model.pose import placed
 from sweep.model.scene import Box, Scenes
 
@@ -93,31 +93,24 @@ def _warp_extent(scenes: Scenes, rows: NDArray[np.intp]) -> tuple[Floats, Floats
     return low, high
 
 
-INSTANTS = 33
+FEWEST_INSTANTS, MOST_INSTANTS = 65, 8193
 """Instants at which a moving marker is looked at for its extent; a step is added all around."""
 
+_COARSE_TURN = math.pi / 8
+"""Turn between two instants from which a marker may be anywhere around its centre between them."""
 
-def _tracks(scenes: Scenes, row: int, begin: float, end: float) -> Floats:
-    """Return the images (INSTANTS, M, 2) of a moving outline from ``begin`` to ``end`` in s."""
-    motion = scenes.motion(row)
-    velocity = np.zeros(6) if motion is None else motion[2]
+
+def _outline_modules(scenes: Scenes, row: int) -> Floats:
+    """Return points (M, 2) of a marker's outline in module coordinates: its corners or, bent, more.
+    """
     low, high = -scenes.quiet_zone[row], scenes.modules[row] + scenes.quiet_zone[row]
     t = np.arange(CHORDS_PER_SIDE if scenes.cameras.distorted[row] else 1)
     ahead = low + t / len(t) * (high - low)
     back, start, stop = low + high - ahead, np.full(len(t), low), np.full(len(t), high)
-    flat = np.stack(
-        [
-            np.concatenate([ahead, stop, back, start]), np.concatenate([start, ahead, stop, back]),
-            np.ones(4 * len(t)),
-        ],
+    return np.stack(
+        [np.concatenate([ahead, stop, back, start]), np.concatenate([start, ahead, stop, back])],
         axis=1,
     )
-    planes = [
-        moved(scenes.plane[row], scenes.translation[row], velocity, instant)
-        for instant in np.linspace(begin, end, INSTANTS).tolist()
-    ]
-    points = np.stack([flat @ plane.T for plane in planes])
-    return scenes.cameras.take(np.full(INSTANTS, row)).project(points)
 
 
 def _exposed_extent(
@@ -125,28 +118,55 @@ def _exposed_extent(
 ) -> tuple[Floats, Floats]:
     """Return the extent, from ``low`` to ``high`` (2,) at rest, under motion and blur.
 
-    NaN where the marker comes behind the camera while its rows are exposed. Which rows it is on
-    depends on when they are exposed, and that on which they are: rows are added until none is
-    missing.
+    NaN where the image has no meaning while rows that see it are exposed. A marker is seen at an
+    instant by those rows that it is on and that are exposed then.
     """
     motion = scenes.motion(row)
-    if motion is not None:
-        height = int(scenes.frame[row, 1])
-        top = min(max(math.floor(low[1]), 0), height - 1)
-        bottom = min(max(math.ceil(high[1]) + 1, top + 1), height)
-        while True:
-            tracks = _tracks(scenes, row, *row_times(top, bottom, height, motion[0], motion[1]))
-            step = np.abs(np.diff(tracks, axis=0)).max(axis=(0, 1))
-            low, high = tracks.min(axis=(0, 1)) - step - 1, tracks.max(axis=(0, 1)) + step + 1
-            if motion[1] == 0.0 or not np.isfinite(step).all():
-                break
-            first = max(min(top, math.floor(max(low[1], 0.0))), 0)
-            last = min(max(bottom, math.ceil(min(high[1], height))), height)
-            if (first, last) == (top, bottom):
-                break
-            top, bottom = first, last
     reach = _largest_spread_px(scenes, row) * REACH
-    return (low - reach - 1, high + reach + 1) if reach > 0 else (low, high)
+    reach = reach + 1 if reach > 0 else 0.0
+    if motion is None:
+        return low - reach, high + reach
+    exposure_s, row_time_s, velocity = motion
+    height = int(scenes.frame[row, 1])
+    begin, end = row_times(0, height, height, exposure_s, row_time_s)
+    turn = float(np.linalg.norm(velocity[3:])) * (end - begin)
+    wanted = max(FEWEST_INSTANTS, (end - begin) / row_time_s if row_time_s > 0 else 0.0)
+    count = int(min(max(wanted, 2 * turn / _COARSE_TURN), MOST_INSTANTS))
+    times = np.linspace(begin, end, count)
+    cameras = scenes.cameras
+    extents, states = track(
+        scenes.plane[row], scenes.translation[row], velocity, cameras.view[row],
+        cameras.lenses[row], bool(cameras.distorted[row]), _outline_modules(scenes, row), times,
+    )
+    front = states != UNSEEN
+    with np.errstate(invalid="ignore"):
+        step = np.abs(np.diff(extents, axis=0))
+    margin = np.zeros(count)
+    for side in (np.s_[:-1], np.s_[1:]):
+        margin[side] = np.maximum(margin[side], np.nan_to_num(step, posinf=0.0).max(axis=1))
+    if turn > _COARSE_TURN * (count - 1):
+        margin += np.where(front, np.abs(extents[:, 2:] - extents[:, :2]).max(axis=1), 0.0)
+    margin += 1 + reach
+    top, bottom = extents[:, 1] - margin, extents[:, 3] + margin
+    if row_time_s > 0:
+        spare = exposure_s / 2 + times[1] - times[0]
+        middle = (height - 1) / 2
+        first, last = (times - spare) / row_time_s + middle, (times + spare) / row_time_s + middle
+        seen = front & (first <= bottom) & (last >= top)
+        top, bottom = np.maximum(top, first - 1), np.minimum(bottom, last + 1)
+    else:
+        seen = front
+    if not seen.any():
+        return low, low
+    crossing = seen & (states == MEANINGLESS)
+    crossing[:-1] |= seen[:-1] & ~front[1:]
+    crossing[1:] |= seen[1:] & ~front[:-1]
+    if crossing.any():
+        return np.full(2, np.nan), np.full(2, np.nan)
+    left, right = extents[seen, 0] - margin[seen], extents[seen, 2] + margin[seen]
+    return (
+        np.array([left.min(), top[seen].min()]), np.array([right.max(), bottom[seen].max()])
+    )
 
 
 def _largest_spread_px(scenes: Scenes, row: int) -> float:
@@ -154,24 +174,42 @@ def _largest_spread_px(scenes: Scenes, row: int) -> float:
     effect = scenes.effect(row)
     if math.isnan(effect["aperture_mm"]):
         return effect["blur_px"]
-    low, high = -scenes.quiet_zone[row], scenes.modules[row] + scenes.quiet_zone[row]
-    corners = np.array([[low, low, 1], [low, high, 1], [high, low, 1], [high, high, 1]])
-    depth = corners @ scenes.plane[row][2]
-    widest = np.abs(1 / effect["focus_distance_m"] - 1 / depth).max()
+    widest = np.abs(1 / effect["focus_distance_m"] - 1 / corner_depths(scenes, row)).max()
     aperture_px = scenes.cameras.view[row, 0] * effect["aperture_mm"] * 1e-3
     return math.hypot(effect["blur_px"], aperture_px * float(widest) / 4)
 
 
+def corner_depths(scenes: Scenes, row: int) -> Floats:
+    """Return the depths (4,) in metres of the quiet zone's corners."""
+    low, high = -scenes.quiet_zone[row], scenes.modules[row] + scenes.quiet_zone[row]
+    corners = np.array([[low, low, 1], [low, high, 1], [high, low, 1], [high, high, 1]])
+    return np.asarray(corners @ scenes.plane[row][2])
+
+
 def path_px(scenes: Scenes, row: int, box: Box) -> float:
-    """Return how far a corner of a moving marker's outline travels while a row is exposed."""
+    """Return at most how far a corner of a moving marker travels while a row is exposed."""
     motion = scenes.motion(row)
     if motion is None or motion[0] == 0.0:
         return 0.0
+    exposure_s, row_time_s, velocity = motion
+    outline, cameras = _outline_modules(scenes, row), scenes.cameras
+    still = velocity * np.array([1.0, 1, 1, 0, 0, 0])
     longest = 0.0
     for line in (box[1], (box[1] + box[3]) // 2, box[3] - 1):
-        times = row_times(line, line + 1, int(scenes.frame[row, 1]), motion[0], motion[1])
-        steps = np.diff(_tracks(scenes, row, *times), axis=0)
-        longest = max(longest, float(np.hypot(steps[..., 0], steps[..., 1]).sum(axis=0).max()))
+        times = np.linspace(
+            *row_times(line, line + 1, int(scenes.frame[row, 1]), exposure_s, row_time_s),
+            FEWEST_INSTANTS,
+        )
+        extents, states = track(
+            scenes.plane[row], scenes.translation[row], still, cameras.view[row],
+            cameras.lenses[row], bool(cameras.distorted[row]), outline, times,
+        )
+        extents = extents[states != UNSEEN]
+        if not len(extents):
+            continue
+        along = np.hypot(*np.abs(np.diff(extents, axis=0)).reshape(-1, 2, 2).max(axis=1).T).sum()
+        around = np.hypot(*(extents[:, 2:] - extents[:, :2]).max(axis=0)) * exposure_s
+        longest = max(longest, float(along + np.linalg.norm(velocity[3:]) * around))
     return longest
 
 
@@ -248,7 +286,8 @@ def _half_plane(polygon: Floats, inside: Floats) -> Floats:
 def not_modelled(scenes: Scenes) -> NDArray[np.bool_]:
     """Tell (N,) where the image has no meaning.
 
-    The lens model folds on the marker, or the marker comes behind the camera in the exposure.
+    The lens model folds on the marker, or does so while it moves in the exposure, or the marker
+    comes behind the camera in it or shows its back.
     """
     folded = np.zeros(len(scenes), dtype=bool)
     for row in np.flatnonzero(scenes.affected).tolist():
@@ -260,7 +299,7 @@ def not_modelled(scenes: Scenes) -> NDArray[np.bool_]:
         widened = 1 + 2 * scenes.quiet_zone[rows] / scenes.modules[rows]
         outline = marker_corners(scenes.size_m[rows] * widened)
         points = placed(outline, scenes.rotation[rows], scenes.translation[rows])
-        folded[rows] = lens_model.folds(
+        folded[rows] |= lens_model.folds(
             np.ascontiguousarray(points[..., :2] / points[..., 2:]),
             scenes.cameras.lenses[rows],
         )

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
+from sweep.model.lens import distort, jacobian
 
 Floats = NDArray[np.float64]
 
@@ -39,6 +40,55 @@ def moved(plane: Floats, translation: Floats, velocity: Floats, time_s: float) -
     for k in range(3):
         after[k, 2] += translation[k] + velocity[k] * time_s
     return after
+
+
+SEEN, UNSEEN, MEANINGLESS = 0, 1, 2
+"""States of a moving marker: in front of the camera; behind it as a whole; or across its plane,
+seen from behind, or where the lens folds, so that its image has no meaning."""
+
+
+@compiled
+def track(
+    plane: Floats, translation: Floats, velocity: Floats, view: Floats, lens: Floats,
+    distorted: bool, outline: Floats, times_s: Floats,
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Return the extents (T, 4) left, top, right, bottom in px of a marker, and states (T,).
+
+    ``outline`` (M, 2) are points of its outline in module coordinates.
+    """
+    extents = np.empty((len(times_s), 4))
+    states = np.zeros(len(times_s), dtype=np.int64)
+    for k in range(len(times_s)):
+        p = moved(plane, translation, velocity, times_s[k])
+        behind = 0
+        extents[k, 0] = extents[k, 1] = math.inf
+        extents[k, 2] = extents[k, 3] = -math.inf
+        for j in range(len(outline)):
+            z = p[2, 0] * outline[j, 0] + p[2, 1] * outline[j, 1] + p[2, 2]
+            if not z > 0.0:
+                behind += 1
+                continue
+            x = (p[0, 0] * outline[j, 0] + p[0, 1] * outline[j, 1] + p[0, 2]) / z
+            y = (p[1, 0] * outline[j, 0] + p[1, 1] * outline[j, 1] + p[1, 2]) / z
+            if distorted:
+                a, b, c, d = jacobian(x, y, lens)
+                if not (math.hypot(x, y) < lens[23] and a * d - b * c > 0.0):
+                    states[k] = MEANINGLESS
+                x, y = distort(x, y, lens)
+            u, v = view[0] * x + view[2], view[1] * y + view[3]
+            extents[k, 0], extents[k, 2] = min(extents[k, 0], u), max(extents[k, 2], u)
+            extents[k, 1], extents[k, 3] = min(extents[k, 1], v), max(extents[k, 3], v)
+        # The sign of the line of sight along the normal, which is the columns' cross product.
+        facing = 0.0
+        for i in range(3):
+            a, b = (i + 1) % 3, (i + 2) % 3
+            normal = p[a, 0] * p[b, 1] - p[b, 0] * p[a, 1]
+            facing += normal * (translation[i] + velocity[i] * times_s[k])
+        if behind == len(outline):
+            states[k] = UNSEEN
+        elif behind > 0 or not facing > 0.0:
+            states[k] = MEANINGLESS
+    return extents, states
 
 
 def row_times(

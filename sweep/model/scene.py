@@ -180,10 +180,13 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
 
     # Steps 2, 3, 5, 6: the corners, moved by the pose and projected.
     size = numbers("size_m")
-    # A quiet zone on a background of its own level cannot be seen: it is not modelled.
+    # A quiet zone on a background of its own level cannot be seen, unless a sheet hides it: it is
+    # not modelled.
+    hiding = is_on("occlusion", values.get("occlusion", 0.0))
     keys = mapped(
         lambda dictionary, marker_id, width, white, background: (
-            dictionary, int(marker_id), 0.0 if background == white else float(width)
+            dictionary, int(marker_id),
+            0.0 if background == white and not hiding else float(width),
         ),
         "dictionary", "marker_id", "quiet_zone_modules", "white", "background",
     )

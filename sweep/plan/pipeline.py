@@ -353,7 +353,7 @@ class _Reader:
         """Judge the effects that need one another, and a renderer that has them."""
         moving = [
             name for name in VELOCITIES
-            if name in self.distributions or any(self._values(name))
+            if name in self.distributions or any(self._values(name) or [name in self.given])
         ]
         timed = [name for name in ("exposure_s", "row_time_s") if self._is_on(name)]
         for name in timed:

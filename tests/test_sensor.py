@@ -1,0 +1,444 @@
+"""Noise, its statistics and what it depends on; quantisation; windows under noise.
+
+Every draw is seeded. Statistical tests pass a correct sensor with a probability of 1 - 1e-6 or
+more each. With ``-s`` a row: effect | reference | cases | worst error | tolerance.
+"""
+
+import numba
+import numpy as np
+import pytest
+from conftest import lengths
+from scipy import stats
+from test_window import outcomes_elsewhere
+
+from sweep.errors import PipelineError
+from sweep.kernel import search, search_windows, single_thread, visibility_flags
+from sweep.measure.detector import REFINEMENTS, DetectorSetting
+from sweep.measure.flags import Detection
+from sweep.model import sensor
+from sweep.model.extent import marker_boxes
+from sweep.model.renderers import marker_levels, render_all
+from sweep.model.scene import build_scenes
+from sweep.plan.grid import scene_axes, scene_values
+from sweep.plan.pipeline import Pipeline
+
+UNLIKELY = 1e-6
+FAR = 5.5
+"""Standard deviations that a normal number exceeds with a probability of 4e-8."""
+
+
+def row(effect, reference, cases, worst, tolerance):
+    print(f"\n| {effect} | {reference} | {cases} | {worst:.2g} | {tolerance:g} |")
+    assert worst <= tolerance
+
+
+# A frame of one level: its marker is 8 px in the middle, and left out.
+
+FLAT = """
+seed = {seed}
+[camera]
+width_px = 1000
+height_px = {height}
+[pose]
+side_px = 8
+tilt_deg = {tilt_deg}
+[scene]
+background = {level}
+"""
+
+
+def scenes_of(pipeline, trial=0):
+    axes = scene_axes(pipeline)
+    return build_scenes(scene_values(pipeline, [np.array([trial])] * len(axes)), 1)
+
+
+def image_of(pipeline, trial=0, window=None):
+    scenes = scenes_of(pipeline, trial)
+    window = window or (0, 0, *scenes.frame[0].tolist())
+    return render_all(scenes, np.array([0]), marker_boxes(scenes), np.array([window]))[0]
+
+
+def flat(level, *settings, seed=1, trial=0, tilt_deg=0, height=720):
+    """Pixels (height - 20, 1000) of a frame of one level, the marker's rows cut out."""
+    text = FLAT.format(level=level, seed=seed, tilt_deg=tilt_deg, height=height)
+    if trial:
+        settings = (*settings, f"trial={trial + 1}")
+    image = image_of(Pipeline.from_text(text, settings), trial)
+    middle = height // 2
+    return np.concatenate([image[: middle - 10], image[middle + 10 :]])
+
+
+def chi_square(counts, probabilities, total):
+    """p-value of counts, cells of a low expectation joined with their neighbours."""
+    joined, expected, have, want = [], [], 0, 0.0
+    for count, probability in zip(counts, probabilities, strict=True):
+        have, want = have + count, want + total * probability
+        if want >= 20:
+            joined.append(have)
+            expected.append(want)
+            have, want = 0, 0.0
+    joined[-1] += have
+    expected[-1] += want
+    expected = np.array(expected)
+    return stats.chisquare(joined, expected * (total / expected.sum())).pvalue
+
+
+@pytest.mark.parametrize(
+    ("mean", "noise"), [(128, 1), (100.25, 5), (127.5, 40), (3, 20), (200, 90)]
+)
+def test_grey_noise_is_normal_rounded_and_clipped(mean, noise):
+    image = flat(mean, f"noise_grey={noise}")
+    upper = stats.norm.cdf((np.arange(256) + 0.5 - mean) / noise)
+    upper[255] = 1.0
+    counts = np.bincount(image.ravel(), minlength=256)
+    p = chi_square(counts, np.diff(upper, prepend=0.0), image.size)
+    print(f"\n| grey noise {noise} at {mean} | binned normal | {image.size} | p = {p:.2g} |")
+    assert p > UNLIKELY
+
+
+@pytest.mark.parametrize("mean", [0.1, 1.0, 5.0, 9.99, 10.0, 30.0, 100.0, 200.0])
+def test_shot_noise_is_poisson_where_an_electron_is_a_level(mean):
+    image = flat(mean, "full_well_e=255")
+    upper = stats.poisson.cdf(np.arange(256), mean)
+    upper[255] = 1.0
+    p = chi_square(
+        np.bincount(image.ravel(), minlength=256), np.diff(upper, prepend=0.0), image.size
+    )
+    print(f"\n| shot noise, {mean} e- | binned Poisson | {image.size} | p = {p:.2g} |")
+    assert p > UNLIKELY
+
+
+@numba.njit
+def many(kind, mean, start, count):
+    """Draw numbers of ``count`` pixel keys: a Poisson number, or normal ones of two draws."""
+    drawn = np.empty(count)
+    for i in range(count):
+        pixel = sensor._mixed(np.uint64(start) + np.uint64(0x9E3779B97F4A7C15) * np.uint64(i + 1))
+        drawn[i] = sensor._poisson(mean, pixel, 4) if kind < 0 else sensor._normal(pixel, kind)
+    return drawn
+
+
+@pytest.mark.parametrize("mean", [0.1, 1.0, 5.0, 9.99, 10.0, 11.3, 30.0, 1e3, 1e6, 1e9])
+@lengths(200_000, 4_000_000)
+def test_poisson_numbers_are_exactly_distributed(count, mean):
+    drawn = many(-1, mean, 7, count)
+    # At most 200 cells of about the same probability.
+    edges = np.unique(stats.poisson.ppf(np.linspace(0.001, 0.999, 200), mean))
+    upper = np.append(stats.poisson.cdf(edges, mean), 1.0)
+    counts = np.bincount(np.searchsorted(edges, drawn), minlength=len(upper))
+    p = chi_square(counts, np.diff(upper, prepend=0.0), count)
+    print(f"\n| Poisson, mean {mean:g} | scipy.stats.poisson, chi-square | {count} | p = {p:.2g} |")
+    assert p > UNLIKELY
+    assert abs(drawn.mean() - mean) < FAR * np.sqrt(mean / count)
+    # The variance of a sample variance of Poisson numbers: (2 mean² + mean) / n.
+    assert abs(drawn.var() - mean) < FAR * np.sqrt((2 * mean**2 + mean) / count)
+
+
+@lengths(200_000, 2_000_000)
+def test_normal_numbers_are_normal_and_independent(count):
+    read, grey, electrons = many(0, 0.0, 7, count), many(2, 0.0, 7, count), many(-1, 50.0, 7, count)
+    for drawn in (read, grey):
+        assert stats.kstest(drawn, "norm").pvalue > UNLIKELY
+        assert abs(stats.kurtosis(drawn)) < FAR * np.sqrt(24 / count)
+    for a, b in ((read, grey), (read, electrons), (grey, electrons), (read[1:], read[:-1])):
+        assert abs(stats.spearmanr(a, b).statistic) * np.sqrt(count) < FAR
+
+
+def correlation(a, b):
+    """Correlation of two fields, in standard deviations of that of independent ones."""
+    return abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) * np.sqrt(a.size)
+
+
+@pytest.mark.parametrize("noise", ["noise_grey=20", "full_well_e=300"])
+def test_noise_of_pixels_scenes_trials_and_seeds_is_independent(noise):
+    image = flat(128, noise).astype(float)
+    worst = 0.0
+    for down, right in ((0, 1), (1, 0), (1, 1), (0, 2), (2, 0), (0, 32), (64, 0), (5, 7)):
+        worst = max(worst, correlation(
+            image[down:, right:], image[: 700 - down, : 1000 - right]
+        ))
+        absolute = np.abs(image - image.mean())
+        worst = max(worst, correlation(
+            absolute[down:, right:], absolute[: 700 - down, : 1000 - right]
+        ))
+    others = [
+        flat(128, noise, trial=1), flat(128, noise, trial=2), flat(128, noise, seed=2),
+        flat(128, noise, tilt_deg=1), flat(128, noise, "marker_id=3"),
+        flat(128, noise, "size_m=0.02"), flat(128, noise, "focal_length_mm=4.5"),
+    ]
+    for other in others:
+        assert (other != image).mean() > 0.9
+        worst = max(worst, correlation(image, other.astype(float)))
+    row(f"independence, {noise}", "correlation, standard deviations", 16 + len(others), worst, FAR)
+
+
+@pytest.mark.parametrize("noise", [["noise_grey=20"], ["full_well_e=300", "read_noise_e=4"]])
+def test_noise_is_that_of_the_scene_whatever_renderer_window_and_levels(noise):
+    image = flat(128, *noise)
+    for given in (["renderer=warp"], ["renderer=supersample-2"], ["window=full"], ["black=30"],
+                  ["white=200"], ["cornerRefinementMethod=subpix"], ["solver=ippe"]):
+        assert np.array_equal(flat(128, *noise, *given), image), given
+    assert np.array_equal(flat(128, *noise, seed=1, trial=0), image)
+
+
+def test_noise_of_other_levels_and_strengths_is_the_same_noise():
+    image = flat(128, "noise_grey=10").astype(int)
+    assert np.array_equal(flat(120, "noise_grey=10") + 8, image)
+    twice = flat(128, "noise_grey=20").astype(int)
+    # Each is rounded once: 2 · 0.5 + 0.5.
+    assert np.abs(twice - 128 - 2 * (image - 128)).max() <= 1.5
+    read = flat(128, "full_well_e=1e9", "read_noise_e=4e7").astype(float)
+    stronger = flat(128, "full_well_e=1e9", "read_noise_e=8e7").astype(float)
+    inside = (stronger > 0) & (stronger < 255)
+    assert np.abs(stronger - 128 - 2 * (read - 128))[inside].max() <= 1.51
+
+
+@pytest.mark.parametrize("noise", ["noise_grey=20", "full_well_e=300"])
+def test_noise_of_a_pixel_does_not_depend_on_the_window(noise):
+    rng = np.random.default_rng(8)
+    pipeline = Pipeline.from_text(
+        FLAT.format(level=90, seed=5, tilt_deg=30, height=300), [noise, "side_px=60"]
+    )
+    frame = image_of(pipeline)
+    box = marker_boxes(scenes_of(pipeline))[0]
+    for _ in range(20):
+        left, top = rng.integers(0, box[:2] + 1).tolist()
+        right, bottom = rng.integers(box[2:], [1001, 301]).tolist()
+        image = image_of(pipeline, window=(left, top, right, bottom))
+        assert np.array_equal(image, frame[top:bottom, left:right])
+
+
+# Photon transfer.
+
+def test_photon_transfer_is_within_one_percent_of_theory():
+    """Variance against mean: gain² · (mean · 255 / full well + (read · 255 / full well)²) + grey²
+    + 1/12 of quantisation, which holds where steps of an electron are smoothed over the levels: by
+    many electrons a level, or by read noise. Of 700,000 pixels the variance has a standard
+    deviation of 0.17 %."""
+    worst_mean = worst = cases = 0
+    for full_well, read, gain, grey in (
+        (500, 2, 1, 0), (5000, 0, 1, 0), (20_000, 0, 1, 0), (500, 2, 0.5, 0), (2000, 2, 2, 0),
+        (1000, 20, 1, 0), (1000, 5, 1.5, 3),
+    ):
+        for level in (40, 120, 200):
+            if level * gain > 220:
+                continue
+            image = flat(
+                level, f"full_well_e={full_well}", f"read_noise_e={read}", f"gain={gain}",
+                f"noise_grey={grey}",
+            ).astype(float)
+            a_level = 255 / full_well
+            theory = gain**2 * (level * a_level + (read * a_level) ** 2) + grey**2 + 1 / 12
+            worst = max(worst, abs(image.var() / theory - 1))
+            deviation = abs(image.mean() - gain * level) / np.sqrt(theory / image.size)
+            worst_mean = max(worst_mean, deviation)
+            cases += 1
+    row("photon transfer: variance", "theory, relative", cases, worst, 0.01)
+    row("photon transfer: mean", "theory, standard deviations", cases, worst_mean, FAR)
+
+
+def test_full_well_and_saturation_clip():
+    # 255 of level is a full well of 100 electrons on average; more do not fit.
+    image = flat(255, "full_well_e=100", "gain=0.5")
+    assert image.max() == 128  # 127.5 rounds up
+    share = stats.poisson.sf(99, 100)
+    deviation = np.sqrt(share * (1 - share) / image.size)
+    assert abs((image == 128).mean() - share) < FAR * deviation
+    assert (flat(250, "full_well_e=1e6", "gain=2") == 255).all()
+    assert (flat(0, "full_well_e=1000", "gain=2") == 0).all()
+
+
+def test_brightness_is_kept_and_read_noise_is_not_clipped_before_it_is_read_out():
+    # Full wells and read noise: electrons below 0 are negative voltages, clipped by quantisation.
+    image = flat(0, "full_well_e=1000", "read_noise_e=40").astype(float)
+    deviation = 40 * 255 / 1000
+    upper = stats.norm.cdf((np.arange(256) + 0.5) / deviation)
+    counts = np.bincount(image.astype(int).ravel(), minlength=256)
+    assert chi_square(counts, np.diff(upper, prepend=0.0), image.size) > UNLIKELY
+
+
+# Quantisation.
+
+def test_quantisation_is_rounding_half_up_clipped_and_seen_in_8_bits():
+    text = """
+[camera]
+width_px = 64
+height_px = 48
+[pose]
+side_px = 300
+tilt_deg = 20
+roll_deg = 33
+[scene]
+black = 30.3
+white = 201.7
+background = 90.4
+"""
+    worst = cases = 0
+    for gain in (0.01, 0.7, 1.0, 1.3, 5.0, 1e6):
+        for bits in range(8, 17):
+            pipeline = Pipeline.from_text(text, [f"gain={gain}", f"bit_depth={bits}", "side_px=20"])
+            scenes = scenes_of(pipeline)
+            mean, share = marker_levels(scenes, 0, (0, 0, 64, 48))
+            levels = gain * (mean + (1 - share) * 90.4)
+            most = 2**bits - 1
+            scaled = levels * most / 255
+            counts = np.clip(np.floor(scaled + 0.5), 0, most).astype(np.int64)
+            expected = (2 * 255 * counts + most) // (2 * most)
+            decided = np.abs(scaled % 1 - 0.5) > 1e-6
+            found = image_of(pipeline).astype(int)
+            worst = max(worst, np.abs(found - expected)[decided].max())
+            cases += 1
+    row("gain, 8-16 bits, clipping", "integers of NumPy", cases, worst, 0)
+
+
+def test_finer_bits_follow_the_levels_more_closely_than_8():
+    # 8 bits are what OpenCV sees: of more bits, only levels near a half may come out otherwise.
+    eight = flat(100.4999, "gain=1.00001")
+    assert (eight == 101).all()
+    assert (flat(100.49, "bit_depth=16") == 100).all()
+
+
+# Extremes.
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        ["full_well_e=1"], ["full_well_e=1e9"], ["full_well_e=1e9", "read_noise_e=1e9"],
+        ["noise_grey=1e6"], ["noise_grey=1e6", "gain=1e6"], ["gain=1e6"], ["gain=1e-300"],
+        ["full_well_e=1.5", "gain=1e6", "noise_grey=1e6", "bit_depth=16", "read_noise_e=1e9"],
+        ["noise_grey=1e-300"], ["full_well_e=2", "read_noise_e=1e-300"],
+        ["full_well_e=1e9", "illumination_gradient=2", "vignetting=100", "white=0", "black=0"],
+    ],
+    ids=",".join,
+)
+@pytest.mark.parametrize("size", [(1, 1), (8, 8), (640, 480)])
+def test_extreme_noise_ends_without_a_warning(given, size):
+    text = "[pose]\nside_px = 12\n[scene]\nbackground = 77.7\n"
+    settings = [*given, f"width_px={size[0]}", f"height_px={size[1]}"]
+    image = image_of(Pipeline.from_text(text, settings))
+    assert image.shape == size[::-1]
+    if given == ["noise_grey=1e6"] and size[0] == 640:
+        # Black or white, nearly all of it.
+        assert np.isin(image, (0, 255)).mean() > 0.99
+
+
+# Windows.
+
+NOISY = """
+seed = 21
+[pose]
+tilt_deg = { uniform = [0, 75] }
+azimuth_deg = { uniform = [0, 360] }
+roll_deg = { uniform = [0, 360] }
+bearing_x_deg = { uniform = [-30, 30] }
+bearing_y_deg = { uniform = [-23, 23] }
+[axes]
+background = [0, 128, 255]
+side_px = { geom = [10, 250, 12] }
+noise_grey = [1, 2, 4, 8, 16, 32]
+trial = 20
+"""
+
+
+def both_searches(count, setting):
+    """Return the scenes, and what a setting finds in the windows and in the whole frames."""
+    pipeline = Pipeline.from_text(NOISY)
+    shape = tuple(len(axis) for axis in scene_axes(pipeline))
+    order = np.random.default_rng(6).permutation(int(np.prod(shape)))[: count * 5 // 4 + 20]
+
+    def built(cells):
+        indices = list(np.unravel_index(cells, shape))
+        return build_scenes(scene_values(pipeline, indices), len(cells))
+
+    seen = np.flatnonzero(visibility_flags(built(order)) == Detection.not_run)[:count]
+    assert len(seen) == count
+    scenes = built(order[seen])
+    single_thread()
+    failures = []
+    windowed, framed = (
+        search(scenes, np.ones((count, 1), dtype=bool), [setting], np.full(count, full), failures)
+        [0][0] for full in (False, True)
+    )
+    assert not failures
+    return scenes, windowed, framed
+
+
+@lengths(25, 400)
+@pytest.mark.parametrize("refinement", REFINEMENTS)
+def test_window_finds_what_the_frame_holds_under_noise(count, refinement):
+    setting = DetectorSetting(cornerRefinementMethod=refinement)
+    scenes, windowed, framed = both_searches(count, setting)
+    windows = search_windows(scenes, marker_boxes(scenes), setting, np.zeros(count, dtype=bool))
+    assert (windows[:, 2:] - windows[:, :2] < scenes.frame).any()
+    exceptions = np.flatnonzero(windowed.flags != framed.flags)
+    both = (windowed.flags == Detection.detected) & (framed.flags == Detection.detected)
+    difference = np.abs(windowed.corners - framed.corners)[both].max(axis=(1, 2))
+    print(
+        f"\n{refinement}: {count} poses, {both.sum()} detected, {len(exceptions)} exceptions "
+        f"{[(int(windowed.flags[i]), int(framed.flags[i])) for i in exceptions]}; corners differ "
+        f"by 99th percentile {np.quantile(difference, 0.99):.2g}, worst {difference.max():.2g} px"
+    )
+    assert both.sum() > count // 4
+    # As in test_window.py, whose bounds have their reasons there: OpenCV itself may make something
+    # else of the very same pixels elsewhere in the frame.
+    assert len(exceptions) <= max(1, 0.001 * count)
+    for i in exceptions:
+        assert len(outcomes_elsewhere(scenes, i, setting)) > 1
+    limit = {"none": 0.0, "subpix": 10.0, "contour": 1.0, "apriltag": np.spacing(np.float32(640))}
+    assert difference.max() <= limit[refinement]
+    if refinement == "subpix":
+        assert np.quantile(difference, 0.99) < DetectorSetting().cornerRefinementMinAccuracy
+
+
+# Files that cannot be run.
+
+BROKEN = {
+    "7 bits": ("bit_depth = 7", "scene.bit_depth = 7: expected a whole number from 8 to 16"),
+    "17 bits": ("bit_depth = 17", "scene.bit_depth = 17: expected a whole number from 8 to 16"),
+    "half a bit": ("bit_depth = 8.5", "scene.bit_depth = 8.5: expected a whole number from 8 to"),
+    "read noise without a full well": (
+        "read_noise_e = 3", "scene.read_noise_e = 3: expected full_well_e beside it",
+    ),
+    "negative read noise": (
+        "full_well_e = 9\nread_noise_e = -3", "scene.read_noise_e = -3: expected a number from 0",
+    ),
+    "no gain": ("gain = 0", "scene.gain = 0: expected a number above 0"),
+    "negative gain": ("gain = -1", "scene.gain = -1: expected a number above 0"),
+    "no full well": ("full_well_e = 0", "scene.full_well_e = 0: expected a number from 1"),
+    "noise that is no number": ("noise_grey = nan", "scene.noise_grey = nan: expected a number"),
+    "endless noise": ("noise_grey = inf", "scene.noise_grey = inf: expected a number from 0"),
+    "negative noise": ("noise_grey = -1", "scene.noise_grey = -1: expected a number from 0"),
+    "drawn bits": (
+        "bit_depth = { uniform = [8, 16] }", "expected a fixed value; only these can be drawn",
+    ),
+    "trials of nothing random": (
+        "gain = 2\n[axes]\ntrial = 2", "axes.trial = 2: expected something random to repeat",
+    ),
+    "trials of noise of strength 0": (
+        "noise_grey = 0\n[axes]\ntrial = 2", "axes.trial = 2: expected something random to repeat",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_sensor_that_cannot_be_is_said_in_one_line(name):
+    lines, expected = BROKEN[name]
+    with pytest.raises(PipelineError) as raised:
+        Pipeline.from_text(
+            f"[pose]\ndistance_m = 1\n[scene]\n{lines}\n", source="broken.toml"
+        )
+    faults = str(raised.value).splitlines()
+    assert len(faults) == 1, faults
+    assert faults[0].startswith("broken.toml: ")
+    assert expected in faults[0]
+
+
+@pytest.mark.parametrize(
+    "lines",
+    ["noise_grey = 1", "full_well_e = 1000", "full_well_e = { uniform = [100, 1000] }",
+     "noise_grey = { uniform = [0, 5] }", "blur_px = { uniform = [0, 2] }"],
+)
+def test_trials_of_noise_or_of_a_drawn_effect_are_run(lines):
+    text = f"[pose]\nside_px = 40\n[scene]\n{lines}\n[axes]\ntrial = 2\n"
+    pipeline = Pipeline.from_text(text)
+    assert (image_of(pipeline, 0) != image_of(pipeline, 1)).any()

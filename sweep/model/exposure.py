@@ -71,15 +71,16 @@ def marker_exposure(scenes: Scenes, row: int, box: Box, levels: Floats) -> Float
 
 @compiled
 def _expose(
-    cover: Floats, bounds: Floats, ends: Floats, sides: NDArray[np.int64], levels: Floats, plane: Floats,
-    translation: Floats, view: Floats, lens: Floats, distorted: bool, left: int, top: int,
+    cover: Floats, bounds: Floats, ends: Floats, sides: NDArray[np.int64], levels: Floats,
+    plane: Floats, translation: Floats, view: Floats, lens: Floats, distorted: bool, left: int, top: int,
     sigma: float, velocity: Floats, exposure_s: float, panels: int, row_time_s: float,
     middle_row: float,
 ) -> None:
     """Add a marker's edges to ``cover``, averaged over each row's exposure.
 
     By three Gauss-Legendre nodes on each of ``panels`` parts of the exposure; 0 where nothing
-    moves while a row is exposed.
+    moves while a row is exposed. Where the marker, with its columns and rows between ``bounds``
+    (2,), is behind the camera, it is not seen.
     """
     groups = cover.shape[0] if row_time_s > 0.0 else 1
     for group in range(groups):

@@ -101,8 +101,7 @@ _COARSE_TURN = math.pi / 8
 
 
 def _outline_modules(scenes: Scenes, row: int) -> Floats:
-    """Return points (M, 2) of a marker's outline in module coordinates: its corners or, bent, more.
-    """
+    """Return points (M, 2) of a marker's outline in modules: its corners, or more where bent."""
     low, high = -scenes.quiet_zone[row], scenes.modules[row] + scenes.quiet_zone[row]
     t = np.arange(CHORDS_PER_SIDE if scenes.cameras.distorted[row] else 1)
     ahead = low + t / len(t) * (high - low)

@@ -303,7 +303,11 @@ def confusion_px(value, u, v):
         (u - (value["width_px"] - 1) / 2) / value["fx_px"],
         (v - (value["height_px"] - 1) / 2) / value["fx_px"], 1.0,
     ])
-    depth = normal @ plane[:, 2] / (normal @ ray)
+    # Beyond the marker its plane goes on, but nothing on it is seen: the nearest of its depths.
+    quiet = 0 if value["white"] == value["background"] else value["quiet_zone_modules"]
+    ends = (-quiet, len(modules_of(value)) - 2 + quiet)
+    depths = [plane[2] @ [column, line, 1] for column in ends for line in ends]
+    depth = 1 / np.clip(normal @ ray / (normal @ plane[:, 2]), 1 / max(depths), 1 / min(depths))
     behind, sensor = (1 / (1 / 4e-3 - 1 / z) for z in (depth, value["focus_distance_m"]))
     # A cone of light as wide as the opening, cut by the sensor off its tip; fx pixels of it make
     # the sensor's distance.

@@ -72,8 +72,8 @@ def marker_exposure(scenes: Scenes, row: int, box: Box, levels: Floats) -> Float
 @compiled
 def _expose(
     cover: Floats, bounds: Floats, ends: Floats, sides: NDArray[np.int64], levels: Floats,
-    plane: Floats, translation: Floats, view: Floats, lens: Floats, distorted: bool, left: int, top: int,
-    sigma: float, velocity: Floats, exposure_s: float, panels: int, row_time_s: float,
+    plane: Floats, translation: Floats, view: Floats, lens: Floats, distorted: bool, left: int,
+    top: int, sigma: float, velocity: Floats, exposure_s: float, panels: int, row_time_s: float,
     middle_row: float,
 ) -> None:
     """Add a marker's edges to ``cover``, averaged over each row's exposure.

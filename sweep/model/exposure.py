@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.model import coverage
-from sweep.model.extent import corner_depths, path_px
+from sweep.model.extent import corner_depths, outline_modules, path_px
+from sweep.model.lens import distort
 from sweep.model.marker import edges, occluded_edges
 from sweep.model.motion import moved
 from sweep.model.scene import Box, Scenes
@@ -49,7 +50,7 @@ def marker_exposure(scenes: Scenes, row: int, box: Box, levels: Floats) -> Float
     plane = scenes.plane[row]
     spread, varies = _spreads(scenes, row, box)
     path = path_px(scenes, row, box)
-    bounds = np.array([-scenes.quiet_zone[row], scenes.modules[row] + scenes.quiet_zone[row]])
+    outline = outline_modules(scenes, row)
     shape = (len(spread), box[3] - box[1], box[2] - box[0])
     images = np.empty(shape)
     cover = np.zeros((shape[1], shape[2] + 2))
@@ -58,7 +59,7 @@ def marker_exposure(scenes: Scenes, row: int, box: Box, levels: Floats) -> Float
         panel = max(SHARP_PANEL_PX, 1.5 * sigma)
         panels = math.ceil(min(path / panel, MOST_PANELS if row_time_s == 0 else MOST_ROW_PANELS))
         _expose(
-            cover, bounds, outlines.ends, outlines.sides, levels, plane, scenes.translation[row],
+            cover, outline, outlines.ends, outlines.sides, levels, plane, scenes.translation[row],
             scenes.cameras.view[row], scenes.cameras.lenses[row],
             bool(scenes.cameras.distorted[row]), box[0], box[1], sigma, velocity, exposure_s,
             panels, row_time_s, (scenes.frame[row, 1] - 1) / 2,
@@ -71,7 +72,7 @@ def marker_exposure(scenes: Scenes, row: int, box: Box, levels: Floats) -> Float
 
 @compiled
 def _expose(
-    cover: Floats, bounds: Floats, ends: Floats, sides: NDArray[np.int64], levels: Floats,
+    cover: Floats, outline: Floats, ends: Floats, sides: NDArray[np.int64], levels: Floats,
     plane: Floats, translation: Floats, view: Floats, lens: Floats, distorted: bool, left: int,
     top: int, sigma: float, velocity: Floats, exposure_s: float, panels: int, row_time_s: float,
     middle_row: float,
@@ -79,8 +80,8 @@ def _expose(
     """Add a marker's edges to ``cover``, averaged over each row's exposure.
 
     By three Gauss-Legendre nodes on each of ``panels`` parts of the exposure; 0 where nothing
-    moves while a row is exposed. Where the marker, with its columns and rows between ``bounds``
-    (2,), is behind the camera, it is not seen.
+    moves while a row is exposed. Instants at which no part of the marker, whose ``outline`` (M, 2)
+    is in module coordinates, is seen by the rows that are exposed cost next to nothing.
     """
     groups = cover.shape[0] if row_time_s > 0.0 else 1
     for group in range(groups):
@@ -94,7 +95,11 @@ def _expose(
                     offset, weight = 0.5, 1.0
                 instant = begin + exposure_s * ((panel + offset) / max(panels, 1) - 0.5)
                 placed = moved(plane, translation, velocity, instant) if instant != 0.0 else plane
-                if not _in_front(placed, bounds):
+                seen = _is_seen(
+                    placed, outline, view, lens, distorted, left, top + group, rows.shape[0],
+                    rows.shape[1] - 2, coverage.REACH * sigma + 2.0,
+                )
+                if not seen:
                     continue
                 coverage.accumulate(
                     rows, ends, sides, levels * (weight / max(panels, 1)), placed, view, lens,
@@ -103,13 +108,28 @@ def _expose(
 
 
 @compiled
-def _in_front(plane: Floats, bounds: Floats) -> bool:
-    """Tell whether all corners of a marker, columns and rows at both bounds, have z > 0."""
-    for a in range(2):
-        for b in range(2):
-            if not plane[2, 0] * bounds[a] + plane[2, 1] * bounds[b] + plane[2, 2] > 0.0:
-                return False
-    return True
+def _is_seen(
+    plane: Floats, outline: Floats, view: Floats, lens: Floats, distorted: bool, left: int,
+    top: int, height: int, width: int, margin: float,
+) -> bool:
+    """Tell whether a marker is in front of the camera and within ``margin`` px of a box."""
+    low_x = low_y = math.inf
+    high_x = high_y = -math.inf
+    for j in range(len(outline)):
+        z = plane[2, 0] * outline[j, 0] + plane[2, 1] * outline[j, 1] + plane[2, 2]
+        if not z > 0.0:
+            return False
+        x = (plane[0, 0] * outline[j, 0] + plane[0, 1] * outline[j, 1] + plane[0, 2]) / z
+        y = (plane[1, 0] * outline[j, 0] + plane[1, 1] * outline[j, 1] + plane[1, 2]) / z
+        if distorted:
+            x, y = distort(x, y, lens)
+        u, v = view[0] * x + view[2] - left, view[1] * y + view[3] - top
+        low_x, high_x = min(low_x, u), max(high_x, u)
+        low_y, high_y = min(low_y, v), max(high_y, v)
+    return (
+        high_x > -margin and low_x < width + margin
+        and high_y > -margin and low_y < height + margin
+    )
 
 
 def defocus_px(scenes: Scenes, row: int, box: Box) -> Floats:

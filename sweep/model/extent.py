@@ -100,7 +100,7 @@ _COARSE_TURN = math.pi / 8
 """Turn between two instants from which a marker may be anywhere around its centre between them."""
 
 
-def _outline_modules(scenes: Scenes, row: int) -> Floats:
+def outline_modules(scenes: Scenes, row: int) -> Floats:
     """Return points (M, 2) of a marker's outline in modules: its corners, or more where bent."""
     low, high = -scenes.quiet_zone[row], scenes.modules[row] + scenes.quiet_zone[row]
     t = np.arange(CHORDS_PER_SIDE if scenes.cameras.distorted[row] else 1)
@@ -135,7 +135,7 @@ def _exposed_extent(
     cameras = scenes.cameras
     extents, states = track(
         scenes.plane[row], scenes.translation[row], velocity, cameras.view[row],
-        cameras.lenses[row], bool(cameras.distorted[row]), _outline_modules(scenes, row), times,
+        cameras.lenses[row], bool(cameras.distorted[row]), outline_modules(scenes, row), times,
     )
     front = states != UNSEEN
     with np.errstate(invalid="ignore"):
@@ -191,7 +191,7 @@ def path_px(scenes: Scenes, row: int, box: Box) -> float:
     if motion is None or motion[0] == 0.0:
         return 0.0
     exposure_s, row_time_s, velocity = motion
-    outline, cameras = _outline_modules(scenes, row), scenes.cameras
+    outline, cameras = outline_modules(scenes, row), scenes.cameras
     still = velocity * np.array([1.0, 1, 1, 0, 0, 0])
     longest = 0.0
     for line in (box[1], (box[1] + box[3]) // 2, box[3] - 1):

@@ -25,8 +25,11 @@ def _keep_compiled_code_by_content() -> None:
         digest.update(path.read_bytes())
     config: Any = numba.config
     kept = Path(config.CACHE_DIR or package / "__pycache__")
-    if os.access(kept if kept.exists() else kept.parent, os.W_OK):
-        config.CACHE_DIR = str(kept / f"compiled-{digest.hexdigest()[:16]}")
+    for folder in (kept.absolute(), Path.home() / ".cache" / "sweep"):
+        there = next(above for above in (folder, *folder.parents) if above.exists())
+        if os.access(there, os.W_OK):
+            config.CACHE_DIR = str(folder / f"compiled-{digest.hexdigest()[:16]}")
+            return
 
 
 _keep_compiled_code_by_content()

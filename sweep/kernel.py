@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from sweep.measure.accuracy import pose_error, rotation_difference
 from sweep.measure.detector import (
     NOISE_MARGIN_PX,
+    UNEVEN_LIGHT_CONSTANT,
     Detector,
     DetectorSetting,
     Found,
@@ -204,6 +205,7 @@ def search_windows(
     margin = margin_px(setting) + NOISE_MARGIN_PX * scenes.noisy[:, None].astype(np.int64)
     cut = windows(boxes, scenes.frame, margin)
     whole = full | (full_frame_reason(setting) is not None)
+    whole |= setting.adaptiveThreshConstant < UNEVEN_LIGHT_CONSTANT * scenes.uneven_gain
     frame = np.concatenate([np.zeros_like(scenes.frame), scenes.frame], axis=1)
     return np.where(whole[:, None], frame, cut)
 
@@ -306,8 +308,10 @@ def _chunks(
     if not len(rows):
         return
     size = windows[rows, 2:] - windows[rows, :2]
-    number = np.cumsum(np.where(plain[rows], size[:, 0] * size[:, 1], CHUNK_PX)) // CHUNK_PX
-    yield from np.split(rows, np.flatnonzero(np.diff(number)) + 1)
+    number = np.cumsum(size[:, 0] * size[:, 1]) // CHUNK_PX
+    alone = ~plain[rows]
+    cuts = (np.diff(number) != 0) | alone[1:] | alone[:-1]
+    yield from np.split(rows, np.flatnonzero(cuts) + 1)
 
 
 def _rendered(

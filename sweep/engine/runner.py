@@ -11,14 +11,16 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from distributed import Client, as_completed
+from distributed import Client
 
 from sweep.engine.calibration import block_extents, calibrate
 from sweep.engine.cluster import default_workers, embedded, external
+from sweep.engine.interrupts import Interrupts
 from sweep.engine.lock import locked, refuse_if_held
 from sweep.engine.provenance import differences
 from sweep.engine.reuse import match
@@ -43,6 +45,9 @@ from sweep.plan.pipeline import Pipeline
 
 WINDOW = 3
 """Blocks in flight per worker thread: enough that none waits, few enough that none pile up."""
+
+POLL_S = 0.2
+"""How often a run that waits for blocks looks whether it is to stop."""
 
 CALIBRATION_S = 0.6
 
@@ -139,7 +144,7 @@ def execute(
         match(pipeline, open_store(source))
     if opened is None:
         check_place(url)
-    with ThreadPoolExecutor(1) as beside:
+    with Interrupts() as interrupts, ThreadPoolExecutor(1) as beside:
         # Compiling and measuring here while the workers' processes come up.
         measuring = beside.submit(calibrate, pipeline, CALIBRATION_S) if opened is None else None
         cluster = embedded(workers or default_workers()) if scheduler is None else (
@@ -155,7 +160,7 @@ def execute(
             if opened is None:
                 raise AssertionError(url)
             with locked(opened):
-                receipts_seen = _compute(opened, client, sources, on_progress)
+                receipts_seen = _compute(opened, client, sources, on_progress, interrupts)
                 finish(opened, _cost(opened))
     return _summary(open_store(url), receipts_seen, time.perf_counter() - started)
 
@@ -183,6 +188,7 @@ def _compute(
     client: Client,
     sources: Sequence[str],
     on_progress: Callable[[Progress], None] | None,
+    interrupts: Interrupts,
 ) -> list[dict[str, int]]:
     """Compute what is not committed, a bounded window of blocks at a time.
 
@@ -197,19 +203,29 @@ def _compute(
         on_progress(progress)
     url = place(store.url)
 
-    def submit(block: Block) -> Any:
-        return client.submit(
+    finished: SimpleQueue[Any] = SimpleQueue()
+    flying: set[Any] = set()
+
+    def submit(block: Block) -> None:
+        future = client.submit(
             compute_block, url, store.run_id, block, sources, pure=False,
             key=f"block-{block}-{uuid.uuid4().hex[:8]}",
         )
+        flying.add(future)
+        future.add_done_callback(finished.put)
 
     computed: list[dict[str, int]] = []
     faults: list[str] = []
     room = _Room(client)
-    flight = as_completed(
-        [submit(block) for block in itertools.islice(todo, room())], loop=client.loop
-    )
-    for future in flight:
+    for block in itertools.islice(todo, room()):
+        submit(block)
+    while flying:
+        interrupts.check()
+        try:
+            future = finished.get(timeout=POLL_S)
+        except Empty:
+            continue
+        flying.discard(future)
         if future.status == "finished":
             receipt = future.result()
             computed.append(receipt["computed"])
@@ -223,8 +239,8 @@ def _compute(
             faults.append(f"{future.key}: {type(error).__name__}: {error}")
         future.release()
         if len(faults) < MOST_FAULTS:
-            for block in itertools.islice(todo, max(room() - flight.count(), 0)):
-                flight.add(submit(block))
+            for block in itertools.islice(todo, max(room() - len(flying), 0)):
+                submit(block)
     if faults:
         raise RunError(
             f"{store.url}: {len(faults)} blocks failed; run again to continue\n"

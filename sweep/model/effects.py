@@ -5,6 +5,7 @@ Each effect is absent, at no cost, unless a value other than its neutral one is 
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -122,6 +123,10 @@ GEOMETRIC = ("occlusion", "exposure_s", "row_time_s", "blur_px", "aperture_mm")
 
 RANDOM = ("noise_grey", "full_well_e")
 """Switches of the effects that draw random numbers."""
+
+
+NEUTRAL = {field.name: field.default for field in dataclasses.fields(Effects)}
+"""Every parameter of the effects at its default: none of them active."""
 
 
 def is_on(name: str, value: Any) -> bool:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sweep.model import lens as lens_model
 from sweep.model.camera import VIEW_PARAMETERS, Cameras, intrinsics
 from sweep.model.declaration import parameter
-from sweep.model.effects import SWITCHES, VELOCITIES, Effects, is_on
+from sweep.model.effects import NEUTRAL, SWITCHES, VELOCITIES, Effects, is_on
 from sweep.model.marker import MarkerKey, marker_corners, module_count
 from sweep.model.pose import placed, rotation_of_angles
 
@@ -114,6 +114,14 @@ class Scenes:
             return self.affected
         return (self.effects["noise_grey"] > 0) | ~np.isnan(self.effects["full_well_e"])
 
+    @property
+    def uneven_gain(self) -> Floats:
+        """How much stronger than drawn a scene's uneven light is, (N,): 0 where light is even."""
+        if self.effects is None:
+            return np.zeros(len(self))
+        uneven = (self.effects["illumination_gradient"] != 0) | (self.effects["vignetting"] > 0)
+        return np.where(uneven, np.maximum(self.effects["gain"], 1.0), 0.0)
+
     def effect(self, row: int) -> dict[str, float]:
         """Return the effects' parameters of one scene."""
         if self.effects is None:
@@ -136,6 +144,8 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
     ``values`` has every parameter of camera, marker, pose and scene (``distance_m`` resolved,
     ``distortion`` canonical) and ``shift_u_px``, ``shift_v_px``: the drawn jitter.
     """
+    values = {**NEUTRAL, **values}
+
     def numbers(name: str) -> Floats:
         column = np.asarray(values[name], dtype=np.float64)  # None becomes NaN
         return np.ascontiguousarray(np.broadcast_to(column, (count,)))
@@ -182,13 +192,12 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
     size = numbers("size_m")
     # A quiet zone on a background of its own level cannot be seen, unless a sheet hides it: it is
     # not modelled.
-    hiding = is_on("occlusion", values.get("occlusion", 0.0))
     keys = mapped(
-        lambda dictionary, marker_id, width, white, background: (
+        lambda dictionary, marker_id, width, white, background, occlusion: (
             dictionary, int(marker_id),
-            0.0 if background == white and not hiding else float(width),
+            0.0 if background == white and occlusion == 0 else float(width),
         ),
-        "dictionary", "marker_id", "quiet_zone_modules", "white", "background",
+        "dictionary", "marker_id", "quiet_zone_modules", "white", "background", "occlusion",
     )
     markers, marker = distinct(keys)
     modules = np.array([module_count(key[0]) for key in markers], dtype=np.float64)[marker]
@@ -215,7 +224,7 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
         axis=1,
     )
     effects, affected = None, np.zeros(count, dtype=bool)
-    if any(is_on(name, values.get(name, off)) for name, off in SWITCHES.items()):
+    if any(is_on(name, values[name]) for name in SWITCHES):
         effects = {
             field.name: numbers(field.name) for field in dataclasses.fields(Effects)
         }

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sweep.measure.detector import NOISE_MARGIN_PX, full_frame_reason, margin_px
+from sweep.measure.detector import (
+    NOISE_MARGIN_PX,
+    UNEVEN_LIGHT_CONSTANT,
+    full_frame_reason,
+    margin_px,
+)
 from sweep.model.camera import canonical_distortion
 from sweep.model.effects import RANDOM, SWITCHES, is_on
 from sweep.plan.grid import detector_settings
@@ -68,6 +73,13 @@ def parts(pipeline: Pipeline) -> list[Part]:
     asked = pipeline.any_value("window", lambda value: value == "full")
     settings = detector_settings(pipeline)
     whole = sorted({reason for s in settings if (reason := full_frame_reason(s)) is not None})
+    gain = max([1.0, *(value for value in pipeline.values_of("gain"))])
+    uneven = any(
+        pipeline.any_value(name, lambda value: value != 0) or name in pipeline.distributions
+        for name in ("illumination_gradient", "vignetting")
+    )
+    if uneven and any(s.adaptiveThreshConstant < UNEVEN_LIGHT_CONSTANT * gain for s in settings):
+        whole.append("adaptiveThreshConstant is low for uneven light")
     if image:
         whole.append("the background is an image: clutter near the marker may change what is found")
     if asked:

@@ -357,13 +357,13 @@ class _Reader:
         ]
         timed = [name for name in ("exposure_s", "row_time_s") if self._is_on(name)]
         for name in timed:
-            if not moving:
+            if not self.given.intersection(VELOCITIES):
                 self.fault(
                     f"scene.{name}", self._given_value(name),
                     f"a velocity beside it: {', '.join(VELOCITIES)}",
                 )
         for name in moving:
-            if not timed:
+            if not self.given.intersection(("exposure_s", "row_time_s")):
                 self.fault(
                     f"scene.{name}", self._given_value(name), "exposure_s or row_time_s beside it"
                 )

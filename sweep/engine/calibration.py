@@ -16,8 +16,11 @@ from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.template import bytes_per_block
 
-BATCH = 24
-"""Scenes measured at a time."""
+SMALLEST_BATCH, LARGEST_BATCH = 24, 1536
+"""Scenes measured at a time; more where they are cheap, for a call has a cost of its own."""
+
+LONG_BATCH_S = 0.06
+"""Time from which a batch is large enough."""
 
 MOST_BATCHES = 40
 
@@ -67,10 +70,10 @@ def calibrate(pipeline: Pipeline, budget_s: float) -> Calibration:
     run_cells(pipeline, _sample(axes, generator, min(4, total)))
     rows: list[NDArray[np.float64]] = []
     picks: list[list[NDArray[np.intp]]] = []
-    batch_s: list[float] = []
+    total_s, batch = 0.0, SMALLEST_BATCH
     started = time.perf_counter()
     while True:
-        indices = _sample(axes, generator, BATCH)
+        indices = _sample(axes, generator, batch)
         begun, working = time.perf_counter(), time.thread_time()
         result = run_cells(pipeline, indices)
         # This thread's own time: the workers' processes come up meanwhile, and use the processors.
@@ -80,7 +83,9 @@ def calibrate(pipeline: Pipeline, budget_s: float) -> Calibration:
         count = len(own)
         rows.append(own + (spent - own.sum()) / count)
         picks.append(indices)
-        batch_s.append(spent / count)
+        total_s += spent
+        if spent < LONG_BATCH_S:
+            batch = min(2 * batch, LARGEST_BATCH)
         used = time.perf_counter() - started
         if used >= budget_s or len(rows) >= MOST_BATCHES:
             break
@@ -95,7 +100,7 @@ def calibrate(pipeline: Pipeline, budget_s: float) -> Calibration:
         a, b = cost[low].mean(), cost[~low].mean()
         unevenness.append(float(abs(a - b) / (a + b) * 2))
     error = float(cost.std(ddof=1) / math.sqrt(len(cost))) if len(cost) > 1 else 0.0
-    return Calibration(float(np.mean(batch_s)), error, len(cost), tuple(unevenness))
+    return Calibration(total_s / len(cost), error, len(cost), tuple(unevenness))
 
 
 def _sample(

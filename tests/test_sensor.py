@@ -113,7 +113,7 @@ def many(kind, mean, start, count):
     """Draw numbers of ``count`` pixel keys: a Poisson number, or normal ones of two draws."""
     drawn = np.empty(count)
     for i in range(count):
-        pixel = sensor._mixed(np.uint64(start) + np.uint64(0x9E3779B97F4A7C15) * np.uint64(i + 1))
+        pixel = sensor.mixed(np.uint64(start) + np.uint64(0x9E3779B97F4A7C15) * np.uint64(i + 1))
         drawn[i] = sensor._poisson(mean, pixel, 4) if kind < 0 else sensor._normal(pixel, kind)
     return drawn
 

@@ -67,13 +67,13 @@ def calibrate(pipeline: Pipeline, budget_s: float) -> Calibration:
     axes = scene_axes(pipeline)
     generator = np.random.Generator(np.random.PCG64(0))
     total = pipeline.size(Stage.scene)
-    run_cells(pipeline, _sample(axes, generator, min(4, total)))
+    run_cells(pipeline, sample(axes, generator, min(4, total)))
     rows: list[NDArray[np.float64]] = []
     picks: list[list[NDArray[np.intp]]] = []
     total_s, batch = 0.0, SMALLEST_BATCH
     started = time.perf_counter()
     while True:
-        indices = _sample(axes, generator, batch)
+        indices = sample(axes, generator, batch)
         begun, working = time.perf_counter(), time.thread_time()
         result = run_cells(pipeline, indices)
         # This thread's own time: the workers' processes come up meanwhile, and use the processors.
@@ -103,9 +103,10 @@ def calibrate(pipeline: Pipeline, budget_s: float) -> Calibration:
     return Calibration(total_s / len(cost), error, len(cost), tuple(unevenness))
 
 
-def _sample(
+def sample(
     axes: tuple[Axis, ...], generator: np.random.Generator, count: int
 ) -> list[NDArray[np.intp]]:
+    """Return random indices (count,) along each scene axis."""
     return [generator.integers(0, len(axis), count).astype(np.intp) for axis in axes]
 
 

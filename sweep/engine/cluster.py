@@ -13,6 +13,7 @@ from typing import Any
 import dask
 from distributed import Client, LocalCluster, fire_and_forget
 
+from sweep.engine.interrupts import in_main_thread
 from sweep.engine.provenance import fingerprint
 from sweep.errors import StoreError
 from sweep.plan.pipeline import Pipeline
@@ -61,7 +62,7 @@ def embedded(workers: int) -> Iterator[Client]:
     _hush()
     settings = {"distributed.nanny.pre-spawn-environ": WORKER_ENVIRONMENT, **STILL}
     # Ctrl-C reaches every process of the terminal; the workers leave it to the client.
-    before = signal.getsignal(signal.SIGINT) if _in_main_thread() else None
+    before = signal.getsignal(signal.SIGINT) if in_main_thread() else None
     if before is not None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -85,14 +86,6 @@ def embedded(workers: int) -> Iterator[Client]:
 def _warm() -> None:
     """Import what a block needs."""
     importlib.import_module("sweep.engine.task")
-
-
-def _in_main_thread() -> bool:
-    try:
-        signal.signal(signal.SIGINT, signal.getsignal(signal.SIGINT))
-    except (ValueError, TypeError):
-        return False
-    return True
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sweep.engine.calibration import block_extents, calibrate
+from sweep.engine.calibration import block_extents, calibrate, sample
 from sweep.engine.cluster import default_workers
 from sweep.engine.runner import CALIBRATION_S
 from sweep.errors import StoreError
@@ -62,7 +62,7 @@ def effect_costs(
     axes = scene_axes(pipeline)
     generator = np.random.Generator(np.random.PCG64(1))
     count = min(max(int(EFFECT_S / (6 * pose_s)), 8), EFFECT_SCENES) if axes else 1
-    indices = [generator.integers(0, len(axis), count).astype(np.intp) for axis in axes]
+    indices = sample(axes, generator, count)
     costs = {}
     for switch in switches:
         pair = pipeline, _without(pipeline, switch)

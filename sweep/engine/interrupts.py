@@ -8,6 +8,11 @@ from types import FrameType
 from typing import Any, Self
 
 
+def in_main_thread() -> bool:
+    """Tell whether this is the thread that signals arrive in."""
+    return threading.current_thread() is threading.main_thread()
+
+
 class Interrupts:
     """While it is entered, Ctrl-C is noted, and raised where :meth:`check` is called.
 
@@ -21,7 +26,7 @@ class Interrupts:
         self._before: Any = None
 
     def __enter__(self) -> Self:
-        if threading.current_thread() is threading.main_thread():
+        if in_main_thread():
             self._before = signal.signal(signal.SIGINT, self._note)
         return self
 

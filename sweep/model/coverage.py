@@ -156,6 +156,10 @@ REACH = 5.0
 
 _SHORTEST_PANEL_PX = 0.015
 
+NODES = (0.1127016653792583, 0.5, 0.8872983346207417)
+WEIGHTS = (0.2777777777777778, 0.4444444444444444, 0.2777777777777778)
+"""Three Gauss-Legendre nodes on [0, 1], and their weights."""
+
 
 _STEPS = 256
 _AT = np.arange(-6 * _STEPS, 6 * _STEPS + 2) / _STEPS
@@ -166,6 +170,13 @@ deviations: interpolated linearly they are right to 8e-7."""
 
 
 @compiled
+def _interpolated(table: NDArray[np.float64], at: float) -> float:
+    """Return a table's value between its steps."""
+    k = int(at)
+    return float(table[k] + (at - k) * (table[k + 1] - table[k]))
+
+
+@compiled
 def _below(t: float, sigma: float) -> float:
     """Return the share of the point spread, a Gaussian, that lies below t."""
     at = (t / sigma + 6.0) * _STEPS
@@ -173,8 +184,7 @@ def _below(t: float, sigma: float) -> float:
         return 0.0
     if at >= 12.0 * _STEPS:
         return 1.0
-    k = int(at)
-    return float(_BELOW[k] + (at - k) * (_BELOW[k + 1] - _BELOW[k]))
+    return _interpolated(_BELOW, at)
 
 
 @compiled
@@ -185,8 +195,7 @@ def _below_sum(t: float, sigma: float) -> float:
         return 0.0
     if at >= 12.0 * _STEPS:
         return t
-    k = int(at)
-    return float(sigma * (_BELOW_SUM[k] + (at - k) * (_BELOW_SUM[k + 1] - _BELOW_SUM[k])))
+    return sigma * _interpolated(_BELOW_SUM, at)
 
 
 @compiled
@@ -254,9 +263,8 @@ def _add_spread(
     steps = np.empty(width)
     for panel in range(panels):
         for node in range(3):
-            offset = (0.1127016653792583, 0.5, 0.8872983346207417)[node]
-            weight = (0.2777777777777778, 0.4444444444444444, 0.2777777777777778)[node]
-            t = (panel + offset) / panels
+            weight = WEIGHTS[node]
+            t = (panel + NODES[node]) / panels
             x, y = xa + t * (xb - xa), ya + t * (yb - ya)
             first = max(math.floor(x - reach), 0)
             last = min(math.floor(x + reach) + 1, width - 1)

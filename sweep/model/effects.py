@@ -111,10 +111,15 @@ VELOCITIES = (
     "rotation_x_deg_s", "rotation_y_deg_s", "rotation_z_deg_s",
 )
 
+NEUTRAL = {field.name: field.default for field in dataclasses.fields(Effects)}
+"""Every parameter of the effects at its default: none of them active."""
+
 SWITCHES = {
-    "occlusion": 0.0, "illumination_gradient": 0.0, "exposure_s": 0.0, "row_time_s": 0.0,
-    "blur_px": 0.0, "aperture_mm": None, "vignetting": 0.0, "full_well_e": None, "gain": 1.0,
-    "noise_grey": 0.0, "bit_depth": 8,
+    name: NEUTRAL[name]
+    for name in (
+        "occlusion", "illumination_gradient", "exposure_s", "row_time_s", "blur_px", "aperture_mm",
+        "vignetting", "full_well_e", "gain", "noise_grey", "bit_depth",
+    )
 }
 """Parameters that switch an effect on -> the value at which it is absent."""
 
@@ -123,10 +128,6 @@ GEOMETRIC = ("occlusion", "exposure_s", "row_time_s", "blur_px", "aperture_mm")
 
 RANDOM = ("noise_grey", "full_well_e")
 """Switches of the effects that draw random numbers."""
-
-
-NEUTRAL = {field.name: field.default for field in dataclasses.fields(Effects)}
-"""Every parameter of the effects at its default: none of them active."""
 
 
 def is_on(name: str, value: Any) -> bool:

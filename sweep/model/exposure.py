@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.model import coverage
-from sweep.model.extent import corner_depths, outline_modules, path_px
-from sweep.model.lens import distort
+from sweep.model.extent import corner_depths, outline_modules, path_px, spread_px
 from sweep.model.marker import edges, occluded_edges
-from sweep.model.motion import moved
+from sweep.model.motion import moved, outline_extent
 from sweep.model.scene import Box, Scenes
 
 Floats = NDArray[np.float64]
@@ -89,8 +88,7 @@ def _expose(
         begin = row_time_s * (top + group - middle_row)
         for panel in range(max(panels, 1)):
             for node in range(3 if panels > 0 else 1):
-                offset = (0.1127016653792583, 0.5, 0.8872983346207417)[node]
-                weight = (0.2777777777777778, 0.4444444444444444, 0.2777777777777778)[node]
+                offset, weight = coverage.NODES[node], coverage.WEIGHTS[node]
                 if panels == 0:
                     offset, weight = 0.5, 1.0
                 instant = begin + exposure_s * ((panel + offset) / max(panels, 1) - 0.5)
@@ -113,37 +111,20 @@ def _is_seen(
     top: int, height: int, width: int, margin: float,
 ) -> bool:
     """Tell whether a marker is in front of the camera and within ``margin`` px of a box."""
-    low_x = low_y = math.inf
-    high_x = high_y = -math.inf
-    for j in range(len(outline)):
-        z = plane[2, 0] * outline[j, 0] + plane[2, 1] * outline[j, 1] + plane[2, 2]
-        if not z > 0.0:
-            return False
-        x = (plane[0, 0] * outline[j, 0] + plane[0, 1] * outline[j, 1] + plane[0, 2]) / z
-        y = (plane[1, 0] * outline[j, 0] + plane[1, 1] * outline[j, 1] + plane[1, 2]) / z
-        if distorted:
-            x, y = distort(x, y, lens)
-        u, v = view[0] * x + view[2] - left, view[1] * y + view[3] - top
-        low_x, high_x = min(low_x, u), max(high_x, u)
-        low_y, high_y = min(low_y, v), max(high_y, v)
+    extent = np.empty(4)
+    behind, _ = outline_extent(plane, view, lens, distorted, outline, extent)
     return (
-        high_x > -margin and low_x < width + margin
-        and high_y > -margin and low_y < height + margin
+        behind == 0
+        and extent[2] - left > -margin and extent[0] - left < width + margin
+        and extent[3] - top > -margin and extent[1] - top < height + margin
     )
 
 
 def defocus_px(scenes: Scenes, row: int, box: Box) -> Floats:
     """Return the point spread's standard deviation (height, width) at the marker's depth.
 
-    The circle of confusion of a thin lens has the diameter fx · aperture · |1/focus - 1/z| in
-    pixels; a disk's standard deviation along an axis is a quarter of its diameter. The depth is
-    that of the marker's plane in a pixel's direction, whose inverse is linear in the image.
+    That of its plane in a pixel's direction, whose inverse is linear in the image.
     """
-    effect = scenes.effect(row)
-    blur = effect["blur_px"]
-    height, width = box[3] - box[1], box[2] - box[0]
-    if math.isnan(effect["aperture_mm"]):
-        return np.full((height, width), blur)
     fx, fy, cx, cy = scenes.cameras.view[row]
     normal = scenes.rotation[row][:, 2]
     x = (np.arange(box[0], box[2]) - cx) / fx
@@ -153,9 +134,7 @@ def defocus_px(scenes: Scenes, row: int, box: Box) -> Floats:
     )
     # Beyond the marker its plane may come near the camera, or end: there is nothing to be blurred.
     depth = corner_depths(scenes, row)
-    inverse = np.clip(inverse, 1 / depth.max(), 1 / depth.min())
-    diameter = fx * effect["aperture_mm"] * 1e-3 * (1 / effect["focus_distance_m"] - inverse)
-    return np.asarray(np.hypot(blur, diameter / 4))
+    return spread_px(scenes, row, np.clip(inverse, 1 / depth.max(), 1 / depth.min()))
 
 
 def _spreads(scenes: Scenes, row: int, box: Box) -> tuple[list[float], bool]:

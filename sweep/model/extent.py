@@ -21,18 +21,23 @@ WARP_PX_PER_MODULE = 10
 """Resolution of the bitmap that the ``warp`` renderer maps (the paper's)."""
 
 
+def _square(low: Floats, high: Floats, per_side: int) -> Floats:
+    """Return points (n, 4 · per_side, 2) along squares from ``low`` to ``high`` (n,) in modules."""
+    t = np.arange(per_side) / per_side
+    ends = np.repeat(low[:, None], per_side, 1), np.repeat(high[:, None], per_side, 1)
+    ahead = ends[0] + t * (ends[1] - ends[0])
+    back = ends[1] - t * (ends[1] - ends[0])
+    columns = np.concatenate([ahead, ends[1], back, ends[0]], axis=1)
+    lines = np.concatenate([ends[0], ahead, ends[1], back], axis=1)
+    return np.stack([columns, lines], axis=2)
+
+
 def _outline(scenes: Scenes, rows: NDArray[np.intp], quiet: bool, per_side: int) -> Floats:
     """Return points (n, 4 · per_side, 2) along the images of the outline or the black square."""
     modules = scenes.modules[rows]
     margin = scenes.quiet_zone[rows] if quiet else np.zeros(len(rows))
-    low, high = -margin[:, None], (modules + margin)[:, None]
-    t = np.arange(per_side) / per_side
-    ahead, back = low + t * (high - low), high - t * (high - low)
-    columns = np.concatenate([ahead, np.repeat(high, per_side, 1), back,
-                              np.repeat(low, per_side, 1)], axis=1)
-    lines = np.concatenate([np.repeat(low, per_side, 1), ahead,
-                            np.repeat(high, per_side, 1), back], axis=1)
-    flat = np.stack([columns, lines, np.ones_like(columns)], axis=2)
+    square = _square(-margin, modules + margin, per_side)
+    flat = np.concatenate([square, np.ones_like(square[..., :1])], axis=2)
     return scenes.cameras.take(rows).project(
         np.ascontiguousarray(flat @ np.swapaxes(scenes.plane[rows], 1, 2))
     )
@@ -102,14 +107,9 @@ _COARSE_TURN = math.pi / 8
 
 def outline_modules(scenes: Scenes, row: int) -> Floats:
     """Return points (M, 2) of a marker's outline in modules: its corners, or more where bent."""
-    low, high = -scenes.quiet_zone[row], scenes.modules[row] + scenes.quiet_zone[row]
-    t = np.arange(CHORDS_PER_SIDE if scenes.cameras.distorted[row] else 1)
-    ahead = low + t / len(t) * (high - low)
-    back, start, stop = low + high - ahead, np.full(len(t), low), np.full(len(t), high)
-    return np.stack(
-        [np.concatenate([ahead, stop, back, start]), np.concatenate([start, ahead, stop, back])],
-        axis=1,
-    )
+    quiet = scenes.quiet_zone[row : row + 1]
+    per_side = CHORDS_PER_SIDE if scenes.cameras.distorted[row] else 1
+    return np.asarray(_square(-quiet, scenes.modules[row : row + 1] + quiet, per_side)[0])
 
 
 def _exposed_extent(
@@ -170,19 +170,29 @@ def _exposed_extent(
 
 def _largest_spread_px(scenes: Scenes, row: int) -> float:
     """Return the largest point spread on the marker, at one of its outline's corners."""
+    return float(spread_px(scenes, row, 1 / corner_depths(scenes, row)).max())
+
+
+def spread_px(scenes: Scenes, row: int, inverse_depth: Floats) -> Floats:
+    """Return the point spread's standard deviation in px at inverse depths (...) in 1/m.
+
+    The circle of confusion of a thin lens has the diameter fx · aperture · |1/focus - 1/z| in
+    pixels; a disk's standard deviation along an axis is a quarter of its diameter.
+    """
     effect = scenes.effect(row)
     if math.isnan(effect["aperture_mm"]):
-        return effect["blur_px"]
-    widest = np.abs(1 / effect["focus_distance_m"] - 1 / corner_depths(scenes, row)).max()
+        return np.full(inverse_depth.shape, effect["blur_px"])
     aperture_px = scenes.cameras.view[row, 0] * effect["aperture_mm"] * 1e-3
-    return math.hypot(effect["blur_px"], aperture_px * float(widest) / 4)
+    diameter = aperture_px * (1 / effect["focus_distance_m"] - inverse_depth)
+    return np.asarray(np.hypot(effect["blur_px"], diameter / 4))
 
 
 def corner_depths(scenes: Scenes, row: int) -> Floats:
     """Return the depths (4,) in metres of the quiet zone's corners."""
-    low, high = -scenes.quiet_zone[row], scenes.modules[row] + scenes.quiet_zone[row]
-    corners = np.array([[low, low, 1], [low, high, 1], [high, low, 1], [high, high, 1]])
-    return np.asarray(corners @ scenes.plane[row][2])
+    quiet = scenes.quiet_zone[row : row + 1]
+    (corners,) = _square(-quiet, scenes.modules[row : row + 1] + quiet, 1)
+    depth = scenes.plane[row][2]
+    return np.asarray(corners @ depth[:2] + depth[2])
 
 
 def path_px(scenes: Scenes, row: int, box: Box) -> float:

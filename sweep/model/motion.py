@@ -48,6 +48,35 @@ seen from behind, or where the lens folds, so that its image has no meaning."""
 
 
 @compiled
+def outline_extent(
+    plane: Floats, view: Floats, lens: Floats, distorted: bool, outline: Floats, extent: Floats
+) -> tuple[int, bool]:
+    """Write left, top, right, bottom in px of an outline's image to ``extent`` (4,).
+
+    Of the points (M, 2), in module coordinates, before the camera. Returns how many are behind
+    it, and whether the lens folds at one of the others.
+    """
+    behind, folds = 0, False
+    extent[0] = extent[1] = math.inf
+    extent[2] = extent[3] = -math.inf
+    for j in range(len(outline)):
+        z = plane[2, 0] * outline[j, 0] + plane[2, 1] * outline[j, 1] + plane[2, 2]
+        if not z > 0.0:
+            behind += 1
+            continue
+        x = (plane[0, 0] * outline[j, 0] + plane[0, 1] * outline[j, 1] + plane[0, 2]) / z
+        y = (plane[1, 0] * outline[j, 0] + plane[1, 1] * outline[j, 1] + plane[1, 2]) / z
+        if distorted:
+            a, b, c, d = jacobian(x, y, lens)
+            folds = folds or not (math.hypot(x, y) < lens[23] and a * d - b * c > 0.0)
+            x, y = distort(x, y, lens)
+        u, v = view[0] * x + view[2], view[1] * y + view[3]
+        extent[0], extent[2] = min(extent[0], u), max(extent[2], u)
+        extent[1], extent[3] = min(extent[1], v), max(extent[3], v)
+    return behind, folds
+
+
+@compiled
 def track(
     plane: Floats, translation: Floats, velocity: Floats, view: Floats, lens: Floats,
     distorted: bool, outline: Floats, times_s: Floats,
@@ -60,24 +89,9 @@ def track(
     states = np.zeros(len(times_s), dtype=np.int64)
     for k in range(len(times_s)):
         p = moved(plane, translation, velocity, times_s[k])
-        behind = 0
-        extents[k, 0] = extents[k, 1] = math.inf
-        extents[k, 2] = extents[k, 3] = -math.inf
-        for j in range(len(outline)):
-            z = p[2, 0] * outline[j, 0] + p[2, 1] * outline[j, 1] + p[2, 2]
-            if not z > 0.0:
-                behind += 1
-                continue
-            x = (p[0, 0] * outline[j, 0] + p[0, 1] * outline[j, 1] + p[0, 2]) / z
-            y = (p[1, 0] * outline[j, 0] + p[1, 1] * outline[j, 1] + p[1, 2]) / z
-            if distorted:
-                a, b, c, d = jacobian(x, y, lens)
-                if not (math.hypot(x, y) < lens[23] and a * d - b * c > 0.0):
-                    states[k] = MEANINGLESS
-                x, y = distort(x, y, lens)
-            u, v = view[0] * x + view[2], view[1] * y + view[3]
-            extents[k, 0], extents[k, 2] = min(extents[k, 0], u), max(extents[k, 2], u)
-            extents[k, 1], extents[k, 3] = min(extents[k, 1], v), max(extents[k, 3], v)
+        behind, folds = outline_extent(p, view, lens, distorted, outline, extents[k])
+        if folds:
+            states[k] = MEANINGLESS
         # The sign of the line of sight along the normal, which is the columns' cross product.
         facing = 0.0
         for i in range(3):

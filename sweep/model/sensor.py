@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.model.coverage import ROUNDING_SNAP
+from sweep.model.mixing import mixed
 
 _PIXEL_STEP = np.uint64(0x9E3779B97F4A7C15)
 _DRAW_STEP = np.uint64(0xD1342543DE82EF95)
@@ -38,17 +39,9 @@ def illuminate(
 
 
 @compiled
-def _mixed(bits: np.uint64) -> np.uint64:
-    """Return 64 bits mixed so that each depends on all (SplitMix64's finaliser; see plan.draws)."""
-    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return bits ^ (bits >> np.uint64(31))
-
-
-@compiled
 def _uniform(pixel: np.uint64, draw: int) -> float:
     """Return the draw of a given number of a pixel's key, in (0, 1)."""
-    bits = _mixed(pixel + _DRAW_STEP * (np.uint64(draw) + _ONE))
+    bits = mixed(pixel + _DRAW_STEP * (np.uint64(draw) + _ONE))
     return (float(bits >> np.uint64(11)) + 0.5) * 2.0**-53
 
 
@@ -112,7 +105,7 @@ def read_out(
         for j in range(levels.shape[1]):
             level = levels[i, j]
             place = (np.uint64(top + i) << np.uint64(32)) + np.uint64(left + j)
-            pixel = _mixed(key + _PIXEL_STEP * (place + _ONE))
+            pixel = mixed(key + _PIXEL_STEP * (place + _ONE))
             if not math.isnan(full_well):
                 electrons = _poisson(level * full_well / 255.0, pixel, 4)
                 electrons = min(electrons, full_well)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion, intrinsics
+from sweep.model.mixing import mixed
 from sweep.plan.axes import Distribution
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
 
@@ -105,16 +106,6 @@ def _hash(text: str) -> np.uint64:
     return np.uint64(int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little"))
 
 
-def _mixed(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Return 64-bit numbers mixed so that each bit depends on all (SplitMix64's finaliser).
-
-    Steele, Lea and Flood, "Fast splittable pseudorandom number generators", 2014.
-    """
-    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return bits ^ (bits >> np.uint64(31))
-
-
 _STEP = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -133,5 +124,5 @@ def bits(
     seed: int, quantity: str, keys: NDArray[np.uint64], trials: NDArray[np.int64]
 ) -> NDArray[np.uint64]:
     """Return 64 random bits for each scene, as :func:`uniform`."""
-    start = _mixed(keys ^ _hash(f"{seed}\n{quantity}"))
-    return _mixed(start + _STEP * (np.asarray(trials).astype(np.uint64) + np.uint64(1)))
+    start = mixed(keys ^ _hash(f"{seed}\n{quantity}"))
+    return np.asarray(mixed(start + _STEP * (np.asarray(trials).astype(np.uint64) + np.uint64(1))))

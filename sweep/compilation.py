@@ -21,7 +21,7 @@ def _keep_compiled_code_by_content() -> None:
     """
     package = Path(__file__).parent
     digest = sha256()
-    for path in sorted((package / "model").glob("*.py")):
+    for path in sorted([*package.glob("model/*.py"), *package.glob("measure/*.py")]):
         digest.update(path.read_bytes())
     config: Any = numba.config
     kept = Path(config.CACHE_DIR or package / "__pycache__")

@@ -9,7 +9,9 @@ settings, and a detection is shared by all estimators.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
+import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -21,6 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.measure.accuracy import pose_error, rotation_difference
+from sweep.measure.bound import Bound, bounds
+from sweep.measure.covariance import squared_deviations
 from sweep.measure.detector import (
     NOISE_MARGIN_PX,
     UNEVEN_LIGHT_CONSTANT,
@@ -31,10 +35,13 @@ from sweep.measure.detector import (
     margin_px,
     windows,
 )
+from sweep.measure.estimation import Estimates, EstimatorProtocol, Sightings
+from sweep.measure.estimators import build
 from sweep.measure.finding import classify
 from sweep.measure.flags import Detection, Estimate, Flipped
-from sweep.measure.solver import Estimates, Estimator, estimate
+from sweep.measure.solver import Estimator
 from sweep.model.camera import Cameras
+from sweep.model.derivatives import POSE
 from sweep.model.extent import (
     areas_px,
     hidden,
@@ -96,11 +103,17 @@ class BlockResult:
 
 @dataclass(slots=True)
 class Search:
-    """What one detector setting gave on N scenes: flags (N,), found corners (N, 4, 2) px."""
+    """What one detector setting gave on N scenes: flags (N,), found corners (N, 4, 2) px.
+
+    ``images`` has what was searched of each scene, where that was to be kept; its first pixel in
+    the frame is in ``origins`` (N, 2).
+    """
 
     flags: NDArray[np.uint8]
     corners: Floats
     seconds: float
+    images: dict[int, Grey]
+    origins: NDArray[np.int64]
 
 
 def single_thread() -> None:
@@ -130,20 +143,32 @@ def run_cells(
     """
     single_thread()
     count = len(indices[0]) if indices else 1
+    settings = detector_settings(pipeline)
+    estimating = estimators(pipeline)
+    if need is None:
+        need = np.ones((count, len(settings), len(estimating)), dtype=bool)
+    most = _most_kept(pipeline, estimating)
+    if count > most:
+        return _joined(
+            [
+                run_cells(pipeline, [index[at : at + most] for index in indices],
+                          need[at : at + most])
+                for at in range(0, count, most)
+            ],
+            most,
+        )
     failures: list[Failure] = []
     start = time.perf_counter()
     values = scene_values(pipeline, indices)
     scenes = build_scenes(values, count)
     visibility = visibility_flags(scenes)
-    settings = detector_settings(pipeline)
-    estimating = estimators(pipeline)
-    if need is None:
-        need = np.ones((count, len(settings), len(estimating)), dtype=bool)
     to_search = need.any(axis=2) & (visibility == Detection.not_run)[:, None]
     geometry_s = time.perf_counter() - start
 
+    builds = [build(estimator) for estimator in estimating]
+    keep = any(one.needs_images for one in builds)
     searches, render_s, row_s = search(
-        scenes, to_search, settings, whole_frames(values, count), failures
+        scenes, to_search, settings, whole_frames(values, count), failures, keep=keep
     )
     seconds: dict[str, list[float]] = {
         "scene": [geometry_s + render_s],
@@ -154,6 +179,10 @@ def run_cells(
     out["true_rvec"] = [vector_of_rotation(scenes.rotation)]
     out["true_tvec_m"] = [scenes.translation]
     out["marker_area_px"] = [areas_px(scenes)]
+    begun = time.perf_counter()
+    for name, column in _bounded(values, scenes, visibility).items():
+        out[name] = [column]
+    seconds["scene"][0] += time.perf_counter() - begun
     for k, found in enumerate(searches):
         flags = np.where(visibility == Detection.not_run, found.flags, visibility)
         flags[~need[:, k].any(axis=1)] = Detection.not_run
@@ -162,10 +191,8 @@ def run_cells(
         for j, estimator in enumerate(estimating):
             rows = np.flatnonzero((flags == Detection.detected) & need[:, k, j])
             begun = time.perf_counter()
-            cameras, size = believed(estimator, values, scenes)
-            estimates = _estimated(
-                found.corners[rows], cameras.take(rows), size[rows], estimator, rows, failures
-            )
+            seen = sightings(estimator, values, scenes, found, rows)
+            estimates = _estimated(seen, builds[j], rows, failures)
             measured = _measured(estimates, scenes, rows)
             measured["estimate"][~need[:, k, j]] = Estimate.not_run
             measured["flipped"][~need[:, k, j]] = Flipped.not_run
@@ -173,6 +200,63 @@ def run_cells(
             for name, column in measured.items():
                 out[name].append(column)
     return CellsResult(out, seconds, row_s, failures)
+
+
+KEPT_PX = 1 << 26
+"""Pixels of images that are kept for the estimators: 67 MB of memory, were they whole frames."""
+
+
+def _most_kept(pipeline: Pipeline, estimating: Sequence[Estimator]) -> int:
+    """Return how many scenes are computed at a time: fewer where their images must be kept."""
+    if not any(build(estimator).needs_images for estimator in estimating):
+        return sys.maxsize
+    frame = max(pipeline.values_of("width_px")) * max(pipeline.values_of("height_px"))
+    return int(max(KEPT_PX // frame, 1))
+
+
+def _joined(parts: Sequence[CellsResult], most: int) -> CellsResult:
+    """Return the results of runs of ``most`` scenes each as one."""
+
+    def each(pieces: Sequence[Any], join: Callable[[Sequence[Any]], Any]) -> dict[str, list[Any]]:
+        return {
+            name: [join(column) for column in zip(*(piece[name] for piece in pieces), strict=True)]
+            for name in pieces[0]
+        }
+
+    return CellsResult(
+        each([part.columns for part in parts], np.concatenate),
+        each([part.seconds for part in parts], sum),
+        np.concatenate([part.row_seconds for part in parts]),
+        [
+            dataclasses.replace(failure, scene=failure.scene + number * most)
+            for number, part in enumerate(parts) for failure in part.failures
+        ],
+    )
+
+
+def _bounded(
+    values: dict[str, Any], scenes: Scenes, visibility: NDArray[np.uint8]
+) -> dict[str, NDArray[Any]]:
+    """Return the bound's variables, for the scenes that ask for it."""
+    count = len(scenes)
+    out: dict[str, NDArray[Any]] = {
+        "bound": np.full(count, Bound.not_run, dtype=np.uint8),
+        "bound_std": np.broadcast_to(np.nan, (count, POSE)),
+        "bound_kappa": np.broadcast_to(np.nan, count),
+        "mirror_distance": np.broadcast_to(np.nan, count),
+    }
+    asked = np.broadcast_to(np.array(values["bound"]), count)
+    if (asked == "none").all():
+        return out
+    out = {name: column.copy() for name, column in out.items()}
+    out["bound"][asked != "none"] = Bound.not_visible
+    boxes = marker_boxes(scenes)
+    for unknown in ("known_blur", "unknown_blur"):
+        rows = np.flatnonzero((asked == unknown) & (visibility == Detection.not_run))
+        found = bounds(scenes, rows, boxes[rows], unknown == "unknown_blur")
+        out["bound"][rows], out["bound_std"][rows] = found.status, found.std
+        out["bound_kappa"][rows], out["mirror_distance"][rows] = found.kappa, found.mirror_distance
+    return out
 
 
 def whole_frames(values: dict[str, Any], count: int) -> NDArray[np.bool_]:
@@ -216,11 +300,14 @@ def search(
     settings: Sequence[DetectorSetting],
     full: NDArray[np.bool_],
     failures: list[Failure],
+    *,
+    keep: bool = False,
 ) -> tuple[list[Search], float, Floats]:
     """Render scenes once each and search them with the settings ``wanted`` (N, settings).
 
-    ``full`` (N,) tells which are rendered and searched as whole frames. Returns what each setting
-    gave, the seconds spent on rendering, and the seconds spent on each scene (N,).
+    ``full`` (N,) tells which are rendered and searched as whole frames, ``keep`` whether the images
+    are kept. Returns what each setting gave, the seconds spent on rendering, and the seconds spent
+    on each scene (N,).
     """
     boxes = marker_boxes(scenes)
     cut = [search_windows(scenes, boxes, setting, full) for setting in settings]
@@ -250,7 +337,7 @@ def search(
         for row in rows.tolist():
             row_s[row] = (now - begun) / len(rows)
         for hit, crop, ask in zip(hits, crops, asked, strict=True):
-            find, keep = hit.find, hit.found.append
+            find, note = hit.find, hit.found.append
             begun = now = clock()
             for row, image in zip(rows.tolist(), images, strict=True):
                 if not ask[row]:
@@ -263,8 +350,10 @@ def search(
                 if crop is not None:
                     x0, y0, x1, y1 = crop[row]
                     seen = image[y0:y1, x0:x1]
+                if keep:
+                    hit.images[row] = seen
                 try:
-                    keep((row, *find(seen, dictionary[row], sides[row])))
+                    note((row, *find(seen, dictionary[row], sides[row])))
                 except Exception:
                     failures.append(Failure(row, "detection", traceback.format_exc()))
                     hit.failed.append(row)
@@ -280,7 +369,9 @@ def search(
             scenes.corners_px, marker_id, hit.found, window[:, :2].astype(np.float64)
         )
         flags[hit.failed] = Detection.failed
-        searches.append(Search(flags, found_corners, hit.seconds + clock() - start))
+        searches.append(
+            Search(flags, found_corners, hit.seconds + clock() - start, hit.images, window[:, :2])
+        )
     return searches, render_s, np.array(row_s)
 
 
@@ -290,6 +381,7 @@ class _Hits:
 
     find: Callable[[Grey, str, int], Found]
     found: list[tuple[int, *Found]] = field(default_factory=list)
+    images: dict[int, Grey] = field(default_factory=dict)
     failed: list[int] = field(default_factory=list)
     seconds: float = 0.0
 
@@ -360,20 +452,38 @@ def believed(
     return Cameras(view, lenses, distorted), size
 
 
+def sightings(
+    estimator: Estimator, values: dict[str, Any], scenes: Scenes, found: Search,
+    rows: NDArray[np.intp],
+) -> Sightings:
+    """Return what an estimator gets of the scenes ``rows`` (n,), as it believes them."""
+    cameras, size = believed(estimator, values, scenes)
+    truth = {"noise_grey": 0.0, "blur_px": 0.0} if scenes.effects is None else scenes.effects
+    noise, blur = (
+        np.broadcast_to(truth[name] if belief is None else belief, len(scenes))
+        for name, belief in (
+            ("noise_grey", estimator.believed_noise_grey), ("blur_px", estimator.believed_blur_px)
+        )
+    )
+    return Sightings(
+        found.corners[rows], cameras.take(rows), size[rows], noise[rows], blur[rows],
+        [scenes.markers[k] for k in scenes.marker[rows]],
+        [found.images[row] for row in rows.tolist()] if found.images else [],
+        found.origins[rows],
+    )
+
+
 def _estimated(
-    corners: Floats, cameras: Cameras, size: Floats, estimator: Estimator,
-    rows: NDArray[np.intp], failures: list[Failure],
+    seen: Sightings, estimator: EstimatorProtocol, rows: NDArray[np.intp], failures: list[Failure]
 ) -> Estimates:
     """Estimate poses (n,); where the batch raises, one by one, so that one costs only itself."""
-    arguments = (estimator.solver, estimator.guarded, estimator.reprojection_limit)
     try:
-        return estimate(corners, cameras, size, *arguments)
+        return estimator(seen)
     except Exception:
         parts = []
         for i in range(len(rows)):
-            one = np.array([i])
             try:
-                parts.append(estimate(corners[one], cameras.take(one), size[one], *arguments))
+                parts.append(estimator(seen.take(np.array([i]))))
             except Exception:
                 failures.append(Failure(int(rows[i]), "estimation", traceback.format_exc()))
                 parts.append(Estimates.none(1, Estimate.failed))
@@ -409,6 +519,14 @@ def _measured(
         "alternative_reprojection_error_px": spread(
             estimates.alternative_reprojection_px, np.nan
         ),
+        "predicted_std": spread(
+            np.sqrt(np.diagonal(estimates.covariance, axis1=1, axis2=2)), np.nan
+        ),
+        "nees": spread(
+            squared_deviations(error.rotation_rad, error.translation_m, estimates.covariance),
+            np.nan,
+        ),
+        "residual_variance_ratio": spread(estimates.residual_ratio, np.nan),
         "flipped": spread(
             np.where(solved, flipped, Flipped.no_estimate).astype(np.uint8), Flipped.no_estimate
         ),

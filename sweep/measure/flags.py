@@ -42,6 +42,10 @@ class Estimate(IntEnum):
     """An exception was raised."""
     crashed = 5
     """The process died."""
+    not_converged = 6
+    """The likelihood's maximum was not reached."""
+    not_explained = 7
+    """The pixels are not explained by the estimator's model; its pose is kept beside the flag."""
 
 
 class Flipped(IntEnum):

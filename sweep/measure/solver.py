@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.measure.covariance import corner_covariance
+from sweep.measure.estimation import Estimates, Sightings
 from sweep.measure.flags import Estimate
 from sweep.model.camera import Cameras
 from sweep.model.declaration import parameter
@@ -39,8 +40,8 @@ class Estimator:
     solver: str = parameter(
         "ippe_square",
         "OpenCV's solver (epnp is unreliable for a single marker: it is not made for four "
-        "coplanar points)",
-        choices=tuple(SOLVERS),
+        "coplanar points), or photometric: maximum likelihood on the pixels, started from ippe",
+        choices=(*SOLVERS, "photometric"),
     )
     guarded: bool = parameter(
         True, "true: called where the solver is stable, checked, and replaced by iterative where "
@@ -49,6 +50,18 @@ class Estimator:
     reprojection_limit: float = parameter(
         0.25, "a solution whose RMS reprojection error is above this share of the found side is "
         "no solution; at infinity it is 0.7", low=0, high=0.5, open_low=True,
+    )
+    corner_noise_px: float | None = parameter(
+        None, "standard deviation of a found corner's coordinates, of which the solvers' pose "
+        "covariance is made; photometric makes its own from the pixels", unit="px", low=1e-6,
+        high=1e6,
+    )
+    photometric_starts: int = parameter(
+        2, "2: from the detector's corners; 4: also from these after cv2.cornerSubPix", low=2,
+        high=4,
+    )
+    estimate_blur: bool = parameter(
+        False, "photometric estimates the point spread, too, from believed_blur_px on"
     )
     believed_fx_px: float | None = parameter(
         None, f"focal length along x {BELIEVED}; that along y stays as it is", unit="px",
@@ -69,43 +82,15 @@ class Estimator:
     believed_size_m: float | None = parameter(
         None, f"side of the black square {BELIEVED}", unit="m", low=1e-9, high=1e9, drawable=True
     )
+    believed_blur_px: float | None = parameter(
+        None, f"Gaussian point spread {BELIEVED}", unit="px", low=0, high=1000
+    )
+    believed_noise_grey: float | None = parameter(
+        None, f"noise of a pixel {BELIEVED}", unit="grey level", low=0, high=1e6
+    )
 
 
-@dataclass(frozen=True, slots=True)
-class Estimates:
-    """N estimated poses; NaN where ``status`` is not solved, and where there is no alternative."""
-
-    status: NDArray[np.uint8]
-    rotation: Floats
-    """(N, 3, 3)"""
-    translation: Floats
-    """(N, 3) in metres"""
-    reprojection_px: Floats
-    """(N,) RMS over the corners"""
-    alternative_rotation: Floats
-    """(N, 3, 3) of the other planar solution"""
-    alternative_reprojection_px: Floats
-    """(N,) RMS over the corners"""
-
-    @staticmethod
-    def none(count: int, status: Estimate) -> Estimates:
-        """Return ``count`` estimates that do not exist, all with one status."""
-        matrix, vector, scalar = (
-            np.full((count, *shape), np.nan) for shape in ((3, 3), (3,), ())
-        )
-        flags = np.full(count, status, dtype=np.uint8)
-        return Estimates(flags, matrix, vector, scalar, matrix.copy(), scalar.copy())
-
-    @staticmethod
-    def joined(parts: Sequence[Estimates]) -> Estimates:
-        """Return the estimates of several parts as one."""
-        names = [field.name for field in dataclasses.fields(Estimates)]
-        return Estimates(
-            *(np.concatenate([getattr(part, name) for part in parts]) for name in names)
-        )
-
-
-def _reprojection_px(
+def reprojection_errors_px(
     rotation: Floats, translation: Floats, size_m: Floats, corners: Floats, cameras: Cameras
 ) -> Floats:
     """Return the RMS reprojection error (N,); NaN for poses with a corner behind the camera."""
@@ -127,7 +112,7 @@ def estimate(
     rotation, translation = call(corners, cameras, size_m, SOLVERS[solver])
     reprojection = np.stack(
         [
-            _reprojection_px(rotation[:, k], translation[:, k], size_m, corners, cameras)
+            reprojection_errors_px(rotation[:, k], translation[:, k], size_m, corners, cameras)
             for k in range(2)
         ],
         axis=1,
@@ -140,6 +125,7 @@ def estimate(
     for k in range(2):
         rotation[~solved[:, 0], k] = np.nan
         reprojection[~solved[:, 0], k] = np.nan
+    count = len(corners)
     return Estimates(
         status=np.where(solved[:, 0], Estimate.solved, Estimate.solver_failed).astype(np.uint8),
         rotation=rotation[:, 0],
@@ -147,7 +133,44 @@ def estimate(
         reprojection_px=reprojection[:, 0],
         alternative_rotation=rotation[:, 1],
         alternative_reprojection_px=reprojection[:, 1],
+        covariance=np.broadcast_to(np.nan, (count, 6, 6)),
+        residual_ratio=np.broadcast_to(np.nan, (count,)),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class CornerSolver:
+    """OpenCV's solvers as estimators: poses from corners alone."""
+
+    setting: Estimator
+
+    @property
+    def needs_images(self) -> bool:
+        """Corners are all that it looks at."""
+        return False
+
+    def __call__(self, sightings: Sightings) -> Estimates:
+        """Return the poses, with covariances where the corners' noise is told."""
+        setting = self.setting
+        found = estimate(
+            sightings.corners, sightings.cameras, sightings.size_m, setting.solver,
+            setting.guarded, setting.reprojection_limit,
+        )
+        if setting.corner_noise_px is None:
+            return found
+        covariance = corner_covariance(
+            found.rotation, found.translation, sightings.cameras, sightings.size_m,
+            setting.corner_noise_px,
+        )
+        return dataclasses.replace(found, covariance=covariance)
+
+
+def both_planar_solutions(
+    corners: Floats, cameras: Cameras, size_m: Floats
+) -> tuple[Floats, Floats]:
+    """Return IPPE's rotations (N, 2, 3, 3) and translations (N, 2, 3), guarded; NaN for none."""
+    corners = np.ascontiguousarray(corners, dtype=np.float64)
+    return _guarded(corners, cameras, size_m, cv2.SOLVEPNP_IPPE)
 
 
 def _plain(
@@ -218,7 +241,7 @@ def _guarded(
     side = np.linalg.norm(np.roll(points, -1, axis=1) - points, axis=2).mean(axis=1)
 
     def errors(rows: NDArray[np.intp], r: Floats, t: Floats) -> Floats:
-        return _reprojection_px(r, t, unit[rows], pixels[rows], pinhole.take(rows))
+        return reprojection_errors_px(r, t, unit[rows], pixels[rows], pinhole.take(rows))
 
     everyone = np.arange(len(points))
     error = errors(everyone, rotation[:, 0], translation[:, 0])

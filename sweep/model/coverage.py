@@ -85,7 +85,7 @@ def _add_segment(
 
 
 @compiled
-def _clip(a: float, b: float, lower: float, upper: float) -> tuple[float, float]:
+def clip(a: float, b: float, lower: float, upper: float) -> tuple[float, float]:
     """Narrow the interval [lower, upper] of t to where a + t (b - a) >= 0; empty: lower > upper."""
     if a >= 0.0 and b >= 0.0:
         return lower, upper
@@ -124,12 +124,12 @@ def _add_projected(
     coordinates keeps points exact whose images lie far outside.
     """
     height, width = cover.shape[0] * 1.0, (cover.shape[1] - 2) * 1.0
-    lower, upper = _clip(y0, y1, 0.0, 1.0)
-    lower, upper = _clip(height * z0 - y0, height * z1 - y1, lower, upper)
+    lower, upper = clip(y0, y1, 0.0, 1.0)
+    lower, upper = clip(height * z0 - y0, height * z1 - y1, lower, upper)
     if lower >= upper:
         return
     # Left of the box: on [lower, upper] minus where x >= 0.
-    inner_lower, inner_upper = _clip(x0, x1, lower, upper)
+    inner_lower, inner_upper = clip(x0, x1, lower, upper)
     if inner_lower >= inner_upper:
         _, ya = _at(lower, width, height, x0, y0, z0, x1, y1, z1)
         _, yb = _at(upper, width, height, x0, y0, z0, x1, y1, z1)
@@ -143,7 +143,7 @@ def _add_projected(
         _, ya = _at(inner_upper, width, height, x0, y0, z0, x1, y1, z1)
         _, yb = _at(upper, width, height, x0, y0, z0, x1, y1, z1)
         _add_segment(cover, jump, 0.0, ya, 0.0, yb)
-    lower, upper = _clip(width * z0 - x0, width * z1 - x1, inner_lower, inner_upper)
+    lower, upper = clip(width * z0 - x0, width * z1 - x1, inner_lower, inner_upper)
     if lower >= upper:
         return
     xa, ya = _at(lower, width, height, x0, y0, z0, x1, y1, z1)
@@ -154,7 +154,7 @@ def _add_projected(
 REACH = 5.0
 """Standard deviations at which the point spread ends; 6e-7 of it lies beyond."""
 
-_SHORTEST_PANEL_PX = 0.015
+SHORTEST_PANEL_PX = 0.015
 
 NODES = (0.1127016653792583, 0.5, 0.8872983346207417)
 WEIGHTS = (0.2777777777777778, 0.4444444444444444, 0.2777777777777778)
@@ -177,7 +177,7 @@ def _interpolated(table: NDArray[np.float64], at: float) -> float:
 
 
 @compiled
-def _below(t: float, sigma: float) -> float:
+def spread_below(t: float, sigma: float) -> float:
     """Return the share of the point spread, a Gaussian, that lies below t."""
     at = (t / sigma + 6.0) * _STEPS
     if at <= 0.0:
@@ -189,7 +189,7 @@ def _below(t: float, sigma: float) -> float:
 
 @compiled
 def _below_sum(t: float, sigma: float) -> float:
-    """Return the integral of :func:`_below` up to t."""
+    """Return the integral of :func:`spread_below` up to t."""
     at = (t / sigma + 6.0) * _STEPS
     if at <= 0.0:
         return 0.0
@@ -227,12 +227,12 @@ def _add_blurred(
     """
     height, width = cover.shape[0] * 1.0, (cover.shape[1] - 2) * 1.0
     reach = REACH * sigma + 0.5
-    lower, upper = _clip(y0 + reach * z0, y1 + reach * z1, 0.0, 1.0)
-    lower, upper = _clip((height + reach) * z0 - y0, (height + reach) * z1 - y1, lower, upper)
-    lower, upper = _clip((width + reach) * z0 - x0, (width + reach) * z1 - x1, lower, upper)
+    lower, upper = clip(y0 + reach * z0, y1 + reach * z1, 0.0, 1.0)
+    lower, upper = clip((height + reach) * z0 - y0, (height + reach) * z1 - y1, lower, upper)
+    lower, upper = clip((width + reach) * z0 - x0, (width + reach) * z1 - x1, lower, upper)
     if lower >= upper:
         return
-    inner, outer = _clip(x0 + reach * z0, x1 + reach * z1, lower, upper)
+    inner, outer = clip(x0 + reach * z0, x1 + reach * z1, lower, upper)
     if inner >= outer:
         inner = outer = upper
     ends = (lower, inner, outer, upper)
@@ -258,7 +258,7 @@ def _add_spread(
     reach = REACH * sigma + 0.5
     height, width = cover.shape[0], cover.shape[1] - 2
     length = math.hypot(xb - xa, yb - ya)
-    panels = math.ceil(length / max(1.5 * sigma, _SHORTEST_PANEL_PX))
+    panels = math.ceil(length / max(1.5 * sigma, SHORTEST_PANEL_PX))
     dy = (yb - ya) / panels
     steps = np.empty(width)
     for panel in range(panels):
@@ -280,9 +280,9 @@ def _add_spread(
                 below = above
             top = max(math.floor(y - reach), 0)
             bottom = min(math.floor(y + reach) + 1, height - 1)
-            below = _below(top - y, sigma)
+            below = spread_below(top - y, sigma)
             for i in range(top, bottom + 1):
-                above = _below(i + 1.0 - y, sigma)
+                above = spread_below(i + 1.0 - y, sigma)
                 scale = jump * dy * weight * (above - below)
                 below = above
                 for j in range(first, last + 1):
@@ -290,7 +290,7 @@ def _add_spread(
 
 
 @compiled
-def _bent(
+def bent(
     t: float, plane: NDArray[np.float64], lens: NDArray[np.float64], view: NDArray[np.float64],
     a: float, b: float, c: float, d: float,
 ) -> tuple[float, float]:
@@ -312,6 +312,24 @@ def _off_chord(px: float, py: float, x0: float, y0: float, x1: float, y1: float)
     if length == 0.0:
         return math.hypot(px - x0, py - y0)
     return abs((px - x0) * (y1 - y0) - (py - y0) * (x1 - x0)) / length
+
+
+@compiled
+def chord_count(
+    plane: NDArray[np.float64], lens: NDArray[np.float64], view: NDArray[np.float64],
+    a: float, b: float, c: float, d: float,
+) -> int:
+    """Return how many equal chords stand for the image of the segment (a, b)-(c, d) of the plane.
+
+    A chord's distance from a smooth curve falls with the square of their number.
+    """
+    u0, v0 = bent(0.0, plane, lens, view, a, b, c, d)
+    u1, v1 = bent(1.0, plane, lens, view, a, b, c, d)
+    off = 0.0
+    for quarter in range(1, 4):
+        u, v = bent(0.25 * quarter, plane, lens, view, a, b, c, d)
+        off = max(off, _off_chord(u, v, u0, v0, u1, v1))
+    return min(max(math.ceil(math.sqrt(off / CHORD_TOLERANCE_PX)), 1), 4096)
 
 
 @compiled
@@ -365,19 +383,14 @@ def accumulate(
             else:
                 _add_projected(cover, jump, x0, y0, z0, x1, y1, z1)
             continue
-        u0, v0 = _bent(0.0, plane, lens, view, a, b, c, d)
-        u1, v1 = _bent(1.0, plane, lens, view, a, b, c, d)
-        off = 0.0
-        for quarter in range(1, 4):
-            u, v = _bent(0.25 * quarter, plane, lens, view, a, b, c, d)
-            off = max(off, _off_chord(u, v, u0, v0, u1, v1))
-        # A chord's distance from a smooth curve falls with the square of the number of chords.
-        chords = min(max(math.ceil(math.sqrt(off / CHORD_TOLERANCE_PX)), 1), 4096)
+        u0, v0 = bent(0.0, plane, lens, view, a, b, c, d)
+        u1, v1 = bent(1.0, plane, lens, view, a, b, c, d)
+        chords = chord_count(plane, lens, view, a, b, c, d)
         x, y = u0 + (0.5 - left), v0 + (0.5 - top)
         for chord in range(1, chords + 1):
             u, v = u1, v1
             if chord < chords:
-                u, v = _bent(chord / chords, plane, lens, view, a, b, c, d)
+                u, v = bent(chord / chords, plane, lens, view, a, b, c, d)
             u, v = u + (0.5 - left), v + (0.5 - top)
             if sigma > 0.0:
                 _add_blurred(cover, jump, sigma, x, y, 1.0, u, v, 1.0)

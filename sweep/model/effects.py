@@ -111,7 +111,7 @@ VELOCITIES = (
     "rotation_x_deg_s", "rotation_y_deg_s", "rotation_z_deg_s",
 )
 
-NEUTRAL = {field.name: field.default for field in dataclasses.fields(Effects)}
+NEUTRAL: dict[str, Any] = {field.name: field.default for field in dataclasses.fields(Effects)}
 """Every parameter of the effects at its default: none of them active."""
 
 SWITCHES = {

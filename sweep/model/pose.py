@@ -89,7 +89,7 @@ def rotation_of_angles(tilt: Any, azimuth: Any, roll: Any) -> Floats:
 def rotation_of_vector(rvec: Floats) -> Floats:
     """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3) (Rodrigues)."""
     vectors = np.ascontiguousarray(rvec, dtype=np.float64).reshape(-1, 3)
-    return _rotations(vectors).reshape(*rvec.shape, 3)
+    return rotations(vectors).reshape(*rvec.shape, 3)
 
 
 def vector_of_rotation(rotation: Floats) -> Floats:
@@ -99,12 +99,12 @@ def vector_of_rotation(rotation: Floats) -> Floats:
     neither angles near 0 nor near π lose digits; ``cv2.Rodrigues`` returns 0 below 1e-5 rad.
     """
     matrices = np.ascontiguousarray(rotation, dtype=np.float64).reshape(-1, 3, 3)
-    return _vectors(matrices).reshape(rotation.shape[:-1])
+    return vectors(matrices).reshape(rotation.shape[:-1])
 
 
 @compiled
-def _rotations(rvec: Floats) -> Floats:
-    """As :func:`rotation_of_vector`, (N, 3) to (N, 3, 3)."""
+def rotations(rvec: Floats) -> Floats:
+    """As :func:`rotation_of_vector`, (N, 3) to (N, 3, 3), for compiled code."""
     rotation = np.empty((len(rvec), 3, 3))
     for i in range(len(rvec)):
         x, y, z = rvec[i, 0], rvec[i, 1], rvec[i, 2]
@@ -124,8 +124,8 @@ def _rotations(rvec: Floats) -> Floats:
 
 
 @compiled
-def _vectors(rotation: Floats) -> Floats:
-    """As :func:`vector_of_rotation`, (N, 3, 3) to (N, 3)."""
+def vectors(rotation: Floats) -> Floats:
+    """As :func:`vector_of_rotation`, (N, 3, 3) to (N, 3), for compiled code."""
     rvec = np.empty((len(rotation), 3))
     for i in range(len(rotation)):
         r = rotation[i]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -127,6 +128,16 @@ class Scenes:
         if self.effects is None:
             raise ValueError("no effect is active")
         return {name: float(column[row]) for name, column in self.effects.items()}
+
+    def active(self, row: int) -> list[str]:
+        """Return the switches of the effects that are active in one scene."""
+        if not self.affected[row]:
+            return []
+        effect = self.effect(row)
+        return [
+            name for name, off in SWITCHES.items()
+            if not (math.isnan(effect[name]) if off is None else effect[name] == off)
+        ]
 
     def motion(self, row: int) -> tuple[float, float, Floats] | None:
         """Return exposure and row time in s and the velocity (6,), m/s and rad/s; None at rest."""

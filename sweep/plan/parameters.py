@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
+from sweep.measure.bound import BoundSetting
 from sweep.measure.detector import DetectorSetting
 from sweep.measure.solver import Estimator
 from sweep.model.camera import Camera
@@ -34,7 +35,7 @@ SECTIONS: dict[str, tuple[tuple[type, ...], Stage]] = {
     "camera": ((Camera,), Stage.scene),
     "marker": ((Marker,), Stage.scene),
     "pose": ((Pose,), Stage.scene),
-    "scene": ((Scene, Effects), Stage.scene),
+    "scene": ((Scene, Effects, BoundSetting), Stage.scene),
     "detector": ((DetectorSetting,), Stage.detection),
     "estimator": ((Estimator,), Stage.estimation),
 }

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from sweep.measure.bound import Bound
 from sweep.measure.flags import Detection, Estimate, Flipped
 from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline
@@ -18,7 +19,11 @@ from sweep.plan.pipeline import Pipeline
 XYZ = ("x", "y", "z")
 CORNERS = ("top_left", "top_right", "bottom_right", "bottom_left")
 
-LABELS: dict[str, tuple[str, ...]] = {"corner": CORNERS, "xy": ("x", "y"), "xyz": XYZ}
+POSE_PARAMETERS = tuple(f"{part}_{axis}" for part in ("rotation", "translation") for axis in XYZ)
+
+LABELS: dict[str, tuple[str, ...]] = {
+    "corner": CORNERS, "xy": ("x", "y"), "xyz": XYZ, "pose_parameter": POSE_PARAMETERS,
+}
 """Coordinates of the dimensions that are no axes."""
 
 
@@ -71,6 +76,14 @@ TEMPLATE: tuple[Variable, ...] = (
     Variable("true_rvec", _S, "f8", "true rotation vector, marker to camera", "radian", ("xyz",)),
     Variable("true_tvec_m", _S, "f8", "true position of the marker's centre", "m", ("xyz",)),
     Variable("marker_area_px", _S, "f8", "area of the projected black square", "px2"),
+    Variable("bound", _S, "u1", "what became of the accuracy bound", flags=Bound),
+    Variable("bound_std", _S, "f4",
+             "least standard deviation of an unbiased estimate, camera frame (Cramér-Rao)",
+             "radian, m", ("pose_parameter",)),
+    Variable("bound_kappa", _S, "f4",
+             "bias of the depth from the bound's own spread of the tilt, in standard deviations"),
+    Variable("mirror_distance", _S, "f4",
+             "standard deviations between the pose and its mirrored minimum; NaN: there is none"),
     Variable("detection", _D, "u1", "what became of the marker", flags=Detection),
     Variable("corner_error_px", _D, "f4", "found corner minus true corner", "px",
              ("corner", "xy")),
@@ -87,6 +100,13 @@ TEMPLATE: tuple[Variable, ...] = (
              "angle of the rotation error of the other planar solution", "degree"),
     Variable("alternative_reprojection_error_px", _E, "f4",
              "RMS over the corners of the other planar solution", "px"),
+    Variable("predicted_std", _E, "f4",
+             "standard deviation of the error that the estimator expects, camera frame",
+             "radian, m", ("pose_parameter",)),
+    Variable("nees", _E, "f4",
+             "squared error in units of the expected covariance; its mean is 6 where that is true"),
+    Variable("residual_variance_ratio", _E, "f4",
+             "variance of the pixels' residuals over that of noise and rounding"),
     Variable("flipped", _E, "u1", "whether the solution is nearer to the mirror of the truth",
              flags=Flipped),
 )

@@ -1,0 +1,242 @@
+"""How well a pose can be known at all: the Cramér-Rao bound of the exact image's pixels."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.compilation import compiled
+from sweep.measure.likelihood import (
+    FIRST_LEVEL,
+    LEAST_SPREAD_PX,
+    SETTLED,
+    SPREAD,
+    Sight,
+    curvature,
+    fit,
+    mirrored_state,
+    plane_of,
+    solve_positive,
+    squares,
+    state_of,
+    work_space,
+)
+from sweep.model import coverage
+from sweep.model.declaration import parameter
+from sweep.model.derivatives import POSE
+from sweep.model.effects import NEUTRAL
+from sweep.model.marker import MarkerKey, edges, module_count
+from sweep.model.scene import Scenes
+
+Floats = NDArray[np.float64]
+
+LEAST_NOISE = 0.5
+"""Grey levels of noise below which quantisation is no noise of its own, uniform and independent."""
+
+CLIPPING_DEVIATIONS = 2.0
+"""Standard deviations that every grey level must keep from the ends of the scale."""
+
+QUANTISATION_VARIANCE = 1 / 12
+"""Variance in squared grey levels that rounding to whole levels adds."""
+
+BACKGROUND_MARGIN_PX = 4
+"""Pixels of background around the marker that tell its level."""
+
+MODELLED = ("blur_px", "gain", "noise_grey")
+"""The effects that the bound's model of an image has."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoundSetting:
+    """Whether the accuracy bound is computed beside the scenes."""
+
+    bound: str = parameter(
+        "none",
+        "accuracy bound (Cramér-Rao) of each scene's pixels, black, white and background levels "
+        "unknown: none; known_blur: the point spread is known; unknown_blur: it is estimated too",
+        choices=("none", "known_blur", "unknown_blur"),
+    )
+
+
+class Bound(IntEnum):
+    """What became of the bound."""
+
+    not_run = 0
+    given = 1
+    no_noise = 2
+    """Noise below half a grey level: rounding rules then, and it is no noise."""
+    no_contrast = 3
+    """Nothing in the image changes with some part of the pose."""
+    clipped = 4
+    """A grey level lies within two standard deviations of the scale's ends."""
+    not_in_model = 5
+    """An effect is active that the bound's model of the image has not."""
+    not_visible = 6
+    """The marker is not visible, or not modelled."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """The bounds of N scenes; NaN where ``status`` is not given.
+
+    Attributes
+    ----------
+    status
+        (N,) :class:`Bound`.
+    std
+        (N, 6) least standard deviations of an unbiased estimate: rotation about the camera's x, y
+        and z in radians, position along them in metres.
+    kappa
+        (N,) the depth's bias by the bound's own spread of the tilt, in standard deviations.
+    mirror_distance
+        (N,) standard deviations between the pose and the other minimum of chi-square, near its
+        mirror; NaN where there is none.
+    """
+
+    status: NDArray[np.uint8]
+    std: Floats
+    kappa: Floats
+    mirror_distance: Floats
+
+
+@compiled
+def pose_covariance(information: Floats, variance: float, distance: float) -> tuple[Floats, bool]:
+    """Return the covariance (6, 6) of the pose in radians and metres, and whether there is one."""
+    free = information.shape[0]
+    inverse = np.eye(free)
+    found = solve_positive(information, inverse)
+    for i in range(POSE):
+        for j in range(POSE):
+            unit = (distance if i >= 3 else 1.0) * (distance if j >= 3 else 1.0)
+            inverse[i, j] *= variance * unit
+    return inverse[:POSE, :POSE].copy(), found
+
+
+@compiled
+def curvature_at_truth(
+    state: Floats, sight: Sight, height: int, width: int, spread_free: bool
+) -> tuple[Floats, bool]:
+    """Return the Cramér-Rao bound's covariance (6, 6), and whether there is one."""
+    free = POSE + 1 if spread_free else POSE
+    information, gradient = np.empty((free, free)), np.empty(free)
+    curvature(
+        np.zeros((height, width)), state.copy(), sight, work_space(height, width), spread_free,
+        information, gradient,
+    )
+    return pose_covariance(information, sight.variance, abs(state[11]))
+
+
+@compiled
+def depth_nonlinearity(covariance: Floats, state: Floats) -> float:
+    """Return κ = z (s₁² + s₂²) / (4 s_z), s₁ and s₂ those of the turns that tilt the normal.
+
+    A tilt by a small angle foreshortens by half its square, which looks like depth: an estimate
+    whose tilt scatters has a depth that is off by about κ standard deviations.
+    """
+    tilting = 0.0
+    for i in range(3):
+        tilting += covariance[i, i]
+        for j in range(3):
+            tilting -= state[3 * i + 2] * covariance[i, j] * state[3 * j + 2]
+    return float(abs(state[11]) * tilting / (4.0 * math.sqrt(covariance[5, 5])))
+
+
+@compiled
+def mirror_chi_square(
+    state: Floats, sight: Sight, height: int, width: int, spread_free: bool, most_steps: int
+) -> float:
+    """Return the noise-free chi-square of the minimum that is reached from the mirrored pose.
+
+    NaN where that is the pose itself, or none is reached.
+    """
+    cover, image = np.zeros((height, width + 2)), np.empty((height, width))
+    coverage.accumulate(
+        cover, sight.ends, sight.sides, state[FIRST_LEVEL:], plane_of(state, sight),
+        sight.intrinsics, sight.lens, sight.distorted, 0, 0, state[SPREAD],
+    )
+    coverage.sum_levels(cover, state[FIRST_LEVEL], image)
+    free = POSE + 1 if spread_free else POSE
+    mirror = mirrored_state(state)
+    chi_square, reached = fit(
+        image, squares(image), mirror, sight, work_space(height, width), spread_free, most_steps,
+        SETTLED, math.inf, np.empty((free, free)),
+    )
+    if not reached or chi_square < 1e-2:
+        return math.nan
+    return chi_square
+
+
+def sight_of(
+    marker: MarkerKey, size_m: float, view: Floats, lens: Floats, distorted: bool,
+    corner: NDArray[np.int64], variance: float,
+) -> Sight:
+    """Return what is known of a marker's image whose first pixel is ``corner`` (2,)."""
+    outlines, modules = edges(*marker), module_count(marker[0])
+    local = view.copy()
+    local[2:] -= corner
+    return Sight(
+        outlines.ends, outlines.sides, np.array([-marker[2], modules + marker[2]]),
+        float(modules), float(size_m), local, lens, bool(distorted), float(variance),
+    )
+
+
+def noise_variance(noise_grey: float) -> float:
+    """Return the variance of a pixel in squared grey levels: its noise and its rounding."""
+    return noise_grey**2 + QUANTISATION_VARIANCE
+
+
+def bounds(
+    scenes: Scenes, rows: NDArray[np.intp], boxes: NDArray[np.int64], unknown_blur: bool
+) -> Bounds:
+    """Return the bounds of scenes ``rows`` (n,), visible ones with the marker's ``boxes`` (n, 4).
+
+    The bound is that of the exact image, whichever renderer draws it, after its gain, in the
+    frame. Levels of black, white and background are unknown; so is the point spread where
+    ``unknown_blur``. From Kay, "Fundamentals of statistical signal processing: estimation theory"
+    (1993), section 3.9, with analytic derivatives (:mod:`sweep.model.derivatives`).
+    """
+    count = len(rows)
+    status = np.full(count, Bound.given, dtype=np.uint8)
+    std, kappa, mirror = np.full((count, POSE), np.nan), *np.full((2, count), np.nan)
+    frames = scenes.frame[rows]
+    low = np.maximum(boxes[:, :2] - BACKGROUND_MARGIN_PX, 0)
+    high = np.minimum(boxes[:, 2:] + BACKGROUND_MARGIN_PX, frames)
+    for i, row in enumerate(rows.tolist()):
+        noise, gain, blur = (
+            (scenes.effect(row) if scenes.affected[row] else NEUTRAL)[name]
+            for name in ("noise_grey", "gain", "blur_px")
+        )
+        levels = scenes.levels[row] * gain
+        margin = CLIPPING_DEVIATIONS * noise
+        unmodelled = isinstance(scenes.background[row], str) or any(
+            name not in MODELLED for name in scenes.active(row)
+        )
+        if unmodelled:
+            status[i] = Bound.not_in_model
+        elif noise < LEAST_NOISE:
+            status[i] = Bound.no_noise
+        elif levels.min() < margin or levels.max() > 255 - margin:
+            status[i] = Bound.clipped
+        if status[i] != Bound.given:
+            continue
+        cameras = scenes.cameras
+        sight = sight_of(
+            scenes.markers[scenes.marker[row]], scenes.size_m[row], cameras.view[row],
+            cameras.lenses[row], cameras.distorted[row], low[i], noise_variance(noise),
+        )
+        state = state_of(scenes.rotation[row], scenes.translation[row], blur, levels)
+        width, height = (high[i] - low[i]).tolist()
+        if unknown_blur:
+            state[SPREAD] = max(state[SPREAD], LEAST_SPREAD_PX)
+        covariance, found = curvature_at_truth(state, sight, height, width, unknown_blur)
+        if not found:
+            status[i] = Bound.no_contrast
+            continue
+        std[i] = np.sqrt(np.diag(covariance))
+        kappa[i] = depth_nonlinearity(covariance, state)
+        mirror[i] = math.sqrt(mirror_chi_square(state, sight, height, width, unknown_blur, 60))
+    return Bounds(status, std, kappa, mirror)

@@ -1,0 +1,84 @@
+"""How sure a pose is, by a model of the corners' noise; and whether errors are as that says."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.compilation import compiled
+from sweep.measure.likelihood import solve_positive
+from sweep.model.camera import Cameras
+from sweep.model.derivatives import POSE, velocity
+from sweep.model.marker import marker_corners
+from sweep.model.pose import placed
+
+Floats = NDArray[np.float64]
+
+
+def corner_covariance(
+    rotation: Floats, translation: Floats, cameras: Cameras, size_m: Floats, noise_px: float
+) -> Floats:
+    """Return the first-order covariance (N, 6, 6) of poses (N, 3, 3), (N, 3) from four corners.
+
+    That of least squares, noise_px² (JᵀJ)⁻¹, for corners whose coordinates have independent errors
+    of ``noise_px``; J (8, 6) are the corners' velocities in pixels by turn about the camera's
+    axes (radians) and shift along them (metres). Hartley and Zisserman, "Multiple view geometry",
+    2nd edition, section 5.2.1. NaN where the pose is, or where J has no full rank.
+    """
+    points = placed(marker_corners(size_m), rotation, translation)
+    return _corner_covariance(
+        points, np.ascontiguousarray(translation), cameras.view, cameras.lenses,
+        cameras.distorted, float(noise_px),
+    )
+
+
+@compiled
+def _corner_covariance(
+    points: Floats, translation: Floats, view: Floats, lenses: Floats,
+    distorted: NDArray[np.bool_], noise_px: float,
+) -> Floats:
+    """As :func:`corner_covariance`, for corners (N, 4, 3) in the camera frame."""
+    covariance = np.full((points.shape[0], POSE, POSE), np.nan)
+    rates = np.empty((2, POSE))
+    for n in range(points.shape[0]):
+        distance = abs(translation[n, 2])
+        information, inverse = np.zeros((POSE, POSE)), np.eye(POSE)
+        for corner in range(4):
+            x, y, z = points[n, corner, 0], points[n, corner, 1], points[n, corner, 2]
+            velocity(
+                x, y, z, translation[n], view[n], lenses[n], distorted[n], rates[0], rates[1]
+            )
+            for axis in range(2):
+                for i in range(POSE):
+                    for j in range(POSE):
+                        # Shifts as shares of the distance, so that all is of one size.
+                        unit = (distance if i >= 3 else 1.0) * (distance if j >= 3 else 1.0)
+                        information[i, j] += rates[axis, i] * rates[axis, j] * unit
+        if solve_positive(information, inverse):
+            for i in range(POSE):
+                for j in range(POSE):
+                    unit = (distance if i >= 3 else 1.0) * (distance if j >= 3 else 1.0)
+                    covariance[n, i, j] = noise_px**2 * inverse[i, j] * unit
+    return covariance
+
+
+def squared_deviations(
+    rotation_error: Floats, translation_error: Floats, covariance: Floats
+) -> Floats:
+    """Return eᵀ C⁻¹ e (N,) of errors (N, 3) rad and (N, 3) m under covariances (N, 6, 6).
+
+    The normalised estimation error squared: where the covariances are true and errors Gaussian it
+    is chi-square distributed with six degrees of freedom (Bar-Shalom, Li and Kirubarajan,
+    "Estimation with applications to tracking and navigation", 2001, section 5.4.2). NaN where an
+    input is.
+    """
+    error = np.concatenate([rotation_error, translation_error], axis=1)
+    deviations = np.full(len(error), np.nan)
+    known = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    if known.any():
+        spread = np.sqrt(np.diagonal(covariance[known], axis1=1, axis2=2))
+        scaled = error[known] / spread
+        correlation = covariance[known] / (spread[:, :, None] * spread[:, None, :])
+        solved = np.linalg.solve(correlation, scaled[:, :, None])[:, :, 0]
+        deviations[known] = np.sum(scaled * solved, axis=1)
+    return deviations

@@ -1,0 +1,14 @@
+"""From an estimator's setting to what runs it."""
+
+from __future__ import annotations
+
+from sweep.measure.estimation import EstimatorProtocol
+from sweep.measure.photometric import Photometric
+from sweep.measure.solver import CornerSolver, Estimator
+
+
+def build(setting: Estimator) -> EstimatorProtocol:
+    """Return the estimator that a setting describes: the place to add others of either kind."""
+    if setting.solver == "photometric":
+        return Photometric(setting.photometric_starts, setting.estimate_blur)
+    return CornerSolver(setting)

@@ -1,0 +1,312 @@
+"""Pose from pixels: maximum likelihood with the exact image, started from the detector's corners.
+
+The chi-square of a small image has several minima: the two planar solutions, and poses where edges
+fall on wrong pixels. So there are several starts; each is fitted to the means of 2 x 2 pixels
+first, for which the exact model holds as well and whose minima are wider; those that end far above
+the best are dropped, the others are fitted to the pixels; and the best is held against the minimum
+that is reached from its mirror. Where none explains the pixels, the starts are fitted to them
+directly.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.compilation import compiled
+from sweep.measure.bound import (
+    BACKGROUND_MARGIN_PX,
+    LEAST_NOISE,
+    noise_variance,
+    pose_covariance,
+    sight_of,
+)
+from sweep.measure.estimation import Estimates, Sightings
+from sweep.measure.flags import Estimate
+from sweep.measure.likelihood import (
+    NEARLY_SETTLED,
+    SETTLED,
+    SPREAD,
+    STATE,
+    Sight,
+    Work,
+    binned,
+    binned_sight,
+    fit,
+    is_before_camera,
+    mirrored_state,
+    squares,
+    state_of,
+    turn_between,
+    work_space,
+)
+from sweep.measure.solver import both_planar_solutions, reprojection_errors_px
+from sweep.model.derivatives import LEVELS, POSE
+from sweep.model.marker import module_count
+
+Floats = NDArray[np.float64]
+
+COARSE_STEPS = 15
+FINE_STEPS = 30
+
+HOPELESS = 100.0
+"""Chi-square above the best coarse fit's from which a start is given up."""
+
+SAME_TURN_RAD = 1e-3
+"""Coarse fits that differ by less than this are one."""
+
+LIKELY_SPREAD_PX = 0.5
+"""The least point spread that its estimation starts from: one of 0 is a minimum of its own."""
+
+EXCESS = 5.0
+"""Standard deviations of the residuals' variance from which the model does not explain them."""
+
+
+@compiled
+def coarse_fit(
+    coarse: Floats, total: float, state: Floats, sight: Sight, work: Work, spread_free: bool,
+    worth: float,
+) -> float:
+    """Fit a state to the means of 2 x 2 pixels, whose point spread is half as wide."""
+    free = POSE + 1 if spread_free else POSE
+    state[SPREAD] *= 0.5
+    chi_square, _ = fit(
+        coarse, total, state, sight, work, spread_free, COARSE_STEPS, NEARLY_SETTLED, worth,
+        np.empty((free, free)),
+    )
+    state[SPREAD] *= 2.0
+    return chi_square
+
+
+@compiled
+def is_settled(chi_square: Floats, states: Floats, k: int) -> bool:
+    """Tell whether the k-th coarse fit is hopeless, or the same as one before it."""
+    if not chi_square[k] < chi_square.min() + HOPELESS:
+        return True
+    for m in range(k):
+        same = turn_between(states[k], states[m]) < SAME_TURN_RAD
+        if same and chi_square[m] < chi_square.min() + HOPELESS:
+            return True
+    return False
+
+
+@compiled
+def was_tried(mirror: Floats, found: Floats, starts: Floats) -> bool:
+    """Tell whether a start was nearer to the mirror than halfway between it and the solution."""
+    nearest = math.inf
+    for start in starts:
+        nearest = min(nearest, turn_between(mirror, start))
+    return nearest < 0.5 * turn_between(mirror, found)
+
+
+@compiled
+def locate(
+    image: Floats, starts: Floats, sight: Sight, spread_free: bool, information: Floats
+) -> tuple[Floats, float, bool, Floats, float]:
+    """Return the most likely pose, and the next minimum.
+
+    Parameters
+    ----------
+    image
+        (height, width) grey levels.
+    starts
+        (K, 16) states; those that are not before the camera are left out.
+    sight
+        What is known beside the pixels.
+    spread_free
+        Whether the point spread is estimated.
+    information
+        Overwritten: as :func:`sweep.measure.likelihood.fit` leaves it.
+
+    Returns
+    -------
+    tuple
+        The state (16,), its chi-square, whether it is a maximum of the likelihood, and the same
+        but for the last of the next best one; NaN where there is none.
+    """
+    count = len(starts)
+    coarse, coarse_sight = binned(image), binned_sight(sight)
+    coarse_work = work_space(coarse.shape[0], coarse.shape[1])
+    coarse_total = squares(coarse)
+    states = starts.copy()
+    chi_square = np.full(count, math.inf)
+    for k in range(count):
+        if is_before_camera(states[k], sight):
+            chi_square[k] = coarse_fit(
+                coarse, coarse_total, states[k], coarse_sight, coarse_work, spread_free,
+                chi_square.min() + HOPELESS,
+            )
+    work = work_space(image.shape[0], image.shape[1])
+    total = squares(image)
+    trial_information = np.empty_like(information)
+    found, other = np.full(STATE, math.nan), np.full(STATE, math.nan)
+    lowest = next_lowest = math.inf
+    reached = False
+    freedom = image.size - len(information) - LEVELS
+    likely = freedom + EXCESS * math.sqrt(2.0 * freedom)
+    for k in range(2 * count + 1):
+        worth = lowest + HOPELESS
+        if k < count:
+            if is_settled(chi_square, states, k):
+                continue
+            state = states[k].copy()
+        elif k == count:
+            state = mirrored_state(found)
+            if was_tried(state, found, starts):
+                continue
+        else:
+            # The coarse fits of all starts have led astray, or the model is wrong.
+            if lowest <= likely:
+                break
+            state, worth = starts[k - count - 1].copy(), math.inf
+        if not is_before_camera(state, sight):
+            continue
+        level, done = fit(
+            image, total, state, sight, work, spread_free, FINE_STEPS, SETTLED,
+            worth, trial_information,
+        )
+        same = turn_between(state, found) < SAME_TURN_RAD
+        if level < lowest:
+            if not same:
+                other[:], next_lowest = found, lowest
+            found[:], lowest, reached = state, level, done
+            information[:] = trial_information
+        elif not same and level < next_lowest:
+            other[:], next_lowest = state, level
+    return found, lowest, reached, other, next_lowest
+
+
+def explains(chi_square: float, freedom: int, noise_grey: float) -> bool:
+    """Tell whether residuals of an expected chi-square ``freedom`` are those of noise.
+
+    Within :data:`EXCESS` standard deviations, sqrt(2 · freedom). Without noise residuals are those
+    of rounding, which are smaller wherever the levels are whole numbers: only an excess counts.
+    """
+    away = (chi_square / freedom - 1.0) * math.sqrt(freedom / 2.0)
+    return abs(away) <= EXCESS if noise_grey >= LEAST_NOISE else away <= EXCESS
+
+
+@dataclass(frozen=True, slots=True)
+class Photometric:
+    """Maximum likelihood on the pixels, as an estimator.
+
+    ``starts`` is 2 (both planar solutions of the corners as found) or more (of these after
+    ``cv2.cornerSubPix``, too); ``spread_free`` tells that the point spread is estimated.
+    """
+
+    starts: int
+    spread_free: bool
+
+    @property
+    def needs_images(self) -> bool:
+        """Pixels are what it fits."""
+        return True
+
+    def __call__(self, sightings: Sightings) -> Estimates:
+        """Return the poses, with the covariances of the likelihood's own curvature."""
+        count = len(sightings.corners)
+        out = Estimates.none(count, Estimate.solver_failed)
+        sets = [sightings.corners]
+        if self.starts > 2:
+            sets.append(_refined(sightings))
+        poses = [
+            both_planar_solutions(corners, sightings.cameras, sightings.size_m)
+            for corners in sets
+        ]
+        turns = np.concatenate([rotation for rotation, _ in poses], axis=1)
+        shifts = np.concatenate([translation for _, translation in poses], axis=1)
+        windows = _windows(sightings)
+        free = POSE + 1 if self.spread_free else POSE
+        for i in range(count):
+            starts = self._starts(turns[i], shifts[i], float(sightings.blur_px[i]))
+            left, top, right, bottom = windows[i]
+            if not len(starts) or right - left < 2 or bottom - top < 2:
+                continue
+            noise = float(sightings.noise_grey[i])
+            cameras = sightings.cameras
+            sight = sight_of(
+                sightings.markers[i], sightings.size_m[i], cameras.view[i], cameras.lenses[i],
+                cameras.distorted[i], sightings.origins[i] + (left, top), noise_variance(noise),
+            )
+            image = sightings.images[i][top:bottom, left:right].astype(np.float64)
+            information = np.empty((free, free))
+            state, chi_square, reached, other, _ = locate(
+                image, starts, sight, self.spread_free, information
+            )
+            freedom = image.size - free - LEVELS
+            if not math.isfinite(chi_square) or freedom < 1:
+                continue
+            if not reached:
+                out.status[i] = Estimate.not_converged
+                continue
+            out.status[i] = (
+                Estimate.solved if explains(chi_square, freedom, noise)
+                else Estimate.not_explained
+            )
+            out.rotation[i], out.translation[i] = state[:9].reshape(3, 3), state[9:12]
+            out.alternative_rotation[i] = other[:9].reshape(3, 3)
+            out.alternative_reprojection_px[i] = self._reprojection_px(other, sightings, i)
+            out.reprojection_px[i] = self._reprojection_px(state, sightings, i)
+            covariance, found = pose_covariance(information, sight.variance, abs(state[11]))
+            if found:
+                out.covariance[i] = covariance
+            out.residual_ratio[i] = chi_square / freedom
+        return out
+
+    def _starts(self, rotation: Floats, translation: Floats, spread_px: float) -> Floats:
+        """Return the states (K, 16) of those of (M, 3, 3), (M, 3) that are poses."""
+        spread = max(spread_px, LIKELY_SPREAD_PX) if self.spread_free else spread_px
+        none = np.zeros(LEVELS)
+        states = np.array(
+            [state_of(*pose, spread, none) for pose in zip(rotation, translation, strict=True)]
+        )
+        return np.asarray(states[np.isfinite(states).all(axis=1)])
+
+    @staticmethod
+    def _reprojection_px(state: Floats, sightings: Sightings, i: int) -> float:
+        one = np.array([i])
+        return float(
+            reprojection_errors_px(
+                state[None, :9].reshape(1, 3, 3), state[None, 9:12], sightings.size_m[one],
+                sightings.corners[one], sightings.cameras.take(one),
+            )[0]
+        )
+
+
+def _windows(sightings: Sightings) -> list[list[int]]:
+    """Return what is fitted of each image: left, top, right, bottom around the quiet zone.
+
+    A share of the corners' extent as wide as the quiet zone, and half of that for perspective.
+    """
+    low, high = sightings.corners.min(axis=1), sightings.corners.max(axis=1)
+    share = np.array(
+        [1.5 * quiet / module_count(dictionary) for dictionary, _, quiet in sightings.markers]
+    )
+    margin = BACKGROUND_MARGIN_PX + share[:, None] * (high - low)
+    sizes = np.array([image.shape[::-1] for image in sightings.images]).reshape(-1, 2)
+    low = np.clip(np.floor(low - margin) - sightings.origins, 0, sizes)
+    high = np.clip(np.ceil(high + margin) + 1 - sightings.origins, 0, sizes)
+    windows: list[list[int]] = np.concatenate([low, high], axis=1).astype(np.int64).tolist()
+    return windows
+
+
+def _refined(sightings: Sightings) -> Floats:
+    """Return the corners (N, 4, 2) after ``cv2.cornerSubPix``, its window OpenCV's for markers."""
+    refined = sightings.corners.copy()
+    for i, image in enumerate(sightings.images):
+        corners = sightings.corners[i] - sightings.origins[i]
+        if not ((corners >= 0) & (corners <= np.array(image.shape[::-1]) - 1)).all():
+            continue
+        side = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
+        module = side / module_count(sightings.markers[i][0])
+        half = min(5, max(1, round(0.3 * module)))
+        moved = cv2.cornerSubPix(
+            image, np.ascontiguousarray(corners[:, None], dtype=np.float32), (half, half),
+            (-1, -1), (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 30, 0.1),
+        )
+        refined[i] = moved[:, 0] + sightings.origins[i]
+    return refined

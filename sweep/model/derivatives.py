@@ -1,0 +1,321 @@
+"""The exact image's derivatives by the marker's pose, by the point spread and by the grey levels.
+
+Where an edge moves, the level of a pixel changes by the edge's jump times the integral of its
+normal velocity over the part of it that lies in the pixel. Under a homography that velocity is
+linear along the edge's image, so that length times the value in the middle of each part is exact:
+twelve numbers an edge, its two ends' velocities under six pose parameters.
+
+A pose moves by δ = (ω, τ): rotation to exp(ω) R, translation to t + τ, in the camera frame, in
+radians and metres: the same six numbers as ``rotation_error_rad`` and ``translation_error_m``.
+
+The box begins at pixel (0, 0) here: a principal point is given relative to the box.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.compilation import compiled
+from sweep.model.coverage import (
+    NODES,
+    REACH,
+    SHORTEST_PANEL_PX,
+    WEIGHTS,
+    accumulate,
+    bent,
+    chord_count,
+    clip,
+    spread_below,
+)
+from sweep.model.lens import distort, jacobian
+
+Floats = NDArray[np.float64]
+
+POSE = 6
+"""Parameters of a pose; the point spread, where its slope is asked for, is one more."""
+
+LEVELS = 3
+"""Unknown grey levels: outside, black, white."""
+
+JUST_BLACK = np.array([0.0, 1.0, 0.0])
+JUST_WHITE = np.array([0.0, 0.0, 1.0])
+
+
+@compiled
+def _slot(place: NDArray[np.int32], slopes: Floats, count: int, i: int, j: int) -> int:
+    """Return the row of ``slopes`` of a pixel, the next free one (``count``) where it has none."""
+    slot = place[i, j]
+    if slot < 0:
+        place[i, j] = count
+        slopes[count] = 0.0
+        return count
+    return int(slot)
+
+
+@compiled
+def _add_sharp(
+    place: NDArray[np.int32], slopes: Floats, count: int, jump: float, xa: float, ya: float,
+    xb: float, yb: float, at_a: Floats, at_b: Floats,
+) -> int:
+    """Add the slopes that a segment in pixels stands for, pixel by pixel; return the new count.
+
+    ``at_a`` and ``at_b`` (6,) are the normal velocities times the segment's length at its ends.
+    """
+    height, width = place.shape
+    dx, dy = xb - xa, yb - ya
+    line_x = math.floor(xa) + 1.0 if dx > 0.0 else math.ceil(xa) - 1.0
+    line_y = math.floor(ya) + 1.0 if dy > 0.0 else math.ceil(ya) - 1.0
+    step_x, step_y = math.copysign(1.0, dx), math.copysign(1.0, dy)
+    next_x = (line_x - xa) / dx if dx != 0.0 else 2.0
+    next_y = (line_y - ya) / dy if dy != 0.0 else 2.0
+    t = 0.0
+    while t < 1.0:
+        end = min(next_x, next_y, 1.0)
+        if end > t:
+            middle = 0.5 * (t + end)
+            j, i = int(xa + middle * dx), int(ya + middle * dy)
+            if 0 <= i < height and 0 <= j < width:
+                slot = _slot(place, slopes, count, i, j)
+                count = max(count, slot + 1)
+                share = jump * (end - t)
+                for k in range(POSE):
+                    slopes[slot, k] -= share * (at_a[k] + middle * (at_b[k] - at_a[k]))
+            t = end
+        if next_x <= end:
+            line_x += step_x
+            next_x = (line_x - xa) / dx
+        if next_y <= end:
+            line_y += step_y
+            next_y = (line_y - ya) / dy
+    return count
+
+
+@compiled
+def _add_spread(
+    place: NDArray[np.int32], slopes: Floats, count: int, jump: float, sigma: float,
+    xa: float, ya: float, xb: float, yb: float, at_a: Floats, at_b: Floats,
+) -> int:
+    """As :func:`_add_sharp` through a Gaussian point spread, with the slope by ``sigma``.
+
+    The point spread obeys the heat equation, dK/dsigma = sigma · (Laplacian of K), so that the
+    slope by sigma is an integral along the edge, too: that of sigma times K's normal derivative.
+    """
+    height, width = place.shape
+    reach = REACH * sigma + 0.5
+    dx, dy = xb - xa, yb - ya
+    panels = math.ceil(math.hypot(dx, dy) / max(1.5 * sigma, SHORTEST_PANEL_PX))
+    most = int(2 * reach) + 3
+    near, slope = np.empty((2, most)), np.empty((2, most))
+    normal = 1.0 / (sigma * math.sqrt(2.0 * math.pi))
+    first = np.zeros(2, dtype=np.int64)
+    last = np.zeros(2, dtype=np.int64)
+    for panel in range(panels):
+        for node in range(3):
+            weight = WEIGHTS[node] / panels
+            t = (panel + NODES[node]) / panels
+            at = (xa + t * dx, ya + t * dy)
+            for axis in range(2):
+                size = width if axis == 0 else height
+                first[axis] = max(math.floor(at[axis] - reach), 0)
+                last[axis] = min(math.floor(at[axis] + reach) + 1, size - 1)
+                # The share of the point spread that falls on each pixel, and its slope.
+                d = first[axis] - at[axis]
+                below, density = spread_below(d, sigma), normal * math.exp(-0.5 * (d / sigma) ** 2)
+                for j in range(last[axis] - first[axis] + 1):
+                    d += 1.0
+                    above = spread_below(d, sigma)
+                    higher = normal * math.exp(-0.5 * (d / sigma) ** 2)
+                    near[axis, j], slope[axis, j] = above - below, density - higher
+                    below, density = above, higher
+            for i in range(last[1] - first[1] + 1):
+                for j in range(last[0] - first[0] + 1):
+                    slot = _slot(place, slopes, count, first[1] + i, first[0] + j)
+                    count = max(count, slot + 1)
+                    share = jump * weight * near[0, j] * near[1, i]
+                    for k in range(POSE):
+                        slopes[slot, k] -= share * (at_a[k] + t * (at_b[k] - at_a[k]))
+                    slopes[slot, POSE] += jump * weight * sigma * (
+                        near[0, j] * slope[1, i] * dx - slope[0, j] * near[1, i] * dy
+                    )
+    return count
+
+
+@compiled
+def velocity(
+    x: float, y: float, z: float, translation: Floats, view: Floats, lens: Floats,
+    distorted: bool, u_rate: Floats, v_rate: Floats,
+) -> tuple[float, float]:
+    """Return the pixel of a point in space, and its velocities (6,) under the pose parameters."""
+    px, py, pz = x - translation[0], y - translation[1], z - translation[2]
+    xn, yn = x / z, y / z
+    a, b, c, d = 1.0, 0.0, 0.0, 1.0
+    u, v = xn, yn
+    if distorted:
+        a, b, c, d = jacobian(xn, yn, lens)
+        u, v = distort(xn, yn, lens)
+    for k in range(POSE):
+        if k == 0:
+            rx, ry, rz = 0.0, -pz, py
+        elif k == 1:
+            rx, ry, rz = pz, 0.0, -px
+        elif k == 2:
+            rx, ry, rz = -py, px, 0.0
+        else:
+            rx, ry, rz = 1.0 * (k == 3), 1.0 * (k == 4), 1.0 * (k == 5)
+        x_rate, y_rate = (rx - xn * rz) / z, (ry - yn * rz) / z
+        u_rate[k] = view[0] * (a * x_rate + b * y_rate)
+        v_rate[k] = view[1] * (c * x_rate + d * y_rate)
+    return view[0] * u + view[2] + 0.5, view[1] * v + view[3] + 0.5
+
+
+@compiled
+def differentiate(
+    shares: Floats, place: NDArray[np.int32], slopes: Floats, ends: Floats,
+    sides: NDArray[np.int64], levels: Floats, plane: Floats, translation: Floats, view: Floats,
+    lens: Floats, distorted: bool, sigma: float,
+) -> int:
+    """Draw a marker's image and its derivatives; return how many pixels have slopes.
+
+    Parameters
+    ----------
+    shares
+        (2, height, width + 2), zero: gets what :func:`sweep.model.coverage.accumulate` gives for
+        the areas that black and white cover.
+    place
+        (height, width), all -1: gets each pixel's row of ``slopes``.
+    slopes
+        (height · width, 7): gets d(level)/d(pose) and, where ``sigma > 0``, d(level)/d(sigma).
+    ends, sides, plane, view, lens, distorted, sigma
+        As :func:`sweep.model.coverage.accumulate`.
+    levels
+        (3,) grey levels outside, of black and of white, that the slopes are for.
+    translation
+        (3,) of the marker's centre, which ω turns it about.
+    """
+    accumulate(
+        shares[0], ends, sides, JUST_BLACK, plane, view, lens, distorted, 0, 0, sigma
+    )
+    accumulate(
+        shares[1], ends, sides, JUST_WHITE, plane, view, lens, distorted, 0, 0, sigma
+    )
+    height, width = place.shape
+    margin = REACH * sigma + 0.5 if sigma > 0.0 else 0.0
+    rates = np.empty((4, POSE))
+    at_a, at_b = np.empty(POSE), np.empty(POSE)
+    shift_x, shift_y = view[2] + 0.5 + margin, view[3] + 0.5 + margin
+    far_x, far_y = width + 2.0 * margin, height + 2.0 * margin
+    count = 0
+    for e in range(ends.shape[0]):
+        jump = levels[sides[e, 1]] - levels[sides[e, 0]]
+        if jump == 0.0:
+            continue
+        a, b, c, d = ends[e, 0], ends[e, 1], ends[e, 2], ends[e, 3]
+        chords = chord_count(plane, lens, view, a, b, c, d) if distorted else 1
+        for chord in range(chords):
+            t0, t1 = chord / chords, (chord + 1.0) / chords
+            if not distorted:
+                # To the box and what spreads into it, before division, as the image is.
+                z0 = plane[2, 0] * a + plane[2, 1] * b + plane[2, 2]
+                z1 = plane[2, 0] * c + plane[2, 1] * d + plane[2, 2]
+                x0 = view[0] * (plane[0, 0] * a + plane[0, 1] * b + plane[0, 2]) + shift_x * z0
+                x1 = view[0] * (plane[0, 0] * c + plane[0, 1] * d + plane[0, 2]) + shift_x * z1
+                y0 = view[1] * (plane[1, 0] * a + plane[1, 1] * b + plane[1, 2]) + shift_y * z0
+                y1 = view[1] * (plane[1, 0] * c + plane[1, 1] * d + plane[1, 2]) + shift_y * z1
+                t0, t1 = clip(x0, x1, t0, t1)
+                t0, t1 = clip(y0, y1, t0, t1)
+                t0, t1 = clip(far_x * z0 - x0, far_x * z1 - x1, t0, t1)
+                t0, t1 = clip(far_y * z0 - y0, far_y * z1 - y1, t0, t1)
+            else:
+                u0, v0 = bent(t0, plane, lens, view, a, b, c, d)
+                u1, v1 = bent(t1, plane, lens, view, a, b, c, d)
+                if (
+                    max(u0, u1) + 0.5 < -margin or min(u0, u1) + 0.5 > width + margin
+                    or max(v0, v1) + 0.5 < -margin or min(v0, v1) + 0.5 > height + margin
+                ):
+                    continue
+            if not t0 < t1:
+                continue
+            ca, cb, da, db = a + t0 * (c - a), a + t1 * (c - a), b + t0 * (d - b), b + t1 * (d - b)
+            xa, ya = velocity(
+                plane[0, 0] * ca + plane[0, 1] * da + plane[0, 2],
+                plane[1, 0] * ca + plane[1, 1] * da + plane[1, 2],
+                plane[2, 0] * ca + plane[2, 1] * da + plane[2, 2],
+                translation, view, lens, distorted, rates[0], rates[1],
+            )
+            xb, yb = velocity(
+                plane[0, 0] * cb + plane[0, 1] * db + plane[0, 2],
+                plane[1, 0] * cb + plane[1, 1] * db + plane[1, 2],
+                plane[2, 0] * cb + plane[2, 1] * db + plane[2, 2],
+                translation, view, lens, distorted, rates[2], rates[3],
+            )
+            for k in range(POSE):
+                at_a[k] = rates[0, k] * (yb - ya) - rates[1, k] * (xb - xa)
+                at_b[k] = rates[2, k] * (yb - ya) - rates[3, k] * (xb - xa)
+            if sigma > 0.0:
+                count = _add_spread(
+                    place, slopes, count, jump, sigma, xa, ya, xb, yb, at_a, at_b
+                )
+            else:
+                count = _add_sharp(place, slopes, count, jump, xa, ya, xb, yb, at_a, at_b)
+    return count
+
+
+@compiled
+def normal_equations(
+    image: Floats, shares: Floats, place: NDArray[np.int32], slopes: Floats, free: int,
+    matrix: Floats, vector: Floats,
+) -> None:
+    """Sum up JᵀJ and Jᵀ·image over the pixels of a box, and clear ``shares`` and ``place``.
+
+    J's columns are the first ``free`` slopes and the areas outside, of black and of white.
+    ``matrix`` (free + 3, free + 3) and ``vector`` (free + 3,) are overwritten.
+    """
+    size = free + LEVELS
+    matrix[:] = 0.0
+    vector[:] = 0.0
+    column = np.empty(size)
+    height, width = place.shape
+    for i in range(height):
+        black = white = 0.0
+        pixels = total = 0.0
+        for j in range(width):
+            more_black, more_white, slot = shares[0, i, j], shares[1, i, j], place[i, j]
+            level = image[i, j]
+            if more_black == 0.0 and more_white == 0.0 and slot < 0:
+                pixels += 1.0
+                total += level
+                continue
+            # A run of pixels with the same areas ends.
+            column[free], column[free + 1], column[free + 2] = 1.0 - black - white, black, white
+            for k in range(free, size):
+                vector[k] += total * column[k]
+                for m in range(free, k + 1):
+                    matrix[k, m] += pixels * column[k] * column[m]
+            black += more_black
+            white += more_white
+            shares[0, i, j] = shares[1, i, j] = 0.0
+            if slot < 0:
+                pixels, total = 1.0, level
+                continue
+            pixels = total = 0.0
+            place[i, j] = -1
+            column[free], column[free + 1], column[free + 2] = 1.0 - black - white, black, white
+            for k in range(free):
+                column[k] = slopes[slot, k]
+            for k in range(size):
+                vector[k] += level * column[k]
+                for m in range(k + 1):
+                    matrix[k, m] += column[k] * column[m]
+        column[free], column[free + 1], column[free + 2] = 1.0 - black - white, black, white
+        for k in range(free, size):
+            vector[k] += total * column[k]
+            for m in range(free, k + 1):
+                matrix[k, m] += pixels * column[k] * column[m]
+        shares[0, i, width:] = 0.0
+        shares[1, i, width:] = 0.0
+    for k in range(size):
+        for m in range(k):
+            matrix[m, k] = matrix[k, m]

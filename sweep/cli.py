@@ -85,6 +85,31 @@ def _parser() -> argparse.ArgumentParser:
     show.add_argument("--plain", action="store_true", help="the image alone")
     show.add_argument("--full", action="store_true", help="the whole frame")
 
+    trade = command(
+        "tradeoff", _tradeoff,
+        "measure what each treatment costs, and how accurate it is on the same images",
+    )
+    trade.add_argument(
+        "source", metavar="STORE|PIPELINE",
+        help="a finished store, or a TOML file, which is run into its default store first",
+    )
+    trade.add_argument(
+        "--per", action="append", default=[], metavar="AXIS",
+        help="a scene axis whose values are told apart, such as side_px; may be repeated",
+    )
+    trade.add_argument(
+        "--criterion", default="rotation_p95_deg", metavar="NAME",
+        help="the error that decides (default: rotation_p95_deg)",
+    )
+    trade.add_argument(
+        "--seconds", type=float, default=60.0, metavar="S",
+        help="measure costs for at most so long (default: 60)",
+    )
+    trade.add_argument("-o", "--output", metavar="FIGURE", help="draw it: a PNG or SVG file")
+    form = trade.add_mutually_exclusive_group()
+    form.add_argument("--json", action="store_true", help="print one JSON object")
+    form.add_argument("--markdown", action="store_true", help="print Markdown tables")
+
     status = command("status", _status, "say how far a store is; also while it is written")
     status.add_argument("store", metavar="STORE")
     status.add_argument("--json", action="store_true", help="print one JSON object")
@@ -248,6 +273,55 @@ def _show(chosen: argparse.Namespace) -> int:
     except OSError as error:
         raise StoreError(f"{path}: cannot be written: {error.strerror}") from None
     print(f"{path}: {seen.detection.name}, {seen.estimate.name}")
+    return 0
+
+
+def _tradeoff(chosen: argparse.Namespace) -> int:
+    from sweep.analysis.pareto import CRITERIA, advice  # noqa: PLC0415
+    from sweep.engine.tradeoff import measure_trade  # noqa: PLC0415
+    from sweep.report.renderer_table import renderer_lines  # noqa: PLC0415
+    from sweep.report.trade_table import (  # noqa: PLC0415
+        as_json,
+        table_markdown,
+        table_text,
+    )
+
+    if chosen.criterion not in CRITERIA:
+        raise StoreError(f"--criterion {chosen.criterion}: expected one of {', '.join(CRITERIA)}")
+    if not chosen.seconds > 0:
+        raise StoreError(f"--seconds {chosen.seconds}: expected a number above 0")
+    output = Path(chosen.output) if chosen.output else None
+    if output is not None and output.suffix.lower() not in (".png", ".svg"):
+        raise StoreError(f"{output}: expected a file that ends in .png or .svg")
+    store = chosen.source
+    if store.endswith(".toml"):
+        from sweep.engine.runner import execute  # noqa: PLC0415
+        from sweep.plan.pipeline import Pipeline  # noqa: PLC0415
+
+        with _Bar() as bar:
+            store = execute(Pipeline.from_toml(store), None, on_progress=bar).store
+    trade, renderers = measure_trade(store, chosen.per, chosen.seconds)
+    if output is not None:
+        from sweep.report.trade_figure import draw_trade  # noqa: PLC0415
+
+        try:
+            draw_trade(trade, chosen.criterion, output)
+        except OSError as error:
+            raise StoreError(f"{output}: cannot be written: {error.strerror}") from None
+    if chosen.json:
+        content = as_json(trade)
+        if renderers is not None:
+            content["renderers"] = as_json(renderers)
+        content["advice"] = advice(trade, chosen.criterion)
+        _print_json(content)
+        return 0
+    form = table_markdown if chosen.markdown else table_text
+    print(form(trade, chosen.criterion))
+    if renderers is not None:
+        print()
+        print("\n".join(renderer_lines(renderers, markdown=chosen.markdown)))
+    print()
+    print("\n".join(advice(trade, chosen.criterion)))
     return 0
 
 

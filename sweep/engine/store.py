@@ -409,12 +409,26 @@ def finish(store: RunStore, cost: xr.Dataset) -> None:
     about = store.about
     about["finished"] = True
     about["finished_at"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+    write_group(store, "cost", cost, about)
+
+
+def write_group(
+    store: RunStore, name: str, content: xr.Dataset, about: dict[str, Any] | None = None
+) -> None:
+    """Write a dataset to a group of a complete store, then what is new about the store, if any.
+
+    All metadata is then put in one place.
+    """
+    # Zarr 3 specifies strings of any length, none of a fixed one.
+    texts = [label for label in content.variables if content[label].dtype.kind == "U"]
+    content = content.assign({label: content[label].astype(object) for label in texts})
     with warnings.catch_warnings():
         # Consolidated metadata is not part of the Zarr 3 specification; xarray reads it, and
         # warns where it is missing.
         warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
-        cost.to_zarr(store.url, group="cost", mode="w", zarr_format=3, consolidated=False)
-        store.group.attrs["sweep"] = about
+        content.to_zarr(store.url, group=name, mode="w", zarr_format=3, consolidated=False)
+        if about is not None:
+            store.group.attrs["sweep"] = about
         zarr.consolidate_metadata(store.group.store, zarr_format=3)
 
 

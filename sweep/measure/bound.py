@@ -46,6 +46,11 @@ QUANTISATION_VARIANCE = 1 / 12
 BACKGROUND_MARGIN_PX = 4
 """Pixels of background around the marker that tell its level."""
 
+MIRROR_STEPS = 60
+
+FARTHEST_MIRROR = 100.0
+"""Standard deviations from which on a second minimum is not looked for."""
+
 MODELLED = ("blur_px", "gain", "noise_grey")
 """The effects that the bound's model of an image has."""
 
@@ -70,7 +75,7 @@ class Bound(IntEnum):
     no_noise = 2
     """Noise below half a grey level: rounding rules then, and it is no noise."""
     no_contrast = 3
-    """Nothing in the image changes with some part of the pose."""
+    """Nothing in the image changes with some part of the pose, or next to nothing."""
     clipped = 4
     """A grey level lies within two standard deviations of the scale's ends."""
     not_in_model = 5
@@ -94,7 +99,7 @@ class Bounds:
         (N,) the depth's bias by the bound's own spread of the tilt, in standard deviations.
     mirror_distance
         (N,) standard deviations between the pose and the other minimum of chi-square, near its
-        mirror; NaN where there is none.
+        mirror; NaN where there is none within :data:`FARTHEST_MIRROR`.
     """
 
     status: NDArray[np.uint8]
@@ -147,11 +152,12 @@ def depth_nonlinearity(covariance: Floats, state: Floats) -> float:
 
 @compiled
 def mirror_chi_square(
-    state: Floats, sight: Sight, height: int, width: int, spread_free: bool, most_steps: int
+    state: Floats, sight: Sight, height: int, width: int, spread_free: bool
 ) -> float:
     """Return the noise-free chi-square of the minimum that is reached from the mirrored pose.
 
-    NaN where that is the pose itself, or none is reached.
+    NaN where that is the pose itself, or none is reached; and where it is so far above that no
+    noise leads there.
     """
     cover, image = np.zeros((height, width + 2)), np.empty((height, width))
     coverage.accumulate(
@@ -162,8 +168,8 @@ def mirror_chi_square(
     free = POSE + 1 if spread_free else POSE
     mirror = mirrored_state(state)
     chi_square, reached = fit(
-        image, squares(image), mirror, sight, work_space(height, width), spread_free, most_steps,
-        SETTLED, math.inf, np.empty((free, free)),
+        image, squares(image), mirror, sight, work_space(height, width), spread_free,
+        MIRROR_STEPS, SETTLED, FARTHEST_MIRROR**2, np.empty((free, free)),
     )
     if not reached or chi_square < 1e-2:
         return math.nan
@@ -233,10 +239,11 @@ def bounds(
         if unknown_blur:
             state[SPREAD] = max(state[SPREAD], LEAST_SPREAD_PX)
         covariance, found = curvature_at_truth(state, sight, height, width, unknown_blur)
-        if not found:
+        # Half a turn is no knowledge: rounding has made a singular problem a regular one.
+        if not found or np.diag(covariance)[:3].max() > math.pi**2:
             status[i] = Bound.no_contrast
             continue
         std[i] = np.sqrt(np.diag(covariance))
         kappa[i] = depth_nonlinearity(covariance, state)
-        mirror[i] = math.sqrt(mirror_chi_square(state, sight, height, width, unknown_blur, 60))
+        mirror[i] = math.sqrt(mirror_chi_square(state, sight, height, width, unknown_blur))
     return Bounds(status, std, kappa, mirror)

@@ -70,15 +70,18 @@ def squared_deviations(
     The normalised estimation error squared: where the covariances are true and errors Gaussian it
     is chi-square distributed with six degrees of freedom (Bar-Shalom, Li and Kirubarajan,
     "Estimation with applications to tracking and navigation", 2001, section 5.4.2). NaN where an
-    input is.
+    input is, and where a covariance is singular.
     """
     error = np.concatenate([rotation_error, translation_error], axis=1)
+    return _squared_deviations(np.ascontiguousarray(error), np.ascontiguousarray(covariance))
+
+
+@compiled
+def _squared_deviations(error: Floats, covariance: Floats) -> Floats:
     deviations = np.full(len(error), np.nan)
-    known = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
-    if known.any():
-        spread = np.sqrt(np.diagonal(covariance[known], axis1=1, axis2=2))
-        scaled = error[known] / spread
-        correlation = covariance[known] / (spread[:, :, None] * spread[:, None, :])
-        solved = np.linalg.solve(correlation, scaled[:, :, None])[:, :, 0]
-        deviations[known] = np.sum(scaled * solved, axis=1)
+    for n in range(len(error)):
+        if np.isfinite(error[n]).all() and np.isfinite(covariance[n]).all():
+            solved = error[n].copy().reshape(POSE, 1)
+            if solve_positive(covariance[n], solved):
+                deviations[n] = np.sum(error[n] * solved[:, 0])
     return deviations

@@ -87,7 +87,7 @@ def state_of(rotation: Floats, translation: Floats, spread_px: float, levels: Fl
 def solve_positive(matrix: Floats, right: Floats) -> bool:
     """Solve matrix · x = right in place for a positive definite matrix; False where it is not.
 
-    Scaled to a unit diagonal, then by Cholesky's factors; a pivot below 1e-13 is none.
+    Scaled to a unit diagonal, then by Cholesky's factors; a pivot below 1e-11 is none.
     """
     n = matrix.shape[0]
     scale, factor = np.empty(n), np.empty((n, n))
@@ -102,7 +102,7 @@ def solve_positive(matrix: Floats, right: Floats) -> bool:
                 total -= factor[i, k] * factor[j, k]
             if i > j:
                 factor[i, j] = total / factor[j, j]
-            elif total > 1e-13:
+            elif total > 1e-11:
                 factor[i, i] = math.sqrt(total)
             else:
                 return False
@@ -176,18 +176,21 @@ def curvature(
         if spread_free and state[SPREAD] > 0.0:
             work.slopes[slot, POSE] /= 2.0 * state[SPREAD]
     normal_equations(image, work.shares, work.place, work.slopes, free, matrix, vector)
-    # An area that is not seen has no level: the ridge makes it 0.
-    ridge = 1e-12 * (1.0 + matrix[free, free])
     levels = np.empty((LEVELS, LEVELS))
     right = np.empty((LEVELS, free + 1))
     for k in range(LEVELS):
         right[k, free] = vector[free + k]
         for m in range(LEVELS):
             levels[k, m] = matrix[free + k, free + m]
-        levels[k, k] += ridge
+        if not levels[k, k] > 0.0:
+            # An area that is not seen has no level: 0.
+            levels[k, k] = 1.0
         for m in range(free):
             right[k, m] = matrix[free + k, m]
-    solve_positive(levels, right)
+    if not solve_positive(levels, right):
+        information[:] = 0.0
+        gradient[:] = 0.0
+        return 0.0
     explained = 0.0
     for k in range(LEVELS):
         state[FIRST_LEVEL + k] = right[k, free]

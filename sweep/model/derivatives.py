@@ -76,7 +76,7 @@ def _add_sharp(
         end = min(next_x, next_y, 1.0)
         if end > t:
             middle = 0.5 * (t + end)
-            j, i = int(xa + middle * dx), int(ya + middle * dy)
+            j, i = math.floor(xa + middle * dx), math.floor(ya + middle * dy)
             if 0 <= i < height and 0 <= j < width:
                 slot = _slot(place, slopes, count, i, j)
                 count = max(count, slot + 1)

@@ -1,0 +1,230 @@
+"""What accuracy costs: a finished store's treatments, with what they cost and how good they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from sweep.analysis.error_summaries import (
+    covariance_trust,
+    efficiency,
+    renderer_bias,
+    summarise,
+)
+from sweep.engine.paired_costs import (
+    measure,
+    measure_renderers,
+    median_interval,
+    sample_cells,
+)
+from sweep.engine.store import open_dataset, open_store, write_group
+from sweep.errors import StoreError
+from sweep.plan.axes import TRIAL, nearest
+from sweep.plan.grid import combinations, estimators
+from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline, fixed_at
+
+REFERENCE = "exact"
+"""The renderer that others are compared with, where several are in a grid."""
+
+
+def measure_trade(
+    url: str, per: Sequence[str] = (), limit_s: float = 60.0
+) -> tuple[xr.Dataset, xr.Dataset | None]:
+    """Measure the trade of a finished store, and write it to its group ``cost/tradeoff``.
+
+    A treatment is a combination of detector and estimator settings. Each has its costs, measured
+    for at most ``limit_s`` seconds (:func:`sweep.engine.paired_costs.measure`), and its accuracy in
+    the store (:func:`sweep.analysis.error_summaries.summarise`), for each combination of the
+    values of the scene axes ``per``; the first one is the baseline. Where renderers are an axis,
+    the treatments are those on ``exact`` images, and a second dataset tells what other renderers
+    change (``cost/renderers``); else that is None.
+
+    Raises
+    ------
+    StoreError
+        Where there is no finished store, or ``per`` names no axis of its scenes.
+    """
+    store = open_store(url, "r+")
+    if not store.finished:
+        raise StoreError(f"{url}: unfinished; `sweep run` continues it")
+    pipeline, results = store.pipeline, open_dataset(url)
+    axes = [axis.name for axis in pipeline.axes_of(Stage.scene) if axis.name != TRIAL]
+    for name in per:
+        if name not in axes:
+            known = ", ".join(axes) or "none"
+            raise StoreError(f"--per {name}: no axis of the scene{nearest(name, axes)}; there are "
+                             f"{known}")
+    if results["estimate"].size == 0:
+        raise StoreError(f"{url}: there are no results")
+    fidelity = None
+    if "renderer" in axes:
+        if "renderer" in per:
+            raise StoreError("--per renderer: renderers are compared with exact in any case")
+        names = [str(name) for name in results["renderer"].values.tolist()]
+        if REFERENCE not in names:
+            raise StoreError(f"{url}: renderers are compared with {REFERENCE}, which is not there")
+        fidelity = _fidelity(pipeline, results, names, limit_s / 4)
+        write_group(store, "cost/renderers", fidelity)
+        pipeline = fixed_at(pipeline, {"renderer": REFERENCE})
+        results = results.sel(renderer=REFERENCE, drop=True)
+    trade = _trade(pipeline, results, per, limit_s)
+    write_group(store, "cost/tradeoff", trade)
+    return trade, fidelity
+
+
+def _trade(
+    pipeline: Pipeline, results: xr.Dataset, per: Sequence[str], limit_s: float
+) -> xr.Dataset:
+    settings = [
+        axis.name for stage in (Stage.detection, Stage.estimation)
+        for axis in pipeline.axes_of(stage)
+    ]
+    found = xr.merge(
+        [
+            summarise(results, settings, per),
+            efficiency(results, settings, per),
+            covariance_trust(
+                results, settings, per, scale=_corner_noise_scale(pipeline, results, per)
+            ),
+            _bound(results, per),
+        ],
+        compat="no_conflicts", join="exact",
+    )
+    trade = _flattened(found, pipeline, settings)
+    lengths = [results.sizes[name] for name in per]
+    regimes = list(np.ndindex(*lengths))
+    costs = measure(
+        pipeline,
+        [sample_cells(pipeline, dict(zip(per, regime, strict=True)), len(regimes))
+         for regime in regimes],
+        limit_s,
+    )
+    treatments = trade.sizes["treatment"]
+
+    def add(name: str, meaning: str, unit: str, interval: tuple[Any, Any, Any]) -> None:
+        for ending, values in zip(("", "_low", "_high"), interval, strict=True):
+            shaped = np.asarray(values).reshape(*lengths, treatments)
+            trade[name + ending] = ((*per, "treatment"), shaped, {
+                "long_name": meaning + {"": "", "_low": ", lower end of the 95 % interval",
+                                        "_high": ", upper end of the 95 % interval"}[ending],
+                "units": unit,
+            })
+
+    total = costs.total
+    add("cost_ms", "detection and estimation of a frame", "ms", median_interval(1e3 * total))
+    add("cost_ratio", "cost over the baseline's", "1", median_interval(costs.ratio))
+    each = np.broadcast_to(costs.detection[..., None], total.shape)
+    add("detection_ms", "detection of a frame", "ms", median_interval(1e3 * each))
+    add("estimation_ms", "estimation of a frame", "ms", median_interval(1e3 * costs.estimation))
+    whole = pipeline.any_value("window", lambda value: value == "full")
+    trade.attrs = {
+        "title": pipeline.title or pipeline.name,
+        "poses": pipeline.size(Stage.scene),
+        "window": "full" if whole else "auto",
+        "baseline": str(trade["treatment"].values[0]),
+        "rounds": len(total),
+        "frames": int(costs.frames.sum()),
+        "covariance": "of the solvers with the corners' noise as it was measured in each regime; "
+                      "of photometric from its likelihood",
+    }
+    return trade
+
+
+def _label(name: str, value: Any) -> str:
+    return value if isinstance(value, str) else f"{name} {value}"
+
+
+def _flattened(found: xr.Dataset, pipeline: Pipeline, settings: Sequence[str]) -> xr.Dataset:
+    """Return a dataset whose dimensions of settings are one, ``treatment``, with labels."""
+    axes = [
+        axis for stage in (Stage.detection, Stage.estimation) for axis in pipeline.axes_of(stage)
+    ]
+    labels = [
+        " · ".join(_label(name, value) for name, value in chosen.items()) or "as set"
+        for chosen in combinations(axes)
+    ]
+    if not settings:
+        return found.expand_dims(treatment=labels)
+    flat = found.stack(treatment=list(settings), create_index=False)
+    return flat.assign_coords(treatment=("treatment", labels))
+
+
+def _bound(results: xr.Dataset, per: Sequence[str]) -> xr.Dataset:
+    """Return the RMS bound of rotation and range over the poses that have one."""
+    bound = results["bound_std"].astype(np.float64).load()
+    over = [dim for dim in bound.dims if dim not in (*per, "pose_parameter")]
+    turns = bound.sel(pose_parameter=[f"rotation_{axis}" for axis in "xyz"])
+    turn = (turns**2).sum("pose_parameter", skipna=False).mean(over) ** 0.5
+    depth = bound.sel(pose_parameter="translation_z", drop=True) / results["true_tvec_m"].sel(
+        xyz="z", drop=True
+    ).load()
+    shift = (depth**2).mean(over) ** 0.5
+    return xr.Dataset(
+        {
+            "bound_rotation_deg": (turn * (180 / np.pi)).assign_attrs(
+                long_name="RMS bound of the rotation error", units="degree"),
+            "bound_range_percent": (100 * shift).assign_attrs(
+                long_name="RMS bound of the depth error, of the true depth", units="percent"),
+        }
+    )
+
+
+def _corner_noise_scale(
+    pipeline: Pipeline, results: xr.Dataset, per: Sequence[str]
+) -> xr.DataArray:
+    """Return what turns squared deviations under the assumed corner noise into the measured one's.
+
+    1 for estimators that make their covariance of something else.
+    """
+    error = results["corner_error_px"].astype(np.float64)
+    searched = [axis.name for axis in pipeline.axes_of(Stage.detection)]
+    over = [dim for dim in error.dims if dim not in (*per, *searched)]
+    measured = (error**2).mean(over).compute()
+    axes = pipeline.axes_of(Stage.estimation)
+    assumed = np.array(
+        [
+            np.nan if one.corner_noise_px is None else one.corner_noise_px
+            for one in estimators(pipeline)
+        ]
+    )
+    other = np.array([one.solver == "photometric" for one in estimators(pipeline)])
+    shape = [len(axis) for axis in axes]
+    names = [axis.name for axis in axes]
+
+    def over_estimators(values: NDArray[Any]) -> xr.DataArray:
+        return xr.DataArray(values.reshape(shape), dims=names,
+                            coords={name: results[name] for name in names})
+
+    scale = over_estimators(assumed) ** 2 / measured
+    return scale.where(~over_estimators(other), 1.0)
+
+
+def _fidelity(
+    pipeline: Pipeline, results: xr.Dataset, names: Sequence[str], limit_s: float
+) -> xr.Dataset:
+    """Return what each renderer costs, and what it changes against exact images."""
+    samples = [
+        sample_cells(pipeline, {"renderer": number}, len(names)) for number in range(len(names))
+    ]
+    seconds, errors = measure_renderers(pipeline, samples, names.index(REFERENCE), limit_s)
+    changed = renderer_bias(results, REFERENCE)
+    at = names.index(REFERENCE)
+    for name, meaning, unit, interval in (
+        ("render_ms", "rendering of an image", "ms", median_interval(1e3 * seconds)),
+        ("render_ratio", "cost over that of exact", "1",
+         median_interval(seconds / seconds[:, at : at + 1])),
+    ):
+        for ending, values in zip(("", "_low", "_high"), interval, strict=True):
+            changed[name + ending] = ("renderer", values, {"long_name": meaning, "units": unit})
+    for name, meaning, values in (
+        ("grey_rms", "RMS difference of the marker's pixels from the exact image's", errors[0]),
+        ("grey_max", "largest difference from the exact image", errors[1]),
+    ):
+        changed[name] = ("renderer", values, {"long_name": meaning, "units": "grey level"})
+    changed.attrs = {"title": pipeline.title or pipeline.name, "reference": REFERENCE}
+    return changed

@@ -1,0 +1,650 @@
+"""Summaries of errors against plain loops, and their intervals against simulated coverage."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import xarray as xr
+from conftest import lengths
+from scipy import stats
+
+from sweep.analysis.error_summaries import (
+    covariance_trust,
+    efficiency,
+    renderer_bias,
+    summarise,
+)
+from sweep.errors import StoreError
+from sweep.measure.flags import Detection, Estimate, Flipped
+
+INNER = {"corner": 4, "xy": 2, "xyz": 3, "pose_parameter": 6}
+LABELS = {
+    "xyz": ["x", "y", "z"],
+    "pose_parameter": [f"{kind}_{axis}" for kind in ("rotation", "translation") for axis in "xyz"],
+}
+SCENE = {"distance_m": 2, "marker_id": 3, "trial": 5}
+DETECTOR = {"refinement": 2}
+ESTIMATOR = {"solver": 2}
+
+
+def dataset(scene, detector, estimator, **arrays):
+    """Return a dataset of ``name=(dimensions, values)``, with coordinates."""
+    sizes = scene | detector | estimator
+    coordinates = {name: 10.0 * np.arange(size) for name, size in sizes.items()}
+    return xr.Dataset(arrays, coordinates | LABELS)
+
+
+def measured(
+    rng, scene=SCENE, detector=DETECTOR, estimator=ESTIMATOR, *, rotation=None, relative=None
+):
+    """Return a dataset whose poses are all solved, of the given errors (..., xyz) and (...)."""
+    sizes = scene | detector | estimator
+    detected, estimated = tuple(scene) + tuple(detector), tuple(sizes)
+    shape = tuple(sizes.values())
+    depth = rng.uniform(0.5, 2.0, tuple(scene.values()))
+    if rotation is None:
+        rotation = rng.normal(0.001, 0.01, (*shape, 3))
+    if relative is None:
+        relative = rng.normal(0.001, 0.01, shape)
+    error = np.zeros((*shape, 3))
+    error[..., 2] = relative * depth.reshape(depth.shape + (1,) * (len(shape) - depth.ndim))
+    truth = np.stack([depth, depth, depth], axis=-1) * [0.1, 0.2, 1.0]
+    return dataset(
+        scene, detector, estimator,
+        true_tvec_m=((*scene, "xyz"), truth),
+        detection=(detected, np.full(shape[: len(detected)], Detection.detected, np.uint8)),
+        corner_error_px=((*detected, "corner", "xy"),
+                         rng.normal(0, 0.1, (*shape[: len(detected)], 4, 2)).astype("f4")),
+        estimate=(estimated, np.full(shape, Estimate.solved, np.uint8)),
+        flipped=(estimated, np.full(shape, Flipped.not_flipped, np.uint8)),
+        rotation_error_rad=((*estimated, "xyz"), rotation),
+        translation_error_m=((*estimated, "xyz"), error),
+        nees=(estimated, rng.chisquare(6, shape)),
+        bound_std=((*scene, "pose_parameter"), rng.uniform(0.001, 0.01, (*depth.shape, 6))),
+    )
+
+
+def with_flags_of_every_kind(rng, results):
+    """Return the dataset with poses that went wrong in every way, mostly detected and solved."""
+    out = results.copy(deep=True)
+    kinds = [Detection.detected] * 12 + list(Detection)
+    out["detection"].values[...] = rng.choice(kinds, results["detection"].shape)
+    seen, _ = xr.broadcast(out["detection"], out["estimate"])
+    seen = seen.transpose(*out["estimate"].dims).values
+    solved = rng.choice([Estimate.solved] * 8 + list(Estimate), seen.shape)
+    estimate = np.where(seen == Detection.detected, solved, Estimate.no_detection)
+    estimate[seen == Detection.not_run] = Estimate.not_run
+    out["estimate"].values[...] = estimate
+    mirrored = rng.choice([Flipped.not_flipped] * 4 + [Flipped.flipped], seen.shape)
+    out["flipped"].values[...] = np.where(
+        estimate == Estimate.solved, mirrored, Flipped.no_estimate
+    )
+    out["corner_error_px"] = out["corner_error_px"].where(out["detection"] == Detection.detected)
+    for name in ("rotation_error_rad", "translation_error_m", "nees"):
+        out[name] = out[name].where(out["estimate"] == Estimate.solved)
+    out["nees"] = out["nees"].where(out["nees"] > 3)
+    out["bound_std"] = out["bound_std"].where(out["bound_std"].isel(pose_parameter=0) > 0.003)
+    return out
+
+
+def poses(results, **kept):
+    """Yield each pose as a dictionary of its values and axes, by plain loops."""
+    axes = {
+        name: range(size) for name, size in results.sizes.items()
+        if name not in INNER and name not in kept
+    }
+    arrays = {name: (array.dims, array.values) for name, array in results.data_vars.items()}
+    for index in itertools.product(*axes.values()):
+        at = dict(zip(axes, index, strict=True)) | kept
+        yield at | {
+            name: values[tuple(at[dim] for dim in dims if dim not in INNER)]
+            for name, (dims, values) in arrays.items()
+        }
+
+
+def looked_for(pose):
+    return pose["detection"] not in {
+        Detection.not_run, Detection.not_visible, Detection.not_modelled
+    }
+
+
+def is_solved(pose):
+    return pose["estimate"] == Estimate.solved
+
+
+def is_unflipped(pose):
+    return is_solved(pose) and pose["flipped"] == Flipped.not_flipped
+
+
+def percent(pose):
+    return 100 * float(pose["translation_error_m"][2]) / float(pose["true_tvec_m"][2])
+
+
+def degrees(pose):
+    return math.degrees(math.hypot(*pose["rotation_error_rad"].tolist()))
+
+
+def rms(values):
+    return math.sqrt(math.fsum(value**2 for value in values) / len(values))
+
+
+def quantile(values, share):
+    """Return the smallest value with at least ``share`` per cent at or below."""
+    return next(value for value in sorted(values)
+                if sum(other <= value for other in values) * 100 >= share * len(values))
+
+
+def expected_summary(found):
+    """Return the variables without intervals of a list of poses."""
+    aimed = [pose for pose in found if looked_for(pose)]
+    solved = [pose for pose in aimed if is_solved(pose)]
+    unflipped = [pose for pose in solved if is_unflipped(pose)]
+    out = {
+        "looked_for": len(aimed),
+        "detection_rate": sum(p["detection"] == Detection.detected for p in aimed) / len(aimed),
+        "solved_rate": len(solved) / len(aimed),
+        "flip_rate": (len(solved) - len(unflipped)) / len(solved),
+        "rotation_bias_deg": math.degrees(math.hypot(
+            *(math.fsum(p["rotation_error_rad"][k] for p in unflipped) / len(unflipped)
+              for k in range(3)))),
+        "range_bias_percent": math.fsum(map(percent, unflipped)) / len(unflipped),
+    }
+    for error, name, unit in ((degrees, "rotation", "deg"), (percent, "range", "percent")):
+        out[f"{name}_rmse_{unit}"] = rms([error(pose) for pose in solved])
+        out[f"{name}_rmse_unflipped_{unit}"] = rms([error(pose) for pose in unflipped])
+        errors = [abs(error(pose)) if is_solved(pose) else math.inf for pose in aimed]
+        for label, share in (("median", 50), ("p95", 95), ("p99", 99)):
+            out[f"{name}_{label}_{unit}"] = quantile(errors, share)
+    return out
+
+
+@pytest.fixture(scope="module")
+def mixed():
+    rng = np.random.default_rng(1)
+    return with_flags_of_every_kind(rng, measured(rng))
+
+
+# Values.
+
+@pytest.mark.parametrize(("per", "treatments"), [
+    (("distance_m",), ("refinement", "solver")), ((), ()), (("marker_id", "distance_m"), ()),
+    ((), ("solver", "refinement")),
+])
+def test_every_summary_is_that_of_plain_loops_over_the_poses(mixed, per, treatments):
+    summary = summarise(mixed, treatments, per)
+    kept = (*per, *treatments)
+    assert tuple(summary["looked_for"].dims) == kept
+    for index in np.ndindex(*(mixed.sizes[name] for name in kept)):
+        at = dict(zip(kept, index, strict=True))
+        for name, value in expected_summary(list(poses(mixed, **at))).items():
+            assert summary[name].isel(at).item() == pytest.approx(value, rel=1e-12), name
+
+
+def test_every_value_lies_in_its_interval_and_is_described(mixed):
+    tables = [
+        summarise(mixed, ["solver"], ["distance_m"]), efficiency(mixed, ["solver"]),
+        covariance_trust(mixed, ["solver"]),
+        renderer_bias(mixed.rename(marker_id="renderer"), reference="10.0"),
+    ]
+    for table in tables:
+        for name, array in table.data_vars.items():
+            assert array.attrs["long_name"]
+            assert array.attrs["units"]
+            if f"{name}_low" in table:
+                assert not (table[f"{name}_low"] > array).any(), name
+                assert not (table[f"{name}_high"] < array).any(), name
+                assert table[f"{name}_low"].attrs["units"] == array.attrs["units"]
+    assert tables[0]["distance_m"].values.tolist() == [0.0, 10.0]
+    assert tables[0]["range_p95_percent_low"].attrs["long_name"].startswith("lower end of the 95 %")
+
+
+def test_lazy_arrays_give_the_same(mixed):
+    for function in (summarise, efficiency, covariance_trust):
+        xr.testing.assert_identical(
+            function(mixed.chunk(trial=2), ["solver"]), function(mixed, ["solver"])
+        )
+
+
+def test_a_share_that_was_not_solved_makes_quantiles_infinite():
+    rng = np.random.default_rng(2)
+    results = measured(rng, {"trial": 100}, {}, {})
+    results["estimate"].values[:3] = Estimate.no_detection
+    results["detection"].values[:3] = Detection.rejected
+    summary = summarise(results, [])
+    assert np.isfinite(summary["rotation_p95_deg"])
+    assert summary["rotation_p95_deg_high"] == np.inf
+    assert summary["rotation_p99_deg"] == np.inf
+    assert summary["range_p99_percent"] == np.inf
+
+
+def test_nothing_seen_says_nothing():
+    results = measured(np.random.default_rng(3))
+    results["detection"].values[...] = Detection.not_visible
+    results["estimate"].values[...] = Estimate.no_detection
+    summary = summarise(results, ["solver"])
+    assert (summary["looked_for"] == 0).all()
+    assert all(array.isnull().all() for name, array in summary.items() if name != "looked_for")
+    assert all(array.isnull().all() for array in efficiency(results, []).values())
+    assert not covariance_trust(results, [])["covariance_trusted"]
+
+
+@pytest.mark.parametrize("function", [summarise, efficiency, covariance_trust])
+def test_a_dimension_that_is_not_there_is_told_in_one_line(mixed, function):
+    there = "there are distance_m, marker_id, trial, refinement, solver"
+    for treatments, per in ((["solverr"], []), ([], ["solverr"]), (["xyz"], [])):
+        with pytest.raises(StoreError, match=there) as refused:
+            function(mixed, treatments, per)
+        assert "\n" not in str(refused.value)
+
+
+# Intervals of means, against the formulas in plain loops.
+
+def stratified(cells):
+    """Return mean, standard error and Welch's degrees of freedom of a list of cells' values."""
+    n = sum(map(len, cells))
+    terms = [len(cell) * np.var(cell, ddof=1) for cell in cells]
+    freedom = sum(terms) ** 2 / sum(
+        term**2 / (len(cell) + 1) for term, cell in zip(terms, cells, strict=True)
+    ) - 2
+    return (sum(map(sum, cells)) / n, math.sqrt(sum(terms)) / n,
+            min(freedom, n - len(cells)))
+
+
+def in_cells(results, value, trials, **kept):
+    """Return the values of all poses, a list for each marker and distance."""
+    cells = {}
+    for pose in poses(results, **kept):
+        if pose["trial"] in trials:
+            cells.setdefault((pose["distance_m"], pose["marker_id"]), []).append(value(pose))
+    return list(cells.values())
+
+
+def test_intervals_of_means_have_the_variance_within_cells():
+    results = measured(np.random.default_rng(4))
+    summary = summarise(results, ["refinement", "solver"])
+    for i, j in itertools.product(range(2), range(2)):
+        told = summary.isel(refinement=i, solver=j)
+        cells = in_cells(results, percent, range(5), refinement=i, solver=j)
+        mean, error, freedom = stratified(cells)
+        ends = mean + error * stats.t.ppf([0.025, 0.975], freedom)
+        assert told["range_bias_percent_low"].item() == pytest.approx(ends[0], rel=1e-9)
+        assert told["range_bias_percent_high"].item() == pytest.approx(ends[1], rel=1e-9)
+        squares = [[value**2 for value in cell] for cell in cells]
+        mean, error, freedom = stratified(squares)
+        ends = np.sqrt(mean * np.exp(error / mean * stats.t.ppf([0.025, 0.975], freedom)))
+        assert told["range_rmse_percent_low"].item() == pytest.approx(ends[0], rel=1e-9)
+        assert told["range_rmse_percent_high"].item() == pytest.approx(ends[1], rel=1e-9)
+
+
+def test_the_rotation_bias_ends_at_students_and_scheffes_distance():
+    results = measured(np.random.default_rng(18))
+    told = summarise(results, ["refinement", "solver"]).isel(refinement=1, solver=0)
+    cells = in_cells(results, lambda pose: np.degrees(pose["rotation_error_rad"]), range(5),
+                     refinement=1, solver=0)
+    centre = np.concatenate(cells).mean(axis=0)
+    along = [[vector @ centre / np.linalg.norm(centre) for vector in cell] for cell in cells]
+    mean, error, freedom = stratified(along)
+    low = mean - error * math.sqrt(3 * freedom / (freedom - 2) * stats.f.ppf(0.95, 3, freedom - 2))
+    high = mean + error * stats.t.ppf(0.975, freedom)
+    assert told["rotation_bias_deg_low"].item() == pytest.approx(max(low, 0), rel=1e-9)
+    assert told["rotation_bias_deg_high"].item() == pytest.approx(high, rel=1e-9)
+
+
+def test_a_cell_with_a_single_draw_gets_the_pooled_variance():
+    results = measured(np.random.default_rng(5), {"marker_id": 3, "trial": 4}, {}, {})
+    results["detection"].values[0, 1:] = Detection.not_run
+    results["estimate"].values[0, 1:] = Estimate.not_run
+    cells = [[percent(pose) for pose in poses(results, marker_id=k)] for k in range(3)]
+    alone = cells[0][:1]
+    mean, error, freedom = stratified(cells[1:])
+    pooled = np.mean([np.var(cell, ddof=1) for cell in cells[1:]])
+    mean = (8 * mean + alone[0]) / 9
+    half = math.sqrt((8 * error) ** 2 + pooled) / 9 * stats.t.ppf(0.975, freedom)
+    summary = summarise(results, [])
+    assert summary["range_bias_percent"].item() == pytest.approx(mean, rel=1e-12)
+    assert summary["range_bias_percent_high"].item() == pytest.approx(mean + half, rel=1e-9)
+
+
+@pytest.mark.parametrize("how", ["no trial", "one trial", "one pose a cell", "trial kept"])
+def test_where_nothing_was_drawn_there_is_no_interval(mixed, how):
+    kept = ["trial"] if how == "trial kept" else []
+    if how == "no trial":
+        results = mixed.isel(trial=0, drop=True)
+    elif how == "one trial":
+        results = mixed.isel(trial=[0])
+    else:
+        results = mixed.copy(deep=True)
+    if how == "one pose a cell":
+        results["detection"].values[:, :, 1:] = Detection.not_run
+        results["estimate"].values[:, :, 1:] = Estimate.not_run
+    tables = (summarise(results, ["solver"], kept), efficiency(results, ["solver"], kept),
+              covariance_trust(results, ["solver"], kept))
+    for table in tables:
+        ends = [name for name in table if name.endswith(("_low", "_high"))]
+        assert ends
+        assert all(table[name].isnull().all() for name in ends)
+    if how == "one trial":
+        expected = expected_summary(list(poses(results, solver=1)))
+        for name, value in expected.items():
+            assert tables[0][name][1].item() == pytest.approx(value, rel=1e-12), name
+
+
+def test_rates_have_wilsons_interval(mixed):
+    told = summarise(mixed, ["refinement", "solver"]).isel(refinement=1, solver=1)
+    found = [pose for pose in poses(mixed, refinement=1, solver=1) if looked_for(pose)]
+    solved = [pose for pose in found if is_solved(pose)]
+    for name, of, hits in (
+        ("detection_rate", found, sum(p["detection"] == Detection.detected for p in found)),
+        ("solved_rate", found, len(solved)),
+        ("flip_rate", solved, len(solved) - sum(map(is_unflipped, solved))),
+    ):
+        ends = stats.binomtest(hits, len(of)).proportion_ci(method="wilson")
+        assert told[f"{name}_low"].item() == pytest.approx(ends.low, rel=1e-9)
+        assert told[f"{name}_high"].item() == pytest.approx(ends.high, rel=1e-9)
+
+
+@pytest.mark.parametrize("n", [2, 5, 6, 50, 72, 73, 367, 368, 1000])
+def test_quantiles_have_the_binomial_interval_of_order_statistics(n):
+    results = measured(np.random.default_rng(6), {"trial": n}, {}, {})
+    told = summarise(results, [])
+    values = np.array([degrees(pose) for pose in poses(results)])
+    for name, p in (("median", 0.5), ("p95", 0.95), ("p99", 0.99)):
+        ends = stats.quantile_test(values, p=p).confidence_interval(0.95)
+        for end, value in (("low", ends.low), ("high", ends.high)):
+            assert told[f"rotation_{name}_deg_{end}"].item() == pytest.approx(
+                value, rel=1e-12, nan_ok=True)
+
+
+def test_settings_that_are_pooled_see_the_same_draws_and_add_no_certainty(mixed):
+    rng = np.random.default_rng(7)
+    one = with_flags_of_every_kind(rng, measured(rng, detector={}, estimator={}))
+    many = xr.concat([one] * 3, dim="solver", data_vars=["estimate", "flipped", "nees",
+                     "rotation_error_rad", "translation_error_m"]).transpose("distance_m", ...)
+    for function in (summarise, covariance_trust, efficiency):
+        alone, pooled = function(one, []), function(many, [])
+        for name in alone:
+            if alone[name].dtype == int:
+                assert pooled[name] == 3 * alone[name]
+            else:
+                np.testing.assert_allclose(pooled[name], alone[name], rtol=1e-12)
+    assert (summarise(mixed, [])["solved_rate_high"] < 1).all()
+
+
+# Coverage: each replicate is a regime of its own.
+
+def covered(table, name, truth):
+    return int(((table[f"{name}_low"] <= truth) & (truth <= table[f"{name}_high"])).sum())
+
+
+def assert_coverage(count, n, least=0.93, most=0.97):
+    """Fail a coverage within the limits with a probability below 1e-6; long counts, by itself."""
+    print(f"coverage {count / n:.4f} of {n}")
+    assert stats.binom.cdf(count, n, least) > 5e-7
+    assert stats.binom.sf(count - 1, n, most) > 5e-7
+
+
+TAILS = {
+    "normal": (lambda rng, shape: rng.normal(size=shape), 1.0),
+    "uniform": (lambda rng, shape: rng.uniform(-1, 1, shape), 1 / 3),
+}
+
+
+@lengths(60, 10_000)
+@pytest.mark.parametrize(("cells", "trials"), [(1, 50), (5, 10), (25, 2), (4, 50)])
+@pytest.mark.parametrize("tails", TAILS)
+def test_means_and_rmse_of_light_tails_are_covered(tails, cells, trials, count):
+    # Chance of a false alarm: below 1e-6 for each of the four, for a coverage of 0.93 to 0.97.
+    rng = np.random.default_rng([8, cells])
+    draw, variance = TAILS[tails]
+    offsets = np.linspace(-1, 1, cells)[:, None]  # the cells differ, as on a grid
+    shape = (count, cells, trials)
+    rotation = 0.01 * (draw(rng, (*shape, 3)) + np.array([30.0, 0.0, 0.0]))
+    results = measured(
+        rng, {"regime": count, "marker_id": cells, "trial": trials}, {}, {},
+        relative=0.01 * (draw(rng, shape) + offsets), rotation=rotation,
+    )
+    summary = summarise(results, [], ["regime"])
+    assert_coverage(covered(summary, "range_bias_percent", offsets.mean()), count)
+    mean_square = variance + (offsets**2).mean()
+    assert_coverage(covered(summary, "range_rmse_percent", math.sqrt(mean_square)), count)
+    square = math.degrees(0.01) ** 2 * (900 + 3 * variance)
+    assert_coverage(covered(summary, "rotation_rmse_deg", math.sqrt(square)), count)
+    bias = covered(summary, "rotation_bias_deg", math.degrees(0.3))
+    assert_coverage(bias, count, 0.95, 0.995)
+
+
+@lengths(60, 10_000)
+@pytest.mark.parametrize("bias", [0.0, 0.1, 0.4])
+def test_a_rotation_bias_is_covered_be_it_nothing_or_small(bias, count):
+    # Chance of a false alarm below 1e-6, for a coverage of 0.94 to 1.
+    rng = np.random.default_rng(9)
+    rotation = rng.normal(size=(count, 5, 10, 3)) * [1.0, 0.3, 2.0] + [0.6 * bias, 0.0, 0.8 * bias]
+    results = measured(
+        rng, {"regime": count, "marker_id": 5, "trial": 10}, {}, {}, rotation=0.01 * rotation
+    )
+    summary = summarise(results, [], ["regime"])
+    hit = covered(summary, "rotation_bias_deg", math.degrees(0.01 * bias) - 1e-12)
+    hit = hit if bias else int((summary["rotation_bias_deg_low"] == 0).sum())
+    assert_coverage(hit, count, 0.94, 1.0)
+
+
+@lengths(60, 10_000)
+def test_misses_at_random_widen_what_cells_of_other_means_leave_unsure(count):
+    # Chance of a false alarm below 1e-6, for a coverage of 0.93 to 0.97.
+    rng = np.random.default_rng(10)
+    shape = (count, 4, 25)
+    offsets, chances = np.array([-2.0, 0.0, 0.0, 3.0]), np.array([0.3, 0.9, 0.5, 0.6])
+    results = measured(
+        rng, {"regime": count, "marker_id": 4, "trial": 25}, {}, {},
+        relative=0.01 * (rng.normal(size=shape) + offsets[:, None]),
+    )
+    missed = rng.random(shape) > chances[:, None]
+    results["detection"].values[missed] = Detection.no_candidate
+    results["estimate"].values[missed] = Estimate.no_detection
+    summary = summarise(results, [], ["regime"])
+    mean = (offsets * chances).sum() / chances.sum()
+    mean_square = ((offsets**2 + 1) * chances).sum() / chances.sum()
+    assert_coverage(covered(summary, "range_bias_percent", mean), count)
+    assert_coverage(covered(summary, "range_rmse_percent", math.sqrt(mean_square)), count)
+    assert_coverage(covered(summary, "solved_rate", chances.mean()), count, 0.95, 0.99)
+
+
+@lengths(60, 10_000)
+def test_intervals_of_quantiles_cover_at_least_what_they_say(count):
+    # Chance of a false alarm below 1e-6, for a coverage of 0.95 to 1.
+    rng = np.random.default_rng(11)
+    n, half = 400, 0.5  # p99 needs 368
+    shape = (count, 2, n // 2)
+    results = measured(
+        rng, {"regime": count, "marker_id": 2, "trial": n // 2}, {}, {},
+        relative=rng.random(shape) * np.array([half, 1.0])[:, None] / 100,
+    )
+    summary = summarise(results, [], ["regime"])
+    for name, share in (("median", 0.5), ("p95", 0.95), ("p99", 0.99)):
+        # Half of the values are uniform on [0, 1/2], half on [0, 1].
+        truth = share / 1.5 if share <= 0.75 else 2 * share - 1
+        assert_coverage(covered(summary, f"range_{name}_percent", truth), count, 0.95, 1.0)
+
+
+# Efficiency.
+
+def test_efficiency_is_that_of_plain_loops(mixed):
+    told = efficiency(mixed, ["solver"], ["distance_m"])
+    for i, j in itertools.product(range(2), range(2)):
+        found = [pose for pose in poses(mixed, distance_m=i, solver=j)
+                 if is_unflipped(pose) and not np.isnan(pose["bound_std"]).any()]
+        rotation = rms([rms(p["bound_std"][:3].tolist()) * math.sqrt(3) for p in found]) / rms(
+            [math.radians(degrees(p)) for p in found])
+        depth = rms([p["bound_std"][5] / p["true_tvec_m"][2] for p in found]) / rms(
+            [percent(p) / 100 for p in found])
+        told_here = told.isel(distance_m=i, solver=j)
+        assert told_here["rotation_efficiency"].item() == pytest.approx(rotation, rel=1e-12)
+        assert told_here["range_efficiency"].item() == pytest.approx(depth, rel=1e-12)
+
+
+@lengths(60, 10_000)
+def test_on_the_bound_the_interval_holds_one(count):
+    # Chance of a false alarm below 1e-6, for a coverage of 0.93 to 0.97.
+    rng = np.random.default_rng(12)
+    scene = {"regime": count, "marker_id": 5, "trial": 60}  # one cell can make most of the error
+    results = measured(rng, scene, {}, {})
+    results["bound_std"].values[...] = results["bound_std"].values[:1, :, :1]
+    bound = results["bound_std"].values
+    results["rotation_error_rad"].values[...] = rng.normal(size=(*bound.shape[:3], 3)) * (
+        bound[..., :3])
+    results["translation_error_m"].values[..., 2] = rng.normal(size=bound.shape[:3]) * (
+        bound[..., 5])
+    results["true_tvec_m"].values[...] = 1.0 + np.arange(5)[:, None, None]
+    told = efficiency(results, [], ["regime"])
+    assert_coverage(covered(told, "rotation_efficiency", 1.0), count)
+    assert_coverage(covered(told, "range_efficiency", 1.0), count)
+
+
+def test_without_a_bound_there_is_no_efficiency(mixed):
+    nothing = mixed.assign(bound_std=mixed["bound_std"] * np.nan)
+    for results in (mixed.drop_vars(["bound_std", "pose_parameter"]), nothing):
+        told = efficiency(results, ["solver"])
+        assert told["rotation_efficiency"].dims == ("solver",)
+        assert all(array.isnull().all() for array in told.values())
+
+
+def test_no_error_at_all_is_infinitely_efficient():
+    told = efficiency(measured(np.random.default_rng(13), relative=0.0, rotation=np.zeros(
+        (2, 3, 5, 2, 2, 3))), [])
+    assert told["range_efficiency"] == np.inf
+    assert told["rotation_efficiency_low"] == np.inf
+
+
+# Covariances.
+
+def test_true_covariances_are_trusted_and_others_are_not():
+    rng = np.random.default_rng(14)
+    results = measured(rng, {"marker_id": 5, "trial": 400}, {}, {"solver": 3})
+    results["nees"].values[..., 1] *= 1.5
+    results["nees"].values[..., 2] *= 0.6
+    told = covariance_trust(results, ["solver"])
+    assert told["covariance_trusted"].values.tolist() == [True, False, False]
+    assert told["nees_count"].values.tolist() == [2000] * 3
+    assert told["nees_mean_low"][0] < 6 < told["nees_mean_high"][0]
+    assert told["nees_mean_low"][1] > 6 > told["nees_mean_high"][2]
+    assert told["covariance_coverage"].dims == ("solver", "level")
+    assert told["level"].values.tolist() == [0.5, 0.9, 0.99]
+    for k, level in enumerate((0.5, 0.9, 0.99)):
+        hits = int((results["nees"].values[..., 1] <= stats.chi2.ppf(level, 6)).sum())
+        ends = stats.binomtest(hits, 2000).proportion_ci(method="wilson")
+        coverage = told["covariance_coverage"].values[1, k]
+        assert coverage == pytest.approx(hits / 2000)
+        assert told["covariance_coverage_low"].values[1, k] == pytest.approx(ends.low)
+    scale = xr.DataArray([1.0, 1 / 1.5, 1 / 0.6], {"solver": results["solver"]}, "solver")
+    mended = covariance_trust(results, ["solver"], scale=scale)
+    assert mended["covariance_trusted"].all()
+    kept = covariance_trust(results, ["solver"], scale=scale[::-1].sortby("solver"))
+    xr.testing.assert_identical(kept, mended)
+    with pytest.raises(ValueError, match="align"):
+        covariance_trust(results, ["solver"], scale=scale[:2])
+    with pytest.raises(StoreError, match="lens: no such dimension"):
+        covariance_trust(results, [], scale=xr.DataArray([1.0], dims="lens"))
+
+
+@pytest.mark.parametrize("n", [49, 50, 200])
+def test_trust_is_an_interval_for_all_levels_together_within_the_tolerance(n):
+    levels, results = (0.5, 0.9, 0.99), measured(np.random.default_rng(17), {"trial": n}, {}, {})
+    trusted = []
+    for within in range(n // 2, n, 1 + n // 100):
+        counts = (n // 2, within, max(within, n - 1))
+        edges = np.searchsorted(counts, np.arange(n), side="right")
+        results["nees"].values[:] = np.array([1.0, 7.0, 12.0, 100.0])[edges]
+        ends = [stats.binomtest(k, n).proportion_ci(1 - 0.05 / 3, "wilson") for k in counts]
+        expected = n >= 50 and all(end.low - 0.02 <= level <= end.high + 0.02
+                                   for end, level in zip(ends, levels, strict=True))
+        assert covariance_trust(results, [])["covariance_trusted"] == expected
+        trusted.append(expected)
+    assert any(trusted) == (n >= 50)
+    assert not all(trusted)
+
+
+def test_flips_cost_the_trust_and_too_few_draws_give_none():
+    rng = np.random.default_rng(15)
+    results = measured(rng, {"marker_id": 5, "trial": 100}, {}, {})
+    assert covariance_trust(results, [])["covariance_trusted"]
+    flipped = results.copy(deep=True)
+    flipped["flipped"].values[:, :10] = Flipped.flipped
+    flipped["nees"].values[:, :10] = 1e4
+    assert not covariance_trust(flipped, [])["covariance_trusted"]
+    few = covariance_trust(results.isel(trial=slice(9)), [])
+    assert few["nees_count"] == 45
+    assert not few["covariance_trusted"]
+    assert covariance_trust(results.isel(trial=slice(10)), [])["nees_count"] == 50
+    none = covariance_trust(results.drop_vars("nees"), [], ["marker_id"])
+    assert not none["covariance_trusted"].any()
+    assert (none["nees_count"] == 0).all()
+    assert none["nees_mean"].isnull().all()
+    infinite = results.copy(deep=True)
+    infinite["nees"].values[0, 0] = np.inf
+    assert covariance_trust(infinite, [])["nees_mean"] == np.inf
+
+
+@pytest.mark.parametrize("levels", [(), (0.5, 1.0), (50,), (math.nan,)])
+def test_a_level_that_is_no_probability_is_refused(mixed, levels):
+    with pytest.raises(ValueError, match="give numbers between 0 and 1"):
+        covariance_trust(mixed, [], levels=levels)
+
+
+# Renderers.
+
+def test_renderers_are_compared_pose_by_pose():
+    rng = np.random.default_rng(16)
+    scene = {"renderer": 3, "marker_id": 8, "trial": 10}
+    results = with_flags_of_every_kind(rng, measured(rng, scene))
+    results["true_tvec_m"].values[...] = results["true_tvec_m"].values[:1]
+    names = ["warp", "exact", "supersample-4"]
+    told = renderer_bias(results.assign_coords(renderer=names))
+    assert told["corner_shift_rms_px"].dims == ("renderer", "refinement")
+    assert told["range_bias_percent"].dims == ("renderer", "refinement", "solver")
+    exact = told.sel(renderer="exact")
+    assert (exact["differing"] == 0).all()
+    assert (exact["rotation_shift_deg_high"] == 0).all()
+    for r, d, s in itertools.product(range(3), range(2), range(2)):
+        pairs = list(zip(poses(results, renderer=r, refinement=d, solver=s),
+                         poses(results, renderer=1, refinement=d, solver=s), strict=True))
+        aimed = [(a, b) for a, b in pairs if looked_for(a) and looked_for(b)]
+        seen = [[p["detection"] == Detection.detected for p in pair] for pair in aimed]
+        shifts = [a["corner_error_px"].astype(float) - b["corner_error_px"]
+                  for (a, b), both in zip(aimed, seen, strict=True) if all(both)]
+        ranges = [percent(a) - percent(b) for a, b in aimed if is_solved(a) and is_solved(b)]
+        turns = [np.degrees(a["rotation_error_rad"] - b["rotation_error_rad"])
+                 for a, b in aimed if is_unflipped(a) and is_unflipped(b)]
+        here = told.isel(renderer=r, refinement=d, solver=s)
+        assert here["compared"] == len(aimed)
+        assert here["differing"] == sum(a != b for a, b in seen)
+        assert here["detection_disagreement"] == sum(a != b for a, b in seen) / len(aimed)
+        assert here["corner_shift_rms_px"].item() == pytest.approx(
+            rms(np.ravel(shifts).tolist()), rel=1e-12)
+        assert here["range_bias_percent"].item() == pytest.approx(
+            math.fsum(ranges) / len(ranges), rel=1e-9, abs=1e-12)
+        assert here["rotation_shift_deg"].item() == pytest.approx(
+            rms([math.hypot(*turn) for turn in turns]), rel=1e-12)
+
+
+def test_what_one_renderer_has_not_run_is_no_draw():
+    results = measured(np.random.default_rng(19), {"renderer": 2, "marker_id": 3, "trial": 9})
+    results["estimate"].values[:, :, ::3] = Estimate.no_detection  # so that draws without count
+    results["detection"].values[:, :, ::3] = Detection.rejected
+    short = renderer_bias(results.isel(trial=slice(5)), reference="0.0")
+    results["detection"].values[0, :, 5:] = Detection.not_run
+    results["estimate"].values[0, :, 5:] = Estimate.not_run
+    results["detection"].values[1, :, 8:] = Detection.not_run
+    results["estimate"].values[1, :, 8:] = Estimate.not_run
+    xr.testing.assert_allclose(renderer_bias(results, reference="0.0"), short, rtol=1e-12)
+    flipped = results.assign_coords(renderer=["b", "a"])
+    assert (renderer_bias(flipped, "a")["range_bias_percent_low"].sel(renderer="b").values
+            == -renderer_bias(flipped, "b")["range_bias_percent_high"].sel(renderer="a")).all()
+
+
+def test_a_renderer_that_is_not_there_is_told(mixed):
+    with pytest.raises(StoreError, match=r"^renderer: no such dimension; there are distance_m"):
+        renderer_bias(mixed)
+    renamed = mixed.isel(marker_id=[0, 1]).assign_coords(marker_id=["warp", "fine"])
+    with pytest.raises(StoreError, match="reference = exact: the renderers are warp, fine"):
+        renderer_bias(renamed.rename(marker_id="renderer"))

@@ -1,0 +1,305 @@
+"""What accuracy costs: the front, the advice, the tables and the figure."""
+
+import itertools
+import json
+import re
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sweep.analysis.pareto import CRITERIA, UNITS, advice, digits, mark_front, pareto_front
+from sweep.report.trade_figure import draw_trade
+from sweep.report.trade_table import WIDEST, as_json, table_markdown, table_text
+
+P95 = "rotation_p95_deg"
+SOLVERS = ("ippe_square", "ippe", "iterative", "sqpnp", "ap3p")
+# Time of detection (ms), error of the corners (px).
+REFINEMENTS = {"none": (0.21, 0.5), "subpix": (0.24, 0.12), "contour": (0.27, 0.16),
+               "apriltag": (0.9, 0.07)}
+
+
+def synthetic(sides=(20, 50, 150), treatments=21):
+    """Return a plausible `trade`: 4 refinements x 5 solvers and a photometric one, by side_px."""
+    rng = np.random.default_rng(5)
+    settings = [(r, s) for r in REFINEMENTS for s in SOLVERS] + [("subpix", "photometric")]
+    settings = settings[-treatments:]
+    side = np.array(sides, dtype=float)[:, None]
+    shape = (len(sides), len(settings))
+    detection = np.array([REFINEMENTS[r][0] for r, _ in settings]) * (1 + side / 200)
+    estimation = np.array([
+        2.4 if s == "photometric" else 0.02 + 0.03 * SOLVERS.index(s) for _, s in settings
+    ]) * np.exp(rng.normal(0, 0.1, shape))
+    pixels = np.array([0.02 if s == "photometric" else REFINEMENTS[r][1] for r, s in settings])
+    error = pixels * 60 / side * np.exp(rng.normal(0, 0.25, shape))
+    misses = np.where((side < 30) & (pixels > 0.1), 0.08, 0.004) * np.ones(shape)
+
+    coords = {
+        "side_px": list(sides),
+        "treatment": [" \u00b7 ".join(pair) for pair in settings],
+        "cornerRefinementMethod": ("treatment", [r for r, _ in settings]),
+        "solver": ("treatment", [s for _, s in settings]),
+        "level": [0.5, 0.9, 0.99],
+    }
+    trade = {}
+    dims = ("side_px", "treatment")
+
+    def add(name, values, spread):
+        trade[name] = dims, values
+        trade[f"{name}_low"] = dims, values / (1 + spread)
+        trade[f"{name}_high"] = dims, values * (1 + spread)
+
+    add("cost_ms", detection + estimation, 0.03)
+    add("cost_ratio", (detection + estimation) / (detection + estimation)[:, :1], 0.02)
+    add("detection_ms", detection, 0.03)
+    add("estimation_ms", estimation, 0.03)
+    add("detection_rate", 1 - misses, 0.01)
+    add("solved_rate", 1 - misses, 0.01)
+    add("flip_rate", misses / 4, 0.3)
+    trade["looked_for"] = dims, np.full(shape, 4000)
+    for quantity, unit in UNITS.items():
+        for name, factor, share in (("bias", 0.1, 1), ("rmse", 1, 1), ("rmse_unflipped", 0.9, 1),
+                                    ("median", 0.7, 0.5), ("p95", 2, 0.05), ("p99", 3, 0.01)):
+            values = np.where(misses > share, np.inf, factor * error)
+            add(f"{quantity}_{name}_{unit}", values, 0.08)
+        trade[f"{quantity}_efficiency"] = dims, 0.015 * 60 / side / error
+        trade[f"bound_{quantity}_{unit}"] = "side_px", 0.03 * 60 / side[:, 0]
+    trade["nees_mean"] = dims, 6 * np.exp(rng.normal(0, 0.2, shape))
+    trade["nees_count"] = dims, np.full(shape, 3900)
+    trade["covariance_trusted"] = dims, rng.random(shape) < 0.7
+    trade["covariance_coverage"] = (
+        (*dims, "level"), rng.normal([0.48, 0.88, 0.985], 0.004, (*shape, 3))
+    )
+    return xr.Dataset(trade, coords, {
+        "title": "What accuracy costs", "poses": 4000, "window": "auto", "criterion": P95,
+        "baseline": coords["treatment"][0],
+    })
+
+
+def one_regime(costs, errors, low=None, high=None):
+    """Return a `trade` of one regime with treatments named 0, 1, ..."""
+    low, high = (np.full(len(costs), np.nan) if end is None else end for end in (low, high))
+    columns = {"cost_ms": costs, P95: errors, f"{P95}_low": low, f"{P95}_high": high,
+               "solved_rate": np.ones(len(costs))}
+    return xr.Dataset(
+        {name: ("treatment", np.asarray(values, dtype=float)) for name, values in columns.items()},
+        coords={"treatment": [str(k) for k in range(len(costs))]},
+    )
+
+
+def named(sentence):
+    """Return the budgets (ms) and the treatments that a sentence names."""
+    pairs = re.findall(r"within ([\d.]+) ms a frame take (\S+) |wait ([\d.]+) ms, (\S+) ", sentence)
+    return [(float(a or c), int(b or d)) for a, b, c, d in pairs]
+
+
+# Few different values, so that ties are common.
+VALUES = st.sampled_from([0.1, 0.12, 0.25, 0.5, 1.0, 2.0, 3.0, np.inf, np.nan]) | st.floats(
+    1e-3, 1e3
+)
+POINTS = st.lists(st.tuples(VALUES, VALUES), min_size=1, max_size=12)
+
+
+# The front.
+
+@given(POINTS)
+def test_the_front_is_what_no_other_point_beats(points):
+    def beats(a, b):
+        return all(np.isfinite(a)) and a[0] <= b[0] and a[1] <= b[1] and a != b
+
+    expected = [
+        all(np.isfinite(one)) and not any(beats(other, one) for other in points) for one in points
+    ]
+    assert pareto_front(*zip(*points, strict=True)).tolist() == expected
+
+
+def test_equal_points_are_both_on_the_front():
+    assert pareto_front([1, 1, 1], [2, 2, 3]).tolist() == [True, True, False]
+
+
+def test_costs_and_errors_must_be_of_one_shape():
+    with pytest.raises(ValueError, match="one shape"):
+        pareto_front([1, 2], [1])
+
+
+@pytest.mark.parametrize("criterion", CRITERIA)
+def test_each_regime_has_its_own_front(criterion):
+    trade = mark_front(synthetic(), criterion)
+    assert trade.on_front.dtype == bool
+    for k in range(3):
+        one = trade.isel(side_px=k)
+        assert (one.on_front == pareto_front(one.cost_ms, one[criterion])).all()
+    assert not (trade.on_front & ~np.isfinite(trade[criterion])).any()
+
+
+# The advice.
+
+@given(POINTS, st.floats(0, 0.5))
+def test_advice_is_true(points, spread):
+    costs, errors = np.array(points).T
+    low, high = errors * (1 - spread), errors * (1 + spread)
+    (sentence,) = advice(one_regime(costs, errors, low, high), P95)
+    steps = named(sentence)
+    if not (np.isfinite(costs) & np.isfinite(errors)).any():
+        assert not steps
+        assert sentence.startswith(f"no treatment has a finite {P95}: ")
+        return
+    assert 1 <= len(steps) <= 3
+    front = pareto_front(costs, errors)
+    assert all(front[k] and costs[k] <= budget <= 1.11 * costs[k] for budget, k in steps)
+    for (budget, k), (next_budget, following) in itertools.pairwise(steps):
+        assert budget < next_budget
+        assert not high[following] >= low[k]
+    last = steps[-1][1]
+    if spread == 0:
+        assert errors[last] == errors[front].min()
+
+
+@pytest.mark.parametrize(
+    ("costs", "errors", "chosen"),
+    [
+        ([0.31, 1.05, 4.0], [1.2, 0.3, 0.2], [(0.31, 0), (1.1, 1), (4.0, 2)]),
+        ([0.31, 1.05, 4.0], [1.2, 1.1, 0.2], [(0.31, 0), (4.0, 2)]),  # no knee
+        ([0.31, 1.05, 4.0], [0.22, 0.205, 0.2], [(0.31, 0), (4.0, 2)]),  # not worth while
+        ([0.311, 0.312, 9.9], [1.2, 0.6, 0.7], [(0.32, 1)]),  # the best of one budget
+        ([123.0], [0.5], [(130.0, 0)]),
+    ],
+)
+def test_at_most_cheapest_knee_and_best_are_named(costs, errors, chosen):
+    assert named(advice(one_regime(costs, errors), P95)[0]) == chosen
+
+
+def test_overlapping_intervals_are_no_step():
+    trade = one_regime([1, 2, 3], [1.0, 0.9, 0.5], [0.9, 0.8, 0.3], [1.1, 1.0, 0.95])
+    (sentence,) = advice(trade, P95)
+    assert sentence == (
+        "within 1.0 ms a frame take 0 (rotation_p95 1.00 deg); "
+        "no dearer one on the front is clearly better"
+    )
+    trade[f"{P95}_high"][2] = np.nan
+    assert named(advice(trade, P95)[0]) == [(1.0, 0), (3.0, 2)]
+
+
+def test_advice_says_why_there_is_none():
+    trade = one_regime([1, 2], [np.inf, np.inf]).expand_dims(side_px=[20])
+    (sentence,) = advice(trade, P95)
+    assert sentence == (
+        f"side_px = 20: no treatment has a finite {P95}: each misses at least 5 % of the poses; "
+        "another --criterion may tell them apart"
+    )
+    assert "none solved enough" in advice(one_regime([1, 2], [np.inf, np.nan]), P95)[0]
+    nothing = trade.assign(solved_rate=0 * trade.solved_rate)
+    assert "none solved any pose" in advice(nothing, P95)[0]
+
+
+def test_an_rmse_is_not_told_without_what_was_solved():
+    (sentence,) = advice(synthetic([20]), "range_rmse_percent")
+    assert sentence.startswith("side_px = 20: within 0.25 ms a frame take none")
+    assert sentence.count("% solved)") == len(sentence.split("; "))
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.31, "0.310"), (99.96, "100"), (999.6, "1000"), (123456, "123000"), (1e7, "1.00e+07"),
+     (-0.01234, "-0.0123"), (0, "0"), (np.inf, "inf"), (np.nan, "-")],
+)
+def test_numbers_have_three_digits(value, text):
+    assert digits(value) == text
+
+
+# Tables, JSON and figures, for one, three and no regimes, and for one treatment.
+
+def spoilt():
+    """Return a `trade` whose criterion is infinite or NaN throughout the first regime."""
+    trade = synthetic([20, 50], treatments=8)
+    for end in ("", "_low", "_high"):
+        trade[f"{P95}{end}"][0] = np.inf
+        trade[f"{P95}{end}"][0, ::2] = np.nan
+    return trade
+
+
+def bare():
+    """Return a `trade` without what may be absent, and without intervals."""
+    trade = synthetic().isel(side_px=1)
+    for name in trade.data_vars:
+        if name.endswith(("_low", "_high")):
+            trade[name] = trade[name] * np.nan
+    return trade.drop_vars([
+        "nees_mean", "nees_count", "covariance_trusted", "covariance_coverage", "level",
+        "rotation_efficiency", "range_efficiency", "bound_rotation_deg", "bound_range_percent",
+        "cornerRefinementMethod", "solver",
+    ])
+
+
+TRADES = pytest.mark.parametrize(
+    "trade",
+    [synthetic(), synthetic([20]), synthetic().isel(side_px=2), synthetic([20], treatments=1),
+     spoilt(), bare()],
+    ids=["three regimes", "one regime", "no regime", "one treatment", "spoilt", "bare"],
+)
+
+
+@TRADES
+def test_tables_have_a_row_for_every_treatment(trade):
+    text, markdown = table_text(trade, P95), table_markdown(trade, P95)
+    assert max(map(len, text.splitlines())) <= WIDEST
+    regimes = trade.sizes.get("side_px", 1)
+    tables = text.count("  treatment")
+    assert tables % regimes == 0
+    front = mark_front(trade, P95).on_front
+    assert text.count("\n* ") == int(front.sum()) * tables // regimes + 1  # and the legend
+    assert markdown.count("| **") == int(front.sum())
+    rows = [line for line in markdown.splitlines() if line.startswith("|")]
+    assert len(rows) == regimes * (trade.sizes["treatment"] + 2)
+    assert len({line.count("|") for line in rows}) == 1
+    assert "nan" not in text + markdown
+
+
+def test_tables_are_sorted_by_cost_and_show_intervals():
+    trade = synthetic([20])
+    text = table_text(trade, P95)
+    order = trade.isel(side_px=0).sortby("cost_ms").treatment.values
+    found = [line[2:].split("  ")[0] for line in text.splitlines() if " \u00b7 " in line]
+    assert found[1:22] == order.tolist()  # behind the baseline's headline
+    one = trade.isel(side_px=0, treatment=-1)
+    for name in ("cost_ms", "cost_ratio", P95):
+        low, value, high = (digits(one[f"{name}{end}"]) for end in ("_low", "", "_high"))
+        assert f"{value} ({low}..{high})" in text
+
+
+@TRADES
+def test_json_holds_everything(trade):
+    content = json.loads(json.dumps(as_json(trade), allow_nan=False))
+    assert content["attrs"] == trade.attrs
+    assert content["data_vars"].keys() | content["coords"].keys() == set(trade.variables)
+
+    def back(value):
+        if isinstance(value, list):
+            return [back(one) for one in value]
+        return {"infinite": np.inf, None: np.nan}.get(value, value)
+
+    for name, variable in trade.variables.items():
+        stored = (content["data_vars"] | content["coords"])[name]
+        assert tuple(stored["dims"]) == variable.dims
+        assert np.array_equal(
+            back(stored["data"]), variable.values, equal_nan=variable.dtype.kind == "f"
+        )
+
+
+@pytest.mark.parametrize(
+    ("trade", "suffix", "start"),
+    [(synthetic(), "png", b"\x89PNG"), (synthetic([20], treatments=1), "svg", b"<?xml"),
+     (spoilt(), "png", b"\x89PNG"), (bare(), "png", b"\x89PNG")],
+    ids=["three regimes", "one treatment", "spoilt", "bare"],
+)
+def test_a_figure_is_written(trade, suffix, start, tmp_path):
+    path = tmp_path / f"trade.{suffix}"
+    draw_trade(trade, P95, path)
+    assert path.read_bytes().startswith(start)
+
+
+def test_a_figure_of_an_unknown_format_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="Format"):
+        draw_trade(synthetic([20], treatments=1), P95, tmp_path / "trade.nonsense")

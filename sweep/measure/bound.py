@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.measure.likelihood import (
+    BACKGROUND_MARGIN_PX,
     FIRST_LEVEL,
+    LEAST_NOISE,
     LEAST_SPREAD_PX,
     SETTLED,
     SPREAD,
@@ -19,8 +21,10 @@ from sweep.measure.likelihood import (
     curvature,
     fit,
     mirrored_state,
+    noise_variance,
     plane_of,
-    solve_positive,
+    pose_covariance,
+    sight_of,
     squares,
     state_of,
     work_space,
@@ -29,22 +33,12 @@ from sweep.model import coverage
 from sweep.model.declaration import parameter
 from sweep.model.derivatives import POSE
 from sweep.model.effects import NEUTRAL
-from sweep.model.marker import MarkerKey, edges, module_count
 from sweep.model.scene import Scenes
 
 Floats = NDArray[np.float64]
 
-LEAST_NOISE = 0.5
-"""Grey levels of noise below which quantisation is no noise of its own, uniform and independent."""
-
 CLIPPING_DEVIATIONS = 2.0
 """Standard deviations that every grey level must keep from the ends of the scale."""
-
-QUANTISATION_VARIANCE = 1 / 12
-"""Variance in squared grey levels that rounding to whole levels adds."""
-
-BACKGROUND_MARGIN_PX = 4
-"""Pixels of background around the marker that tell its level."""
 
 MIRROR_STEPS = 60
 
@@ -109,19 +103,6 @@ class Bounds:
 
 
 @compiled
-def pose_covariance(information: Floats, variance: float, distance: float) -> tuple[Floats, bool]:
-    """Return the covariance (6, 6) of the pose in radians and metres, and whether there is one."""
-    free = information.shape[0]
-    inverse = np.eye(free)
-    found = solve_positive(information, inverse)
-    for i in range(POSE):
-        for j in range(POSE):
-            unit = (distance if i >= 3 else 1.0) * (distance if j >= 3 else 1.0)
-            inverse[i, j] *= variance * unit
-    return inverse[:POSE, :POSE].copy(), found
-
-
-@compiled
 def curvature_at_truth(
     state: Floats, sight: Sight, height: int, width: int, spread_free: bool
 ) -> tuple[Floats, bool]:
@@ -174,25 +155,6 @@ def mirror_chi_square(
     if not reached or chi_square < 1e-2:
         return math.nan
     return chi_square
-
-
-def sight_of(
-    marker: MarkerKey, size_m: float, view: Floats, lens: Floats, distorted: bool,
-    corner: NDArray[np.int64], variance: float,
-) -> Sight:
-    """Return what is known of a marker's image whose first pixel is ``corner`` (2,)."""
-    outlines, modules = edges(*marker), module_count(marker[0])
-    local = view.copy()
-    local[2:] -= corner
-    return Sight(
-        outlines.ends, outlines.sides, np.array([-marker[2], modules + marker[2]]),
-        float(modules), float(size_m), local, lens, bool(distorted), float(variance),
-    )
-
-
-def noise_variance(noise_grey: float) -> float:
-    """Return the variance of a pixel in squared grey levels: its noise and its rounding."""
-    return noise_grey**2 + QUANTISATION_VARIANCE
 
 
 def bounds(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.model.derivatives import LEVELS, POSE, differentiate, normal_equations
+from sweep.model.marker import MarkerKey, edges, module_count
 from sweep.model.pose import rotations, vectors
 
 Floats = NDArray[np.float64]
@@ -36,6 +37,15 @@ LARGEST_SHIFT = 0.1
 SETTLED, NEARLY_SETTLED = 1e-4, 1e-2
 """Squared standard deviations that an undamped step may still go: then it is the last. Where the
 second minimum has just vanished steps get ever shorter: the larger will do for these."""
+
+LEAST_NOISE = 0.5
+"""Grey levels of noise below which quantisation is no noise of its own, uniform and independent."""
+
+QUANTISATION_VARIANCE = 1 / 12
+"""Variance in squared grey levels that rounding to whole levels adds."""
+
+BACKGROUND_MARGIN_PX = 4
+"""Pixels of background around the marker that tell its level."""
 
 PATIENCE = 2
 """Steps in a row that must foresee an end above what is worth while, to give up."""
@@ -76,6 +86,25 @@ def work_space(height: int, width: int) -> Work:
         np.full((height, width), -1, dtype=np.int32),
         np.empty((height * width, POSE + 1)),
     )
+
+
+def sight_of(
+    marker: MarkerKey, size_m: float, view: Floats, lens: Floats, distorted: bool,
+    corner: NDArray[np.int64], variance: float,
+) -> Sight:
+    """Return what is known of a marker's image whose first pixel is ``corner`` (2,)."""
+    outlines, modules = edges(*marker), module_count(marker[0])
+    local = view.copy()
+    local[2:] -= corner
+    return Sight(
+        outlines.ends, outlines.sides, np.array([-marker[2], modules + marker[2]]),
+        float(modules), float(size_m), local, lens, bool(distorted), float(variance),
+    )
+
+
+def noise_variance(noise_grey: float) -> float:
+    """Return the variance of a pixel in squared grey levels: its noise and its rounding."""
+    return noise_grey**2 + QUANTISATION_VARIANCE
 
 
 def state_of(rotation: Floats, translation: Floats, spread_px: float, levels: Floats) -> Floats:
@@ -363,3 +392,16 @@ def turn_between(state: Floats, other: Floats) -> float:
                 difference[0, i, j] += state[3 * i + k] * other[3 * j + k]
     turn = vectors(difference)[0]
     return math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
+
+
+@compiled
+def pose_covariance(information: Floats, variance: float, distance: float) -> tuple[Floats, bool]:
+    """Return the covariance (6, 6) of the pose in radians and metres, and whether there is one."""
+    free = information.shape[0]
+    inverse = np.eye(free)
+    found = solve_positive(information, inverse)
+    for i in range(POSE):
+        for j in range(POSE):
+            unit = (distance if i >= 3 else 1.0) * (distance if j >= 3 else 1.0)
+            inverse[i, j] *= variance * unit
+    return inverse[:POSE, :POSE].copy(), found

@@ -18,16 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
-from sweep.measure.bound import (
-    BACKGROUND_MARGIN_PX,
-    LEAST_NOISE,
-    noise_variance,
-    pose_covariance,
-    sight_of,
-)
 from sweep.measure.estimation import Estimates, Sightings
 from sweep.measure.flags import Estimate
 from sweep.measure.likelihood import (
+    BACKGROUND_MARGIN_PX,
+    LEAST_NOISE,
     NEARLY_SETTLED,
     SETTLED,
     SPREAD,
@@ -39,6 +34,9 @@ from sweep.measure.likelihood import (
     fit,
     is_before_camera,
     mirrored_state,
+    noise_variance,
+    pose_covariance,
+    sight_of,
     squares,
     state_of,
     turn_between,

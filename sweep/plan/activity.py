@@ -92,6 +92,8 @@ def parts(pipeline: Pipeline) -> list[Part]:
         name for name in PARAMETERS
         if name.startswith("believed_") and pipeline.fixed.get(name, "varies") is not None
     ]
+    bounds = sorted(set(pipeline.values_of("bound")) - {"none"})
+    pixels = "photometric" in pipeline.values_of("solver")
     return [
         Part("lens distortion", lens, "distortion is given" if lens else "distortion is empty"),
         Part("random draws", bool(draws), ", ".join(draws) if draws else "nothing is random"),
@@ -107,6 +109,14 @@ def parts(pipeline: Pipeline) -> list[Part]:
         Part(
             "solver guard", guarded,
             "guarded = true" if guarded else "guarded = false: plain cv2.solvePnP",
+        ),
+        Part(
+            "accuracy bound", bool(bounds),
+            f"bound is {', '.join(bounds)}" if bounds else "bound is none",
+        ),
+        Part(
+            "pixels kept", pixels,
+            "solver photometric fits them" if pixels else "no estimator looks at them",
         ),
         Part(
             "mistaken beliefs", bool(beliefs),

@@ -123,6 +123,6 @@ def _figures(look: Look) -> str:
             f"position by {1000 * look.errors['translation_error_m']:.3g} mm",
             f"reprojection {look.errors['reprojection_error_px']:.2g} px",
         ]
-    elif look.detection.name == "detected":
+    if look.detection.name == "detected" and look.estimate.name != "solved":
         parts.append(look.estimate.name.replace("_", " "))
     return ", ".join(parts)

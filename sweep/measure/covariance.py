@@ -72,8 +72,12 @@ def squared_deviations(
     "Estimation with applications to tracking and navigation", 2001, section 5.4.2). NaN where an
     input is, and where a covariance is singular.
     """
-    error = np.concatenate([rotation_error, translation_error], axis=1)
-    return _squared_deviations(np.ascontiguousarray(error), np.ascontiguousarray(covariance))
+    deviations = np.full(len(covariance), np.nan)
+    known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
+    if len(known):
+        error = np.concatenate([rotation_error[known], translation_error[known]], axis=1)
+        deviations[known] = _squared_deviations(error, covariance[known])
+    return deviations
 
 
 @compiled

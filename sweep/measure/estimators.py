@@ -10,5 +10,5 @@ from sweep.measure.solver import CornerSolver, Estimator
 def build(setting: Estimator) -> EstimatorProtocol:
     """Return the estimator that a setting describes: the place to add others of either kind."""
     if setting.solver == "photometric":
-        return Photometric(setting.photometric_starts, setting.estimate_blur)
+        return Photometric(setting.refined_starts, setting.estimate_blur)
     return CornerSolver(setting)

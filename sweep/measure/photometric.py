@@ -93,15 +93,6 @@ def is_settled(chi_square: Floats, states: Floats, k: int) -> bool:
 
 
 @compiled
-def was_tried(mirror: Floats, found: Floats, starts: Floats) -> bool:
-    """Tell whether a start was nearer to the mirror than halfway between it and the solution."""
-    nearest = math.inf
-    for start in starts:
-        nearest = min(nearest, turn_between(mirror, start))
-    return nearest < 0.5 * turn_between(mirror, found)
-
-
-@compiled
 def locate(
     image: Floats, starts: Floats, sight: Sight, spread_free: bool, information: Floats
 ) -> tuple[Floats, float, bool, Floats, float]:
@@ -154,8 +145,20 @@ def locate(
             state = states[k].copy()
         elif k == count:
             state = mirrored_state(found)
-            if was_tried(state, found, starts):
+            if not is_before_camera(state, sight):
                 continue
+            # Not worth a fit where it has been found, or where the coarse pixels rule it out.
+            away = turn_between(state, found)
+            if turn_between(state, other) < 0.5 * away:
+                continue
+            tried, best = state.copy(), chi_square.min() + HOPELESS
+            level = coarse_fit(
+                coarse, coarse_total, tried, coarse_sight, coarse_work, spread_free, best
+            )
+            if not level < best:
+                continue
+            if turn_between(tried, found) > 0.5 * away:
+                state = tried
         else:
             # The coarse fits of all starts have led astray, or the model is wrong.
             if lowest <= likely:
@@ -192,11 +195,11 @@ def explains(chi_square: float, freedom: int, noise_grey: float) -> bool:
 class Photometric:
     """Maximum likelihood on the pixels, as an estimator.
 
-    ``starts`` is 2 (both planar solutions of the corners as found) or more (of these after
-    ``cv2.cornerSubPix``, too); ``spread_free`` tells that the point spread is estimated.
+    It starts from both planar solutions of the corners as found and, where ``refined``, of these
+    after ``cv2.cornerSubPix``, too; ``spread_free`` tells that the point spread is estimated.
     """
 
-    starts: int
+    refined: bool
     spread_free: bool
 
     @property
@@ -209,7 +212,7 @@ class Photometric:
         count = len(sightings.corners)
         out = Estimates.none(count, Estimate.solver_failed)
         sets = [sightings.corners]
-        if self.starts > 2:
+        if self.refined:
             sets.append(_refined(sightings))
         poses = [
             both_planar_solutions(corners, sightings.cameras, sightings.size_m)

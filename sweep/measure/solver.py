@@ -56,9 +56,9 @@ class Estimator:
         "covariance is made; photometric makes its own from the pixels", unit="px", low=1e-6,
         high=1e6,
     )
-    photometric_starts: int = parameter(
-        2, "2: from the detector's corners; 4: also from these after cv2.cornerSubPix", low=2,
-        high=4,
+    refined_starts: bool = parameter(
+        False, "photometric starts from the detector's corners after cv2.cornerSubPix, too: four "
+        "starts instead of two",
     )
     estimate_blur: bool = parameter(
         False, "photometric estimates the point spread, too, from believed_blur_px on"

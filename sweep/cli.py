@@ -103,7 +103,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     trade.add_argument(
         "--seconds", type=float, default=60.0, metavar="S",
-        help="measure costs for at most so long (default: 60)",
+        help="measure costs for about so long at most (default: 60)",
     )
     trade.add_argument("-o", "--output", metavar="FIGURE", help="draw it: a PNG or SVG file")
     form = trade.add_mutually_exclusive_group()
@@ -288,11 +288,15 @@ def _tradeoff(chosen: argparse.Namespace) -> int:
 
     if chosen.criterion not in CRITERIA:
         raise StoreError(f"--criterion {chosen.criterion}: expected one of {', '.join(CRITERIA)}")
-    if not chosen.seconds > 0:
-        raise StoreError(f"--seconds {chosen.seconds}: expected a number above 0")
+    if not 0 < chosen.seconds < math.inf:
+        raise StoreError(f"--seconds {chosen.seconds}: expected a finite number above 0")
     output = Path(chosen.output) if chosen.output else None
     if output is not None and output.suffix.lower() not in (".png", ".svg"):
         raise StoreError(f"{output}: expected a file that ends in .png or .svg")
+    if output is not None and output.is_dir():
+        raise StoreError(f"{output}: cannot be written: Is a directory")
+    if output is not None and not output.absolute().parent.is_dir():
+        raise StoreError(f"{output}: cannot be written: No such file or directory")
     store = chosen.source
     if store.endswith(".toml"):
         from sweep.engine.runner import execute  # noqa: PLC0415

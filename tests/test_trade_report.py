@@ -178,7 +178,10 @@ def test_overlapping_intervals_are_no_step():
         "within 1.0 ms a frame take 0 (rotation_p95 1.00 deg); "
         "no dearer one on the front is clearly better"
     )
+    # An upper end that is missing is beyond all draws; without any interval the value counts.
     trade[f"{P95}_high"][2] = np.nan
+    assert named(advice(trade, P95)[0]) == [(1.0, 0)]
+    trade[f"{P95}_low"][2] = np.nan
     assert named(advice(trade, P95)[0]) == [(1.0, 0), (3.0, 2)]
 
 

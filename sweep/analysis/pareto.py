@@ -175,6 +175,8 @@ def _steps(cost: Floats, error: Floats, low: Floats, high: Floats) -> list[int]:
     front = front[np.unique(budgets[front], return_index=True)[1]]
     if not front.size:
         return []
+    # An upper end that is missing beside a lower one lies beyond the largest draw.
+    high = np.where(np.isnan(high) & ~np.isnan(low), np.inf, high)
     clearly_better = (error[:, None] < error) & ~(high[:, None] >= low)
     first = front[0]
     better = [k for k in front if clearly_better[k, first]]

@@ -32,12 +32,15 @@ def locked(store: RunStore) -> Iterator[None]:
     Raises
     ------
     StoreError
-        Where another living client holds it.
+        Where another living client holds it, or it cannot be written.
     """
     place = store.group.store
     refuse_if_held(store.url, place)
     mine = {"token": uuid.uuid4().hex, "host": socket.gethostname(), "pid": os.getpid()}
-    put(place, KEY, {**mine, "beat": time.time()})
+    try:
+        put(place, KEY, {**mine, "beat": time.time()})
+    except OSError as error:
+        raise StoreError(f"{store.url}: cannot be written: {error.strerror}") from None
     held = get(place, KEY)
     if held is None or held.get("token") != mine["token"]:
         raise StoreError(_held(store.url, held or {}))

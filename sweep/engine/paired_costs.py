@@ -2,14 +2,19 @@
 
 Each round measures every treatment once, in a new order; what the machine does meanwhile (clock,
 cache, neighbours) it does to all of them. A treatment's ratio to the baseline is the median over
-rounds, with the order statistics' interval; rounds go on until all of these are narrow.
+rounds, with the order statistics' interval; rounds go on until all of these are narrow. Another
+process, with its memory laid out otherwise, gives ratios that are off by a little more than the
+rounds of one can tell: :data:`PROCESS_SHARE` is added to their intervals on both sides.
+
+Frames are searched one at a time, as a user does. Estimators solve :data:`BATCH` sightings in one
+call, so that their calls' own cost is that of a run.
 """
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -18,16 +23,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from sweep.engine.interrupts import Interrupts
 from sweep.kernel import (
     Search,
     search,
-    search_windows,
     sightings,
     single_thread,
     visibility_flags,
     whole_frames,
 )
-from sweep.measure.detector import Detector, Found
+from sweep.measure.detector import Detector, Found, full_frame_reason
+from sweep.measure.estimation import EstimatorProtocol, Sightings
 from sweep.measure.estimators import build
 from sweep.measure.flags import Detection
 from sweep.model.extent import marker_boxes
@@ -39,10 +45,13 @@ from sweep.plan.pipeline import Pipeline
 Floats = NDArray[np.float64]
 
 FEWEST_SCENES, MOST_SCENES = 6, 48
-"""Scenes whose costs are measured in each regime: fewer where they are slow."""
+"""Scenes whose costs are measured in each regime: fewer where whole frames are searched."""
 
-ROUNDS_IN_TIME = 60
-"""Rounds of searching that the time limit is to hold."""
+BATCH = 48
+"""Sightings that an estimator gets in one call."""
+
+PROCESS_SHARE = 0.025
+"""By how much ratios differ between processes: standard deviations of 0.3 to 1.5 % were seen."""
 
 MOST_PX = 1 << 27
 """Pixels of images that are kept, over all regimes: 134 MB."""
@@ -82,14 +91,13 @@ class _Regime:
 
     scenes: Scenes
     values: dict[str, Any]
-    images: list[list[Grey]]
-    """What each detector setting searches of each scene."""
     found: list[Search]
-    """What each detector setting finds."""
+    """What each detector setting finds, with what it searches of each scene."""
 
 
 def measure(
-    pipeline: Pipeline, regimes: Sequence[Sequence[NDArray[np.intp]]], limit_s: float
+    pipeline: Pipeline, regimes: Sequence[Sequence[NDArray[np.intp]]], limit_s: float,
+    interrupts: Interrupts,
 ) -> Costs:
     """Measure detection and estimation of every treatment on the scenes of each regime.
 
@@ -98,73 +106,70 @@ def measure(
     """
     single_thread()
     settings, estimating = detector_settings(pipeline), estimators(pipeline)
-    prepared = [_prepare(pipeline, indices) for indices in regimes]
-    searched_s = sum(found.seconds for regime in prepared for found in regime.found)
-    share = limit_s / (ROUNDS_IN_TIME * max(searched_s, 1e-9))
-    if share < 1.0:
-        # Few frames and many rounds tell more than many frames and few rounds.
-        fewer = [
-            [index[: max(math.ceil(share * len(index)), FEWEST_SCENES)] for index in indices]
-            for indices in regimes
-        ]
-        prepared = [_prepare(pipeline, indices) for indices in fewer]
+    prepared = []
+    for indices in regimes:
+        interrupts.check()
+        prepared.append(_prepare(pipeline, indices))
     finders = [Detector(setting).find for setting in settings]
     builds = [build(estimator) for estimator in estimating]
-    seen = [
-        [
-            [
-                sightings(
-                    estimator, regime.values, regime.scenes, found,
-                    np.flatnonzero(found.flags == Detection.detected),
-                )
-                for estimator in estimating
-            ]
-            for found in regime.found
-        ]
-        for regime in prepared
-    ]
     shape = (len(prepared), len(settings), len(builds))
     parts: list[Callable[[], Any]] = []
+    found_share = np.zeros(shape[:2])
     for g, regime in enumerate(prepared):
         sides = regime.scenes.frame.max(axis=1).tolist()
         for d, find in enumerate(finders):
-            parts.append(partial(_search_all, find, regime.images[d], regime.scenes, sides))
-            parts += [
-                partial(one, seen[g][d][e]) if len(seen[g][d][e].corners) else _nothing
-                for e, one in enumerate(builds)
-            ]
+            parts.append(partial(_search_all, find, regime.found[d].images, regime.scenes, sides))
+            rows = np.flatnonzero(regime.found[d].flags == Detection.detected)
+            found_share[g, d] = len(rows) / len(regime.scenes)
+            for estimator, one in zip(estimating, builds, strict=True):
+                seen = sightings(
+                    estimator, regime.values, regime.scenes, regime.found[d],
+                    np.resize(rows, BATCH if len(rows) else 0),
+                )
+                parts.append(partial(_estimate_all, one, seen))
     frames = np.array([len(regime.scenes) for regime in prepared])
+    visible = np.array([len(regime.found[0].images) > 0 for regime in prepared])
 
     def costs(seconds: Floats) -> Costs:
-        each = seconds.reshape(-1, *shape[:2], 1 + shape[2]) / frames[:, None, None]
-        return Costs(each[..., 0], each[..., 1:], frames)
+        each = seconds.reshape(-1, *shape[:2], 1 + shape[2])
+        # Where nothing is to be seen nothing costs anything.
+        shown = np.where(visible, frames, np.nan)[:, None]
+        estimation = each[..., 1:] / BATCH * found_share[..., None]
+        return Costs(
+            each[..., 0] / shown, np.where(visible[:, None, None], estimation, np.nan),
+            np.where(visible, frames, 0),
+        )
 
     def ratios(seconds: Floats) -> Floats:
         return costs(seconds).ratio
 
-    return costs(in_turns(parts, ratios, limit_s))
+    return costs(in_turns(parts, ratios, limit_s, interrupts))
 
 
 def _search_all(
-    find: Callable[[Grey, str, int], Found], images: Sequence[Grey], scenes: Scenes,
+    find: Callable[[Grey, str, int], Found], images: Mapping[int, Grey], scenes: Scenes,
     sides: Sequence[int],
 ) -> None:
-    # A regime without a visible scene has no images.
-    for image, name, side in zip(images, scenes.dictionary, sides, strict=False):
-        find(image, name, side)
+    for row, image in images.items():
+        # Where it raises, the run has flagged the pose; the attempt costs all the same.
+        with suppress(Exception):
+            find(image, scenes.dictionary[row], sides[row])
 
 
-def _nothing() -> None:
-    """Cost nothing, as an estimator for which nothing was detected."""
+def _estimate_all(estimator: EstimatorProtocol, seen: Sightings) -> None:
+    with suppress(Exception):
+        if len(seen.corners):
+            estimator(seen)
 
 
 def in_turns(
-    parts: Sequence[Callable[[], Any]], ratios: Callable[[Floats], Floats], limit_s: float
+    parts: Sequence[Callable[[], Any]], ratios: Callable[[Floats], Floats], limit_s: float,
+    interrupts: Interrupts,
 ) -> Floats:
     """Return the seconds (R, P) that P parts took in R rounds, each in a random order of its own.
 
     It ends when the medians of ``ratios``, of (R, P) to (R, ...), are known to :data:`NARROW`, or
-    after ``limit_s`` seconds. Time is this thread's own.
+    after ``limit_s`` seconds. Time is this thread's own. Ctrl-C is raised between two parts.
     """
     generator = np.random.Generator(np.random.PCG64(0))
     clock = time.thread_time
@@ -173,6 +178,7 @@ def in_turns(
     # The first round warms up.
     for count in range(MOST_ROUNDS):
         for place in generator.permutation(len(parts)):
+            interrupts.check()
             begun = clock()
             parts[place]()
             rounds[count, place] = clock() - begun
@@ -193,19 +199,14 @@ def _prepare(pipeline: Pipeline, indices: Sequence[NDArray[np.intp]]) -> _Regime
     if 0 < len(rows) < count:
         return _prepare(pipeline, [index[rows] for index in indices])
     settings = detector_settings(pipeline)
-    whole = whole_frames(values, count)
-    boxes = marker_boxes(scenes)
-    cut = [search_windows(scenes, boxes, setting, whole) for setting in settings]
-    # Each setting's images lie in memory by themselves, as a user's frame does.
-    images = [render_all(scenes, rows, boxes, window) if len(rows) else [] for window in cut]
     wanted = np.full((count, len(settings)), len(rows) > 0)
-    found, _, _ = search(scenes, wanted, settings, whole, [], keep=True)
-    return _Regime(scenes, values, images, found)
+    found, _, _ = search(scenes, wanted, settings, whole_frames(values, count), [], keep=True)
+    return _Regime(scenes, values, found)
 
 
 def measure_renderers(
     pipeline: Pipeline, samples: Sequence[Sequence[NDArray[np.intp]]], reference: int,
-    limit_s: float,
+    limit_s: float, interrupts: Interrupts,
 ) -> tuple[Floats, tuple[Floats, Floats]]:
     """Measure K renderers on the same scenes.
 
@@ -244,7 +245,8 @@ def measure_renderers(
         for one, box in zip(scenes, boxes, strict=True)
     ]
     seconds = in_turns(
-        parts, lambda spent: np.asarray(spent / spent[:, reference : reference + 1]), limit_s
+        parts, lambda spent: np.asarray(spent / spent[:, reference : reference + 1]), limit_s,
+        interrupts,
     )
     return seconds / len(rows), (rms, largest)
 
@@ -262,18 +264,27 @@ def median_interval(values: Floats) -> tuple[Floats, Floats, Floats]:
     return np.median(ordered, axis=0), ordered[lowest], ordered[count - 1 - lowest]
 
 
+def whole_frames_of(pipeline: Pipeline) -> list[bool]:
+    """Return whether whole frames are searched, for each detector setting."""
+    whole = pipeline.any_value("window", lambda value: value == "full")
+    whole |= pipeline.any_value("background", lambda value: isinstance(value, str))
+    return [
+        whole or full_frame_reason(setting) is not None for setting in detector_settings(pipeline)
+    ]
+
+
 def sample_cells(
     pipeline: Pipeline, fixed: dict[str, int], regimes: int
 ) -> list[NDArray[np.intp]]:
     """Return indices (n,) along each scene axis: a seeded random sample of scenes of a regime.
 
-    ``fixed`` has the indices of the axes that make the regime; there are as many scenes as
-    :data:`MOST_PX` allows for so many regimes.
+    ``fixed`` has the indices of the axes that make the regime. How many there are follows from the
+    pipeline and the number of ``regimes`` alone, so that the same are measured each time.
     """
     generator = np.random.Generator(np.random.PCG64(0))
     frame = max(pipeline.values_of("width_px")) * max(pipeline.values_of("height_px"))
-    settings = len(detector_settings(pipeline))
-    count = int(min(max(MOST_PX // (frame * regimes * settings), 4), MOST_SCENES))
+    count = FEWEST_SCENES if any(whole_frames_of(pipeline)) else MOST_SCENES
+    count = int(min(max(MOST_PX // (frame * regimes), 1), count))
     return [
         np.full(count, fixed[axis.name], dtype=np.intp) if axis.name in fixed
         else generator.integers(0, len(axis), count).astype(np.intp)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,18 +16,23 @@ from sweep.analysis.error_summaries import (
     renderer_bias,
     summarise,
 )
+from sweep.engine.interrupts import Interrupts
+from sweep.engine.lock import locked
 from sweep.engine.paired_costs import (
+    PROCESS_SHARE,
     measure,
     measure_renderers,
     median_interval,
     sample_cells,
+    whole_frames_of,
 )
+from sweep.engine.provenance import differences
 from sweep.engine.store import open_dataset, open_store, write_group
 from sweep.errors import StoreError
 from sweep.plan.axes import TRIAL, nearest
 from sweep.plan.grid import combinations, estimators
 from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline, fixed_at
+from sweep.plan.pipeline import Pipeline
 
 REFERENCE = "exact"
 """The renderer that others are compared with, where several are in a grid."""
@@ -52,33 +58,54 @@ def measure_trade(
     store = open_store(url, "r+")
     if not store.finished:
         raise StoreError(f"{url}: unfinished; `sweep run` continues it")
-    pipeline, results = store.pipeline, open_dataset(url)
-    axes = [axis.name for axis in pipeline.axes_of(Stage.scene) if axis.name != TRIAL]
-    for name in per:
-        if name not in axes:
-            known = ", ".join(axes) or "none"
-            raise StoreError(f"--per {name}: no axis of the scene{nearest(name, axes)}; there are "
-                             f"{known}")
-    if results["estimate"].size == 0:
-        raise StoreError(f"{url}: there are no results")
+    stored, results = store.pipeline, open_dataset(url)
+    per = list(dict.fromkeys(per))
+    _check(url, stored, results, per)
+    # What is measured here must be what was run: the same versions, the same files.
+    pipeline = Pipeline.from_text(stored.text, name=stored.name, source=url, folder=stored.folder)
+    lines = differences(pipeline, stored, store.fingerprint)
+    if lines:
+        raise StoreError("\n".join([f"{url}: its costs cannot be measured here:", *lines]))
     fidelity = None
-    if "renderer" in axes:
-        if "renderer" in per:
-            raise StoreError("--per renderer: renderers are compared with exact in any case")
-        names = [str(name) for name in results["renderer"].values.tolist()]
-        if REFERENCE not in names:
-            raise StoreError(f"{url}: renderers are compared with {REFERENCE}, which is not there")
-        fidelity = _fidelity(pipeline, results, names, limit_s / 4)
-        write_group(store, "cost/renderers", fidelity)
-        pipeline = fixed_at(pipeline, {"renderer": REFERENCE})
-        results = results.sel(renderer=REFERENCE, drop=True)
-    trade = _trade(pipeline, results, per, limit_s)
-    write_group(store, "cost/tradeoff", trade)
+    with locked(store), Interrupts() as interrupts:
+        if "renderer" in results.dims:
+            names = [str(name) for name in results["renderer"].values.tolist()]
+            fidelity = _fidelity(pipeline, results, names, limit_s / 4, interrupts)
+            pipeline = dataclasses.replace(
+                pipeline, fixed={**pipeline.fixed, "renderer": REFERENCE},
+                axes=tuple(axis for axis in pipeline.axes if axis.name != "renderer"),
+            )
+            results = results.sel(renderer=REFERENCE, drop=True)
+        trade = _trade(pipeline, results, per, limit_s, interrupts)
+        if fidelity is not None:
+            write_group(store, "cost/renderers", fidelity)
+        write_group(store, "cost/tradeoff", trade)
     return trade, fidelity
 
 
+def _check(url: str, pipeline: Pipeline, results: xr.Dataset, per: Sequence[str]) -> None:
+    """Raise StoreError where a trade cannot be told apart by the axes ``per``."""
+    axes = [axis.name for axis in pipeline.axes_of(Stage.scene) if axis.name != TRIAL]
+    for name in per:
+        if name == TRIAL:
+            raise StoreError("--per trial: trials are draws, of which the intervals speak")
+        if name not in axes:
+            known = nearest(name, axes) or f"; there are {', '.join(axes) or 'none'}"
+            raise StoreError(f"--per {name}: no axis of the scene{known}")
+    if results["estimate"].size == 0:
+        raise StoreError(f"{url}: there are no results")
+    if "renderer" in per:
+        raise StoreError("--per renderer: renderers are compared with exact in any case")
+    if "renderer" in axes and REFERENCE not in results["renderer"].values.tolist():
+        raise StoreError(
+            f"{url}: renderers are compared with {REFERENCE}, which is not among them: "
+            "add it to the axis"
+        )
+
+
 def _trade(
-    pipeline: Pipeline, results: xr.Dataset, per: Sequence[str], limit_s: float
+    pipeline: Pipeline, results: xr.Dataset, per: Sequence[str], limit_s: float,
+    interrupts: Interrupts,
 ) -> xr.Dataset:
     settings = [
         axis.name for stage in (Stage.detection, Stage.estimation)
@@ -102,7 +129,7 @@ def _trade(
         pipeline,
         [sample_cells(pipeline, dict(zip(per, regime, strict=True)), len(regimes))
          for regime in regimes],
-        limit_s,
+        limit_s, interrupts,
     )
     treatments = trade.sizes["treatment"]
 
@@ -117,15 +144,15 @@ def _trade(
 
     total = costs.total
     add("cost_ms", "detection and estimation of a frame", "ms", median_interval(1e3 * total))
-    add("cost_ratio", "cost over the baseline's", "1", median_interval(costs.ratio))
+    add("cost_ratio", "cost over the baseline's", "1", _of_any_process(costs.ratio))
     each = np.broadcast_to(costs.detection[..., None], total.shape)
     add("detection_ms", "detection of a frame", "ms", median_interval(1e3 * each))
     add("estimation_ms", "estimation of a frame", "ms", median_interval(1e3 * costs.estimation))
-    whole = pipeline.any_value("window", lambda value: value == "full")
+    whole = whole_frames_of(pipeline)
     trade.attrs = {
         "title": pipeline.title or pipeline.name,
         "poses": pipeline.size(Stage.scene),
-        "window": "full" if whole else "auto",
+        "window": "full" if all(whole) else "auto" if not any(whole) else "mixed",
         "baseline": str(trade["treatment"].values[0]),
         "rounds": len(total),
         "frames": int(costs.frames.sum()),
@@ -133,6 +160,16 @@ def _trade(
                       "of photometric from its likelihood",
     }
     return trade
+
+
+def _of_any_process(ratio: NDArray[np.float64]) -> tuple[Any, Any, Any]:
+    """Return the median ratio of rounds (R, ...) with the interval of what any process measures.
+
+    That of the baseline is 1, whatever the process.
+    """
+    value, low, high = median_interval(ratio)
+    spare = np.where(high > low, PROCESS_SHARE * value, 0.0)
+    return value, low - spare, high + spare
 
 
 def _label(name: str, value: Any) -> str:
@@ -205,19 +242,20 @@ def _corner_noise_scale(
 
 
 def _fidelity(
-    pipeline: Pipeline, results: xr.Dataset, names: Sequence[str], limit_s: float
+    pipeline: Pipeline, results: xr.Dataset, names: Sequence[str], limit_s: float,
+    interrupts: Interrupts,
 ) -> xr.Dataset:
     """Return what each renderer costs, and what it changes against exact images."""
     samples = [
         sample_cells(pipeline, {"renderer": number}, len(names)) for number in range(len(names))
     ]
-    seconds, errors = measure_renderers(pipeline, samples, names.index(REFERENCE), limit_s)
-    changed = renderer_bias(results, REFERENCE)
     at = names.index(REFERENCE)
+    seconds, errors = measure_renderers(pipeline, samples, at, limit_s, interrupts)
+    changed = renderer_bias(results, REFERENCE)
     for name, meaning, unit, interval in (
         ("render_ms", "rendering of an image", "ms", median_interval(1e3 * seconds)),
         ("render_ratio", "cost over that of exact", "1",
-         median_interval(seconds / seconds[:, at : at + 1])),
+         _of_any_process(seconds / seconds[:, at : at + 1])),
     ):
         for ending, values in zip(("", "_low", "_high"), interval, strict=True):
             changed[name + ending] = ("renderer", values, {"long_name": meaning, "units": unit})

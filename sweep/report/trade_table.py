@@ -33,6 +33,7 @@ STATISTICS = {
 WINDOWS = {
     "auto": "searched: the marker's surroundings",
     "full": "searched: the whole frame",
+    "mixed": "searched: the whole frame or the marker's surroundings, as each setting needs",
 }
 
 
@@ -189,7 +190,10 @@ def _groups(regime: xr.Dataset, criterion: str) -> list[Group]:
         covariance.append(Column(f"{levels} % cover", cells))
     if "covariance_trusted" in regime:
         trusted = regime["covariance_trusted"].to_numpy()
-        covariance.append(Column("", ["trusted" if one else "not trusted" for one in trusted]))
+        covariance.append(Column("", [
+            ("trusted" if one else "not trusted") if number else "-"
+            for one, number in zip(trusted, regime["nees_count"].to_numpy(), strict=True)
+        ]))
     groups.append(Group("covariance", covariance))
     return [group for group in groups if group.columns]
 

@@ -1,0 +1,573 @@
+"""What accuracy costs, from a store to the tables: `sweep tradeoff`, and how costs are measured."""
+
+import _thread
+import contextlib
+import io
+import itertools
+import json
+import math
+import shutil
+import subprocess
+import sys
+import threading
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import stats
+
+from sweep import cli
+from sweep.engine import paired_costs, tradeoff
+from sweep.engine.interrupts import Interrupts
+from sweep.engine.paired_costs import FEWEST_ROUNDS, NARROW, in_turns, median_interval
+from sweep.engine.progress import status
+from sweep.engine.runner import _cost, execute
+from sweep.engine.store import create_store, finish
+from sweep.engine.task import compute_block
+from sweep.plan.grid import scene_axes
+from sweep.plan.pipeline import Pipeline
+from sweep.report.trade_table import as_json
+
+CAMERA = """
+seed = 3
+[camera]
+width_px = 200
+height_px = 160
+sensor_width_mm = 4.8
+sensor_height_mm = 3.84
+focal_length_mm = 4.0
+[pose]
+jitter_px = 0.5
+azimuth_deg = { uniform = [0, 360] }
+roll_deg = { uniform = [0, 360] }
+"""
+
+# At 18 px some are missed, at 60 px none.
+TRADE = f"""
+title = "A small trade"
+{CAMERA}
+[scene]
+black = 40
+white = 220
+background = 120
+noise_grey = 6
+bound = "known_blur"
+[estimator]
+corner_noise_px = 0.3
+[axes]
+side_px = [18, 60]
+tilt_deg = [10, 40]
+cornerRefinementMethod = ["none", "subpix"]
+solver = ["ippe_square", "iterative", "photometric"]
+trial = 40
+"""
+
+RENDERERS = f"""
+{CAMERA}
+[axes]
+side_px = [25, 60]
+renderer = ["warp", "exact", "supersample-2", "supersample-8"]
+solver = ["ippe_square", "iterative"]
+trial = 12
+"""
+
+UNSEEN = f"""
+{CAMERA}
+side_px = 40
+[axes]
+tilt_deg = [0, 180]
+solver = ["ippe_square", "iterative"]
+trial = 3
+"""
+
+TREATMENTS = [
+    f"{refinement} \u00b7 {solver}" for refinement in ("none", "subpix")
+    for solver in ("ippe_square", "iterative", "photometric")
+]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_scenes():
+    """Measure costs on few scenes: what is told is the same, and sooner."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paired_costs, "MOST_SCENES", 4)
+        yield
+
+
+def made(folder, text, name, *, finished=True):
+    """Compute a store in this process, without a cluster; return its place."""
+    url, pipeline = str(folder / f"{name}.zarr"), Pipeline.from_text(text, name=name)
+    store = create_store(url, pipeline, tuple(len(axis) for axis in scene_axes(pipeline)))
+    if finished:
+        for block in store.blocks:
+            compute_block(url, store.run_id, block)
+        finish(store, _cost(store))
+    return url
+
+
+def command(*arguments):
+    """Run `sweep tradeoff` in this process; return its exit status, output and error output."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = cli.main(["tradeoff", *map(str, arguments)])
+        except SystemExit as stopped:
+            code = stopped.code
+    return code, out.getvalue(), err.getvalue()
+
+
+def told(*arguments):
+    """Return what the command prints, where it is content."""
+    code, out, err = command(*arguments)
+    assert (code, err) == (0, "")
+    return out
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    return made(tmp_path_factory.mktemp("trade"), TRADE, "trade")
+
+
+@pytest.fixture(scope="module")
+def renderer_store(tmp_path_factory):
+    return made(tmp_path_factory.mktemp("renderers"), RENDERERS, "renderers")
+
+
+@pytest.fixture(scope="module")
+def unseen_store(tmp_path_factory):
+    return made(tmp_path_factory.mktemp("unseen"), UNSEEN, "unseen")
+
+
+@pytest.fixture(scope="module")
+def trade(store):
+    """What the command says of the store as JSON, told apart by side_px."""
+    return json.loads(told(store, "--per", "side_px", "--seconds", "0.5", "--json"))
+
+
+def values(content, name):
+    """Return a variable of the JSON as an array: null is NaN."""
+    def number(value):
+        if isinstance(value, list):
+            return [number(one) for one in value]
+        return {None: math.nan, "infinite": math.inf}.get(value, value)
+
+    return np.array(number(content["data_vars"][name]["data"]), dtype=float)
+
+
+# From a store to what is printed.
+
+def test_json_has_every_treatment_with_its_intervals(trade):
+    assert trade["coords"]["treatment"]["data"] == TREATMENTS
+    assert trade["coords"]["side_px"]["data"] == [18, 60]
+    assert trade["attrs"]["baseline"] == TREATMENTS[0]
+    assert trade["attrs"]["poses"] == 160
+    assert len(trade["advice"]) == 2
+    with_interval = [name for name in trade["data_vars"] if f"{name}_low" in trade["data_vars"]]
+    assert {"cost_ms", "cost_ratio", "detection_ms", "estimation_ms", "rotation_p95_deg",
+            "detection_rate"} <= {*with_interval}
+    for name in with_interval:
+        value, low, high = (values(trade, name + end) for end in ("", "_low", "_high"))
+        assert not (low > value).any(), name
+        assert not (high < value).any(), name
+    for name in ("cost_ms", "cost_ratio", "estimation_ms"):
+        value, low, high = (values(trade, name + end) for end in ("", "_low", "_high"))
+        assert value.shape == (2, len(TREATMENTS))
+        assert (low > 0).all()
+        assert np.isfinite(high).all()
+
+
+def test_the_baseline_costs_exactly_once_itself(trade):
+    for end in ("", "_low", "_high"):
+        assert (values(trade, f"cost_ratio{end}")[:, 0] == 1).all()
+
+
+def test_accuracy_is_that_of_plain_arithmetic_on_the_store(trade, store):
+    with xr.open_zarr(store) as results:
+        over = ("cornerRefinementMethod", "solver")
+        flags = {
+            name: results[name].transpose("side_px", ..., "tilt_deg", "trial").to_numpy()
+            for name in ("detection", "estimate", "flipped")
+        }
+        error = results["rotation_error_rad"].transpose(
+            "side_px", *over, "tilt_deg", "trial", "xyz").to_numpy().astype(float)
+        depth = (results["translation_error_m"] / results["true_tvec_m"]).sel(xyz="z").transpose(
+            "side_px", *over, "tilt_deg", "trial").to_numpy().astype(float)
+    rotation = np.degrees(np.sqrt((error**2).sum(axis=-1)))
+    for side, (refinement, solver) in itertools.product(
+        range(2), itertools.product(range(2), range(3))
+    ):
+        detection = flags["detection"][side, refinement].ravel()
+        looked_for = ~np.isin(detection, (0, 5, 6))
+        solved = (flags["estimate"][side, refinement, solver] == 1).ravel()
+        expected = {
+            "looked_for": looked_for.sum(),
+            "detection_rate": (detection == 1).sum() / looked_for.sum(),
+            "solved_rate": solved.sum() / looked_for.sum(),
+            "flip_rate":
+                (flags["flipped"][side, refinement, solver].ravel()[solved] == 2).mean(),
+        }
+        for name, all_errors in (("rotation_{}_deg", rotation), ("range_{}_percent", 100 * depth)):
+            one = all_errors[side, refinement, solver].ravel()
+            expected[name.format("rmse")] = np.sqrt(np.mean(one[solved] ** 2))
+            ordered = np.sort(np.where(solved, np.abs(one), np.inf)[looked_for])
+            for percent, statistic in ((50, "median"), (95, "p95"), (99, "p99")):
+                rank = -(-len(ordered) * percent // 100)
+                expected[name.format(statistic)] = ordered[rank - 1]
+        found = {name: values(trade, name)[side, 3 * refinement + solver] for name in expected}
+        # Both are sums of the same numbers in double precision: no chance, rounding only.
+        assert found == pytest.approx(expected, rel=1e-9)
+    rates = values(trade, "detection_rate")
+    assert (rates[0] < 1).all()
+    assert (rates[1] == 1).all()
+    assert np.isinf(values(trade, "rotation_p99_deg")[0]).all()
+
+
+def test_costs_are_in_order(trade):
+    """Ten iterations on the pixels cost twice one closed solution; it is some ten times."""
+    estimation = values(trade, "estimation_ms").reshape(2, 2, 3)
+    assert (estimation[..., 2] > 2 * estimation[..., 0]).all()
+    assert (values(trade, "cost_ratio").reshape(2, 2, 3)[..., 2] > 1).all()
+    total = values(trade, "detection_ms") + values(trade, "estimation_ms")
+    # The median of a sum is not the sum of the medians.
+    assert values(trade, "cost_ms") == pytest.approx(total, rel=0.2)
+
+
+def test_the_group_holds_what_was_printed_and_the_store_is_as_before(store, trade):
+    with xr.open_zarr(store) as before, xr.open_zarr(store, group="cost") as cost:
+        results, spent = before.load(), cost.load()
+    # Another dimension than in ``trade``, of which nothing is to be left.
+    assert "side_px" in trade["dims"]
+    printed = json.loads(told(store, "--seconds", "0.1", "--per", "tilt_deg", "--json"))
+    del printed["advice"]
+    with xr.open_zarr(store, group="cost/tradeoff") as written:
+        assert written["cost_ms"].dims == ("tilt_deg", "treatment")
+        again = json.loads(json.dumps(as_json(written.load())))
+    for part in ("attrs", "dims", "data_vars"):
+        assert again[part] == printed[part]
+    assert {name: one["data"] for name, one in again["coords"].items()} == {
+        name: one["data"] for name, one in printed["coords"].items()
+    }
+    with xr.open_zarr(store) as after, xr.open_zarr(store, group="cost") as cost:
+        assert after.load().identical(results)
+        assert cost.load().identical(spent)
+    assert status(store).finished
+    assert execute(Pipeline.from_text(TRADE, name="trade"), store, workers=1).computed_blocks == 0
+
+
+def test_text_markdown_and_figures_name_every_treatment(store, tmp_path):
+    text = told(store, "--seconds", "0.1", "-o", tmp_path / "trade.png")
+    markdown = told(store, "--seconds", "0.1", "--markdown", "-o", tmp_path / "trade.SVG",
+                    "--criterion", "range_rmse_percent")
+    for label in TREATMENTS:
+        assert f"{label} " in text
+        assert label in markdown
+    assert "rotation p95, deg" in text
+    assert text.rstrip().splitlines()[-1].startswith("within ")
+    assert "range RMSE, %" in markdown
+    assert (tmp_path / "trade.png").read_bytes().startswith(b"\x89PNG")
+    assert "<svg" in (tmp_path / "trade.SVG").read_text()
+
+
+# Renderers.
+
+@pytest.fixture(scope="module")
+def renderers(renderer_store):
+    return json.loads(told(renderer_store, "--seconds", "0.4", "--json"))
+
+
+def test_cheaper_images_differ_from_exact_ones_and_exact_ones_do_not(renderers, renderer_store):
+    content = renderers["renderers"]
+    order = content["coords"]["renderer"]["data"]
+    warp, exact, two, eight = (
+        order.index(name) for name in ("warp", "exact", "supersample-2", "supersample-8")
+    )
+    rms, largest = values(content, "grey_rms"), values(content, "grey_max")
+    assert rms[exact] == largest[exact] == 0
+    assert rms[two] > rms[eight] > 0
+    assert rms[warp] > 0
+    assert (largest >= rms).all()
+    for name in ("detection_disagreement", "corner_shift_rms_px", "range_bias_percent",
+                 "rotation_shift_deg"):
+        assert (values(content, name)[exact] == 0).all(), name
+        with xr.open_zarr(renderer_store, group="cost/renderers") as written:
+            assert np.array_equal(written[name], values(content, name), equal_nan=True)
+    assert (values(content, "corner_shift_rms_px")[[warp, two, eight]] > 0).all()
+    for end in ("", "_low", "_high"):
+        assert values(content, f"render_ratio{end}")[exact] == 1
+    assert (values(content, "render_ms") > 0).all()
+    # 64 samples a pixel against 4.
+    assert values(content, "render_ms")[eight] > 2 * values(content, "render_ms")[two]
+
+
+def test_renderers_are_told_beside_the_table(renderer_store):
+    out = told(renderer_store, "--seconds", "0.1")
+    for name in ("warp", "exact", "supersample-2", "supersample-8"):
+        assert f"\n{name} " in out
+
+
+def test_treatments_on_exact_images_are_measured_on_all_their_trials(renderers):
+    assert renderers["attrs"]["poses"] == 24
+
+
+# What cannot be done.
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--per", "zzz"], "--per zzz: no axis of the scene; there are side_px, tilt_deg"),
+        (["--per", "trial"], "--per trial: trials are draws"),
+        (["--per", "solver"], "--per solver: no axis of the scene; there are side_px, tilt_deg"),
+        (["--per", "side_pxx"], "did you mean side_px?"),
+        (["--criterion", "cost_ms"], "--criterion cost_ms: expected one of rotation_rmse_deg, "),
+        (["--criterion", "nan"], "--criterion nan: expected one of "),
+        (["--criterion", ""], "expected one of "),
+        (["--seconds", "0"], "--seconds 0.0: expected a finite number above 0"),
+        (["--seconds", "-1"], "--seconds -1.0: expected a finite number above 0"),
+        (["--seconds", "nan"], "--seconds nan: expected a finite number above 0"),
+        (["--output", "figure.jpg"], "figure.jpg: expected a file that ends in .png or .svg"),
+    ],
+)
+def test_bad_arguments_are_told_in_one_line(arguments, message, store):
+    code, out, err = command(store, "--seconds", "0.05", *arguments)
+    assert (code, out) == (2, "")
+    assert message in err
+    assert err.count("\n") == 1
+
+
+def test_a_figure_that_cannot_be_written_is_told_in_one_line(store, tmp_path):
+    (tmp_path / "folder.png").mkdir()
+    code, _, err = command(store, "--seconds", "0.05", "-o", tmp_path / "folder.png")
+    assert code == 2
+    assert err == f"{tmp_path / 'folder.png'}: cannot be written: Is a directory\n"
+
+
+def test_a_figure_that_cannot_be_written_is_told_before_anything_is_measured(
+    store, tmp_path, monkeypatch
+):
+    measured = []
+    monkeypatch.setattr(tradeoff, "measure_trade", lambda *_: measured.append(1))
+    with contextlib.suppress(TypeError):
+        command(store, "-o", tmp_path / "missing" / "x.png")
+    assert not measured
+
+
+def test_what_is_no_finished_store_is_told_in_one_line(renderer_store, tmp_path):
+    made(tmp_path, UNSEEN, "unfinished", finished=False)
+    (tmp_path / "text.zarr").write_text("hello")
+    (tmp_path / "empty").mkdir()
+    for place, message in (
+        ("missing.zarr", "there is no store; `sweep run` makes one"),
+        ("missing.toml", "cannot be read: No such file or directory"),
+        ("text.zarr", "holds something else than a store of sweep; name another place"),
+        ("empty", "holds something else than a store of sweep; name another place"),
+        ("unfinished.zarr", "unfinished; `sweep run` continues it"),
+    ):
+        assert command(tmp_path / place) == (2, "", f"{tmp_path / place}: {message}\n")
+    code, _, err = command(renderer_store, "--per", "renderer")
+    assert (code, err.count("\n")) == (2, 1)
+    assert err.startswith("--per renderer: ")
+
+
+def test_without_exact_images_renderers_are_not_compared(tmp_path):
+    text = RENDERERS.replace('"exact", ', "").replace("trial = 12", "trial = 2")
+    url = made(tmp_path, text, "inexact")
+    assert command(url) == (
+        2, "",
+        f"{url}: renderers are compared with exact, which is not among them: add it to the axis\n",
+    )
+
+
+# Nothing to be seen.
+
+def test_where_nothing_is_to_be_seen_nothing_has_a_cost(unseen_store):
+    content = json.loads(told(unseen_store, "--per", "tilt_deg", "--seconds", "0.1", "--json"))
+    for name in ("cost_ms", "cost_ratio", "detection_ms", "estimation_ms"):
+        value = values(content, name)
+        assert np.isfinite(value[0]).all()
+        assert np.isnan(value[1]).all()
+
+
+def test_what_is_not_to_be_seen_has_no_error_and_no_advice(unseen_store):
+    out = told(unseen_store, "--per", "tilt_deg", "--seconds", "0.1")
+    assert "tilt_deg = 180: no treatment has a finite rotation_p95_deg" in out
+
+
+# A pose that failed in the run.
+
+def test_a_detector_that_raises_has_a_cost_all_the_same(tmp_path):
+    text = CAMERA + """
+side_px = 40
+[detector]
+cornerRefinementWinSize = 200
+relativeCornerRefinmentWinSize = 1000
+[axes]
+cornerRefinementMethod = ["none", "subpix"]
+trial = 2
+"""
+    url = made(tmp_path, text, "raising")
+    with xr.open_zarr(url) as results:
+        assert (results["detection"].sel(cornerRefinementMethod="subpix") == 7).all()
+    content = json.loads(told(url, "--seconds", "0.1", "--json"))
+    assert values(content, "detection_rate").tolist() == [1, 0]
+
+
+# Ctrl-C.
+
+def test_ctrl_c_while_costs_are_measured_leaves_the_store_as_it_was(
+    store, trade, monkeypatch
+):
+    assert trade
+    with xr.open_zarr(store, group="cost/tradeoff") as written:
+        before = written.load()
+    monkeypatch.setattr(paired_costs, "NARROW", 0.0)
+
+    def interrupted(*arguments):
+        threading.Timer(0.3, _thread.interrupt_main).start()
+        return in_turns(*arguments)
+
+    monkeypatch.setattr(paired_costs, "in_turns", interrupted)
+    code, out, err = command(store, "--seconds", "20")
+    assert (code, out) == (130, "")
+    assert err.startswith("stopped")
+    assert err.count("\n") == 1
+    assert status(store).finished
+    with xr.open_zarr(store, group="cost/tradeoff") as written:
+        assert written.load().identical(before)
+
+
+# How costs are measured, on a clock of our own.
+
+class Clock:
+    """Time that passes only where something is done."""
+
+    def __init__(self):
+        self.now = 0.0
+        self.order = []
+
+    def part(self, number, cost):
+        """Return something to be measured that takes ``cost(call)`` seconds."""
+        calls = itertools.count()
+
+        def run():
+            self.order.append(number)
+            self.now += cost(next(calls))
+
+        return run
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    one = Clock()
+    fake = SimpleNamespace(thread_time=lambda: one.now, perf_counter=lambda: one.now)
+    monkeypatch.setattr(paired_costs, "time", fake)
+    return one
+
+
+def to_first(seconds):
+    return seconds / seconds[:, :1]
+
+
+def test_rounds_end_when_every_ratio_is_known(clock):
+    parts = [clock.part(k, lambda _, k=k: 1.0 + k) for k in range(3)]
+    seconds = in_turns(parts, to_first, math.inf, Interrupts())
+    assert seconds.tolist() == [[1.0, 2.0, 3.0]] * FEWEST_ROUNDS
+
+
+def test_rounds_go_on_until_the_widest_ratio_is_narrow(clock):
+    noise = np.random.default_rng(1).lognormal(0, 0.05, 2000)
+    parts = [clock.part(0, lambda _: 1.0), clock.part(1, lambda call: 2.0 * noise[call])]
+    seconds = in_turns(parts, to_first, math.inf, Interrupts())
+    assert FEWEST_ROUNDS < len(seconds) < 2000 - 1
+
+    def width(count):
+        value, low, high = median_interval(to_first(seconds[:count]))
+        return ((high - low) / value).max()
+
+    assert width(len(seconds)) <= NARROW
+    assert all(width(count) > NARROW for count in range(FEWEST_ROUNDS, len(seconds)))
+
+
+@pytest.mark.parametrize(("limit", "rounds"), [(100.0, 33), (1.0, FEWEST_ROUNDS)])
+def test_rounds_end_at_the_limit_but_not_before_there_are_enough(clock, limit, rounds):
+    parts = [clock.part(0, lambda _: 1.0), clock.part(1, lambda call: 1.0 + 2.0 * (call % 2))]
+    # Rounds of 2 and 4 s by turns, the first of which warms up: 34 rounds take 102 s.
+    assert len(in_turns(parts, to_first, limit, Interrupts())) == rounds
+
+
+def test_rounds_end_at_the_most_rounds(clock, monkeypatch):
+    monkeypatch.setattr(paired_costs, "MOST_ROUNDS", 50)
+    parts = [clock.part(0, lambda _: 1.0), clock.part(1, lambda call: 1.0 + call % 2)]
+    assert len(in_turns(parts, to_first, math.inf, Interrupts())) == 49
+
+
+def test_a_ratio_that_does_not_exist_does_not_hold_up_the_rounds(clock):
+    parts = [clock.part(k, lambda _: 1.0) for k in range(2)]
+    seconds = in_turns(parts, lambda spent: to_first(spent) * [1.0, np.nan], math.inf, Interrupts())
+    assert len(seconds) == FEWEST_ROUNDS
+
+
+def test_the_first_round_warms_up(clock):
+    parts = [clock.part(k, lambda call: 100.0 if call == 0 else 1.0) for k in range(2)]
+    assert (in_turns(parts, to_first, math.inf, Interrupts()) == 1.0).all()
+
+
+def test_each_round_has_every_part_once_in_an_order_of_its_own(clock):
+    count = 6
+    in_turns([clock.part(k, lambda _: 1.0) for k in range(count)], to_first, math.inf, Interrupts())
+    rounds = np.reshape(clock.order, (FEWEST_ROUNDS + 1, count))
+    assert (np.sort(rounds) == np.arange(count)).all()
+    # 13 of 720 orders: that two of them are the same is no fault, that half are would be.
+    assert len(np.unique(rounds, axis=0)) > len(rounds) // 2
+    assert len(np.unique(rounds[:, 0])) > 1
+
+
+@pytest.mark.parametrize("count", [6, FEWEST_ROUNDS, 13, 60, 1999])
+def test_the_medians_interval_is_the_narrowest_of_order_statistics_that_covers(count):
+    value, low, high = median_interval(np.random.default_rng(0).permutation(count).astype(float))
+    assert value == (count - 1) / 2
+    assert low + high == count - 1
+
+    def coverage(rank):
+        return 1 - 2 * stats.binom.cdf(rank, count, 0.5)
+
+    assert coverage(low) >= 0.95 > coverage(low + 1)
+
+
+@pytest.mark.parametrize("count", [FEWEST_ROUNDS, 41])
+def test_the_medians_interval_covers_in_a_simulation(count):
+    times = 20_000
+    values = np.random.default_rng(7).exponential(size=(count, times))
+    value, low, high = median_interval(values)
+    assert (low <= value).all()
+    assert (value <= high).all()
+    held = int(((low <= math.log(2)) & (math.log(2) <= high)).sum())
+    # 95 % or more: below this with a probability of 1e-7.
+    assert held >= stats.binom.ppf(1e-7, times, 0.95)
+
+
+# Agreement.
+
+@pytest.mark.long
+def test_two_measurements_agree(tmp_path):
+    """Of honest 95 % intervals more than 99 % overlap; 95 % is asked of 7 treatments' ratios."""
+    text = TRADE.replace('["none", "subpix"]', '["none", "subpix", "contour", "apriltag"]')
+    text = text.replace('"iterative", "photometric"', '"iterative"')
+    url = made(tmp_path, text, "eight")
+    found = []
+    for number in range(2):
+        one = str(tmp_path / f"{number}.zarr")
+        shutil.copytree(url, one)
+        done = subprocess.run(
+            [sys.executable, "-m", "sweep.cli", "tradeoff", one, "--seconds", "20", "--json"],
+            capture_output=True, text=True, check=True, timeout=300,
+        )
+        found.append(json.loads(done.stdout))
+    (low, high), (other_low, other_high) = (
+        (values(one, "cost_ratio_low"), values(one, "cost_ratio_high")) for one in found
+    )
+    overlap = (low <= other_high) & (other_low <= high)
+    print(f"\n{overlap.mean():.1%} of {overlap.size} overlap;",
+          " ".join(f"{a:.3f}..{b:.3f}/{c:.3f}..{d:.3f}" for a, b, c, d in
+                   zip(low, high, other_low, other_high, strict=True)))
+    assert overlap.mean() >= 0.95

@@ -12,6 +12,7 @@ call, so that their calls' own cost is that of a run.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -39,15 +40,16 @@ from sweep.measure.flags import Detection
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import Grey, render_all
 from sweep.model.scene import Scenes, build_scenes
+from sweep.plan.axes import TRIAL
 from sweep.plan.grid import detector_settings, estimators, scene_axes, scene_values
 from sweep.plan.pipeline import Pipeline
 
 Floats = NDArray[np.float64]
 
-FEWEST_SCENES, MOST_SCENES = 6, 48
+FEWEST_SCENES, MOST_SCENES = 12, 48
 """Scenes whose costs are measured in each regime: fewer where whole frames are searched."""
 
-BATCH = 48
+BATCH = 16
 """Sightings that an estimator gets in one call."""
 
 PROCESS_SHARE = 0.025
@@ -276,17 +278,32 @@ def whole_frames_of(pipeline: Pipeline) -> list[bool]:
 def sample_cells(
     pipeline: Pipeline, fixed: dict[str, int], regimes: int
 ) -> list[NDArray[np.intp]]:
-    """Return indices (n,) along each scene axis: a seeded random sample of scenes of a regime.
+    """Return indices (n,) along each scene axis: a seeded sample of the scenes of a regime.
 
-    ``fixed`` has the indices of the axes that make the regime. How many there are follows from the
-    pipeline and the number of ``regimes`` alone, so that the same are measured each time.
+    ``fixed`` has the indices of the axes that make the regime. The cells of the other axes come in
+    equal shares, or at random where they are more than there is room for; trials are random. How
+    many scenes there are follows from the pipeline and the number of ``regimes`` alone, so that
+    the same are measured each time.
     """
     generator = np.random.Generator(np.random.PCG64(0))
     frame = max(pipeline.values_of("width_px")) * max(pipeline.values_of("height_px"))
     count = FEWEST_SCENES if any(whole_frames_of(pipeline)) else MOST_SCENES
     count = int(min(max(MOST_PX // (frame * regimes), 1), count))
-    return [
-        np.full(count, fixed[axis.name], dtype=np.intp) if axis.name in fixed
-        else generator.integers(0, len(axis), count).astype(np.intp)
-        for axis in scene_axes(pipeline)
+    axes = scene_axes(pipeline)
+    lengths = [
+        1 if axis.name in fixed or axis.name == TRIAL else len(axis) for axis in axes
     ]
+    cells = math.prod(lengths)
+    numbers = (
+        np.arange(count) * cells // count if cells <= count
+        else generator.integers(0, cells, count)
+    )
+    indices = []
+    for axis, length in zip(reversed(axes), reversed(lengths), strict=True):
+        numbers, index = numbers // length, numbers % length
+        if axis.name in fixed:
+            index = np.full(count, fixed[axis.name])
+        elif axis.name == TRIAL:
+            index = generator.integers(0, len(axis), count)
+        indices.append(index.astype(np.intp))
+    return indices[::-1]

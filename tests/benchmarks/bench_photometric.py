@@ -1,0 +1,91 @@
+"""What the accuracy bound and the photometric estimator cost, in this thread's own time.
+
+    python tests/benchmarks/bench_photometric.py
+
+Black 40, white 220, background 120, noise 2, tilts 0 to 75°, 640 x 480; medians over tilts.
+"""
+
+import time
+
+import numpy as np
+
+from sweep.kernel import search, sightings, single_thread, whole_frames
+from sweep.measure.bound import curvature_at_truth
+from sweep.measure.flags import Detection
+from sweep.measure.likelihood import BACKGROUND_MARGIN_PX, noise_variance, sight_of, state_of
+from sweep.measure.photometric import Photometric
+from sweep.model.extent import marker_boxes
+from sweep.model.scene import build_scenes
+from sweep.plan.grid import detector_settings, estimators, scene_values
+from sweep.plan.pipeline import Pipeline
+
+SCENES = 120
+TEXT = f"""
+[marker]
+size_m = 0.05
+[pose]
+jitter_px = 0.5
+azimuth_deg = {{ uniform = [0, 360] }}
+roll_deg = {{ uniform = [0, 360] }}
+side_px = SIDE
+tilt_deg = TILT
+[scene]
+black = 40
+white = 220
+background = 120
+noise_grey = 2
+[detector]
+cornerRefinementMethod = "subpix"
+[axes]
+trial = {SCENES}
+"""
+
+
+def best_ms(call, count, repeats=5):
+    """Return the least time of some calls, a count of things in each."""
+    call()
+    spent = []
+    for _ in range(repeats):
+        begun = time.thread_time()
+        call()
+        spent.append(1e3 * (time.thread_time() - begun) / count)
+    return min(spent)
+
+
+def measured(side, tilt):
+    """Return ms of the bound, of two starts and of four, a scene."""
+    pipeline = Pipeline.from_text(TEXT.replace("SIDE", str(side)).replace("TILT", str(tilt)))
+    values = scene_values(pipeline, [np.arange(SCENES)])
+    scenes = build_scenes(values, SCENES)
+    box = marker_boxes(scenes)[0] + BACKGROUND_MARGIN_PX * np.array([-1, -1, 1, 1])
+    sight = sight_of(
+        scenes.markers[0], scenes.size_m[0], scenes.cameras.view[0], scenes.cameras.lenses[0],
+        False, box[:2], noise_variance(2.0),
+    )
+    state = state_of(scenes.rotation[0], scenes.translation[0], 0.0, scenes.levels[0])
+    width, height = (box[2:] - box[:2]).tolist()
+    found, _, _ = search(
+        scenes, np.ones((SCENES, 1), dtype=bool), detector_settings(pipeline),
+        whole_frames(values, SCENES), [], keep=True,
+    )
+    rows = np.flatnonzero(found[0].flags == Detection.detected)
+    seen = sightings(estimators(pipeline)[0], values, scenes, found[0], rows)
+    return (
+        best_ms(lambda: curvature_at_truth(state, sight, height, width, False), 1, 50),
+        *(best_ms(lambda k=k: Photometric(k, spread_free=False)(seen), len(rows))
+          for k in (False, True)),
+    )
+
+
+def main():
+    """Print the table."""
+    single_thread()
+    print("| side, px | bound, ms | photometric, two starts, ms | four starts, ms |")
+    print("| --- | --- | --- | --- |")
+    for side in (20, 50, 100, 150):
+        each = np.median([measured(side, tilt) for tilt in (0, 15, 30, 45, 60, 75)], axis=0)
+        print(f"| {side} | " + " | ".join(f"{value:.3g}" for value in each) + " |")
+
+
+if __name__ == "__main__":
+    main()

@@ -15,7 +15,6 @@ combination at a time.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -25,8 +24,16 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
-from sweep.analysis.intervals import wilson
-from sweep.analysis.moments import Moments
+from sweep.analysis.draw_intervals import (
+    LEVEL,
+    exponential,
+    mean_length,
+    mean_of,
+    quantiles_of,
+    rate_of,
+    rms_of,
+    symmetric,
+)
 from sweep.errors import StoreError
 from sweep.measure.flags import Detection, Estimate, Flipped
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
@@ -38,12 +45,7 @@ Group = dict[str, NDArray[Any]]
 """What was measured at one kept combination: (cells, draws, settings, ...) by name."""
 Row = dict[str, ArrayLike]
 """The variables of one kept combination, by name."""
-Interval = tuple[float, float, float]
-"""Value, low, high."""
 
-LEVEL = 0.95
-TAIL = (1.0 - LEVEL) / 2.0
-PERCENTS = {"median": 50, "p95": 95, "p99": 99}
 DEGREES_OF_FREEDOM = 6  # of a pose
 TOLERANCE = 0.02  # by how much a trusted covariance's coverage may be off
 FEWEST = 50  # from this many draws on a covariance can be trusted
@@ -116,8 +118,8 @@ def summarise(
     that share at or below; so are their intervals, whose ends are NaN where n is too small.
 
     The interval of a mean is Student's, that of an RMSE Student's of the logarithm of the mean
-    square: see `_mean` and `_rms`. Both need some 50 draws and tails not much heavier than normal;
-    where a few cells have nearly all of the error, only their draws count.
+    square: see `mean_of` and `rms_of`. Both need some 50 draws and tails not much heavier than
+    normal; where a few cells have nearly all of the error, only their draws count.
 
     Raises ``StoreError`` for a dimension that is not there.
     """
@@ -134,14 +136,14 @@ def summarise(
             ("solved_rate", solved, looked_for),
             ("flip_rate", group["flipped"] == Flipped.flipped, solved),
         ):
-            found |= _named(name, _rate(successes, of))
-        found |= _named("rotation_bias_deg", _mean_length(rotation, unflipped, draws))
-        found |= _named("range_bias_percent", _symmetric(*_mean(percent, unflipped, draws)))
+            found |= _named(name, rate_of(successes, of))
+        found |= _named("rotation_bias_deg", mean_length(rotation, unflipped, draws))
+        found |= _named("range_bias_percent", symmetric(*mean_of(percent, unflipped, draws)))
         for quantity, unit, _, _ in _QUANTITIES:
             errors = {
-                "rmse": _rms(squares[quantity], solved, draws),
-                "rmse_unflipped": _rms(squares[quantity], unflipped, draws),
-            } | _quantiles(np.sqrt(squares[quantity]), solved, looked_for)
+                "rmse": rms_of(squares[quantity], solved, draws),
+                "rmse_unflipped": rms_of(squares[quantity], unflipped, draws),
+            } | quantiles_of(np.sqrt(squares[quantity]), solved, looked_for)
             for statistic, interval in errors.items():
                 found |= _named(f"{quantity}_{statistic}_{unit}", interval)
         return found
@@ -163,7 +165,7 @@ def efficiency(
     of the rotation error. ``range_efficiency`` is the RMS of bound over true z, over that of error
     over true z: so distances weigh alike. Both over the poses that have a bound and are solved and
     not flipped: a flip is another minimum, of which the bound knows nothing. A biased estimator
-    can be above 1. The intervals are those of the RMSE, `_rms`; the bound is taken as known.
+    can be above 1. The intervals are those of the RMSE, `rms_of`; the bound is taken as known.
 
     NaN where no such pose has a bound, and everywhere if there is no ``bound_std``. An error of
     exactly 0 gives infinity. Raises ``StoreError`` for a dimension that is not there.
@@ -185,7 +187,7 @@ def efficiency(
             ("range_efficiency", _relative(group, "depth_bound") ** 2, _relative(group) ** 2),
         ):
             used = _unflipped(group) & np.isfinite(bound_squared)
-            rms, low, high = _rms(error_squared, used, _draws(group["detection"]))
+            rms, low, high = rms_of(error_squared, used, _draws(group["detection"]))
             least = np.sqrt(bound_squared[used].mean()) if used.any() else np.float64(np.nan)
             with np.errstate(divide="ignore", invalid="ignore"):
                 found |= _named(name, least / np.array([rms, high, low]))
@@ -238,9 +240,9 @@ def covariance_trust(
     def row(group: Group) -> Row:
         nees = group["nees"].astype(np.float64)
         used = (group["estimate"] == Estimate.solved) & ~np.isnan(nees)
-        mean = _exponential(*_mean(nees, used, _draws(group["detection"])))
-        coverage = np.array([_rate(nees <= limit, used) for limit in limits])
-        joint = np.array([_rate(nees <= limit, used, joint_level) for limit in limits])
+        mean = exponential(*mean_of(nees, used, _draws(group["detection"])))
+        coverage = np.array([rate_of(nees <= limit, used) for limit in limits])
+        joint = np.array([rate_of(nees <= limit, used, joint_level) for limit in limits])
         right = (joint[:, 1] - TOLERANCE <= nominal) & (nominal <= joint[:, 2] + TOLERANCE)
         enough = used.any(axis=2).sum() >= FEWEST
         found: Row = {"nees_count": used.sum(), "covariance_trusted": right.all() and enough}
@@ -286,11 +288,11 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
             side["detection"] == Detection.detected for side in (group, other)
         )
         shift = np.subtract(group["corners"], other["corners"], dtype=np.float64)
-        rms = _rms((shift**2).mean(axis=(-2, -1)), detected & detected_too,
+        rms = rms_of((shift**2).mean(axis=(-2, -1)), detected & detected_too,
                    _draws(group["detection"]) & _draws(other["detection"]))
         differing = compared & (detected != detected_too)
         found: Row = {"compared": compared.sum(), "differing": differing.sum()}
-        found |= _named("detection_disagreement", _rate(differing, compared))
+        found |= _named("detection_disagreement", rate_of(differing, compared))
         return found | _named("corner_shift_rms_px", rms)
 
     def posed(group: Group, other: Group) -> Row:
@@ -298,8 +300,8 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
         solved = (group["estimate"] == Estimate.solved) & (other["estimate"] == Estimate.solved)
         percent = 100.0 * (_relative(group) - _relative(other))
         shift = np.subtract(group["rotation"], other["rotation"], dtype=np.float64)
-        rms = _rms(_norm_squared(np.degrees(shift)), _unflipped(group) & _unflipped(other), draws)
-        found = _named("range_bias_percent", _symmetric(*_mean(percent, solved, draws)))
+        rms = rms_of(_norm_squared(np.degrees(shift)), _unflipped(group) & _unflipped(other), draws)
+        found = _named("range_bias_percent", symmetric(*mean_of(percent, solved, draws)))
         return found | _named("rotation_shift_deg", rms)
 
     sides = (results, at_reference)
@@ -456,143 +458,3 @@ def _relative(group: Group, name: str = "depth_error") -> Floats:
 def _norm_squared(vectors: NDArray[Any]) -> Floats:
     """Return the squared norms of (..., xyz)."""
     return np.asarray(np.square(vectors, dtype=np.float64).sum(axis=-1))
-
-
-def _freedom(used: Masks) -> int:
-    """Return how many draws with a used value there are beyond the first of each cell."""
-    return int(np.maximum(used.any(axis=2).sum(axis=1) - 1, 0).sum())
-
-
-def _rate(successes: Masks, used: Masks, level: float = LEVEL) -> Interval:
-    """Return the share of ``used`` that are ``successes``, with Wilson's interval.
-
-    Pooled settings see the same draws: n is the number of draws, and the successes are rounded
-    outwards to whole draws.
-    """
-    n, draws = int(used.sum()), int(used.any(axis=2).sum())
-    hits = int((successes & used).sum())
-    if n == 0 or _freedom(used) == 0:
-        return hits / n if n else np.nan, np.nan, np.nan
-    low, high = wilson([hits * draws // n, -(-hits * draws // n)], draws, level)
-    return hits / n, float(low[0]), float(high[1])
-
-
-def _mean(values: Floats, used: Masks, draws: Masks) -> Interval:
-    """Return the mean of the used values, its standard error, and the degrees of freedom of that.
-
-    The mean is a ratio of two sums over a stratified sample, the cells being the strata and the
-    draws the sample: of the values, and of what counts. So its variance is that of the sum of
-    ``used · (value - mean)`` over n², each cell's from its own draws: Cochran, "Sampling
-    Techniques", 3rd ed. 1977, sections 6.11 and 5A.14. Where all draws count it is the sum of
-    n_c s_c² over n²; where some do not, it also knows that which ones do is random. A cell with a
-    single draw cannot tell its variance and gets the pooled one.
-
-    The degrees of freedom are Welch's (Biometrika 34, 1947, the form with f + 2): a few cells
-    with the largest errors can make most of the variance. They are no more than the draws with a
-    used value beyond the first of each cell; 0 of these: standard error NaN.
-    """
-    if not used.any():
-        return np.nan, np.nan, np.nan
-    mean, n = float(values[used].mean()), int(used.sum())
-    most = _freedom(used)
-    if most == 0:
-        return mean, np.nan, np.nan
-    with np.errstate(all="ignore"):
-        deviations = np.where(used, values - mean, 0.0).sum(axis=2)
-        within = Moments.of(np.where(draws, deviations, np.nan), axis=1)
-        repeated = within.count > 1
-        m2, freedom = within.m2[repeated], within.count[repeated] - 1.0
-        terms = (freedom + 1.0) * m2 / freedom
-        alone = (within.count == 1).sum() * m2.sum() / freedom.sum()
-        spread = terms.sum()
-        welch = spread**2 / (terms**2 / (freedom + 2.0)).sum() - 2.0
-        return mean, float(np.sqrt(spread + alone) / n), float(np.fmin(most, welch))
-
-
-def _symmetric(mean: float, error: float, freedom: float) -> Interval:
-    """Return Student's interval of a mean."""
-    half = error * special.stdtrit(freedom, 1.0 - TAIL)
-    return mean, float(mean - half), float(mean + half)
-
-
-def _exponential(mean: float, error: float, freedom: float) -> Interval:
-    """Return the interval of a positive mean: Student's of its logarithm, by the delta method."""
-    if mean == 0.0:
-        return _symmetric(mean, error, freedom)
-    with np.errstate(over="ignore", invalid="ignore"):
-        factor = np.exp(error / mean * special.stdtrit(freedom, 1.0 - TAIL))
-        return mean, float(mean / factor), float(mean * factor)
-
-
-def _rms(squares: Floats, used: Masks, draws: Masks) -> Interval:
-    """Return the root of the mean of the used squares.
-
-    Squares are skewed, and a mean square's error goes with its size: Student's interval is right
-    for the logarithm. With 50 normal errors in 1, 5, 10 or 25 cells it covers 0.938 to 0.954,
-    without the logarithm 0.92 to 0.95; with Laplace's tails 0.90 to 0.94.
-    """
-    mean, low, high = np.sqrt(_exponential(*_mean(squares, used, draws)))
-    return float(mean), float(low), float(high)
-
-
-def _mean_length(vectors: Floats, used: Masks, draws: Masks) -> Interval:
-    """Return the length of the mean of the used vectors (..., xyz).
-
-    Along its own direction the mean vector is a plain mean, and the upper end is Student's. The
-    mean's length grows by chance, so the lower end is Scheffé's: the length minus
-    sqrt(3 d / (d - 2) · F(3, d - 2)) standard errors, d degrees of freedom, at least 0. By the
-    Cauchy-Schwarz inequality this holds a bias of 0 whenever Hotelling's T² does, in 95 % at
-    least. With 50 normal errors it covers 0.97 (a large bias) to 0.995 (a bias of its error).
-    """
-    if not used.any():
-        return np.nan, np.nan, np.nan
-    centre = vectors[used].mean(axis=0)
-    length = np.linalg.norm(centre)
-    direction = centre / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
-    along, error, freedom = _mean((vectors * direction).sum(axis=-1), used, draws)
-    _, _, high = _symmetric(along, error, freedom)
-    rest = freedom - (len(XYZ) - 1)
-    if np.isnan(error):
-        return along, np.nan, np.nan
-    if rest <= 0.0:
-        return along, 0.0, high
-    scheffe = np.sqrt(len(XYZ) * freedom / rest * special.fdtri(len(XYZ), rest, LEVEL))
-    return along, max(0.0, float(along - scheffe * error)), high
-
-
-def _quantiles(errors: Floats, solved: Masks, looked_for: Masks) -> dict[str, Interval]:
-    """Return the quantiles of `PERCENTS` over ``looked_for``; not solved is infinite.
-
-    The interval's ends are order statistics of the pooled sample: David and Nagaraja, "Order
-    Statistics", 3rd ed. 2003, section 7.1. Where cells differ, the count below the quantile varies
-    less than binomially (Hoeffding, Annals of Mathematical Statistics 27, 1956): it then covers
-    more. Pooled settings see the same draws: ranks are counted in draws.
-    """
-    ordered = np.sort(np.where(solved, errors, np.inf)[looked_for])
-    n, draws = len(ordered), int(looked_for.any(axis=2).sum())
-    found = {}
-    for name, percent in PERCENTS.items():
-        value, low, high = np.nan, np.nan, np.nan
-        if n > 0:
-            value = ordered[-(-n * percent // 100) - 1]
-        if _freedom(looked_for) > 0:
-            first, last = _ranks(draws, percent)
-            low = ordered[first * n // draws - 1] if first >= 1 else np.nan
-            high = ordered[-(-last * n // draws) - 1] if last <= draws else np.nan
-        found[name] = float(value), float(low), float(high)
-    return found
-
-
-@functools.lru_cache(maxsize=4096)
-def _ranks(n: int, percent: int) -> tuple[int, int]:
-    """Return the ranks, from 1, between which the quantile lies, beyond each with 2.5 % at most.
-
-    0 and n + 1 stand for ends that the sample does not have.
-    """
-    p = percent / 100.0
-    reach = 10.0 * np.sqrt(n * p * (1.0 - p)) + 10.0
-    below = np.arange(max(0, int(n * p - reach)), min(n, int(n * p + reach)) + 1)
-    chance = special.bdtr(below, n, p)
-    first = below[np.searchsorted(chance, TAIL)]
-    last = below[np.searchsorted(chance, 1.0 - TAIL)] + 1
-    return int(first), int(last)

@@ -34,6 +34,9 @@ from sweep.plan.grid import combinations, estimators
 from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline
 
+Interval = tuple[Any, Any, Any]
+"""Values and the ends of their intervals, arrays of one shape."""
+
 REFERENCE = "exact"
 """The renderer that others are compared with, where several are in a grid."""
 
@@ -133,14 +136,9 @@ def _trade(
     )
     treatments = trade.sizes["treatment"]
 
-    def add(name: str, meaning: str, unit: str, interval: tuple[Any, Any, Any]) -> None:
-        for ending, values in zip(("", "_low", "_high"), interval, strict=True):
-            shaped = np.asarray(values).reshape(*lengths, treatments)
-            trade[name + ending] = ((*per, "treatment"), shaped, {
-                "long_name": meaning + {"": "", "_low": ", lower end of the 95 % interval",
-                                        "_high": ", upper end of the 95 % interval"}[ending],
-                "units": unit,
-            })
+    def add(name: str, meaning: str, unit: str, interval: Interval) -> None:
+        shaped = [np.asarray(end).reshape(*lengths, treatments) for end in interval]
+        _add(trade, (*per, "treatment"), name, meaning, unit, shaped)
 
     total = costs.total
     add("cost_ms", "detection and estimation of a frame", "ms", median_interval(1e3 * total))
@@ -162,7 +160,20 @@ def _trade(
     return trade
 
 
-def _of_any_process(ratio: NDArray[np.float64]) -> tuple[Any, Any, Any]:
+def _add(
+    table: xr.Dataset, dims: Sequence[str], name: str, meaning: str, unit: str,
+    interval: Sequence[Any],
+) -> None:
+    """Add a variable and the ends of its 95 % interval to a dataset."""
+    for ending, words, values in zip(
+        ("", "_low", "_high"),
+        ("", ", lower end of the 95 % interval", ", upper end of the 95 % interval"),
+        interval, strict=True,
+    ):
+        table[name + ending] = (dims, values, {"long_name": meaning + words, "units": unit})
+
+
+def _of_any_process(ratio: NDArray[np.float64]) -> Interval:
     """Return the median ratio of rounds (R, ...) with the interval of what any process measures.
 
     That of the baseline is 1, whatever the process.
@@ -252,13 +263,10 @@ def _fidelity(
     at = names.index(REFERENCE)
     seconds, errors = measure_renderers(pipeline, samples, at, limit_s, interrupts)
     changed = renderer_bias(results, REFERENCE)
-    for name, meaning, unit, interval in (
-        ("render_ms", "rendering of an image", "ms", median_interval(1e3 * seconds)),
-        ("render_ratio", "cost over that of exact", "1",
-         _of_any_process(seconds / seconds[:, at : at + 1])),
-    ):
-        for ending, values in zip(("", "_low", "_high"), interval, strict=True):
-            changed[name + ending] = ("renderer", values, {"long_name": meaning, "units": unit})
+    _add(changed, ("renderer",), "render_ms", "rendering of an image", "ms",
+         median_interval(1e3 * seconds))
+    _add(changed, ("renderer",), "render_ratio", "cost over that of exact", "1",
+         _of_any_process(seconds / seconds[:, at : at + 1]))
     for name, meaning, values in (
         ("grey_rms", "RMS difference of the marker's pixels from the exact image's", errors[0]),
         ("grey_max", "largest difference from the exact image", errors[1]),

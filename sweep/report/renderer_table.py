@@ -11,8 +11,11 @@ from sweep.analysis.pareto import digits
 
 IMAGES = {"ms an image": "render_ms", "x exact": "render_ratio", "grey RMS": "grey_rms",
           "grey max": "grey_max"}
-CHANGES = {"found or not, %": "detection_disagreement", "corner RMS px": "corner_shift_rms_px",
-           "range bias %": "range_bias_percent", "rotation RMS deg": "rotation_shift_deg"}
+CHANGES = {
+    "found or not, %": ("detection_disagreement", 100), "corner RMS px": ("corner_shift_rms_px", 1),
+    "range bias %": ("range_bias_percent", 1), "rotation RMS deg": ("rotation_shift_deg", 1),
+}
+"""Headings, the variables below them, and what these are multiplied by."""
 
 
 def renderer_lines(renderers: xr.Dataset, *, markdown: bool) -> list[str]:
@@ -47,9 +50,7 @@ def _rows(renderers: xr.Dataset) -> Iterator[list[str]]:
             treated = one.isel(chosen)
             label = " · ".join(str(treated[dim].item()) for dim in settings)
             changes = [
-                digits(float(treated[variable]) * (100 if "%" in heading and "found" in heading
-                                                   else 1))
-                for heading, variable in CHANGES.items()
+                digits(float(treated[variable]) * factor) for variable, factor in CHANGES.values()
             ]
             first = not any(index)
             yield [name if first else "", *(images if first else [""] * len(images)), label,

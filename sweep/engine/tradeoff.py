@@ -29,7 +29,8 @@ from sweep.engine.paired_costs import (
 from sweep.engine.provenance import differences
 from sweep.engine.store import open_dataset, open_store, write_group
 from sweep.errors import StoreError
-from sweep.plan.axes import TRIAL, nearest
+from sweep.measure.estimators import build
+from sweep.plan.axes import TRIAL, Axis, nearest
 from sweep.plan.grid import combinations, estimators
 from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline
@@ -110,10 +111,8 @@ def _trade(
     pipeline: Pipeline, results: xr.Dataset, per: Sequence[str], limit_s: float,
     interrupts: Interrupts,
 ) -> xr.Dataset:
-    settings = [
-        axis.name for stage in (Stage.detection, Stage.estimation)
-        for axis in pipeline.axes_of(stage)
-    ]
+    axes = [*pipeline.axes_of(Stage.detection), *pipeline.axes_of(Stage.estimation)]
+    settings = [axis.name for axis in axes]
     found = xr.merge(
         [
             summarise(results, settings, per),
@@ -125,7 +124,7 @@ def _trade(
         ],
         compat="no_conflicts", join="exact",
     )
-    trade = _flattened(found, pipeline, settings)
+    trade = _flattened(found, axes)
     lengths = [results.sizes[name] for name in per]
     regimes = list(np.ndindex(*lengths))
     costs = measure(
@@ -187,18 +186,15 @@ def _label(name: str, value: Any) -> str:
     return value if isinstance(value, str) else f"{name} {value}"
 
 
-def _flattened(found: xr.Dataset, pipeline: Pipeline, settings: Sequence[str]) -> xr.Dataset:
+def _flattened(found: xr.Dataset, axes: Sequence[Axis]) -> xr.Dataset:
     """Return a dataset whose dimensions of settings are one, ``treatment``, with labels."""
-    axes = [
-        axis for stage in (Stage.detection, Stage.estimation) for axis in pipeline.axes_of(stage)
-    ]
     labels = [
         " · ".join(_label(name, value) for name, value in chosen.items()) or "as set"
         for chosen in combinations(axes)
     ]
-    if not settings:
+    if not axes:
         return found.expand_dims(treatment=labels)
-    flat = found.stack(treatment=list(settings), create_index=False)
+    flat = found.stack(treatment=[axis.name for axis in axes], create_index=False)
     return flat.assign_coords(treatment=("treatment", labels))
 
 
@@ -240,7 +236,7 @@ def _corner_noise_scale(
             for one in estimators(pipeline)
         ]
     )
-    other = np.array([one.solver == "photometric" for one in estimators(pipeline)])
+    other = np.array([build(one).needs_images for one in estimators(pipeline)])
     shape = [len(axis) for axis in axes]
     names = [axis.name for axis in axes]
 

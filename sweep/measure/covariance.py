@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
-from sweep.measure.likelihood import solve_positive
+from sweep.measure.likelihood import pose_covariance, solve_positive
 from sweep.model.camera import Cameras
 from sweep.model.derivatives import POSE, velocity
 from sweep.model.marker import marker_corners
@@ -42,7 +42,7 @@ def _corner_covariance(
     rates = np.empty((2, POSE))
     for n in range(points.shape[0]):
         distance = abs(translation[n, 2])
-        information, inverse = np.zeros((POSE, POSE)), np.eye(POSE)
+        information = np.zeros((POSE, POSE))
         for corner in range(4):
             x, y, z = points[n, corner, 0], points[n, corner, 1], points[n, corner, 2]
             velocity(
@@ -54,11 +54,9 @@ def _corner_covariance(
                         # Shifts as shares of the distance, so that all is of one size.
                         unit = (distance if i >= 3 else 1.0) * (distance if j >= 3 else 1.0)
                         information[i, j] += rates[axis, i] * rates[axis, j] * unit
-        if solve_positive(information, inverse):
-            for i in range(POSE):
-                for j in range(POSE):
-                    unit = (distance if i >= 3 else 1.0) * (distance if j >= 3 else 1.0)
-                    covariance[n, i, j] = noise_px**2 * inverse[i, j] * unit
+        found, known = pose_covariance(information, noise_px**2, distance)
+        if known:
+            covariance[n] = found
     return covariance
 
 

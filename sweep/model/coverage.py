@@ -290,6 +290,21 @@ def _add_spread(
 
 
 @compiled
+def imaged(
+    plane: NDArray[np.float64], view: NDArray[np.float64], shift_x: float, shift_y: float,
+    column: float, line: float,
+) -> tuple[float, float, float]:
+    """Return the image of a point of the module plane in homogeneous pixels.
+
+    The principal point is at (``shift_x``, ``shift_y``).
+    """
+    z = plane[2, 0] * column + plane[2, 1] * line + plane[2, 2]
+    x = view[0] * (plane[0, 0] * column + plane[0, 1] * line + plane[0, 2]) + shift_x * z
+    y = view[1] * (plane[1, 0] * column + plane[1, 1] * line + plane[1, 2]) + shift_y * z
+    return x, y, z
+
+
+@compiled
 def bent(
     t: float, plane: NDArray[np.float64], lens: NDArray[np.float64], view: NDArray[np.float64],
     a: float, b: float, c: float, d: float,
@@ -372,12 +387,8 @@ def accumulate(
             continue
         a, b, c, d = ends[e, 0], ends[e, 1], ends[e, 2], ends[e, 3]
         if not distorted:
-            z0 = plane[2, 0] * a + plane[2, 1] * b + plane[2, 2]
-            z1 = plane[2, 0] * c + plane[2, 1] * d + plane[2, 2]
-            x0 = view[0] * (plane[0, 0] * a + plane[0, 1] * b + plane[0, 2]) + shift_x * z0
-            x1 = view[0] * (plane[0, 0] * c + plane[0, 1] * d + plane[0, 2]) + shift_x * z1
-            y0 = view[1] * (plane[1, 0] * a + plane[1, 1] * b + plane[1, 2]) + shift_y * z0
-            y1 = view[1] * (plane[1, 0] * c + plane[1, 1] * d + plane[1, 2]) + shift_y * z1
+            x0, y0, z0 = imaged(plane, view, shift_x, shift_y, a, b)
+            x1, y1, z1 = imaged(plane, view, shift_x, shift_y, c, d)
             if sigma > 0.0:
                 _add_blurred(cover, jump, sigma, x0, y0, z0, x1, y1, z1)
             else:

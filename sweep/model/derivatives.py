@@ -28,6 +28,7 @@ from sweep.model.coverage import (
     bent,
     chord_count,
     clip,
+    imaged,
     spread_below,
 )
 from sweep.model.lens import distort, jacobian
@@ -218,12 +219,8 @@ def differentiate(
             t0, t1 = chord / chords, (chord + 1.0) / chords
             if not distorted:
                 # To the box and what spreads into it, before division, as the image is.
-                z0 = plane[2, 0] * a + plane[2, 1] * b + plane[2, 2]
-                z1 = plane[2, 0] * c + plane[2, 1] * d + plane[2, 2]
-                x0 = view[0] * (plane[0, 0] * a + plane[0, 1] * b + plane[0, 2]) + shift_x * z0
-                x1 = view[0] * (plane[0, 0] * c + plane[0, 1] * d + plane[0, 2]) + shift_x * z1
-                y0 = view[1] * (plane[1, 0] * a + plane[1, 1] * b + plane[1, 2]) + shift_y * z0
-                y1 = view[1] * (plane[1, 0] * c + plane[1, 1] * d + plane[1, 2]) + shift_y * z1
+                x0, y0, z0 = imaged(plane, view, shift_x, shift_y, a, b)
+                x1, y1, z1 = imaged(plane, view, shift_x, shift_y, c, d)
                 t0, t1 = clip(x0, x1, t0, t1)
                 t0, t1 = clip(y0, y1, t0, t1)
                 t0, t1 = clip(far_x * z0 - x0, far_x * z1 - x1, t0, t1)

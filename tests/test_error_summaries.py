@@ -9,12 +9,8 @@ import xarray as xr
 from conftest import lengths
 from scipy import stats
 
-from sweep.analysis.error_summaries import (
-    covariance_trust,
-    efficiency,
-    renderer_bias,
-    summarise,
-)
+from sweep.analysis.comparisons import renderer_bias
+from sweep.analysis.error_summaries import covariance_trust, efficiency, error_statistics
 from sweep.errors import StoreError
 from sweep.measure.flags import Detection, Estimate, Flipped
 
@@ -135,6 +131,12 @@ def quantile(values, share):
                 if sum(other <= value for other in values) * 100 >= share * len(values))
 
 
+def approximately(name, value):
+    """Return what to compare a variable with; quantiles are in single precision."""
+    quantile = any(part in name for part in ("median", "p95", "p99"))
+    return pytest.approx(value, rel=2e-7 if quantile else 1e-12)
+
+
 def expected_summary(found):
     """Return the variables without intervals of a list of poses."""
     aimed = [pose for pose in found if looked_for(pose)]
@@ -172,25 +174,25 @@ def mixed():
     ((), ("solver", "refinement")),
 ])
 def test_every_summary_is_that_of_plain_loops_over_the_poses(mixed, per, treatments):
-    summary = summarise(mixed, treatments, per)
     kept = (*per, *treatments)
+    summary = error_statistics(mixed, kept)
     assert tuple(summary["looked_for"].dims) == kept
     for index in np.ndindex(*(mixed.sizes[name] for name in kept)):
         at = dict(zip(kept, index, strict=True))
         for name, value in expected_summary(list(poses(mixed, **at))).items():
-            assert summary[name].isel(at).item() == pytest.approx(value, rel=1e-12), name
+            assert summary[name].isel(at).item() == approximately(name, value), name
 
 
 def test_every_value_lies_in_its_interval_and_is_described(mixed):
     tables = [
-        summarise(mixed, ["solver"], ["distance_m"]), efficiency(mixed, ["solver"]),
+        error_statistics(mixed, ["distance_m", "solver"]), efficiency(mixed, ["solver"]),
         covariance_trust(mixed, ["solver"]),
         renderer_bias(mixed.rename(marker_id="renderer"), reference="10.0"),
     ]
     for table in tables:
         for name, array in table.data_vars.items():
             assert array.attrs["long_name"]
-            assert array.attrs["units"]
+            assert array.attrs.get("units") or "flag_values" in array.attrs
             if f"{name}_low" in table:
                 assert not (table[f"{name}_low"] > array).any(), name
                 assert not (table[f"{name}_high"] < array).any(), name
@@ -200,10 +202,10 @@ def test_every_value_lies_in_its_interval_and_is_described(mixed):
 
 
 def test_lazy_arrays_give_the_same(mixed):
-    for function in (summarise, efficiency, covariance_trust):
-        xr.testing.assert_identical(
-            function(mixed.chunk(trial=2), ["solver"]), function(mixed, ["solver"])
-        )
+    for function in (error_statistics, efficiency, covariance_trust):
+        lazy = function(mixed.chunk(trial=2), ["solver"])
+        assert all(array.chunks is not None for array in lazy.values())
+        xr.testing.assert_allclose(lazy.compute(), function(mixed, ["solver"]), rtol=1e-12)
 
 
 def test_a_share_that_was_not_solved_makes_quantiles_infinite():
@@ -211,7 +213,7 @@ def test_a_share_that_was_not_solved_makes_quantiles_infinite():
     results = measured(rng, {"trial": 100}, {}, {})
     results["estimate"].values[:3] = Estimate.no_detection
     results["detection"].values[:3] = Detection.rejected
-    summary = summarise(results, [])
+    summary = error_statistics(results, [])
     assert np.isfinite(summary["rotation_p95_deg"])
     assert summary["rotation_p95_deg_high"] == np.inf
     assert summary["rotation_p99_deg"] == np.inf
@@ -222,19 +224,20 @@ def test_nothing_seen_says_nothing():
     results = measured(np.random.default_rng(3))
     results["detection"].values[...] = Detection.not_visible
     results["estimate"].values[...] = Estimate.no_detection
-    summary = summarise(results, ["solver"])
+    summary = error_statistics(results, ["solver"])
     assert (summary["looked_for"] == 0).all()
-    assert all(array.isnull().all() for name, array in summary.items() if name != "looked_for")
+    assert (summary["solved"] == 0).all()
+    assert all(array.isnull().all() for array in summary.values() if array.dtype == float)
     assert all(array.isnull().all() for array in efficiency(results, []).values())
     assert not covariance_trust(results, [])["covariance_trusted"]
 
 
-@pytest.mark.parametrize("function", [summarise, efficiency, covariance_trust])
+@pytest.mark.parametrize("function", [error_statistics, efficiency, covariance_trust])
 def test_a_dimension_that_is_not_there_is_told_in_one_line(mixed, function):
     there = "there are distance_m, marker_id, trial, refinement, solver"
     for treatments, per in ((["solverr"], []), ([], ["solverr"]), (["xyz"], [])):
         with pytest.raises(StoreError, match=there) as refused:
-            function(mixed, treatments, per)
+            function(mixed, (*per, *treatments))
         assert "\n" not in str(refused.value)
 
 
@@ -262,7 +265,7 @@ def in_cells(results, value, trials, **kept):
 
 def test_intervals_of_means_have_the_variance_within_cells():
     results = measured(np.random.default_rng(4))
-    summary = summarise(results, ["refinement", "solver"])
+    summary = error_statistics(results, ["refinement", "solver"])
     for i, j in itertools.product(range(2), range(2)):
         told = summary.isel(refinement=i, solver=j)
         cells = in_cells(results, percent, range(5), refinement=i, solver=j)
@@ -279,7 +282,7 @@ def test_intervals_of_means_have_the_variance_within_cells():
 
 def test_the_rotation_bias_ends_at_students_and_scheffes_distance():
     results = measured(np.random.default_rng(18))
-    told = summarise(results, ["refinement", "solver"]).isel(refinement=1, solver=0)
+    told = error_statistics(results, ["refinement", "solver"]).isel(refinement=1, solver=0)
     cells = in_cells(results, lambda pose: np.degrees(pose["rotation_error_rad"]), range(5),
                      refinement=1, solver=0)
     centre = np.concatenate(cells).mean(axis=0)
@@ -301,7 +304,7 @@ def test_a_cell_with_a_single_draw_gets_the_pooled_variance():
     pooled = np.mean([np.var(cell, ddof=1) for cell in cells[1:]])
     mean = (8 * mean + alone[0]) / 9
     half = math.sqrt((8 * error) ** 2 + pooled) / 9 * stats.t.ppf(0.975, freedom)
-    summary = summarise(results, [])
+    summary = error_statistics(results, [])
     assert summary["range_bias_percent"].item() == pytest.approx(mean, rel=1e-12)
     assert summary["range_bias_percent_high"].item() == pytest.approx(mean + half, rel=1e-9)
 
@@ -318,8 +321,8 @@ def test_where_nothing_was_drawn_there_is_no_interval(mixed, how):
     if how == "one pose a cell":
         results["detection"].values[:, :, 1:] = Detection.not_run
         results["estimate"].values[:, :, 1:] = Estimate.not_run
-    tables = (summarise(results, ["solver"], kept), efficiency(results, ["solver"], kept),
-              covariance_trust(results, ["solver"], kept))
+    tables = (error_statistics(results, [*kept, "solver"]), efficiency(results, [*kept, "solver"]),
+              covariance_trust(results, [*kept, "solver"]))
     for table in tables:
         ends = [name for name in table if name.endswith(("_low", "_high"))]
         assert ends
@@ -327,11 +330,11 @@ def test_where_nothing_was_drawn_there_is_no_interval(mixed, how):
     if how == "one trial":
         expected = expected_summary(list(poses(results, solver=1)))
         for name, value in expected.items():
-            assert tables[0][name][1].item() == pytest.approx(value, rel=1e-12), name
+            assert tables[0][name][1].item() == approximately(name, value), name
 
 
 def test_rates_have_wilsons_interval(mixed):
-    told = summarise(mixed, ["refinement", "solver"]).isel(refinement=1, solver=1)
+    told = error_statistics(mixed, ["refinement", "solver"]).isel(refinement=1, solver=1)
     found = [pose for pose in poses(mixed, refinement=1, solver=1) if looked_for(pose)]
     solved = [pose for pose in found if is_solved(pose)]
     for name, of, hits in (
@@ -347,13 +350,13 @@ def test_rates_have_wilsons_interval(mixed):
 @pytest.mark.parametrize("n", [2, 5, 6, 50, 72, 73, 367, 368, 1000])
 def test_quantiles_have_the_binomial_interval_of_order_statistics(n):
     results = measured(np.random.default_rng(6), {"trial": n}, {}, {})
-    told = summarise(results, [])
+    told = error_statistics(results, [])
     values = np.array([degrees(pose) for pose in poses(results)])
     for name, p in (("median", 0.5), ("p95", 0.95), ("p99", 0.99)):
         ends = stats.quantile_test(values, p=p).confidence_interval(0.95)
         for end, value in (("low", ends.low), ("high", ends.high)):
             assert told[f"rotation_{name}_deg_{end}"].item() == pytest.approx(
-                value, rel=1e-12, nan_ok=True)
+                value, rel=2e-7, nan_ok=True)
 
 
 def test_settings_that_are_pooled_see_the_same_draws_and_add_no_certainty(mixed):
@@ -361,14 +364,14 @@ def test_settings_that_are_pooled_see_the_same_draws_and_add_no_certainty(mixed)
     one = with_flags_of_every_kind(rng, measured(rng, detector={}, estimator={}))
     many = xr.concat([one] * 3, dim="solver", data_vars=["estimate", "flipped", "nees",
                      "rotation_error_rad", "translation_error_m"]).transpose("distance_m", ...)
-    for function in (summarise, covariance_trust, efficiency):
+    for function in (error_statistics, covariance_trust, efficiency):
         alone, pooled = function(one, []), function(many, [])
         for name in alone:
             if alone[name].dtype == int:
                 assert pooled[name] == 3 * alone[name]
-            else:
-                np.testing.assert_allclose(pooled[name], alone[name], rtol=1e-12)
-    assert (summarise(mixed, [])["solved_rate_high"] < 1).all()
+            elif "_sd_" not in name:  # its n - 1 counts the settings
+                np.testing.assert_allclose(pooled[name], alone[name], rtol=1e-12, err_msg=name)
+    assert (error_statistics(mixed, [])["solved_rate_high"] < 1).all()
 
 
 # Coverage: each replicate is a regime of its own.
@@ -404,7 +407,7 @@ def test_means_and_rmse_of_light_tails_are_covered(tails, cells, trials, count):
         rng, {"regime": count, "marker_id": cells, "trial": trials}, {}, {},
         relative=0.01 * (draw(rng, shape) + offsets), rotation=rotation,
     )
-    summary = summarise(results, [], ["regime"])
+    summary = error_statistics(results, ["regime"])
     assert_coverage(covered(summary, "range_bias_percent", offsets.mean()), count)
     mean_square = variance + (offsets**2).mean()
     assert_coverage(covered(summary, "range_rmse_percent", math.sqrt(mean_square)), count)
@@ -423,7 +426,7 @@ def test_a_rotation_bias_is_covered_be_it_nothing_or_small(bias, count):
     results = measured(
         rng, {"regime": count, "marker_id": 5, "trial": 10}, {}, {}, rotation=0.01 * rotation
     )
-    summary = summarise(results, [], ["regime"])
+    summary = error_statistics(results, ["regime"])
     hit = covered(summary, "rotation_bias_deg", math.degrees(0.01 * bias) - 1e-12)
     hit = hit if bias else int((summary["rotation_bias_deg_low"] == 0).sum())
     assert_coverage(hit, count, 0.94, 1.0)
@@ -442,7 +445,7 @@ def test_misses_at_random_widen_what_cells_of_other_means_leave_unsure(count):
     missed = rng.random(shape) > chances[:, None]
     results["detection"].values[missed] = Detection.no_candidate
     results["estimate"].values[missed] = Estimate.no_detection
-    summary = summarise(results, [], ["regime"])
+    summary = error_statistics(results, ["regime"])
     mean = (offsets * chances).sum() / chances.sum()
     mean_square = ((offsets**2 + 1) * chances).sum() / chances.sum()
     assert_coverage(covered(summary, "range_bias_percent", mean), count)
@@ -460,7 +463,7 @@ def test_intervals_of_quantiles_cover_at_least_what_they_say(count):
         rng, {"regime": count, "marker_id": 2, "trial": n // 2}, {}, {},
         relative=rng.random(shape) * np.array([half, 1.0])[:, None] / 100,
     )
-    summary = summarise(results, [], ["regime"])
+    summary = error_statistics(results, ["regime"])
     for name, share in (("median", 0.5), ("p95", 0.95), ("p99", 0.99)):
         # Half of the values are uniform on [0, 1/2], half on [0, 1].
         truth = share / 1.5 if share <= 0.75 else 2 * share - 1
@@ -470,7 +473,7 @@ def test_intervals_of_quantiles_cover_at_least_what_they_say(count):
 # Efficiency.
 
 def test_efficiency_is_that_of_plain_loops(mixed):
-    told = efficiency(mixed, ["solver"], ["distance_m"])
+    told = efficiency(mixed, ["distance_m", "solver"])
     for i, j in itertools.product(range(2), range(2)):
         found = [pose for pose in poses(mixed, distance_m=i, solver=j)
                  if is_unflipped(pose) and not np.isnan(pose["bound_std"]).any()]
@@ -496,7 +499,7 @@ def test_on_the_bound_the_interval_holds_one(count):
     results["translation_error_m"].values[..., 2] = rng.normal(size=bound.shape[:3]) * (
         bound[..., 5])
     results["true_tvec_m"].values[...] = 1.0 + np.arange(5)[:, None, None]
-    told = efficiency(results, [], ["regime"])
+    told = efficiency(results, ["regime"])
     assert_coverage(covered(told, "rotation_efficiency", 1.0), count)
     assert_coverage(covered(told, "range_efficiency", 1.0), count)
 
@@ -576,7 +579,7 @@ def test_flips_cost_the_trust_and_too_few_draws_give_none():
     assert few["nees_count"] == 45
     assert not few["covariance_trusted"]
     assert covariance_trust(results.isel(trial=slice(10)), [])["nees_count"] == 50
-    none = covariance_trust(results.drop_vars("nees"), [], ["marker_id"])
+    none = covariance_trust(results.drop_vars("nees"), ["marker_id"])
     assert not none["covariance_trusted"].any()
     assert (none["nees_count"] == 0).all()
     assert none["nees_mean"].isnull().all()

@@ -215,8 +215,8 @@ def test_accuracy_is_that_of_plain_arithmetic_on_the_store(trade, store):
                 rank = -(-len(ordered) * percent // 100)
                 expected[name.format(statistic)] = ordered[rank - 1]
         found = {name: values(trade, name)[side, 3 * refinement + solver] for name in expected}
-        # Both are sums of the same numbers in double precision: no chance, rounding only.
-        assert found == pytest.approx(expected, rel=1e-9)
+        # Both are of the same numbers, quantiles in single precision: no chance, rounding only.
+        assert found == pytest.approx(expected, rel=2e-7)
     rates = values(trade, "detection_rate")
     assert (rates[0] < 1).all()
     assert (rates[1] == 1).all()

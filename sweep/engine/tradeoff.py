@@ -10,12 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sweep.analysis.error_summaries import (
-    covariance_trust,
-    efficiency,
-    renderer_bias,
-    summarise,
-)
+from sweep.analysis import covariance_trust, efficiency, error_statistics, renderer_bias
 from sweep.engine.interrupts import Interrupts
 from sweep.engine.lock import locked
 from sweep.engine.paired_costs import (
@@ -49,7 +44,7 @@ def measure_trade(
 
     A treatment is a combination of detector and estimator settings. Each has its costs, measured
     for at most ``limit_s`` seconds (:func:`sweep.engine.paired_costs.measure`), and its accuracy in
-    the store (:func:`sweep.analysis.error_summaries.summarise`), for each combination of the
+    the store (:func:`sweep.analysis.error_statistics`), for each combination of the
     values of the scene axes ``per``; the first one is the baseline. Where renderers are an axis,
     the treatments are those on ``exact`` images, and a second dataset tells what other renderers
     change (``cost/renderers``); else that is None.
@@ -113,17 +108,16 @@ def _trade(
 ) -> xr.Dataset:
     axes = [*pipeline.axes_of(Stage.detection), *pipeline.axes_of(Stage.estimation)]
     settings = [axis.name for axis in axes]
+    kept = [*per, *settings]
     found = xr.merge(
         [
-            summarise(results, settings, per),
-            efficiency(results, settings, per),
-            covariance_trust(
-                results, settings, per, scale=_corner_noise_scale(pipeline, results, per)
-            ),
+            error_statistics(results, kept),
+            efficiency(results, kept),
+            covariance_trust(results, kept, scale=_corner_noise_scale(pipeline, results, per)),
             _bound(results, per),
         ],
         compat="no_conflicts", join="exact",
-    )
+    ).compute()
     trade = _flattened(found, axes)
     lengths = [results.sizes[name] for name in per]
     regimes = list(np.ndindex(*lengths))
@@ -258,7 +252,7 @@ def _fidelity(
     ]
     at = names.index(REFERENCE)
     seconds, errors = measure_renderers(pipeline, samples, at, limit_s, interrupts)
-    changed = renderer_bias(results, REFERENCE)
+    changed = renderer_bias(results, REFERENCE).compute()
     _add(changed, ("renderer",), "render_ms", "rendering of an image", "ms",
          median_interval(1e3 * seconds))
     _add(changed, ("renderer",), "render_ratio", "cost over that of exact", "1",

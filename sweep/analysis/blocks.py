@@ -1,0 +1,384 @@
+"""How a dataset that may be larger than memory is looked at: block by block, twice.
+
+Of a dataset's dimensions those that are named are kept, all others are pooled. Of these, ``trial``
+counts random draws; the other dimensions of camera, marker and pose make cells, a fixed grid; all
+others that are pooled (effects, levels, renderers, settings of detector and estimator) see the
+same draws (`sweep.plan.draws`), so that their values together count as one draw.
+
+The blocks are the chunks of a lazy dataset, and the result is then lazy, too. What is kept of a
+block does not grow with the dataset; the second look reads the chunks again.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import dask.array as da
+import numpy as np
+import xarray as xr
+from dask.delayed import Delayed, delayed
+from dask.graph_manipulation import bind
+from numpy.typing import NDArray
+
+from sweep.analysis.poses import INSIDE, Poses
+from sweep.analysis.statistics import (
+    Found,
+    Output,
+    State,
+    Statistic,
+    combined,
+    every_nth,
+    flagged_attributes,
+    folded,
+    interleaved,
+    scattered,
+)
+from sweep.errors import StoreError
+from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
+from sweep.plan.template import LABELS, TEMPLATE
+
+Arrays = dict[str, NDArray[Any]]
+Masks = NDArray[np.bool_]
+Bins = Mapping[str, Sequence[float]]
+
+LARGEST_BLOCK = 1 << 18
+"""Poses in a block of a dataset that is in memory."""
+FAN_IN = 16
+"""States that are merged at once."""
+
+
+def axes_of(results: xr.Dataset) -> list[str]:
+    """Return the axes of the template's variables, in their order."""
+    dims = [str(dim) for v in TEMPLATE if v.name in results for dim in results[v.name].dims]
+    return [dim for dim in dict.fromkeys(dims) if dim not in LABELS]
+
+
+def kept_of(results: xr.Dataset, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the dimensions to keep, each once, if all are there.
+
+    Raises
+    ------
+    StoreError
+        For those that are not, with those that are; and where there are no results at all.
+    """
+    axes = axes_of(results)
+    missing = [name for name in dict.fromkeys(names) if name not in axes]
+    if missing:
+        there = ", ".join(axes) or "none"
+        raise StoreError(f"{', '.join(missing)}: no such dimension; there are {there}")
+    lacking = [name for name in ("detection", "estimate") if name not in results]
+    if lacking:
+        there = ", ".join(map(str, results.data_vars)) or "none"
+        raise StoreError(f"no variable {' or '.join(lacking)}: there are {there}")
+    return tuple(dict.fromkeys(names))
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What each dimension is, and how each array of a block is laid out.
+
+    ``arrays`` gives each array's dimensions; ``bins`` the edges of each array that is binned.
+    """
+
+    arrays: Mapping[str, tuple[str, ...]]
+    kept: tuple[str, ...]
+    cells: tuple[str, ...]
+    draws: tuple[str, ...]
+    settings: tuple[str, ...]
+    bins: Mapping[str, NDArray[np.float64]]
+    view: Callable[[Arrays], Any]
+
+    @property
+    def bin_count(self) -> int:
+        """How many combinations of bins there are."""
+        return math.prod(len(edges) - 1 for edges in self.bins.values())
+
+    def arranged(self, blocks: Sequence[NDArray[Any]], sizes: Mapping[str, int]) -> Arrays:
+        """Return a block's arrays as (groups, cells, draws, settings, ...)."""
+        found = {}
+        parts = (self.kept, self.cells, self.draws, self.settings)
+        every = tuple(itertools.chain(*parts))
+        shape = [math.prod(sizes[name] for name in names) for names in parts]
+        for (name, dims), block in zip(self.arrays.items(), blocks, strict=True):
+            inner = [dim for dim in dims if dim not in every]
+            present = [dim for dim in every if dim in dims]
+            array = np.asarray(block).transpose([dims.index(dim) for dim in (*present, *inner)])
+            rest = array.shape[len(present):]
+            array = array.reshape(*(sizes[d] if d in dims else 1 for d in every), *rest)
+            array = np.broadcast_to(array, (*(sizes[dim] for dim in every), *rest))
+            found[name] = array.reshape(*shape, *rest)
+        return found
+
+
+def streamed(
+    results: xr.Dataset,
+    needed: Mapping[str, xr.DataArray],
+    kept: Sequence[str],
+    statistics: Sequence[Statistic],
+    bins: Bins | None = None,
+    view: Callable[[Arrays], Any] = Poses,
+) -> xr.Dataset:
+    """Return the statistics of the poses of each combination of ``kept`` and of bins.
+
+    ``needed`` are the arrays, by name, of which ``view`` makes the poses that the statistics look
+    at; ``bins`` gives the edges (n + 1,) of bins [low, high) of a variable or coordinate of the
+    scene. Lazy where any of the arrays is.
+
+    Raises ``StoreError`` for bins of what is not there, or is no number of a scene.
+    """
+    binned = _binned(results, bins or {})
+    lazy = any(array.chunks is not None for array in needed.values())
+    dataset = xr.Dataset(
+        {name: array.reset_coords(drop=True) for name, array in needed.items()}
+        | {f"bin {name}": array for name, (array, _) in binned.items()}
+    )
+    dims = [str(dim) for dim in dataset.dims if dim not in LABELS]
+    pooled = [name for name in dims if name not in kept]
+    cells = tuple(name for name in pooled if name in PARAMETERS
+                  and PARAMETERS[name].section in GEOMETRY_SECTIONS)
+    draws = tuple(name for name in pooled if name == "trial")
+    layout = Layout(
+        {str(name): tuple(map(str, array.dims)) for name, array in dataset.items()},
+        tuple(kept), cells, draws,
+        tuple(name for name in pooled if name not in (*cells, *draws)),
+        {f"bin {name}": edges for name, (_, edges) in binned.items()}, view,
+    )
+    chunked = _chunked(dataset, layout, lazy=lazy)
+    tables, grid = _tables(chunked, results, layout, statistics)
+    outputs = [output for statistic in statistics for output in statistic.outputs()]
+    found = _assembled(tables, grid, layout, outputs)
+    coordinates = {name: value for name, value in results.coords.items()
+                   if set(value.dims) <= set(kept)}
+    table = xr.Dataset(found, coordinates).assign_coords(_bin_coordinates(results, binned))
+    return table if lazy else table.compute(scheduler="synchronous")
+
+
+def _binned(
+    results: xr.Dataset, bins: Bins
+) -> dict[str, tuple[xr.DataArray, NDArray[np.float64]]]:
+    """Return what is binned, with its edges."""
+    found = {}
+    for name, given in bins.items():
+        edges = np.asarray(given, dtype=np.float64)
+        if name not in results.variables or name in axes_of(results):
+            there = [str(n) for n, v in results.variables.items()
+                     if v.dtype.kind == "f" and n not in results.dims]
+            raise StoreError(f"bins of {name}: no such variable; there are {', '.join(there)}")
+        array = results[name].reset_coords(drop=True)
+        if array.dtype.kind not in "fiu" or any(dim in LABELS for dim in array.dims):
+            raise StoreError(f"bins of {name}: expected one number for each scene")
+        if edges.ndim != 1 or len(edges) < 2 or not (np.diff(edges) > 0).all():
+            raise StoreError(f"bins of {name}: expected at least two increasing edges")
+        found[name] = array, edges
+    return found
+
+
+def _bin_coordinates(results: xr.Dataset, binned: Mapping[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, (_, edges) in binned.items():
+        attributes = dict(results[name].attrs)
+        for label, values in ((name, (edges[:-1] + edges[1:]) / 2),
+                              (f"{name}_low", edges[:-1]), (f"{name}_high", edges[1:])):
+            found[label] = (name, values, attributes)
+    return found
+
+
+def _chunked(dataset: xr.Dataset, layout: Layout, *, lazy: bool) -> xr.Dataset:
+    """Return the dataset in chunks; settings and inner dimensions are whole in each."""
+    if not lazy:
+        lengths, size = {}, math.prod(dataset.sizes[name] for name in _axes(layout, dataset))
+        for name in (*layout.cells, *layout.draws, *layout.kept):
+            if name in dataset.sizes and size > LARGEST_BLOCK:
+                length = dataset.sizes[name]
+                lengths[name] = max(1, length * LARGEST_BLOCK // size)
+                size = size // length * lengths[name]
+        return dataset.chunk({str(name): lengths.get(str(name), -1) for name in dataset.dims})
+    whole = {name: -1 for name in dataset.dims if name in LABELS or name in layout.settings}
+    return dataset.chunk().unify_chunks().chunk(whole)
+
+
+def _axes(layout: Layout, dataset: xr.Dataset) -> list[str]:
+    return [name for name in (*layout.kept, *layout.cells, *layout.draws, *layout.settings)
+            if name in dataset.sizes]
+
+
+Grid = tuple[tuple[int, ...], ...]
+"""The lengths of the chunks of each kept dimension."""
+
+
+def _tables(
+    dataset: xr.Dataset, results: xr.Dataset, layout: Layout, statistics: Sequence[Statistic]
+) -> tuple[list[Delayed], Grid]:
+    """Return what is found in each block of the kept dimensions, and how long these are."""
+    lengths = {name: tuple(dataset.chunks[name]) if name in dataset.sizes
+               else (results.sizes[name],) for name in layout.kept}
+    lengths |= {name: tuple(dataset.chunks[name])
+                for name in _axes(layout, dataset) if name not in lengths}
+    arrays = [da.asarray(array.data) for array in dataset.data_vars.values()]
+    first_look = _looks(arrays, layout, lengths, functools.partial(_first, layout, statistics))
+    between = _task(_between, statistics)
+    known = [between(_merged_in_tree(states)) for states in first_look]
+    # The second look must not keep in memory what the first has read: it reads again.
+    again = bind(arrays, known)
+    second_look = _looks(again, layout, lengths, functools.partial(_second, layout, statistics),
+                         known)
+    finish = _task(_finish, statistics)
+    tables = [finish(of_first, _merged_in_tree(states))
+              for of_first, states in zip(known, second_look, strict=True)]
+    return tables, tuple(lengths[name] for name in layout.kept)
+
+
+def _looks(
+    arrays: Sequence[Any], layout: Layout, lengths: Mapping[str, tuple[int, ...]],
+    look: Callable[..., Any], known: Sequence[Delayed] = (),
+) -> list[list[Delayed]]:
+    """Return the states of all blocks, folded, by block of the kept dimensions."""
+    pieces = [array.to_delayed(optimize_graph=False) for array in arrays]
+    observe, fold = _task(look), _task(_folded)
+    found = []
+
+    def numbers(names: Sequence[str]) -> list[dict[str, int]]:
+        every = itertools.product(*(range(len(lengths[name])) for name in names))
+        return [dict(zip(names, each, strict=True)) for each in every]
+
+    for number, kept in enumerate(numbers(layout.kept)):
+        states = []
+        for cell in numbers(layout.cells):
+            parts = []
+            for draw in numbers(layout.draws):
+                at = kept | cell | draw
+                blocks = [
+                    piece[tuple(at.get(dim, 0) for dim in dims)]
+                    for piece, dims in zip(pieces, layout.arrays.values(), strict=True)
+                ]
+                sizes = {name: chunks[at.get(name, 0)] for name, chunks in lengths.items()}
+                parts.append(observe(sizes, blocks, *known[number : number + 1]))
+            states.append(fold(parts))
+        found.append(states)
+    return found
+
+
+def _task(function: Callable[..., Any], *fixed: Any) -> Any:
+    """Return a delayed function; what is fixed is not searched for lazy values."""
+    bound = functools.partial(function, *fixed)
+    return delayed(bound, name=None, pure=False, traverse=False)
+
+
+def _merged_in_tree(states: list[Delayed]) -> Delayed:
+    merge = _task(_combined)
+    while len(states) > 1:
+        states = [merge(states[k : k + FAN_IN]) for k in range(0, len(states), FAN_IN)]
+    return states[0]
+
+
+Look = list[tuple[State, State]]
+"""The states of a block and of its cells, for each statistic."""
+
+
+def _first(
+    layout: Layout, statistics: Sequence[Statistic], sizes: Mapping[str, int],
+    blocks: Sequence[NDArray[Any]],
+) -> Look:
+    arrays = layout.arranged(blocks, sizes)
+    return _joined([
+        _in_their_cells([s.first(poses) for s in statistics], cells)
+        for poses, cells in _in_bins(layout, arrays)
+    ])
+
+
+def _second(
+    layout: Layout, statistics: Sequence[Statistic], sizes: Mapping[str, int],
+    blocks: Sequence[NDArray[Any]], known: list[State],
+) -> Look:
+    arrays = layout.arranged(blocks, sizes)
+    return _joined([
+        _in_their_cells(
+            [s.second(poses, every_nth(of_first, layout.bin_count, number))
+             for s, of_first in zip(statistics, known, strict=True)],
+            cells,
+        )
+        for number, (poses, cells) in enumerate(_in_bins(layout, arrays))
+    ])
+
+
+def _in_bins(layout: Layout, arrays: Arrays) -> Iterator[tuple[Any, Masks | None]]:
+    """Yield the poses of each combination of bins, and the cells that have any (None: all)."""
+    if not layout.bins:
+        yield layout.view(arrays), None
+        return
+    # Of values at the last edge and beyond, and of NaN, it is the number of bins.
+    within = [np.searchsorted(edges, arrays[name], side="right") - 1
+              for name, edges in layout.bins.items()]
+    counts = [len(edges) - 1 for edges in layout.bins.values()]
+    for index in np.ndindex(*counts):
+        inside = np.logical_and.reduce([a == b for a, b in zip(within, index, strict=True)])
+        cells = inside.any(axis=(0, 2, 3))
+        part = {name: array[:, cells] for name, array in (arrays | {INSIDE: inside}).items()}
+        yield layout.view(part), cells
+
+
+def _in_their_cells(look: Look, cells: Masks | None) -> Look:
+    """Return the states of some cells as those of all."""
+    if cells is None:
+        return look
+    return [(pooled, scattered(state, cells)) for pooled, state in look]
+
+
+def _joined(looks: list[Look]) -> Look:
+    """Return what was seen in the bins as one."""
+    return [
+        (interleaved([pooled for pooled, _ in each]), interleaved([cells for _, cells in each]))
+        for each in zip(*looks, strict=True)
+    ]
+
+
+def _folded(parts: list[Look]) -> list[State]:
+    """Return the states of some cells, of all their draws."""
+    return [
+        combined([pooled for pooled, _ in each]) | folded(combined([cells for _, cells in each]))
+        for each in zip(*parts, strict=True)
+    ]
+
+
+def _combined(states: list[list[State]]) -> list[State]:
+    return [combined(each) for each in zip(*states, strict=True)]
+
+
+def _between(statistics: Sequence[Statistic], states: list[State]) -> list[State]:
+    return [s.between(state) for s, state in zip(statistics, states, strict=True)]
+
+
+def _finish(
+    statistics: Sequence[Statistic], known: list[State], second: list[State]
+) -> Found:
+    found: Found = {}
+    for statistic, of_first, of_second in zip(statistics, known, second, strict=True):
+        found |= statistic.finish(of_first, of_second)
+    return found
+
+
+def _assembled(
+    tables: list[Delayed], grid: Grid, layout: Layout, outputs: Sequence[Output]
+) -> dict[str, tuple[tuple[str, ...], Any, Mapping[str, Any]]]:
+    """Return the variables, put together from the blocks of the kept dimensions."""
+    bins = tuple(len(edges) - 1 for edges in layout.bins.values())
+    dims = (*layout.kept, *(name.removeprefix("bin ") for name in layout.bins))
+    found = {}
+    for output in outputs:
+        pieces = np.empty([len(lengths) for lengths in grid], dtype=object)
+        for table, index in zip(tables, np.ndindex(*pieces.shape), strict=True):
+            shape = (*(lengths[k] for lengths, k in zip(grid, index, strict=True)), *bins)
+            piece = _task(_variable, output, shape)(table)
+            pieces[index] = da.from_delayed(piece, shape, output.dtype)
+        array = da.block(pieces.tolist()) if grid else pieces[()]
+        found[output.name] = dims, array, flagged_attributes(output)
+    return found
+
+
+def _variable(output: Output, shape: tuple[int, ...], table: Found) -> NDArray[Any]:
+    return table[output.name].reshape(shape).astype(output.dtype)

@@ -1,0 +1,145 @@
+"""Which marker IDs are weak: each against the others, corrected for how many there are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+from scipy import special
+
+from sweep.analysis.blocks import axes_of, kept_of
+from sweep.analysis.rates import detection_rate
+from sweep.errors import StoreError
+from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
+
+Floats = NDArray[np.float64]
+
+SIGNIFICANCE = 0.05
+"""Chance that any ID at all is called weak, or strong, where all are alike."""
+
+
+def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
+    """Return how each marker ID compares with the others: dimensions (*per, marker_id).
+
+    Dictionaries hold different markers: a dimension ``dictionary`` is always kept.
+
+    ``detection_rate`` and its interval are as in `sweep.analysis.rates.detection_rate`;
+    ``expected_rate`` is what the ID's cells would give if in each of them all IDs were alike.
+    ``p_value`` is of the test of Cochran, Mantel and Haenszel, each ID against the others,
+    stratified by cell: J. Natl. Cancer Inst. 22 (1959), 719-748. Under the hypothesis the ID's
+    detections in a cell are hypergeometric; the tails of their sum are taken from the gamma
+    distribution (Pearson's type III) with the same mean, variance and skewness, with a continuity
+    correction of 1/2, so that they are right where misses are rare. ``p_adjusted`` is corrected for
+    all comparisons in the table: Holm, Scandinavian Journal of Statistics 6 (1979), 65-70.
+    ``weak``: below its expected rate with ``p_adjusted`` below 0.05. ``rank`` 1 has the lowest
+    share of what is expected of it.
+
+    Where nothing was drawn there are no intervals and no p-values, and nothing is called weak.
+    Lazy where ``results`` is. Raises ``StoreError`` without a dimension ``marker_id``.
+    """
+    dictionaries = [name for name in ("dictionary",) if name in axes_of(results)]
+    kept = kept_of(results, (*per, *dictionaries, "marker_id"))
+    kept = (*(name for name in kept if name != "marker_id"), "marker_id")
+    if "trial" in kept:
+        raise StoreError("trial: trials are draws, of which the ranking speaks; it cannot be kept")
+    cells = [name for name in axes_of(results)
+             if name in results["detection"].dims and name not in (*kept, "trial")
+             and name in PARAMETERS and PARAMETERS[name].section in GEOMETRY_SECTIONS]
+    table = detection_rate(results, kept)[
+        ["looked_for", "detection_rate", "detection_rate_low", "detection_rate_high"]]
+    counts = detection_rate(results, (*kept, *cells))
+    n = counts["draws"].astype(np.float64)
+    hits = (counts["detected"] * n / counts["looked_for"]).where(n > 0, 0.0)
+    strata = [n, n.sum("marker_id"), hits.sum("marker_id")]
+    expected, variance, third = xr.apply_ufunc(
+        hypergeometric_moments, *strata, dask="parallelized", output_core_dims=[[]] * 3,
+        output_dtypes=[np.float64] * 3,
+    )
+    found = {name: array.sum(cells).transpose(*kept) for name, array in (
+        ("n", n), ("hits", hits), ("expected", expected), ("variance", variance),
+        ("third", third))}
+    drawn = table["detection_rate_low"].notnull()
+    p_value = xr.apply_ufunc(
+        two_sided, found["hits"] - found["expected"], found["variance"], found["third"],
+        dask="parallelized", output_dtypes=[np.float64],
+    ).where(drawn)
+    whole = dict.fromkeys(p_value.dims, -1)
+    adjusted = xr.apply_ufunc(
+        holm, p_value.chunk(whole) if p_value.chunks else p_value, dask="parallelized",
+        output_dtypes=[np.float64],
+    )
+    expected_rate = found["expected"] / found["n"]
+    share = table["detection_rate"] / expected_rate
+    rank = xr.apply_ufunc(
+        _rank, share.chunk(marker_id=-1) if share.chunks else share, dask="parallelized",
+        input_core_dims=[["marker_id"]], output_core_dims=[["marker_id"]],
+        output_dtypes=[np.float64],
+    )
+    below = table["detection_rate"] < expected_rate
+    meanings = {
+        "expected_rate": (expected_rate, "detection rate if all IDs were alike in each cell"),
+        "p_value": (p_value, "chance of a rate so far from it if they were alike"),
+        "p_adjusted": (adjusted, "the same for the whole table (Holm)"),
+        "weak": (below & (adjusted < SIGNIFICANCE),
+                 "whether the rate is below the expected one, p_adjusted < 0.05"),
+        "rank": (rank, "1 has the lowest share of its expected rate"),
+    }
+    return table.assign({
+        name: array.assign_attrs(long_name=meaning, units="1")
+        for name, (array, meaning) in meanings.items()
+    })
+
+
+def hypergeometric_moments(
+    n: Floats, total: Floats, all_hits: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Return mean, variance and third central moment of the hits of ``n`` draws of ``total``.
+
+    ``all_hits`` are those of all. Johnson, Kemp and Kotz, "Univariate Discrete Distributions",
+    3rd ed. 2005, section 6.3.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = n * all_hits / total
+        variance = mean * (total - all_hits) * (total - n) / (total * (total - 1.0))
+        third = variance * (total - 2 * all_hits) * (total - 2 * n) / (total * (total - 2.0))
+    return (np.where(total > 0, mean, 0.0), np.where(total > 1, variance, 0.0),
+            np.where(total > 2, third, 0.0))
+
+
+def two_sided(deviation: Floats, variance: Floats, third: Floats) -> Floats:
+    """Return twice the smaller tail of a sum of counts beyond its deviation from the mean.
+
+    Of the gamma distribution with that variance and third central moment, shifted to mean 0; with
+    a continuity correction of 1/2.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # In units in which the skewness is not negative.
+        sign = np.where(third < 0, -1.0, 1.0)
+        skewness = np.maximum(np.abs(third) / variance**1.5, 1e-6)
+        shape, scale = 4.0 / skewness**2, np.sqrt(variance) * skewness / 2.0
+        above = special.gammaincc(
+            shape, np.maximum(sign * deviation - 0.5, -shape * scale) / scale + shape)
+        below = special.gammainc(
+            shape, np.maximum(sign * deviation + 0.5, -shape * scale) / scale + shape)
+    p_value = np.minimum(1.0, 2.0 * np.minimum(above, below))
+    return np.where(variance > 0, p_value, 1.0)
+
+
+def holm(p_values: Floats) -> Floats:
+    """Return p-values corrected for their number, that of those that are not NaN."""
+    flat = p_values.ravel()
+    order = np.argsort(flat)  # NaN last
+    count = int((~np.isnan(flat)).sum())
+    factors = np.arange(count, 0, -1)
+    adjusted = np.full(flat.shape, np.nan)
+    stepped = np.maximum.accumulate(np.minimum(1.0, flat[order[:count]] * factors))
+    adjusted[order[:count]] = stepped
+    return adjusted.reshape(p_values.shape)
+
+
+def _rank(share: Floats) -> Floats:
+    """Return the ranks along the last axis, from 1; NaN of NaN."""
+    ranks = np.argsort(np.argsort(share, axis=-1, kind="stable"), axis=-1) + 1.0
+    return np.where(np.isnan(share), np.nan, ranks)

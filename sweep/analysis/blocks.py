@@ -14,6 +14,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,8 +22,9 @@ from typing import Any
 import dask.array as da
 import numpy as np
 import xarray as xr
-from dask.delayed import Delayed, delayed
+from dask.delayed import Delayed
 from dask.graph_manipulation import bind
+from dask.highlevelgraph import HighLevelGraph
 from numpy.typing import NDArray
 
 from sweep.analysis.poses import INSIDE, Poses
@@ -75,6 +77,9 @@ def kept_of(results: xr.Dataset, names: Sequence[str]) -> tuple[str, ...]:
     if lacking:
         there = ", ".join(map(str, results.data_vars)) or "none"
         raise StoreError(f"no variable {' or '.join(lacking)}: there are {there}")
+    empty = [name for name in axes if results.sizes[name] == 0]
+    if empty:
+        raise StoreError(f"there are no poses: {', '.join(empty)} has no values")
     return tuple(dict.fromkeys(names))
 
 
@@ -149,9 +154,11 @@ def streamed(
         {f"bin {name}": edges for name, (_, edges) in binned.items()}, view,
     )
     chunked = _chunked(dataset, layout, lazy=lazy)
-    tables, grid = _tables(chunked, results, layout, statistics)
+    lengths = {name: tuple(chunked.chunks[name]) if name in chunked.sizes
+               else (results.sizes[name],) for name in (*layout.kept, *pooled)}
+    graph, tables = _tables(chunked, lengths, layout, statistics)
     outputs = [output for statistic in statistics for output in statistic.outputs()]
-    found = _assembled(tables, grid, layout, outputs)
+    found = _assembled(graph, tables, lengths, layout, outputs)
     coordinates = {name: value for name, value in results.coords.items()
                    if set(value.dims) <= set(kept)}
     table = xr.Dataset(found, coordinates).assign_coords(_bin_coordinates(results, binned))
@@ -207,39 +214,65 @@ def _axes(layout: Layout, dataset: xr.Dataset) -> list[str]:
             if name in dataset.sizes]
 
 
-Grid = tuple[tuple[int, ...], ...]
-"""The lengths of the chunks of each kept dimension."""
+Lengths = Mapping[str, tuple[int, ...]]
+"""The lengths of the chunks of each dimension."""
+Key = tuple[str, int]
+"""Name of a task: that of its layer, and a number."""
+
+
+class Layer:
+    """Tasks of one name, which may refer to each other and to those of other collections."""
+
+    def __init__(self, name: str) -> None:
+        self.name = f"{name}-{uuid.uuid4().hex}"
+        self.tasks: dict[Any, Any] = {}
+
+    def add(self, function: Callable[..., Any], *arguments: Any) -> Key:
+        """Add a task and return its key; arguments are keys, or lists of keys."""
+        key = (self.name, len(self.tasks))
+        self.tasks[key] = (function, *arguments)
+        return key
+
+    def merged(self, states: list[Key]) -> Key:
+        """Add tasks that merge states, a few at a time."""
+        while len(states) > 1:
+            states = [self.add(_combined, states[k : k + FAN_IN])
+                      for k in range(0, len(states), FAN_IN)]
+        return states[0]
 
 
 def _tables(
-    dataset: xr.Dataset, results: xr.Dataset, layout: Layout, statistics: Sequence[Statistic]
-) -> tuple[list[Delayed], Grid]:
-    """Return what is found in each block of the kept dimensions, and how long these are."""
-    lengths = {name: tuple(dataset.chunks[name]) if name in dataset.sizes
-               else (results.sizes[name],) for name in layout.kept}
-    lengths |= {name: tuple(dataset.chunks[name])
-                for name in _axes(layout, dataset) if name not in lengths}
+    dataset: xr.Dataset, lengths: Lengths, layout: Layout, statistics: Sequence[Statistic]
+) -> tuple[HighLevelGraph, list[Key]]:
+    """Return the graph, and the keys of what is found in each block of the kept dimensions."""
     arrays = [da.asarray(array.data) for array in dataset.data_vars.values()]
-    first_look = _looks(arrays, layout, lengths, functools.partial(_first, layout, statistics))
-    between = _task(_between, statistics)
-    known = [between(_merged_in_tree(states)) for states in first_look]
+    layer = Layer("first")
+    looks = _looks(layer, arrays, layout, lengths, functools.partial(_first, layout, statistics))
+    known = [layer.add(functools.partial(_between, statistics), layer.merged(states))
+             for states in looks]
+    last = layer.add(_nothing, known)
+    first = HighLevelGraph.from_collections(layer.name, layer.tasks, arrays)
     # The second look must not keep in memory what the first has read: it reads again.
-    again = bind(arrays, known)
-    second_look = _looks(again, layout, lengths, functools.partial(_second, layout, statistics),
-                         known)
-    finish = _task(_finish, statistics)
-    tables = [finish(of_first, _merged_in_tree(states))
-              for of_first, states in zip(known, second_look, strict=True)]
-    return tables, tuple(lengths[name] for name in layout.kept)
+    waited = Delayed(last, first, layer=layer.name)
+    again = bind(arrays, waited)
+    layer = Layer("second")
+    looks = _looks(layer, again, layout, lengths, functools.partial(_second, layout, statistics),
+                   known)
+    tables = [layer.add(functools.partial(_finish, statistics), of_first, layer.merged(states))
+              for of_first, states in zip(known, looks, strict=True)]
+    needed: list[Any] = [*again, waited]
+    return HighLevelGraph.from_collections(layer.name, layer.tasks, needed), tables
+
+
+def _nothing(_: Any) -> None:
+    """Return nothing, once all that is given is there."""
 
 
 def _looks(
-    arrays: Sequence[Any], layout: Layout, lengths: Mapping[str, tuple[int, ...]],
-    look: Callable[..., Any], known: Sequence[Delayed] = (),
-) -> list[list[Delayed]]:
-    """Return the states of all blocks, folded, by block of the kept dimensions."""
-    pieces = [array.to_delayed(optimize_graph=False) for array in arrays]
-    observe, fold = _task(look), _task(_folded)
+    layer: Layer, arrays: Sequence[da.Array], layout: Layout, lengths: Lengths,
+    look: Callable[..., Any], known: Sequence[Key] = (),
+) -> list[list[Key]]:
+    """Add looks at all blocks; return the states, folded, by block of the kept dimensions."""
     found = []
 
     def numbers(names: Sequence[str]) -> list[dict[str, int]]:
@@ -253,27 +286,15 @@ def _looks(
             for draw in numbers(layout.draws):
                 at = kept | cell | draw
                 blocks = [
-                    piece[tuple(at.get(dim, 0) for dim in dims)]
-                    for piece, dims in zip(pieces, layout.arrays.values(), strict=True)
+                    (array.name, *(at.get(dim, 0) for dim in dims))
+                    for array, dims in zip(arrays, layout.arrays.values(), strict=True)
                 ]
                 sizes = {name: chunks[at.get(name, 0)] for name, chunks in lengths.items()}
-                parts.append(observe(sizes, blocks, *known[number : number + 1]))
-            states.append(fold(parts))
+                parts.append(layer.add(
+                    functools.partial(look, sizes), blocks, *known[number : number + 1]))
+            states.append(layer.add(_folded, parts))
         found.append(states)
     return found
-
-
-def _task(function: Callable[..., Any], *fixed: Any) -> Any:
-    """Return a delayed function; what is fixed is not searched for lazy values."""
-    bound = functools.partial(function, *fixed)
-    return delayed(bound, name=None, pure=False, traverse=False)
-
-
-def _merged_in_tree(states: list[Delayed]) -> Delayed:
-    merge = _task(_combined)
-    while len(states) > 1:
-        states = [merge(states[k : k + FAN_IN]) for k in range(0, len(states), FAN_IN)]
-    return states[0]
 
 
 Look = list[tuple[State, State]]
@@ -363,19 +384,24 @@ def _finish(
 
 
 def _assembled(
-    tables: list[Delayed], grid: Grid, layout: Layout, outputs: Sequence[Output]
-) -> dict[str, tuple[tuple[str, ...], Any, Mapping[str, Any]]]:
+    graph: HighLevelGraph, tables: list[Key], lengths: Lengths, layout: Layout,
+    outputs: Sequence[Output],
+) -> dict[str, tuple[tuple[str, ...], da.Array, Mapping[str, Any]]]:
     """Return the variables, put together from the blocks of the kept dimensions."""
     bins = tuple(len(edges) - 1 for edges in layout.bins.values())
     dims = (*layout.kept, *(name.removeprefix("bin ") for name in layout.bins))
+    chunks = (*(lengths[name] for name in layout.kept), *((count,) for count in bins))
     found = {}
     for output in outputs:
-        pieces = np.empty([len(lengths) for lengths in grid], dtype=object)
-        for table, index in zip(tables, np.ndindex(*pieces.shape), strict=True):
-            shape = (*(lengths[k] for lengths, k in zip(grid, index, strict=True)), *bins)
-            piece = _task(_variable, output, shape)(table)
-            pieces[index] = da.from_delayed(piece, shape, output.dtype)
-        array = da.block(pieces.tolist()) if grid else pieces[()]
+        layer = Layer(output.name)
+        for table, index in zip(tables, np.ndindex(*map(len, chunks)), strict=True):
+            shape = tuple(sizes[k] for sizes, k in zip(chunks, index, strict=True))
+            layer.tasks[layer.name, *index] = (functools.partial(_variable, output, shape), table)
+        whole = HighLevelGraph(
+            {**graph.layers, layer.name: layer.tasks},
+            {**graph.dependencies, layer.name: {tables[0][0]}},
+        )
+        array = da.Array(whole, layer.name, chunks, dtype=output.dtype)
         found[output.name] = dims, array, flagged_attributes(output)
     return found
 

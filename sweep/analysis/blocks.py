@@ -28,18 +28,8 @@ from dask.highlevelgraph import HighLevelGraph
 from numpy.typing import NDArray
 
 from sweep.analysis.poses import INSIDE, Poses
-from sweep.analysis.statistics import (
-    Found,
-    Output,
-    State,
-    Statistic,
-    combined,
-    every_nth,
-    flagged_attributes,
-    folded,
-    interleaved,
-    scattered,
-)
+from sweep.analysis.states import State, combined, every_nth, folded, interleaved, scattered
+from sweep.analysis.statistics import Found, Output, Statistic, flagged_attributes
 from sweep.errors import StoreError
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
 from sweep.plan.template import LABELS, TEMPLATE

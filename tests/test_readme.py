@@ -69,6 +69,20 @@ def test_first_analysis_runs_on_the_smoke_pipeline(tmp_path):
     )
     assert shown.returncode == 0, shown.stderr
     assert "tilt_deg" in shown.stdout
+    answered = subprocess.run(
+        [sys.executable, "-c", block_after("answers", "python")], cwd=tmp_path,
+        capture_output=True, text=True, check=False,
+    )
+    assert answered.returncode == 0, answered.stderr
+    for name in ("detection_rate_low", "rotation_p95_deg", "per_module", "p_adjusted"):
+        assert name in answered.stdout
+
+
+def test_every_link_of_the_readme_leads_somewhere():
+    links = re.findall(r"\]\((?!https?:)([^)#]+)\)|src=\"([^\"]+)\"", README)
+    assert links
+    for link in links:
+        assert (TOP / "".join(link)).exists(), link
 
 
 def test_show_draws_a_scene_or_its_plain_image(tmp_path, capsys):

@@ -126,7 +126,7 @@ def streamed(
 
     Raises ``StoreError`` for bins of what is not there, or is no number of a scene.
     """
-    binned = _binned(results, bins or {})
+    binned = _binned(results, kept, bins or {})
     lazy = any(array.chunks is not None for array in needed.values())
     dataset = xr.Dataset(
         {name: array.reset_coords(drop=True) for name, array in needed.items()}
@@ -156,15 +156,15 @@ def streamed(
 
 
 def _binned(
-    results: xr.Dataset, bins: Bins
+    results: xr.Dataset, kept: Sequence[str], bins: Bins
 ) -> dict[str, tuple[xr.DataArray, NDArray[np.float64]]]:
     """Return what is binned, with its edges."""
     found = {}
     for name, given in bins.items():
         edges = np.asarray(given, dtype=np.float64)
-        if name not in results.variables or name in axes_of(results):
+        if name not in results.variables or name in kept:
             there = [str(n) for n, v in results.variables.items()
-                     if v.dtype.kind == "f" and n not in results.dims]
+                     if v.dtype.kind == "f" and n not in kept]
             raise StoreError(f"bins of {name}: no such variable; there are {', '.join(there)}")
         array = results[name].reset_coords(drop=True)
         if array.dtype.kind not in "fiu" or any(dim in LABELS for dim in array.dims):

@@ -30,6 +30,9 @@ Integers = NDArray[np.int64]
 Masks = NDArray[np.bool_]
 
 
+TRUTH = ("true_tvec_m", "true_rvec")
+
+
 class Pair:
     """The same poses, treated in two ways."""
 
@@ -45,6 +48,13 @@ class Pair:
     def compared(self) -> Masks:
         """Poses that were looked for in both."""
         return self.first.looked_for & self.second.looked_for
+
+    @property
+    def differing(self) -> Masks:
+        """Poses whose truth differs."""
+        names = [name for name in TRUTH if name in self.first and name in self.second]
+        return np.any(
+            [(self.first[name] != self.second[name]).any(axis=-1) for name in names], axis=0)
 
     @property
     def both_solved(self) -> Masks:
@@ -67,6 +77,8 @@ def compare(
       has the interval of Newcombe (Statistics in Medicine 17, 1998, method 10).
       ``detection_p_value``: McNemar's test, exact: how often chance alone makes the two discordant
       counts as unequal.
+    - ``different_scenes``: compared poses whose truth differs, as those of two dictionaries where
+      anything is drawn. Where there are any, nothing is paired, and the test compares two samples.
     - ``both_solved``, ``only_first_solved``, ``only_second_solved``, ``neither_solved``.
     - Of the poses solved in both: ``*_difference_*``, the mean difference of the absolute errors,
       and ``*_rmse_ratio``, the second's RMSE over the first's. They say nothing of the poses that
@@ -83,7 +95,7 @@ def compare(
     alone = [name for name, value in first.coords.items() if not value.dims
              and not (name in second.coords and value.equals(second.coords[name]))]
     first = first.drop_vars(alone)  # such as the name of its solver
-    needed = _both(errors(first), errors(second))
+    needed = _both(_with_truth(first), _with_truth(second))
     statistics: list[Statistic] = []
     for what, seen in (("detected", lambda poses: poses.detected),
                        ("solved", lambda poses: poses.solved)):
@@ -98,6 +110,9 @@ def compare(
             statistics.append(Count(f"{name}_{what}", f"compared poses, {name} {what}", ended))
     statistics.append(Rate("rate", "both of compared", lambda pair: pair.compared,
                            lambda pair: pair.compared, counts=("compared", "all of compared")))
+    statistics.append(Count(
+        "different_scenes", "compared poses whose truth differs, so that they are no pairs",
+        lambda pair: pair.compared & pair.differing))
     for quantity in QUANTITIES:
         statistics += _differences(quantity)
     table = streamed(first, needed, kept, statistics, bins, Pair)
@@ -137,6 +152,11 @@ def _see_that_they_pair(first: xr.Dataset, second: xr.Dataset) -> None:
              for side in (first, second)]
     if None not in seeds and seeds[0] != seeds[1]:
         raise StoreError(f"not the same draws: seeds {seeds[0]} and {seeds[1]}")
+
+
+def _with_truth(results: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Return what tells the errors, and the true poses."""
+    return errors(results) | {name: results[name] for name in TRUTH if name in results}
 
 
 def _both(

@@ -40,6 +40,10 @@ class Poses:
             return np.where(inside, array, 0)
         return array
 
+    def __contains__(self, name: object) -> bool:
+        """Tell whether there is such an array."""
+        return f"{self._prefix}{name}" in self._arrays
+
     @cached_property
     def detection(self) -> NDArray[np.uint8]:
         """Flags of `Detection`."""

@@ -110,6 +110,17 @@ def _parser() -> argparse.ArgumentParser:
     form.add_argument("--json", action="store_true", help="print one JSON object")
     form.add_argument("--markdown", action="store_true", help="print Markdown tables")
 
+    report = command("report", _report, "write a page with the answer, figures and scenes")
+    report.add_argument("store", metavar="STORE", help="a finished store")
+    report.add_argument(
+        "-o", "--output", metavar="FILE", help="default: report.html, or report.md with --format md"
+    )
+    report.add_argument(
+        "--format", choices=("html", "md"),
+        help="one HTML page, or Markdown with a folder of figures (default: as FILE ends)",
+    )
+    report.add_argument("--figures", metavar="DIR", help="write each figure as SVG and PNG too")
+
     status = command("status", _status, "say how far a store is; also while it is written")
     status.add_argument("store", metavar="STORE")
     status.add_argument("--json", action="store_true", help="print one JSON object")
@@ -326,6 +337,32 @@ def _tradeoff(chosen: argparse.Namespace) -> int:
         print("\n".join(renderer_lines(renderers, markdown=chosen.markdown)))
     print()
     print("\n".join(advice(trade, chosen.criterion)))
+    return 0
+
+
+def _report(chosen: argparse.Namespace) -> int:
+    import xarray as xr  # noqa: PLC0415
+
+    from sweep.engine.store import committed, open_dataset, open_store  # noqa: PLC0415
+    from sweep.report.subject import Subject  # noqa: PLC0415
+    from sweep.report.writing import check_output, write_report  # noqa: PLC0415
+
+    form = chosen.format or ("md" if str(chosen.output).lower().endswith(".md") else "html")
+    output = Path(chosen.output or f"report.{form}")
+    figures = Path(chosen.figures) if chosen.figures else None
+    store = open_store(chosen.store)
+    if not store.finished:
+        done, blocks = len(committed(store)), len(store.blocks)
+        raise StoreError(
+            f"{store.url}: unfinished: {done:,} of {blocks:,} blocks; `sweep run` continues it"
+        )
+    check_output(output, figures)
+    trade = None
+    if "cost/tradeoff" in store.group:
+        trade = xr.open_zarr(store.url, group="cost/tradeoff", consolidated=False)
+    subject = Subject(store.url, open_dataset(store.url), store.pipeline, store.about, trade)
+    count = write_report(subject, output, form, figures)
+    print(f"{output}: {count} figures, {_bytes(output.stat().st_size)}")
     return 0
 
 

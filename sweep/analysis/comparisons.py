@@ -53,8 +53,8 @@ class Pair:
     def differing(self) -> Masks:
         """Poses whose truth differs."""
         names = [name for name in TRUTH if name in self.first and name in self.second]
-        return np.any(
-            [(self.first[name] != self.second[name]).any(axis=-1) for name in names], axis=0)
+        differ = [(self.first[name] != self.second[name]).any(axis=-1) for name in names]
+        return np.asarray(np.any(differ, axis=0))
 
     @property
     def both_solved(self) -> Masks:

@@ -1,0 +1,524 @@
+"""The report: what it tells is what the store holds, whatever the store, and nothing else."""
+
+import base64
+import contextlib
+import io
+import math
+import os
+import re
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import xarray as xr
+
+from sweep import cli
+from sweep.analysis import compare, detection_rate, error_statistics, failure_composition
+from sweep.engine.runner import _cost
+from sweep.engine.store import create_store, finish, open_dataset, open_store, write_group
+from sweep.engine.task import compute_block
+from sweep.errors import StoreError
+from sweep.measure.flags import Detection, Estimate
+from sweep.model.renderers import background_image
+from sweep.plan.grid import scene_axes
+from sweep.plan.pipeline import Pipeline
+from sweep.report import gallery
+from sweep.report import subject as subjects
+from sweep.report.figures import figures_of
+from sweep.report.gallery import scenes_of
+from sweep.report.subject import Grouping, Subject, texts_of
+from sweep.report.table import number
+from sweep.report.writing import write_report
+
+CAMERA = """
+seed = 7
+[camera]
+width_px = 160
+height_px = 120
+fx_px = 150
+[marker]
+size_m = 0.05
+"""
+
+FULL = f"""
+title = "All <axes> & \\"kinds\\" of $figures$"
+{CAMERA}
+[pose]
+jitter_px = 0.5
+azimuth_deg = {{ uniform = [0, 360] }}
+[scene]
+black = 40
+white = 220
+background = 120
+noise_grey = 4
+bound = "known_blur"
+[axes]
+marker_id = [0, 7, 23]
+side_px = [7, 14, 40]
+tilt_deg = [0, 50]
+cornerRefinementMethod = ["none", "subpix"]
+solver = ["ippe_square", "photometric"]
+trial = 4
+"""
+
+ODD = {
+    "single pose": f"{CAMERA}[pose]\nside_px = 40\n",
+    "one axis of one value": f"{CAMERA}[pose]\nside_px = 40\n[axes]\ntilt_deg = [20]\n",
+    "only trial": f"{CAMERA}[pose]\nside_px = 40\njitter_px = 0.5\n[axes]\ntrial = 6\n",
+    "nothing detected": f"{CAMERA}[pose]\njitter_px = 0.5\n[axes]\nside_px = [3, 4]\n"
+                        "tilt_deg = [0, 60]\ntrial = 3\n",
+    "nothing visible": f"{CAMERA}[pose]\ntilt_deg = 180\n[axes]\nside_px = [20, 40]\n",
+    "no draws": f"{CAMERA}[axes]\nside_px = [20, 40]\ntilt_deg = [0, 30]\n"
+                'solver = ["ippe", "iterative"]\n',
+    "lists and words": f"{CAMERA}[pose]\nside_px = 40\njitter_px = 0.5\n[axes]\n"
+                       'distortion = [[], [-0.1, 0.01, 0, 0]]\nrenderer = ["exact", "warp"]\n'
+                       "guarded = [true, false]\ntrial = 3\n",
+    "distances drawn": f"{CAMERA}[pose]\ndistance_m = {{ uniform = [0.1, 0.9] }}\n[axes]\n"
+                       'dictionary = ["DICT_4X4_50", "DICT_6X6_50"]\nmarker_id = [0, 1]\n'
+                       "trial = 20\n",
+    "long axes": f"{CAMERA}[pose]\njitter_px = 0.5\n[axes]\nmarker_id = {{ range = [0, 26] }}\n"
+                 "side_px = { linspace = [8, 40, 42] }\n",
+}
+
+
+def made(folder, text, name, *, finished=True, settings=()):
+    """Compute a store in this process, without a cluster; return its place."""
+    url = str(folder / f"{name}.zarr")
+    pipeline = Pipeline.from_text(text, settings, name=name)
+    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
+    store = create_store(url, pipeline, tuple(-(-length // 2) for length in lengths))
+    for block in list(store.blocks)[: None if finished else 1]:
+        compute_block(url, store.run_id, block)
+    if finished:
+        finish(store, _cost(store))
+    return url
+
+
+def opened(url, trade=None):
+    store = open_store(url)
+    return Subject(url, open_dataset(url), store.pipeline, store.about, trade)
+
+
+def command(*arguments):
+    """Run a command in this process; return its exit status, output and error output."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = cli.main(list(map(str, arguments)))
+        except SystemExit as stopped:
+            code = stopped.code
+    return code, out.getvalue(), err.getvalue()
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory):
+    return made(tmp_path_factory.mktemp("full"), FULL, "full")
+
+
+@pytest.fixture(scope="module")
+def page(full, tmp_path_factory):
+    output = tmp_path_factory.mktemp("page") / "report.html"
+    code, out, err = command("report", full, "-o", output)
+    assert (code, err) == (0, "")
+    assert out.startswith(f"{output}: ")
+    return output.read_text(encoding="utf-8")
+
+
+class Page(HTMLParser):
+    """A page's tags, what they refer to, and its tables by caption."""
+
+    VOID = frozenset({"meta", "img", "br", "link", "input"})
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.ids, self.references, self.tables, self.faults = [], [], [], {}, []
+        self.cells = self.caption = None
+        self.images = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        named = dict(attrs)
+        self.references += [
+            (name, named[name])
+            for name in ("src", "href", "xlink:href", "action", "data", "poster", "srcset")
+            if name in named
+        ]
+        if "id" in named:
+            self.ids.append(named["id"])
+        if tag in {"img", "svg"}:
+            self.images.append((tag, named))
+        if tag == "table":
+            self.cells, self.caption = [], None
+        if tag == "tr":
+            self.cells.append([])
+        if tag in {"th", "td", "caption"}:
+            self.text = ""
+            if tag == "th" and named.get("scope") not in {"col", "row"}:
+                self.faults.append("a heading of a table without scope")
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        if tag not in self.VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        if not self.open or self.open.pop() != tag:
+            self.faults.append(f"</{tag}> closes something else")
+        if tag in {"th", "td"}:
+            self.cells[-1].append(self.text)
+        if tag == "caption":
+            self.caption = self.text
+        if tag == "table":
+            self.tables.setdefault(self.caption, self.cells)
+
+    def handle_data(self, data):
+        self.text = getattr(self, "text", "") + data
+
+
+def test_the_page_needs_nothing_else(page):
+    read = Page(page)
+    assert read.open == []
+    assert read.faults == []
+    for name, value in read.references:
+        assert value.startswith(("data:", "#")), (name, value[:80])
+    fragments = {value[1:] for _, value in read.references if value.startswith("#")}
+    assert fragments <= set(read.ids)
+    assert len(read.ids) == len(set(read.ids))
+    assert not re.search(r"url\((?!#|data:|['\"]data:)", page)
+    assert not re.search(r"<script|@import|javascript:|\son\w+=", page)
+    assert "default-src 'none'" in page
+    assert "http" not in re.sub(r"http-equiv|<pre.*?</pre>", "", page, flags=re.DOTALL)
+
+
+def test_the_page_can_be_read_by_those_who_cannot_see_it(page):
+    read = Page(page)
+    assert '<html lang="en">' in page
+    assert "<title>All &lt;axes&gt; &amp; &quot;kinds&quot; of $figures$</title>" in page
+    assert read.images
+    for tag, attributes in read.images:
+        assert attributes.get("alt" if tag == "img" else "aria-label")
+    assert read.tables
+    assert None not in read.tables
+    assert page.count("<h1>") == 1
+
+
+def test_drawings_take_the_colours_of_the_page(page):
+    svgs = re.findall(r"<svg.*?</svg>", page, re.DOTALL)
+    assert len(svgs) >= 20
+    for svg in svgs:
+        assert "var(--ink)" in svg
+        assert not re.search(r"#(282828|7a7a7a|ffffff|000000|0072b2)\b", svg, re.IGNORECASE)
+    assert "prefers-color-scheme: dark" in page
+    assert "@media print" in page
+
+
+def kinds(url):
+    return [kind.name for kind in figures_of(opened(url))]
+
+
+def test_each_figure_applies_where_it_should(full, tmp_path):
+    assert kinds(full) == [
+        "detection", "errors", "maps", "failures", "flips", "ranking", "treatments", "paired",
+        "bound",
+    ]
+    found = {name: kinds(made(tmp_path, text, name.replace(" ", "_")))
+             for name, text in ODD.items() if name != "long axes"}
+    assert found == {
+        "single pose": ["failures"],
+        "one axis of one value": ["failures"],
+        "only trial": ["failures"],
+        "nothing detected": ["detection", "errors", "maps", "failures"],
+        "nothing visible": ["detection", "errors", "failures"],
+        "no draws": ["detection", "errors", "maps", "failures", "flips", "treatments", "paired"],
+        "lists and words": ["failures", "treatments", "paired", "effect-distortion",
+                            "effect-renderer"],
+        "distances drawn": ["detection", "errors", "failures", "ranking", "effect-dictionary"],
+    }
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_odd_stores_have_a_report_without_a_warning(name, tmp_path):
+    url = made(tmp_path, ODD[name], "odd")
+    output = tmp_path / "report.html"
+    assert command("report", url, "-o", output)[::2] == (0, "")
+    text = output.read_text(encoding="utf-8")
+    assert not re.search(r"\bnan\b|\binf\b", re.sub(r"<pre.*?</pre>", "", text))
+    read = Page(text)
+    assert (read.open, read.faults) == ([], [])
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".report")]
+
+
+def test_numbers_of_the_tables_are_those_of_the_analysis(full, page):
+    tables = Page(page).tables
+    results = open_dataset(full)
+    errors = error_statistics(results, per=("tilt_deg", "side_px")).compute()
+    rows = tables["Errors, with 95 % intervals"]
+    assert len(rows) == 1 + errors["looked_for"].size
+    column = rows[0].index("rotation median, deg")
+    for row in rows[1:]:
+        one = errors.sel(tilt_deg=float(row[0]), side_px=float(row[1]))
+        low, value, high = (
+            float(one[f"rotation_median_deg{end}"]) for end in ("_low", "", "_high"))
+        assert row[2] == f"{int(one.looked_for):,}"
+        between = "" if math.isnan(low) and math.isnan(high) else (
+            f" ({number(low)} to {number(high)})")
+        assert row[column] == number(value) + between
+    rates = detection_rate(results, per=("marker_id",)).compute()
+    rows = tables["IDs by detection rate, with 95 % intervals"]
+    for row in rows[1:]:
+        rate = 100 * float(rates["detection_rate"].sel(marker_id=int(row[0])))
+        assert row[2].split(" (")[0] == number(rate)
+    shares = failure_composition(results, per=("side_px",)).compute()
+    rows = tables["Shares in percent, with 95 % intervals"]
+    column = rows[0].index("solved, %")
+    for row in rows[1:]:
+        share = 100 * float(shares["share"].sel(side_px=float(row[0]), outcome="solved"))
+        assert row[column].split(" (")[0] == number(share)
+
+
+def test_each_treatment_is_paired_with_the_first(full, page):
+    results = open_dataset(full)
+    first, second = (
+        results.sel(cornerRefinementMethod=refinement, solver=solver, drop=True)
+        for refinement, solver in (("none", "ippe_square"), ("subpix", "photometric"))
+    )
+    expected = compare(first, second).compute()
+    rows = Page(page).tables["Against none \u00b7 ippe_square, with 95 % intervals"]
+    (row,) = (row for row in rows if row[0] == "subpix \u00b7 photometric")
+    for heading, name in {"compared": "compared", "both solved": "both_solved",
+                          "found by it only": "only_second_detected"}.items():
+        assert row[rows[0].index(heading)] == f"{int(expected[name]):,}"
+    low, ratio, high = (
+        number(float(expected[f"rotation_rmse_ratio{end}"])) for end in ("_low", "", "_high"))
+    assert row[rows[0].index("rotation RMSE ratio")] == f"{ratio} ({low} to {high})"
+
+
+def test_the_answer_is_that_of_plain_arithmetic(full, page):
+    results = open_dataset(full).load()
+    detected = 100 * float((results["detection"] == Detection.detected).mean())
+    solved = results["estimate"] == Estimate.solved
+    ordered = np.sort(results["rotation_error_deg"].where(solved, np.inf).values.ravel())
+    median = ordered[math.ceil(len(ordered) / 2) - 1]
+    paragraph = re.search(r'<p class="answer">(.*?)</p>', page)[1]
+    assert f"found in {number(detected)} %" in paragraph
+    assert f"median is {number(median)}\u00b0" in paragraph
+    poses = np.prod([results.sizes[axis] for axis in ("marker_id", "side_px", "tilt_deg", "trial")])
+    assert f'<span class="value">{poses}</span>' in page
+
+
+def test_long_axes_are_put_in_bins_that_hold_every_pose(tmp_path):
+    subject = opened(made(tmp_path, ODD["long axes"], "long"))
+    grouping = subject.along("side_px", 10)
+    found = subject.of(detection_rate, grouping)
+    assert found.sizes["side_px"] == 10
+    assert int(found["looked_for"].sum()) == int(
+        subject.of(detection_rate, Grouping())["looked_for"])
+    assert grouping.notes == ("The 42 values of side_px are in 10 bins.",)
+    thinned = subject.along("marker_id", 5, binned=False)
+    assert subject.of(detection_rate, thinned)["marker_id"].values.tolist() == [0, 6, 12, 19, 25]
+
+
+def test_bins_are_the_same_whether_a_store_is_loaded_or_read_in_pieces(full, monkeypatch):
+    subject, loaded = opened(full), opened(full).in_memory()
+    assert loaded.results["estimate"].chunks is None
+    monkeypatch.setattr(subjects, "LOADED_BYTES", 0)
+    assert subject.in_memory().results["estimate"].chunks is not None
+    for grouping in (subject.by_tilt() + subject.along("side_px", 2), subject.along("solver")):
+        xr.testing.assert_allclose(
+            subject.of(error_statistics, grouping), loaded.of(error_statistics, grouping))
+
+
+# Scenes.
+
+def test_scenes_are_those_with_the_smallest_and_largest_errors(full, monkeypatch):
+    subject = opened(full)
+    results = subject.results.load()
+    solved = results["rotation_error_deg"].where(results["estimate"] == Estimate.solved)
+    for piece in (10**9, 50):
+        monkeypatch.setattr(gallery, "PIECE", piece)
+        chosen = dict(gallery._chosen(results if piece > 50 else opened(full).results))
+        found = {
+            title.split(":")[0]: float(results["rotation_error_deg"].isel(index))
+            for title, index in chosen.items()
+        }
+        assert found["best"] == float(solved.min())
+        assert found["worst"] == float(solved.max())
+        median = float(np.nanmedian(solved))
+        assert found["median rotation error of the solved"] == pytest.approx(median, rel=0.1)
+        for flag in (Detection.rejected, Detection.no_candidate):
+            assert bool((results["detection"] == flag).any()) == any(
+                title.startswith(flag.name.replace("_", " ")) for title in chosen)
+
+
+def test_scenes_looked_at_again_are_what_the_store_holds(full):
+    scenes = list(scenes_of(opened(full)))
+    assert len(scenes) >= 4
+    for scene in scenes:
+        assert scene.problem == ""
+        image = cv2.imdecode(np.frombuffer(scene.picture, np.uint8), cv2.IMREAD_COLOR)
+        assert image.shape[:2] == scene.size[::-1]
+        assert scene.command.startswith("sweep show full.toml --at ")
+
+
+def test_a_scene_s_command_shows_it(full, tmp_path):
+    pipeline = tmp_path / "full.toml"
+    pipeline.write_text(open_store(full).pipeline.text, encoding="utf-8")
+    scene = next(scenes_of(opened(full)))
+    at = re.fullmatch(r"sweep show full.toml --at '?([^']*)'?", scene.command)[1]
+    code, out, err = command("show", pipeline, "--at", at, "-o", tmp_path / "scene.png")
+    assert (code, err) == (0, "")
+    assert out.endswith(": detected, solved\n")
+
+
+def test_a_scene_that_is_not_what_the_store_holds_is_told(full):
+    subject = opened(full)
+    results = subject.results.load()
+    subject.results["rotation_error_deg"] = results["rotation_error_deg"] * 1.5
+    told = [scene.problem for scene in scenes_of(subject)]
+    assert any("Not what the store holds: rotation_error_deg is" in problem for problem in told)
+
+
+def test_a_crashed_scene_is_not_rendered_and_a_lost_background_is_told(full, tmp_path):
+    subject = opened(full)
+    results = subject.results.load()
+    results["detection"][0, 0, 0] = Detection.crashed
+    problems = {title: scene.problem for scene in scenes_of(subject) for title in scene.titles}
+    assert problems["crashed: the process died"].startswith("Not drawn")
+    background = tmp_path / "wall.png"
+    cv2.imwrite(str(background), np.full((120, 160), 130, np.uint8))
+    text = f'{CAMERA}[pose]\nside_px = 40\n[scene]\nbackground = "{background}"\n'
+    url = made(tmp_path, text, "wall")
+    assert [scene.problem for scene in scenes_of(opened(url))] == [""]
+    background.unlink()
+    background_image.cache_clear()
+    (scene,) = scenes_of(opened(url))
+    assert scene.problem.startswith("Cannot be drawn here: ")
+    assert scene.picture is None
+
+
+# Trade, Markdown, files.
+
+def small_trade():
+    names = ["none \u00b7 ippe_square", "subpix \u00b7 ippe_square"]
+    shape = ("side_px", "treatment")
+    values = np.array([[0.2, 0.3], [0.4, 0.6]])
+    columns = {"cost_ms": values, "rotation_p95_deg": 1 / values, "rotation_median_deg": values,
+               "solved_rate": values, "detection_rate": values}
+    return xr.Dataset({name: (shape, column) for name, column in columns.items()},
+                      {"side_px": [14.0, 40.0], "treatment": np.array(names, dtype=object)})
+
+
+def test_a_trade_is_shown_where_the_store_has_one(tmp_path):
+    url = made(tmp_path, ODD["no draws"], "trade")
+    write_group(open_store(url, "r+"), "cost/tradeoff", small_trade())
+    output = tmp_path / "report.html"
+    assert command("report", url, "-o", output)[::2] == (0, "")
+    text = output.read_text(encoding="utf-8")
+    assert 'id="trade"' in text
+    assert f"sweep tradeoff {url} --per side_px" in text
+    rows = Page(text).tables["Cost and accuracy, the cheapest first, with 95 % intervals"]
+    assert [row[0] for row in rows[1:3]] == small_trade()["treatment"].values.tolist()
+
+
+def test_markdown_has_its_figures_beside_it_and_figures_go_where_they_are_asked(full, tmp_path):
+    output, folder = tmp_path / "answer.md", tmp_path / "pictures"
+    code, out, err = command("report", full, "-o", output, "--figures", folder)
+    assert (code, err) == (0, "")
+    assert out.startswith(f"{output}: 9 figures")
+    text = output.read_text(encoding="utf-8")
+    assert text.startswith('# All &lt;axes&gt; &amp; "kinds" of \\$figures\\$\n')
+    linked = re.findall(r"!\[[^\]]*\]\(([^)]*)\)", text)
+    assert len(linked) >= 9 + 4
+    for link in linked:
+        encoded = (tmp_path / link).read_bytes()
+        assert cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR) is not None
+    for name in kinds(full):
+        assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        ET.parse(folder / f"{name}.svg")  # noqa: S314  (our own file)
+    for line in text.splitlines():
+        if line.startswith("|") and "---" not in line:
+            assert re.sub(r"\\.", "", line).count("|") >= 3
+
+
+def test_the_pipeline_can_be_taken_from_the_page(full, page):
+    encoded = re.search(r'href="data:application/toml;base64,([^"]*)"', page)[1]
+    assert base64.b64decode(encoded).decode() == open_store(full).pipeline.text
+
+
+def test_numbers_of_axes_are_short_and_told_apart():
+    assert texts_of([0.15, 0.208424, 0.2891]) == ["0.15", "0.208", "0.289"]
+    assert texts_of([1.00001, 1.00002]) == ["1.00001", "1.00002"]
+    assert texts_of([True, False]) == ["True", "False"]
+    assert texts_of([]) == []
+
+
+# What cannot be.
+
+def test_what_cannot_be_reported_is_told_in_one_line(full, tmp_path):
+    unfinished = made(tmp_path, ODD["no draws"], "unfinished", finished=False)
+    folder, file = tmp_path / "folder", tmp_path / "file"
+    folder.mkdir()
+    file.write_text("mine")
+    wanted = {
+        (tmp_path / "none.zarr",): "there is no store",
+        (folder,): "holds something else than a store",
+        (unfinished,): f"{unfinished}: unfinished: 1 of 4 blocks; `sweep run` continues it",
+        (full, "-o", folder): "it is a folder",
+        (full, "-o", tmp_path / "missing" / "report.html"): "there is no folder",
+        (full, "-o", file / "report.html"): "there is no folder",
+        (full, "--figures", file): "it is a file",
+        (full, "--figures", tmp_path / "missing" / "pictures"): "there is no folder",
+        (full, "--format", "pdf"): "invalid choice",
+    }
+    with contextlib.chdir(tmp_path):
+        before = sorted(path.name for path in tmp_path.iterdir())
+        for arguments, message in wanted.items():
+            code, out, err = command("report", *arguments)
+            assert (code, out) == (2, "")
+            assert message in err
+            assert len(err.splitlines()) == 1 or "usage" in err
+        assert sorted(path.name for path in tmp_path.iterdir()) == before
+    assert file.read_text() == "mine"
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_cannot_be_written_is_told(full, tmp_path):
+    tmp_path.chmod(0o500)
+    code, _, err = command("report", full, "-o", tmp_path / "report.html")
+    tmp_path.chmod(0o700)
+    assert code == 2
+    assert "cannot be written: Permission denied" in err
+
+
+def test_a_report_is_whole_or_not_there(full, tmp_path, monkeypatch):
+    output = tmp_path / "report.html"
+    output.write_text("the one before")
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sweep.report.writing.page", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_report(opened(full), output)
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+    assert output.read_text() == "the one before"
+
+
+def test_results_without_poses_are_refused(full, tmp_path):
+    subject = opened(full)
+    empty = Subject(subject.store, subject.results.isel(trial=slice(0, 0)), subject.pipeline,
+                    subject.about)
+    with pytest.raises(StoreError, match="there are no results"):
+        write_report(empty, tmp_path / "report.html")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_report_needs_neither_dask_nor_the_engine():
+    for path in Path(subjects.__file__).parent.glob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        assert not re.search(r"^\s*(from|import) (dask|sweep\.engine)", text, re.MULTILINE)

@@ -1,0 +1,117 @@
+"""A report in a real browser: wide and narrow, light and dark; it is right and asks for nothing."""
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from test_report import FULL, command, made
+
+PIPELINES = Path(__file__).parents[1] / "pipelines"
+BROWSER = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+pytestmark = pytest.mark.skipif(
+    BROWSER is None, reason="there is no chromium, chromium-browser or google-chrome")
+
+WIDTHS = (1280, 390)
+SCHEMES = {"dark": 0, "light": 1}
+PAPERS = {"dark": "rgb(23, 24, 27)", "light": "rgb(255, 255, 255)"}
+
+# Windows are no narrower than 500 px; a frame is as wide as it is told to be.
+FRAME = """<!DOCTYPE html><body style="margin: 0"><pre id="told"></pre>
+<iframe id="frame" src="{page}" style="border: 0; width: {width}px; height: 900px"></iframe>
+<script>
+document.getElementById("frame").onload = event => {{
+  const page = event.target.contentDocument, root = page.documentElement;
+  page.querySelectorAll("details").forEach(one => one.open = true);
+  const boxes = [...page.querySelectorAll("body *")].filter(one => {{
+    for (let box = one.parentElement; box; box = box.parentElement)
+      if (["auto", "hidden", "scroll"].includes(getComputedStyle(box).overflowX)) return false;
+    return one.getBoundingClientRect().right > root.clientWidth + 1;
+  }});
+  document.getElementById("told").textContent = JSON.stringify({{
+    width: root.clientWidth, content: root.scrollWidth, beyond: boxes.map(one => one.outerHTML
+      .slice(0, 80)), paper: getComputedStyle(page.body).backgroundColor,
+    images: [...page.images].every(one => one.complete && one.naturalWidth > 0),
+    drawings: [...page.querySelectorAll("svg")].every(
+      one => one.getBoundingClientRect().height > 50),
+    unread: [...page.querySelectorAll("svg text")].filter(
+      one => getComputedStyle(one).fill === getComputedStyle(page.body).backgroundColor).length,
+  }});
+}};
+</script>"""
+
+
+def browse(place, *options):
+    """Open a page in the browser; return its tags in the end, and what is on the console."""
+    done = subprocess.run(
+        [BROWSER, "--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
+         "--disable-dev-shm-usage", "--disable-background-networking", "--no-first-run",
+         "--allow-file-access-from-files", "--enable-logging=stderr", "--v=0",
+         "--virtual-time-budget=4000", "--window-size=1400,1000", *options, "--dump-dom",
+         place.as_uri()],
+        capture_output=True, text=True, timeout=120, check=True,
+    )
+    return done.stdout, re.findall(r".*CONSOLE.*", done.stderr)
+
+
+def check(page, folder):
+    for width in WIDTHS:
+        for scheme, number in SCHEMES.items():
+            frame = folder / f"{width}-{scheme}.html"
+            frame.write_text(FRAME.format(page=page.as_uri(), width=width))
+            tags, console = browse(frame, f"--blink-settings=preferredColorScheme={number}")
+            assert console == []
+            told = json.loads(re.search(r'<pre id="told">(.*?)</pre>', tags)[1])
+            assert told["paper"] == PAPERS[scheme]
+            assert told["width"] == width
+            assert told["content"] <= width
+            assert told["beyond"] == []
+            assert told["images"]
+            assert told["drawings"]
+            assert told["unread"] == 0
+
+
+def test_the_report_is_right_wide_and_narrow_light_and_dark(tmp_path):
+    page = tmp_path / "report.html"
+    assert command("report", made(tmp_path, FULL, "full"), "-o", page)[0] == 0
+    check(page, tmp_path)
+
+
+def test_a_page_that_asked_for_something_would_be_told(tmp_path):
+    page = tmp_path / "report.html"
+    assert command("report", made(
+        tmp_path, "seed = 1\n[pose]\nside_px = 40\n", "one"), "-o", page)[0] == 0
+    asking = page.read_text(encoding="utf-8").replace(
+        "</main>", '<img src="http://192.0.2.1/picture.png" alt="none"></main>')
+    page.write_text(asking, encoding="utf-8")
+    console = browse(page)[1]
+    assert len(console) == 1
+    assert "Content Security Policy" in console[0]
+
+
+SMALLER = {
+    "paper_fig3": ["marker_id=[0, 1]", "distance_m={ linspace = [0.1, 0.5, 45] }", "trial=2"],
+    "paper_fig4": ["marker_id=[0, 1]", "distance_m={ linspace = [0.02, 0.3, 9] }", "trial=2"],
+    "smoke": ["trial=2"],
+    "bound": ["trial=3", "side_px=[20, 50]", "tilt_deg=[0, 30, 60]"],
+    "renderers": ["trial=2", "renderer=['exact', 'warp', 'supersample-2']", "side_px=[20, 50]"],
+    "tradeoff": ["trial=2", "side_px=[20, 50]"],
+    "faults": ["trial=2", "exposure_s=[0, 0.002]", "distance_m=[0.8, 1.6]"],
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", sorted(path.stem for path in PIPELINES.glob("*.toml")))
+def test_reports_of_every_pipeline_are_right(name, tmp_path):
+    text = (PIPELINES / f"{name}.toml").read_text(encoding="utf-8")
+    url = made(tmp_path, text, name, settings=SMALLER.get(name, ["trial=2"]))
+    if name == "tradeoff":
+        assert command("tradeoff", url, "--per", "side_px", "--seconds", "20")[0] == 0
+    page = tmp_path / "report.html"
+    code, _, err = command("report", url, "-o", page)
+    assert (code, err) == (0, "")
+    check(page, tmp_path)

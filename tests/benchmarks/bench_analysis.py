@@ -1,0 +1,152 @@
+"""The analysis functions on a store of many poses: time and peak memory of each, by itself.
+
+    python tests/benchmarks/bench_analysis.py [POSES [SECONDS]]
+
+The store is one as `sweep run` makes it, in chunks of about 10,000 poses along the axes of the
+scene, with the variables that the analyses read, filled at random (default 10^7 poses). Each
+function runs in a fresh interpreter on the default threads, and is stopped after SECONDS (600).
+"""
+
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from sweep.engine.store import create_store, region
+from sweep.measure.flags import Detection, Estimate, Flipped
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.template import TEMPLATE
+
+GRID = """
+seed = 1
+[marker]
+size_m = 0.04
+[pose]
+jitter_px = 0.5
+[axes]
+marker_id = {{ range = [0, 50] }}
+tilt_deg = [0, 25, 50, 75]
+side_px = {{ geom = [10, 200, 25] }}
+solver = ["ippe_square", "iterative"]
+trial = {trials}
+"""
+POSES_A_TRIAL = 50 * 4 * 25 * 2
+EXTENTS = (1, 4, 25)
+TRIALS_A_CHUNK = 50  # 10,000 poses
+
+CALLS = {
+    "open and look": "results",
+    "detection_rate": "detection_rate(results, ('tilt_deg', 'side_px'))",
+    "detection_rate, bins": "detection_rate(results, bins={'marker_area_px': AREAS})",
+    "flip_rate": "flip_rate(results, ('solver', 'tilt_deg'))",
+    "failure_composition": "failure_composition(results, ('solver', 'side_px'))",
+    "error_statistics, all": "error_statistics(results)",
+    "error_statistics": "error_statistics(results, ('solver', 'tilt_deg', 'side_px'))",
+    "error_statistics, bins":
+        "error_statistics(results, ('solver',), {'marker_area_px': AREAS})",
+    "marker_ranking": "marker_ranking(results)",
+    "compare": "compare(results.isel(solver=0), results.isel(solver=1), ('tilt_deg',))",
+    "detection_limit": "detection_limit(results, 0.9)",
+}
+
+CHILD = """
+import json, sys, time
+import numpy as np
+import sweep
+from sweep.analysis import (compare, detection_limit, detection_rate, error_statistics,
+                            failure_composition, flip_rate, marker_ranking)
+AREAS = np.geomspace(100, 40_000, 13)
+begun = time.perf_counter()
+results = sweep.open(sys.argv[1])
+lazy = {call}
+called = time.perf_counter()
+table = lazy if lazy is results else lazy.compute()
+done = time.perf_counter()
+# Not ru_maxrss, which begins at the parent's size.
+status = dict(line.split(":", 1) for line in open("/proc/self/status"))
+print(json.dumps({{"peak": int(status["VmHWM"].split()[0]) * 1024, "call_s": called - begun,
+                   "compute_s": done - called,
+                   "values": sum(a.size for a in table.data_vars.values())}}))
+"""
+
+
+def write_store(folder, poses):
+    """Write a store of about so many poses, at least one chunk; return its place and its poses."""
+    trials = max(poses // POSES_A_TRIAL, 1)
+    pipeline = Pipeline.from_text(GRID.format(trials=trials))
+    store = create_store(
+        str(Path(folder) / f"{poses}.zarr"), pipeline, (*EXTENTS, min(TRIALS_A_CHUNK, trials)))
+    rng = np.random.default_rng(1)
+    variables = {variable.name: variable for variable in TEMPLATE}
+    for block in store.blocks:
+        for name, values in chunk(rng, pipeline, block).items():
+            variable = variables[name]
+            store.array(name)[region(variable, pipeline, block)] = values
+    return store.url, trials * POSES_A_TRIAL
+
+
+def chunk(rng, pipeline, block):
+    """Return plausible values of a block: small markers are missed, steep ones flip less."""
+    scene = block.shape
+    sides = np.array(pipeline.axis("side_px").values)[block.starts[2]:block.stops[2], None]
+    tilts = np.array(pipeline.axis("tilt_deg").values)[block.starts[1]:block.stops[1]]
+    solvers = len(pipeline.axis("solver"))
+    depth = np.broadcast_to(30.0 / sides, scene)
+    found = rng.random(scene) < 1 - np.exp(-sides / 8)
+    solved = found[..., None] & (rng.random((*scene, solvers)) < 0.995)
+    flipped = solved & (rng.random((*scene, solvers)) < (0.1 - 0.001 * tilts)[:, None, None, None])
+    noise = (0.3 / sides)[..., None, None]
+    rotation = noise * rng.standard_normal((*scene, solvers, 3), dtype=np.float32)
+    position = noise * rng.standard_normal((*scene, solvers, 3), dtype=np.float32)
+    for errors in (rotation, position):
+        errors[~solved] = np.nan
+    angle = np.degrees(np.sqrt((rotation**2).sum(axis=-1)))
+    of_solvers = {
+        "estimate": np.where(solved, Estimate.solved, np.where(
+            found[..., None], Estimate.solver_failed, Estimate.no_detection)),
+        "flipped": np.where(flipped, Flipped.flipped, np.where(
+            solved, Flipped.not_flipped, Flipped.no_estimate)),
+        "rotation_error_rad": rotation, "translation_error_m": position,
+        "rotation_error_deg": angle,
+    }
+    return {
+        "true_tvec_m": np.stack([0 * depth, 0 * depth, depth], axis=-1),
+        "marker_area_px": sides**2 * rng.uniform(0.9, 1.0, scene),
+        "detection": np.where(found, Detection.detected, Detection.no_candidate),
+    } | {name: np.moveaxis(values, 4, 3) for name, values in of_solvers.items()}
+
+
+def measured(store, call, seconds=600):
+    """Run a call on a store in a fresh interpreter; return its figures."""
+    ran = subprocess.run(
+        [sys.executable, "-c", CHILD.format(call=call), store], capture_output=True, text=True,
+        check=False, timeout=seconds)
+    if ran.returncode:
+        raise RuntimeError(ran.stderr[-2000:])
+    return json.loads(ran.stdout)
+
+
+def main():
+    poses = int(float(sys.argv[1])) if len(sys.argv) > 1 else 10**7
+    seconds = float(sys.argv[2]) if len(sys.argv) > 2 else 600
+    with tempfile.TemporaryDirectory(prefix="sweep-bench-") as folder:
+        begun = time.perf_counter()
+        store, written = write_store(folder, poses)
+        print(f"{written:,} poses written in {time.perf_counter() - begun:.0f} s")
+        print(f"{'':24}{'call s':>8}{'compute s':>11}{'peak MB':>9}{'values':>9}")
+        for name, call in CALLS.items():
+            try:
+                found = measured(store, call, seconds)
+            except (subprocess.TimeoutExpired, RuntimeError) as error:
+                print(f"{name:24} {str(error).splitlines()[-1][-100:]}")
+                continue
+            print(f"{name:24}{found['call_s']:8.2f}{found['compute_s']:11.1f}"
+                  f"{found['peak'] / 1e6:9.0f}{found['values']:9,}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

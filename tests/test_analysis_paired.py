@@ -1,0 +1,580 @@
+"""Rankings, comparisons and limits against plain loops, exact distributions and statsmodels."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import stats
+from test_analysis_reference import (
+    FX,
+    GRIDS,
+    QUANTITIES,
+    SIZE_M,
+    assert_agrees,
+    freedom_in,
+    is_detected,
+    is_run,
+    is_solved,
+    length,
+    looked_for,
+    mean_of,
+    mixed,
+    named,
+    perfect,
+    pipeline_text,
+    poses,
+    rate,
+    student,
+    students,
+    wilson,
+)
+
+from sweep.analysis import compare, detection_limit, detection_rate, marker_ranking
+from sweep.errors import StoreError
+from sweep.measure.flags import Detection, Estimate, Flipped
+
+
+def with_detected(results, hits):
+    """Return the dataset with poses detected where ``hits``, and solved where detected."""
+    out = results.copy(deep=True)
+    dims = results["detection"].dims
+    detected = xr.DataArray(np.broadcast_to(hits, results["detection"].shape), dims=dims)
+    out["detection"] = (dims, np.where(detected, Detection.detected, Detection.no_candidate)
+                        .astype(np.uint8))
+    estimated = results["estimate"]
+    seen = xr.broadcast(detected, estimated.drop_vars(estimated.coords))[0]
+    seen = seen.transpose(*estimated.dims)
+    for name, yes, no in (("estimate", Estimate.solved, Estimate.no_detection),
+                          ("flipped", Flipped.not_flipped, Flipped.no_estimate)):
+        out[name] = (seen.dims, np.where(seen, yes, no).astype(np.uint8))
+    for name in ("rotation_error_rad", "translation_error_m", "rotation_error_deg"):
+        out[name] = out[name].where(seen)
+    return out
+
+
+# Ranking of marker IDs.
+
+def strata_of(found):
+    """Return {cell: {marker: [hits, looked for]}} of poses of all IDs.
+
+    ``found`` are (marker, cell, pose).
+    """
+    strata = {}
+    for marker, cell, pose in found:
+        if looked_for(pose):
+            counts = strata.setdefault(cell, {}).setdefault(marker, [0, 0])
+            counts[0] += is_detected(pose)
+            counts[1] += 1
+    return strata
+
+
+def hypergeometric_parts(strata, marker):
+    """Return an ID's hits and, of each cell that others were in, (looked for, its, hits)."""
+    parts, hits = [], 0
+    for counts in strata.values():
+        if marker not in counts:
+            continue
+        own, total = counts[marker], sum(n for _, n in counts.values())
+        detected = sum(k for k, _ in counts.values())
+        hits += own[0]
+        parts.append((total, own[1], detected))
+    return hits, parts
+
+
+def exact_tails(hits, parts):
+    """Return P(S <= hits), P(S >= hits) of the sum of the cells' hypergeometric numbers."""
+    chances = np.ones(1)
+    for total, own, detected in parts:
+        k = np.arange(min(own, detected) + 1)
+        chances = np.convolve(chances, stats.hypergeom.pmf(k, total, detected, own))
+    return chances[: hits + 1].sum(), chances[hits:].sum()
+
+
+def cumulants(parts):
+    """Return mean, variance and third central moment of the sum (Johnson, Kemp and Kotz 2005,
+    section 6.3).
+    """
+    mean = variance = third = 0.0
+    for n, m, k in parts:
+        mean += m * k / n
+        if n > 1:
+            own = m * k * (n - m) * (n - k) / (n * n * (n - 1))
+            variance += own
+            third += own * (n - 2 * m) * (n - 2 * k) / (n * (n - 2)) if n > 2 else 0.0
+    return mean, variance, third
+
+
+def holm(p_values):
+    """Holm 1979: the smallest times m, the next times m - 1, ..., never falling."""
+    adjusted, largest = {}, 0.0
+    for k, index in enumerate(sorted(range(len(p_values)), key=lambda i: p_values[i])):
+        largest = max(largest, (len(p_values) - k) * p_values[index])
+        adjusted[index] = min(1.0, largest)
+    return [adjusted[index] for index in range(len(p_values))]
+
+
+def of_markers(results, per):
+    """Return {kept indices without the marker: (marker, cell, pose)}; cells hold all IDs."""
+    names = (*per, "marker_id")
+    groups = {}
+    for index, found in poses(results, "detection", names).items():
+        groups.setdefault(index[:-1], []).extend(
+            (index[-1], pose["cell"], pose) for pose in found)
+    return groups
+
+
+RANKED = {
+    "plain": (mixed({"marker_id": 5, "tilt_deg": 3, "trial": 30}, 1, good=0.8), ()),
+    "kept": (mixed({"trial": 20, "marker_id": 4, "tilt_deg": 2, "side_px": 3}, 2), ("tilt_deg",)),
+    "dictionaries": (mixed({"dictionary": 2, "marker_id": 3, "trial": 25}, 3), ()),
+    "kept setting": (
+        mixed({"noise_grey": 2, "marker_id": 3, "side_px": 2, "trial": 25}, 4), ("noise_grey",)),
+}
+
+
+@pytest.mark.parametrize("case", RANKED)
+def test_rates_of_ids_and_what_their_cells_expect_are_those_of_plain_loops(case):
+    results, per = RANKED[case]
+    told = marker_ranking(results, per).compute()
+    kept = (*per, "dictionary") if "dictionary" in results.dims else per
+    assert set(told["looked_for"].dims) == {*kept, "marker_id"}
+    adjusted = holm(told["p_value"].transpose(*kept, "marker_id").values.ravel().tolist())
+    np.testing.assert_allclose(
+        told["p_adjusted"].transpose(*kept, "marker_id").values.ravel(), adjusted, rtol=1e-12)
+    for index, found in of_markers(results, kept).items():
+        strata = strata_of(found)
+        markers = range(results.sizes["marker_id"])
+        for marker in markers:
+            aimed = [pose | {"cell": cell} for who, cell, pose in found
+                     if who == marker and looked_for(pose)]
+            hits, parts = hypergeometric_parts(strata, marker)
+            expected = {"looked_for": len(aimed), **rate("detection_rate", aimed, hits),
+                        "expected_rate": cumulants(parts)[0] / len(aimed)}
+            at = dict(zip((*kept, "marker_id"), (*index, marker), strict=True))
+            assert_agrees(told, at, expected)
+            here = told.isel(at)
+            below = here["detection_rate"] < here["expected_rate"]
+            assert here["weak"].item() == bool(below and here["p_adjusted"] < 0.05)
+        here = told.isel(dict(zip(kept, index, strict=True)))
+        assert here["weak"].dtype == bool
+        if kept == per:
+            assert sorted(here["rank"].values.tolist()) == [m + 1 for m in markers]
+
+
+@pytest.mark.parametrize("case", RANKED)
+def test_p_values_of_ids_are_pearsons_third_curve_near_the_exact_ones(case):
+    # Two-sided: twice the smaller tail of the sum of the cells' hypergeometric numbers.
+    results, per = RANKED[case]
+    told = marker_ranking(results, per).compute()
+    kept = (*per, "dictionary") if "dictionary" in results.dims else per
+    for index, found in of_markers(results, kept).items():
+        strata = strata_of(found)
+        for marker in range(results.sizes["marker_id"]):
+            hits, parts = hypergeometric_parts(strata, marker)
+            mean, variance, third = cumulants(parts)
+            at = dict(zip((*kept, "marker_id"), (*index, marker), strict=True))
+            p_value = told["p_value"].isel(at).item()
+            deviation = math.sqrt(variance)
+            curve = stats.pearson3(third / deviation**3, mean, deviation)
+            tails = curve.cdf(hits + 0.5), curve.sf(hits - 0.5)
+            assert p_value == pytest.approx(min(1.0, 2 * min(tails)), rel=1e-9)
+            exact = min(1.0, 2 * min(exact_tails(hits, parts)))
+            assert p_value == pytest.approx(exact, rel=0.02, abs=0.002)
+
+
+def test_of_two_ids_looked_for_alike_the_p_value_is_that_of_cochran_mantel_and_haenszel():
+    # Half of each cell's poses are each ID's: no skewness, so that Pearson's curve is the normal.
+    contingency = pytest.importorskip("statsmodels.stats.contingency_tables")
+    rng = np.random.default_rng(5)
+    results = perfect(rng, {"marker_id": 2, "tilt_deg": 3, "trial": 60})
+    chances = np.array([[0.9, 0.7, 0.4], [0.8, 0.6, 0.2]])[..., None]
+    results = with_detected(results, rng.random((2, 3, 60)) < chances)
+    told = marker_ranking(results).compute()
+    tables = []
+    for tilt in range(3):
+        hits = [(results["detection"].values[m, tilt] == Detection.detected).sum()
+                for m in range(2)]
+        tables.append(np.array([[hits[0], 60 - hits[0]], [hits[1], 60 - hits[1]]]))
+    found = contingency.StratifiedTable(tables).test_null_odds(correction=True)
+    np.testing.assert_allclose(told["p_value"], [found.pvalue] * 2, rtol=1e-9)
+    assert told["rank"].values.tolist() == [2, 1]
+
+
+@pytest.mark.parametrize("case", RANKED)
+def test_the_references_statistic_is_that_of_statsmodels(case):
+    contingency = pytest.importorskip("statsmodels.stats.contingency_tables")
+    results, per = RANKED[case]
+    kept = (*per, "dictionary") if "dictionary" in results.dims else per
+    for found in of_markers(results, kept).values():
+        strata = strata_of(found)
+        hits, parts = hypergeometric_parts(strata, 1)
+        tables = []
+        for counts in strata.values():
+            own = counts[1]
+            others = np.sum([counts[m] for m in counts if m != 1], axis=0)
+            tables.append(np.array([[own[0], own[1] - own[0]],
+                                    [others[0], others[1] - others[0]]], dtype=float))
+        told = contingency.StratifiedTable(tables).test_null_odds(correction=True)
+        mean, variance, _ = cumulants(parts)
+        assert (abs(hits - mean) - 0.5) ** 2 / variance == pytest.approx(told.statistic, rel=1e-9)
+
+
+def test_the_references_holm_is_that_of_statsmodels():
+    multitest = pytest.importorskip("statsmodels.stats.multitest")
+    rng = np.random.default_rng(6)
+    for p_values in (rng.random(20) ** 4, np.array([0.01, 0.01, 1.0, 0.03]), np.array([0.2])):
+        adjusted = multitest.multipletests(p_values, method="holm")[1]
+        np.testing.assert_allclose(holm(p_values.tolist()), adjusted, rtol=1e-14)
+
+
+def test_settings_that_see_the_same_draws_make_no_id_weaker():
+    rng = np.random.default_rng(7)
+    one = perfect(rng, {"marker_id": 6, "tilt_deg": 2, "trial": 25, "noise_grey": 1})
+    one = with_detected(one, rng.random((6, 2, 25, 1)) < 0.7)
+    many = xr.concat([one.assign_coords(noise_grey=[level]) for level in (1.0, 2.0, 4.0, 8.0)],
+                     dim="noise_grey").transpose(*one.dims)
+    alone, pooled = marker_ranking(one).compute(), marker_ranking(many).compute()
+    for name in ("detection_rate", "detection_rate_low", "expected_rate", "p_value", "p_adjusted",
+                 "weak", "rank"):
+        np.testing.assert_allclose(
+            pooled[name].astype(float), alone[name].astype(float), rtol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize("detected", [False, True])
+def test_where_all_ids_are_alike_none_is_weak(detected):
+    results = perfect(np.random.default_rng(8), {"marker_id": 4, "trial": 10})
+    told = marker_ranking(with_detected(results, detected)).compute()
+    assert not told["weak"].any()
+    assert (told["p_value"].fillna(1.0) == 1.0).all()
+    assert (told["expected_rate"] == float(detected)).all()
+
+
+def test_a_ranking_without_ids_is_refused():
+    results = perfect(np.random.default_rng(9), {"trial": 10})
+    with pytest.raises(StoreError, match="marker_id: no such dimension; there are trial"):
+        marker_ranking(results)
+
+
+# Comparison of two treatments.
+
+def newcombe(both, first, second, neither):
+    """Return the difference of two paired rates, second minus first, and its interval.
+
+    Newcombe, Statistics in Medicine 17, 1998, 2635-2650, method 10.
+    """
+    n = both + first + second + neither
+    one, two = (both + first) / n, (both + second) / n
+    (low1, high1), (low2, high2) = wilson(both + first, n), wilson(both + second, n)
+    margins = (both + first) * (second + neither) * (both + second) * (first + neither)
+    product = both * neither - first * second
+    if product > 0:
+        product = max(product - n / 2, 0)
+    phi = product / math.sqrt(margins) if margins else 0.0
+    difference = two - one
+    below, above, over, under = two - low2, high2 - two, high1 - one, one - low1
+    low = difference - math.sqrt(below**2 - 2 * phi * below * over + over**2)
+    high = difference + math.sqrt(above**2 - 2 * phi * above * under + under**2)
+    return difference, low, high
+
+
+GOLDEN = pytest.mark.parametrize(("table", "low", "high"), [
+    # Newcombe 1998, table III: 36 both, 12 and 2 one only, 0 neither.
+    ((36, 2, 12, 0), 0.0569, 0.3404),
+    # Fagerland, Lydersen and Laake, "Statistical Analysis of Contingency Tables", 2017, chapter 8
+    # (their R package's test): complete response before and after a therapy.
+    ((59, 16, 6, 80), -0.1186, -0.0046),
+])
+
+
+@GOLDEN
+def test_the_references_difference_is_the_published_one(table, low, high):
+    assert np.round(newcombe(*table)[1:], 4).tolist() == [low, high]
+
+
+@GOLDEN
+def test_the_difference_of_two_rates_is_the_published_one(table, low, high):
+    results = perfect(np.random.default_rng(16), {"trial": sum(table)})
+    seen = np.repeat([[1, 1], [1, 0], [0, 1], [0, 0]], table, axis=0).astype(bool)
+    told = compare(*(with_detected(results, seen[:, k]) for k in range(2))).compute()
+    assert [told[name].item() for name in (
+        "both_detected", "only_first_detected", "only_second_detected", "neither_detected",
+    )] == list(table)
+    assert round(told["detection_difference_low"].item(), 4) == low
+    assert round(told["detection_difference_high"].item(), 4) == high
+
+
+@pytest.mark.parametrize("table", [(50, 0, 0, 0), (50, 3, 0, 1), (20, 5, 14, 8), (0, 9, 9, 9)])
+def test_the_p_value_of_a_difference_is_mcnemars_exact_one(table):
+    contingency = pytest.importorskip("statsmodels.stats.contingency_tables")
+    results = perfect(np.random.default_rng(17), {"trial": sum(table)})
+    seen = np.repeat([[1, 1], [1, 0], [0, 1], [0, 0]], table, axis=0).astype(bool)
+    told = compare(*(with_detected(results, seen[:, k]) for k in range(2))).compute()
+    expected = contingency.mcnemar(np.array(table).reshape(2, 2), exact=True).pvalue
+    assert told["detection_p_value"].item() == pytest.approx(expected, rel=1e-12)
+
+
+def pairs_of(first, second, per, bins=None):
+    """Return {kept indices: pairs of poses of the same scene}."""
+    ones, others = (poses(side, "estimate", per, bins) for side in (first, second))
+    groups = {}
+    for index, found in ones.items():
+        at = {pose["at"]: pose for pose in others[index]}
+        groups[index] = [(pose, at[pose["at"]]) for pose in found]
+    return groups
+
+
+def expected_seen(pairs):
+    """Of the estimates' poses: a detection counts with each of its estimators."""
+    compared = [pair for pair in pairs if all(map(looked_for, pair))]
+    tally = dict.fromkeys(itertools.product((True, False), repeat=2), 0)
+    for pair in compared:
+        tally[tuple(map(is_detected, pair))] += 1
+    both, first = tally[True, True], tally[True, False]
+    second, neither = tally[False, True], tally[False, False]
+    out = {"compared": len(compared), "both_detected": both, "only_first_detected": first,
+           "only_second_detected": second, "neither_detected": neither}
+    unknown = named("detection_difference", [math.nan] * 3) | {"detection_p_value": math.nan}
+    if not compared:
+        return out | unknown
+    difference, low, high = newcombe(both, first, second, neither)
+    if freedom_in([pose for pose, _ in compared]) == 0:
+        return out | unknown | {"detection_difference": difference}
+    odd = first + second
+    return out | named("detection_difference", (difference, low, high)) | {
+        "detection_p_value": stats.binomtest(first, odd).pvalue if odd else 1.0}
+
+
+def expected_solved(pairs):
+    compared = [pair for pair in pairs if all(map(looked_for, pair))]
+    run = [pose for pose, other in pairs if is_run(pose) and is_run(other)]
+    tally = dict.fromkeys(itertools.product((True, False), repeat=2), 0)
+    for pair in compared:
+        tally[tuple(map(is_solved, pair))] += 1
+    out = {"both_solved": tally[True, True], "only_first_solved": tally[True, False],
+           "only_second_solved": tally[False, True], "neither_solved": tally[False, False]}
+    solved = [pair for pair in compared if all(map(is_solved, pair))]
+    for name, (unit, error) in QUANTITIES.items():
+        sizes = [(pose, length(error(pose)), length(error(other))) for pose, other in solved]
+        differences = [(pose, second - first) for pose, first, second in sizes]
+        out |= named(f"{name}_difference_{unit}", student(*mean_of(differences, run)))
+        ratio = low = high = math.nan
+        if sizes:
+            # The logarithm of the ratio of two mean squares, by the delta method.
+            squares = [math.fsum(pair[k] ** 2 for pair in sizes) / len(sizes) for k in (1, 2)]
+            ratio = math.sqrt(squares[1] / squares[0])
+            relative = [(pose, second**2 / squares[1] - first**2 / squares[0])
+                        for pose, first, second in sizes]
+            _, deviation, freedom = mean_of(relative, run)
+            half = deviation / 2 * students(freedom)
+            low, high = ratio * math.exp(-half), ratio * math.exp(half)
+        out |= named(f"{name}_rmse_ratio", (ratio, low, high))
+    return out
+
+
+PAIRED = {"trial": 40, "tilt_deg": 2, "marker_id": 2}
+
+
+def two_solvers(**options):
+    return mixed({**PAIRED, "solver": 2}, 10, **options)
+
+
+def two_detectors():
+    return mixed({**PAIRED, "cornerRefinementMethod": 2, "solver": 1}, 11)
+
+
+COMPARED = {
+    "solvers": (two_solvers(), "solver"), "detectors": (two_detectors(), "cornerRefinementMethod"),
+    "few lost": (two_solvers(good=0.97), "solver"),
+}
+
+
+@pytest.mark.parametrize("per", [(), ("tilt_deg",), ("marker_id", "tilt_deg"), ("trial",)])
+@pytest.mark.parametrize("case", COMPARED)
+def test_comparisons_are_those_of_plain_loops(case, per):
+    results, name = COMPARED[case]
+    first, second = (results.isel({name: k}) for k in range(2))
+    told = compare(first, second, per).compute()
+    assert tuple(told["compared"].dims) == per
+    for index, pairs in pairs_of(first, second, per).items():
+        assert_agrees(told, dict(zip(per, index, strict=True)),
+                      expected_seen(pairs) | expected_solved(pairs))
+
+
+def test_comparisons_in_bins_are_those_of_plain_loops():
+    results, bins = COMPARED["solvers"][0], {"marker_area_px": [100.0, 300.0, 600.0, 1001.0]}
+    first, second = results.isel(solver=0), results.isel(solver=1)
+    told = compare(first, second, ("tilt_deg",), bins=bins).compute()
+    for index, pairs in pairs_of(first, second, ("tilt_deg",), bins).items():
+        at = dict(zip(("tilt_deg", "marker_area_px"), index, strict=True))
+        assert_agrees(told, at, expected_seen(pairs) | expected_solved(pairs))
+
+
+def test_counts_of_comparisons_with_pooled_settings_are_those_of_plain_loops():
+    results = GRIDS["all"]
+    first, second = results.isel(noise_grey=0), results.isel(noise_grey=1)
+    told = compare(first, second, ("tilt_deg",)).compute()
+    unsure = ("detection_p_value", "detection_difference_low", "detection_difference_high")
+    for index, pairs in pairs_of(first, second, ("tilt_deg",)).items():
+        wanted = expected_seen(pairs) | expected_solved(pairs)
+        assert_agrees(told, {"tilt_deg": index[0]},
+                      {name: value for name, value in wanted.items() if name not in unsure})
+
+
+def test_settings_that_see_the_same_draws_make_no_difference_surer():
+    one, _ = COMPARED["solvers"]
+    one = one.expand_dims(noise_grey=[1.0], axis=0)
+    many = xr.concat([one.assign_coords(noise_grey=[level]) for level in (1.0, 2.0, 4.0)],
+                     dim="noise_grey")
+    alone, pooled = (
+        compare(results.isel(solver=0), results.isel(solver=1)).compute()
+        for results in (one, many)
+    )
+    for name, array in alone.data_vars.items():
+        if array.dtype.kind == "f":
+            np.testing.assert_allclose(pooled[name], array, rtol=1e-9, err_msg=name)
+
+
+def test_a_treatment_compared_with_itself_shows_no_difference():
+    results = COMPARED["solvers"][0].isel(solver=0)
+    told = compare(results, results).compute()
+    assert told["detection_difference"] == 0
+    assert told["detection_p_value"] == 1
+    for name, (unit, _) in QUANTITIES.items():
+        for end in ("", "_low", "_high"):
+            assert told[f"{name}_difference_{unit}{end}"] == 0
+            assert told[f"{name}_rmse_ratio{end}"].item() == pytest.approx(1, rel=1e-12)
+
+
+def test_the_other_way_round_the_comparison_turns():
+    results = COMPARED["detectors"][0]
+    sides = [results.isel(cornerRefinementMethod=k) for k in range(2)]
+    one, other = compare(*sides).compute(), compare(*sides[::-1]).compute()
+    assert one["only_first_detected"] == other["only_second_detected"]
+    assert one["detection_p_value"] == other["detection_p_value"]
+    for name in ("detection_difference", "range_difference_percent", "position_difference_m"):
+        for end, turned in (("", ""), ("_low", "_high"), ("_high", "_low")):
+            assert one[name + end].item() == pytest.approx(-other[name + turned].item(), rel=1e-9)
+    assert one["rotation_rmse_ratio_low"].item() == pytest.approx(
+        1 / other["rotation_rmse_ratio_high"].item(), rel=1e-9)
+
+
+def test_scenes_of_two_ids_are_no_treatments_of_the_same_scenes():
+    # Camera, marker and pose make the key of the draws: these are others, nothing is paired.
+    results = mixed({"marker_id": 2, "tilt_deg": 2, "trial": 10, "noise_grey": 2}, 12)
+    for name in ("marker_id", "tilt_deg"):
+        with pytest.raises(StoreError, match=name):
+            compare(results.isel({name: 0}), results.isel({name: 1}))
+    compare(results.isel(noise_grey=0), results.isel(noise_grey=1))
+
+
+def test_other_scenes_and_other_draws_are_not_compared():
+    sizes = {"marker_id": 2, "trial": 10}
+    first = mixed(sizes, 12)
+    second = first.copy(deep=True)
+    compare(first, second)
+    with pytest.raises(StoreError) as told:
+        compare(first, second.assign_coords(marker_id=[3, 8]))
+    assert "marker_id" in str(told.value)
+    assert "\n" not in str(told.value)
+    with pytest.raises(StoreError) as told:
+        compare(first, second.isel(trial=slice(5)))
+    assert "trial" in str(told.value)
+    for side, seed in ((first, 1), (second, 2)):
+        side.attrs["pipeline"] = pipeline_text(sizes, seed=seed)
+        side.attrs["sweep"] = {"fingerprint": {"seed": seed}}
+    with pytest.raises(StoreError) as told:
+        compare(first, second)
+    assert "seed" in str(told.value)
+
+
+# Limit of detection.
+
+def stepped(rates, sizes, trials=40):
+    """Return a dataset whose rate at each size (..., size) is exactly this (in 1 / trials)."""
+    results = perfect(np.random.default_rng(13), sizes | {"trial": trials})
+    hits = np.round(np.array(rates) * trials)[..., None] > np.arange(trials)
+    return with_detected(results, hits)
+
+
+def expected_limit(sides, rates, wanted):
+    """Return limit flag, side and next smaller side of (side, rate) in any order."""
+    ladder = sorted(zip(sides, rates, strict=True), reverse=True)
+    good = list(itertools.takewhile(lambda step: step[1] >= wanted, ladder))
+    if not good:
+        return 2, math.inf, ladder[0][0]
+    if len(good) == len(ladder):
+        return 3, good[-1][0], math.nan
+    return 1, good[-1][0], ladder[len(good)][0]
+
+
+@pytest.mark.parametrize("axis", ["side_px", "distance_m"])
+@pytest.mark.parametrize("rates", [
+    [0.0, 0.5, 0.95, 1.0], [0.9, 0.9, 0.9, 0.9], [0.0, 0.1, 0.2, 0.3], [0.95, 0.5, 0.95, 1.0],
+    [0.0, 0.0, 0.0, 0.9], [1.0, 1.0, 1.0, 0.875],
+])
+def test_the_limit_is_the_smallest_side_from_which_on_all_are_found(axis, rates):
+    along = rates[::-1] if axis == "distance_m" else rates  # far is small
+    results = stepped([along], {"tilt_deg": 1, axis: 4})
+    told = detection_limit(results, 0.9).compute()
+    sides = results[axis].values if axis == "side_px" else FX * SIZE_M / results[axis].values
+    flag, side, below = expected_limit(sides, along, 0.9)
+    here = told.isel(tilt_deg=0)
+    assert here["limit"].item() == flag
+    if flag != 2:
+        assert here["side_px"].item() == pytest.approx(side, rel=1e-12)
+        assert here["side_px_per_module"].item() == pytest.approx(side / 7, rel=1e-12)
+        for end, sign in (("low", -1), ("high", 1)):
+            limit = here[f"side_px_{end}"].item()
+            assert math.isnan(limit) or sign * (limit - side) >= 0
+    else:
+        assert here["side_px"].item() == math.inf
+    if flag == 1:
+        assert here["side_px_below"].item() == pytest.approx(below, rel=1e-12)
+    if flag == 3:
+        assert math.isnan(here["side_px_below"].item())
+
+
+@pytest.mark.parametrize("per", [(), ("tilt_deg",), ("noise_grey", "tilt_deg")])
+def test_limits_are_those_of_the_pooled_rates(per):
+    rng = np.random.default_rng(14)
+    sizes = {"side_px": 5, "tilt_deg": 3, "noise_grey": 2, "marker_id": 2, "trial": 30}
+    chance = np.array([0.1, 0.4, 0.8, 0.95, 1.0]).reshape(5, 1, 1, 1, 1)
+    results = with_detected(perfect(rng, sizes), rng.random(tuple(sizes.values())) < chance)
+    results["detection"].values[rng.random(tuple(sizes.values())) < 0.1] = Detection.not_visible
+    rates = detection_rate(results, (*per, "side_px")).compute()
+    for rate_ in (0.5, 0.75, 0.9):
+        told = detection_limit(results, rate_, per=per).compute()
+        assert tuple(told["side_px"].dims) == per
+        for index in np.ndindex(*(sizes[name] for name in per)):
+            at = dict(zip(per, index, strict=True))
+            flag, side, below = expected_limit(
+                results["side_px"].values, rates["detection_rate"].isel(at).values, rate_)
+            here = told.isel(at)
+            assert here["limit"] == flag
+            np.testing.assert_allclose(here["side_px"], side, rtol=1e-12)
+            if flag == 1:
+                assert here["side_px_below"] == below
+
+
+@pytest.mark.parametrize("settings", [2, 3])
+def test_all_that_is_looked_for_may_be_found_with_pooled_settings(settings):
+    # Some of a draw's settings were not run: a draw is no whole number of poses.
+    trials = 60
+    results = perfect(np.random.default_rng(18), {
+        "regime": trials, "side_px": 2, "trial": trials, "cornerRefinementMethod": settings})
+    for missing in range(trials):
+        results["detection"].values[missing, :, :missing, 0] = Detection.not_run
+    assert (detection_rate(results, ["regime"])["detection_rate_high"] == 1).all()
+    alike = compare(results, results, ["regime"])
+    assert (alike["detection_difference"] == 0).all()
+    assert (alike["detection_difference_high"] > 0).all()
+    assert (detection_limit(results, per=["regime"])["limit"] == 3).all()
+
+
+def test_a_limit_needs_sizes():
+    results = perfect(np.random.default_rng(15), {"tilt_deg": 2, "trial": 10})
+    with pytest.raises(StoreError, match=r"side_px|distance_m") as told:
+        detection_limit(results)
+    assert "\n" not in str(told.value)

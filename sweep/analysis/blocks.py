@@ -15,16 +15,17 @@ import functools
 import itertools
 import math
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import dask.array as da
 import numpy as np
 import xarray as xr
-from dask.delayed import Delayed
-from dask.graph_manipulation import bind
 from dask.highlevelgraph import HighLevelGraph
+from dask.local import get_sync
+from dask.optimization import cull
+from dask.utils import ensure_dict
 from numpy.typing import NDArray
 
 from sweep.analysis.poses import INSIDE, Poses
@@ -34,8 +35,14 @@ from sweep.errors import StoreError
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
 from sweep.plan.template import LABELS, TEMPLATE
 
+NEEDED = ("detection", "estimate", "flipped", "rotation_error_rad", "translation_error_m",
+          "true_tvec_m")
+"""Variables without which a dataset is none of results."""
+
 Arrays = dict[str, NDArray[Any]]
 Masks = NDArray[np.bool_]
+Read = Callable[[], list[NDArray[Any]]]
+"""What computes the arrays of a block."""
 Bins = Mapping[str, Sequence[float]]
 
 LARGEST_BLOCK = 1 << 18
@@ -50,6 +57,11 @@ def axes_of(results: xr.Dataset) -> list[str]:
     return [dim for dim in dict.fromkeys(dims) if dim not in LABELS]
 
 
+def listed(names: Sequence[str]) -> tuple[str, ...]:
+    """Return names as they are given: several, or one by itself."""
+    return (names,) if isinstance(names, str) else tuple(names)
+
+
 def kept_of(results: xr.Dataset, names: Sequence[str]) -> tuple[str, ...]:
     """Return the dimensions to keep, each once, if all are there.
 
@@ -58,15 +70,16 @@ def kept_of(results: xr.Dataset, names: Sequence[str]) -> tuple[str, ...]:
     StoreError
         For those that are not, with those that are; and where there are no results at all.
     """
+    names = listed(names)
     axes = axes_of(results)
     missing = [name for name in dict.fromkeys(names) if name not in axes]
     if missing:
         there = ", ".join(axes) or "none"
         raise StoreError(f"{', '.join(missing)}: no such dimension; there are {there}")
-    lacking = [name for name in ("detection", "estimate") if name not in results]
+    lacking = [name for name in NEEDED if name not in results]
     if lacking:
         there = ", ".join(map(str, results.data_vars)) or "none"
-        raise StoreError(f"no variable {' or '.join(lacking)}: there are {there}")
+        raise StoreError(f"no variable {', '.join(lacking)}; there are {there}")
     empty = [name for name in axes if results.sizes[name] == 0]
     if empty:
         raise StoreError(f"there are no poses: {', '.join(empty)} has no values")
@@ -102,11 +115,11 @@ class Layout:
         for (name, dims), block in zip(self.arrays.items(), blocks, strict=True):
             inner = [dim for dim in dims if dim not in every]
             present = [dim for dim in every if dim in dims]
-            array = np.asarray(block).transpose([dims.index(dim) for dim in (*present, *inner)])
+            array = block.transpose([dims.index(dim) for dim in (*present, *inner)])
             rest = array.shape[len(present):]
-            array = array.reshape(*(sizes[d] if d in dims else 1 for d in every), *rest)
+            array = array.reshape((*(sizes[d] if d in dims else 1 for d in every), *rest))
             array = np.broadcast_to(array, (*(sizes[dim] for dim in every), *rest))
-            found[name] = array.reshape(*shape, *rest)
+            found[name] = array.reshape((*shape, *rest))
         return found
 
 
@@ -146,9 +159,9 @@ def streamed(
     chunked = _chunked(dataset, layout, lazy=lazy)
     lengths = {name: tuple(chunked.chunks[name]) if name in chunked.sizes
                else (results.sizes[name],) for name in (*layout.kept, *pooled)}
-    graph, tables = _tables(chunked, lengths, layout, statistics)
+    layer, tables = _tables(chunked, lengths, layout, statistics)
     outputs = [output for statistic in statistics for output in statistic.outputs()]
-    found = _assembled(graph, tables, lengths, layout, outputs)
+    found = _assembled(layer, tables, lengths, layout, outputs)
     coordinates = {name: value for name, value in results.coords.items()
                    if set(value.dims) <= set(kept)}
     table = xr.Dataset(found, coordinates).assign_coords(_bin_coordinates(results, binned))
@@ -211,7 +224,7 @@ Key = tuple[str, int]
 
 
 class Layer:
-    """Tasks of one name, which may refer to each other and to those of other collections."""
+    """Tasks of one name, which may refer to each other."""
 
     def __init__(self, name: str) -> None:
         self.name = f"{name}-{uuid.uuid4().hex}"
@@ -231,35 +244,46 @@ class Layer:
         return states[0]
 
 
+class Reading:
+    """How the chunks of some arrays are computed, those of a block together, within a task.
+
+    Were they tasks of their own, a scheduler would keep those of the first look for the second.
+    """
+
+    def __init__(self, arrays: Sequence[da.Array]) -> None:
+        self._names = [array.name for array in arrays]
+        self._graph = {key: task for array in arrays
+                       for key, task in ensure_dict(array.__dask_graph__()).items()}
+
+    def of(self, indices: Iterable[tuple[int, ...]]) -> Read:
+        """Return what computes a chunk of each array."""
+        keys = [(name, *index) for name, index in zip(self._names, indices, strict=True)]
+        needed, _ = cull(self._graph, keys)
+        return functools.partial(_computed, needed, keys)
+
+
+def _computed(graph: Mapping[Any, Any], keys: list[Any]) -> list[NDArray[Any]]:
+    return [np.asarray(chunk) for chunk in get_sync(graph, keys)]
+
+
 def _tables(
     dataset: xr.Dataset, lengths: Lengths, layout: Layout, statistics: Sequence[Statistic]
-) -> tuple[HighLevelGraph, list[Key]]:
-    """Return the graph, and the keys of what is found in each block of the kept dimensions."""
-    arrays = [da.asarray(array.data) for array in dataset.data_vars.values()]
-    layer = Layer("first")
-    looks = _looks(layer, arrays, layout, lengths, functools.partial(_first, layout, statistics))
+) -> tuple[Layer, list[Key]]:
+    """Return the tasks, and the keys of what is found in each block of the kept dimensions."""
+    layer = Layer("looks")
+    reading = Reading([da.asarray(array.data) for array in dataset.data_vars.values()])
+    looks = _looks(layer, reading, layout, lengths, functools.partial(_first, layout, statistics))
     known = [layer.add(functools.partial(_between, statistics), layer.merged(states))
              for states in looks]
-    last = layer.add(_nothing, known)
-    first = HighLevelGraph.from_collections(layer.name, layer.tasks, arrays)
-    # The second look must not keep in memory what the first has read: it reads again.
-    waited = Delayed(last, first, layer=layer.name)
-    again = bind(arrays, waited)
-    layer = Layer("second")
-    looks = _looks(layer, again, layout, lengths, functools.partial(_second, layout, statistics),
+    looks = _looks(layer, reading, layout, lengths, functools.partial(_second, layout, statistics),
                    known)
     tables = [layer.add(functools.partial(_finish, statistics), of_first, layer.merged(states))
               for of_first, states in zip(known, looks, strict=True)]
-    needed: list[Any] = [*again, waited]
-    return HighLevelGraph.from_collections(layer.name, layer.tasks, needed), tables
-
-
-def _nothing(_: Any) -> None:
-    """Return nothing, once all that is given is there."""
+    return layer, tables
 
 
 def _looks(
-    layer: Layer, arrays: Sequence[da.Array], layout: Layout, lengths: Lengths,
+    layer: Layer, reading: Reading, layout: Layout, lengths: Lengths,
     look: Callable[..., Any], known: Sequence[Key] = (),
 ) -> list[list[Key]]:
     """Add looks at all blocks; return the states, folded, by block of the kept dimensions."""
@@ -275,13 +299,11 @@ def _looks(
             parts = []
             for draw in numbers(layout.draws):
                 at = kept | cell | draw
-                blocks = [
-                    (array.name, *(at.get(dim, 0) for dim in dims))
-                    for array, dims in zip(arrays, layout.arrays.values(), strict=True)
-                ]
+                read = reading.of(
+                    tuple(at.get(dim, 0) for dim in dims) for dims in layout.arrays.values())
                 sizes = {name: chunks[at.get(name, 0)] for name, chunks in lengths.items()}
                 parts.append(layer.add(
-                    functools.partial(look, sizes), blocks, *known[number : number + 1]))
+                    functools.partial(look, sizes, read), *known[number : number + 1]))
             states.append(layer.add(_folded, parts))
         found.append(states)
     return found
@@ -293,9 +315,9 @@ Look = list[tuple[State, State]]
 
 def _first(
     layout: Layout, statistics: Sequence[Statistic], sizes: Mapping[str, int],
-    blocks: Sequence[NDArray[Any]],
+    read: Read,
 ) -> Look:
-    arrays = layout.arranged(blocks, sizes)
+    arrays = layout.arranged(read(), sizes)
     return _joined([
         _in_their_cells([s.first(poses) for s in statistics], cells)
         for poses, cells in _in_bins(layout, arrays)
@@ -304,9 +326,9 @@ def _first(
 
 def _second(
     layout: Layout, statistics: Sequence[Statistic], sizes: Mapping[str, int],
-    blocks: Sequence[NDArray[Any]], known: list[State],
+    read: Read, known: list[State],
 ) -> Look:
-    arrays = layout.arranged(blocks, sizes)
+    arrays = layout.arranged(read(), sizes)
     return _joined([
         _in_their_cells(
             [s.second(poses, every_nth(of_first, layout.bin_count, number))
@@ -374,7 +396,7 @@ def _finish(
 
 
 def _assembled(
-    graph: HighLevelGraph, tables: list[Key], lengths: Lengths, layout: Layout,
+    looks: Layer, tables: list[Key], lengths: Lengths, layout: Layout,
     outputs: Sequence[Output],
 ) -> dict[str, tuple[tuple[str, ...], da.Array, Mapping[str, Any]]]:
     """Return the variables, put together from the blocks of the kept dimensions."""
@@ -387,11 +409,9 @@ def _assembled(
         for table, index in zip(tables, np.ndindex(*map(len, chunks)), strict=True):
             shape = tuple(sizes[k] for sizes, k in zip(chunks, index, strict=True))
             layer.tasks[layer.name, *index] = (functools.partial(_variable, output, shape), table)
-        whole = HighLevelGraph(
-            {**graph.layers, layer.name: layer.tasks},
-            {**graph.dependencies, layer.name: {tables[0][0]}},
-        )
-        array = da.Array(whole, layer.name, chunks, dtype=output.dtype)
+        graph = HighLevelGraph({looks.name: looks.tasks, layer.name: layer.tasks},
+                               {looks.name: set(), layer.name: {looks.name}})
+        array = da.Array(graph, layer.name, chunks, dtype=output.dtype)
         found[output.name] = dims, array, flagged_attributes(output)
     return found
 

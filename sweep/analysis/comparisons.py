@@ -22,7 +22,7 @@ from sweep.analysis.statistics import (
     Statistic,
 )
 from sweep.errors import StoreError
-from sweep.plan.parameters import Stage
+from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS, Stage
 from sweep.plan.template import TEMPLATE
 
 Floats = NDArray[np.float64]
@@ -77,8 +77,8 @@ def compare(
       has the interval of Newcombe (Statistics in Medicine 17, 1998, method 10).
       ``detection_p_value``: McNemar's test, exact: how often chance alone makes the two discordant
       counts as unequal.
-    - ``different_scenes``: compared poses whose truth differs, as those of two dictionaries where
-      anything is drawn. Where there are any, nothing is paired, and the test compares two samples.
+    - ``different_scenes``: compared poses whose truth differs, as those of stores with other
+      distributions. Where there are any, nothing is paired, and the test compares two samples.
     - ``both_solved``, ``only_first_solved``, ``only_second_solved``, ``neither_solved``.
     - Of the poses solved in both: ``*_difference_*``, the mean difference of the absolute errors,
       and ``*_rmse_ratio``, the second's RMSE over the first's. They say nothing of the poses that
@@ -141,6 +141,13 @@ def _differences(quantity: Quantity) -> list[Statistic]:
 
 def _see_that_they_pair(first: xr.Dataset, second: xr.Dataset) -> None:
     """Raise StoreError where two datasets are not of the same scenes."""
+    for name, value in first.coords.items():
+        here = name in PARAMETERS and PARAMETERS[str(name)].section in GEOMETRY_SECTIONS
+        if here and not value.dims and name in second.coords and not second[name].dims:
+            values = value.item(), second[name].item()
+            if values[0] != values[1]:
+                raise StoreError(f"not the same scenes: {name} is {values[0]} and {values[1]}, "
+                                 "of which the draws are others")
     one, other = axes_of(first), axes_of(second)
     if set(one) != set(other):
         raise StoreError(f"not the same scenes: dimensions {', '.join(one) or 'none'} "
@@ -202,18 +209,20 @@ def newcombe_and_mcnemar(
     """
     n = both + first + second + neither
     with np.errstate(divide="ignore", invalid="ignore"):
-        scale = draws / np.maximum(n, 1)
+        poses = np.maximum(n, 1)
+        scale = draws / poses
         rates, lows, highs = [], [], []
         for hits in (both + second, both + first):
-            scaled = hits * scale
             rates.append(hits / n)
-            lows.append(wilson(np.floor(scaled), draws)[0])
-            highs.append(wilson(np.ceil(scaled), draws)[1])
+            lows.append(wilson(hits * draws // poses, draws)[0])
+            highs.append(wilson(-(-hits * draws // poses), draws)[1])
         margins = ((both + first) * (second + neither)).astype(np.float64) * (
             (both + second) * (first + neither))
         cross = both.astype(np.float64) * neither - first.astype(np.float64) * second
-        lessened = np.where(cross > 0, np.maximum(cross - n / 2, 0.0), cross)
-        correlation = np.where(margins > 0, lessened / np.sqrt(margins), 0.0)
+        # Of counts scaled to draws.
+        corrected = np.maximum(cross * scale**2 - draws / 2, 0.0)
+        lessened = np.where(cross > 0, corrected, cross * scale**2)
+        correlation = np.where(margins > 0, lessened / (np.sqrt(margins) * scale**2), 0.0)
 
         def reach(up: Floats, down: Floats) -> Floats:
             squares = up**2 - 2 * correlation * up * down + down**2
@@ -222,9 +231,9 @@ def newcombe_and_mcnemar(
         difference = rates[0] - rates[1]
         low = difference - reach(rates[0] - lows[0], highs[1] - rates[1])
         high = difference + reach(highs[0] - rates[0], rates[1] - lows[1])
-        fewer = np.ceil(np.minimum(first, second) * scale)
-        discordant = np.maximum(np.floor((first + second) * scale), fewer)
-        p_value = np.minimum(1.0, 2.0 * special.bdtr(fewer, discordant.astype(np.int64), 0.5))
+        fewer = -(-np.minimum(first, second) * draws // poses)
+        discordant = np.maximum((first + second) * draws // poses, fewer)
+        p_value = np.minimum(1.0, 2.0 * special.bdtr(fewer, discordant, 0.5))
     low, high, p_value = (np.where(drawn, each, np.nan) for each in (low, high, p_value))
     return difference, low, high, p_value
 

@@ -108,7 +108,8 @@ def error_statistics(
     ]
     for quantity in QUANTITIES:
         statistics += statistics_of(quantity, with_reason=quantity is QUANTITIES[0])
-    return streamed(results, errors(results), kept_of(results, per), statistics, bins)
+    kept = kept_of(results, per)
+    return streamed(results, errors(results), kept, statistics, bins)
 
 
 def efficiency(

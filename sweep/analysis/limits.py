@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sweep.analysis.blocks import axes_of, kept_of
+from sweep.analysis.blocks import axes_of, kept_of, listed
 from sweep.analysis.intervals import wilson
 from sweep.analysis.rates import detection_rate
 from sweep.analysis.statistics import LEVEL
@@ -69,7 +69,7 @@ def detection_limit(
         there = ", ".join(axes_of(results)) or "none"
         raise StoreError(f"side_px or distance_m: no such dimension; there are {there}")
     dictionaries = [name for name in ("dictionary",) if name in axes_of(results)]
-    kept = kept_of(results, (*per, *dictionaries))
+    kept = kept_of(results, (*listed(per), *dictionaries))
     for name in (axis, "trial"):
         if name in kept:
             raise StoreError(f"{name}: the limit is over this dimension; it cannot be kept")
@@ -125,11 +125,12 @@ def _limit(
     drawn = np.take_along_axis(drawn, order, axis=-1)
     there = n > 0
     with np.errstate(divide="ignore", invalid="ignore"):
-        scaled = hits * (draws / np.maximum(n, 1))
         reached = hits / n >= rate
+    # Of draws, rounded outwards, as in `Rate`.
+    fewest, most = hits * draws // np.maximum(n, 1), -(-hits * draws // np.maximum(n, 1))
     joint = 1.0 - (1.0 - LEVEL) / sides.shape[-1]
-    surely = wilson(np.floor(scaled), draws)[0] >= rate
-    possibly = wilson(np.ceil(scaled), draws, joint)[1] >= rate
+    surely = wilson(fewest, draws)[0] >= rate
+    possibly = wilson(most, draws, joint)[1] >= rate
 
     def smallest(holds: Masks, none: float) -> tuple[Floats, Masks]:
         """Return the smallest side down to which it holds, and whether it holds for all."""

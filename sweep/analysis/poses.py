@@ -35,14 +35,18 @@ class Poses:
     def __getitem__(self, name: str) -> NDArray[Any]:
         """Return an array, of flags only where the poses count."""
         array = self._arrays[self._prefix + name]
-        inside = self._arrays.get(INSIDE)
-        if inside is not None and name in {"detection", "estimate", "flipped"}:
-            return np.where(inside, array, 0)
+        if name in {"detection", "estimate", "flipped"}:
+            return np.where(self.inside, array, 0)
         return array
 
     def __contains__(self, name: object) -> bool:
         """Tell whether there is such an array."""
         return f"{self._prefix}{name}" in self._arrays
+
+    @property
+    def inside(self) -> Masks:
+        """Poses that count at all."""
+        return self._arrays.get(INSIDE, np.ones((), dtype=bool))
 
     @cached_property
     def detection(self) -> NDArray[np.uint8]:

@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import special
 
-from sweep.analysis.blocks import axes_of, kept_of
+from sweep.analysis.blocks import axes_of, kept_of, listed
 from sweep.analysis.rates import detection_rate
 from sweep.errors import StoreError
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
@@ -18,6 +18,9 @@ Floats = NDArray[np.float64]
 
 SIGNIFICANCE = 0.05
 """Chance that any ID at all is called weak, or strong, where all are alike."""
+
+LEAST_SKEWNESS = 1e-6
+"""Below it the gamma distribution is normal to 1e-6, and its functions lose digits."""
 
 
 def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
@@ -40,7 +43,7 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     Lazy where ``results`` is. Raises ``StoreError`` without a dimension ``marker_id``.
     """
     dictionaries = [name for name in ("dictionary",) if name in axes_of(results)]
-    kept = kept_of(results, (*per, *dictionaries, "marker_id"))
+    kept = kept_of(results, (*listed(per), *dictionaries, "marker_id"))
     kept = (*(name for name in kept if name != "marker_id"), "marker_id")
     if "trial" in kept:
         raise StoreError("trial: trials are draws, of which the ranking speaks; it cannot be kept")
@@ -112,17 +115,21 @@ def two_sided(deviation: Floats, variance: Floats, third: Floats) -> Floats:
     """Return twice the smaller tail of a sum of counts beyond its deviation from the mean.
 
     Of the gamma distribution with that variance and third central moment, shifted to mean 0; with
-    a continuity correction of 1/2.
+    a continuity correction of 1/2. Without skewness it is the normal distribution.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         # In units in which the skewness is not negative.
         sign = np.where(third < 0, -1.0, 1.0)
-        skewness = np.maximum(np.abs(third) / variance**1.5, 1e-6)
+        skewness = np.abs(third) / variance**1.5
         shape, scale = 4.0 / skewness**2, np.sqrt(variance) * skewness / 2.0
-        above = special.gammaincc(
-            shape, np.maximum(sign * deviation - 0.5, -shape * scale) / scale + shape)
-        below = special.gammainc(
-            shape, np.maximum(sign * deviation + 0.5, -shape * scale) / scale + shape)
+        upper, lower = sign * deviation - 0.5, sign * deviation + 0.5
+        symmetric = skewness < LEAST_SKEWNESS
+        above = np.where(
+            symmetric, special.ndtr(-upper / np.sqrt(variance)),
+            special.gammaincc(shape, np.maximum(upper, -shape * scale) / scale + shape))
+        below = np.where(
+            symmetric, special.ndtr(lower / np.sqrt(variance)),
+            special.gammainc(shape, np.maximum(lower, -shape * scale) / scale + shape))
     p_value = np.minimum(1.0, 2.0 * np.minimum(above, below))
     return np.where(variance > 0, p_value, 1.0)
 

@@ -64,10 +64,11 @@ def flip_rate(
 def _rate(
     results: xr.Dataset, per: Sequence[str], bins: Bins | None, rate: Rate, of: str, hits: str
 ) -> xr.Dataset:
+    kept = kept_of(results, per)
     needed = estimates(results) if rate is FLIP_RATE else detections(results)
     full = Rate(rate.name, rate.meaning, rate.successes, rate.used, counts=(of, hits),
                 with_jeffreys=True)
-    return streamed(results, needed, kept_of(results, per), [full], bins)
+    return streamed(results, needed, kept, [full], bins)
 
 
 OUTCOMES = (
@@ -86,7 +87,7 @@ def outcome_of(outcome: str, poses: Poses) -> NDArray[np.bool_]:
     """
     ends = np.zeros(poses.estimate.shape, dtype=bool)
     if outcome in Detection.__members__:
-        ends |= poses.detection == Detection[outcome]
+        ends |= poses.inside & (poses.detection == Detection[outcome])
     if outcome in Estimate.__members__:
         ends |= poses.detected & (poses.estimate == Estimate[outcome])
     return ends

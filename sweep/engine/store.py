@@ -444,4 +444,8 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
     import xarray as xr  # noqa: PLC0415  (slow to import, and workers do without)
 
     dataset: xr.Dataset = xr.open_zarr(store.url, consolidated=False)
-    return dataset
+    # NumPy's strings of any length are new, and much of xarray and pandas does without them.
+    texts = {name: (value.dims, value.to_numpy().astype(object), value.attrs)
+             for name, value in dataset.coords.items() if value.dtype.kind == "T"}
+    ordered = [variable.name for variable in TEMPLATE if variable.name in dataset]
+    return dataset.assign_coords(texts)[ordered]

@@ -180,6 +180,8 @@ def _binned(
                      if v.dtype.kind == "f" and n not in kept]
             raise StoreError(f"bins of {name}: no such variable; there are {', '.join(there)}")
         array = results[name].reset_coords(drop=True)
+        if name in results.dims:  # an index, which has no chunks
+            array = xr.DataArray(array.to_numpy(), dims=name)
         if array.dtype.kind not in "fiu" or any(dim in LABELS for dim in array.dims):
             raise StoreError(f"bins of {name}: expected one number for each scene")
         if edges.ndim != 1 or len(edges) < 2 or not (np.diff(edges) > 0).all():

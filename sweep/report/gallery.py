@@ -210,7 +210,7 @@ def _scene(subject: Subject, index: Index, titles: tuple[str, ...]) -> Scene:
     plain = Scene(titles, at.replace(",", ", "), command, flags, "", None)
     if "crashed" in flags:
         return dataclasses.replace(
-            plain, problem="Not drawn: rendering it ended a process; `sweep repro` looks closer.")
+            plain, problem="Not drawn: rendering it ended a process.")
     try:
         one = cell(subject.pipeline, at)
         seen = look(one)

@@ -232,19 +232,8 @@ class Subject:
         key = (analysis.__name__, grouping.per, grouping.bins, grouping.chosen)
         if key not in self._found:
             results = self.results.isel({name: list(some) for name, some in grouping.chosen})
-            bins = {}
-            names: dict[str, str] = {}
-            for name, edges in grouping.bins:
-                binned = name
-                if name in results.dims:
-                    # Not the axis itself is put in bins, which is pooled, but its values.
-                    binned = f"{name} in bins"
-                    values = results[name].values.astype(np.float64)
-                    results = results.assign_coords({binned: (name, values)})
-                    names |= {f"{binned}{end}": f"{name}{end}" for end in ("", "_low", "_high")}
-                bins[binned] = np.array(edges)
-            found = analysis(results, per=grouping.per, bins=bins or None).compute()
-            self._found[key] = found.rename(names).transpose(*grouping.dims, ...)
+            found = analysis(results, per=grouping.per, bins=dict(grouping.bins)).compute()
+            self._found[key] = found.transpose(*grouping.dims, ...)
         return self._found[key]
 
     def once(self, key: str, find: Callable[[], xr.Dataset]) -> xr.Dataset:

@@ -7,6 +7,7 @@ of `sweep.analysis` is used in them.
 import functools
 import itertools
 import math
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -254,7 +255,9 @@ def draws_by_cell(found):
 
 
 def draws_in(found):
-    return sum(map(len, draws_by_cell(found).values()))
+    """Return what poses are worth in draws, Kish's effective number; their number if m is equal."""
+    sizes = Counter((pose["cell"], pose["draw"]) for pose in found).values()
+    return sum(sizes) ** 2 // max(1, sum(size**2 for size in sizes))
 
 
 def freedom_in(found):
@@ -471,7 +474,7 @@ def expected_errors(found):
             interval = order_statistics(sizes, aimed, share)
             out |= named(f"{name}_{label}_{unit}", interval)
             given = 2 if freedom_in(aimed) == 0 else 3 if any(map(math.isnan, interval)) else 1
-            out[f"{label}_interval"] = given
+            out[f"{label}_interval"] = given if aimed else 0
     return out
 
 
@@ -782,3 +785,48 @@ def test_the_references_mean_without_cells_is_students():
     ends = stats.ttest_1samp(values, 0).confidence_interval(0.95)
     assert freedom == 19
     assert student(mean, error, freedom) == pytest.approx((values.mean(), ends.low, ends.high))
+
+
+# What users do to datasets.
+
+def test_what_was_cut_away_was_not_run():
+    whole = GRIDS["draws"]
+    cut = whole.where(whole["marker_area_px"] > float(whole["marker_area_px"].median()))
+    kept = {"marker_area_px": [float(np.nextafter(whole["marker_area_px"].median(), np.inf)), 1e9]}
+    expected = detection_rate(whole, bins=kept).isel(marker_area_px=0)
+    for name in ("looked_for", "detected", "detection_rate"):
+        assert detection_rate(cut)[name] == expected[name], name
+
+
+def test_a_draw_with_more_solved_settings_counts_more():
+    # Kish 1965: 10 draws with 30 settings each and 90 with one are worth 19 draws, not 100.
+    results = perfect(np.random.default_rng(1), {"trial": 100, "solver": 30})
+    results["estimate"].values[10:, 1:] = Estimate.solver_failed
+    told = flip_rate(results)
+    assert told["solved"] == 10 * 30 + 90
+    assert told["draws"] == (10 * 30 + 90) ** 2 // (10 * 30**2 + 90) == 16
+
+
+def test_a_solved_pose_without_a_number_counts_in_no_mean():
+    results = perfect(np.random.default_rng(2), {"trial": 60})
+    results["rotation_error_rad"].values[:3] = np.nan
+    told, without = error_statistics(results), error_statistics(results.isel(trial=slice(3, None)))
+    for name in ("rotation_rmse_deg", "rotation_sd_deg", "rotation_bias_deg"):
+        assert told[name].item() == pytest.approx(without[name].item(), rel=1e-12), name
+    assert told["rotation_p99_deg"] == np.inf
+
+
+@pytest.mark.parametrize(("call", "message"), [
+    (lambda r: detection_rate(r, per=[3]), "expected names of dimensions"),
+    (lambda r: detection_rate(r, per=None), "expected names of dimensions"),
+    (lambda r: detection_rate(r, bins=["marker_area_px"]), "expected names with edges"),
+    (lambda r: detection_rate(r, bins={"marker_area_px": "abc"}), "two increasing edges"),
+    (lambda r: detection_rate(r, bins={"marker_area_px": [1, np.nan]}), "two increasing edges"),
+    (lambda r: detection_rate(r.drop_vars("estimate")), "no variable estimate; there are"),
+    (lambda _: error_statistics(xr.Dataset()), "no variable detection, estimate"),
+    (lambda r: detection_rate(r.isel(trial=slice(0))), "there are no poses: trial has no values"),
+])
+def test_what_cannot_be_asked_is_told_in_one_line(call, message):
+    with pytest.raises(StoreError, match=message) as refused:
+        call(GRIDS["draws"])
+    assert "\n" not in str(refused.value)

@@ -2,8 +2,9 @@
 
 Of a dataset's dimensions those that are named are kept, all others are pooled. Of these, ``trial``
 counts random draws; the other dimensions of camera, marker and pose make cells, a fixed grid; all
-others that are pooled (effects, levels, renderers, settings of detector and estimator) see the
-same draws (`sweep.plan.draws`), so that their values together count as one draw.
+others that are pooled (effects, levels, renderers, settings of detector and estimator, and what
+has a name that is no parameter's) see the same draws (`sweep.plan.draws`), so that their values
+together count as one draw.
 
 The blocks are the chunks of a lazy dataset, and the result is then lazy, too. What is kept of a
 block does not grow with the dataset; the second look reads the chunks again.
@@ -58,8 +59,25 @@ def axes_of(results: xr.Dataset) -> list[str]:
 
 
 def listed(names: Sequence[str]) -> tuple[str, ...]:
-    """Return names as they are given: several, or one by itself."""
-    return (names,) if isinstance(names, str) else tuple(names)
+    """Return names as they are given: several, or one by itself.
+
+    Raises
+    ------
+    StoreError
+        For what is no list of names.
+    """
+    if isinstance(names, str):
+        return (names,)
+    if not isinstance(names, Iterable) or not all(isinstance(name, str) for name in names):
+        raise StoreError(f"per = {names}: expected names of dimensions")
+    return tuple(names)
+
+
+def fingerprint_of(results: xr.Dataset) -> Mapping[str, Any]:
+    """Return the fingerprint in a dataset's attributes; empty where they do not have it."""
+    about = results.attrs.get("sweep")
+    found = about.get("fingerprint") if isinstance(about, Mapping) else None
+    return found if isinstance(found, Mapping) else {}
 
 
 def kept_of(results: xr.Dataset, names: Sequence[str]) -> tuple[str, ...]:
@@ -172,9 +190,15 @@ def _binned(
     results: xr.Dataset, kept: Sequence[str], bins: Bins
 ) -> dict[str, tuple[xr.DataArray, NDArray[np.float64]]]:
     """Return what is binned, with its edges."""
+    if not isinstance(bins, Mapping):
+        raise StoreError(f"bins = {bins}: expected names with edges, such as "
+                         '{"marker_area_px": [0, 100, 1000]}')
     found = {}
     for name, given in bins.items():
-        edges = np.asarray(given, dtype=np.float64)
+        try:
+            edges = np.asarray(given, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise StoreError(f"bins of {name}: expected at least two increasing edges") from None
         if name not in results.variables or name in kept:
             there = [str(n) for n, v in results.variables.items()
                      if v.dtype.kind == "f" and n not in kept]
@@ -182,9 +206,10 @@ def _binned(
         array = results[name].reset_coords(drop=True)
         if name in results.dims:  # an index, which has no chunks
             array = xr.DataArray(array.to_numpy(), dims=name)
-        if array.dtype.kind not in "fiu" or any(dim in LABELS for dim in array.dims):
+        scalar = name in results.coords and not array.dims
+        if array.dtype.kind not in "fiu" or scalar or any(dim in LABELS for dim in array.dims):
             raise StoreError(f"bins of {name}: expected one number for each scene")
-        if edges.ndim != 1 or len(edges) < 2 or not (np.diff(edges) > 0).all():
+        if edges.ndim != 1 or len(edges) < 2 or not (edges[1:] > edges[:-1]).all():
             raise StoreError(f"bins of {name}: expected at least two increasing edges")
         found[name] = array, edges
     return found
@@ -194,7 +219,9 @@ def _bin_coordinates(results: xr.Dataset, binned: Mapping[str, Any]) -> dict[str
     found: dict[str, Any] = {}
     for name, (_, edges) in binned.items():
         attributes = dict(results[name].attrs)
-        for label, values in ((name, (edges[:-1] + edges[1:]) / 2),
+        # Of a bin without an end the middle is its other end.
+        finite = np.nan_to_num(edges, neginf=edges[1], posinf=edges[-2])
+        for label, values in ((name, (finite[:-1] + finite[1:]) / 2),
                               (f"{name}_low", edges[:-1]), (f"{name}_high", edges[1:])):
             found[label] = (name, values, attributes)
     return found

@@ -10,16 +10,18 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import special
 
-from sweep.analysis.blocks import Arrays, Bins, axes_of, kept_of, streamed
+from sweep.analysis.blocks import Arrays, Bins, axes_of, fingerprint_of, kept_of, streamed
 from sweep.analysis.intervals import wilson
 from sweep.analysis.poses import QUANTITIES, Poses, Quantity, errors, norm_squared
 from sweep.analysis.statistics import (
     Count,
+    Draws,
     Mean,
     Rate,
     RootMeanSquare,
     RootMeanSquareRatio,
     Statistic,
+    in_draws,
 )
 from sweep.errors import StoreError
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS, Stage
@@ -91,6 +93,7 @@ def compare(
     differ, and for a dimension that is not there.
     """
     kept = kept_of(first, per)
+    kept_of(second, per)
     _see_that_they_pair(first, second)
     alone = [name for name, value in first.coords.items() if not value.dims
              and not (name in second.coords and value.equals(second.coords[name]))]
@@ -107,19 +110,17 @@ def compare(
                 agree = (seen(pair.first) == one) & (seen(pair.second) == other)
                 return np.asarray(pair.compared & agree)
 
-            statistics.append(Count(f"{name}_{what}", f"compared poses, {name} {what}", ended))
-    statistics.append(Rate("rate", "both of compared", lambda pair: pair.compared,
-                           lambda pair: pair.compared, counts=("compared", "all of compared")))
+            words = f"compared poses, {what} in {name.replace('_', ' ')}"
+            statistics.append(Count(f"{name}_{what}", words, ended))
+    statistics.append(Draws("compared", "poses that were looked for in both",
+                            lambda pair: pair.compared))
     statistics.append(Count(
         "different_scenes", "compared poses whose truth differs, so that they are no pairs",
         lambda pair: pair.compared & pair.differing))
     for quantity in QUANTITIES:
         statistics += _differences(quantity)
     table = streamed(first, needed, kept, statistics, bins, Pair)
-    tested = _tested(table)
-    dropped = ["rate", "rate_low", "rate_high", "all of compared"]
-    table["compared"].attrs["long_name"] = "poses that were looked for in both"
-    return table.drop_vars(dropped).assign(tested)
+    return table.assign(_tested(table)).drop_vars("drawn")
 
 
 def _differences(quantity: Quantity) -> list[Statistic]:
@@ -155,8 +156,7 @@ def _see_that_they_pair(first: xr.Dataset, second: xr.Dataset) -> None:
     for name in one:
         if not np.array_equal(first[name].values, second[name].values):
             raise StoreError(f"not the same scenes: the values of {name} differ")
-    seeds = [side.attrs.get("sweep", {}).get("fingerprint", {}).get("seed")
-             for side in (first, second)]
+    seeds = [fingerprint_of(side).get("seed") for side in (first, second)]
     if None not in seeds and seeds[0] != seeds[1]:
         raise StoreError(f"not the same draws: seeds {seeds[0]} and {seeds[1]}")
 
@@ -179,7 +179,7 @@ def _tested(table: xr.Dataset) -> dict[str, xr.DataArray]:
     counts = [table[f"{name}_detected"] for name in (
         "both", "only_first", "only_second", "neither")]
     found = xr.apply_ufunc(
-        newcombe_and_mcnemar, *counts, table["draws"], table["rate_low"].notnull(),
+        newcombe_and_mcnemar, *counts, table["draws"], table["drawn"],
         output_core_dims=[[]] * 4, dask="parallelized", output_dtypes=[np.float64] * 4,
     )
     difference = "detection rate, second minus first"
@@ -209,13 +209,13 @@ def newcombe_and_mcnemar(
     """
     n = both + first + second + neither
     with np.errstate(divide="ignore", invalid="ignore"):
-        poses = np.maximum(n, 1)
-        scale = draws / poses
+        scale = draws / np.maximum(n, 1)
         rates, lows, highs = [], [], []
         for hits in (both + second, both + first):
             rates.append(hits / n)
-            lows.append(wilson(hits * draws // poses, draws)[0])
-            highs.append(wilson(-(-hits * draws // poses), draws)[1])
+            fewest, most = in_draws(hits, n, draws)
+            lows.append(wilson(fewest, draws)[0])
+            highs.append(wilson(most, draws)[1])
         margins = ((both + first) * (second + neither)).astype(np.float64) * (
             (both + second) * (first + neither))
         cross = both.astype(np.float64) * neither - first.astype(np.float64) * second
@@ -231,8 +231,8 @@ def newcombe_and_mcnemar(
         difference = rates[0] - rates[1]
         low = difference - reach(rates[0] - lows[0], highs[1] - rates[1])
         high = difference + reach(highs[0] - rates[0], rates[1] - lows[1])
-        fewer = -(-np.minimum(first, second) * draws // poses)
-        discordant = np.maximum((first + second) * draws // poses, fewer)
+        _, fewer = in_draws(np.minimum(first, second), n, draws)
+        discordant = np.maximum(in_draws(first + second, n, draws)[0], fewer)
         p_value = np.minimum(1.0, 2.0 * special.bdtr(fewer, discordant, 0.5))
     low, high, p_value = (np.where(drawn, each, np.nan) for each in (low, high, p_value))
     return difference, low, high, p_value
@@ -284,7 +284,9 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
         [
             Rate("detection_disagreement", "differing of compared",
                  lambda pair: pair.first.detected != pair.second.detected,
-                 lambda pair: pair.compared, counts=("compared", "differing")),
+                 lambda pair: pair.compared,
+                 counts=(("compared", "poses that were looked for with both renderers"),
+                         ("differing", "poses detected with one of both renderers only"))),
             RootMeanSquare(
                 "corner_shift_rms_px", "RMS of a corner's coordinate minus the reference's", "px",
                 shift, lambda pair: pair.first.detected & pair.second.detected),

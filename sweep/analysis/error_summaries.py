@@ -208,9 +208,9 @@ def covariance_trust(
     Raises ``StoreError`` for a dimension that is not there, ``ValueError`` for a level outside
     (0, 1) and for a ``scale`` whose coordinates are others.
     """
-    nominal = np.array(levels, dtype=np.float64)
+    nominal = np.atleast_1d(np.array(levels, dtype=np.float64))
     if not (nominal.size and ((nominal > 0.0) & (nominal < 1.0)).all()):
-        raise ValueError(f"levels = {tuple(levels)}: give numbers between 0 and 1")
+        raise ValueError(f"levels = {levels}: give numbers between 0 and 1")
     kept = kept_of(results, per)
     nees = results.get("nees", xr.DataArray(np.nan))
     if scale is not None:
@@ -236,7 +236,8 @@ def covariance_trust(
 
         statistics += [
             Rate(f"coverage {at}", "within the region of used", within, used,
-                 counts=("nees_count", f"hits {at}")),
+                 counts=(("nees_count", "estimates with a normalised estimation error squared"),
+                         (f"hits {at}", ""))),
             Rate(f"joint {at}", "within the region of used", within, used, joint),
         ]
     needed = errors(results) | {"nees": nees}
@@ -251,8 +252,7 @@ def covariance_trust(
     right = ((over_levels("joint {}_low") - TOLERANCE <= level)
              & (level <= over_levels("joint {}_high") + TOLERANCE)).all("level")
     found = {name: table[name] for name in ("nees_mean", "nees_mean_low", "nees_mean_high")}
-    found["nees_count"] = table["nees_count"].assign_attrs(
-        long_name="estimates with a normalised estimation error squared")
+    found["nees_count"] = table["nees_count"]
     found["covariance_trusted"] = (right & (table["draws"] >= FEWEST)).assign_attrs(
         long_name="whether the coverage is the level, at every level", units="1")
     for ending, words in (("", ""), ("_low", "lower end of the 95 % interval: "),

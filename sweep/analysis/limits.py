@@ -10,10 +10,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sweep.analysis.blocks import axes_of, kept_of, listed
+from sweep.analysis.blocks import axes_of, fingerprint_of, kept_of, listed
 from sweep.analysis.intervals import wilson
 from sweep.analysis.rates import detection_rate
-from sweep.analysis.statistics import LEVEL
+from sweep.analysis.statistics import LEVEL, in_draws
 from sweep.errors import StoreError, SweepError
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.model.marker import module_count
@@ -39,9 +39,11 @@ class Limit(IntEnum):
 
 
 def detection_limit(
-    results: xr.Dataset, rate: float = 0.9, per: Sequence[str] = ("tilt_deg",)
+    results: xr.Dataset, rate: float = 0.9, per: Sequence[str] | None = None
 ) -> xr.Dataset:
     """Return the smallest side of the black square that is seen often enough: dimensions (*per).
+
+    ``per`` are the dimensions that are kept: the tilt, where there are several, if none are named.
 
     ``side_px`` is the side in pixels, were the square parallel to the image, from which on, at
     all larger sides of the grid, the detection rate is at least ``rate``: so a dip at a larger
@@ -68,7 +70,9 @@ def detection_limit(
     if axis is None:
         there = ", ".join(axes_of(results)) or "none"
         raise StoreError(f"side_px or distance_m: no such dimension; there are {there}")
-    dictionaries = [name for name in ("dictionary",) if name in axes_of(results)]
+    dictionaries = ["dictionary"] if "dictionary" in axes_of(results) else []
+    if per is None:
+        per = [name for name in ("tilt_deg",) if name in axes_of(results)]
     kept = kept_of(results, (*listed(per), *dictionaries))
     for name in (axis, "trial"):
         if name in kept:
@@ -110,8 +114,7 @@ def detection_limit(
         long_name="whether the rate is reached within the grid",
         flag_values=[int(flag) for flag in Limit],
         flag_meanings=" ".join(flag.name for flag in Limit))
-    return xr.Dataset({name: array.transpose(*kept) for name, array in out.items()}).drop_vars(
-        [name for name in (axis,) if name not in out], errors="ignore")
+    return xr.Dataset({name: array.transpose(*kept) for name, array in out.items()})
 
 
 def _limit(
@@ -127,7 +130,7 @@ def _limit(
     with np.errstate(divide="ignore", invalid="ignore"):
         reached = hits / n >= rate
     # Of draws, rounded outwards, as in `Rate`.
-    fewest, most = hits * draws // np.maximum(n, 1), -(-hits * draws // np.maximum(n, 1))
+    fewest, most = in_draws(hits, n, draws)
     joint = 1.0 - (1.0 - LEVEL) / sides.shape[-1]
     surely = wilson(fewest, draws)[0] >= rate
     possibly = wilson(most, draws, joint)[1] >= rate
@@ -155,12 +158,21 @@ def _limit(
 
 def _sides(results: xr.Dataset, axis: str) -> xr.DataArray:
     """Return the sides in pixels, over the axis and whatever else they depend on."""
+    if axis not in results.coords:
+        raise StoreError(f"{axis}: has no coordinate, of which the sides are made")
     if axis == "side_px":
-        return results["side_px"].astype(np.float64)
+        return _positive(results["side_px"].astype(np.float64))
     values = {name: _value(results, name) for name in (*VIEW_PARAMETERS, "size_m")}
     fx = xr.DataArray(intrinsics(*(values[name] for name in VIEW_PARAMETERS))[0])
     sides: xr.DataArray = fx * values["size_m"] / results["distance_m"]
-    return sides.astype(np.float64)
+    return _positive(sides.astype(np.float64))
+
+
+def _positive(sides: xr.DataArray) -> xr.DataArray:
+    if not (np.isfinite(sides) & (sides > 0)).all():
+        raise StoreError("sides must be finite and above 0 px: see the coordinates of the size, "
+                         "the distance and the camera")
+    return sides
 
 
 def _modules(results: xr.Dataset) -> Any:
@@ -177,11 +189,13 @@ def _value(results: xr.Dataset, name: str) -> Any:
     if name in results.coords:
         return results[name].reset_coords(drop=True)
     try:
-        files = results.attrs.get("sweep", {}).get("fingerprint", {}).get("files", {})
+        files = fingerprint_of(results).get("files", {})
         pipeline = Pipeline.from_text(results.attrs["pipeline"], files=files)
     except (KeyError, SweepError):
         raise StoreError(f"{name}: neither a coordinate, nor is there a pipeline in the "
                          "attributes that tells it") from None
+    if pipeline.axis(name) is not None:
+        raise StoreError(f"{name}: varies in this store, but the dataset lacks its coordinate")
     value = pipeline.fixed.get(name, PARAMETERS[name].default)
     if value is not None and not isinstance(value, (int, float, str)):
         raise StoreError(f"{name}: is drawn, so that a side is no number of the grid")

@@ -36,7 +36,8 @@ class Poses:
         """Return an array, of flags only where the poses count."""
         array = self._arrays[self._prefix + name]
         if name in {"detection", "estimate", "flipped"}:
-            return np.where(self.inside, array, 0)
+            # A dataset that was cut or joined has NaN where nothing was run.
+            return np.where(self.inside, np.nan_to_num(array, nan=0.0), 0)
         return array
 
     def __contains__(self, name: object) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from scipy import special
+from scipy import special, stats
 
 from sweep.analysis.blocks import axes_of, kept_of, listed
 from sweep.analysis.rates import detection_rate
@@ -42,7 +42,7 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     Where nothing was drawn there are no intervals and no p-values, and nothing is called weak.
     Lazy where ``results`` is. Raises ``StoreError`` without a dimension ``marker_id``.
     """
-    dictionaries = [name for name in ("dictionary",) if name in axes_of(results)]
+    dictionaries = ["dictionary"] if "dictionary" in axes_of(results) else []
     kept = kept_of(results, (*listed(per), *dictionaries, "marker_id"))
     kept = (*(name for name in kept if name != "marker_id"), "marker_id")
     if "trial" in kept:
@@ -147,6 +147,6 @@ def holm(p_values: Floats) -> Floats:
 
 
 def _rank(share: Floats) -> Floats:
-    """Return the ranks along the last axis, from 1; NaN of NaN."""
-    ranks = np.argsort(np.argsort(share, axis=-1, kind="stable"), axis=-1) + 1.0
+    """Return the ranks along the last axis, from 1, the least of equal ones; NaN of NaN."""
+    ranks = stats.rankdata(np.nan_to_num(share, nan=np.inf), method="min", axis=-1)
     return np.where(np.isnan(share), np.nan, ranks)

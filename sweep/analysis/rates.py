@@ -39,14 +39,17 @@ def detection_rate(
     ``marker_area_px_low`` and ``marker_area_px_high``; what is outside of all is left out.
 
     ``detected`` of ``looked_for``: of the poses whose detection is none of not_run, not_visible
-    and not_modelled. ``draws`` are the random draws among these: pooled settings see the same
-    ones. ``detection_rate`` has Wilson's interval at 95 %, and Jeffreys' in
-    ``detection_rate_jeffreys_low`` and ``_high``: of the draws, on a fixed grid; NaN where nothing
-    was drawn.
+    and not_modelled. ``draws`` are the random draws that these are worth: pooled settings see the
+    same ones (`sweep.analysis.statistics.draws_of`). ``detection_rate`` has Wilson's interval at
+    95 %, and Jeffreys' in ``detection_rate_jeffreys_low`` and ``_high``: of the draws, on a fixed
+    grid; NaN where nothing was drawn.
 
     Lazy where ``results`` is. Raises ``StoreError`` for a dimension that is not there.
     """
-    return _rate(results, per, bins, DETECTION_RATE, "looked_for", "detected")
+    return _rate(results, per, bins, DETECTION_RATE, (
+        ("looked_for", "poses that were run, visible and modelled"),
+        ("detected", "detected poses"),
+    ))
 
 
 def flip_rate(
@@ -58,15 +61,19 @@ def flip_rate(
     of which the parameters are, too. It means nothing for frontal markers, whose mirror is no
     other pose.
     """
-    return _rate(results, per, bins, FLIP_RATE, "solved", "flipped")
+    return _rate(results, per, bins, FLIP_RATE, (
+        ("solved", "solved poses"),
+        ("flipped", "solved poses that are nearer to the mirror of the truth"),
+    ))
 
 
 def _rate(
-    results: xr.Dataset, per: Sequence[str], bins: Bins | None, rate: Rate, of: str, hits: str
+    results: xr.Dataset, per: Sequence[str], bins: Bins | None, rate: Rate,
+    counts: Sequence[tuple[str, str]],
 ) -> xr.Dataset:
     kept = kept_of(results, per)
     needed = estimates(results) if rate is FLIP_RATE else detections(results)
-    full = Rate(rate.name, rate.meaning, rate.successes, rate.used, counts=(of, hits),
+    full = Rate(rate.name, rate.meaning, rate.successes, rate.used, counts=counts,
                 with_jeffreys=True)
     return streamed(results, needed, kept, [full], bins)
 
@@ -112,7 +119,7 @@ def failure_composition(
     rates = [
         Rate(f"share {outcome}", f"{outcome} of looked_for",
              functools.partial(outcome_of, outcome), functools.partial(_of_which, outcome),
-             counts=(f"of {outcome}", f"count {outcome}"))
+             counts=((f"of {outcome}", ""), (f"count {outcome}", "")))
         for outcome in OUTCOMES
     ]
     table = streamed(results, estimates(results), kept, rates, bins)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, NamedTuple, Protocol
 
@@ -42,6 +42,7 @@ class IntervalOf(IntEnum):
     """Why an interval has an end, or not."""
 
     not_run = 0
+    """There is nothing that counts."""
     given = 1
     nothing_drawn = 2
     """No cell has two draws that count."""
@@ -151,9 +152,30 @@ def _named(name: str, interval: Sequence[NDArray[Any]]) -> Found:
     return dict(zip((name, f"{name}_low", f"{name}_high"), interval, strict=True))
 
 
-def _counted(used: Masks) -> State:
-    """Return the cells' number of draws with a used value, (groups, cells)."""
-    return {"draws": used.any(axis=3).sum(axis=2)}
+def counted(used: Masks) -> tuple[State, State]:
+    """Return the states of how many poses are used, and of the draws that these are of."""
+    settings = used.sum(axis=3)
+    squares = np.square(settings, dtype=np.float64).sum(axis=(1, 2))
+    return ({"n": settings.sum(axis=(1, 2)), "squares": squares},
+            {"draws": (settings > 0).sum(axis=2)})
+
+
+def draws_of(known: State) -> Integers:
+    """Return the number of draws that the used poses are worth.
+
+    That is the number of draws with a used pose where each has as many of them; else it is less,
+    for those with more of them count more: the effective sample size, (Σ m)² / Σ m² of m used
+    poses a draw, rounded down (Kish, "Survey Sampling", 1965, section 11.7).
+    """
+    n = known["n"].astype(np.float64)
+    worth = n**2 / np.maximum(known["squares"], 1.0)
+    return np.asarray(np.floor(worth * (1.0 + 1e-12)), dtype=np.int64)
+
+
+def in_draws(hits: Integers, n: Integers, draws: Integers) -> tuple[Integers, Integers]:
+    """Return ``hits`` of ``n`` poses as hits of draws, rounded down and up."""
+    n = np.maximum(n, 1)
+    return hits * draws // n, -(-hits * draws // n)
 
 
 # The records.
@@ -188,11 +210,32 @@ class Count:
 
 
 @dataclass(frozen=True)
+class Draws(Count):
+    """How many poses there are of a kind, the draws that they are worth, and if any was drawn."""
+
+    def outputs(self) -> Sequence[Output]:
+        """Return the three variables."""
+        return [*super().outputs(),
+                Output("draws", "random draws that the intervals are of", "1", "i8"),
+                Output("drawn", "whether any cell has two draws", "1", "?")]
+
+    def first(self, poses: Any) -> tuple[State, State]:
+        """Count."""
+        return counted(self.of(poses))
+
+    def finish(self, known: State, second: State) -> Found:
+        """Return the counts."""
+        return super().finish(known, second) | {
+            "draws": draws_of(known), "drawn": known["freedom"] > 0}
+
+
+@dataclass(frozen=True)
 class Rate:
     """The share of ``used`` that are ``successes``, with Wilson's interval of a level.
 
-    Pooled settings see the same draws: n of the interval is the number of draws, and the successes
-    are rounded outwards to whole draws. It is a little wide where the cells' rates differ.
+    Pooled settings see the same draws: n of the interval is the number of draws, `draws_of`, and
+    the successes are rounded outwards to whole draws. It is a little wide where the cells' rates
+    differ.
     """
 
     name: str
@@ -200,17 +243,16 @@ class Rate:
     successes: Callable[[Any], Masks]
     used: Callable[[Any], Masks]
     level: float = LEVEL
-    counts: tuple[str, str] | None = None
-    """Names for the number of ``used`` and of ``successes``, where they are wanted, too."""
+    counts: Sequence[tuple[str, str]] = ()
+    """Names and meanings for the number of ``used`` and of ``successes``, where they are wanted."""
     with_jeffreys: bool = False
 
     def outputs(self) -> Sequence[Output]:
         """Return the rate, its interval, and the counts that are asked for."""
-        of, hits = self.meaning.split(" of ", 1)[::-1] if " of " in self.meaning else ("", "")
+        draws = Output("draws", "random draws that the interval is of", "1", "i8")
         return [
-            *(Output(name, text, "1", "i8")
-              for name, text in zip(self.counts or (), (of, hits), strict=False)),
-            *([Output("draws", f"draws with any {of}", "1", "i8")] if self.counts else []),
+            *(Output(name, meaning, "1", "i8") for name, meaning in self.counts),
+            *([draws] if self.counts else []),
             *with_interval(self.name, self.meaning, "1"),
             *(with_interval(f"{self.name}_jeffreys", f"{self.meaning} (Jeffreys)", "1")[1:]
               if self.with_jeffreys else []),
@@ -219,8 +261,8 @@ class Rate:
     def first(self, poses: Any) -> tuple[State, State]:
         """Count."""
         used = self.used(poses)
-        hits = (self.successes(poses) & used).sum(axis=OVER_ALL)
-        return {"n": used.sum(axis=OVER_ALL), "hits": hits}, _counted(used)
+        pooled, cells = counted(used)
+        return pooled | {"hits": (self.successes(poses) & used).sum(axis=OVER_ALL)}, cells
 
     def between(self, first: State) -> State:
         """Return the counts."""
@@ -232,14 +274,14 @@ class Rate:
 
     def finish(self, known: State, second: State) -> Found:  # noqa: ARG002
         """Return the rate and its intervals."""
-        n, hits, draws = known["n"], known["hits"], known["draws"]
+        n, hits, draws = known["n"], known["hits"], draws_of(known)
         drawn = known["freedom"] > 0
-        fewest = hits * draws // np.maximum(n, 1)
-        most = -(-hits * draws // np.maximum(n, 1))
+        fewest, most = in_draws(hits, n, draws)
         with np.errstate(invalid="ignore"):
             found: Found = {self.name: hits / n}
         if self.counts:
-            found |= dict(zip(self.counts, (n, hits), strict=True)) | {"draws": draws}
+            names = (name for name, _ in self.counts)
+            found |= dict(zip(names, (n, hits), strict=False)) | {"draws": draws}
         kinds = {"": wilson} | ({"_jeffreys": jeffreys} if self.with_jeffreys else {})
         for ending, interval in kinds.items():
             low, high = interval(fewest, draws, self.level)[0], interval(most, draws, self.level)[1]
@@ -250,10 +292,9 @@ class Rate:
 
 @dataclass(frozen=True)
 class Mean:
-    """A mean of values, (groups, cells, draws, settings, components).
+    """A mean of values, (groups, cells, draws, settings, components), with Student's interval.
 
-    Raises nothing; of values that are NaN only the others count. Subclasses say what the mean is
-    of, and make its interval.
+    Values that are NaN do not count.
     """
 
     name: str
@@ -268,9 +309,10 @@ class Mean:
 
     def first(self, poses: Any) -> tuple[State, State]:
         """Take the moments of the values, all together."""
-        used = self.used(poses)
-        values = np.where(used[..., None], self.values(poses), np.nan)
-        return {"moments": Moments.of(values, axis=OVER_ALL)}, _counted(used)
+        values = self.values(poses)
+        used = self._used(poses, values)
+        moments = Moments.of(np.where(used[..., None], values, np.nan), axis=OVER_ALL)
+        return {"moments": moments}, counted(used)[1]
 
     def between(self, first: State) -> State:
         """Return the moments with the mean of the scores."""
@@ -278,9 +320,10 @@ class Mean:
 
     def second(self, poses: Any, known: State) -> tuple[State, State]:
         """Take the moments of the draws' deviations within the cells."""
-        used, moments = self.used(poses), known["moments"]
+        values, moments = self.values(poses), known["moments"]
+        used = self._used(poses, values)
         with np.errstate(all="ignore"):
-            scores = self._scores(self.values(poses), moments)
+            scores = self._scores(values, moments)
             centre = known["centre"][:, None, None, None]
             deviations = np.where(used, scores - centre, 0.0).sum(axis=3)
         within = Moments.of(np.where(poses.draws, deviations, np.nan), axis=2)
@@ -291,6 +334,9 @@ class Mean:
         n = known["moments"].count[:, 0]
         estimated = error_of(known["centre"], n, known["freedom"], second)
         return _named(self.name, self._interval(estimated))
+
+    def _used(self, poses: Any, values: Floats) -> Masks:
+        return np.asarray(self.used(poses) & ~np.isnan(values).any(axis=-1))
 
     def _centre(self, moments: Moments) -> Floats:
         return np.asarray(moments.mean[:, 0])
@@ -414,7 +460,7 @@ class Quantiles:
     errors: Callable[[Any], Floats]
     solved: Callable[[Any], Masks]
     used: Callable[[Any], Masks]
-    with_reason: bool = field(default=False)
+    with_reason: bool = False
 
     def outputs(self) -> Sequence[Output]:
         """Return the quantiles and their intervals."""
@@ -431,12 +477,12 @@ class Quantiles:
     def first(self, poses: Any) -> tuple[State, State]:
         """Count the values by their upper bits."""
         used = self.used(poses)
-        return {"n": used.sum(axis=OVER_ALL),
-                "upper": tallies.upper_tally(*self._flat(poses, used))}, _counted(used)
+        pooled, cells = counted(used)
+        return pooled | {"upper": tallies.upper_tally(*self._flat(poses, used))}, cells
 
     def between(self, first: State) -> State:
         """Return the bins in which the ranks lie that are wanted."""
-        n, draws = first["n"], first["draws"]
+        n, draws = first["n"], draws_of(first)
         ranks = np.zeros((len(n), len(PERCENTS), 3), dtype=np.int64)
         for at, percent in enumerate(PERCENTS.values()):
             ranks[:, at, 0] = -(-n * percent // 100)
@@ -465,15 +511,17 @@ class Quantiles:
             if self.with_reason:
                 missing = (bins[:, at, 1:] < 0).any(axis=1)
                 found[f"{statistic}_interval"] = np.select(
-                    [known["freedom"] == 0, missing],
-                    [IntervalOf.nothing_drawn, IntervalOf.too_few_draws], IntervalOf.given,
+                    [known["n"] == 0, known["freedom"] == 0, missing],
+                    [IntervalOf.not_run, IntervalOf.nothing_drawn, IntervalOf.too_few_draws],
+                    IntervalOf.given,
                 ).astype(np.uint8)
         return found
 
     def _flat(self, poses: Any, used: Masks) -> tuple[Integers, Floats]:
         groups = np.nonzero(used)[0]
-        errors = np.where(self.solved(poses), self.errors(poses), np.inf)[used]
-        return groups, errors
+        errors = self.errors(poses)
+        known = self.solved(poses) & ~np.isnan(errors)
+        return groups, np.where(known, errors, np.inf)[used]
 
 
 def _groups_of(array: NDArray[Any]) -> Integers:

@@ -344,9 +344,12 @@ def _report(chosen: argparse.Namespace) -> int:
     import xarray as xr  # noqa: PLC0415
 
     from sweep.engine.store import committed, open_dataset, open_store  # noqa: PLC0415
-    from sweep.report.subject import Subject  # noqa: PLC0415
-    from sweep.report.writing import check_output, write_report  # noqa: PLC0415
+    from sweep.report.subject import Subject, reading  # noqa: PLC0415
+    from sweep.report.writing import write_report  # noqa: PLC0415
 
+    for option, given in (("-o", chosen.output), ("--figures", chosen.figures)):
+        if given is not None and not given.strip():
+            raise StoreError(f"{option} '{given}': expected a name")
     form = chosen.format or ("md" if str(chosen.output).lower().endswith(".md") else "html")
     output = Path(chosen.output or f"report.{form}")
     figures = Path(chosen.figures) if chosen.figures else None
@@ -356,11 +359,12 @@ def _report(chosen: argparse.Namespace) -> int:
         raise StoreError(
             f"{store.url}: unfinished: {done:,} of {blocks:,} blocks; `sweep run` continues it"
         )
-    check_output(output, figures)
     trade = None
-    if "cost/tradeoff" in store.group:
-        trade = xr.open_zarr(store.url, group="cost/tradeoff", consolidated=False)
-    subject = Subject(store.url, open_dataset(store.url), store.pipeline, store.about, trade)
+    with reading(store.url):
+        if "cost/tradeoff" in store.group:
+            trade = xr.open_zarr(store.url, group="cost/tradeoff", consolidated=False).load()
+        results = open_dataset(store.url)
+    subject = Subject(store.url, results, store.pipeline, store.about, trade)
     count = write_report(subject, output, form, figures)
     print(f"{output}: {count} figures, {_bytes(output.stat().st_size)}")
     return 0

@@ -12,6 +12,7 @@ import pytest
 import xarray as xr
 from conftest import lengths
 from scipy import stats
+from statsmodels.stats import proportion
 from test_analysis_paired import holm, with_detected
 from test_analysis_reference import perfect
 
@@ -95,7 +96,6 @@ def test_near_no_success_the_coverage_falls_to_poissons_limits():
 @METHODS
 @pytest.mark.parametrize("n", LEAST)
 def test_intervals_of_rates_are_those_of_statsmodels(interval, n):
-    proportion = pytest.importorskip("statsmodels.stats.proportion")
     k = np.unique(np.concatenate([np.arange(min(n, 50) + 1), n - np.arange(min(n, 50) + 1),
                                   np.linspace(0, n, 20).astype(int)]))
     low, high = interval(k, n)

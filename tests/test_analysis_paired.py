@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import xarray as xr
 from scipy import stats
+from statsmodels.stats import contingency_tables as contingency
+from statsmodels.stats import multitest
 from test_analysis_reference import (
     FX,
     GRIDS,
@@ -186,7 +188,6 @@ def test_p_values_of_ids_are_pearsons_third_curve_near_the_exact_ones(case):
 
 def test_of_two_ids_looked_for_alike_the_p_value_is_that_of_cochran_mantel_and_haenszel():
     # Half of each cell's poses are each ID's: no skewness, so that Pearson's curve is the normal.
-    contingency = pytest.importorskip("statsmodels.stats.contingency_tables")
     rng = np.random.default_rng(5)
     results = perfect(rng, {"marker_id": 2, "tilt_deg": 3, "trial": 60})
     chances = np.array([[0.9, 0.7, 0.4], [0.8, 0.6, 0.2]])[..., None]
@@ -204,7 +205,6 @@ def test_of_two_ids_looked_for_alike_the_p_value_is_that_of_cochran_mantel_and_h
 
 @pytest.mark.parametrize("case", RANKED)
 def test_the_references_statistic_is_that_of_statsmodels(case):
-    contingency = pytest.importorskip("statsmodels.stats.contingency_tables")
     results, per = RANKED[case]
     kept = (*per, "dictionary") if "dictionary" in results.dims else per
     for found in of_markers(results, kept).values():
@@ -222,7 +222,6 @@ def test_the_references_statistic_is_that_of_statsmodels(case):
 
 
 def test_the_references_holm_is_that_of_statsmodels():
-    multitest = pytest.importorskip("statsmodels.stats.multitest")
     rng = np.random.default_rng(6)
     for p_values in (rng.random(20) ** 4, np.array([0.01, 0.01, 1.0, 0.03]), np.array([0.2])):
         adjusted = multitest.multipletests(p_values, method="holm")[1]
@@ -307,7 +306,6 @@ def test_the_difference_of_two_rates_is_the_published_one(table, low, high):
 
 @pytest.mark.parametrize("table", [(50, 0, 0, 0), (50, 3, 0, 1), (20, 5, 14, 8), (0, 9, 9, 9)])
 def test_the_p_value_of_a_difference_is_mcnemars_exact_one(table):
-    contingency = pytest.importorskip("statsmodels.stats.contingency_tables")
     results = perfect(np.random.default_rng(17), {"trial": sum(table)})
     seen = np.repeat([[1, 1], [1, 0], [0, 1], [0, 0]], table, axis=0).astype(bool)
     told = compare(*(with_detected(results, seen[:, k]) for k in range(2))).compute()

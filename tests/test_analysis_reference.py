@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from scipy import special, stats
+from statsmodels.stats import proportion
 
 from sweep.analysis import detection_rate, error_statistics, failure_composition, flip_rate
 from sweep.errors import StoreError
@@ -766,7 +767,6 @@ def test_the_pipelines_of_the_datasets_are_valid():
 
 @pytest.mark.parametrize("n", [1, 2, 7, 50, 1000])
 def test_the_references_intervals_are_those_of_statsmodels(n):
-    proportion = pytest.importorskip("statsmodels.stats.proportion")
     for k in {0, 1, n // 3, n - 1, n}:
         for method, interval in (("wilson", wilson), ("jeffreys", jeffreys)):
             low, high = proportion.proportion_confint(k, n, method=method)

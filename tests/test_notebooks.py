@@ -1,7 +1,8 @@
-"""The notebooks run as they are, show their figures, and are kept without outputs."""
+"""The notebooks run, show their figures, and are kept without outputs."""
 
 import asyncio
 import os
+import re
 from pathlib import Path
 
 import nbformat
@@ -10,6 +11,7 @@ from nbclient import NotebookClient
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 FIGURES = {"choosing_a_marker": 6, "paper_reproduced": 4, "first_analysis": 5}
+FEW_TRIALS = 2  # in place of what a reader gets
 TIMEOUT_S = 300  # a cell, on a busy machine
 
 
@@ -17,34 +19,47 @@ def read(name):
     return nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
 
 
+def shortened(notebook):
+    """Return a notebook with few trials, whose number it sets in one place, and one worker."""
+    changed = 0
+    for cell in code_cells(notebook):
+        cell.source, count = re.subn(
+            r"^trials = \d+", f"trials = {FEW_TRIALS}", cell.source, flags=re.MULTILINE)
+        changed += count
+        cell.source = cell.source.replace("workers=2", "workers=1")  # quicker to start
+    assert changed == 1
+    return notebook
+
+
 def code_cells(notebook):
     return [cell for cell in notebook.cells if cell.cell_type == "code"]
 
 
-async def executed(name, runs, turn):
+async def executed(notebook, runs, turn):
     """Return a notebook after it ran in its folder, its stores in ``runs``."""
-    client = NotebookClient(read(name), timeout=TIMEOUT_S, kernel_name="python3",
+    client = NotebookClient(notebook, timeout=TIMEOUT_S, kernel_name="python3",
                             resources={"metadata": {"path": str(NOTEBOOKS)}})
     async with turn:
         return await client.async_execute(env=os.environ | {"SWEEP_RUNS": str(runs)})
 
 
-async def all_executed(folders):
+async def all_executed(folders, *, short):
     """Run the notebooks two at a time: what starts up leaves processors idle."""
     turn = asyncio.Semaphore(2)
-    running = [executed(name, runs, turn) for name, runs in folders.items()]
+    notebooks = [shortened(read(name)) if short else read(name) for name in folders]
+    running = [executed(notebook, runs, turn)
+               for notebook, runs in zip(notebooks, folders.values(), strict=True)]
     return await asyncio.gather(*running, return_exceptions=True)
 
 
-@pytest.fixture(scope="module")
-def folders(tmp_path_factory):
-    return {name: tmp_path_factory.mktemp(name) for name in FIGURES}
-
-
-@pytest.fixture(scope="module")
-def outcomes(folders):
-    """Each notebook as it ran, or what it raised."""
-    return dict(zip(folders, asyncio.run(all_executed(folders)), strict=True))
+@pytest.fixture(scope="module", params=[
+    "short", pytest.param("as it stands", marks=pytest.mark.long)])
+def outcomes(request, tmp_path_factory):
+    """Each notebook as it ran, or what it raised, and the folder of its stores."""
+    short = request.param == "short"
+    folders = {name: tmp_path_factory.mktemp(name) for name in FIGURES}
+    found = asyncio.run(all_executed(folders, short=short))
+    return dict(zip(folders, zip(found, folders.values(), strict=True), strict=True))
 
 
 def test_all_notebooks_are_known():
@@ -65,11 +80,12 @@ def test_notebook_is_kept_without_outputs(name):
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_notebook_runs_and_shows_its_figures(name, outcomes, folders):
-    if isinstance(outcomes[name], Exception):
-        raise outcomes[name]
+def test_notebook_runs_and_shows_its_figures(name, outcomes):
+    outcome, folder = outcomes[name]
+    if isinstance(outcome, Exception):
+        raise outcome
     shown = 0
-    for cell in code_cells(outcomes[name]):
+    for cell in code_cells(outcome):
         kinds = {output.output_type for output in cell.outputs}
         complaints = [output.text for output in cell.outputs
                       if output.output_type == "stream" and output.name == "stderr"]
@@ -80,4 +96,4 @@ def test_notebook_runs_and_shows_its_figures(name, outcomes, folders):
         assert len(images) == cell.source.count("plt.show()"), cell.source
         shown += len(images)
     assert shown == FIGURES[name]
-    assert list(folders[name].glob("*.zarr")), "stores go where SWEEP_RUNS says"
+    assert list(folder.glob("*.zarr")), "stores go where SWEEP_RUNS says"

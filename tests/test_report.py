@@ -6,6 +6,7 @@ import io
 import math
 import os
 import re
+import shutil
 import xml.etree.ElementTree as ET
 from html.parser import HTMLParser
 from pathlib import Path
@@ -16,7 +17,14 @@ import pytest
 import xarray as xr
 
 from sweep import cli
-from sweep.analysis import compare, detection_rate, error_statistics, failure_composition
+from sweep.analysis import (
+    compare,
+    detection_limit,
+    detection_rate,
+    error_statistics,
+    failure_composition,
+)
+from sweep.analysis.statistics import IntervalOf
 from sweep.engine.runner import _cost
 from sweep.engine.store import create_store, finish, open_dataset, open_store, write_group
 from sweep.engine.task import compute_block
@@ -27,6 +35,7 @@ from sweep.plan.grid import scene_axes
 from sweep.plan.pipeline import Pipeline
 from sweep.report import gallery
 from sweep.report import subject as subjects
+from sweep.report.answer import _best, answer
 from sweep.report.figures import figures_of
 from sweep.report.gallery import scenes_of
 from sweep.report.subject import Grouping, Subject, texts_of
@@ -241,6 +250,15 @@ def test_each_figure_applies_where_it_should(full, tmp_path):
     }
 
 
+def test_an_axis_of_too_many_treatments_has_a_figure_of_its_own(tmp_path):
+    text = (f"{CAMERA}[pose]\nside_px = 40\n[axes]\nminMarkerDistanceRate = [0.1, 0.12]\n"
+            "errorCorrectionRate = [0.2, 0.4, 0.6, 0.8]\n"
+            "polygonalApproxAccuracyRate = [0.01, 0.02, 0.03, 0.04, 0.05]\n")
+    url = made(tmp_path, text, "many")
+    assert kinds(url) == ["failures", "treatments", "paired", "effect-polygonalApproxAccuracyRate"]
+    assert command("report", url, "-o", tmp_path / "report.html")[::2] == (0, "")
+
+
 @pytest.mark.parametrize("name", ODD)
 def test_odd_stores_have_a_report_without_a_warning(name, tmp_path):
     url = made(tmp_path, ODD[name], "odd")
@@ -309,6 +327,65 @@ def test_the_answer_is_that_of_plain_arithmetic(full, page):
     assert f"median is {number(median)}\u00b0" in paragraph
     poses = np.prod([results.sizes[axis] for axis in ("marker_id", "side_px", "tilt_deg", "trial")])
     assert f'<span class="value">{poses}</span>' in page
+
+
+def test_the_answer_s_numbers_have_their_own_denominators(full, page, tmp_path):
+    results = open_dataset(full).load()
+    paragraph = re.search(r'<p class="answer">(.*?)</p>', page)[1]
+    assert (f"looked for {results.detection.size} times, with 2 settings of the detector together,"
+            in paragraph)
+    solved = 100 * float((results["estimate"] == Estimate.solved).mean())
+    assert (f"solved in {number(solved)} % of {results.estimate.size} results, with 4 treatments "
+            "together." in paragraph)
+    assert f"to {number(100 * float(error_statistics(results)['solved_rate_high']))} %, of " + str(
+        results.estimate.size) in page
+    single = answer(opened(made(tmp_path, ODD["single pose"], "single"))).paragraph
+    assert single.startswith("The marker was looked for once and found in 100 %; a pose was ")
+
+
+def test_the_limit_is_that_of_the_detector_s_first_setting(full, page):
+    results = open_dataset(full)
+    first = detection_limit(
+        results.isel(cornerRefinementMethod=0), rate=0.9, per=("tilt_deg",)).compute()
+    shown = answer(opened(full))
+    assert "With cornerRefinementMethod none, at least 90 % are found from" in shown.paragraph
+    tile = shown.tiles[-1]
+    assert tile.detail.endswith("with cornerRefinementMethod none")
+    assert tile.value.endswith(f"{number(float(first['side_px'][0]))} px")
+    assert tile.detail in page
+
+
+def treated(medians, intervals, flag):
+    """Return a subject whose estimators have these medians; nothing of it is read."""
+    low, high = np.transpose(intervals)
+    names = np.array(list("abcdef"[:len(medians)]), dtype=object)
+    found = xr.Dataset(
+        {"rotation_median_deg": ("solver", medians), "rotation_median_deg_low": ("solver", low),
+         "rotation_median_deg_high": ("solver", high),
+         "median_interval": ("solver", np.full(len(medians), flag)),
+         "solved_rate": ("solver", np.ones(len(medians)))}, {"solver": names})
+    solvers = ["ippe", "iterative", "sqpnp", "epnp", "ippe_square", "ap3p"][:len(medians)]
+    text = f"{CAMERA}[pose]\nside_px = 40\n[axes]\nsolver = {solvers}\n"
+    pipeline = Pipeline.from_text(text, name="treated")
+    subject = Subject("treated", xr.Dataset(), pipeline, {})
+    subject._found["error_statistics", ("solver",), (), ()] = found
+    return subject
+
+
+def test_the_best_treatment_is_told_with_those_that_it_cannot_be_told_from():
+    nan, given, none, few = np.nan, *map(IntervalOf, (1, 2, 3))
+    subject = treated([2, 1, 9], [(1.4, 3), (0.5, 1.5), (8, 10)], given)
+    assert _best(subject) == (
+        "Of the treatments b has the smallest median rotation error, 1.00\u00b0 (0.500 to 1.50), "
+        "and solves 100 %; it is not told apart from a.")
+    assert _best(treated([2, 1], [(1.6, 3), (0.5, 1.5)], given)).endswith("solves 100 %.")
+    many = treated([1, 2, 3, 4, 5], [(0, 9)] * 5, given)
+    assert _best(many).endswith("not told apart from b, c, d and 1 more.")
+    # Nothing was drawn: what is larger is larger. Too few draws: an end may lie anywhere.
+    assert _best(treated([2, 1, 1], [(nan, nan)] * 3, none)).endswith("1.00\u00b0, and solves "
+                                                                    "100 %; it is not told apart "
+                                                                    "from c.")
+    assert _best(treated([2, 1], [(nan, nan)] * 2, few)).endswith("not told apart from a.")
 
 
 def test_long_axes_are_put_in_bins_that_hold_every_pose(tmp_path):
@@ -445,6 +522,29 @@ def test_markdown_has_its_figures_beside_it_and_figures_go_where_they_are_asked(
             assert re.sub(r"\\.", "", line).count("|") >= 3
 
 
+def test_the_figures_of_an_earlier_markdown_go_but_nothing_else_does(tmp_path):
+    url = made(tmp_path, f"title = ' '\n{ODD['single pose']}", "one")
+    output, folder = tmp_path / "answer.md", tmp_path / "answer_figures"
+    folder.write_text("mine")
+    assert "it is a file" in command("report", url, "-o", output)[2]
+    assert not output.exists()
+    folder.unlink()
+    folder.mkdir()
+    (folder / "stale.png").write_text("old")
+    assert command("report", url, "-o", output)[::2] == (0, "")
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "failures.png", "failures.svg", "scene-1.png"]
+    assert output.read_text(encoding="utf-8").startswith("# one\n")
+    (folder / "notes.txt").write_text("mine")
+    code, _, err = command("report", url, "-o", output)
+    held = f"{folder}: cannot be replaced: it holds notes.txt, which is no figure"
+    assert (code, err) == (2, f"{held}; name another output\n")
+    (folder / "notes.txt").unlink()
+    inside = folder / "inside"
+    assert "is replaced as a whole" in command(
+        "report", url, "-o", output, "--figures", inside)[2]
+
+
 def test_the_pipeline_can_be_taken_from_the_page(full, page):
     encoded = re.search(r'href="data:application/toml;base64,([^"]*)"', page)[1]
     assert base64.b64decode(encoded).decode() == open_store(full).pipeline.text
@@ -484,6 +584,75 @@ def test_what_cannot_be_reported_is_told_in_one_line(full, tmp_path):
             assert len(err.splitlines()) == 1 or "usage" in err
         assert sorted(path.name for path in tmp_path.iterdir()) == before
     assert file.read_text() == "mine"
+
+
+def test_a_report_is_never_written_into_a_store(tmp_path):
+    url = made(tmp_path, ODD["single pose"], "one")
+    other = made(tmp_path, ODD["single pose"], "other")
+    link = tmp_path / "link"
+    link.symlink_to(url)
+    hidden = tmp_path / "hidden_figures"
+    hidden.symlink_to(Path(url) / "cost")
+
+    def held():
+        return {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+    before = held()
+    with contextlib.chdir(tmp_path):
+        for arguments in (
+            ("-o", f"{url}/zarr.json"), ("-o", f"{url}/cost/report.html"), ("-o", url),
+            ("-o", "one.zarr/../one.zarr/zarr.json"), ("-o", link / "zarr.json"),
+            ("-o", f"{other}/zarr.json"), ("--figures", f"{url}/figs"), ("--figures", url),
+            ("--figures", link), ("-o", "hidden.md"),
+        ):
+            code, out, err = command("report", url, *arguments)
+            assert (code, out, len(err.splitlines())) == (2, "", 1)
+            assert "cannot be written: it lies in the store" in err
+        for option in ("-o", "--figures"):
+            assert command("report", url, option, "")[::2] == (2, f"{option} '': expected a name\n")
+    assert held() == before
+
+
+def chunks_of(url, name):
+    return sorted(path for path in (Path(url) / name / "c").rglob("*") if path.is_file())
+
+
+def test_poses_that_are_missing_are_told(tmp_path):
+    url = made(tmp_path, ODD["no draws"], "lost")
+    output = tmp_path / "report.html"
+    chunks_of(url, "detection")[0].unlink()
+    again = "`sweep run` with --overwrite makes the store again\n"
+    assert command("report", url, "-o", output)[::2] == (
+        2, f"{url}: 1 pose is missing; {again}")
+    chunks_of(url, "estimate")[-1].unlink()
+    assert command("report", url, "-o", output)[::2] == (
+        2, f"{url}: 2 poses are missing; {again}")
+    assert not output.exists()
+
+
+@pytest.mark.parametrize("loaded", [200_000_000, 0])
+def test_a_damaged_store_is_told_in_one_line(loaded, tmp_path, monkeypatch):
+    monkeypatch.setattr(subjects, "LOADED_BYTES", loaded)
+    output = tmp_path / "report.html"
+
+    def flip(url):
+        chunk = chunks_of(url, "rotation_error_deg")[0]
+        chunk.write_bytes(bytes([chunk.read_bytes()[0] ^ 1]) + chunk.read_bytes()[1:])
+
+    for k, (damage, message) in enumerate((
+        (flip, "cannot be read: "),
+        (lambda url: (Path(url) / "detection/zarr.json").write_text("{"), "cannot be read: "),
+        (lambda url: shutil.rmtree(Path(url) / "marker_area_px"), "no marker_area_px;"),
+        (lambda url: shutil.rmtree(Path(url) / "side_px"), "no coordinate side_px;"),
+        (lambda url: shutil.rmtree(Path(url) / "solver"), "no coordinate solver;"),
+    )):
+        url = made(tmp_path, ODD["no draws"], f"damaged{k}")
+        damage(url)
+        code, out, err = command("report", url, "-o", output)
+        assert (code, out, len(err.splitlines())) == (2, "", 1)
+        assert err.startswith(f"{url}: ")
+        assert message in err
+        assert not output.exists()
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")

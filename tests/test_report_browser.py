@@ -100,6 +100,9 @@ SMALLER = {
     "bound": ["trial=3", "side_px=[20, 50]", "tilt_deg=[0, 30, 60]"],
     "renderers": ["trial=2", "renderer=['exact', 'warp', 'supersample-2']", "side_px=[20, 50]"],
     "tradeoff": ["trial=2", "side_px=[20, 50]"],
+    "second_dip": ["marker_id=[0, 1]", "side_px=[13, 15.5, 18, 25]", "trial=2"],
+    "second_dip_settings": ["marker_id=[0, 1]", "side_px=[15.2, 18, 22]", "trial=2",
+                            "perspectiveRemovePixelPerCell=[4, 8]"],
     "faults": ["trial=2", "exposure_s=[0, 0.002]", "distance_m=[0.8, 1.6]"],
 }
 

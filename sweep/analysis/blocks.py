@@ -292,7 +292,8 @@ class Reading:
 
 
 def _computed(graph: Mapping[Any, Any], keys: list[Any]) -> list[NDArray[Any]]:
-    return [np.asarray(chunk) for chunk in get_sync(graph, keys)]
+    # No callbacks: a user's progress bar is that of the whole.
+    return [np.asarray(chunk) for chunk in get_sync(graph, keys, callbacks=())]
 
 
 def _tables(

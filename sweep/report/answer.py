@@ -11,6 +11,7 @@ import xarray as xr
 
 from sweep.analysis import detection_limit, detection_rate, error_statistics
 from sweep.analysis.limits import Limit
+from sweep.analysis.statistics import IntervalOf
 from sweep.errors import StoreError
 from sweep.plan.parameters import Stage
 from sweep.report.figure import ends_of, sentences
@@ -25,15 +26,26 @@ MOST_LIMITS = 3
 """Limits that the paragraph names."""
 
 
+MOST_RIVALS = 3
+"""Treatments that the paragraph names as not told apart from the best."""
+
 NEVER = "never"
 
 
-class Limits(NamedTuple):
+class SeenFrom(NamedTuple):
     """From which side on the marker is seen, and how far away that is, as text."""
 
     where: str
     side: str
     distance: str
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """From which side on the marker is seen, by tilt and dictionary; with which ``settings``."""
+
+    limits: tuple[SeenFrom, ...] = ()
+    settings: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +70,7 @@ def answer(subject: Subject) -> Answer:
     """Return the answer in numbers over the whole store."""
     rates, errors = subject.of(detection_rate), subject.of(error_statistics)
     poses = subject.pipeline.size(Stage.scene)
-    looked_for = int(rates["looked_for"])
-    limits = _limits(subject)
+    seen = _seen(subject)
     tiles = [
         Tile("poses", f"{poses:,}", _results(subject, poses)),
         _share_tile("detected", rates, "detection_rate"),
@@ -67,12 +78,12 @@ def answer(subject: Subject) -> Answer:
         _error_tile("rotation error, median", errors, "rotation_median_deg", "\u00b0"),
         _error_tile("rotation error, p95", errors, "rotation_p95_deg", "\u00b0"),
     ]
-    if limits:
-        where, side, distance = limits[0]
+    if seen.limits:
+        where, side, distance = seen.limits[0]
         tiles.append(Tile(f"{100 * SEEN:.0f} % found from a side of", side,
-                          ", ".join(filter(None, (distance, where)))))
-    tables = (_errors_table(errors), *_limits_table(limits))
-    return Answer(_paragraph(subject, looked_for, limits), tuple(tiles), tables)
+                          ", ".join(filter(None, (distance, where, seen.settings)))))
+    tables = (_errors_table(errors), *_limits_table(seen))
+    return Answer(_paragraph(subject, seen), tuple(tiles), tables)
 
 
 def _results(subject: Subject, poses: int) -> str:
@@ -84,8 +95,9 @@ def _results(subject: Subject, poses: int) -> str:
 
 def _share_tile(heading: str, found: xr.Dataset, name: str) -> Tile:
     value, low, high = (float(end) for end in ends_of(found, name, 100))
-    between = f"{number(low)} to {number(high)} %" if math.isfinite(low) else ""
-    return Tile(heading, "\u2013" if math.isnan(value) else f"{number(value)} %", between)
+    between = f"{number(low)} to {number(high)} %, " if math.isfinite(low) else ""
+    return Tile(heading, "\u2013" if math.isnan(value) else f"{number(value)} %",
+                f"{between}of {int(found['looked_for']):,}")
 
 
 def _error_tile(heading: str, found: xr.Dataset, name: str, unit: str) -> Tile:
@@ -98,20 +110,12 @@ def _error_tile(heading: str, found: xr.Dataset, name: str, unit: str) -> Tile:
     return Tile(heading, shown, f"{number(low)} to {number(high)}{unit}" if known else "")
 
 
-def _paragraph(
-    subject: Subject, looked_for: int, limits: list[Limits]
-) -> str:
+def _paragraph(subject: Subject, seen: Seen) -> str:
     rates, errors = subject.of(detection_rate), subject.of(error_statistics)
-    if looked_for == 0:
+    if int(rates["looked_for"]) == 0:
         return "In no pose was the marker looked for: none was visible and modelled."
-    treatments = subject.pipeline.size(Stage.detection, Stage.estimation)
-    over = f", with {treatments:,} treatments together," if treatments > 1 else ""
-    found, solved = float(rates["detection_rate"]), float(errors["solved_rate"])
-    looked = (
-        f"The marker was looked for {looked_for:,} times{over} and found in "
-        f"{number(100 * found)} %; a pose was solved in {number(100 * solved)} %."
-    )
-    parts = [looked]
+    solved = float(errors["solved_rate"])
+    parts = [_counted(subject, rates, errors)]
     if solved > 0:
         median, p95 = (float(errors[f"rotation_{name}_deg"]) for name in ("median", "p95"))
         ranges = float(errors["range_rmse_unflipped_percent"])
@@ -121,8 +125,27 @@ def _paragraph(
             f"misses the range is off by {number(ranges)} % (RMS)."
         )
         parts.append(_best(subject))
-    parts.append(_seen(limits))
+    parts.append(_seen_sentence(seen))
     return sentences(*parts)
+
+
+def _counted(subject: Subject, rates: xr.Dataset, errors: xr.Dataset) -> str:
+    """Return how many were found and solved, each of how many, as a sentence.
+
+    Each setting of the detector looks once, and of each look every estimator makes a result.
+    """
+    detectors = subject.pipeline.size(Stage.detection)
+    treatments = subject.pipeline.size(Stage.detection, Stage.estimation)
+    looks, results = int(rates["looked_for"]), int(errors["looked_for"])
+    times = "once" if looks == 1 else f"{looks:,} times"
+    over = f", with {detectors:,} settings of the detector together," if detectors > 1 else ""
+    of = f" of {results:,} results, with {treatments:,} treatments together" if (
+        results != looks) else ""
+    return (
+        f"The marker was looked for {times}{over} and found in "
+        f"{number(100 * float(rates['detection_rate']))} %; a pose was solved in "
+        f"{number(100 * float(errors['solved_rate']))} %{of}."
+    )
 
 
 def _best(subject: Subject) -> str:
@@ -131,14 +154,29 @@ def _best(subject: Subject) -> str:
     if not grouping.dims:
         return ""
     names, found = stacked(subject.of(error_statistics, grouping), grouping.dims)
-    median = found["rotation_median_deg"].values
+    median, low, high = ends_of(found, "rotation_median_deg")
     if not np.isfinite(median).any():
         return ""
     best = int(np.nanargmin(median))
-    return (
+    known = found["median_interval"].values == IntervalOf.nothing_drawn
+    between = "" if math.isnan(low[best]) and math.isnan(high[best]) else (
+        f" ({number(low[best])} to {number(high[best])})")
+    # Without draws a median is what it is; an end that is missing else lies beyond all draws.
+    low = np.where(np.isnan(low), np.where(known, median, -np.inf), low)
+    high = np.where(np.isnan(high), np.where(known, median, np.inf), high)
+    rivals = [
+        name for k, name in enumerate(names)
+        if k != best and not math.isnan(median[k]) and low[k] <= high[best]
+    ]
+    listed = ", ".join(rivals[:MOST_RIVALS])
+    if len(rivals) > MOST_RIVALS:
+        listed += f" and {len(rivals) - MOST_RIVALS:,} more"
+    return sentences(
         f"Of the treatments {names[best]} has the smallest median rotation error, "
-        f"{_degrees(float(median[best]))}, and solves "
-        f"{number(100 * float(found['solved_rate'].values[best]))} %."
+        f"{_degrees(float(median[best]))}{between}, and solves "
+        f"{number(100 * float(found['solved_rate'].values[best]))} %"
+        + (f"; it is not told apart from {listed}." if rivals else "."),
+        *grouping.notes,
     )
 
 
@@ -146,31 +184,41 @@ def _degrees(value: float) -> str:
     return f"{number(value)}\u00b0" if math.isfinite(value) else "infinite"
 
 
-def _seen(limits: list[Limits]) -> str:
+def _seen_sentence(seen: Seen) -> str:
     """Return from how far the marker is seen, as a sentence: all limits, or the first and last."""
+    limits = seen.limits
     if not limits:
         return ""
+    share = f"at least {100 * SEEN:.0f} % are found"
+    start = f"{seen.settings}, " if seen.settings else ""
     if all(limit.side == NEVER for limit in limits):
-        return f"There is no side from which on at least {100 * SEEN:.0f} % are found."
+        told = f"{start}there is no side from which on {share}."
+        return told[0].upper() + told[1:]
     listed = [
         f"{f'{where}: ' if where else ''}{side}{f' ({distance})' if distance else ''}"
         for where, side, distance in limits
     ]
-    told = "; ".join(listed) if len(listed) <= MOST_LIMITS else (
+    text = "; ".join(listed) if len(listed) <= MOST_LIMITS else (
         f"{listed[0]}, to {listed[-1]} (the table below has all)")
-    return f"At least {100 * SEEN:.0f} % are found from this side in the image on: {told}."
+    told = f"{start}{share} from this side in the image on: {text}."
+    return told[0].upper() + told[1:]
 
 
-def _limits(subject: Subject) -> list[Limits]:
-    """Return where, the side from which on the marker is seen, and its distance, as text."""
+def _seen(subject: Subject) -> Seen:
+    """Return from which side on the marker is seen with the first setting of the detector."""
     if subject.size_axis is None:
-        return []
+        return Seen()
+    axes = subject.pipeline.axes_of(Stage.detection)
+    first = subject.results.isel({axis.name: 0 for axis in axes})
+    settings = ", ".join(
+        f"{axis.name} {text_of(first[axis.name].item())}" for axis in axes if len(axis) > 1
+    )
     per = (TILT,) if subject.tilted else ()
     try:
-        found = subject.once(
-            "detection_limit", lambda: detection_limit(subject.results, rate=SEEN, per=per))
+        limit_of = detection_limit(first, rate=SEEN, per=per)
     except StoreError:  # the side is not the same over what is pooled, or not known
-        return []
+        return Seen()
+    found = subject.once("detection_limit", lambda: limit_of)
     dims = [str(dim) for dim in found["side_px"].dims]
     limits = []
     for index in np.ndindex(*(found.sizes[name] for name in dims)):
@@ -181,14 +229,14 @@ def _limits(subject: Subject) -> list[Limits]:
         )
         limit = int(one["limit"])
         if limit == Limit.never:
-            limits.append(Limits(where, NEVER, ""))
+            limits.append(SeenFrom(where, NEVER, ""))
             continue
         least = "\u2264 " if limit == Limit.always else ""
         distance = ""
         if "distance_m" in one.variables and math.isfinite(float(one["distance_m"])):
             distance = f"{number(float(one['distance_m']))} m"
-        limits.append(Limits(where, f"{least}{number(float(one['side_px']))} px", distance))
-    return limits
+        limits.append(SeenFrom(where, f"{least}{number(float(one['side_px']))} px", distance))
+    return Seen(tuple(limits), f"with {settings}" if settings else "")
 
 
 QUANTITIES = {"rotation": ("rotation", "deg"), "range": ("range (depth)", "percent"),
@@ -216,11 +264,13 @@ def _errors_table(errors: xr.Dataset) -> Table:
         "Errors over the whole store, with 95 % intervals", ["statistic", *quantities], rows)
 
 
-def _limits_table(limits: list[Limits]) -> list[Table]:
+def _limits_table(seen: Seen) -> list[Table]:
+    limits = seen.limits
     if len(limits) <= MOST_LIMITS:
         return []
     wide = 3 if any(limit.distance for limit in limits) else 2
+    settings = f", {seen.settings}" if seen.settings else ""
     return [Table(
-        f"At least {100 * SEEN:.0f} % are found from this side on",
+        f"At least {100 * SEEN:.0f} % are found from this side on{settings}",
         ["of", "side", "distance"][:wide], [list(limit)[:wide] for limit in limits],
     )]

@@ -9,15 +9,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from sweep.analysis.statistics import IntervalOf
 from sweep.report.ink import Panel
 from sweep.report.marks import Series
 from sweep.report.subject import Subject, labels_of
 from sweep.report.table import Table
 
 Floats = NDArray[np.float64]
-
-TOO_FEW = 3
-"""Flag of ``median_interval`` and its like: an end lies beyond all draws."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +94,8 @@ def on_intervals(found: xr.Dataset, *names: str, marks: str = "Bars") -> str:
             if f"{name}_{end}" in found]
     if any(bool(np.isfinite(end).any()) for end in ends):
         return f"{marks} are 95 % intervals, of the random draws on this fixed grid."
-    few = "median_interval" in found and bool((found["median_interval"] == TOO_FEW).any())
+    few = "median_interval" in found and bool(
+        (found["median_interval"] == IntervalOf.too_few_draws).any())
     return "No intervals: too few draws." if few else (
         "No intervals: nothing was drawn at random.")
 

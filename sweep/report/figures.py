@@ -24,7 +24,7 @@ KINDS: tuple[FigureKind, ...] = (
 
 
 def figures_of(subject: Subject) -> Iterator[FigureKind]:
-    """Yield the kinds of figures that apply to a store; no axis of it is left out."""
+    """Yield the kinds of figures that apply to a store; no axis of it is only pooled."""
     covered: set[str] = set()
     for kind in KINDS:
         if kind.applies(subject):

@@ -27,7 +27,7 @@ from sweep.plan.one_cell import cell, coordinates_text
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.template import TEMPLATE
 from sweep.report.scene_drawing import LINE_HEIGHT, LONGEST_SIDE, draw_scene
-from sweep.report.subject import AREA, Subject
+from sweep.report.subject import AREA, NEEDED, Subject, reading
 from sweep.report.table import number
 
 PIECE = 2_000_000
@@ -101,7 +101,9 @@ class _Found:
 def scenes_of(subject: Subject) -> Iterator[Scene]:
     """Yield the scenes of a store's gallery; two that are the same are one."""
     chosen: dict[tuple[tuple[str, int], ...], list[str]] = {}
-    for title, index in _chosen(subject.results):
+    with reading(subject.store):
+        listed = list(_chosen(subject.results))
+    for title, index in listed:
         chosen.setdefault(tuple(sorted(index.items())), []).append(title)
     for key, titles in chosen.items():
         yield _scene(subject, dict(key), tuple(titles))
@@ -202,7 +204,8 @@ def _pieces(results: xr.Dataset) -> Iterator[tuple[Index, xr.Dataset]]:
 # Looked at again.
 
 def _scene(subject: Subject, index: Index, titles: tuple[str, ...]) -> Scene:
-    stored = subject.results.isel(index)
+    with reading(subject.store):
+        stored = subject.results[list(NEEDED)].isel(index).load()
     at = at_text(subject.pipeline, index)
     command = f"sweep show {pipeline_file(subject.pipeline)}"
     command += f" --at {shlex.quote(at)}" if at else ""

@@ -56,17 +56,16 @@ class Series(NamedTuple):
 
 def draw_lines(
     axes: Axes, series: Sequence[Series], labels: tuple[str, str], *, share: bool = False,
-    level: float | None = None,
 ) -> None:
     """Draw lines with their intervals; infinite values stand at the upper edge.
 
-    ``share``: y is a share, shown from 0 to 100 %. ``level``: a dashed horizontal line.
+    ``share``: y is a share, shown from 0 to 100 %.
     """
     x = np.concatenate([one.x for one in series])
     logarithmic_x = _spans(x, 5) and bool((x > 0).all())
     axes.set_xscale("log" if logarithmic_x else "linear")
     axes.set_xlim(*_limits(x, logarithmic=logarithmic_x, margin=0.05))
-    _set_y(axes, series, share=share, level=level)
+    _set_y(axes, series, share=share)
     bottom, top = axes.get_ylim()
     if not any(np.isfinite(one.y).any() for one in series):
         _say_nothing_finite(axes)
@@ -99,8 +98,6 @@ def draw_lines(
             transform=place, clip_on=False,
             markerfacecolor=PAPER, markersize=3 if many else 5, zorder=4,
         )
-    if level is not None:
-        axes.axhline(level, color=INK, linewidth=0.9, linestyle=(0, (5, 3)), zorder=1.5)
     _plain(axes.xaxis, logarithmic=logarithmic_x)
     places = np.unique(x)
     if 0 < places.size <= FEW_TICKS:
@@ -127,7 +124,7 @@ def draw_dots(
     """Draw a row for each name: a dot and its interval along x; infinite ones at the right edge.
 
     ``marked`` rows have another colour and shape; ``ticks`` are small upright lines to compare
-    with.
+    with; ``level`` is a dashed line through all rows.
     """
     flat = [one._replace(y=np.asarray(one.y, dtype=np.float64))]
     if ticks is not None:
@@ -216,11 +213,10 @@ def draw_stack(
     """Draw a bar for each name, its shares upon each other in the order of ``parts``."""
     places = np.arange(len(names), dtype=np.float64)
     below = np.zeros(len(names))
-    colours = _part_colours(list(parts))
     for part, share in parts.items():
         height = 100 * np.nan_to_num(share)
         axes.bar(places, height, 0.86 if len(names) < 30 else 1.0, below, label=part,
-                 color=colours[part], edgecolor=PAPER, linewidth=0.5)
+                 color=PART_COLOURS.get(part, FAINT), edgecolor=PAPER, linewidth=0.5)
         below += height
     every = math.ceil(len(names) / 14)
     axes.set_xticks(places[::every], [_short(name, 18) for name in names[::every]])
@@ -239,10 +235,6 @@ PART_COLOURS = {
     "solver_failed": COLOURS[3], "not_converged": COLOURS[0], "not_explained": COLOURS[2],
     "failed": INK, "crashed": COLOURS[6],
 }
-
-
-def _part_colours(parts: list[str]) -> dict[str, str]:
-    return {part: PART_COLOURS.get(part, FAINT) for part in parts}
 
 
 def _legend(axes: Axes, labels: list[str]) -> None:
@@ -278,7 +270,7 @@ def _limits(values: Floats, *, logarithmic: bool, margin: float) -> tuple[float,
 
 
 def _extent(
-    series: Sequence[Series], *, share: bool, level: float | None
+    series: Sequence[Series], *, share: bool, level: float | None = None
 ) -> tuple[bool, tuple[float, float]]:
     """Return whether a scale of values is logarithmic, and its ends."""
     if share:
@@ -301,10 +293,8 @@ def _extent(
     return logarithmic, (low, high)
 
 
-def _set_y(
-    axes: Axes, series: Sequence[Series], *, share: bool, level: float | None
-) -> None:
-    logarithmic, limits = _extent(series, share=share, level=level)
+def _set_y(axes: Axes, series: Sequence[Series], *, share: bool) -> None:
+    logarithmic, limits = _extent(series, share=share)
     axes.set_yscale("log" if logarithmic else "linear")
     axes.set_ylim(*limits)
     _plain(axes.yaxis, logarithmic=logarithmic, share=share)

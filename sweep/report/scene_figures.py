@@ -232,7 +232,6 @@ def _failures(subject: Subject) -> Shown:
         if counted.sel(outcome=outcome) > 0
     )
     label = subject.label(axis) if axis else "all poses"
-    headings = {"result": [*names]}
     columns = {
         outcome: cells(found.sel(outcome=outcome), "share", 100) for outcome in parts
     }
@@ -240,7 +239,7 @@ def _failures(subject: Subject) -> Shown:
     looked_for = [f"{int(value):,}" for value in np.atleast_1d(total.values)]
     rows = [
         [name, looked_for[k], *(column[k] for column in columns.values())]
-        for k, name in enumerate(headings["result"])
+        for k, name in enumerate(names)
     ]
     return Shown(
         "failures", "What became of the poses",
@@ -248,8 +247,7 @@ def _failures(subject: Subject) -> Shown:
             "Shares of the poses looked for" + (f", by {_long_name(axis)}" if axis else "")
             + ": solved, or the flag that says why not.",
             f"Left out of the shares: {aside}." if aside else "",
-            on_intervals(found, "share", marks="In the table there")
-            if "share_low" in found else "",
+            on_intervals(found, "share", marks="In the table there"),
             *grouping.notes, subject.pooled(*grouping.dims),
         ),
         Table("Shares in percent, with 95 % intervals",
@@ -320,7 +318,7 @@ def _ranking(subject: Subject) -> Shown:
 # The effect of any one axis.
 
 def effect_of(name: str) -> FigureKind:
-    """Return the kind of figure that shows the effect of one axis of the scene."""
+    """Return the kind of figure that shows the effect of one axis, of the scene or a treatment."""
     return FigureKind(f"effect-{name}", lambda subject: subject.length(name) > 1,
                       lambda subject: _effect(subject, name), lambda _: (name,))
 
@@ -377,12 +375,12 @@ def _by_tilt(subject: Subject) -> str:
     return ", by tilt" if subject.tilted else ""
 
 
-def _by_size(subject: Subject) -> list[str]:
+def _size_axes(subject: Subject) -> list[str]:
     return [name for name in (subject.size_axis, TILT if subject.tilted else None) if name]
 
 
-DETECTION = FigureKind("detection", lambda s: s.size is not None, _detection, _by_size)
-ERRORS_BY_SIZE = FigureKind("errors", lambda s: s.size is not None, _errors, _by_size)
+DETECTION = FigureKind("detection", lambda s: s.size is not None, _detection, _size_axes)
+ERRORS_BY_SIZE = FigureKind("errors", lambda s: s.size is not None, _errors, _size_axes)
 MAPS = FigureKind("maps", _has_map, _maps)
 FAILURES = FigureKind("failures", lambda _: True, _failures)
 FLIPS = FigureKind(

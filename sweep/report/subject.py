@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,16 +14,15 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sweep.measure.flags import Detection
+from sweep.analysis.limits import SIZE_AXES
+from sweep.analysis.poses import NOT_LOOKED_FOR
+from sweep.errors import StoreError, SweepError
 from sweep.model.camera import VIEW_PARAMETERS
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline
 
 AREA = "marker_area_px"
-SIZES = ("side_px", "distance_m")
-"""Axes along which the marker's size in the image changes most."""
-
 TILT = "tilt_deg"
 IDS = "marker_id"
 AREA_BINS = 24
@@ -32,15 +32,13 @@ MANY_SIZES = 20
 SHORT = 5
 """Characters of a number that needs no rounding to be short."""
 
-LOOKED_FOR_NOT = (Detection.not_run, Detection.not_visible, Detection.not_modelled)
-
 NEEDED = (
     "detection", "estimate", "flipped", "rotation_error_deg", "rotation_error_rad",
     "normal_error_deg", "reprojection_error_px", "translation_error_m", "true_tvec_m", AREA,
     "alternative_rotation_error_deg", "alternative_reprojection_error_px", "bound", "bound_std",
     "nees", "residual_variance_ratio",
 )
-"""The variables that a report looks at."""
+"""The variables that a report needs."""
 
 LOADED_BYTES = 200_000_000
 
@@ -109,7 +107,7 @@ class Subject:
     @property
     def size_axis(self) -> str | None:
         """The axis along which the marker's size changes."""
-        return next((name for name in SIZES if self.length(name) > 1), None)
+        return next((name for name in SIZE_AXES if self.length(name) > 1), None)
 
     @property
     def tilted(self) -> bool:
@@ -124,17 +122,18 @@ class Subject:
         }
         detection = self.results["detection"].isel(settings)
         area = self.results[AREA]
-        area = area.where(~detection.isin(LOOKED_FOR_NOT) & (area > 0))
-        both = xr.Dataset({"low": area.min(), "high": area.max()}).compute()
+        area = area.where(~detection.isin(NOT_LOOKED_FOR) & (area > 0))
+        with reading(self.store):
+            both = xr.Dataset({"low": area.min(), "high": area.max()}).compute()
         return float(both["low"]), float(both["high"])
 
     @property
     def areas_vary(self) -> bool:
         """Whether areas differ for other reasons than an axis of sizes or tilts."""
-        reasons = {*VIEW_PARAMETERS, *SIZES, TILT, "size_m"}
+        reasons = {*VIEW_PARAMETERS, *SIZE_AXES, TILT, "size_m"}
         drawn = bool(reasons & self.pipeline.distributions.keys())
         axes = {axis.name for axis in self.pipeline.axes if len(axis) > 1}
-        if not drawn and not axes & (reasons - {*SIZES, TILT}):
+        if not drawn and not axes & (reasons - {*SIZE_AXES, TILT}):
             return False
         low, high = self.area_range
         return high > 2 * low
@@ -170,7 +169,8 @@ class Subject:
         needed = self.results[[name for name in NEEDED if name in self.results]]
         if needed.nbytes > LOADED_BYTES:
             return self
-        return dataclasses.replace(self, results=needed.load())
+        with reading(self.store):
+            return dataclasses.replace(self, results=needed.load())
 
     # Groupings.
 
@@ -232,15 +232,31 @@ class Subject:
         key = (analysis.__name__, grouping.per, grouping.bins, grouping.chosen)
         if key not in self._found:
             results = self.results.isel({name: list(some) for name, some in grouping.chosen})
-            found = analysis(results, per=grouping.per, bins=dict(grouping.bins)).compute()
-            self._found[key] = found.transpose(*grouping.dims, ...)
+            found = analysis(results, per=grouping.per, bins=dict(grouping.bins))
+            with reading(self.store):
+                self._found[key] = found.compute().transpose(*grouping.dims, ...)
         return self._found[key]
 
     def once(self, key: str, find: Callable[[], xr.Dataset]) -> xr.Dataset:
         """Return what ``find`` returns, loaded; it is called once."""
         if key not in self._found:
-            self._found[key] = find().compute()
+            found = find()
+            with reading(self.store):
+                self._found[key] = found.compute()
         return self._found[key]
+
+
+@contextlib.contextmanager
+def reading(store: str) -> Iterator[None]:
+    """Turn whatever goes wrong while a store is read into a ``StoreError`` of one line."""
+    try:
+        yield
+    except SweepError:
+        raise
+    except Exception as error:
+        # A damaged store fails within zarr, its codecs or xarray, each with errors of its own.
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise StoreError(f"{store}: cannot be read: {reason}") from None
 
 
 def is_numeric(axis: Axis) -> bool:

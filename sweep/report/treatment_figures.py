@@ -31,7 +31,7 @@ from sweep.report.table import Table, cells
 from sweep.report.trade_figure import draw_trade
 
 MOST_TREATMENTS = 30
-MAP_COLUMNS = 12
+SIZE_COLUMNS = 12
 
 CRITERION = "rotation_p95_deg"
 OTHER_CRITERION = "rotation_median_deg"
@@ -85,7 +85,7 @@ def _treatments(subject: Subject) -> Shown:
             _dot_panel(found, names, "flip_rate", "Flipped", "%", scale=100, share=True))
     notes = list(grouping.notes)
     if subject.size_axis is not None:
-        panel, note = _by_size(subject, grouping)
+        panel, note = _map_by_size(subject, grouping)
         panels.append(panel)
         notes += note
     columns = {"looked for": ("looked_for", 1.0)} | ERRORS
@@ -104,10 +104,10 @@ def _treatments(subject: Subject) -> Shown:
     )
 
 
-def _by_size(subject: Subject, grouping: Grouping) -> tuple[Panel, tuple[str, ...]]:
+def _map_by_size(subject: Subject, grouping: Grouping) -> tuple[Panel, tuple[str, ...]]:
     """Return a map of the median rotation error over size and treatment."""
     axis = str(subject.size_axis)
-    sizes = subject.along(axis, MAP_COLUMNS)
+    sizes = subject.along(axis, SIZE_COLUMNS)
     table = subject.of(error_statistics, grouping + sizes)
     names, found = stacked(table, grouping.dims)
     values = found["rotation_median_deg"].transpose("treatment", axis).values
@@ -198,7 +198,7 @@ def _has_bound(subject: Subject) -> bool:
 def _bound(subject: Subject) -> Shown:
     grouping = treatment_grouping(subject)
     along = subject.size_axis or (TILT if subject.tilted else None)
-    sizes = subject.along(along, MAP_COLUMNS) if along else Grouping()
+    sizes = subject.along(along, SIZE_COLUMNS) if along else Grouping()
     treatments, per = list(grouping.dims), list(sizes.dims)
     ratio = _over_bound(subject.of(efficiency, grouping + sizes))
     if treatments:
@@ -251,7 +251,7 @@ def _over_bound(found: xr.Dataset) -> xr.Dataset:
 def _trade(subject: Subject) -> Shown:
     if subject.trade is None:
         raise KeyError("cost/tradeoff")
-    trade = subject.trade.load().drop_attrs(deep=False)  # the page says the title
+    trade = subject.trade.drop_attrs(deep=False)  # the page says the title
     criterion = next(
         (name for name in (CRITERION, OTHER_CRITERION)
          if np.isfinite(trade[name].values).any(axis=trade[name].dims.index("treatment")).all()),
@@ -305,7 +305,7 @@ def _trade(subject: Subject) -> Shown:
 
 
 def _covered(subject: Subject) -> tuple[str, ...]:
-    return subject.treatments
+    return treatment_grouping(subject).dims
 
 
 TREATMENTS = FigureKind("treatments", lambda s: bool(s.treatments), _treatments, _covered)

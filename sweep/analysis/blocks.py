@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from sweep.analysis.poses import INSIDE, Poses
 from sweep.analysis.states import State, combined, every_nth, folded, interleaved, scattered
-from sweep.analysis.statistics import Found, Output, Statistic, flagged_attributes
+from sweep.analysis.statistics import Found, Output, Statistic
 from sweep.errors import StoreError
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
 from sweep.plan.template import LABELS, TEMPLATE
@@ -433,7 +433,7 @@ def _assembled(
     bins = tuple(len(edges) - 1 for edges in layout.bins.values())
     dims = (*layout.kept, *(name.removeprefix("bin ") for name in layout.bins))
     chunks = (*(lengths[name] for name in layout.kept), *((count,) for count in bins))
-    found = {}
+    found: dict[str, tuple[tuple[str, ...], da.Array, Mapping[str, Any]]] = {}
     for output in outputs:
         layer = Layer(output.name)
         for table, index in zip(tables, np.ndindex(*map(len, chunks)), strict=True):
@@ -442,7 +442,7 @@ def _assembled(
         graph = HighLevelGraph({looks.name: looks.tasks, layer.name: layer.tasks},
                                {looks.name: set(), layer.name: {looks.name}})
         array = da.Array(graph, layer.name, chunks, dtype=output.dtype)
-        found[output.name] = dims, array, flagged_attributes(output)
+        found[output.name] = dims, array, output.attributes()
     return found
 
 

@@ -19,6 +19,7 @@ from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.model.marker import module_count
 from sweep.plan.parameters import PARAMETERS
 from sweep.plan.pipeline import Pipeline
+from sweep.plan.template import cf_attributes
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -111,9 +112,7 @@ def detection_limit(
         out["distance_m"] = (scale / named["side_px"]).assign_attrs(
             long_name="the distance of that side", units="m")
     out["limit"] = found[4].astype(np.uint8).assign_attrs(
-        long_name="whether the rate is reached within the grid",
-        flag_values=[int(flag) for flag in Limit],
-        flag_meanings=" ".join(flag.name for flag in Limit))
+        cf_attributes("whether the rate is reached within the grid", flags=Limit))
     return xr.Dataset({name: array.transpose(*kept) for name, array in out.items()})
 
 

@@ -11,7 +11,7 @@ that count it is NaN.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, NamedTuple, Protocol
@@ -24,6 +24,7 @@ from sweep.analysis import tallies
 from sweep.analysis.intervals import jeffreys, wilson
 from sweep.analysis.moments import Moments
 from sweep.analysis.states import State
+from sweep.plan.template import cf_attributes
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -58,6 +59,10 @@ class Output(NamedTuple):
     units: str
     dtype: str = "f8"
     flags: type[IntEnum] | None = None
+
+    def attributes(self) -> dict[str, Any]:
+        """Return its attributes."""
+        return cf_attributes(self.meaning, self.units, self.flags)
 
 
 class Statistic(Protocol):
@@ -543,14 +548,3 @@ def _ranks(n: int, percent: int) -> tuple[int, int]:
     first = below[np.searchsorted(chance, TAIL)]
     last = below[np.searchsorted(chance, 1.0 - TAIL)] + 1
     return int(first), int(last)
-
-
-def flagged_attributes(output: Output) -> Mapping[str, Any]:
-    """Return the attributes of a variable, after the CF conventions."""
-    attributes: dict[str, Any] = {"long_name": output.meaning}
-    if output.units:
-        attributes["units"] = output.units
-    if output.flags is not None:
-        attributes["flag_values"] = [int(flag) for flag in output.flags]
-        attributes["flag_meanings"] = " ".join(flag.name for flag in output.flags)
-    return attributes

@@ -27,6 +27,19 @@ LABELS: dict[str, tuple[str, ...]] = {
 """Coordinates of the dimensions that are no axes."""
 
 
+def cf_attributes(
+    meaning: str, units: str = "", flags: type[IntEnum] | None = None
+) -> dict[str, Any]:
+    """Return the attributes of a variable, after the CF conventions."""
+    attributes: dict[str, Any] = {"long_name": meaning}
+    if units:
+        attributes["units"] = units
+    if flags is not None:
+        attributes["flag_values"] = [int(flag) for flag in flags]
+        attributes["flag_meanings"] = " ".join(flag.name for flag in flags)
+    return attributes
+
+
 @dataclass(frozen=True, slots=True)
 class Variable:
     """One variable of the dataset; ``inner`` are its dimensions beside the axes."""
@@ -60,14 +73,8 @@ class Variable:
         return tuple(len(axis) for axis in pipeline.axes_of(*stages)) + self.inner_shape
 
     def attributes(self) -> dict[str, Any]:
-        """Return its attributes, after the CF conventions."""
-        attributes: dict[str, Any] = {"long_name": self.meaning}
-        if self.units:
-            attributes["units"] = self.units
-        if self.flags is not None:
-            attributes["flag_values"] = [int(flag) for flag in self.flags]
-            attributes["flag_meanings"] = " ".join(flag.name for flag in self.flags)
-        return attributes
+        """Return its attributes."""
+        return cf_attributes(self.meaning, self.units, self.flags)
 
 
 _S, _D, _E = Stage.scene, Stage.detection, Stage.estimation

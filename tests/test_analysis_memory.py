@@ -24,5 +24,5 @@ def test_ten_million_poses_are_analysed_below_a_gigabyte(stores, name):
           f"{large['peak'] / 1e6:.0f} MB at {stores[1][1]:,}; "
           f"{small['compute_s']:.1f} and {large['compute_s']:.1f} s")
     assert large["peak"] < 1e9
-    # The poses themselves are 350 MB more; tallies of 200 groups are some 100 MB until they are full.
+    # The poses themselves are 350 MB more; tallies of 200 groups are 100 MB when full.
     assert large["peak"] - small["peak"] < 200e6

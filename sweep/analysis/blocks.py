@@ -7,7 +7,7 @@ has a name that is no parameter's) see the same draws (`sweep.plan.draws`), so t
 together count as one draw.
 
 The blocks are the chunks of a lazy dataset, and the result is then lazy, too. What is kept of a
-block does not grow with the dataset; the second look reads the chunks again.
+block does not grow with the dataset; the second look, where one is needed, reads the chunks again.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from sweep.analysis.poses import INSIDE, Poses
 from sweep.analysis.states import State, combined, every_nth, folded, interleaved, scattered
-from sweep.analysis.statistics import Found, Output, Statistic
+from sweep.analysis.statistics import Found, OneLook, Output, Statistic
 from sweep.errors import StoreError
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
 from sweep.plan.template import LABELS, TEMPLATE
@@ -305,9 +305,12 @@ def _tables(
     looks = _looks(layer, reading, layout, lengths, functools.partial(_first, layout, statistics))
     known = [layer.add(functools.partial(_between, statistics), layer.merged(states))
              for states in looks]
+    finish = functools.partial(_finish, statistics)
+    if all(isinstance(statistic, OneLook) for statistic in statistics):
+        return layer, [layer.add(finish, of_first) for of_first in known]
     looks = _looks(layer, reading, layout, lengths, functools.partial(_second, layout, statistics),
                    known)
-    tables = [layer.add(functools.partial(_finish, statistics), of_first, layer.merged(states))
+    tables = [layer.add(finish, of_first, layer.merged(states))
               for of_first, states in zip(known, looks, strict=True)]
     return layer, tables
 
@@ -417,9 +420,10 @@ def _between(statistics: Sequence[Statistic], states: list[State]) -> list[State
 
 
 def _finish(
-    statistics: Sequence[Statistic], known: list[State], second: list[State]
+    statistics: Sequence[Statistic], known: list[State], second: list[State] | None = None
 ) -> Found:
     found: Found = {}
+    second = second or [{} for _ in known]
     for statistic, of_first, of_second in zip(statistics, known, second, strict=True):
         found |= statistic.finish(of_first, of_second)
     return found

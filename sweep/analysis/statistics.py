@@ -185,8 +185,20 @@ def in_draws(hits: Integers, n: Integers, draws: Integers) -> tuple[Integers, In
 
 # The records.
 
+class OneLook:
+    """What is known after one look: where all statistics are so, there is no second."""
+
+    def between(self, first: State) -> State:
+        """Return what was seen."""
+        return first
+
+    def second(self, poses: Any, known: State) -> tuple[State, State]:  # noqa: ARG002
+        """Return nothing."""
+        return {}, {}
+
+
 @dataclass(frozen=True)
-class Count:
+class Count(OneLook):
     """How many poses there are of a kind."""
 
     name: str
@@ -200,14 +212,6 @@ class Count:
     def first(self, poses: Any) -> tuple[State, State]:
         """Count."""
         return {"n": self.of(poses).sum(axis=OVER_ALL)}, {}
-
-    def between(self, first: State) -> State:
-        """Return the count."""
-        return first
-
-    def second(self, poses: Any, known: State) -> tuple[State, State]:  # noqa: ARG002
-        """Return nothing: one look is enough."""
-        return {}, {}
 
     def finish(self, known: State, second: State) -> Found:  # noqa: ARG002
         """Return the count."""
@@ -235,7 +239,7 @@ class Draws(Count):
 
 
 @dataclass(frozen=True)
-class Rate:
+class Rate(OneLook):
     """The share of ``used`` that are ``successes``, with Wilson's interval of a level.
 
     Pooled settings see the same draws: n of the interval is the number of draws, `draws_of`, and
@@ -268,14 +272,6 @@ class Rate:
         used = self.used(poses)
         pooled, cells = counted(used)
         return pooled | {"hits": (self.successes(poses) & used).sum(axis=OVER_ALL)}, cells
-
-    def between(self, first: State) -> State:
-        """Return the counts."""
-        return first
-
-    def second(self, poses: Any, known: State) -> tuple[State, State]:  # noqa: ARG002
-        """Return nothing: one look is enough."""
-        return {}, {}
 
     def finish(self, known: State, second: State) -> Found:  # noqa: ARG002
         """Return the rate and its intervals."""

@@ -67,6 +67,10 @@ def _parser() -> argparse.ArgumentParser:
         "--reuse", action="append", default=[], metavar="STORE",
         help="take finished cells from this store where they agree",
     )
+    run.add_argument(
+        "--time-limit", type=float, metavar="S", default=600.0,
+        help="seconds after which a block is taken for endless (default: 600)",
+    )
     run.add_argument("--overwrite", action="store_true", help="delete a store that is there")
     run.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -84,6 +88,22 @@ def _parser() -> argparse.ArgumentParser:
     show.add_argument("-o", "--output", default="scene.png", metavar="PNG")
     show.add_argument("--plain", action="store_true", help="the image alone")
     show.add_argument("--full", action="store_true", help="the whole frame")
+
+    repro = command(
+        "repro", _repro, "compute one scene of a store again, here, and compare with the store"
+    )
+    repro.add_argument("store", metavar="STORE")
+    repro.add_argument(
+        "--at", default="", metavar="NAME=VALUE,...",
+        help="the scene and its treatment; axes that are not named take their first value",
+    )
+    repro.add_argument("-o", "--output", default="scene.png", metavar="PNG")
+    repro.add_argument("--plain", action="store_true", help="the image alone")
+    repro.add_argument("--full", action="store_true", help="the whole frame")
+    repro.add_argument(
+        "--time-limit", type=float, default=60.0, metavar="S",
+        help="seconds after which it is taken for endless (default: 60)",
+    )
 
     trade = command(
         "tradeoff", _tradeoff,
@@ -121,6 +141,19 @@ def _parser() -> argparse.ArgumentParser:
     )
     report.add_argument("--figures", metavar="DIR", help="write each figure as SVG and PNG too")
 
+    verify = command("verify", _verify, "check that a store is whole and right, and mend it")
+    verify.add_argument("store", metavar="STORE")
+    verify.add_argument(
+        "--repair", action="store_true",
+        help="compute damaged blocks again, and write again what else is damaged",
+    )
+    verify.add_argument(
+        "--sample", type=int, default=20, metavar="N",
+        help="scenes to compute again and compare (default: 20)",
+    )
+    verify.add_argument("--workers", type=int, metavar="N", help="of the repair")
+    verify.add_argument("--json", action="store_true", help="print one JSON object")
+
     status = command("status", _status, "say how far a store is; also while it is written")
     status.add_argument("store", metavar="STORE")
     status.add_argument("--json", action="store_true", help="print one JSON object")
@@ -152,7 +185,8 @@ def _run(chosen: argparse.Namespace) -> int:
     with _Bar() as bar:
         summary = execute(
             pipeline, chosen.store, workers=chosen.workers, scheduler=chosen.scheduler,
-            reuse=chosen.reuse, overwrite=chosen.overwrite, on_progress=bar,
+            reuse=chosen.reuse, overwrite=chosen.overwrite, time_limit_s=chosen.time_limit,
+            on_progress=bar,
         )
     if chosen.json:
         _print_json(dataclasses.asdict(summary))
@@ -166,8 +200,8 @@ def _run(chosen: argparse.Namespace) -> int:
     )
     for flag, count in (("crashed", summary.crashed), ("failed", summary.failed)):
         if count:
-            print(f"{count:,} flagged {flag}")
-    print(f'xarray.open_zarr("{summary.store}")')
+            print(f"{count:,} flagged {flag}; `sweep status {summary.store}` lists them")
+    print(f'xarray.open_zarr("{summary.data}")')
     return 0
 
 
@@ -268,8 +302,6 @@ def _duration(seconds: float) -> str:
 
 def _show(chosen: argparse.Namespace) -> int:
     pipeline = _read(chosen)
-    import cv2  # noqa: PLC0415
-
     from sweep.inspection import look  # noqa: PLC0415
     from sweep.plan.one_cell import cell, coordinates_text  # noqa: PLC0415
     from sweep.report.scene_drawing import draw_scene  # noqa: PLC0415
@@ -277,13 +309,64 @@ def _show(chosen: argparse.Namespace) -> int:
     one = cell(pipeline, chosen.at)
     seen = look(one, whole_frame=chosen.full)
     picture = seen.image if chosen.plain else draw_scene(seen, coordinates_text(pipeline, one))
+    _write_png(chosen.output, picture)
+    print(f"{chosen.output}: {seen.detection.name}, {seen.estimate.name}")
+    return 0
+
+
+def _write_png(output: str, picture: Any) -> None:
+    import cv2  # noqa: PLC0415
+
     _, encoded = cv2.imencode(".png", picture)
-    path = Path(chosen.output)
     try:
-        path.write_bytes(encoded.tobytes())
+        Path(output).write_bytes(encoded.tobytes())
     except OSError as error:
-        raise StoreError(f"{path}: cannot be written: {error.strerror}") from None
-    print(f"{path}: {seen.detection.name}, {seen.estimate.name}")
+        raise StoreError(f"{output}: cannot be written: {error.strerror}") from None
+
+
+def _repro(chosen: argparse.Namespace) -> int:
+    if not 0 < chosen.time_limit < math.inf:
+        raise StoreError(f"--time-limit {chosen.time_limit}: expected seconds above 0")
+    from sweep.engine.reproduction import reproduce  # noqa: PLC0415
+    from sweep.plan.one_cell import coordinates_text  # noqa: PLC0415
+    from sweep.report.scene_drawing import draw_scene  # noqa: PLC0415
+    from sweep.report.scene_values import value_lines  # noqa: PLC0415
+
+    again = reproduce(
+        chosen.store, chosen.at, whole_frame=chosen.full, time_limit_s=chosen.time_limit
+    )
+    print(f"--at {again.at}")
+    for line in again.others:
+        print(f"other than when the store was begun: {line}")
+    print("\n".join(value_lines(again.here, again.stored)))
+    if again.look is not None:
+        left, top, right, bottom = again.look.window
+        ids = ", ".join(str(marker_id) for marker_id, _ in again.look.decoded) or "none"
+        print(
+            f"columns {left} to {right - 1}, rows {top} to {bottom - 1} of the frame; "
+            f"IDs decoded there: {ids}; {len(again.look.rejected)} candidates rejected"
+        )
+    took = ", ".join(f"{stage} {1e3 * seconds:.3g} ms" for stage, seconds in again.seconds.items())
+    print(f"took {took}")
+    for failure in again.failures:
+        kind = "ended its process" if failure.crashed else "raised"
+        print(f"{failure.stage}: {kind}: {failure.text.strip()}")
+    if again.image is None:
+        print("no image: rendering it fails here")
+    else:
+        picture = again.image
+        if again.look is not None and not chosen.plain:
+            picture = draw_scene(again.look, coordinates_text(again.pipeline, again.one))
+        _write_png(chosen.output, picture)
+        print(f"{chosen.output}: its image")
+    how = "to the bit" if again.exact else "within the tolerances of another processor or version"
+    if again.stored is None:
+        print("the store does not have it yet")
+    elif again.verdict:
+        print(f"differs from the store: {again.verdict}")
+        return 1
+    else:
+        print(f"gives what the store holds, {how}")
     return 0
 
 
@@ -362,12 +445,52 @@ def _report(chosen: argparse.Namespace) -> int:
     trade = None
     with reading(store.url):
         if "cost/tradeoff" in store.group:
-            trade = xr.open_zarr(store.url, group="cost/tradeoff", consolidated=False).load()
+            trade = xr.open_zarr(
+                store.data_url, group="cost/tradeoff", consolidated=False, zarr_format=3
+            ).load()
         results = open_dataset(store.url)
     subject = Subject(store.url, results, store.pipeline, store.about, trade)
     count = write_report(subject, output, form, figures)
     print(f"{output}: {count} figures, {_bytes(output.stat().st_size)}")
     return 0
+
+
+MOST_LINES = 50
+"""Lines of each kind that `sweep status` and `sweep verify` print."""
+
+
+def _verify(chosen: argparse.Namespace) -> int:
+    if chosen.repair:
+        from sweep.engine.repair import repair  # noqa: PLC0415
+
+        found = repair(chosen.store, chosen.sample, workers=chosen.workers)
+    else:
+        from sweep.engine.verification import verify  # noqa: PLC0415
+
+        found = verify(chosen.store, chosen.sample)
+    if chosen.json:
+        _print_json(dataclasses.asdict(found))
+        return 1 if found.damage else 0
+    for what, listed in (("repaired", found.repaired), ("damaged", found.damage)):
+        for damage in listed[:MOST_LINES]:
+            print(f"{what:9} {damage.where}: {damage.what}")
+        if len(listed) > MOST_LINES:
+            print(f"{what:9} and {len(listed) - MOST_LINES:,} more; --json lists all")
+    if found.left_over:
+        print(f"{len(found.left_over):,} files are no part of it, such as {found.left_over[0]}; "
+              "--repair deletes them")
+    again = f"{found.sampled} scenes computed again" if found.sampled else (
+        f"no scene computed again ({found.not_sampled})"
+    )
+    state = "" if found.finished else ", unfinished"
+    print(
+        f"{found.store}: {'damaged' if found.damage else 'sound'}{state}: "
+        f"{found.blocks_done:,} of {found.blocks:,} blocks, {found.files:,} files, "
+        f"{again}"
+        + (f"; {len(found.damage):,} damaged, `sweep verify --repair` mends them"
+           if found.damage and not chosen.repair else "")
+    )
+    return 1 if found.damage else 0
 
 
 def _status(chosen: argparse.Namespace) -> int:
@@ -393,8 +516,11 @@ def _status(chosen: argparse.Namespace) -> int:
         print(f"  rate        {state.poses_per_s:,.0f} poses/s")
     if state.seconds_left is not None:
         print(f"  time left   {_duration(state.seconds_left)}")
-    for failure in state.failures:
-        print(f"  failed      {failure}")
+    for kind, cells in (("crashed", state.crashed), ("failed", state.failed)):
+        for cell in cells[:MOST_LINES]:
+            print(f"  {kind:11} --at {cell.at}  {cell.stage}: {cell.reason}")
+        if len(cells) > MOST_LINES:
+            print(f"  {kind:11} and more; --json lists the first 1,000")
     return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from sweep.measure.flags import Detection, Estimate
 from sweep.model.extent import marker_boxes
 from sweep.model.pose import placed, rotation_of_vector
 from sweep.model.renderers import render
-from sweep.model.scene import build_scenes
+from sweep.model.scene import Scenes, build_scenes
 from sweep.plan.grid import detector_settings, estimators, scene_values
 from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline
@@ -66,25 +67,50 @@ class Look:
     errors: dict[str, float]
 
 
+@dataclass(frozen=True, slots=True)
+class _Rendered:
+    """A pipeline's one scene: its parameters, itself, its image and the image's window."""
+
+    values: dict[str, Any]
+    scenes: Scenes
+    boxes: NDArray[np.int64]
+    unseen: NDArray[np.bool_]
+    window: tuple[int, int, int, int]
+    image: NDArray[np.uint8]
+
+
+def _rendered(pipeline: Pipeline, *, whole_frame: bool) -> _Rendered:
+    indices = [np.zeros(1, dtype=np.intp) for _ in pipeline.axes_of(Stage.scene)]
+    values = scene_values(pipeline, indices)
+    scenes = build_scenes(values, 1)
+    boxes = marker_boxes(scenes)
+    full = whole_frames(values, 1) | whole_frame
+    unseen = visibility_flags(scenes) != Detection.not_run
+    setting = detector_settings(pipeline)[0]
+    left, top, right, bottom = search_windows(scenes, boxes, setting, full | unseen)[0].tolist()
+    drawn = np.zeros_like(boxes[0]) if unseen[0] else boxes[0]
+    window = (left, top, right, bottom)
+    return _Rendered(values, scenes, boxes, unseen, window, render(scenes, 0, drawn, window))
+
+
+def picture(pipeline: Pipeline, *, whole_frame: bool = False) -> NDArray[np.uint8]:
+    """Return the image (h, w) of a pipeline's one scene; nothing is searched in it."""
+    single_thread()
+    return _rendered(pipeline, whole_frame=whole_frame).image
+
+
 def look(pipeline: Pipeline, *, whole_frame: bool = False) -> Look:
     """Return a close look at a pipeline's one scene: every axis but ``trial`` must be fixed."""
     single_thread()
     indices = [np.zeros(1, dtype=np.intp) for _ in pipeline.axes_of(Stage.scene)]
-    values = scene_values(pipeline, indices)
-    scenes = build_scenes(values, 1)
-    setting, estimator = detector_settings(pipeline)[0], estimators(pipeline)[0]
-    boxes = marker_boxes(scenes)
-    full = whole_frames(values, 1) | whole_frame
     result = run_cells(pipeline, indices)
     if result.failures:
         raise RunError(result.failures[0].text.strip().splitlines()[-1])
-    visibility = visibility_flags(scenes)
-    unseen = visibility[0] != Detection.not_run
-    left, top, right, bottom = search_windows(scenes, boxes, setting, full | unseen)[0].tolist()
-    drawn = np.zeros_like(boxes[0]) if unseen else boxes[0]
-    image = render(scenes, 0, drawn, (left, top, right, bottom))
+    seen = _rendered(pipeline, whole_frame=whole_frame)
+    values, scenes, image, (left, top, _, _) = seen.values, seen.scenes, seen.image, seen.window
+    setting, estimator = detector_settings(pipeline)[0], estimators(pipeline)[0]
     # Searched in its own window, as in a run, even where the whole frame is shown.
-    searched = search_windows(scenes, boxes, setting, whole_frames(values, 1) | unseen)
+    searched = search_windows(scenes, seen.boxes, setting, whole_frames(values, 1) | seen.unseen)
     x0, y0, x1, y1 = searched[0].tolist()
     found, ids, rejected = Detector(setting).find(
         image[y0 - top : y1 - top, x0 - left : x1 - left],
@@ -104,7 +130,7 @@ def look(pipeline: Pipeline, *, whole_frame: bool = False) -> Look:
         axes_px = cameras.project(placed(ends[None], rotation[None], position[None]))[0]
     return Look(
         image=image,
-        window=(left, top, right, bottom),
+        window=seen.window,
         true_corners=scenes.corners_px[0],
         area_px=float(columns["marker_area_px"]),
         decoded=[

@@ -63,11 +63,28 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """An exception that one cell raised: which scene of the block, in which stage, and the text."""
+    """What became of a cell that raised, or of which the process died.
+
+    Attributes
+    ----------
+    scene
+        Which scene of the block.
+    stage
+        "scene", "detection" or "estimation".
+    text
+        The traceback; of a cell that ended the process, how it did.
+    setting, estimator
+        Which of the detector settings and estimators, where the stage has them.
+    crashed
+        Whether the process died.
+    """
 
     scene: int
     stage: str
     text: str
+    setting: int | None = None
+    estimator: int | None = None
+    crashed: bool = False
 
 
 @dataclass(slots=True)
@@ -135,11 +152,13 @@ def run_cells(
     pipeline: Pipeline,
     indices: Sequence[NDArray[np.intp]],
     need: NDArray[np.bool_] | None = None,
+    search_too: NDArray[np.bool_] | None = None,
 ) -> CellsResult:
     """Render, detect and estimate the scenes at ``indices`` (N,) along each scene axis.
 
-    ``need`` (N, detector settings, estimators) restricts the work to what is asked for; the rest
-    is flagged ``not_run``.
+    ``need`` (N, detector settings, estimators) restricts the work to what is asked for, and
+    ``search_too`` (N, detector settings) tells what is searched although nothing is estimated
+    there; the rest is flagged ``not_run``.
     """
     single_thread()
     count = len(indices[0]) if indices else 1
@@ -147,22 +166,24 @@ def run_cells(
     estimating = estimators(pipeline)
     if need is None:
         need = np.ones((count, len(settings), len(estimating)), dtype=bool)
+    if search_too is None:
+        search_too = np.zeros((count, len(settings)), dtype=bool)
+    searched = need.any(axis=2) | search_too
     most = _most_kept(pipeline, estimating)
     if count > most:
-        return _joined(
+        return joined(
             [
                 run_cells(pipeline, [index[at : at + most] for index in indices],
-                          need[at : at + most])
+                          need[at : at + most], search_too[at : at + most])
                 for at in range(0, count, most)
-            ],
-            most,
+            ]
         )
     failures: list[Failure] = []
     start = time.perf_counter()
     values = scene_values(pipeline, indices)
     scenes = build_scenes(values, count)
     visibility = visibility_flags(scenes)
-    to_search = need.any(axis=2) & (visibility == Detection.not_run)[:, None]
+    to_search = searched & (visibility == Detection.not_run)[:, None]
     geometry_s = time.perf_counter() - start
 
     builds = [build(estimator) for estimator in estimating]
@@ -185,14 +206,19 @@ def run_cells(
     seconds["scene"][0] += time.perf_counter() - begun
     for k, found in enumerate(searches):
         flags = np.where(visibility == Detection.not_run, found.flags, visibility)
-        flags[~need[:, k].any(axis=1)] = Detection.not_run
+        flags[~searched[:, k]] = Detection.not_run
         out["detection"].append(flags.astype(np.uint8))
         out["corner_error_px"].append(found.corners - scenes.corners_px)
         for j, estimator in enumerate(estimating):
             rows = np.flatnonzero((flags == Detection.detected) & need[:, k, j])
             begun = time.perf_counter()
             seen = sightings(estimator, values, scenes, found, rows)
+            raised = len(failures)
             estimates = _estimated(seen, builds[j], rows, failures)
+            failures[raised:] = [
+                dataclasses.replace(failure, setting=k, estimator=j)
+                for failure in failures[raised:]
+            ]
             measured = _measured(estimates, scenes, rows)
             measured["estimate"][~need[:, k, j]] = Estimate.not_run
             measured["flipped"][~need[:, k, j]] = Flipped.not_run
@@ -214,8 +240,9 @@ def _most_kept(pipeline: Pipeline, estimating: Sequence[Estimator]) -> int:
     return int(max(KEPT_PX // frame, 1))
 
 
-def _joined(parts: Sequence[CellsResult], most: int) -> CellsResult:
-    """Return the results of runs of ``most`` scenes each as one."""
+def joined(parts: Sequence[CellsResult]) -> CellsResult:
+    """Return the results of runs of some scenes each as one."""
+    starts = np.cumsum([0, *(len(part.row_seconds) for part in parts)]).tolist()
 
     def each(pieces: Sequence[Any], join: Callable[[Sequence[Any]], Any]) -> dict[str, list[Any]]:
         return {
@@ -228,8 +255,8 @@ def _joined(parts: Sequence[CellsResult], most: int) -> CellsResult:
         each([part.seconds for part in parts], sum),
         np.concatenate([part.row_seconds for part in parts]),
         [
-            dataclasses.replace(failure, scene=failure.scene + number * most)
-            for number, part in enumerate(parts) for failure in part.failures
+            dataclasses.replace(failure, scene=failure.scene + start)
+            for start, part in zip(starts, parts, strict=False) for failure in part.failures
         ],
     )
 
@@ -336,7 +363,7 @@ def search(
         render_s += now - begun
         for row in rows.tolist():
             row_s[row] = (now - begun) / len(rows)
-        for hit, crop, ask in zip(hits, crops, asked, strict=True):
+        for k, (hit, crop, ask) in enumerate(zip(hits, crops, asked, strict=True)):
             find, note = hit.find, hit.found.append
             begun = now = clock()
             for row, image in zip(rows.tolist(), images, strict=True):
@@ -355,7 +382,7 @@ def search(
                 try:
                     note((row, *find(seen, dictionary[row], sides[row])))
                 except Exception:
-                    failures.append(Failure(row, "detection", traceback.format_exc()))
+                    failures.append(Failure(row, "detection", traceback.format_exc(), k))
                     hit.failed.append(row)
                 now = clock()
                 row_s[row] += now - start

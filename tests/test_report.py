@@ -25,8 +25,8 @@ from sweep.analysis import (
     failure_composition,
 )
 from sweep.analysis.statistics import IntervalOf
-from sweep.engine.runner import _cost
-from sweep.engine.store import create_store, finish, open_dataset, open_store, write_group
+from sweep.engine.closing import close
+from sweep.engine.store import create_store, open_dataset, open_store, write_group
 from sweep.engine.task import compute_block
 from sweep.errors import StoreError
 from sweep.measure.flags import Detection, Estimate
@@ -102,7 +102,7 @@ def made(folder, text, name, *, finished=True, settings=()):
     for block in list(store.blocks)[: None if finished else 1]:
         compute_block(url, store.run_id, block)
     if finished:
-        finish(store, _cost(store))
+        close(store)
     return url
 
 

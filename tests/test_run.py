@@ -18,8 +18,9 @@ import zarr
 
 import sweep
 from sweep.engine.lock import KEY
+from sweep.engine.manifest import put
 from sweep.engine.runner import execute
-from sweep.engine.store import committed, create_store, open_store, put, remove_store
+from sweep.engine.store import committed, create_store, open_store, remove_store
 from sweep.engine.task import compute_block
 from sweep.errors import StoreError
 from sweep.kernel import run_block
@@ -281,15 +282,15 @@ def test_store_in_use_is_refused_and_a_dead_lock_is_not(pipeline, tmp_path):
     url = str(tmp_path / "held.zarr")
     store = create_store(url, pipeline, (2, 4, 2, 3))
     here = {"token": "x", "host": socket.gethostname(), "beat": time.time()}
-    put(store.group.store, KEY, {**here, "pid": os.getpid()})
+    put(store.place, KEY, {**here, "pid": os.getpid()})
     with pytest.raises(StoreError, match=f"process {os.getpid()} on .* is writing it"):
         execute(pipeline, url)
-    put(store.group.store, KEY, {**here, "host": "elsewhere", "pid": 1})
+    put(store.place, KEY, {**here, "host": "elsewhere", "pid": 1})
     with pytest.raises(StoreError, match="process 1 on elsewhere is writing it"):
         execute(pipeline, url)
     with subprocess.Popen([sys.executable, "-c", ""]) as ended:
         pass
-    put(store.group.store, KEY, {**here, "pid": ended.pid})
+    put(store.place, KEY, {**here, "pid": ended.pid})
     assert execute(pipeline, url, workers=1).computed_blocks == 1
     assert not (Path(url) / KEY).exists()
 
@@ -354,7 +355,7 @@ def test_running_scheduler_with_two_workers_gives_the_same(pipeline, undisturbed
 
     url = str(tmp_path / "external.zarr")
     with LocalCluster(
-        n_workers=2, threads_per_worker=2, host="127.0.0.1", dashboard_address=None,
+        n_workers=2, threads_per_worker=2, host="127.0.0.1", dashboard_address="127.0.0.1:0",
         silence_logs=50,
     ) as cluster:
         summary = execute(pipeline, url, scheduler=cluster.scheduler_address, block_s=0.02)
@@ -392,23 +393,14 @@ def test_workers_with_other_versions_are_refused(pipeline, tmp_path, monkeypatch
     from sweep.engine import cluster as connecting  # noqa: PLC0415
     from sweep.engine.provenance import fingerprint  # noqa: PLC0415
 
-    class Elsewhere:
-        def __call__(self, given):
-            return {**fingerprint(given), "opencv": "0.0"}
+    async def elsewhere(_, given):
+        return {"tcp://worker": {**fingerprint(given), "opencv": "0.0"}}
 
-    monkeypatch.setattr(connecting, "fingerprint", fingerprint)
     with LocalCluster(
-        n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None,
+        n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0",
         silence_logs=50,
     ) as cluster:
-        # The client's versions are the odd ones here; which side differs does not matter.
-        real = connecting._refuse_other_versions
-
-        def refuse(client, address, given):
-            client.run = lambda _, p: {"tcp://worker": Elsewhere()(p)}
-            real(client, address, given)
-
-        monkeypatch.setattr(connecting, "_refuse_other_versions", refuse)
+        monkeypatch.setattr(connecting, "_ask_each", elsewhere)
         with pytest.raises(StoreError, match=r"tcp://worker: opencv 0\.0, here"):
             execute(pipeline, tmp_path / "other.zarr", scheduler=cluster.scheduler_address)
     assert not (tmp_path / "other.zarr").exists()

@@ -19,11 +19,12 @@ from scipy import stats
 
 from sweep import cli
 from sweep.engine import paired_costs, tradeoff
+from sweep.engine.closing import close
 from sweep.engine.interrupts import Interrupts
 from sweep.engine.paired_costs import FEWEST_ROUNDS, NARROW, in_turns, median_interval
 from sweep.engine.progress import status
-from sweep.engine.runner import _cost, execute
-from sweep.engine.store import create_store, finish
+from sweep.engine.runner import execute
+from sweep.engine.store import create_store
 from sweep.engine.task import compute_block
 from sweep.plan.grid import scene_axes
 from sweep.plan.pipeline import Pipeline
@@ -102,7 +103,7 @@ def made(folder, text, name, *, finished=True):
     if finished:
         for block in store.blocks:
             compute_block(url, store.run_id, block)
-        finish(store, _cost(store))
+        close(store)
     return url
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.engine.apart import Child, DiedError, RaisedError
 from sweep.kernel import run_cells
 from sweep.plan.axes import Axis
 from sweep.plan.grid import scene_axes
@@ -101,6 +102,20 @@ def calibrate(pipeline: Pipeline, budget_s: float) -> Calibration:
         unevenness.append(float(abs(a - b) / (a + b) * 2))
     error = float(cost.std(ddof=1) / math.sqrt(len(cost))) if len(cost) > 1 else 0.0
     return Calibration(total_s / len(cost), error, len(cost), tuple(unevenness))
+
+
+UNMEASURED_S = 0.01
+"""What a scene is taken to cost where measuring it ended the process."""
+
+
+def calibrate_apart(pipeline: Pipeline, budget_s: float, limit_s: float) -> Calibration:
+    """Measure as :func:`calibrate` does, in a child process: a scene may end it."""
+    try:
+        with Child() as child:
+            measured: Calibration = child.call(calibrate, pipeline, budget_s, limit_s=limit_s)
+    except (DiedError, RaisedError):
+        return Calibration(UNMEASURED_S, 0.0, 0, (0.0,) * len(scene_axes(pipeline)))
+    return measured
 
 
 def sample(

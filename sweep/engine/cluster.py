@@ -2,24 +2,39 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import importlib
 import logging
 import os
 import signal
-from collections.abc import Iterator
+import ssl
+from collections.abc import Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
+from urllib.parse import urlsplit
 
 import dask
-from distributed import Client, LocalCluster, fire_and_forget
+from distributed import Client, LocalCluster, Security, fire_and_forget
+from distributed.comm.core import CommClosedError, connect
+from distributed.comm.registry import backends
+from distributed.core import send_recv
 
 from sweep.engine.interrupts import in_main_thread
 from sweep.engine.provenance import fingerprint
-from sweep.errors import StoreError
+from sweep.errors import RunError, StoreError
 from sweep.plan.pipeline import Pipeline
 
 ANSWER_S = 10.0
 """How long a scheduler, and then its first worker, may take to answer."""
+
+FIRST_ANSWER_S = 60.0
+"""How long all workers may take to say their versions, for which they import this package."""
+
+ASKING_S = 2.0
+"""How long a run waits to hear how many workers there are."""
+
+ENCRYPTED = ("tls://", "wss://")
 
 WORKER_ENVIRONMENT = {
     "OMP_NUM_THREADS": "1",
@@ -92,21 +107,23 @@ def _warm() -> None:
 def external(address: str, pipeline: Pipeline) -> Iterator[Client]:
     """Connect to a running scheduler whose workers make the same numbers as this process.
 
+    Where its address begins with ``tls://``, Dask's own configuration names the certificates.
+
     Raises
     ------
     StoreError
-        Where it does not answer, has no workers, or a worker has other versions.
+        Where it does not answer or refuses, has no workers, or a worker has other versions; each
+        within a bounded time.
     """
     _hush()
-    if "://" not in address:
+    if not _is_address(address):
         raise StoreError(f"--scheduler {address}: expected an address such as tcp://host:8786")
-    try:
+    with _telling_why(address):
+        # Dask's client waits without end for a handshake, so that comes first, and alone.
+        kind = _apart(_kind(address))
+        if kind != "Scheduler":
+            raise StoreError(f"--scheduler {address}: a {kind} answers there, not a scheduler")
         client = Client(address, timeout=ANSWER_S, set_as_default=False)
-    except (OSError, TimeoutError, ValueError):
-        raise StoreError(
-            f"--scheduler {address}: no answer within {ANSWER_S:.0f} s; is `dask scheduler` "
-            "running there?"
-        ) from None
     with client:
         try:
             client.wait_for_workers(1, timeout=ANSWER_S)
@@ -114,14 +131,126 @@ def external(address: str, pipeline: Pipeline) -> Iterator[Client]:
             raise StoreError(
                 f"--scheduler {address}: no workers; start some with `dask worker {address}`"
             ) from None
+        except OSError:
+            raise _went_away(address) from None
         _refuse_other_versions(client, address, pipeline)
         yield client
+
+
+def threads(client: Client) -> int:
+    """Return how many threads the workers of a cluster have; 0 while nobody says.
+
+    Raises
+    ------
+    RunError
+        Where the scheduler went away.
+    """
+    gone = RunError("the scheduler went away; the same command continues once one runs again")
+    if client.scheduler is None or client.status != "running":
+        raise gone
+    try:
+        counts: dict[str, int] = client.sync(client.scheduler.ncores, callback_timeout=ASKING_S)
+    except TimeoutError:
+        return 0  # it is stalled, or busy
+    except OSError:
+        raise gone from None
+    return sum(counts.values())
+
+
+def _is_address(address: str) -> bool:
+    try:
+        parts = urlsplit(address)
+        return parts.scheme in backends and bool(parts.hostname and parts.port)
+    except ValueError:
+        return False
+
+
+def _went_away(address: str) -> StoreError:
+    return StoreError(f"--scheduler {address}: it went away")
+
+
+async def _kind(address: str) -> str:
+    """Return what answers at an address: Scheduler, Worker, Nanny."""
+    options = _connection_options(address)
+    async with asyncio.timeout(ANSWER_S):
+        comm = await connect(address, timeout=ANSWER_S, **options)
+        try:
+            identity: dict[str, Any] = await send_recv(comm, op="identity")
+        finally:
+            comm.abort()
+    return str(identity["type"])
+
+
+def _apart(question: Coroutine[Any, Any, str]) -> str:
+    """Return what a coroutine does, also where the caller is in an event loop, as notebooks are."""
+    with ThreadPoolExecutor(1) as beside:
+        return beside.submit(asyncio.run, question).result()
+
+
+def _connection_options(address: str) -> dict[str, Any]:
+    """Return how Dask's configuration says to connect, its certificates among it."""
+    try:
+        options: dict[str, Any] = Security().get_connection_args("client")
+    except OSError as error:
+        raise StoreError(
+            f"--scheduler {address}: the certificates that Dask's configuration names under "
+            f"distributed.comm.tls cannot be read: {_short(error)}"
+        ) from None
+    if address.startswith(ENCRYPTED) and options.get("ssl_context") is None:
+        raise StoreError(
+            f"--scheduler {address}: no certificates; name them in Dask's configuration, "
+            "distributed.comm.tls.ca-file, .client.cert and .client.key"
+        )
+    return options
+
+
+@contextlib.contextmanager
+def _telling_why(address: str) -> Iterator[None]:
+    """Raise StoreError for what goes wrong while a connection is made."""
+    try:
+        yield
+    except (CommClosedError, ssl.SSLError, ValueError) as error:
+        # Which side closes first, and with which words, is a matter of chance.
+        if address.startswith(ENCRYPTED):
+            why = (
+                f"TLS failed ({_short(error)}); is it a TLS scheduler, and are its "
+                "certificate and the one here signed by the same CA?"
+            )
+        else:
+            why = "it closed the connection; does it expect tls://?"
+    except OSError:
+        why = f"no answer within {ANSWER_S:.0f} s; is `dask scheduler` running there?"
+    except RuntimeError as error:
+        why = str(error)  # Dask's configuration requires encryption
+    else:
+        return
+    raise StoreError(f"--scheduler {address}: {why}") from None
+
+
+def _short(error: BaseException) -> str:
+    """Return what OpenSSL or the system said, in a few words."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, ssl.SSLError):
+        cause = cause.__cause__ or cause.__context__
+    if isinstance(cause, ssl.SSLCertVerificationError):
+        return str(cause.verify_message)
+    if isinstance(cause, ssl.SSLError) and cause.reason:
+        return cause.reason.lower().replace("_", " ")
+    if isinstance(error, OSError) and error.strerror and not isinstance(error, CommClosedError):
+        return str(error.strerror)
+    return "the connection was closed"
 
 
 def _refuse_other_versions(client: Client, address: str, pipeline: Pipeline) -> None:
     mine = fingerprint(pipeline)
     try:
-        answers: dict[str, dict[str, Any]] = client.run(fingerprint, pipeline)
+        answers = client.sync(_ask_each, client, pipeline)
+    except TimeoutError:
+        raise StoreError(
+            f"--scheduler {address}: none of its workers answers within {FIRST_ANSWER_S:.0f} s"
+        ) from None
+    except OSError:
+        raise _went_away(address) from None
     except Exception as error:
         raise StoreError(
             f"--scheduler {address}: its workers cannot run sweep: {error}; install it there"
@@ -139,7 +268,31 @@ def _refuse_other_versions(client: Client, address: str, pipeline: Pipeline) -> 
         )
 
 
+async def _ask_each(client: Client, pipeline: Pipeline) -> dict[str, dict[str, Any]]:
+    """Return the fingerprint of each worker; those that are stalled are left out.
+
+    A worker that is not asked here compares itself with the store when it gets its first block.
+    """
+    asked = [
+        asyncio.ensure_future(client.run(fingerprint, pipeline, workers=[worker]))
+        for worker in await client.nthreads()
+    ]
+    done, _ = await asyncio.wait(
+        asked, timeout=FIRST_ANSWER_S, return_when=asyncio.FIRST_COMPLETED
+    )
+    if not done:
+        raise TimeoutError
+    done, late = await asyncio.wait(asked, timeout=ANSWER_S)
+    for one in late:
+        one.cancel()
+    return {worker: theirs for one in done for worker, theirs in one.result().items()}
+
+
 def _hush() -> None:
-    """Keep distributed from narrating: what matters is told as errors of this package."""
-    for name in ("distributed", "distributed.nanny", "distributed.worker"):
-        logging.getLogger(name).setLevel(QUIET)
+    """Keep distributed from narrating: what matters is told as errors of this package.
+
+    Dask gives some of the loggers below its own a level and a handler of theirs.
+    """
+    for name in ("distributed", *logging.Logger.manager.loggerDict):
+        if name.partition(".")[0] in ("distributed", "tornado"):
+            logging.getLogger(name).setLevel(QUIET)

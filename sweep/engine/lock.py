@@ -14,7 +14,9 @@ from typing import Any
 from zarr.abc.store import Store
 from zarr.core.sync import sync
 
-from sweep.engine.store import RECEIPTS, RunStore, get, put
+from sweep.engine.layout import RECEIPTS
+from sweep.engine.manifest import get, put
+from sweep.engine.store import RunStore, telling
 from sweep.errors import StoreError
 
 KEY = f"{RECEIPTS}/lock.json"
@@ -34,14 +36,12 @@ def locked(store: RunStore) -> Iterator[None]:
     StoreError
         Where another living client holds it, or it cannot be written.
     """
-    place = store.group.store
+    place = store.place
     refuse_if_held(store.url, place)
     mine = {"token": uuid.uuid4().hex, "host": socket.gethostname(), "pid": os.getpid()}
-    try:
+    with telling(store.url, "written"):
         put(place, KEY, {**mine, "beat": time.time()})
-    except OSError as error:
-        raise StoreError(f"{store.url}: cannot be written: {error.strerror}") from None
-    held = get(place, KEY)
+        held = get(place, KEY)
     if held is None or held.get("token") != mine["token"]:
         raise StoreError(_held(store.url, held or {}))
     done = threading.Event()

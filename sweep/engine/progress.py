@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 
+from sweep.engine.failures import MOST_ROWS, FailedCell, failed_cells
 from sweep.engine.lock import holder
 from sweep.engine.store import committed, open_store, receipts
 from sweep.measure.flags import Detection, Estimate
@@ -30,7 +31,8 @@ class Status:
     estimate: dict[str, int]
     poses_per_s: float | None
     seconds_left: float | None
-    failures: list[str]
+    crashed: list[FailedCell]
+    failed: list[FailedCell]
 
 
 def status(url: str) -> Status:
@@ -45,7 +47,7 @@ def status(url: str) -> Status:
     detection: Counter[str] = Counter()
     estimate: Counter[str] = Counter()
     written: list[tuple[float, int]] = []
-    failures: list[str] = []
+    cells: dict[str, list[FailedCell]] = {"crashed": [], "failed": []}
     done = poses = 0
     for number, receipt in receipts(store, committed(store)):
         done += 1
@@ -57,13 +59,11 @@ def status(url: str) -> Status:
             for flag, count in zip(flags, counts, strict=False):
                 counter[flag.name] += count
         written.append((receipt["written"], receipt["scenes"]))
-        failures += [
-            f"block {store.blocks[number]}, scene {failure['scene']}, {failure['stage']}: "
-            f"{failure['text'].strip().splitlines()[-1]}"
-            for failure in receipt["failures"]
-        ]
+        for cell in failed_cells(store, number, receipt):
+            if len(cells[cell.kind]) < MOST_ROWS:
+                cells[cell.kind].append(cell)
     total = store.pipeline.size(Stage.scene)
-    held = holder(store.group.store)
+    held = holder(store.place)
     rate = _rate(written)
     return Status(
         store=url,
@@ -78,7 +78,7 @@ def status(url: str) -> Status:
         estimate={name: count for name, count in estimate.items() if count},
         poses_per_s=rate,
         seconds_left=(total - poses) / rate if rate and held else None,
-        failures=failures,
+        **cells,
     )
 
 

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 import os
 import time
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import xarray as xr
-from distributed import Client
-
-from sweep.engine.calibration import block_extents, calibrate
-from sweep.engine.cluster import default_workers, embedded, external
+from sweep.engine.calibration import block_extents, calibrate_apart
+from sweep.engine.closing import close, lost
+from sweep.engine.failures import MOST_ROWS
 from sweep.engine.interrupts import Interrupts
 from sweep.engine.lock import locked, refuse_if_held
 from sweep.engine.provenance import differences
@@ -30,18 +29,21 @@ from sweep.engine.store import (
     committed,
     create_store,
     exists,
-    finish,
     is_remote,
     open_store,
+    place_of,
     receipts,
+    recorded_about,
     remove_store,
 )
-from sweep.engine.task import compute_block
+from sweep.engine.task import TIME_LIMIT_S, compute_block
 from sweep.errors import RunError, StoreError
-from sweep.measure.flags import Detection, Estimate
-from sweep.plan.grid import Block
+from sweep.measure.flags import Detection
 from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 WINDOW = 3
 """Blocks in flight per worker thread: enough that none waits, few enough that none pile up."""
@@ -50,6 +52,18 @@ POLL_S = 0.2
 """How often a run that waits for blocks looks whether it is to stop."""
 
 CALIBRATION_S = 0.6
+
+CALIBRATION_SHARE = 1 / 8
+"""Of a block's time limit: how long measuring may take, compiling included."""
+
+ASK_EACH_S = 1.0
+"""How often the cluster is asked how many threads it has."""
+
+LONELY_S = 60.0
+"""How long a run waits for workers where there are none."""
+
+MOST_DEATHS = 10
+"""How often a block is handed out again whose workers die."""
 
 MOST_FAULTS = 10
 """Failed blocks after which no more are begun."""
@@ -69,6 +83,7 @@ class Summary:
     """What a run did; ``sweep run --json`` prints it."""
 
     store: str
+    data: str
     poses: int
     results: int
     detected: int
@@ -95,6 +110,7 @@ def execute(
     reuse: Sequence[str | os.PathLike[str]] = (),
     overwrite: bool = False,
     block_s: float | None = None,
+    time_limit_s: float = TIME_LIMIT_S,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> Summary:
     """Run a pipeline into a store; what is committed there already is not computed again.
@@ -114,6 +130,9 @@ def execute(
         Delete a store that is there.
     block_s
         Seconds of work in a block (default: about 2, less where there is little to do).
+    time_limit_s
+        Seconds after which a block is taken for endless; the search for the scene that never
+        returns keeps within them.
     on_progress
         Called after every block.
 
@@ -128,13 +147,15 @@ def execute(
     url = os.fspath(store) if store is not None else f"runs/{pipeline.name}.zarr"
     if workers is not None and workers < 1:
         raise StoreError(f"--workers {workers}: expected at least 1")
+    if not 0 < time_limit_s < math.inf:
+        raise StoreError(f"--time-limit {time_limit_s}: expected seconds above 0")
     opened = _existing(url, pipeline, overwrite)
     if opened is not None and opened.finished:
         done = len(committed(opened))
         if done != len(opened.blocks):
             raise StoreError(
                 f"{url}: damaged: finished, but {done} of {len(opened.blocks)} blocks are there; "
-                "--overwrite computes it again"
+                "`sweep verify --repair` mends it"
             )
         return _summary(opened, [], time.perf_counter() - started)
     sources = [place(os.fspath(old)) for old in reuse]
@@ -145,12 +166,11 @@ def execute(
     if opened is None:
         check_place(url)
     with Interrupts() as interrupts, ThreadPoolExecutor(1) as beside:
-        # Compiling and measuring here while the workers' processes come up.
-        measuring = beside.submit(calibrate, pipeline, CALIBRATION_S) if opened is None else None
-        cluster = embedded(workers or default_workers()) if scheduler is None else (
-            external(scheduler, pipeline)
+        # Compiling and measuring in a child while the workers' processes come up.
+        measuring = None if opened is not None else beside.submit(
+            calibrate_apart, pipeline, CALIBRATION_S, CALIBRATION_SHARE * time_limit_s
         )
-        with cluster as client:
+        with _cluster(pipeline, workers, scheduler) as client:
             if measuring is not None:
                 threads = sum(client.nthreads().values())
                 extents = block_extents(pipeline, measuring.result(), threads, block_s)
@@ -159,21 +179,73 @@ def execute(
                 opened = create_store(url, pipeline, extents)
             if opened is None:
                 raise AssertionError(url)
-            with locked(opened):
-                receipts_seen = _compute(opened, client, sources, on_progress, interrupts)
-                finish(opened, _cost(opened))
+            with locked(opened), failing_while_running():
+                done_before = committed(opened)
+                todo = (k for k in range(len(opened.blocks)) if k not in done_before)
+                receipts_seen = _Run(opened, client, sources, time_limit_s, interrupts).compute(
+                    todo, done_before, on_progress
+                )
+                close(opened)
     return _summary(open_store(url), receipts_seen, time.perf_counter() - started)
+
+
+def recompute(
+    store: RunStore,
+    numbers: Iterable[int],
+    *,
+    workers: int | None = None,
+    time_limit_s: float = TIME_LIMIT_S,
+) -> None:
+    """Compute blocks of a store that is held, on an embedded cluster.
+
+    Raises
+    ------
+    RunError
+        Where blocks failed.
+    """
+    with (
+        Interrupts() as interrupts,
+        _cluster(store.pipeline, workers, None) as client,
+        failing_while_running(),
+    ):
+        _Run(store, client, [], time_limit_s, interrupts).compute(numbers, set(), None)
+
+
+@contextlib.contextmanager
+def failing_while_running() -> Iterator[None]:
+    """Tell what a store refuses while it is written as what it is: a run that could not go on."""
+    try:
+        yield
+    except StoreError as error:
+        raise RunError(f"{error}; the same command continues") from None
+
+
+def _cluster(
+    pipeline: Pipeline, workers: int | None, scheduler: str | None
+) -> contextlib.AbstractContextManager[Client]:
+    from sweep.engine.cluster import (  # noqa: PLC0415  (slow to import, and often not needed)
+        default_workers,
+        embedded,
+        external,
+    )
+
+    if scheduler is not None:
+        return external(scheduler, pipeline)
+    return embedded(workers or default_workers())
 
 
 def _existing(url: str, pipeline: Pipeline, overwrite: bool) -> RunStore | None:
     """Return the store to continue, or None where a new one is to be made."""
     if not exists(url):
         return None
-    store = open_store(url, "r+")
-    refuse_if_held(url, store.group.store)
     if overwrite:
         # It goes when all else has been seen to work, just before the new one is made.
+        there = place_of(url, "r+")
+        recorded_about(url, there)
+        refuse_if_held(url, there)
         return None
+    store = open_store(url, "r+")
+    refuse_if_held(url, store.place)
     lines = differences(pipeline, store.pipeline, store.fingerprint)
     if lines:
         listed = "\n".join(f"  {line}" for line in lines)
@@ -183,70 +255,103 @@ def _existing(url: str, pipeline: Pipeline, overwrite: bool) -> RunStore | None:
     return store
 
 
-def _compute(
-    store: RunStore,
-    client: Client,
-    sources: Sequence[str],
-    on_progress: Callable[[Progress], None] | None,
-    interrupts: Interrupts,
-) -> list[dict[str, int]]:
-    """Compute what is not committed, a bounded window of blocks at a time.
+class _Run:
+    """Blocks of a store being computed on a cluster, a bounded window of them at a time."""
 
-    Returns for each block that was run how many scenes, detections and estimates it computed.
-    """
-    done = committed(store)
-    todo = (store.blocks[k] for k in range(len(store.blocks)) if k not in done)
-    progress = Progress(0, store.pipeline.size(Stage.scene), 0)
-    for _, receipt in receipts(store, done):
-        _count(progress, receipt)
-    if on_progress is not None:
-        on_progress(progress)
-    url = place(store.url)
+    def __init__(
+        self, store: RunStore, client: Client, sources: Sequence[str], time_limit_s: float,
+        interrupts: Interrupts,
+    ) -> None:
+        self._store = store
+        self._client = client
+        self._sources = sources
+        self._time_limit_s = time_limit_s
+        self._interrupts = interrupts
+        self._finished: SimpleQueue[Any] = SimpleQueue()
+        self._flying: dict[Any, int] = {}
+        self._failures = Counter({"failed": 0, "crashed": 0})
+        self._deaths: Counter[int] = Counter()
 
-    finished: SimpleQueue[Any] = SimpleQueue()
-    flying: set[Any] = set()
+    def compute(
+        self, numbers: Iterable[int], done: set[int],
+        on_progress: Callable[[Progress], None] | None,
+    ) -> list[dict[str, int]]:
+        """Compute blocks by their numbers; ``done`` are those that are committed.
 
-    def submit(block: Block) -> None:
-        future = client.submit(
-            compute_block, url, store.run_id, block, sources, pure=False,
-            key=f"block-{block}-{uuid.uuid4().hex[:8]}",
+        Returns for each block that was run how many scenes, detections and estimates it computed.
+        """
+        todo = iter(numbers)
+        progress = Progress(0, self._store.pipeline.size(Stage.scene), 0)
+        for _, receipt in receipts(self._store, done):
+            self._count(progress, receipt)
+        if on_progress is not None:
+            on_progress(progress)
+        computed: list[dict[str, int]] = []
+        faults: list[str] = []
+        room = _Room(self._client)
+        for number in itertools.islice(todo, room()):
+            self._submit(number)
+        while self._flying:
+            self._interrupts.check()
+            wanted = room()
+            try:
+                future = self._finished.get(timeout=POLL_S)
+            except Empty:
+                continue
+            number = self._flying.pop(future)
+            if future.status == "finished":
+                receipt = future.result()
+                computed.append(receipt["computed"])
+                self._count(progress, receipt)
+                if on_progress is not None:
+                    on_progress(progress)
+            elif (fault := self._fault(number, future)) is not None:
+                faults.append(fault)
+            future.release()
+            if len(faults) < MOST_FAULTS:
+                for following in itertools.islice(todo, max(wanted - len(self._flying), 0)):
+                    self._submit(following)
+        if faults:
+            raise RunError(
+                f"{self._store.url}: {len(faults)} blocks failed; run again to continue\n"
+                + "\n".join(f"  {fault}" for fault in faults)
+            )
+        return computed
+
+    def _submit(self, number: int) -> None:
+        block = self._store.blocks[number]
+        room = {kind: max(MOST_ROWS - count, 0) for kind, count in self._failures.items()}
+        future = self._client.submit(
+            compute_block, place(self._store.url), self._store.run_id, block, self._sources,
+            self._time_limit_s, room, pure=False, key=f"block-{block}-{uuid.uuid4().hex[:8]}",
         )
-        flying.add(future)
-        future.add_done_callback(finished.put)
+        self._flying[future] = number
+        future.add_done_callback(self._finished.put)
 
-    computed: list[dict[str, int]] = []
-    faults: list[str] = []
-    room = _Room(client)
-    for block in itertools.islice(todo, room()):
-        submit(block)
-    while flying:
-        interrupts.check()
-        try:
-            future = finished.get(timeout=POLL_S)
-        except Empty:
-            continue
-        flying.discard(future)
-        if future.status == "finished":
-            receipt = future.result()
-            computed.append(receipt["computed"])
-            _count(progress, receipt)
-            if on_progress is not None:
-                on_progress(progress)
-        else:
-            error = future.exception()
-            if isinstance(error, StoreError):
-                raise error
-            faults.append(f"{future.key}: {type(error).__name__}: {error}")
-        future.release()
-        if len(faults) < MOST_FAULTS:
-            for block in itertools.islice(todo, max(room() - len(flying), 0)):
-                submit(block)
-    if faults:
-        raise RunError(
-            f"{store.url}: {len(faults)} blocks failed; run again to continue\n"
-            + "\n".join(f"  {fault}" for fault in faults)
-        )
-    return computed
+    def _fault(self, number: int, future: Any) -> str | None:
+        """Return why a block failed; None where it is run again."""
+        from distributed import KilledWorker  # noqa: PLC0415  (slow to import)
+
+        if future.status in ("cancelled", "lost"):
+            raise RunError(
+                f"{self._store.url}: the scheduler went away; the same command continues"
+            )
+        error = future.exception()
+        if isinstance(error, StoreError):
+            raise error
+        if isinstance(error, KilledWorker) and self._deaths[number] < MOST_DEATHS:
+            # A block that ends its process is found out when it is begun again, but it may have
+            # been in line behind one, or its workers were killed from outside.
+            self._deaths[number] += 1
+            self._submit(number)
+            return None
+        return f"block {self._store.blocks[number]}: {type(error).__name__}: {error}"
+
+    def _count(self, progress: Progress, receipt: Mapping[str, Any]) -> None:
+        progress.done += receipt["scenes"]
+        counts = receipt["detection"]
+        progress.detected += counts[Detection.detected] if len(counts) > Detection.detected else 0
+        self._failures.update(failure["kind"] for failure in receipt["failures"])
 
 
 class _Room:
@@ -256,74 +361,40 @@ class _Room:
         self._client = client
         self._asked = 0.0
         self._blocks = 0
+        self._seen = time.monotonic()
 
     def __call__(self) -> int:
-        if time.monotonic() > self._asked + 1.0:
-            self._blocks = WINDOW * max(sum(self._client.nthreads().values()), 1)
+        """Return the room; RunError where the scheduler went away, or no workers came for long."""
+        if time.monotonic() > self._asked + ASK_EACH_S:
+            from sweep.engine.cluster import threads  # noqa: PLC0415  (slow to import)
+
+            there = threads(self._client)
             self._asked = time.monotonic()
+            self._blocks = WINDOW * max(there, 1)
+            if there:
+                self._seen = self._asked
+        if time.monotonic() > self._seen + LONELY_S:
+            raise RunError(
+                f"there have been no workers for {LONELY_S:.0f} s; start some, and the same "
+                "command continues"
+            )
         return self._blocks
 
 
-def _count(progress: Progress, receipt: Mapping[str, Any]) -> None:
-    progress.done += receipt["scenes"]
-    counts = receipt["detection"]
-    progress.detected += counts[Detection.detected] if len(counts) > Detection.detected else 0
-
-
-def _cost(store: RunStore) -> xr.Dataset:
-    """Return the cost group: seconds per stage and treatment for each block."""
-    numbers, scene, detection, estimation = [], [], [], []
-    for number, receipt in receipts(store, committed(store)):
-        seconds = receipt["seconds"]
-        if not seconds["scene"]:
-            continue
-        numbers.append(number)
-        scene.append(seconds["scene"][0])
-        detection.append(seconds["detection"])
-        estimation.append(seconds["estimation"])
-    pipeline = store.pipeline
-    settings = [axis for axis in pipeline.axes if axis.stage is Stage.detection]
-    solvers = [axis for axis in pipeline.axes if axis.stage is Stage.estimation]
-    both = [*settings, *solvers]
-    count = len(numbers)
-
-    def shaped(values: list[Any], axes: list[Any]) -> Any:
-        return np.asarray(values, dtype=np.float64).reshape(
-            (count, *(len(axis) for axis in axes))
-        )
-
-    return xr.Dataset(
-        {
-            "scene_s": (("block",), shaped(scene, [])),
-            "detection_s": (("block", *(a.name for a in settings)), shaped(detection, settings)),
-            "estimation_s": (("block", *(a.name for a in both)), shaped(estimation, both)),
-        },
-        coords={"block": numbers, **{axis.name: axis.coordinates().astype(object)
-                if axis.coordinates().dtype.kind == "T" else axis.coordinates()
-                for axis in both}},
-        attrs={"long_name": "seconds per stage and treatment for each block"},
-    )
-
-
 def _summary(store: RunStore, computed: Sequence[Mapping[str, int]], seconds: float) -> Summary:
-    """Count a finished store by its receipts."""
-    detection = np.zeros(len(Detection), dtype=np.int64)
-    estimate = np.zeros(len(Estimate), dtype=np.int64)
-    blocks = 0
-    for _, receipt in receipts(store, committed(store)):
-        for total, counts in ((detection, receipt["detection"]), (estimate, receipt["estimate"])):
-            total[: len(counts)] += counts
-        blocks += 1
+    """Tell of a finished store what was counted when it was closed."""
+    counts = store.about["counts"]
+    missing = lost(counts["detection"], counts["estimate"])
     return Summary(
         store=store.url,
+        data=store.data_url,
         poses=store.pipeline.size(Stage.scene),
         results=math.prod(len(axis) for axis in store.pipeline.axes),
-        detected=int(detection[Detection.detected]),
-        blocks=blocks,
+        detected=counts["detection"][Detection.detected],
+        blocks=len(store.blocks),
         computed_blocks=len(computed),
         computed_scenes=sum(block["scenes"] for block in computed),
         computed_estimates=sum(block["estimates"] for block in computed),
         seconds=round(seconds, 3),
-        crashed=int(detection[Detection.crashed] + estimate[Estimate.crashed]),
-        failed=int(detection[Detection.failed] + estimate[Estimate.failed]),
+        **missing,
     )

@@ -2,18 +2,25 @@
 
 A block's values are written first and its receipt last, so that a block is either whole or not
 there. The receipts are the checkpoint; that a chunk exists says nothing.
+
+No path is written by two runs. On this machine, a run holds its store by the folder that it
+opened, wherever that is moved; a remote store's data lie under the run's id, to which the place
+points.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import re
 import shutil
 import tempfile
 import time
 import uuid
 import warnings
-from collections.abc import AsyncIterator, Iterable
+import weakref
+from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -23,31 +30,40 @@ import zarr
 import zarr.errors
 from numpy.typing import NDArray
 from zarr.abc.store import Store
-from zarr.codecs import Crc32cCodec, ZstdCodec
-from zarr.core.buffer import cpu, default_buffer_prototype
+from zarr.core.buffer import default_buffer_prototype
 from zarr.core.sync import sync
+from zarr.storage import FsspecStore, LocalStore
 
+from sweep.compilation import processor
+from sweep.engine.digesting import DigestingStore
+from sweep.engine.layout import RECEIPTS, PlannedArray, planned_arrays
+from sweep.engine.manifest import Manifest, parsed, put, read_manifest, write_manifest
 from sweep.engine.provenance import environment, fingerprint
 from sweep.errors import StoreError
-from sweep.model.camera import VIEW_PARAMETERS
-from sweep.plan.axes import Axis
-from sweep.plan.grid import Block, Blocks, resolve_distance, scene_axes
+from sweep.plan.grid import Block, Blocks, scene_axes
 from sweep.plan.pipeline import Pipeline
-from sweep.plan.template import LABELS, TEMPLATE, Variable
+from sweep.plan.template import TEMPLATE, Variable
 
 if TYPE_CHECKING:
     import xarray as xr
 
-FORMAT = 1
+FORMAT = 2
 """Version of the store's layout."""
 
-RECEIPTS = "commits/receipt"
-"""Array of the blocks' receipts by number, JSON, a chunk each; empty where not committed."""
+BEGUN = f"{RECEIPTS}/begun"
+"""Folder of a mark for each block that was begun and is not committed."""
 
-REQUIRED = {"scenes", "detection", "estimate", "seconds", "failures", "written"}
+REQUIRED = {
+    "run_id", "processor", "scenes", "detection", "estimate", "seconds", "failures", "written",
+    "digests",
+}
 """What every receipt holds."""
 
-COORDINATE_CHUNK = 1 << 20
+GROUPS = ("commits", "cost", "failures")
+"""The groups of a store."""
+
+POINTER = "sweep_run"
+"""Attribute of a remote store's place: the id of the run whose data are the store's."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +76,16 @@ class RunStore:
     run_id: str
     blocks: Blocks
     _arrays: dict[str, zarr.Array[Any]] = field(default_factory=dict, repr=False, compare=False)
+
+    @property
+    def place(self) -> DigestingStore:
+        """Where its files are."""
+        return cast("DigestingStore", self.group.store)
+
+    @property
+    def data_url(self) -> str:
+        """What to open with ``xarray.open_zarr``."""
+        return f"{self.url}/{self.run_id}" if is_remote(self.url) else self.url
 
     def array(self, name: str) -> zarr.Array[Any]:
         """Return an array by its path; its metadata is read once."""
@@ -80,11 +106,7 @@ class RunStore:
     @property
     def about(self) -> dict[str, Any]:
         """What is recorded of the run: format, run id, fingerprint, environment, dates."""
-        return _about(self.group)
-
-
-def _about(group: zarr.Group) -> dict[str, Any]:
-    return dict(cast("dict[str, Any]", group.attrs["sweep"]))
+        return dict(cast("dict[str, Any]", self.group.attrs["sweep"]))
 
 
 def is_remote(url: str) -> bool:
@@ -92,21 +114,111 @@ def is_remote(url: str) -> bool:
     return "://" in url
 
 
-def _open_group(url: str, mode: str) -> zarr.Group:
-    return zarr.open_group(url, mode=mode, use_consolidated=False)  # type: ignore[arg-type]
+@contextlib.contextmanager
+def telling(url: str, doing: str) -> Iterator[None]:
+    """Turn what a disk or a server says into one line: ``url: cannot be <doing>: why``."""
+    try:
+        yield
+    except (StoreError, zarr.errors.BaseZarrError):
+        raise
+    except FileNotFoundError as error:
+        raise StoreError(f"{url}: cannot be {doing}: {error.strerror or error}") from None
+    except OSError as error:
+        raise StoreError(f"{url}: cannot be {doing}: {_reason(error)}") from None
+    except Exception as error:
+        # What a remote store's library raises is no OSError, and is of no one kind.
+        if not is_remote(url) or not _is_foreign(error):
+            raise
+        raise StoreError(f"{url}: cannot be {doing}: {_reason(error)}") from None
+
+
+def _is_foreign(error: Exception) -> bool:
+    return type(error).__module__.partition(".")[0] not in ("sweep", "zarr", "builtins", "numpy")
+
+
+def _reason(error: Exception) -> str:
+    """Return in a line why; what a remote store's library says is never quoted at length."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def _checked_url(url: str) -> str:
+    """Return a store's url; StoreError where it holds what must not be kept or shown."""
+    if is_remote(url):
+        scheme, _, rest = url.partition("://")
+        if "@" in rest.partition("/")[0] or "?" in rest or "#" in rest:
+            raise StoreError(
+                f"{scheme}://...: a store's name is shown and written down: expected no "
+                "credentials or options in it; the environment has them (AWS_ACCESS_KEY_ID, ...)"
+            )
+        return url.rstrip("/")
+    return url
+
+
+def _store_at(url: str, *, read_only: bool) -> Store:
+    """Return the Zarr store of a url."""
+    if not is_remote(url):
+        return LocalStore(url, read_only=read_only)
+    try:
+        return FsspecStore.from_url(url, read_only=read_only)
+    except ImportError as error:
+        raise StoreError(f"{url}: {error}") from None
+    except ValueError as error:
+        raise StoreError(f"{url}: cannot be reached: {_reason(error)}") from None
+
+
+def _run_at(url: str) -> str | None:
+    """Return the run whose data are those of a remote store; None where there is no store."""
+    with telling(url, "reached"):
+        try:
+            pointer = zarr.open_group(_store_at(url, read_only=True), mode="r")
+        except (FileNotFoundError, zarr.errors.GroupNotFoundError):
+            return None
+    run_id = pointer.attrs.get(POINTER)
+    if not isinstance(run_id, str) or not re.fullmatch("[0-9a-f]{32}", run_id):
+        raise StoreError(_something_else(url))
+    return run_id
 
 
 def exists(url: str) -> bool:
     """Tell whether anything is at a store's place."""
-    if not is_remote(url):
+    if not is_remote(_checked_url(url)):
         return Path(url).exists() or Path(url).is_symlink()
+    return _run_at(url) is not None
+
+
+def _something_else(url: str) -> str:
+    return f"{url}: holds something else than a store of sweep; name another place"
+
+
+def place_of(url: str, mode: str = "r") -> DigestingStore:
+    """Return where a store's files are.
+
+    With ``mode`` "r+" a local one is held by its folder: what is written goes there, also when
+    another store has taken its place.
+
+    Raises
+    ------
+    StoreError
+        Where there is none.
+    """
+    url = _checked_url(url)
+    if not exists(url):
+        raise StoreError(f"{url}: there is no store; `sweep run` makes one")
+    if is_remote(url):
+        return DigestingStore(_store_at(f"{url}/{_run_at(url)}", read_only=mode == "r"))
+    if mode == "r" or not Path("/proc/self/fd").is_dir():
+        return DigestingStore(LocalStore(url, read_only=mode == "r"))
     try:
-        _open_group(url, "r")
-    except (FileNotFoundError, zarr.errors.GroupNotFoundError):
-        return False
-    except (ImportError, ValueError, OSError) as error:
-        raise StoreError(f"{url}: cannot be reached: {error}") from None
-    return True
+        folder = os.open(url, os.O_RDONLY | os.O_DIRECTORY)
+    except NotADirectoryError:
+        raise StoreError(_something_else(url)) from None
+    except OSError as error:
+        raise StoreError(f"{url}: cannot be read: {error.strerror}") from None
+    held = DigestingStore(LocalStore(f"/proc/self/fd/{folder}"))
+    weakref.finalize(held, os.close, folder)
+    return held
 
 
 def open_store(url: str, mode: str = "r") -> RunStore:
@@ -115,30 +227,104 @@ def open_store(url: str, mode: str = "r") -> RunStore:
     Raises
     ------
     StoreError
-        Where there is none, or something else.
+        Where there is none, or something else, or its arrays are not what its pipeline asks for.
     """
-    if not exists(url):
-        raise StoreError(f"{url}: there is no store; `sweep run` makes one")
+    url = _checked_url(url)
+    place = place_of(url, mode)
     try:
-        group = _open_group(url, mode)
-        about = _about(group)
+        attributes = dict(_open_group(place, mode).attrs)
+    except PermissionError as error:
+        raise StoreError(f"{url}: cannot be read: {error.strerror}") from None
+    except (KeyError, TypeError, ValueError, OSError, zarr.errors.BaseZarrError):
+        if read_manifest(place)[0] is None:
+            raise StoreError(_something_else(url)) from None
+        raise StoreError(f"{url}: damaged: zarr.json; `sweep verify --repair` mends it") from None
+    store = store_of(url, place, attributes, mode)
+    faults = schema_faults(store)
+    if faults:
+        name, what = next(iter(faults.items()))
+        raise StoreError(
+            f"{url}: not as its pipeline says: {name}: {what}; `sweep verify` tells more"
+        )
+    return store
+
+
+def store_of(
+    url: str, place: DigestingStore, attributes: Mapping[str, Any], mode: str = "r"
+) -> RunStore:
+    """Return the store whose attributes are given; StoreError where they are of something else."""
+    try:
+        about = dict(attributes["sweep"])
+        if about["format"] != FORMAT:
+            raise StoreError(
+                f"{url}: store format {about['format']}, this version of sweep has {FORMAT}; "
+                "run its pipeline into a new store"
+            )
         pipeline = Pipeline.from_text(
-            str(group.attrs["pipeline"]), name=about["name"], source=f"{url} (its pipeline)",
+            str(attributes["pipeline"]), name=about["name"], source=f"{url} (its pipeline)",
             folder=about["folder"], files=about["fingerprint"]["files"],
         )
-        if about["format"] != FORMAT:
-            raise StoreError(f"{url}: store format {about['format']}, expected {FORMAT}")
         lengths, extents = tuple(len(a) for a in scene_axes(pipeline)), tuple(about["block"])
-        if len(extents) != len(lengths) or not all(extent >= 1 for extent in extents):
+        if len(extents) != len(lengths) or not all(
+            type(extent) is int and 1 <= extent <= length
+            for extent, length in zip(extents, lengths, strict=True)
+        ):
             raise ValueError(extents)
-        blocks = Blocks(lengths, extents)
-        return RunStore(url, group, pipeline, about["run_id"], blocks)
-    except (KeyError, TypeError, ValueError, OSError, zarr.errors.BaseZarrError) as error:
-        if isinstance(error, PermissionError):
-            raise StoreError(f"{url}: cannot be read: {error.strerror}") from None
-        raise StoreError(
-            f"{url}: holds something else than a store of sweep; name another place"
-        ) from None
+        if not re.fullmatch("[0-9a-f]{32}", about["run_id"]):
+            raise ValueError(about["run_id"])
+        group = _open_group(place, mode)
+        return RunStore(url, group, pipeline, about["run_id"], Blocks(lengths, extents))
+    except (KeyError, TypeError, ValueError, OSError, zarr.errors.BaseZarrError):
+        raise StoreError(_something_else(url)) from None
+
+
+def _open_group(place: Store, mode: str) -> zarr.Group:
+    return zarr.open_group(place, mode=mode, use_consolidated=False)  # type: ignore[arg-type]
+
+
+def schema_faults(store: RunStore) -> dict[str, str]:
+    """Return what is wrong with a store's arrays by their names: missing, foreign, or others."""
+    planned = {array.path: array for array in planned_arrays(store.pipeline, store.blocks.extents)}
+    faults: dict[str, str] = {}
+    with warnings.catch_warnings():
+        # Files that are not Zarr's are no fault.
+        warnings.simplefilter("ignore")
+        there: set[str] = set()
+        keys = sync(_listed(store.place, ""))
+        for name in sorted({key for key in keys if not key.startswith(".")} | {RECEIPTS}):
+            try:
+                member = store.group[name]
+            except KeyError:
+                continue
+            except Exception as error:
+                # Whatever is in a damaged or forged document.
+                there.add(name)
+                faults[name] = f"unreadable: {_reason(error)}"
+                continue
+            there.add(name)
+            if isinstance(member, zarr.Group):
+                if name not in GROUPS:
+                    faults[name] = "a group that no store of sweep has"
+            elif name not in planned:
+                faults[name] = "an array that no store of sweep has"
+            elif misfit := _misfit(planned[name], member):
+                faults[name] = misfit
+    faults.update({name: "missing" for name in planned if name not in there})
+    return faults
+
+
+def _misfit(planned: PlannedArray, array: zarr.Array[Any]) -> str:
+    try:
+        return planned.misfit(array)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        return f"unreadable: {_reason(error)}"
+
+
+async def _listed(place: Store, prefix: str) -> list[str]:
+    try:
+        return [key async for key in place.list_dir(prefix)]
+    except FileNotFoundError:
+        return []
 
 
 def check_place(url: str) -> None:
@@ -149,14 +335,12 @@ def check_place(url: str) -> None:
     StoreError
         Where it cannot be written.
     """
-    if is_remote(url):
+    if is_remote(_checked_url(url)):
         return
-    try:
+    with telling(url, "written"):
         Path(url).parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=Path(url).parent, prefix=".sweep-"):
             pass
-    except OSError as error:
-        raise StoreError(f"{url}: cannot be written: {error.strerror or error}") from None
 
 
 def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunStore:
@@ -167,20 +351,23 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
     StoreError
         Where the place cannot be written.
     """
-    try:
+    run_id = uuid.uuid4().hex
+    with telling(url, "written"):
         if is_remote(url):
-            _lay_out(url, pipeline, extents)
+            _lay_out(_store_at(f"{url}/{run_id}", read_only=False), pipeline, extents, run_id)
+            # The place points to it once it is whole.
+            zarr.open_group(
+                _store_at(url, read_only=False), mode="w-", attributes={POINTER: run_id}
+            )
         else:
             # Beside its place and then moved there: a kill between leaves no half a store.
             check_place(url)
             building = _beside(url, "new")
             try:
-                _lay_out(str(building), pipeline, extents)
+                _lay_out(LocalStore(building), pipeline, extents, run_id)
                 building.rename(url)
             finally:
                 shutil.rmtree(building, ignore_errors=True)
-    except OSError as error:
-        raise StoreError(f"{url}: cannot be written: {error.strerror or error}") from None
     return open_store(url, "r+")
 
 
@@ -189,41 +376,37 @@ def _beside(url: str, ending: str) -> Path:
     return Path(url).with_name(f".{Path(url).name}.{uuid.uuid4().hex[:8]}.{ending}")
 
 
-def _lay_out(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> None:
-    """Write a store's coordinates, its empty arrays, and its attributes last."""
-    group = _open_group(url, "w-")
-    scene_extent = dict(zip((axis.name for axis in scene_axes(pipeline)), extents, strict=True))
-    for axis in pipeline.axes:
-        _write_axis(group, axis)
-    used = {name for variable in TEMPLATE for name in variable.inner}
-    for name in sorted(used):
-        _write_strings(group, name, LABELS[name], {})
-    coordinates = _write_distance(group, pipeline)
-    for variable in TEMPLATE:
-        _create_variable(group, variable, pipeline, scene_extent)
-    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
-    group.create_array(
-        RECEIPTS, shape=(len(Blocks(lengths, extents)),), chunks=(1,), dtype="string",
-        dimension_names=("block",), compressors=_codecs(),
-    )
-    group.attrs.update(
-        {
-            "title": pipeline.title or pipeline.name,
-            "pipeline": pipeline.text,
-            **({"coordinates": " ".join(coordinates)} if coordinates else {}),
-            "sweep": {
-                "format": FORMAT,
-                "name": pipeline.name,
-                "folder": pipeline.folder,
-                "run_id": uuid.uuid4().hex,
-                "block": list(extents),
-                "fingerprint": fingerprint(pipeline),
-                "environment": environment(),
-                "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-                "finished": False,
-            },
-        }
-    )
+def _lay_out(to: Store, pipeline: Pipeline, extents: tuple[int, ...], run_id: str) -> None:
+    """Write a store's coordinates, its empty arrays, its attributes, and its manifest."""
+    place = DigestingStore(to)
+    group = zarr.open_group(place, mode="w-", use_consolidated=False)
+    planned = planned_arrays(pipeline, extents)
+    for array in planned:
+        array.create(group)
+    derived = [array.path for array in planned if array.path == "distance_m"
+               and pipeline.axis("distance_m") is None]
+    attributes: dict[str, Any] = {
+        "title": pipeline.title or pipeline.name,
+        "pipeline": pipeline.text,
+        **({"coordinates": " ".join(derived)} if derived else {}),
+        "sweep": {
+            "format": FORMAT,
+            "name": pipeline.name,
+            "folder": pipeline.folder,
+            "run_id": run_id,
+            "block": list(extents),
+            "fingerprint": fingerprint(pipeline),
+            "environment": environment(),
+            "created": _now(),
+            "finished": False,
+        },
+    }
+    group.attrs.update(attributes)
+    write_manifest(place, Manifest(attributes, dict(place.digests)))
+
+
+def _now() -> str:
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
 
 
 def remove_store(url: str) -> None:
@@ -234,90 +417,34 @@ def remove_store(url: str) -> None:
     StoreError
         Where something else is there, or it cannot be deleted.
     """
-    store = open_store(url, "r+")
-    try:
+    place = place_of(url, "r+")
+    about = recorded_about(url, place)
+    with telling(url, "overwritten"):
         if is_remote(url):
-            sync(store.group.store.clear())
+            pointer = _store_at(url, read_only=False)
+            sync(pointer.delete("zarr.json"))
+            sync(pointer.delete_dir(str(about["run_id"])))
             return
         # Out of the way at once, then at leisure: a kill between leaves no half a store.
         doomed = _beside(url, "deleted")
         Path(url).rename(doomed)
         shutil.rmtree(doomed, ignore_errors=True)
-    except OSError as error:
-        raise StoreError(f"{url}: cannot be overwritten: {error.strerror or error}") from None
 
 
-def _codecs() -> list[Any]:
-    """Return the codecs of every array: a damaged chunk fails its checksum when it is read."""
-    return [ZstdCodec(level=3), Crc32cCodec()]
+def recorded_about(url: str, place: DigestingStore) -> dict[str, Any]:
+    """Return what is recorded of a store that may be damaged or of another format.
 
-
-def _create_variable(
-    group: zarr.Group, variable: Variable, pipeline: Pipeline, scene_extent: dict[str, int]
-) -> None:
-    names, shape = variable.dimensions(pipeline), variable.shape(pipeline)
-    chunks = tuple(
-        scene_extent.get(name, length) for name, length in zip(names, shape, strict=True)
-    )
-    group.create_array(
-        variable.name, shape=shape, chunks=chunks or (), dtype=variable.dtype,
-        fill_value=variable.fill, dimension_names=names, compressors=_codecs(),
-        attributes=variable.attributes(),
-    )
-
-
-def _write_axis(group: zarr.Group, axis: Axis) -> None:
-    attributes: dict[str, Any] = {"long_name": axis.meaning}
-    if axis.unit:
-        attributes["units"] = axis.unit
-    if axis.labelled:
-        _write_strings(group, axis.name, axis.coordinates().tolist(), attributes)
-        return
-    chunk = min(len(axis), COORDINATE_CHUNK)
-    array = group.create_array(
-        axis.name, shape=(len(axis),), chunks=(chunk,), dtype=axis.coordinates(0, 1).dtype,
-        dimension_names=(axis.name,), compressors=_codecs(), attributes=attributes,
-    )
-    for start in range(0, len(axis), chunk):
-        stop = min(start + chunk, len(axis))
-        array[start:stop] = axis.coordinates(start, stop)
-
-
-def _write_strings(
-    group: zarr.Group, name: str, labels: Iterable[str], attributes: dict[str, Any]
-) -> None:
-    values = np.array(list(labels), dtype=object)
-    array = group.create_array(
-        name, shape=values.shape, chunks=values.shape, dtype="string",
-        dimension_names=(name,), attributes=attributes,
-    )
-    array[:] = values
-
-
-def _write_distance(group: zarr.Group, pipeline: Pipeline) -> list[str]:
-    """Write ``distance_m`` as a coordinate where it follows from ``side_px``; return its name."""
-    sides = pipeline.values_of("side_px")
-    if not sides or sides[0] is None:
-        return []
-    names = (*VIEW_PARAMETERS, "size_m", "side_px")
-    axes = [axis for axis in scene_axes(pipeline) if axis.name in names]
-    grids = np.meshgrid(
-        *(np.array(axis.values, dtype=np.float64) for axis in axes), indexing="ij", sparse=True
-    )
-    values = {**{name: pipeline.fixed.get(name) for name in names},
-              **{axis.name: grid for axis, grid in zip(axes, grids, strict=True)}}
-    resolve_distance(values)
-    distance = np.broadcast_to(
-        np.asarray(values["distance_m"], dtype=np.float64), tuple(len(axis) for axis in axes)
-    )
-    array = group.create_array(
-        "distance_m", shape=distance.shape, chunks=distance.shape, dtype="f8",
-        dimension_names=tuple(axis.name for axis in axes),
-        attributes={"long_name": "depth of the marker's centre along the optical axis",
-                    "units": "m"},
-    )
-    array[...] = distance
-    return ["distance_m"]
+    Raises
+    ------
+    StoreError
+        Where something else is there.
+    """
+    manifest, _ = read_manifest(place)
+    try:
+        attributes = _open_group(place, "r").attrs if manifest is None else manifest.attributes
+        return dict(cast("dict[str, Any]", attributes["sweep"]))
+    except (KeyError, TypeError, ValueError, OSError, zarr.errors.BaseZarrError):
+        raise StoreError(_something_else(url)) from None
 
 
 def region(variable: Variable, pipeline: Pipeline, block: Block) -> tuple[slice, ...]:
@@ -331,57 +458,94 @@ def region(variable: Variable, pipeline: Pipeline, block: Block) -> tuple[slice,
     return tuple(cuts.get(name, slice(None)) for name in variable.dimensions(pipeline))
 
 
+def chunk_key(store: RunStore, variable: Variable, block: Block) -> str:
+    """Return the key of the one chunk of a variable that a block is."""
+    array = store.array(variable.name)
+    position = tuple(
+        (part.start or 0) // extent
+        for part, extent in zip(
+            region(variable, store.pipeline, block), array.chunks, strict=True
+        )
+    )
+    return f"{variable.name}/{array.metadata.encode_chunk_key(position)}"
+
+
+def begin_block(store: RunStore, block: Block) -> bool:
+    """Note that a block is begun; tell whether it had been begun before."""
+    with telling(store.url, "written"):
+        _see_that_it_is_ours(store)
+        key = f"{BEGUN}/{store.blocks.number(block)}"
+        if sync(store.place.exists(key)):
+            return True
+        put(store.place, key, {"pid": os.getpid(), "at": time.time()})
+    return False
+
+
 def write_block(
-    store: RunStore, block: Block, values: dict[str, NDArray[Any]], receipt: dict[str, Any]
+    store: RunStore, block: Block, values: Mapping[str, NDArray[Any]], receipt: Mapping[str, Any]
 ) -> None:
     """Write a block's values, then commit them by its receipt."""
-    _see_that_it_is_ours(store)
-    for variable in TEMPLATE:
-        array = store.array(variable.name)
-        array[region(variable, store.pipeline, block)] = values[variable.name]
-    _see_that_it_is_ours(store)
     number = store.blocks.number(block)
-    content = json.dumps({"run_id": store.run_id, **receipt}, separators=(",", ":"))
-    store.array(RECEIPTS)[number : number + 1] = np.array([content], dtype=object)
+    with telling(store.url, "written"):
+        _see_that_it_is_ours(store)
+        for variable in TEMPLATE:
+            array = store.array(variable.name)
+            array[region(variable, store.pipeline, block)] = values[variable.name]
+        _see_that_it_is_ours(store)
+        digests = [_digest(store, chunk_key(store, variable, block)) for variable in TEMPLATE]
+        content = json.dumps(
+            {"run_id": store.run_id, "processor": processor(), **receipt, "digests": digests},
+            separators=(",", ":"),
+        )
+        store.array(RECEIPTS)[number : number + 1] = np.array([content], dtype=object)
+        with contextlib.suppress(FileNotFoundError):
+            sync(store.place.delete(f"{BEGUN}/{number}"))
+
+
+def _digest(store: RunStore, key: str) -> int:
+    """Return the digest of what was written under a key, and forget it."""
+    if key not in store.place.digests:
+        # The same block was written twice at once in this process.
+        sync(store.place.get(key, default_buffer_prototype()))
+    return store.place.digests.pop(key)
+
+
+def drop_block(store: RunStore, block: Block) -> None:
+    """Take a block's commit back, so that it is computed again, and delete its chunks."""
+    keys = [f"{RECEIPTS}/c/{store.blocks.number(block)}"]
+    keys += [chunk_key(store, variable, block) for variable in TEMPLATE]
+    with telling(store.url, "written"):
+        for key in keys:
+            with contextlib.suppress(FileNotFoundError):
+                sync(store.place.delete(key))
 
 
 def _see_that_it_is_ours(store: RunStore) -> None:
     """Raise StoreError where another run has replaced the store since it was opened."""
-    try:
-        run_id = _about(_open_group(store.url, "r"))["run_id"]
-    except (KeyError, FileNotFoundError):
-        run_id = None
-    if run_id != store.run_id:
+    there: str | None
+    if is_remote(store.url):
+        there = _run_at(store.url)
+    else:
+        try:
+            group = _open_group(LocalStore(store.url, read_only=True), "r")
+            there = cast("dict[str, Any]", group.attrs["sweep"])["run_id"]
+        except (KeyError, FileNotFoundError):
+            there = None
+    if there != store.run_id:
         raise StoreError(f"{store.url}: replaced by another run while this one was going on")
-
-
-def put(store: Store, key: str, content: dict[str, Any]) -> None:
-    """Write a small JSON document beside the arrays."""
-    encoded = json.dumps(content, separators=(",", ":")).encode()
-    sync(store.set(key, cpu.Buffer.from_bytes(encoded)))
-
-
-def get(store: Store, key: str) -> dict[str, Any] | None:
-    """Read a small JSON document; None where it is not there or is torn."""
-    buffer = sync(store.get(key, default_buffer_prototype()))
-    if buffer is None:
-        return None
-    try:
-        content = json.loads(buffer.to_bytes())
-    except ValueError:
-        return None
-    return content if isinstance(content, dict) else None
 
 
 def committed(store: RunStore) -> set[int]:
     """Return the numbers of the blocks that are committed."""
     async def gather(keys: AsyncIterator[str]) -> set[int]:
-        return {int(key) async for key in keys if key.isdecimal()}
+        return {int(key) async for key in keys if key.isascii() and key.isdecimal()}
 
+    count = len(store.blocks)
     try:
-        return sync(gather(store.group.store.list_dir(f"{RECEIPTS}/c")))
+        listed = sync(gather(store.place.list_dir(f"{RECEIPTS}/c")))
     except FileNotFoundError:
         return set()
+    return {number for number in listed if number < count}
 
 
 def receipts(
@@ -393,43 +557,78 @@ def receipts(
         some = ordered[start : start + 1000]
         try:
             texts = np.asarray(store.array(RECEIPTS).oindex[np.array(some)]).tolist()
-            contents = [json.loads(text) for text in texts]
-            if not all(content.keys() >= REQUIRED for content in contents):
-                raise ValueError("incomplete")
-        except (ValueError, AttributeError, KeyError) as error:
+            contents = [parsed_receipt(store, text) for text in texts]
+        except (ValueError, AttributeError, KeyError, TypeError, OSError) as error:
             raise StoreError(
                 f"{store.url}: damaged receipts among blocks {some[0]} to {some[-1]} ({error}); "
-                "--overwrite computes the store again"
+                "`sweep verify --repair` mends it"
             ) from None
         yield from zip(some, contents, strict=True)
 
 
-def finish(store: RunStore, cost: xr.Dataset) -> None:
-    """Close a complete store: its cost group, the mark, and the metadata in one place."""
-    about = store.about
-    about["finished"] = True
-    about["finished_at"] = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-    write_group(store, "cost", cost, about)
+def parsed_receipt(store: RunStore, text: str) -> dict[str, Any]:
+    """Return a receipt's content; ValueError where it is not one of this run."""
+    content = json.loads(text)
+    if not isinstance(content, dict) or not content.keys() >= REQUIRED:
+        raise ValueError("incomplete")
+    if content["run_id"] != store.run_id:
+        raise ValueError("of another run")
+    return content
 
 
-def write_group(
-    store: RunStore, name: str, content: xr.Dataset, about: dict[str, Any] | None = None
+def finish(store: RunStore, groups: Mapping[str, xr.Dataset], counts: dict[str, Any]) -> None:
+    """Close a complete store: its groups, the mark, and the metadata in one place."""
+    about = {**store.about, "finished": True, "finished_at": _now(), "counts": counts}
+    _write_groups(store, groups, about)
+
+
+def write_group(store: RunStore, name: str, content: xr.Dataset) -> None:
+    """Write a dataset to a group of a complete store, and put all metadata in one place again."""
+    _write_groups(store, {name: content}, store.about)
+
+
+def _write_groups(
+    store: RunStore, groups: Mapping[str, xr.Dataset], about: dict[str, Any]
 ) -> None:
-    """Write a dataset to a group of a complete store, then what is new about the store, if any.
-
-    All metadata is then put in one place.
-    """
-    # Zarr 3 specifies strings of any length, none of a fixed one.
-    texts = [label for label in content.variables if content[label].dtype.kind == "U"]
-    content = content.assign({label: content[label].astype(object) for label in texts})
-    with warnings.catch_warnings():
+    manifest, _ = read_manifest(store.place)
+    files = dict(manifest.files) if manifest is not None else {}
+    with telling(store.url, "written"), warnings.catch_warnings():
         # Consolidated metadata is not part of the Zarr 3 specification; xarray reads it, and
         # warns where it is missing.
         warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
-        content.to_zarr(store.url, group=name, mode="w", zarr_format=3, consolidated=False)
-        if about is not None:
-            store.group.attrs["sweep"] = about
-        zarr.consolidate_metadata(store.group.store, zarr_format=3)
+        old = {key for name in groups for key in sync(_own_keys(store, name))} | {"zarr.json"}
+        files = {key: value for key, value in files.items() if key not in old}
+        # What is being written is not vouched for until it is whole.
+        write_manifest(store.place, Manifest(dict(store.group.attrs), files))
+        for key in old - {"zarr.json"}:
+            with contextlib.suppress(FileNotFoundError):
+                sync(store.place.delete(key))
+        store.place.digests.clear()
+        for name, content in groups.items():
+            # Zarr 3 specifies strings of any length, none of a fixed one.
+            texts = [label for label in content.variables if content[label].dtype.kind == "U"]
+            content.assign({label: content[label].astype(object) for label in texts}).to_zarr(
+                store.place, group=name, mode="a", zarr_format=3, consolidated=False
+            )
+        store.group.attrs["sweep"] = about
+        zarr.consolidate_metadata(store.place, zarr_format=3)
+        written = {
+            key: value for key, value in store.place.digests.items()
+            if key == "zarr.json" or any(key.startswith(f"{name}/") for name in groups)
+        }
+        write_manifest(store.place, Manifest(dict(store.group.attrs), {**files, **written}))
+
+
+async def _own_keys(store: RunStore, name: str) -> list[str]:
+    """Return the keys of a group and its arrays, without those of the groups in it."""
+    keys = [key async for key in store.place.list_prefix(f"{name}/")]
+    within: list[str] = []
+    for key in keys:
+        if key.endswith("/zarr.json") and key != f"{name}/zarr.json":
+            content = parsed(await store.place.get(key, default_buffer_prototype())) or {}
+            if content.get("node_type") == "group":
+                within.append(key.removesuffix("zarr.json"))
+    return [key for key in keys if not key.startswith(tuple(within))]
 
 
 def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
@@ -443,7 +642,7 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
     store = open_store(os.fspath(url))
     import xarray as xr  # noqa: PLC0415  (slow to import, and workers do without)
 
-    dataset: xr.Dataset = xr.open_zarr(store.url, consolidated=False)
+    dataset: xr.Dataset = xr.open_zarr(store.data_url, consolidated=False, zarr_format=3)
     # NumPy's strings of any length are new, and much of xarray and pandas does without them.
     texts = {name: (value.dims, value.to_numpy().astype(object), value.attrs)
              for name, value in dataset.coords.items() if value.dtype.kind == "T"}

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,12 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
+from sweep.engine.bisection import WHOLE, run_cells_apart
+from sweep.engine.failures import MOST_ROWS, recorded
 from sweep.engine.provenance import fingerprint
 from sweep.engine.reuse import Source, Taken, match, take
-from sweep.engine.store import RunStore, open_store, write_block
+from sweep.engine.store import RunStore, begin_block, open_store, write_block
+from sweep.engine.watchdog import ending_after
 from sweep.errors import StoreError
 from sweep.kernel import CellsResult, run_cells, shaped
 from sweep.plan.grid import Block, block_indices
@@ -22,8 +26,10 @@ from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline, file_digest
 from sweep.plan.template import TEMPLATE, Variable
 
-MOST_FAILURES = 20
-"""Tracebacks that a receipt holds; beyond, failures are counted by their flags."""
+TIME_LIMIT_S = 600.0
+"""Seconds after which a block is taken for endless, the search for its endless scene included."""
+
+ROOM: dict[str, int] = {"failed": MOST_ROWS, "crashed": MOST_ROWS}
 
 
 @lru_cache(maxsize=4)
@@ -57,14 +63,22 @@ def _source(url: str, run_id: str, old: str) -> Source:
 
 
 def compute_block(
-    url: str, run_id: str, block: Block, reuse: Sequence[str] = ()
+    url: str,
+    run_id: str,
+    block: Block,
+    reuse: Sequence[str] = (),
+    time_limit_s: float = TIME_LIMIT_S,
+    room: Mapping[str, int] = ROOM,
 ) -> dict[str, Any]:
     """Compute, write and commit one block; return its receipt (also when it is run twice).
 
-    Cells that the stores ``reuse`` have are taken from there.
+    Cells that the stores ``reuse`` have are taken from there. A block that was begun before and
+    not committed may have ended its process: it is computed in a child, where what does so is
+    found. ``room`` bounds the rows of failures that the receipt keeps of each kind.
     """
     start = time.perf_counter()
     store = _opened(url, run_id)
+    begun_before = begin_block(store, block)
     pipeline = store.pipeline
     shape = (len(block), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
     taken: Taken | None = None
@@ -76,7 +90,13 @@ def compute_block(
     rows = np.flatnonzero(need.any(axis=(1, 2)))
     cells = None
     if len(rows):
-        cells = run_cells(pipeline, [index[rows] for index in block_indices(block)], need[rows])
+        indices = [index[rows] for index in block_indices(block)]
+        if not begun_before:
+            # What raises for a block as a whole is found as what ends its process is.
+            with ending_after(WHOLE * time_limit_s), contextlib.suppress(Exception):
+                cells = run_cells(pipeline, indices, need[rows])
+        if cells is None:
+            cells = run_cells_apart(pipeline, indices, need[rows], time_limit_s)
     values = {
         v.name: shaped(v, pipeline, block, _columns(v, cells, rows, pipeline, len(block)))
         for v in TEMPLATE
@@ -93,10 +113,7 @@ def compute_block(
         "detection": np.bincount(values["detection"].ravel()).tolist(),
         "estimate": np.bincount(values["estimate"].ravel()).tolist(),
         "seconds": cells.seconds if cells is not None else _NO_SECONDS,
-        "failures": [
-            {"scene": int(rows[f.scene]), "stage": f.stage, "text": f.text}
-            for f in (cells.failures[:MOST_FAILURES] if cells is not None else [])
-        ],
+        "failures": recorded(cells.failures if cells is not None else [], rows.tolist(), room),
         "wall_s": time.perf_counter() - start,
         "written": time.time(),
     }

@@ -7,7 +7,6 @@ import re
 import threading
 from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from sweep.model import coverage
 from sweep.model.exposure import marker_exposure
 from sweep.model.extent import WARP_PX_PER_MODULE
+from sweep.model.image_file import decode_grey
 from sweep.model.marker import edge_table, edges, modules
 from sweep.model.scene import Box, Scenes
 from sweep.model.sensor import illuminate, read_out
@@ -36,14 +36,7 @@ def renderer_fault(name: str) -> str | None:
 @lru_cache(maxsize=16)
 def background_image(path: str) -> Grey:
     """Return an image file as grey levels (height, width); ValueError where it is none."""
-    try:
-        encoded = np.frombuffer(Path(path).read_bytes(), dtype=np.uint8)
-    except OSError as error:
-        raise ValueError(error.strerror or "unreadable") from error
-    image = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE) if len(encoded) else None
-    if image is None:
-        raise ValueError("not an image that OpenCV can read")
-    grey = np.asarray(image, dtype=np.uint8)
+    grey = decode_grey(path)
     grey.setflags(write=False)
     return grey
 

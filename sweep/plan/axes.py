@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.plan.faults import shown
 from sweep.plan.parameters import PARAMETERS, Parameter, Stage
 
 TRIAL = "trial"
@@ -19,8 +20,8 @@ TRIAL = "trial"
 MOST_VALUES = 10**9
 """The longest axis (``range`` and ``trial``; they are never written out)."""
 
-MOST_LISTED = 10**7
-"""The longest axis of any other form."""
+MOST_LISTED = 10**6
+"""The longest axis of any other form; also the most values of all such axes together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +108,14 @@ AXIS_FORMS = {
 DISTRIBUTION_FORMS = {"uniform": "[a, b] with a < b", "normal": "[mean, sd] with sd > 0"}
 
 
+LONGEST_WORD = 60
+"""Words beyond this length are like no known one."""
+
+
 def nearest(word: str, known: Sequence[str]) -> str:
     """Return "; did you mean ...?" for the nearest known word, or nothing."""
+    if len(word) > LONGEST_WORD:
+        return ""
     close = [name for name in known if word and name.startswith(word)]
     close = close or difflib.get_close_matches(word, known, n=1, cutoff=0.5)
     return f"; did you mean {close[0]}?" if close else ""
@@ -153,10 +160,10 @@ def parse_trial(value: Any) -> Axis:
     return Axis(TRIAL, range(value))
 
 
-def parse_axis(parameter: Parameter, given: Any) -> Axis:
+def parse_axis(parameter: Parameter, given: Any, room: int = MOST_LISTED) -> Axis:
     """Return the axis that a list or a table such as ``{ geom = [0.05, 1, 40] }`` stands for.
 
-    ValueError with what was expected where it cannot be one.
+    It lists ``room`` values at most. ValueError with what was expected where it cannot be one.
     """
     forms = ", ".join(AXIS_FORMS)
     if isinstance(given, list):
@@ -171,37 +178,49 @@ def parse_axis(parameter: Parameter, given: Any) -> Axis:
         raise ValueError(f"a list, or a table with one of {forms}{nearest(form, [*AXIS_FORMS])}")
     if not isinstance(ends, list):
         raise ValueError(f"{form} = {AXIS_FORMS[form]}")  # noqa: TRY004  (a fault of the file)
-    values = ends if form == "values" else _expand(form, ends)
+    values = _bounded(ends, room) if form == "values" else _expand(form, ends, room)
     if len(values) == 0:
         raise ValueError("at least one value")
     if isinstance(values, range):
-        if parameter.types != (int,):
-            values = [float(value) for value in _bounded(values)]
-        else:
+        if parameter.types == (int,):
             for end in (values[0], values[-1]):
                 parameter.check(end)
             return Axis(parameter.name, values)
-    checked = []
-    for value in values:
-        try:
-            checked.append(parameter.check(value))
-        except ValueError as error:
-            raise ValueError(f"{error} (not {value!r})") from None
-    seen: set[Any] = set()
-    for value in checked:
-        if value in seen:
-            raise ValueError(f"each value once ({value!r} is repeated)")
-        seen.add(value)
+        values = [float(value) for value in _bounded(values, room)]
+    if form != "values" and float in parameter.types:
+        # All are numbers: where the least and the largest are admitted, so is what is between.
+        for end in (min(values), max(values)):
+            _checked(parameter, end)
+        checked = values
+    else:
+        checked = [_checked(parameter, value) for value in values]
+    if len(set(checked)) < len(checked):
+        seen: set[Any] = set()
+        for value in checked:
+            if value in seen:
+                raise ValueError(f"each value once ({shown(value)} is repeated)")
+            seen.add(value)
     return Axis(parameter.name, tuple(checked))
 
 
-def _bounded(values: range) -> range:
-    if len(values) > MOST_LISTED:
-        raise ValueError(f"at most {MOST_LISTED:,} values")
+def _checked(parameter: Parameter, value: Any) -> Any:
+    try:
+        return parameter.check(value)
+    except ValueError as error:
+        raise ValueError(f"{error} (not {shown(value)})") from None
+
+
+def _bounded(values: Sequence[Any], room: int) -> Sequence[Any]:
+    if len(values) > room:
+        raise _too_many()
     return values
 
 
-def _expand(form: str, ends: list[Any]) -> Sequence[Any]:
+def _too_many() -> ValueError:
+    return ValueError(f"at most {MOST_LISTED:,} values, all axes together")
+
+
+def _expand(form: str, ends: list[Any], room: int) -> Sequence[Any]:
     """Return the values of a generating form."""
     wanted = ValueError(f"{form} = {AXIS_FORMS[form]}")
     if not all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends):
@@ -226,8 +245,8 @@ def _expand(form: str, ends: list[Any]) -> Sequence[Any]:
         if step == 0:
             raise wanted
         steps = (stop - start) / step
-        if steps > MOST_LISTED:
-            raise ValueError(f"at most {MOST_LISTED:,} values")
+        if steps > room:
+            raise _too_many()
         # Half-open also where the last step falls short of the stop by rounding alone.
         count = math.ceil(steps - 1e-9) if steps > 0 else 0
         if all(isinstance(end, int) for end in ends):
@@ -235,8 +254,8 @@ def _expand(form: str, ends: list[Any]) -> Sequence[Any]:
         return [start + step * i for i in range(count)]
     if not isinstance(ends[2], int) or ends[2] < 1:
         raise wanted
-    if ends[2] > MOST_LISTED:
-        raise ValueError(f"at most {MOST_LISTED:,} values")
+    if ends[2] > room:
+        raise _too_many()
     if form == "linspace":
         return list(map(float, np.linspace(ends[0], ends[1], ends[2])))
     if not (ends[0] > 0 and ends[1] > 0):

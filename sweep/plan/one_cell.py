@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import tomllib
+from collections.abc import Mapping
 from typing import Any
 
-from sweep.errors import PipelineError
-from sweep.plan.axes import TRIAL, Axis, nearest
+from sweep.plan.axes import TRIAL, Axis, label, nearest
+from sweep.plan.faults import MOST_FAULTS, plain, refusal
 from sweep.plan.parameters import PARAMETERS
 from sweep.plan.pipeline import Pipeline, fixed_at
+from sweep.plan.toml_text import read_value
 
-_SEPARATOR = re.compile(r",(?![^\[]*\])")
+_PART = re.compile(r"(?:\[[^\]]*\]?|[^,\[])+")
+"""What stands between commas; those of a list do not count."""
 
 
 def cell(pipeline: Pipeline, at: str) -> Pipeline:
@@ -25,26 +27,8 @@ def cell(pipeline: Pipeline, at: str) -> Pipeline:
     PipelineError
         One line for each part of ``at`` that cannot be.
     """
-    faults: list[str] = []
-    chosen: dict[str, Any] = {axis.name: axis.values[0] for axis in pipeline.axes}
-    named: set[str] = set()
-    for part in filter(None, _SEPARATOR.split(at)):
-        name, equals, written = (piece.strip() for piece in part.partition("="))
-        if not equals or not written:
-            faults.append(f"--at {part}: expected name=value, such as tilt_deg=45")
-        elif name != TRIAL and name not in PARAMETERS:
-            known = [*PARAMETERS, TRIAL]
-            faults.append(f"--at {part}: unknown parameter{nearest(name, known)}")
-        else:
-            if name in named:
-                faults.append(f"--at {part}: {name} is given twice")
-            named.add(name)
-            try:
-                chosen[name] = _value(name, written)
-            except ValueError as error:
-                faults.append(f"--at {part}: expected {error}")
-    if faults:
-        raise PipelineError(faults)
+    named = places(at)
+    chosen = {axis.name: axis.values[0] for axis in pipeline.axes} | named
     trial = chosen.pop(TRIAL, 0)
     axes = (Axis(TRIAL, range(trial, trial + 1)),)
     for name, other in (("distance_m", "side_px"), ("side_px", "distance_m")):
@@ -53,16 +37,57 @@ def cell(pipeline: Pipeline, at: str) -> Pipeline:
     return dataclasses.replace(fixed_at(pipeline, chosen), axes=axes)
 
 
+def places(at: str) -> dict[str, Any]:
+    """Return the parameters that ``--at`` names, with their values.
+
+    Raises
+    ------
+    PipelineError
+        One line for each part of ``at`` that cannot be.
+    """
+    faults: list[str] = []
+    named: dict[str, Any] = {}
+    for part in map(str, _PART.findall(at)):
+        name, equals, written = (piece.strip() for piece in part.partition("="))
+        if not equals or not written:
+            faults.append(f"--at {plain(part)}: expected name=value, such as tilt_deg=45")
+        elif name != TRIAL and name not in PARAMETERS:
+            known = [*PARAMETERS, TRIAL]
+            hint = nearest(name, known) if len(faults) < MOST_FAULTS else ""
+            faults.append(f"--at {plain(part)}: unknown parameter{hint}")
+        elif name in named:
+            faults.append(f"--at {plain(part)}: {name} is given twice")
+        else:
+            try:
+                named[name] = _value(name, written)
+            except ValueError as error:
+                faults.append(f"--at {plain(part)}: expected {error}")
+    if faults:
+        raise refusal(faults)
+    return named
+
+
 def _value(name: str, written: str) -> Any:
     try:
-        value = tomllib.loads(f"value = {written}")["value"]
-    except tomllib.TOMLDecodeError:
+        value = read_value(written)
+    except ValueError:
         value = written
     if name != TRIAL:
         return PARAMETERS[name].check(value)
     if isinstance(value, int) and 0 <= value < 2**62:
         return value
     raise ValueError("a whole number, at least 0")
+
+
+def at_text(place: Mapping[str, Any]) -> str:
+    """Return a cell's coordinates as ``--at`` takes them: "distance_m=0.3,tilt_deg=45.0"."""
+    return ",".join(f"{name}={_written(value)}" for name, value in place.items())
+
+
+def _written(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return label(value)
 
 
 def coordinates_text(pipeline: Pipeline, chosen: Pipeline) -> str:

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import math
-import re
-import tomllib
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import tomlkit
-import tomlkit.exceptions
 import tomlkit.items
 
-from sweep.errors import PipelineError
 from sweep.measure.detector import DetectorSetting
 from sweep.model.effects import GEOMETRIC, RANDOM, VELOCITIES, is_on
+from sweep.model.image_file import MOST_PIXELS, image_size, read_image, read_regular
 from sweep.model.marker import marker_count
 from sweep.model.renderers import background_image
 from sweep.plan.axes import (
+    MOST_LISTED,
     TRIAL,
     Axis,
     Distribution,
@@ -29,16 +29,19 @@ from sweep.plan.axes import (
     parse_distribution,
     parse_trial,
 )
+from sweep.plan.faults import MOST_FAULTS, plain, refusal, shown
 from sweep.plan.parameters import PARAMETERS, SECTIONS, Stage
-
-MOST_BYTES = 1_000_000
-"""The largest pipeline file that is read."""
+from sweep.plan.toml_text import MOST_BYTES, quoted_if_bare, read_document, read_value
 
 MOST_POSES = 10**12
 """The largest grid."""
 
-MOST_PIXELS = 500_000_000
-"""The largest frame that is rendered whole."""
+MOST_TREATMENTS = 10_000
+"""The most pairs of a detector setting and an estimator: they are listed, and each has its share
+of every block."""
+
+LONGEST_TITLE = 200
+LONGEST_PATH_SHOWN = 400
 
 HEADER = ("title", "seed")
 
@@ -87,19 +90,21 @@ class Pipeline:
             One line for each fault of the file.
         """
         path = Path(path)
+        source = plain(path, LONGEST_PATH_SHOWN)
         try:
-            with path.open("rb") as file:
-                encoded = file.read(MOST_BYTES + 1)
-        except OSError as error:
-            raise PipelineError([f"{path}: cannot be read: {error.strerror}"]) from None
+            encoded = read_regular(path, MOST_BYTES)
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise refusal([f"{source}: cannot be read: {reason}"]) from None
         if len(encoded) > MOST_BYTES:
-            raise PipelineError([f"{path}: expected at most {MOST_BYTES:,} bytes"])
+            raise refusal([f"{source}: expected at most {MOST_BYTES:,} bytes"])
         try:
             text = encoded.decode()
         except UnicodeDecodeError as error:
-            raise PipelineError([f"{path}: expected UTF-8: byte {error.start} is not"]) from None
+            raise refusal([f"{source}: expected UTF-8: byte {error.start} is not"]) from None
+        text = text.removeprefix("\ufeff")
         return Pipeline.from_text(
-            text, settings, name=path.stem, source=str(path), folder=path.parent
+            text, settings, name=path.stem, source=source, folder=path.parent
         )
 
     @staticmethod
@@ -117,13 +122,16 @@ class Pipeline:
         ``files`` (path as written -> SHA-256) takes the place of looking at the files that the
         text refers to, as for a store whose files may be elsewhere by now.
         """
+        document = _document(text, source)
         if settings:
-            text = with_settings(text, settings, source)
-        try:
-            document = tomllib.loads(text)
-        except (tomllib.TOMLDecodeError, RecursionError) as error:
-            reason = "nested too deeply" if isinstance(error, RecursionError) else error
-            raise PipelineError([f"{source}: not TOML: {reason}"]) from None
+            chosen = _chosen(settings)
+            _apply(document, chosen)
+            # What is refused is refused here: tomlkit, which keeps the comments, is slow.
+            _Reader(document, source, Path(folder), files).pipeline(name, text)
+            written = tomlkit.parse(text)
+            _apply(written, chosen)
+            text = tomlkit.dumps(written)
+            document = _document(text, source)
         return _Reader(document, source, Path(folder), files).pipeline(name, text)
 
     def axis(self, name: str) -> Axis | None:
@@ -170,11 +178,18 @@ class _Reader:
 
     def fault(self, key: str, value: Any, expected: str) -> None:
         """Note one fault: file, key, value, expectation."""
-        shown = _shown(value)
-        self.faults.append(f"{self.source}: {key} = {shown}: expected {expected}")
+        self.faults.append(f"{self.source}: {plain(key)} = {shown(value)}: expected {expected}")
+
+    def unknown(self, key: str, told: str, word: str, known: Sequence[str]) -> None:
+        """Note a key that is none, with the nearest known one where that will be read."""
+        hint = nearest(word, known) if len(self.faults) < MOST_FAULTS else ""
+        self.faults.append(f"{self.source}: {plain(key)}: {told}{hint}")
 
     def pipeline(self, name: str, text: str) -> Pipeline:
-        title = self._header("title", "", str, "a string")
+        line = f"a string: one line of at most {LONGEST_TITLE} characters"
+        title = self._header("title", "", str, line)
+        if len(title) > LONGEST_TITLE or not title.isprintable():
+            self.fault("title", title, line)
         seed = self._header("seed", 0, int, "a whole number from 0 to 2^63 - 1")
         if isinstance(seed, int) and not 0 <= seed < 2**63:
             self.fault("seed", seed, "a whole number from 0 to 2^63 - 1")
@@ -189,10 +204,7 @@ class _Reader:
                 self.fault(key, value, f"it under [{PARAMETERS[key].section}]")
             else:
                 what = "a section" if isinstance(value, dict) else "a key"
-                self.faults.append(
-                    f"{self.source}: {key}: unknown; expected {what} of {', '.join(known)}"
-                    f"{nearest(key, known)}"
-                )
+                self.unknown(key, f"unknown; expected {what} of {', '.join(known)}", key, known)
         for section in SECTIONS:
             self._section(section)
         self._axes()
@@ -201,7 +213,7 @@ class _Reader:
                 self.fixed[parameter.name] = parameter.default
         self._across()
         if self.faults:
-            raise PipelineError(self.faults)
+            raise refusal(self.faults)
         return Pipeline(
             name=name, title=title, seed=seed, fixed=self.fixed, distributions=self.distributions,
             axes=tuple(self.axes.values()), text=text, files=self.files,
@@ -223,13 +235,11 @@ class _Reader:
         for key, value in table.items():
             where = f"{section}.{key}"
             if key not in names:
-                elsewhere = PARAMETERS.get(key)
-                hint = (
-                    f"; it belongs under [{elsewhere.section}]" if elsewhere is not None
-                    else "; it belongs under [axes]" if key == TRIAL
-                    else nearest(key, names)
+                elsewhere = "axes" if key == TRIAL else (
+                    PARAMETERS[key].section if key in PARAMETERS else ""
                 )
-                self.faults.append(f"{self.source}: {where}: unknown key{hint}")
+                told = f"; it belongs under [{elsewhere}]" if elsewhere else ""
+                self.unknown(where, f"unknown key{told}", "" if elsewhere else key, names)
                 continue
             parameter = PARAMETERS[key]
             self.given.add(key)
@@ -245,16 +255,14 @@ class _Reader:
         table = self.document.get("axes", {})
         if not isinstance(table, dict):
             return
+        room = MOST_LISTED
         for key, value in table.items():
             where = f"axes.{key}"
             try:
                 if key == TRIAL:
                     self.axes[key] = parse_trial(value)
                 elif key not in PARAMETERS:
-                    known = [*PARAMETERS, TRIAL]
-                    self.faults.append(
-                        f"{self.source}: {where}: unknown parameter{nearest(key, known)}"
-                    )
+                    self.unknown(where, "unknown parameter", key, [*PARAMETERS, TRIAL])
                 elif key in self.given:
                     section = PARAMETERS[key].section
                     self.fault(
@@ -262,7 +270,8 @@ class _Reader:
                     )
                 else:
                     self.given.add(key)
-                    self.axes[key] = parse_axis(PARAMETERS[key], value)
+                    axis = self.axes[key] = parse_axis(PARAMETERS[key], value, room)
+                    room -= 0 if isinstance(axis.values, range) else len(axis)
             except ValueError as error:
                 self.fault(where, value, str(error))
 
@@ -319,17 +328,43 @@ class _Reader:
                 "axes.trial", trials,
                 "something random to repeat: jitter_px above 0, noise, or a distribution",
             )
-        poses = math.prod(len(axis) for axis in self.axes.values())
+        self._sizes()
+
+    def _sizes(self) -> None:
+        """Judge what the grid and its images take."""
+        lengths = {axis: len(axis) for axis in self.axes.values()}
+        poses = math.prod(lengths.values())
+        if poses > MOST_POSES:
+            self.faults.append(
+                f"{self.source}: axes: {min(poses, 10**300):.3g} poses: expected at most "
+                f"{MOST_POSES:.0e}"
+            )
+        treatments = math.prod(
+            length for axis, length in lengths.items() if axis.stage is not Stage.scene
+        )
+        if treatments > MOST_TREATMENTS:
+            self.faults.append(
+                f"{self.source}: axes: {min(treatments, 10**300):.3g} detector settings times "
+                f"estimators: expected at most {MOST_TREATMENTS:,}"
+            )
         frame = max(self._values("width_px") or (0,)) * max(self._values("height_px") or (0,))
-        if frame > MOST_PIXELS and "full" in self._values("window"):
+        if frame <= MOST_PIXELS:
+            return
+        if "full" in self._values("window"):
             self.fault(
                 "scene.window", self._given_value("window"),
                 f"auto, for a frame of more than {MOST_PIXELS:,} pixels",
             )
-        if poses > MOST_POSES:
-            self.faults.append(
-                f"{self.source}: axes: {poses:.3g} poses: expected at most {MOST_POSES:.0e}"
-            )
+        for name, whole in (
+            ("useAruco3Detection", bool),
+            ("adaptiveThreshConstant", lambda value: value < 1),
+            ("aprilTagQuadDecimate", lambda value: value > 1),
+        ):
+            if any(whole(value) for value in self._values(name)):
+                self.fault(
+                    f"detector.{name}", self._given_value(name),
+                    f"what needs no whole frame, for one of more than {MOST_PIXELS:,} pixels",
+                )
 
     def _ids(self) -> None:
         ids = self._values("marker_id")
@@ -387,24 +422,36 @@ class _Reader:
         for value in self._values("background"):
             if not isinstance(value, str):
                 continue
+            if not value.isprintable():
+                self.fault("scene.background", value, "a path without control characters")
+                continue
             if self.known_files is not None:
                 self.files[value] = self.known_files.get(value, "")
                 continue
-            path = self.folder / value
+            path = os.path.join(self.folder, value)  # noqa: PTH118  (it may be of any length)
             try:
-                image = background_image(str(path.resolve()))
+                width, height = image_size(path)
+                misfit = self._misfit(width, height)
+                if misfit is None or self._misfit(height, width) is None:
+                    # It may be turned as its EXIF tag says.
+                    height, width = background_image(str(Path(path).resolve())).shape
+                    misfit = self._misfit(width, height)
+                    self.files[value] = file_digest(Path(path)) or ""
             except ValueError as error:
                 self.fault("scene.background", value, f"a level or an image file ({error})")
                 continue
-            height, width = image.shape
-            for name, length in (("width_px", width), ("height_px", height)):
-                if self._values(name) and set(self._values(name)) != {length}:
-                    self.fault(
-                        "scene.background", value,
-                        f"an image of exactly the frame's size: it is {width} x {height}, but "
-                        f"{name} = {_shown(self._given_value(name))}",
-                    )
-            self.files[value] = file_digest(path) or ""
+            if misfit is not None:
+                self.fault("scene.background", value, misfit)
+
+    def _misfit(self, width: int, height: int) -> str | None:
+        """Return what was expected of an image where it has not the frame's size."""
+        for name, length in (("width_px", width), ("height_px", height)):
+            if self._values(name) and set(self._values(name)) != {length}:
+                return (
+                    f"an image of exactly the frame's size: it is {width} x {height}, but "
+                    f"{name} = {shown(self._given_value(name))}"
+                )
+        return None
 
     def _detector_fields(self) -> None:
         missing = DetectorSetting.missing_fields()
@@ -416,30 +463,18 @@ class _Reader:
 
 
 def file_digest(path: Path) -> str | None:
-    """Return a file's SHA-256; None where it cannot be read."""
+    """Return the SHA-256 of an image file; None where it cannot be read."""
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError:
+        return hashlib.sha256(read_image(str(path))).hexdigest()
+    except ValueError:
         return None
 
 
-def _shown(value: Any) -> str:
-    """Return a value as TOML would have it, cut where it is long."""
+def _document(text: str, source: str) -> dict[str, Any]:
     try:
-        text = (_inline(value) if isinstance(value, dict) else tomlkit.item(value)).as_string()
-    except (ValueError, TypeError, tomlkit.exceptions.TOMLKitError, RecursionError):
-        text = repr(value)
-    text = " ".join(text.split())
-    return text if len(text) <= 120 else text[:117] + "..."
-
-
-def _inline(table: dict[str, Any]) -> tomlkit.items.InlineTable:
-    inline = tomlkit.inline_table()
-    inline.update(table)
-    return inline
-
-
-_BARE = re.compile(r"[A-Za-z][A-Za-z0-9_.+-]*(/[A-Za-z0-9_.+-]+)*")
+        return read_document(text)
+    except ValueError as error:
+        raise refusal([f"{source}: {error}"]) from None
 
 
 def fixed_at(pipeline: Pipeline, chosen: Mapping[str, Any]) -> Pipeline:
@@ -447,7 +482,7 @@ def fixed_at(pipeline: Pipeline, chosen: Mapping[str, Any]) -> Pipeline:
 
     ``trial`` goes; where ``distance_m`` or ``side_px`` is chosen, the other does.
     """
-    document = tomlkit.parse(pipeline.text)
+    document = _document(pipeline.text, "--at")
     dropped = {TRIAL}
     for name, other in (("distance_m", "side_px"), ("side_px", "distance_m")):
         if name in chosen and other not in chosen:
@@ -458,61 +493,65 @@ def fixed_at(pipeline: Pipeline, chosen: Mapping[str, Any]) -> Pipeline:
                 del table[name]
     for name, value in chosen.items():
         _write(document, name, list(value) if isinstance(value, tuple) else value)
-    return Pipeline.from_text(
-        tomlkit.dumps(document), name=pipeline.name, source="--at", folder=pipeline.folder
-    )
+    reader = _Reader(document, "--at", Path(pipeline.folder), None)
+    one = reader.pipeline(pipeline.name, pipeline.text)
+    return dataclasses.replace(one, text=tomlkit.dumps(document))
 
 
-def with_settings(text: str, settings: Sequence[str], source: str) -> str:
-    """Return pipeline text with "key=value" settings written in.
+def _chosen(settings: Sequence[str]) -> dict[str, Any]:
+    """Return the values that "key=value" settings stand for.
 
-    A parameter's name needs no section. A list or a table of values makes (or replaces) an axis;
-    a single value or a distribution makes it fixed or drawn. A bare word counts as a string.
+    A parameter's name needs no section, and a bare word counts as a string.
 
     Raises
     ------
     PipelineError
         One line for each setting that is not of that form.
     """
-    try:
-        document = tomlkit.parse(text)
-    except (tomlkit.exceptions.TOMLKitError, RecursionError) as error:
-        raise PipelineError([f"{source}: not TOML: {error}"]) from None
-    faults = []
+    faults: list[str] = []
+    chosen: dict[str, Any] = {}
     for setting in settings:
-        key, equals, written = setting.partition("=")
-        key, written = key.strip(), written.strip()
+        key, equals, written = (part.strip() for part in setting.partition("="))
         section, _, name = key.rpartition(".")
+        start = f"--set {plain(setting)}: "
         if not equals or not name:
-            faults.append(f"--set {setting}: expected key=value, such as tilt_deg=45")
+            faults.append(f"{start}expected key=value, such as tilt_deg=45")
             continue
-        if _BARE.fullmatch(written) and written not in ("true", "false", "inf", "nan"):
-            written = f'"{written}"'
         try:
-            parsed = tomllib.loads(f"value = {written}")
-            value = parsed.pop("value")
-            if parsed:
-                raise tomllib.TOMLDecodeError
-        except (tomllib.TOMLDecodeError, RecursionError):
-            faults.append(f"--set {setting}: expected a TOML value, such as [0, 45] or 'text'")
+            value = read_value(quoted_if_bare(written))
+        except ValueError:
+            faults.append(f"{start}expected a TOML value, such as [0, 45] or 'text'")
             continue
+        home = "axes" if name == TRIAL else (
+            PARAMETERS[name].section if name in PARAMETERS else ""
+        )
+        if not home and name not in HEADER:
+            known = [*PARAMETERS, TRIAL, *HEADER]
+            hint = nearest(name, known) if len(faults) < MOST_FAULTS else ""
+            faults.append(f"{start}unknown parameter{hint}")
+        elif home and section not in ("", home, "axes"):
+            faults.append(f"{start}expected {name} or {home}.{name}")
+        else:
+            chosen[name] = value
+    if faults:
+        raise refusal(faults)
+    return chosen
+
+
+def _apply(document: Any, chosen: Mapping[str, Any]) -> None:
+    """Write chosen values into a document, of plain tables or of tomlkit's.
+
+    A list or a table of values makes (or replaces) an axis; a single value or a distribution
+    makes it fixed or drawn.
+    """
+    for name, value in chosen.items():
         if name in HEADER:
             document[name] = value
             continue
-        if name not in PARAMETERS and name != TRIAL:
-            known = [*PARAMETERS, TRIAL, *HEADER]
-            faults.append(f"--set {setting}: unknown parameter{nearest(name, known)}")
-            continue
         home = "axes" if name == TRIAL else PARAMETERS[name].section
-        if section not in ("", home, "axes"):
-            faults.append(f"--set {setting}: expected {name} or {home}.{name}")
-            continue
-        if not all(isinstance(document.get(table, {}), dict) for table in (home, "axes")):
-            continue  # told when the text is read
-        _write(document, name, value)
-    if faults:
-        raise PipelineError(faults)
-    return tomlkit.dumps(document)
+        if all(isinstance(document.get(table, {}), dict) for table in (home, "axes")):
+            _write(document, name, value)
+        # Otherwise it is told when the document is read.
 
 
 def _write(document: Any, name: str, value: Any) -> None:
@@ -523,8 +562,15 @@ def _write(document: Any, name: str, value: Any) -> None:
     if other != place and name in document.get(other, {}):
         del document[other][name]
     if place not in document:
-        document[place] = tomlkit.table()
-    document[place][name] = _inline(value) if isinstance(value, dict) else value
+        document[place] = {}
+    kept = isinstance(document, tomlkit.TOMLDocument)
+    document[place][name] = _inline(value) if kept and isinstance(value, dict) else value
+
+
+def _inline(table: dict[str, Any]) -> tomlkit.items.InlineTable:
+    inline = tomlkit.inline_table()
+    inline.update(table)
+    return inline
 
 
 def _is_axis(name: str, value: Any) -> bool:

@@ -1,0 +1,132 @@
+"""Image files that a pipeline names: their size is read and judged before they are decoded."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+MOST_PIXELS = 500_000_000
+"""The largest image that is read; also the largest frame that is rendered whole."""
+
+HEADER_BYTES = 1_000_000
+"""How much of a file is looked through for the image's size."""
+
+BYTES_PER_PIXEL = 8
+"""The most that a pixel takes in a file, beside the header: four channels of 16 bits."""
+
+LONGEST_PATH = 4096
+
+JPEG = b"\xff\xd8\xff"
+"""How such a file begins."""
+
+_BLANK = rb"(?:[ \t\r\n]|#[^\r\n]*+[\r\n])++"
+_PORTABLE = re.compile(rb"P[1-6]" + _BLANK + rb"([0-9]{1,9})" + _BLANK + rb"([0-9]{1,9})[\s#]")
+
+
+def read_regular(path: str | Path, most: int) -> bytes:
+    """Return up to ``most`` + 1 bytes of a file; no pipe, device or folder is opened.
+
+    Raises
+    ------
+    OSError, ValueError
+        Where there is no such file, it cannot be read, or is no regular file.
+    """
+    if len(str(path)) > LONGEST_PATH:
+        raise ValueError("File name too long")
+    if not stat.S_ISREG(Path(path).stat().st_mode):
+        raise ValueError("Is a directory" if Path(path).is_dir() else "Not a regular file")
+    with Path(path).open("rb") as file:
+        return file.read(most + 1)
+
+
+def image_size(path: str) -> tuple[int, int]:
+    """Return width and height of an image file, from its header.
+
+    ValueError where it is no PNG, JPEG, BMP or PGM (PPM, PBM) image, or too large to be read.
+    """
+    try:
+        size = _size(read_regular(path, HEADER_BYTES - 1))
+        total = Path(path).stat().st_size
+    except OSError as error:
+        raise ValueError(error.strerror or "unreadable") from None
+    if size is None:
+        raise ValueError("not an image that OpenCV can read: a PNG, JPEG, BMP or PGM")
+    width, height = size
+    if not 0 < width * height <= MOST_PIXELS:
+        raise ValueError(f"{width} x {height}; at most {MOST_PIXELS:,} pixels are read")
+    if total > BYTES_PER_PIXEL * width * height + HEADER_BYTES:
+        raise ValueError(f"{total:,} bytes are too many for an image of {width} x {height}")
+    return width, height
+
+
+def read_image(path: str) -> bytes:
+    """Return an image file as it is, encoded; ValueError as :func:`image_size`."""
+    width, height = image_size(path)
+    try:
+        return read_regular(path, BYTES_PER_PIXEL * width * height + HEADER_BYTES)
+    except OSError as error:
+        raise ValueError(error.strerror or "unreadable") from None
+
+
+def decode_grey(path: str) -> NDArray[np.uint8]:
+    """Return an image file as grey levels (height, width); ValueError as :func:`image_size`."""
+    size = image_size(path)
+    encoded = read_image(path)
+    with tempfile.TemporaryFile() as said:
+        # What the decoders write to standard error by themselves would stand beside our one line.
+        kept = os.dup(2)
+        os.dup2(said.fileno(), 2)
+        try:
+            image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
+        except cv2.error:
+            image = None
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+        # A JPEG that ends early is filled up with grey, and only this tells.
+        damaged = encoded.startswith(JPEG) and said.seek(0, os.SEEK_END) > 0
+    # OpenCV turns an image as its EXIF tag says.
+    if image is None or damaged or sorted(image.shape) != sorted(size):
+        raise ValueError("not an image that OpenCV can read")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _size(header: bytes) -> tuple[int, int] | None:
+    """Return the width and height that a file's beginning declares; None where it does not."""
+    if header.startswith(b"\x89PNG\r\n\x1a\n") and header[12:16] == b"IHDR":
+        return _big(header[16:20]), _big(header[20:24])
+    if header.startswith(b"BM") and len(header) >= 26:
+        if header[14:18] == b"\x0c\0\0\0":
+            return _little(header[18:20]), _little(header[20:22])
+        height = int.from_bytes(header[22:26], "little", signed=True)
+        return _little(header[18:22]), abs(height)
+    if header.startswith(JPEG):
+        return _jpeg_size(header)
+    match = _PORTABLE.match(header)
+    return (int(match[1]), int(match[2])) if match else None
+
+
+def _big(digits: bytes) -> int:
+    return int.from_bytes(digits, "big")
+
+
+def _little(digits: bytes) -> int:
+    return int.from_bytes(digits, "little")
+
+
+def _jpeg_size(header: bytes) -> tuple[int, int] | None:
+    """Return what the frame header says; the segments before it are passed over."""
+    at = 2
+    while at + 9 <= len(header) and header[at] == 0xFF:
+        kind, length = header[at + 1], _big(header[at + 2 : at + 4])
+        if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC):
+            return _big(header[at + 7 : at + 9]), _big(header[at + 5 : at + 7])
+        at += 1 if kind == 0xFF else 2 + length
+    return None

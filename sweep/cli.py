@@ -446,7 +446,7 @@ def _report(chosen: argparse.Namespace) -> int:
     with reading(store.url):
         if "cost/tradeoff" in store.group:
             trade = xr.open_zarr(
-                store.data_url, group="cost/tradeoff", consolidated=False, zarr_format=3
+                store.source, group="cost/tradeoff", consolidated=False, zarr_format=3
             ).load()
         results = open_dataset(store.url)
     subject = Subject(store.url, results, store.pipeline, store.about, trade)

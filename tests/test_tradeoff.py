@@ -121,7 +121,7 @@ def command(*arguments):
 def told(*arguments):
     """Return what the command prints, where it is content."""
     code, out, err = command(*arguments)
-    assert (code, err) == (0, "")
+    assert (code, err) == (0, ""), err
     return out
 
 

@@ -20,6 +20,7 @@ from distributed.comm.core import CommClosedError, connect
 from distributed.comm.registry import backends
 from distributed.core import send_recv
 
+from sweep.engine.apart import SINGLE_THREADED
 from sweep.engine.interrupts import in_main_thread
 from sweep.engine.provenance import fingerprint
 from sweep.errors import RunError, StoreError
@@ -37,10 +38,7 @@ ASKING_S = 2.0
 ENCRYPTED = ("tls://", "wss://")
 
 WORKER_ENVIRONMENT = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "OPENCV_FOR_THREADS_NUM": "1",
+    **SINGLE_THREADED,
     "MALLOC_TRIM_THRESHOLD_": "268435456",
     "MALLOC_MMAP_THRESHOLD_": "268435456",
 }

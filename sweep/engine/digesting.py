@@ -21,11 +21,13 @@ class DigestingStore(WrapperStore[Store]):
     """A store beside which the digests of the keys that were written or read whole are kept.
 
     A local one refuses keys whose folder is a link that leads out of it. ``instead`` has what is
-    read in place of keys that are damaged, until they are written.
+    read in place of keys that are damaged, until they are written; ``keeps`` is kept alive as long
+    as the store.
     """
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, keeps: object = None) -> None:
         super().__init__(store)
+        self._keeps = keeps
         self.digests: dict[str, int] = {}
         self.instead: dict[str, Buffer] = {}
         self._root = os.path.realpath(store.root) if isinstance(store, LocalStore) else None
@@ -36,7 +38,7 @@ class DigestingStore(WrapperStore[Store]):
         return self._store
 
     def _with_store(self, store: Store) -> Self:
-        new = type(self)(store)
+        new = type(self)(store, self._keeps)
         new.digests, new.instead = self.digests, self.instead
         return new
 

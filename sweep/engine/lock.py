@@ -48,7 +48,8 @@ def locked(store: RunStore) -> Iterator[None]:
 
     def beat() -> None:
         while not done.wait(BEAT_S):
-            with contextlib.suppress(OSError):
+            # Whatever a disk or a server says now, the next beat may be heard.
+            with contextlib.suppress(Exception):
                 now = get(place, KEY)
                 if now is not None and now.get("token") != mine["token"]:
                     return  # taken over while this process slept
@@ -61,7 +62,7 @@ def locked(store: RunStore) -> Iterator[None]:
     finally:
         done.set()
         heart.join()
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(Exception):
             sync(place.delete(KEY))
 
 

@@ -165,6 +165,8 @@ def execute(
         match(pipeline, open_store(source))
     if opened is None:
         check_place(url)
+    from sweep.engine.cluster import threads  # noqa: PLC0415  (slow to import)
+
     with Interrupts() as interrupts, ThreadPoolExecutor(1) as beside:
         # Compiling and measuring in a child while the workers' processes come up.
         measuring = None if opened is not None else beside.submit(
@@ -172,8 +174,8 @@ def execute(
         )
         with _cluster(pipeline, workers, scheduler) as client:
             if measuring is not None:
-                threads = sum(client.nthreads().values())
-                extents = block_extents(pipeline, measuring.result(), threads, block_s)
+                count = max(threads(client), 1)
+                extents = block_extents(pipeline, measuring.result(), count, block_s)
                 if overwrite and exists(url):
                     remove_store(url)
                 opened = create_store(url, pipeline, extents)
@@ -334,7 +336,7 @@ class _Run:
 
         if future.status in ("cancelled", "lost"):
             raise RunError(
-                f"{self._store.url}: the scheduler went away; the same command continues"
+                "the scheduler went away; the same command continues once one runs again"
             )
         error = future.exception()
         if isinstance(error, StoreError):
@@ -360,7 +362,7 @@ class _Room:
     def __init__(self, client: Client) -> None:
         self._client = client
         self._asked = 0.0
-        self._blocks = 0
+        self._blocks = WINDOW
         self._seen = time.monotonic()
 
     def __call__(self) -> int:
@@ -370,9 +372,8 @@ class _Room:
 
             there = threads(self._client)
             self._asked = time.monotonic()
-            self._blocks = WINDOW * max(there, 1)
             if there:
-                self._seen = self._asked
+                self._blocks, self._seen = WINDOW * there, self._asked
         if time.monotonic() > self._seen + LONELY_S:
             raise RunError(
                 f"there have been no workers for {LONELY_S:.0f} s; start some, and the same "

@@ -84,8 +84,13 @@ class RunStore:
 
     @property
     def data_url(self) -> str:
-        """What to open with ``xarray.open_zarr``."""
+        """What a user opens with ``xarray.open_zarr``."""
         return f"{self.url}/{self.run_id}" if is_remote(self.url) else self.url
+
+    @property
+    def source(self) -> str | Store:
+        """What is opened with ``xarray.open_zarr`` here."""
+        return self.place.below if is_remote(self.url) else self.url
 
     def array(self, name: str) -> zarr.Array[Any]:
         """Return an array by its path; its metadata is read once."""
@@ -161,7 +166,10 @@ def _store_at(url: str, *, read_only: bool) -> Store:
     if not is_remote(url):
         return LocalStore(url, read_only=read_only)
     try:
-        return FsspecStore.from_url(url, read_only=read_only)
+        # What others have written since is listed too.
+        return FsspecStore.from_url(
+            url, storage_options={"use_listings_cache": False}, read_only=read_only
+        )
     except ImportError as error:
         raise StoreError(f"{url}: {error}") from None
     except ValueError as error:
@@ -172,7 +180,7 @@ def _run_at(url: str) -> str | None:
     """Return the run whose data are those of a remote store; None where there is no store."""
     with telling(url, "reached"):
         try:
-            pointer = zarr.open_group(_store_at(url, read_only=True), mode="r")
+            pointer = _open_group(_store_at(url, read_only=True), "r")
         except (FileNotFoundError, zarr.errors.GroupNotFoundError):
             return None
     run_id = pointer.attrs.get(POINTER)
@@ -211,14 +219,20 @@ def place_of(url: str, mode: str = "r") -> DigestingStore:
     if mode == "r" or not Path("/proc/self/fd").is_dir():
         return DigestingStore(LocalStore(url, read_only=mode == "r"))
     try:
-        folder = os.open(url, os.O_RDONLY | os.O_DIRECTORY)
+        folder = _Folder(url)
     except NotADirectoryError:
         raise StoreError(_something_else(url)) from None
     except OSError as error:
         raise StoreError(f"{url}: cannot be read: {error.strerror}") from None
-    held = DigestingStore(LocalStore(f"/proc/self/fd/{folder}"))
-    weakref.finalize(held, os.close, folder)
-    return held
+    return DigestingStore(LocalStore(f"/proc/self/fd/{folder.number}"), folder)
+
+
+class _Folder:
+    """A folder that is held open as long as this object lives."""
+
+    def __init__(self, path: str) -> None:
+        self.number = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+        weakref.finalize(self, os.close, self.number)
 
 
 def open_store(url: str, mode: str = "r") -> RunStore:
@@ -234,7 +248,7 @@ def open_store(url: str, mode: str = "r") -> RunStore:
     try:
         attributes = dict(_open_group(place, mode).attrs)
     except PermissionError as error:
-        raise StoreError(f"{url}: cannot be read: {error.strerror}") from None
+        raise StoreError(f"{url}: cannot be read: {_reason(error)}") from None
     except (KeyError, TypeError, ValueError, OSError, zarr.errors.BaseZarrError):
         if read_manifest(place)[0] is None:
             raise StoreError(_something_else(url)) from None
@@ -279,7 +293,9 @@ def store_of(
 
 
 def _open_group(place: Store, mode: str) -> zarr.Group:
-    return zarr.open_group(place, mode=mode, use_consolidated=False)  # type: ignore[arg-type]
+    return zarr.open_group(
+        place, mode=mode, zarr_format=3, use_consolidated=False  # type: ignore[arg-type]
+    )
 
 
 def schema_faults(store: RunStore) -> dict[str, str]:
@@ -328,7 +344,7 @@ async def _listed(place: Store, prefix: str) -> list[str]:
 
 
 def check_place(url: str) -> None:
-    """See that a local store can be made at a place, before any work is done for it.
+    """See that a store can be made at a place, before any work is done for it.
 
     Raises
     ------
@@ -336,6 +352,11 @@ def check_place(url: str) -> None:
         Where it cannot be written.
     """
     if is_remote(_checked_url(url)):
+        trial = f".sweep-{uuid.uuid4().hex}"
+        with telling(url, "written"):
+            there = _store_at(url, read_only=False)
+            put(there, trial, {})
+            sync(there.delete(trial))
         return
     with telling(url, "written"):
         Path(url).parent.mkdir(parents=True, exist_ok=True)
@@ -356,9 +377,9 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
         if is_remote(url):
             _lay_out(_store_at(f"{url}/{run_id}", read_only=False), pipeline, extents, run_id)
             # The place points to it once it is whole.
-            zarr.open_group(
-                _store_at(url, read_only=False), mode="w-", attributes={POINTER: run_id}
-            )
+            put(_store_at(url, read_only=False), "zarr.json", {
+                "zarr_format": 3, "node_type": "group", "attributes": {POINTER: run_id},
+            })
         else:
             # Beside its place and then moved there: a kill between leaves no half a store.
             check_place(url)
@@ -379,7 +400,7 @@ def _beside(url: str, ending: str) -> Path:
 def _lay_out(to: Store, pipeline: Pipeline, extents: tuple[int, ...], run_id: str) -> None:
     """Write a store's coordinates, its empty arrays, its attributes, and its manifest."""
     place = DigestingStore(to)
-    group = zarr.open_group(place, mode="w-", use_consolidated=False)
+    group = _open_group(place, "w-")
     planned = planned_arrays(pipeline, extents)
     for array in planned:
         array.create(group)
@@ -596,13 +617,16 @@ def _write_groups(
         # Consolidated metadata is not part of the Zarr 3 specification; xarray reads it, and
         # warns where it is missing.
         warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
-        old = {key for name in groups for key in sync(_own_keys(store, name))} | {"zarr.json"}
-        files = {key: value for key, value in files.items() if key not in old}
+        old = tuple(path for name in groups for path in sync(_arrays_in(store, name)))
+        files = {
+            key: value for key, value in files.items()
+            if key not in ("zarr.json", *(f"{name}/zarr.json" for name in groups))
+            and not key.startswith(tuple(f"{path}/" for path in old))
+        }
         # What is being written is not vouched for until it is whole.
         write_manifest(store.place, Manifest(dict(store.group.attrs), files))
-        for key in old - {"zarr.json"}:
-            with contextlib.suppress(FileNotFoundError):
-                sync(store.place.delete(key))
+        for path in old:
+            sync(store.place.delete_dir(path))
         store.place.digests.clear()
         for name, content in groups.items():
             # Zarr 3 specifies strings of any length, none of a fixed one.
@@ -619,16 +643,15 @@ def _write_groups(
         write_manifest(store.place, Manifest(dict(store.group.attrs), {**files, **written}))
 
 
-async def _own_keys(store: RunStore, name: str) -> list[str]:
-    """Return the keys of a group and its arrays, without those of the groups in it."""
-    keys = [key async for key in store.place.list_prefix(f"{name}/")]
-    within: list[str] = []
-    for key in keys:
-        if key.endswith("/zarr.json") and key != f"{name}/zarr.json":
-            content = parsed(await store.place.get(key, default_buffer_prototype())) or {}
-            if content.get("node_type") == "group":
-                within.append(key.removesuffix("zarr.json"))
-    return [key for key in keys if not key.startswith(tuple(within))]
+async def _arrays_in(store: RunStore, name: str) -> list[str]:
+    """Return the paths in a group that are not groups themselves."""
+    paths = []
+    for child in await _listed(store.place, name):
+        path = f"{name}/{child}"
+        document = await store.place.get(f"{path}/zarr.json", default_buffer_prototype())
+        if child != "zarr.json" and (parsed(document) or {}).get("node_type") != "group":
+            paths.append(path)
+    return paths
 
 
 def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
@@ -642,7 +665,7 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
     store = open_store(os.fspath(url))
     import xarray as xr  # noqa: PLC0415  (slow to import, and workers do without)
 
-    dataset: xr.Dataset = xr.open_zarr(store.data_url, consolidated=False, zarr_format=3)
+    dataset: xr.Dataset = xr.open_zarr(store.source, consolidated=False, zarr_format=3)
     # NumPy's strings of any length are new, and much of xarray and pandas does without them.
     texts = {name: (value.dims, value.to_numpy().astype(object), value.attrs)
              for name, value in dataset.coords.items() if value.dtype.kind == "T"}

@@ -1,0 +1,592 @@
+"""Remote: a store on an S3 server, a scheduler over TLS, workers that come and go; on loopback."""
+
+import contextlib
+import dataclasses
+import hashlib
+import http.client
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import boto3
+import dask
+import pytest
+import trustme
+
+from sweep.cli import main
+from sweep.engine.cluster import external
+from sweep.engine.store import committed, open_store
+from sweep.errors import StoreError
+from sweep.kernel import run_block
+from sweep.plan.grid import Block, scene_axes
+from sweep.plan.pipeline import Pipeline
+
+TIMEOUT_S = 240.0
+
+SMALL = """
+title = "A small grid"
+seed = 5
+[marker]
+size_m = 0.04
+[pose]
+jitter_px = 0.5
+azimuth_deg = { uniform = [0, 360] }
+[axes]
+dictionary = ["DICT_4X4_50", "DICT_5X5_50"]
+distance_m = { geom = [0.2, 1.5, 4] }
+tilt_deg = [0, 50]
+solver = ["ippe_square", "iterative"]
+trial = 3
+"""
+
+MANY = "[axes]\ntrial = 5000\ndistance_m = [0.05, 0.08]\n[pose]\njitter_px = 0.5\n"
+
+RUN = """
+import sys
+from sweep.engine.runner import execute
+from sweep.errors import StoreError, SweepError
+from sweep.plan.pipeline import Pipeline
+
+if __name__ == "__main__":
+    path, store, scheduler = sys.argv[1:]
+    try:
+        execute(
+            Pipeline.from_toml(path), store, workers=2, scheduler=scheduler or None, block_s=0.5
+        )
+    except SweepError as error:
+        sys.exit(str(error))
+"""
+"""As `sweep run`, its blocks small."""
+
+DIGESTS = """
+import hashlib, json, sys
+import sweep
+with sweep.open(sys.argv[1]) as results:
+    print(json.dumps(
+        {n: hashlib.sha256(v.to_numpy().tobytes()).hexdigest() for n, v in results.items()}
+    ))
+"""
+
+
+def wait_until(true, what):
+    deadline = time.monotonic() + TIMEOUT_S
+    while not true():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.05)
+
+
+def python(*arguments, **options):
+    return subprocess.run(
+        [sys.executable, *map(str, arguments)], capture_output=True, text=True, check=False,
+        timeout=TIMEOUT_S, **options,
+    )
+
+
+def sweep_command(*arguments, **options):
+    return python("-m", "sweep.cli", *arguments, **options)
+
+
+def expected(text):
+    """What a store must hold, computed here as one block, without a store."""
+    pipeline = Pipeline.from_text(text)
+    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
+    values = run_block(pipeline, Block((0,) * len(lengths), lengths)).values
+    return {name: hashlib.sha256(v.tobytes()).hexdigest() for name, v in values.items()}
+
+
+def digests(url):
+    ran = python("-c", DIGESTS, url)
+    assert ran.returncode == 0, ran.stderr
+    return json.loads(ran.stdout)
+
+
+@contextlib.contextmanager
+def started(log, *arguments, environment=None):
+    """Run a Python command beside the test; kill it when the test is over."""
+    with Path(log).open("w") as told, subprocess.Popen(
+        [sys.executable, *map(str, arguments)], stdout=told, stderr=told,
+        start_new_session=True, env={**os.environ, **(environment or {})},
+    ) as process:
+        try:
+            yield process
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+
+
+@pytest.fixture
+def small(tmp_path):
+    path = tmp_path / "small.toml"
+    path.write_text(SMALL)
+    return path
+
+
+@pytest.fixture
+def many(tmp_path):
+    (tmp_path / "run.py").write_text(RUN)
+    path = tmp_path / "many.toml"
+    path.write_text(MANY)
+    return path
+
+
+# --- the S3 server ---
+
+
+@dataclasses.dataclass
+class Bucket:
+    """A bucket of an S3 server that checks signatures."""
+
+    endpoint: str
+    key: str
+    secret: str
+
+    def client(self):
+        return boto3.client("s3")
+
+    def keys(self, prefix=""):
+        pages = self.client().get_paginator("list_objects_v2").paginate(
+            Bucket="bucket", Prefix=prefix
+        )
+        return [entry["Key"] for page in pages for entry in page.get("Contents", [])]
+
+    def content(self):
+        client = self.client()
+        return {
+            key: client.get_object(Bucket="bucket", Key=key)["Body"].read() for key in self.keys()
+        }
+
+    def told_in(self, text):
+        """Tell whether a text holds the credentials."""
+        return self.key in text or self.secret in text
+
+
+@pytest.fixture(scope="module")
+def bucket(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("s3")
+    log = folder / "server.log"
+    with started(log, "-m", "moto.server", "-H", "127.0.0.1", "-p", "0") as server:
+        def endpoint():
+            return re.search(r"http://127\.0\.0\.1:\d+", log.read_text())
+
+        wait_until(lambda: endpoint() or server.poll() is not None, "the S3 server does not start")
+        url = endpoint()[0]
+        with pytest.MonkeyPatch.context() as patch:
+            for name in [name for name in os.environ if name.startswith("AWS_")]:
+                patch.delenv(name)
+            for name, value in {
+                "AWS_ENDPOINT_URL": url, "AWS_DEFAULT_REGION": "eu-central-1",
+                "AWS_CONFIG_FILE": os.devnull, "AWS_SHARED_CREDENTIALS_FILE": os.devnull,
+                "AWS_EC2_METADATA_DISABLED": "true",
+                "AWS_ACCESS_KEY_ID": "any", "AWS_SECRET_ACCESS_KEY": "any",
+            }.items():
+                patch.setenv(name, value)
+            key = _account()
+            patch.setenv("AWS_ACCESS_KEY_ID", key["AccessKeyId"])
+            patch.setenv("AWS_SECRET_ACCESS_KEY", key["SecretAccessKey"])
+            # From here on signatures count.
+            where = http.client.HTTPConnection(url.removeprefix("http://"), timeout=TIMEOUT_S)
+            with contextlib.closing(where):
+                where.request("POST", "/moto-api/reset-auth", b"0", {"Content-Type": "text/plain"})
+                assert where.getresponse().status == 200
+            yield Bucket(url, key["AccessKeyId"], key["SecretAccessKey"])
+
+
+def _account():
+    """Make the bucket, and a user who may use it; return the user's credentials."""
+    boto3.setup_default_session()
+    boto3.client("s3").create_bucket(
+        Bucket="bucket", CreateBucketConfiguration={"LocationConstraint": "eu-central-1"}
+    )
+    users = boto3.client("iam")
+    users.create_user(UserName="sweep")
+    users.put_user_policy(
+        UserName="sweep", PolicyName="s3",
+        PolicyDocument=json.dumps({
+            "Version": "2012-10-17",
+            "Statement": [{"Effect": "Allow", "Action": "s3:*", "Resource": "*"}],
+        }),
+    )
+    key = users.create_access_key(UserName="sweep")["AccessKey"]
+    boto3.setup_default_session(
+        aws_access_key_id=key["AccessKeyId"], aws_secret_access_key=key["SecretAccessKey"]
+    )
+    return key
+
+
+# --- the cluster ---
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory):
+    """Certificates of two authorities, and the settings by which Dask finds them."""
+    settings = {}
+    for name in ("ours", "theirs"):
+        folder = tmp_path_factory.mktemp(name)
+        authority = trustme.CA()
+        issued = authority.issue_cert("127.0.0.1")
+        authority.cert_pem.write_to_path(folder / "ca.pem")
+        issued.cert_chain_pems[0].write_to_path(folder / "cert.pem")
+        issued.private_key_pem.write_to_path(folder / "key.pem")
+        settings[name] = {
+            "ca": folder / "ca.pem", "cert": folder / "cert.pem", "key": folder / "key.pem",
+        }
+    return settings
+
+
+def client_environment(settings):
+    """Dask's configuration of a client."""
+    return {
+        "DASK_DISTRIBUTED__COMM__TLS__CA_FILE": str(settings["ca"]),
+        "DASK_DISTRIBUTED__COMM__TLS__CLIENT__CERT": str(settings["cert"]),
+        "DASK_DISTRIBUTED__COMM__TLS__CLIENT__KEY": str(settings["key"]),
+    }
+
+
+class Cluster:
+    """A scheduler and workers, each a process; all end with the ``with`` block."""
+
+    def __init__(self, folder, settings=None):
+        folder.mkdir()
+        self._folder = folder
+        self._stack = contextlib.ExitStack()
+        self._count = 0
+        self._options = [] if settings is None else [
+            "--tls-ca-file", settings["ca"], "--tls-cert", settings["cert"],
+            "--tls-key", settings["key"],
+        ]
+        self._protocol = "tcp" if settings is None else "tls"
+
+    def __enter__(self):
+        file = self._folder / "scheduler.json"
+        self.scheduler = self._start(
+            "dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--protocol", self._protocol,
+            "--dashboard-address", "127.0.0.1:0", "--scheduler-file", file,
+        )
+        wait_until(lambda: file.exists() and file.stat().st_size, "the scheduler does not start")
+        self.address = json.loads(file.read_text())["address"]
+        return self
+
+    def __exit__(self, *_):
+        self._stack.close()
+
+    def worker(self):
+        """Start a worker of one thread, without a nanny that would begin it again."""
+        return self._start(
+            "dask_worker", self.address, "--host", "127.0.0.1", "--nthreads", "1",
+            "--no-nanny", "--dashboard-address", "127.0.0.1:0", "--local-directory", self._folder,
+        )
+
+    def log(self):
+        """What all its processes said."""
+        return "\n".join(path.read_text() for path in self._folder.glob("*.log"))
+
+    def _start(self, name, *arguments):
+        self._count += 1
+        return self._stack.enter_context(started(
+            self._folder / f"{name}-{self._count}.log", "-m", f"distributed.cli.{name}",
+            *arguments, *self._options,
+            environment={"DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "5s"},
+        ))
+
+
+# --- stores on the server ---
+
+
+def test_remote_store_of_a_tls_cluster_holds_what_a_local_one_does(
+    bucket, certificates, small, tmp_path
+):
+    url = "s3://bucket/all.zarr"
+    told = ""
+    with Cluster(tmp_path / "cluster", certificates["ours"]) as cluster:
+        cluster.worker()
+        cluster.worker()
+        ran = sweep_command(
+            "run", small, "--store", url, "--scheduler", cluster.address, "--json",
+            env={**os.environ, **client_environment(certificates["ours"])},
+        )
+        assert ran.returncode == 0, ran.stderr
+        assert ran.stderr == ""
+        assert json.loads(ran.stdout)["computed_scenes"] == 48
+        told += ran.stdout + ran.stderr
+        assert digests(url) == expected(SMALL)
+        state = sweep_command("status", url, "--json")
+        assert json.loads(state.stdout)["finished"], state.stderr
+        told += state.stdout + state.stderr + cluster.log()
+    assert "tls://127.0.0.1" in told
+    assert not bucket.told_in(told)
+    for key, content in bucket.content().items():
+        assert not bucket.told_in(key)
+        assert not bucket.told_in(content.decode("latin-1")), key
+
+
+@pytest.mark.long
+def test_remote_store_is_left_alone_overwritten_and_reused(bucket, small):
+    url = "s3://bucket/plain.zarr"
+    run = ("run", small, "--workers", "2", "--json")
+    outcomes = []
+    for options in (
+        ("--store", url),
+        ("--store", url),
+        ("--store", url, "--overwrite"),
+        ("--store", "s3://bucket/grown.zarr", "--reuse", url, "--set", "tilt_deg=[0, 50, 60]"),
+    ):
+        ran = sweep_command(*run, *options)
+        assert (ran.returncode, ran.stderr) == (0, ""), ran.stderr
+        assert not bucket.told_in(ran.stdout)
+        outcomes.append(json.loads(ran.stdout)["computed_scenes"])
+        if len(outcomes) == 3:
+            assert digests(url) == expected(SMALL)
+    assert outcomes == [48, 0, 48, 24]
+    grown = SMALL.replace("tilt_deg = [0, 50]", "tilt_deg = [0, 50, 60]")
+    assert digests("s3://bucket/grown.zarr") == expected(grown)
+    other = sweep_command("run", small, "--store", url, "--set", "seed=6")
+    assert other.returncode == 2
+    assert "seed: the store has 5, this run 6" in other.stderr
+
+
+@pytest.mark.long
+def test_killed_remote_run_is_told_and_continues(bucket, many, tmp_path):
+    url = "s3://bucket/killed.zarr"
+    with started(tmp_path / "run.log", tmp_path / "run.py", many, url, "") as running:
+        wait_until(
+            lambda: sum("/commits/receipt/c/" in key for key in bucket.keys("killed.zarr")) > 1
+            or running.poll() is not None, "no block is committed",
+        )
+        assert running.poll() is None, (tmp_path / "run.log").read_text()
+        held = sweep_command("run", many, "--store", url)
+        assert held.returncode == 2
+        assert f"process {running.pid} on" in held.stderr
+        os.killpg(running.pid, signal.SIGKILL)
+        running.wait(TIMEOUT_S)
+    state = json.loads(sweep_command("status", url, "--json").stdout)
+    assert 0 < state["blocks_done"] < state["blocks"]
+    assert state["writer"] is None
+    ran = sweep_command("run", many, "--store", url, "--workers", "2", "--json")
+    assert (ran.returncode, ran.stderr) == (0, "")
+    summary = json.loads(ran.stdout)
+    assert summary["computed_blocks"] == state["blocks"] - state["blocks_done"]
+    assert digests(url) == expected(MANY)
+
+
+REFUSED = {
+    "wrong secret": ({"AWS_SECRET_ACCESS_KEY": "wrong"}, "s3://bucket/no.zarr"),
+    "wrong key": ({"AWS_ACCESS_KEY_ID": "AKIAWRONG"}, "s3://bucket/no.zarr"),
+    "no credentials": (
+        {"AWS_ACCESS_KEY_ID": "", "AWS_SECRET_ACCESS_KEY": ""}, "s3://bucket/no.zarr",
+    ),
+    "no such bucket": ({}, "s3://nowhere/no.zarr"),
+    "server down": ({"AWS_ENDPOINT_URL": "http://127.0.0.1:9"}, "s3://bucket/no.zarr"),
+    "no such protocol": ({}, "s4://bucket/no.zarr"),
+}
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, id=case, marks=() if case == "wrong secret" else pytest.mark.long)
+        for case in REFUSED
+    ],
+)
+def test_server_that_refuses_is_told_in_a_line(case, bucket, small):
+    settings, url = REFUSED[case]
+    environment = {**os.environ, **settings}
+    ran = sweep_command(
+        "run", small, "--store", url, "--workers", "1",
+        env={name: value for name, value in environment.items() if value},
+    )
+    assert ran.returncode == 2, ran.stderr
+    assert ran.stdout == ""
+    assert ran.stderr.startswith(f"{url}: cannot be ")
+    assert len(ran.stderr.splitlines()) == 1
+    assert not bucket.told_in(ran.stderr)
+
+
+def test_missing_package_for_remote_stores_is_told_in_a_line(small):
+    ran = python(
+        "-c", "import sys; sys.modules['s3fs'] = None; from sweep.cli import main;"
+        f"sys.exit(main(['run', {str(small)!r}, '--store', 's3://bucket/no.zarr']))",
+    )
+    assert ran.returncode == 2, ran.stderr
+    assert re.fullmatch(r"s3://bucket/no\.zarr: .*s3fs.*\n", ran.stderr)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "s3://AKIDEXAMPLE:wJalrXUtnFEMI@bucket/x.zarr",
+        "s3://bucket/x.zarr?secret=wJalrXUtnFEMI",
+        "s3://wJalrXUtnFEMI@bucket/x.zarr",
+    ],
+)
+@pytest.mark.parametrize("option", ["--store", "--reuse"])
+def test_credentials_in_a_store_name_are_refused_and_not_repeated(
+    option, url, small, tmp_path, capsys
+):
+    options = [option, url] + (["--store", str(tmp_path / "x.zarr")] if option != "--store" else [])
+    assert main(["run", str(small), *options]) == 2
+    told = capsys.readouterr()
+    assert "credentials" in told.err
+    assert len(told.err.splitlines()) == 1
+    assert "wJalrXUtnFEMI" not in told.out + told.err
+    assert "AKIDEXAMPLE" not in told.out + told.err
+
+
+# --- schedulers that refuse ---
+
+
+def test_tls_scheduler_that_refuses_is_told_in_a_line(certificates, tmp_path):
+    ours, theirs = certificates["ours"], certificates["theirs"]
+    pipeline = Pipeline.from_text(SMALL)
+
+    def told(address, settings):
+        configuration = {
+            "distributed.comm.tls.ca-file": str(settings["ca"]),
+            "distributed.comm.tls.client.cert": str(settings["cert"]),
+            "distributed.comm.tls.client.key": str(settings["key"]),
+        } if settings else {}
+        with dask.config.set(configuration), pytest.raises(StoreError) as error, external(
+            address, pipeline
+        ):
+            pass
+        assert len(str(error.value).splitlines()) == 1
+        return str(error.value)
+
+    with Cluster(tmp_path / "cluster", ours) as cluster:
+        secure, plain = cluster.address, cluster.address.replace("tls://", "tcp://")
+        worker = cluster.worker()
+        log = tmp_path / "cluster" / "dask_worker-2.log"
+        wait_until(lambda: "Registered to" in log.read_text(), "the worker does not register")
+        assert "no certificates; name them in Dask's configuration" in told(secure, None)
+        assert "TLS failed (self-signed certificate" in told(secure, theirs)
+        assert "TLS failed (" in told(secure, {**theirs, "ca": ours["ca"]})
+        assert "cannot be read: No such file" in told(secure, {**ours, "cert": "/none"})
+        assert "cannot be read: key values mismatch" in told(secure, {**ours, "key": theirs["key"]})
+        assert "it closed the connection; does it expect tls://?" in told(plain, ours)
+        own = re.search(r"Start worker at: +(\S+)", log.read_text())[1]
+        assert "a Worker answers there, not a scheduler" in told(own, ours)
+        worker.terminate()
+    with Cluster(tmp_path / "plain") as cluster:
+        address = cluster.address.replace("tcp://", "tls://")
+        assert "TLS failed (" in told(address, ours)
+
+
+def test_server_that_never_answers_is_given_up(monkeypatch):
+    monkeypatch.setattr("sweep.engine.cluster.ANSWER_S", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        with pytest.raises(StoreError, match="no answer within"), external(
+            address, Pipeline.from_text(SMALL)
+        ):
+            pass
+
+
+@pytest.mark.parametrize("address", ["nowhere", "tcp://", "tcp://a:b", "tcp://a", "foo://a:1"])
+def test_what_is_no_address_is_told(address):
+    with pytest.raises(StoreError, match="expected an address such as tcp://host:8786"), external(
+        address, Pipeline.from_text(SMALL)
+    ):
+        pass
+
+
+@pytest.mark.long
+def test_tls_scheduler_without_certificates_ends_the_command(certificates, small, tmp_path):
+    with Cluster(tmp_path / "cluster", certificates["ours"]) as cluster:
+        for environment in ({}, client_environment(certificates["theirs"])):
+            ran = sweep_command(
+                "run", small, "--store", tmp_path / "x.zarr", "--scheduler", cluster.address,
+                env={**os.environ, **environment},
+            )
+            assert ran.returncode == 2
+            assert ran.stderr.startswith(f"--scheduler {cluster.address}: ")
+            assert len(ran.stderr.splitlines()) == 1
+    assert not (tmp_path / "x.zarr").exists()
+
+
+# --- workers that come and go ---
+
+
+def blocks_done(url):
+    with contextlib.suppress(StoreError):
+        return len(committed(open_store(url)))
+    return 0
+
+
+@contextlib.contextmanager
+def being_run(cluster, many, url, tmp_path):
+    """Run the large grid; by the end of the block it must have ended well, and quietly."""
+    log = tmp_path / "run.log"
+    with started(log, tmp_path / "run.py", many, url, cluster.address) as running:
+        def after(count):
+            wait_until(
+                lambda: running.poll() is not None or blocks_done(url) >= count, "no progress"
+            )
+            assert running.poll() is None, log.read_text()
+
+        yield after
+        assert running.wait(TIMEOUT_S) == 0, log.read_text()
+    assert log.read_text() == ""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_workers_join_and_leave_during_a_run(number, many, tmp_path):
+    url = str(tmp_path / "many.zarr")
+    with Cluster(tmp_path / "cluster") as cluster:
+        first = cluster.worker()
+        with being_run(cluster, many, url, tmp_path) as after:
+            after(1)
+            cluster.worker()
+            after(3)
+            first.send_signal(number)
+            first.wait(TIMEOUT_S)
+            after(5)
+            cluster.worker()
+    assert digests(url) == expected(MANY)
+
+
+@pytest.mark.long
+def test_stalled_worker_is_done_without_and_may_wake_later(many, tmp_path):
+    url = str(tmp_path / "many.zarr")
+    with Cluster(tmp_path / "cluster") as cluster:
+        stalled = cluster.worker()
+        cluster.worker()
+        with being_run(cluster, many, url, tmp_path) as after:
+            after(2)
+            stalled.send_signal(signal.SIGSTOP)
+        assert digests(url) == expected(MANY)
+        # What it was in the middle of is written again, and is the same.
+        stalled.send_signal(signal.SIGCONT)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            stalled.wait(10)
+    assert digests(url) == expected(MANY)
+
+
+@pytest.mark.long
+def test_run_ends_with_its_scheduler_and_continues_on_another(many, tmp_path):
+    url = str(tmp_path / "many.zarr")
+    log = tmp_path / "lost.log"
+    with Cluster(tmp_path / "lost") as cluster:
+        cluster.worker()
+        with started(log, tmp_path / "run.py", many, url, cluster.address) as running:
+            wait_until(
+                lambda: running.poll() is not None or blocks_done(url) >= 2, "no progress"
+            )
+            assert running.poll() is None, log.read_text()
+            cluster.scheduler.kill()
+            assert running.wait(TIMEOUT_S) == 1
+    assert re.fullmatch(r".*the scheduler went away; the same command continues.*\n",
+                        log.read_text())
+    done = blocks_done(url)
+    assert done >= 2
+    with Cluster(tmp_path / "other") as cluster:
+        cluster.worker()
+        cluster.worker()
+        with being_run(cluster, many, url, tmp_path):
+            pass
+    assert digests(url) == expected(MANY)

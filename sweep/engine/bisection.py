@@ -6,7 +6,8 @@ scene that never returns keeps within it:
 - T/4: the block in its worker, before it is taken for endless (:data:`WHOLE`);
 - 3 T/16: pieces of it in a child, cut in 64 up to three times, T/16 each (:data:`PIECE`);
 - T/8 + T/16 + ... : the parts of the scene that is left, searched and solved one by one
-  (:data:`PART`), each limit half of that before it once one has run out.
+  (:data:`PART`), each limit half of that before it once one has run out;
+- the rest: compiled code is loaded by the first call in each child (:data:`LOADING`).
 """
 
 from __future__ import annotations
@@ -27,6 +28,9 @@ from sweep.plan.template import TEMPLATE
 
 WHOLE, PIECE, PART = 1 / 4, 1 / 16, 1 / 8
 """Shares of a block's time limit: for itself, for a piece of it, for a part of a scene."""
+
+LOADING, LOADING_S = 1 / 16, 15.0
+"""What the first call in a child has more: this share of the limit, or so many seconds."""
 
 PIECES = 64
 """Into how many pieces what ended a process is cut."""
@@ -52,13 +56,13 @@ class _Careful:
         self._child: Child | None = None
 
     def __call__(self, share: float, *arguments: Any) -> CellsResult:
+        limit_s = share * self._limit_s
         if self._child is None:
             self._child = Child()
             self._child.call(_hold, self._pipeline, limit_s=self._limit_s)
+            limit_s += min(LOADING * self._limit_s, LOADING_S)
         try:
-            result: CellsResult = self._child.call(
-                _run_held, *arguments, limit_s=share * self._limit_s
-            )
+            result: CellsResult = self._child.call(_run_held, *arguments, limit_s=limit_s)
         except DiedError:
             self._child = None
             raise
@@ -148,7 +152,8 @@ def _one(
         for j in np.flatnonzero(need[0, k]).tolist() if searched[0, k] else ():
             solved[0, k, j] = works("estimation", k, j)
     try:
-        result = careful(share, chosen, solved, searched) if whole else _nothing(pipeline)
+        # None of what is asked here is endless: it has all the time.
+        result = careful(1.0, chosen, solved, searched) if whole else _nothing(pipeline)
     except (DiedError, RaisedError) as error:
         # Each part is harmless alone, but not all of them together.
         died = isinstance(error, DiedError)

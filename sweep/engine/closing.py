@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from sweep.engine.failures import MOST_ROWS, FailedCell, failed_cells, failure_table
 from sweep.engine.store import RunStore, committed, finish, receipts
 from sweep.measure.flags import Detection, Estimate
 from sweep.plan.axes import Axis
 from sweep.plan.parameters import Stage
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 def close(store: RunStore) -> None:
@@ -50,6 +52,8 @@ def lost(detection: list[int], estimate: list[int]) -> dict[str, int]:
 
 def _cost(store: RunStore, blocks: list[tuple[int, dict[str, Any]]]) -> xr.Dataset:
     """Return the cost group: seconds per stage and treatment for each block."""
+    import xarray as xr  # noqa: PLC0415  (slow to import, and often not needed)
+
     pipeline = store.pipeline
     settings = list(pipeline.axes_of(Stage.detection))
     both = [*settings, *pipeline.axes_of(Stage.estimation)]

@@ -16,7 +16,7 @@ from zarr.core.sync import sync
 
 from sweep.engine.layout import RECEIPTS
 from sweep.engine.manifest import get, put
-from sweep.engine.store import RunStore, telling
+from sweep.engine.store import RunStore, telling, tidy
 from sweep.errors import StoreError
 
 KEY = f"{RECEIPTS}/lock.json"
@@ -58,6 +58,7 @@ def locked(store: RunStore) -> Iterator[None]:
     heart = threading.Thread(target=beat, daemon=True, name="store lock")
     heart.start()
     try:
+        tidy(store)
         yield
     finally:
         done.set()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import itertools
 import math
 import os
@@ -165,16 +166,15 @@ def execute(
         match(pipeline, open_store(source))
     if opened is None:
         check_place(url)
-    from sweep.engine.cluster import threads  # noqa: PLC0415  (slow to import)
-
     with Interrupts() as interrupts, ThreadPoolExecutor(1) as beside:
         # Compiling and measuring in a child while the workers' processes come up.
         measuring = None if opened is not None else beside.submit(
             calibrate_apart, pipeline, CALIBRATION_S, CALIBRATION_SHARE * time_limit_s
         )
         with _cluster(pipeline, workers, scheduler) as client:
+            beside.submit(importlib.import_module, "xarray")  # needed at the end
             if measuring is not None:
-                count = max(threads(client), 1)
+                count = max(_threads(client), 1)
                 extents = block_extents(pipeline, measuring.result(), count, block_s)
                 if overwrite and exists(url):
                     remove_store(url)
@@ -234,6 +234,12 @@ def _cluster(
     if scheduler is not None:
         return external(scheduler, pipeline)
     return embedded(workers or default_workers())
+
+
+def _threads(client: Client) -> int:
+    from sweep.engine.cluster import threads  # noqa: PLC0415  (as above)
+
+    return threads(client)
 
 
 def _existing(url: str, pipeline: Pipeline, overwrite: bool) -> RunStore | None:
@@ -368,9 +374,7 @@ class _Room:
     def __call__(self) -> int:
         """Return the room; RunError where the scheduler went away, or no workers came for long."""
         if time.monotonic() > self._asked + ASK_EACH_S:
-            from sweep.engine.cluster import threads  # noqa: PLC0415  (slow to import)
-
-            there = threads(self._client)
+            there = _threads(self._client)
             self._asked = time.monotonic()
             if there:
                 self._blocks, self._seen = WINDOW * there, self._asked

@@ -11,6 +11,7 @@ points.
 from __future__ import annotations
 
 import contextlib
+import glob
 import json
 import os
 import re
@@ -62,6 +63,9 @@ REQUIRED = {
 GROUPS = ("commits", "cost", "failures")
 """The groups of a store."""
 
+ABANDONED_S = 3600.0
+"""Age from which a store that is half made is taken for abandoned."""
+
 POINTER = "sweep_run"
 """Attribute of a remote store's place: the id of the run whose data are the store's."""
 
@@ -111,7 +115,8 @@ class RunStore:
     @property
     def about(self) -> dict[str, Any]:
         """What is recorded of the run: format, run id, fingerprint, environment, dates."""
-        return dict(cast("dict[str, Any]", self.group.attrs["sweep"]))
+        root = parsed(sync(self.place.get("zarr.json", default_buffer_prototype()))) or {}
+        return dict(root["attributes"]["sweep"])
 
 
 def is_remote(url: str) -> bool:
@@ -343,6 +348,18 @@ async def _listed(place: Store, prefix: str) -> list[str]:
         return []
 
 
+def tidy(store: RunStore) -> None:
+    """Delete what killed processes left among a local store's groups; nobody else may write it.
+
+    Zarr warns of files that it does not know there; elsewhere they are harmless.
+    """
+    if is_remote(store.url):
+        return
+    for folder in ("", *GROUPS, *(f"{name}/*" for name in GROUPS)):
+        for path in Path(store.url).glob(f"{folder}/*.partial".lstrip("/")):
+            path.unlink(missing_ok=True)
+
+
 def check_place(url: str) -> None:
     """See that a store can be made at a place, before any work is done for it.
 
@@ -383,6 +400,7 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
         else:
             # Beside its place and then moved there: a kill between leaves no half a store.
             check_place(url)
+            _tidy_beside(url)
             building = _beside(url, "new")
             try:
                 _lay_out(LocalStore(building), pipeline, extents, run_id)
@@ -395,6 +413,15 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
 def _beside(url: str, ending: str) -> Path:
     """Return an unused path in the folder of a local store."""
     return Path(url).with_name(f".{Path(url).name}.{uuid.uuid4().hex[:8]}.{ending}")
+
+
+def _tidy_beside(url: str) -> None:
+    """Delete what killed processes left of stores that they were making or deleting here."""
+    for ending, age_s in (("deleted", 0.0), ("new", ABANDONED_S)):
+        for path in Path(url).parent.glob(f".{glob.escape(Path(url).name)}.*.{ending}"):
+            with contextlib.suppress(OSError):
+                if path.stat().st_mtime <= time.time() - age_s:
+                    shutil.rmtree(path, ignore_errors=True)
 
 
 def _lay_out(to: Store, pipeline: Pipeline, extents: tuple[int, ...], run_id: str) -> None:
@@ -634,13 +661,19 @@ def _write_groups(
             content.assign({label: content[label].astype(object) for label in texts}).to_zarr(
                 store.place, group=name, mode="a", zarr_format=3, consolidated=False
             )
-        store.group.attrs["sweep"] = about
         zarr.consolidate_metadata(store.place, zarr_format=3)
-        written = {
+        digests = {
             key: value for key, value in store.place.digests.items()
-            if key == "zarr.json" or any(key.startswith(f"{name}/") for name in groups)
+            if any(key.startswith(f"{name}/") for name in groups)
         }
-        write_manifest(store.place, Manifest(dict(store.group.attrs), {**files, **written}))
+        files |= digests
+        write_manifest(store.place, Manifest(dict(store.group.attrs), files))
+        # The last thing that is written: a kill before it leaves a store to be closed again.
+        root = parsed(sync(store.place.get("zarr.json", default_buffer_prototype()))) or {}
+        root["attributes"]["sweep"] = about
+        put(store.place, "zarr.json", root)
+        files["zarr.json"] = store.place.digests["zarr.json"]
+        write_manifest(store.place, Manifest(dict(root["attributes"]), files))
 
 
 async def _arrays_in(store: RunStore, name: str) -> list[str]:

@@ -15,7 +15,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from sweep.compilation import compiled
 from sweep.model.lens import distort
@@ -163,8 +162,8 @@ WEIGHTS = (0.2777777777777778, 0.4444444444444444, 0.2777777777777778)
 
 _STEPS = 256
 _AT = np.arange(-6 * _STEPS, 6 * _STEPS + 2) / _STEPS
-_BELOW = ndtr(_AT)
-_BELOW_SUM = _AT * ndtr(_AT) + np.exp(-0.5 * _AT**2) / math.sqrt(2.0 * math.pi)
+_BELOW = np.array([0.5 * math.erfc(-at / math.sqrt(2.0)) for at in _AT.tolist()])
+_BELOW_SUM = _AT * _BELOW + np.exp(-0.5 * _AT**2) / math.sqrt(2.0 * math.pi)
 """The normal distribution's integral, and the integral of that, in steps of 1/256 standard
 deviations: interpolated linearly they are right to 8e-7."""
 

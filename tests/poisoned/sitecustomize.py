@@ -1,0 +1,234 @@
+"""Poison for tests: chosen scenes end, hang or raise in whatever process computes them.
+
+Python imports this module in every process that has its folder on PYTHONPATH. ``SWEEP_POISON``
+holds JSON: ``log``, a file to which notes are appended, and ``poisons``, each with
+
+cell
+    number of the scene on the grid of scene axes, the last axis fastest
+stage
+    truth, scene (rendering), detection or estimation
+how
+    one of ``WAYS``
+setting
+    values that a detector's setting must have to be hit (stage detection)
+solver
+    values that an estimator must have to be hit (stage estimation)
+
+Without that variable nothing is touched.
+"""
+
+import collections
+import ctypes
+import dataclasses
+import importlib.abc
+import importlib.machinery
+import itertools
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+
+def _sleep():
+    while True:
+        time.sleep(1.0)
+
+
+def _spin():
+    """Never return, in C, without ever giving up the interpreter's lock."""
+    collections.deque(itertools.repeat(None), maxlen=0)
+
+
+def _hold():
+    """As ``_spin``, without using the processor."""
+    ctypes.PyDLL(None).sleep(1_000_000)
+
+
+def _raise():
+    raise RuntimeError("poisoned")
+
+
+def _memory():
+    raise MemoryError
+
+
+WAYS = {
+    "segv": lambda: ctypes.string_at(0),
+    "abort": os.abort,
+    "kill": lambda: os.kill(os.getpid(), signal.SIGKILL),
+    "exit": lambda: os._exit(3),
+    "sleep": _sleep,
+    "spin": _spin,
+    "hold": _hold,
+    "raise": _raise,
+    "memory": _memory,
+}
+
+
+def _kind():
+    """Return what this process is: worker, child, client or other."""
+    words = " ".join(sys.orig_argv)
+    if "sweep.engine.apart" in words:
+        return "child"
+    if "--multiprocessing-fork" in words:
+        return "worker"
+    if "sweep.cli" in words:
+        return "client"
+    return "other"
+
+
+class _Poison:
+    """Wraps the kernel's functions by which the scenes of a call are known."""
+
+    def __init__(self, kernel, poisons, log):
+        self._poisons = poisons
+        self._log = log
+        self._here = threading.local()
+        # Scenes made last with their numbers; rendered images by number.
+        self._made = collections.deque(maxlen=4)
+        self._images = {}
+        self._real = {
+            name: getattr(kernel, name)
+            for name in ("scene_values", "build_scenes", "render_all", "sightings", "build")
+        }
+        for name in self._real:
+            setattr(kernel, name, getattr(self, name))
+        kernel.Detector = self._detector(kernel.Detector)
+
+    def note(self, event, **what):
+        line = {"event": event, "kind": _kind(), "pid": os.getpid(), "time": time.time(), **what}
+        file = os.open(self._log, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+        os.write(file, json.dumps(line).encode() + b"\n")
+        os.close(file)
+
+    def _act(self, stage, cells, **treatment):
+        """Do what the poisons say that ``cells`` hold for this stage and treatment."""
+        for poison in self._poisons:
+            hit = poison["stage"] == stage and poison["cell"] in cells and all(
+                getattr(treatment.get(kind), name) == value
+                for kind in ("setting", "solver")
+                for name, value in poison.get(kind, {}).items()
+            )
+            if hit:
+                self.note("act", **poison)
+                WAYS[poison["how"]]()
+
+    def _poisoned(self, stage, cells):
+        """Return which of ``cells`` have a poison for a stage."""
+        return {p["cell"] for p in self._poisons if p["stage"] == stage} & set(cells)
+
+    def _cells(self, scenes):
+        return next((cells for made, cells in self._made if made is scenes), None)
+
+    def scene_values(self, pipeline, indices):
+        import numpy as np  # noqa: PLC0415  (this module is imported by every process)
+
+        lengths = [len(axis) for axis in pipeline.axes if axis.stage.name == "scene"]
+        cells = np.ravel_multi_index(list(indices), lengths).tolist() if lengths else [0]
+        self._here.cells = cells
+        return self._real["scene_values"](pipeline, indices)
+
+    def build_scenes(self, values, count):
+        scenes = self._real["build_scenes"](values, count)
+        self._made.append((scenes, self._here.cells))
+        self._act("truth", self._here.cells)
+        return scenes
+
+    def render_all(self, scenes, rows, boxes, windows):
+        known = self._cells(scenes)
+        cells = [known[row] for row in rows.tolist()] if known else []
+        self._act("scene", cells)
+        images = self._real["render_all"](scenes, rows, boxes, windows)
+        marked = self._poisoned("detection", cells)
+        self._images.update(
+            (cell, image) for cell, image in zip(cells, images, strict=False) if cell in marked
+        )
+        return images
+
+    def _detector(self, real):
+        poison = self
+
+        class Detector(real):
+            """A detector that knows the images of poisoned scenes, also when they are cropped."""
+
+            def __init__(self, setting):
+                super().__init__(setting)
+                self._chosen = setting
+
+            def find(self, image, dictionary, frame_side):
+                import numpy as np  # noqa: PLC0415
+
+                cells = [
+                    cell for cell, marked in poison._images.items()
+                    if np.shares_memory(marked, image)
+                ]
+                poison._act("detection", cells, setting=self._chosen)
+                return super().find(image, dictionary, frame_side)
+
+        return Detector
+
+    def sightings(self, estimator, values, scenes, found, rows):
+        seen = self._real["sightings"](estimator, values, scenes, found, rows)
+        known = self._cells(scenes)
+        return _told(seen, [known[row] for row in rows.tolist()]) if known else seen
+
+    def build(self, setting):
+        return _Estimator(self, setting, self._real["build"](setting))
+
+
+def _told(seen, cells):
+    """Return sightings that know which scenes they are of."""
+
+    class Told(type(seen)):
+        """As its base; found corners alone do not tell one scene from another."""
+
+        def take(self, rows):
+            return _told(super().take(rows), [cells[row] for row in rows])
+
+    told = Told(*(getattr(seen, field.name) for field in dataclasses.fields(seen)))
+    object.__setattr__(told, "cells", cells)
+    return told
+
+
+class _Estimator:
+    """An estimator that looks at which scenes it is given."""
+
+    def __init__(self, poison, setting, real):
+        self._poison, self._setting, self._real = poison, setting, real
+
+    def __getattr__(self, name):
+        return getattr(self._real, name)
+
+    def __call__(self, sightings):
+        cells = getattr(sightings, "cells", ())
+        self._poison._act("estimation", cells, solver=self._setting)
+        return self._real(sightings)
+
+
+class _Finder(importlib.abc.MetaPathFinder):
+    """Has the kernel wrapped as soon as it has been loaded."""
+
+    def __init__(self, poisons, log):
+        self._given = poisons, log
+
+    def find_spec(self, name, path=None, target=None):
+        if name != "sweep.kernel":
+            return None
+        spec = importlib.machinery.PathFinder.find_spec(name, path, target)
+        load = spec.loader.exec_module
+
+        def load_and_wrap(module):
+            load(module)
+            poison = _Poison(module, *self._given)
+            poison.note("start")
+
+        spec.loader.exec_module = load_and_wrap
+        return spec
+
+
+if "SWEEP_POISON" in os.environ:
+    _given = json.loads(os.environ["SWEEP_POISON"])
+    sys.meta_path.insert(0, _Finder(_given["poisons"], str(Path(_given["log"]))))

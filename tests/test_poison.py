@@ -1,0 +1,478 @@
+"""Poison: a scene that ends or stalls the process that computes it costs itself and no other."""
+
+import dataclasses
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from test_run import by_hand
+
+from sweep.engine.store import committed, create_store, open_store
+from sweep.measure.flags import Detection, Estimate, Flipped
+from sweep.plan.grid import scene_axes
+from sweep.plan.one_cell import cell as cell_at
+from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.template import TEMPLATE
+
+POISONED = Path(__file__).parent / "poisoned"
+
+TEXT = """
+title = "Scenes of which some are poisoned"
+seed = 11
+[marker]
+size_m = 0.04
+[pose]
+jitter_px = 0.5
+azimuth_deg = { uniform = [0, 360] }
+[scene]
+background = 128
+[axes]
+distance_m = [0.2, 0.3, 0.4]
+cornerRefinementMethod = ["none", "subpix"]
+tilt_deg = [10, 45]
+solver = ["ippe_square", "iterative"]
+trial = 20
+"""
+
+LIMIT_S = 40
+"""Time limit of long tests: parts of it must do for a start on a busy machine."""
+
+EXTENTS = (1, 1, 20)
+"""Blocks of the short grid: block k has the scenes 20 k to 20 k + 19."""
+
+SIGNALS = {"segv": "SIGSEGV", "abort": "SIGABRT", "kill": "SIGKILL"}
+ENDLESS = ("sleep", "spin", "hold")
+RAISES = ("raise", "memory")
+
+
+@dataclasses.dataclass(frozen=True)
+class Poison:
+    """What one scene does: to detectors with ``setting``, to estimators with ``solver``."""
+
+    cell: int
+    stage: str
+    how: str
+    setting: tuple = ()
+    solver: tuple = ()
+
+    @property
+    def deadly(self):
+        return self.how not in RAISES
+
+    def written(self):
+        return {**dataclasses.asdict(self), "setting": dict(self.setting),
+                "solver": dict(self.solver)}
+
+
+SUBPIX = (("cornerRefinementMethod", "subpix"),)
+ITERATIVE = (("solver", "iterative"),)
+IPPE = (("solver", "ippe_square"),)
+
+
+def poisoned(poisons, log):
+    """Return the environment in which the commands are poisoned."""
+    given = {"log": str(log), "poisons": [poison.written() for poison in poisons]}
+    path = os.pathsep.join(filter(None, [str(POISONED), os.environ.get("PYTHONPATH")]))
+    return {**os.environ, "PYTHONPATH": path, "SWEEP_POISON": json.dumps(given)}
+
+
+def notes(log):
+    """Return what the poisoned processes noted."""
+    return [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+
+
+def command(*arguments, timeout=300, **options):
+    """Run the command line; end whatever it leaves behind."""
+    with subprocess.Popen(
+        [sys.executable, "-m", "sweep.cli", *map(str, arguments)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        **options,
+    ) as running:
+        try:
+            out, err = running.communicate(timeout=timeout)
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(running.pid, signal.SIGKILL)
+    return subprocess.CompletedProcess(running.args, running.returncode, out, err)
+
+
+def scene_index(pipeline, cell):
+    """Return a scene's index along each scene axis."""
+    axes = scene_axes(pipeline)
+    index = np.unravel_index(cell, [len(axis) for axis in axes])
+    return {axis.name: int(i) for axis, i in zip(axes, index, strict=True)}
+
+
+def expected(reference, pipeline, poisons):
+    """Return the reference's variables with what the poisons change in them, and where.
+
+    The flags are those of the stage that is hit; the stages after it have nothing to work on.
+    """
+    values = {v.name: reference[v.name].to_numpy().copy() for v in TEMPLATE}
+    changed = {name: np.zeros(array.shape, dtype=bool) for name, array in values.items()}
+    for poison in poisons:
+        named = dict(poison.setting + poison.solver)
+        at = scene_index(pipeline, poison.cell)
+        for axis in pipeline.axes_of(Stage.detection, Stage.estimation):
+            if axis.name in named:
+                at[axis.name] = list(axis.values).index(named[axis.name])
+        first = {"truth": Stage.scene, "scene": Stage.detection, "detection": Stage.detection,
+                 "estimation": Stage.estimation}[poison.stage]
+        flags = {
+            "detection": Detection.crashed if poison.deadly else Detection.failed,
+            "estimate": Estimate.no_detection,
+            "flipped": Flipped.no_estimate,
+            "bound": 0,
+        }
+        if first is Stage.estimation:
+            flags["estimate"] = Estimate.crashed if poison.deadly else Estimate.failed
+        for v in TEMPLATE:
+            if v.stage >= first:
+                where = tuple(at.get(name, slice(None)) for name in v.dimensions(pipeline))
+                values[v.name][where] = np.nan if v.flags is None else flags[v.name]
+                changed[v.name][where] = True
+    return values, changed
+
+
+def bits(array):
+    return array.view(f"u{array.itemsize}")
+
+
+def differing(url, reference, pipeline, poisons):
+    """Return the variables that are not as expected, with how many values differ in each.
+
+    Bit for bit, but for NaN where a poison put it: any NaN will do.
+    """
+    values, changed = expected(reference, pipeline, poisons)
+    found = {}
+    with xr.open_zarr(url, consolidated=False) as store:
+        assert set(store.variables) == set(reference.variables)
+        for name in store.coords:
+            assert store[name].equals(reference[name]), name
+        for name, wanted in values.items():
+            got = store[name].to_numpy()
+            assert got.dtype == wanted.dtype
+            alike = bits(got) == bits(wanted)
+            if wanted.dtype.kind == "f":
+                alike |= changed[name] & np.isnan(got) & np.isnan(wanted)
+            if not alike.all():
+                found[name] = int((~alike).sum())
+    return found
+
+
+def numbers(reference, pipeline, poisons):
+    """Return how many detections and estimates are flagged crashed and failed."""
+    values, _ = expected(reference, pipeline, poisons)
+    return {
+        flag: int((values["detection"] == Detection[flag]).sum()
+                  + (values["estimate"] == Estimate[flag]).sum())
+        for flag in ("crashed", "failed")
+    }
+
+
+def see_who_died(log, poisons, store, workers):
+    """Assert that no client died, and at most one worker for each block that holds poison.
+
+    Returns the deaths by kind of process.
+    """
+    events = notes(log)
+    deaths = [note for note in events if note["event"] == "act" and note["how"] not in RAISES]
+    kinds = {kind: len({note["pid"] for note in deaths if note["kind"] == kind})
+             for kind in ("client", "worker", "child", "other")}
+    assert kinds["client"] == kinds["other"] == 0, deaths
+    blocks = {block_of(store, poison.cell) for poison in poisons if poison.deadly}
+    assert kinds["worker"] <= len(blocks)
+    begun = {note["pid"] for note in events if (note["event"], note["kind"]) == ("start", "worker")}
+    if not any(poison.how in ENDLESS for poison in poisons):
+        # A worker that was ended for another's poison would have been replaced by one more. With a
+        # short time limit, a busy machine alone may end one.
+        assert len(begun) <= workers + kinds["worker"]
+    asked = {(note["cell"], note["stage"]) for note in events if note["event"] == "act"}
+    assert asked == {(poison.cell, poison.stage) for poison in poisons}, "a poison never acted"
+    return kinds
+
+
+def block_of(store, cell):
+    """Return the number of the block that a scene is in."""
+    index = scene_index(store.pipeline, cell).values()
+    number = 0
+    for i, extent, count in zip(index, store.blocks.extents, store.blocks.counts, strict=True):
+        number = number * count + i // extent
+    return number
+
+
+def see_status(url, pipeline, poisons):
+    """Assert that ``sweep status`` names every crashed scene, where it is, and why."""
+    plain = command("status", url)
+    assert (plain.returncode, plain.stderr) == (0, "")
+    lines = [line for line in plain.stdout.splitlines() if line.split()[0] == "crashed"]
+    told = {}
+    for line in lines:
+        at = re.search(r"--at (\S+)", line)[1]
+        one = cell_at(pipeline, at)  # it can be handed to the other commands as it is
+        key = tuple(
+            one.axes[0].values[0] if axis.name == "trial" else one.fixed[axis.name]
+            for axis in scene_axes(pipeline)
+        )
+        told.setdefault(key, []).append(line)
+    wanted = {}
+    for poison in poisons:
+        if poison.deadly:
+            index = scene_index(pipeline, poison.cell)
+            key = tuple(axis.values[index[axis.name]] for axis in scene_axes(pipeline))
+            wanted.setdefault(key, []).append(poison)
+    assert told.keys() == wanted.keys(), plain.stdout
+    for key, those in wanted.items():
+        for poison in those:
+            why = "time limit" if poison.how in ENDLESS else SIGNALS.get(poison.how, "")
+            assert any(why in line for line in told[key]), (poison, told[key])
+    written = command("status", url, "--json").stdout
+    json.loads(written)
+    for line in lines:
+        assert re.search(r"--at (\S+)", line)[1] in written
+
+
+@pytest.fixture(scope="module")
+def pipeline():
+    return Pipeline.from_text(TEXT, name="poisoned")
+
+
+@pytest.fixture(scope="module")
+def clean(pipeline, tmp_path_factory):
+    """The short grid's results without poison."""
+    url = str(tmp_path_factory.mktemp("clean") / "clean.zarr")
+    by_hand(url, pipeline, tuple(len(axis) for axis in scene_axes(pipeline)))
+    with xr.open_zarr(url, consolidated=False) as opened:
+        loaded = opened.load()
+        assert (loaded.estimate == Estimate.solved).all()
+        return loaded
+
+
+def run_poisoned(tmp_path, text, poisons, *options, timeout=300):
+    """Run a pipeline, poisoned; return what the command said, its seconds, and the notes' file."""
+    path, log = tmp_path / "poisoned.toml", tmp_path / "notes.jsonl"
+    path.write_text(text)
+    begun = time.monotonic()
+    ran = command(
+        "run", path, "--store", tmp_path / "poisoned.zarr", *options,
+        env=poisoned(poisons, log), cwd=tmp_path, timeout=timeout,
+    )
+    return ran, time.monotonic() - begun, log
+
+
+INERT = """
+import hashlib, sys
+import numpy as np
+from sweep.kernel import run_cells
+from sweep.plan.grid import Block, block_indices
+from sweep.plan.pipeline import Pipeline
+
+pipeline = Pipeline.from_text(open(sys.argv[1]).read())
+block = Block((0, 0, 0), (1, 1, 20))
+need = np.ones((20, 2, 2), dtype=bool)
+need[3] = False       # rendering
+need[4, 1] = False    # search with subpix
+need[5, :, 1] = False # the iterative solver
+cells = run_cells(pipeline, block_indices(block), need)
+digest = hashlib.sha256()
+for name in sorted(cells.columns):
+    for column in cells.columns[name]:
+        digest.update(column.tobytes())
+print(digest.hexdigest())
+"""
+
+
+def test_poison_does_nothing_where_its_scene_is_not_asked_for(tmp_path):
+    path, log = tmp_path / "p.toml", tmp_path / "notes.jsonl"
+    path.write_text(TEXT)
+    inert = [
+        Poison(3, "scene", "segv"), Poison(4, "detection", "abort", SUBPIX),
+        Poison(5, "estimation", "kill", (), ITERATIVE), Poison(33, "truth", "exit"),
+    ]
+    digests = []
+    for poisons in ([], inert):
+        ran = subprocess.run(
+            [sys.executable, "-c", INERT, path], env=poisoned(poisons, log), check=True,
+            capture_output=True, text=True, timeout=120,
+        )
+        digests.append(ran.stdout)
+    assert digests[0] == digests[1]
+    assert [note["event"] for note in notes(log)] == ["start", "start"]
+
+
+def test_scene_that_raises_fails_alone(pipeline, clean, tmp_path):
+    poisons = [
+        Poison(20, "scene", "raise"), Poison(21, "detection", "memory", SUBPIX),
+        Poison(39, "estimation", "raise", (), IPPE), Poison(40, "scene", "memory"),
+    ]
+    create_store(str(tmp_path / "poisoned.zarr"), pipeline, EXTENTS)
+    ran, _, log = run_poisoned(tmp_path, TEXT, poisons, "--workers", 2, "--json")
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert differing(tmp_path / "poisoned.zarr", clean, pipeline, poisons) == {}
+    told = json.loads(ran.stdout)
+    assert {flag: told[flag] for flag in ("crashed", "failed")} == numbers(
+        clean, pipeline, poisons
+    )
+    assert sum(see_who_died(log, poisons, open_store(str(tmp_path / "poisoned.zarr")), 2)
+               .values()) == 0
+
+
+def test_scenes_that_end_their_process_are_found_and_no_other_is_touched(
+    pipeline, clean, tmp_path
+):
+    url = str(tmp_path / "poisoned.zarr")
+    poisons = [
+        # First of a block; last and the one before it; one that does not end anything between.
+        Poison(20, "scene", "segv"),
+        Poison(58, "scene", "kill"), Poison(59, "detection", "abort", SUBPIX),
+        Poison(50, "detection", "raise", SUBPIX),
+        Poison(70, "estimation", "segv", (), ITERATIVE),
+        Poison(105, "truth", "exit"),
+    ]
+    store = create_store(url, pipeline, EXTENTS)
+    ran, seconds, log = run_poisoned(tmp_path, TEXT, poisons, "--workers", 2)
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert differing(url, clean, pipeline, poisons) == {}
+    counts = numbers(clean, pipeline, poisons)
+    assert f"{counts['crashed']:,} flagged crashed" in ran.stdout
+    assert f"{counts['failed']:,} flagged failed" in ran.stdout
+    kinds = see_who_died(log, poisons, store, 2)
+    print(f"{seconds:.1f} s; deaths: {kinds}")
+    assert committed(store) == set(range(6))
+    see_status(url, pipeline, poisons)
+    again, _, _ = run_poisoned(tmp_path, TEXT, poisons, "--workers", 2)
+    assert again.returncode == 0
+    assert "is finished" in again.stdout
+
+
+def test_scene_that_never_returns_is_found_within_the_time_limit(pipeline, clean, tmp_path):
+    url = str(tmp_path / "poisoned.zarr")
+    # It keeps the interpreter's lock, so that no other thread of its process can act.
+    poisons = [Poison(47, "detection", "hold", SUBPIX)]
+    store = create_store(url, pipeline, EXTENTS)
+    ran, seconds, log = run_poisoned(
+        tmp_path, TEXT, poisons, "--workers", 2, "--time-limit", 30, "--json"
+    )
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert differing(url, clean, pipeline, poisons) == {}
+    assert json.loads(ran.stdout)["crashed"] == 1
+    print(f"{seconds:.1f} s; stalled: {see_who_died(log, poisons, store, 2)}")
+    see_status(url, pipeline, poisons)
+
+
+def test_poison_in_the_sample_that_is_measured_ends_no_client(pipeline, clean, tmp_path):
+    # A new store: of a grid as small as this every scene is in the sample.
+    poisons = [Poison(33, "scene", "segv")]
+    ran, _, log = run_poisoned(tmp_path, TEXT, poisons, "--workers", 2)
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert differing(tmp_path / "poisoned.zarr", clean, pipeline, poisons) == {}
+    see_who_died(log, poisons, open_store(str(tmp_path / "poisoned.zarr")), 2)
+
+
+@pytest.mark.long
+def test_endless_scene_in_the_sample_that_is_measured_ends_no_client(pipeline, clean, tmp_path):
+    poisons = [Poison(33, "estimation", "spin", (), ITERATIVE)]
+    ran, seconds, log = run_poisoned(
+        tmp_path, TEXT, poisons, "--workers", 2, "--time-limit", LIMIT_S
+    )
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert differing(tmp_path / "poisoned.zarr", clean, pipeline, poisons) == {}
+    see_who_died(log, poisons, open_store(str(tmp_path / "poisoned.zarr")), 2)
+    print(f"{seconds:.1f} s")
+
+
+THOUSANDS = TEXT.replace("distance_m = [0.2, 0.3, 0.4]", "distance_m = { linspace = [0.2, 0.4, 5] }"
+                         ).replace("trial = 20", "trial = 1000")
+SCENES = 10_000
+
+AMONG_THOUSANDS = {
+    "one that ends": [Poison(6_543, "scene", "segv")],
+    "one that is killed in the search": [Poison(0, "detection", "kill")],
+    "one estimator that aborts": [Poison(9_999, "estimation", "abort", (), ITERATIVE)],
+    "three in three ways": [
+        Poison(123, "scene", "segv"), Poison(4_567, "detection", "abort", SUBPIX),
+        Poison(8_901, "estimation", "kill", (), ITERATIVE),
+    ],
+    "two neighbours and a third": [
+        Poison(5_000, "scene", "kill"), Poison(5_001, "detection", "segv", SUBPIX),
+        Poison(7_250, "truth", "abort"),
+    ],
+    "first, middle and last of a block": [
+        Poison(2_000, "scene", "abort"), Poison(2_125, "scene", "exit"),
+        Poison(2_249, "estimation", "segv", (), IPPE),
+    ],
+    "three that raise": [
+        Poison(100, "scene", "raise"), Poison(5_100, "detection", "memory", SUBPIX),
+        Poison(9_100, "estimation", "raise", (), IPPE),
+    ],
+    "one that sleeps": [Poison(3_333, "scene", "sleep")],
+    "one that spins": [Poison(4_444, "detection", "spin", SUBPIX)],
+    "one that holds the lock": [Poison(5_555, "estimation", "hold", (), ITERATIVE)],
+    "an endless one beside a deadly one": [
+        Poison(6_000, "scene", "sleep"), Poison(6_001, "scene", "segv"),
+    ],
+}
+
+
+@pytest.fixture(scope="module")
+def thousands(tmp_path_factory):
+    """Ten thousand scenes without poison: pipeline, results, and seconds of the command."""
+    folder = tmp_path_factory.mktemp("thousands")
+    pipeline = Pipeline.from_text(THOUSANDS, name="poisoned")
+    assert pipeline.size(Stage.scene) == SCENES
+    url = str(folder / "poisoned.zarr")
+    create_store(url, pipeline, (1, 1, 250))
+    ran, seconds, _ = run_poisoned(folder, THOUSANDS, [], "--workers", 2)
+    assert ran.returncode == 0, ran.stderr
+    with xr.open_zarr(url, consolidated=False) as opened:
+        return pipeline, opened.load(), seconds
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("poisons", AMONG_THOUSANDS.values(), ids=AMONG_THOUSANDS)
+def test_poison_among_ten_thousand_scenes_costs_itself_alone(poisons, thousands, tmp_path):
+    pipeline, reference, undisturbed_s = thousands
+    url = str(tmp_path / "poisoned.zarr")
+    store = create_store(url, pipeline, (1, 1, 250))
+    endless = any(poison.how in ENDLESS for poison in poisons)
+    limit = ("--time-limit", LIMIT_S) if endless else ()
+    ran, seconds, log = run_poisoned(
+        tmp_path, THOUSANDS, poisons, "--workers", 2, "--json", *limit, timeout=900
+    )
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert differing(url, reference, pipeline, poisons) == {}
+    told = json.loads(ran.stdout)
+    assert {flag: told[flag] for flag in ("crashed", "failed")} == numbers(
+        reference, pipeline, poisons
+    )
+    kinds = see_who_died(log, poisons, store, 2)
+    see_status(url, pipeline, poisons)
+    hit = {poison.cell for poison in poisons}
+    print(
+        f"{SCENES - len(hit):,} scenes equal; {seconds:.1f} s, {undisturbed_s:.1f} s without "
+        f"poison; deaths: {kinds}"
+    )
+    if endless:
+        # Half as much again, and the start of a few processes: seconds are noisy here.
+        assert seconds < undisturbed_s + 1.5 * LIMIT_S + 30.0
+
+
+@pytest.mark.long
+def test_poison_in_a_grid_that_is_cut_as_the_run_likes(thousands, tmp_path):
+    pipeline, reference, _ = thousands
+    poisons = AMONG_THOUSANDS["three in three ways"]
+    ran, seconds, log = run_poisoned(tmp_path, THOUSANDS, poisons, "--workers", 2)
+    assert (ran.returncode, ran.stderr) == (0, "")
+    url = str(tmp_path / "poisoned.zarr")
+    assert differing(url, reference, pipeline, poisons) == {}
+    print(f"{seconds:.1f} s; deaths: {see_who_died(log, poisons, open_store(url), 2)}")

@@ -25,6 +25,7 @@ from sweep.engine.provenance import differences
 from sweep.engine.store import open_dataset, open_store, write_group
 from sweep.errors import StoreError
 from sweep.measure.estimators import build
+from sweep.measure.flags import Detection, Estimate
 from sweep.plan.axes import TRIAL, Axis, nearest
 from sweep.plan.grid import combinations, estimators
 from sweep.plan.parameters import Stage
@@ -123,8 +124,12 @@ def _trade(
     regimes = list(np.ndindex(*lengths))
     costs = measure(
         pipeline,
-        [sample_cells(pipeline, dict(zip(per, regime, strict=True)), len(regimes))
-         for regime in regimes],
+        [
+            _harmless(pipeline, results, [
+                sample_cells(pipeline, dict(zip(per, regime, strict=True)), len(regimes))
+            ])[0]
+            for regime in regimes
+        ],
         limit_s, interrupts,
     )
     treatments = trade.sizes["treatment"]
@@ -151,6 +156,28 @@ def _trade(
                       "of photometric from its likelihood",
     }
     return trade
+
+
+def _harmless(
+    pipeline: Pipeline, results: xr.Dataset, samples: list[list[NDArray[np.intp]]]
+) -> list[list[NDArray[np.intp]]]:
+    """Return samples of cells with others in place of those that ended their process in the run.
+
+    Samples are paired: what goes in one goes in all.
+    """
+    names = [axis.name for axis in pipeline.axes_of(Stage.scene)]
+    dead = np.zeros(len(samples[0][0]) if names else 1, dtype=bool)
+    for indices in samples:
+        at = {name: xr.DataArray(index, dims="cell")
+              for name, index in zip(names, indices, strict=True)}
+        for name, flag in (("detection", Detection.crashed), ("estimate", Estimate.crashed)):
+            crashed = results[name].isel(at) == flag
+            dead |= crashed.any([dim for dim in crashed.dims if dim != "cell"]).to_numpy()
+    if dead.all():
+        raise StoreError("each scene that would be timed ended its process in the run")
+    alive = np.resize(np.flatnonzero(~dead), len(dead))
+    rows = np.where(dead, alive, np.arange(len(dead)))
+    return [[index[rows] for index in indices] for indices in samples]
 
 
 def _add(
@@ -247,9 +274,9 @@ def _fidelity(
     interrupts: Interrupts,
 ) -> xr.Dataset:
     """Return what each renderer costs, and what it changes against exact images."""
-    samples = [
+    samples = _harmless(pipeline, results, [
         sample_cells(pipeline, {"renderer": number}, len(names)) for number in range(len(names))
-    ]
+    ])
     at = names.index(REFERENCE)
     seconds, errors = measure_renderers(pipeline, samples, at, limit_s, interrupts)
     changed = renderer_bias(results, REFERENCE).compute()

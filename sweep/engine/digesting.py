@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
+import stat
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 from zlib import crc32
 
 from zarr.abc.store import ByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
+from zarr.core.sync import sync
 from zarr.storage import LocalStore, WrapperStore
 
 
 def digest(content: bytes | memoryview) -> int:
     """Return the CRC-32 of stored bytes."""
     return crc32(content)
+
+
+def is_special(path: Path) -> bool:
+    """Tell whether a path is neither a file nor a folder: reading a pipe would never end."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return False
+    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
 
 
 class DigestingStore(WrapperStore[Store]):
@@ -30,7 +43,27 @@ class DigestingStore(WrapperStore[Store]):
         self._keeps = keeps
         self.digests: dict[str, int] = {}
         self.instead: dict[str, Buffer] = {}
-        self._root = os.path.realpath(store.root) if isinstance(store, LocalStore) else None
+        self._root = store.root if isinstance(store, LocalStore) else None
+
+    def contents(self, keys: Sequence[str]) -> list[bytes | None]:
+        """Return what is stored under keys, None where nothing is; from any thread."""
+        if self._root is None:
+            return sync(self._contents(keys))
+        found: list[bytes | None] = []
+        for key in keys:
+            path = Path(self._root, key)
+            try:
+                found.append(None if is_special(path) else path.read_bytes())
+            except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
+                found.append(None)
+        return found
+
+    async def _contents(self, keys: Sequence[str]) -> list[bytes | None]:
+        async def content(key: str) -> bytes | None:
+            buffer = await self._store.get(key, default_buffer_prototype())
+            return None if buffer is None else buffer.to_bytes()
+
+        return await asyncio.gather(*(content(key) for key in keys))
 
     @property
     def below(self) -> Store:
@@ -48,6 +81,8 @@ class DigestingStore(WrapperStore[Store]):
         """Return what is under a key, and note its digest."""
         if key in self.instead:
             return self.instead[key]
+        if self._root is not None and is_special(Path(self._root, key)):
+            return None
         content = await super().get(key, prototype, byte_range)
         if content is not None and byte_range is None:
             self.digests[key] = _digest_of(content)
@@ -75,7 +110,7 @@ class DigestingStore(WrapperStore[Store]):
     def _see_that_it_is_inside(self, key: str) -> None:
         if self._root is None:
             return
-        root = str(self._root)
+        root = os.path.realpath(self._root)
         folder = os.path.realpath(Path(root, key).parent)
         if os.path.commonpath((root, folder)) != root:
             raise PermissionError(0, f"{key} is a link that leads out of the store", key)

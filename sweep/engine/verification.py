@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
@@ -49,10 +47,10 @@ from sweep.plan.grid import Block, scene_axes
 from sweep.plan.one_cell import at_text
 from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline
-from sweep.plan.template import TEMPLATE, Variable, bytes_per_block
+from sweep.plan.template import TEMPLATE, Variable
 
-TOGETHER_BYTES, MOST_TOGETHER = 64_000_000, 32
-"""Blocks are read together up to about this size."""
+THREADS, WINDOW = 4, 256
+"""Blocks that are read and decoded at a time, and that are under way."""
 
 CHANGED = "changed: not what its checksum says"
 
@@ -104,6 +102,16 @@ class Verdict:
     left_over: list[str] = field(default_factory=list)
 
 
+@dataclass(frozen=True, slots=True)
+class _Checked:
+    """A block that was looked through: what is wrong with it by key."""
+
+    number: int
+    faults: dict[str, str]
+    bytes: int
+    processor: str
+
+
 def verify(url: str, sample: int = SAMPLE) -> Verdict:
     """Check a store: every file against its digest, flags against numbers, a sample computed again.
 
@@ -127,7 +135,6 @@ class Check:
         self._bytes = 0
         self.store = store_of(url, self.place, self._attributes(url), mode)
         self.planned = planned_arrays(self.store.pipeline, self.store.blocks.extents)
-        self.keys = sync(self._listed())
 
     async def _listed(self) -> set[str]:
         return {key async for key in self.place.list_prefix("")}
@@ -152,45 +159,54 @@ class Check:
     def verdict(self, sample: int) -> Verdict:
         """Look through the store, and compute up to ``sample`` scenes again."""
         store = self.store
-        done = sorted(committed(store))
-        known = {"zarr.json", *KEYS} | self._check_files()
-        sound: dict[int, dict[str, Any]] = {}
-        expected = range(len(store.blocks)) if store.finished else done
-        size = bytes_per_block(store.pipeline, math.prod(store.blocks.extents))
-        together = min(max(TOGETHER_BYTES // size, 1), MOST_TOGETHER)
-        with ThreadPoolExecutor() as pool:
-            for start in range(0, len(expected), together):
-                numbers = expected[start : start + together]
-                keys = [self._block_keys(number) for number in numbers]
-                contents = sync(self._contents(keys))
-                checked = pool.map(self._check_block, numbers, keys, contents)
-                for number, of_block, (receipt, faults) in zip(
-                    numbers, keys, checked, strict=True
-                ):
-                    known.update(of_block)
-                    self._damage += [Damage(key, what, number) for key, what in faults.items()]
-                    if not faults:
-                        sound[number] = receipt
+        done = committed(store)
+        left = sync(self._listed())
+        files = len(left)
+        left -= {"zarr.json", *KEYS} | self._check_files()
+        sound: dict[int, str] = {}
+        expected = range(len(store.blocks)) if store.finished else sorted(done)
+        with ThreadPoolExecutor(THREADS) as pool:
+            # A window of them at a time: their number may be large.
+            for start in range(0, len(expected), WINDOW):
+                for block in pool.map(self._check_block, expected[start : start + WINDOW]):
+                    left.difference_update(self._block_keys(block.number))
+                    self._bytes += block.bytes
+                    self._damage += [
+                        Damage(key, what, block.number) for key, what in block.faults.items()
+                    ]
+                    if not block.faults:
+                        sound[block.number] = block.processor
+        files -= len(left)
         sampled, not_sampled = 0, "no scenes were asked for" if not sample else "no block is there"
         if sample and sound:
             sampled, not_sampled = self._check_sample(sample, sound)
+        alive = holder(self.place) is not None
         return Verdict(
-            store.url, store.finished, len(store.blocks), len(done), len(self.keys & known),
+            store.url, store.finished, len(store.blocks), len(done), files,
             self._bytes, sampled, not_sampled, self._damage,
-            left_over=sorted(self.keys - known - self._in_use(done)),
+            left_over=[] if alive else sorted(key for key in left if not self._in_use(key, done)),
         )
 
-    def _in_use(self, done: list[int]) -> set[str]:
-        """Return the keys of a run that goes on, or may be continued."""
-        if holder(self.place) is not None:
-            return self.keys
-        begun = {f"{BEGUN}/{number}" for number in range(len(self.store.blocks))}
-        # Chunks of blocks that are not committed are written again.
-        torn = set() if self.store.finished else {
-            chunk_key(self.store, variable, self.store.blocks[number])
-            for number in set(range(len(self.store.blocks))) - set(done) for variable in TEMPLATE
-        }
-        return (begun - {f"{BEGUN}/{number}" for number in done}) | torn
+    def _in_use(self, key: str, done: set[int]) -> bool:
+        """Tell whether a key is of a block that a run will write again."""
+        name, _, place = key.partition("/c/")
+        if key.startswith(f"{BEGUN}/"):
+            number = key.removeprefix(f"{BEGUN}/")
+            return number.isdecimal() and int(number) not in done
+        variable = next((v for v in TEMPLATE if v.name == name), None)
+        if variable is None or self.store.finished:
+            return False
+        position = dict(
+            zip(variable.dimensions(self.store.pipeline), place.split("/"), strict=False)
+        )
+        try:
+            starts = tuple(
+                int(position[axis.name]) * extent for axis, extent in
+                zip(scene_axes(self.store.pipeline), self.store.blocks.extents, strict=True)
+            )
+        except (KeyError, ValueError):
+            return False
+        return self.store.blocks.number(Block(starts, starts)) not in done
 
     def _check_files(self) -> set[str]:
         """Check all files that are no block's; return their keys."""
@@ -222,7 +238,9 @@ class Check:
             if not wrong & {planned.path, *own} and (fault := self._misfit(planned)):
                 self._damage.append(Damage(planned.path, fault))
         if self.manifest is None:
-            known |= {key for key in self.keys if key.startswith(("cost/", "failures/"))}
+            known |= {
+                key for key in sync(self._listed()) if key.startswith(("cost/", "failures/"))
+            }
         return known
 
     def _misfit(self, planned: PlannedArray) -> str:
@@ -247,25 +265,15 @@ class Check:
         return [f"{RECEIPTS}/c/{number}",
                 *(chunk_key(self.store, variable, block) for variable in TEMPLATE)]
 
-    async def _contents(self, keys: Sequence[Sequence[str]]) -> list[list[bytes | None]]:
-        """Return what is stored under keys, block by block."""
-        async def content(key: str) -> bytes | None:
-            found = await self.place.below.get(key, default_buffer_prototype())
-            return None if found is None else found.to_bytes()
-
-        return await asyncio.gather(
-            *(asyncio.gather(*(content(key) for key in of_block)) for of_block in keys)
-        )
-
-    def _check_block(
-        self, number: int, keys: Sequence[str], contents: Sequence[bytes | None]
-    ) -> tuple[dict[str, Any], dict[str, str]]:
-        """Return a block's receipt, and what is wrong with it by key; in any thread."""
+    def _check_block(self, number: int) -> _Checked:
+        """Check one block; in any thread."""
         store, block = self.store, self.store.blocks[number]
+        keys = self._block_keys(number)
+        contents = self.place.contents(keys)
         faults = {
             key: "missing" for key, content in zip(keys, contents, strict=True) if content is None
         }
-        self._bytes += sum(len(content) for content in contents if content is not None)
+        size = sum(len(content) for content in contents if content is not None)
         receipt: dict[str, Any] = {}
         written: list[int] | None = None
         if contents[0] is not None:
@@ -294,7 +302,7 @@ class Check:
             against = contradiction(store.pipeline, values, receipt)
             if against:
                 faults[f"block {block}"] = against
-        return receipt, faults
+        return _Checked(number, faults, size, str(receipt.get("processor")))
 
     def _decoded(self, content: bytes, variable: Variable, block: Block) -> NDArray[Any]:
         """Return a chunk's values within the grid; ValueError where it fails its checksum."""
@@ -306,7 +314,7 @@ class Check:
             for part, length in zip(inside, array.shape, strict=True)
         )]
 
-    def _check_sample(self, count: int, sound: Mapping[int, dict[str, Any]]) -> tuple[int, str]:
+    def _check_sample(self, count: int, sound: Mapping[int, str]) -> tuple[int, str]:
         """Compute scenes of sound blocks again; return how many, or why none."""
         store = self.store
         try:
@@ -315,7 +323,7 @@ class Check:
             return 0, str(error).splitlines()[-1].strip()
         generator = np.random.default_rng()
         numbers = np.array(list(sound))
-        scenes = np.array([sound[number]["scenes"] for number in numbers.tolist()])
+        scenes = np.array([len(store.blocks[number]) for number in numbers.tolist()])
         picked = generator.choice(numbers, size=count, p=scenes / scenes.sum()).tolist()
         cells = sorted({
             (number, int(generator.integers(len(store.blocks[number])))) for number in picked
@@ -351,7 +359,7 @@ class Check:
                 axis.name: axis.values[k]
                 for axis, k in zip(axes, grid_index(store, *cell), strict=True)
             })
-            if sound[cell[0]]["processor"] == processor():
+            if sound[cell[0]] == processor():
                 told = difference(here, there)
             else:
                 elsewhere += 1

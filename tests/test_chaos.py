@@ -302,7 +302,7 @@ class Chaos:
             self._see_it_finished(client)
 
 
-@lengths(6, 200)
+@lengths(3, 200)
 def test_kills_at_random_instants_change_no_bit_and_lose_no_block(count, tmp_path):
     trials = SHORT_TRIALS if count < 100 else LONG_TRIALS
     pipeline, path, reference = prepared(tmp_path, GRID % trials, "undisturbed")

@@ -327,18 +327,28 @@ def test_scene_that_raises_fails_alone(pipeline, clean, tmp_path):
                .values()) == 0
 
 
+FEW = [
+    Poison(59, "detection", "abort", SUBPIX), Poison(70, "estimation", "segv", (), ITERATIVE),
+    Poison(50, "detection", "raise", SUBPIX),
+]
+
+MANY = [
+    # First of a block; last and the one before it; one that does not end anything between.
+    Poison(20, "scene", "segv"),
+    Poison(58, "scene", "kill"), Poison(59, "detection", "abort", SUBPIX),
+    Poison(50, "detection", "raise", SUBPIX),
+    Poison(70, "estimation", "segv", (), ITERATIVE),
+    Poison(105, "truth", "exit"),
+]
+
+
+@pytest.mark.parametrize(
+    "poisons", [pytest.param(FEW, id="few"), pytest.param(MANY, id="many", marks=pytest.mark.long)]
+)
 def test_scenes_that_end_their_process_are_found_and_no_other_is_touched(
-    pipeline, clean, tmp_path
+    poisons, pipeline, clean, tmp_path
 ):
     url = str(tmp_path / "poisoned.zarr")
-    poisons = [
-        # First of a block; last and the one before it; one that does not end anything between.
-        Poison(20, "scene", "segv"),
-        Poison(58, "scene", "kill"), Poison(59, "detection", "abort", SUBPIX),
-        Poison(50, "detection", "raise", SUBPIX),
-        Poison(70, "estimation", "segv", (), ITERATIVE),
-        Poison(105, "truth", "exit"),
-    ]
     store = create_store(url, pipeline, EXTENTS)
     ran, seconds, log = run_poisoned(tmp_path, TEXT, poisons, "--workers", 2)
     assert (ran.returncode, ran.stderr) == (0, "")

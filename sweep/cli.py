@@ -241,13 +241,12 @@ class _Bar:
 
 def _plan(chosen: argparse.Namespace) -> int:
     pipeline = _read(chosen)
-    from sweep.engine.forecasting import effect_costs, forecast  # noqa: PLC0415
+    from sweep.engine.forecasting import forecast_apart  # noqa: PLC0415
     from sweep.plan.activity import parts  # noqa: PLC0415
 
-    expected = forecast(pipeline, chosen.workers)
     listed = parts(pipeline)
     switches = [part.switch for part in listed if part.switch and part.active]
-    costs = effect_costs(pipeline, switches, expected.pose_s)
+    expected, costs = forecast_apart(pipeline, chosen.workers, switches)
     if chosen.json:
         _print_json(
             {

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sweep.engine.apart import Child, DiedError, RaisedError
 from sweep.engine.calibration import block_extents, calibrate, sample
 from sweep.engine.cluster import default_workers
 from sweep.engine.runner import CALIBRATION_S
-from sweep.errors import StoreError
+from sweep.errors import RunError, StoreError
 from sweep.kernel import run_cells
 from sweep.model.effects import SWITCHES
 from sweep.plan.grid import Blocks, scene_axes
@@ -92,6 +93,35 @@ def _without(pipeline: Pipeline, switch: str) -> Pipeline:
             for axis in pipeline.axes
         ),
     )
+
+
+PLAN_LIMIT_S = 600.0
+"""Seconds that all measuring may take; a scene that never returns would have it go on for ever."""
+
+
+def forecast_apart(
+    pipeline: Pipeline, workers: int | None, switches: Sequence[str]
+) -> tuple[Forecast, dict[str, float]]:
+    """Return :func:`forecast` and :func:`effect_costs`, measured in a child process.
+
+    Raises
+    ------
+    RunError
+        Where a scene that is measured ends its process, never returns, or raises.
+    """
+    try:
+        with Child() as child:
+            expected: Forecast = child.call(forecast, pipeline, workers, limit_s=PLAN_LIMIT_S)
+            costs: dict[str, float] = child.call(
+                effect_costs, pipeline, switches, expected.pose_s, limit_s=PLAN_LIMIT_S
+            )
+    except (DiedError, RaisedError) as error:
+        why = str(error).strip().splitlines()[-1]
+        raise RunError(
+            f"a scene that was measured ended its process ({why}); `sweep run` finds it, and "
+            "computes the others"
+        ) from None
+    return expected, costs
 
 
 def forecast(pipeline: Pipeline, workers: int | None = None) -> Forecast:

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from sweep.errors import SweepError
 from sweep.inspection import Look, look
 from sweep.measure.flags import Detection, Estimate, Flipped
-from sweep.plan.axes import label
-from sweep.plan.one_cell import cell, coordinates_text
+from sweep.plan.one_cell import at_text, cell, coordinates_text
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.template import TEMPLATE
 from sweep.report.scene_drawing import LINE_HEIGHT, LONGEST_SIDE, draw_scene
@@ -206,14 +205,16 @@ def _pieces(results: xr.Dataset) -> Iterator[tuple[Index, xr.Dataset]]:
 def _scene(subject: Subject, index: Index, titles: tuple[str, ...]) -> Scene:
     with reading(subject.store):
         stored = subject.results[list(NEEDED)].isel(index).load()
-    at = at_text(subject.pipeline, index)
+    at = at_text({
+        axis.name: axis.values[index[axis.name]] for axis in subject.pipeline.axes
+    })
     command = f"sweep show {pipeline_file(subject.pipeline)}"
     command += f" --at {shlex.quote(at)}" if at else ""
     flags = _flags(stored)
     plain = Scene(titles, at.replace(",", ", "), command, flags, "", None)
     if "crashed" in flags:
         return dataclasses.replace(
-            plain, problem="Not drawn: rendering it ended a process.")
+            plain, problem="Not drawn: it ended its process; `sweep repro` tries again.")
     try:
         one = cell(subject.pipeline, at)
         seen = look(one)
@@ -229,21 +230,6 @@ def _scene(subject: Subject, index: Index, titles: tuple[str, ...]) -> Scene:
         size=(picture.shape[1], picture.shape[0]),
         alt=f"Rendered marker with the true outline and what was found: {told}",
     )
-
-
-def at_text(pipeline: Pipeline, index: Mapping[str, int]) -> str:
-    """Return a cell as ``--at`` takes it: every axis that has more than one value."""
-    parts = []
-    for axis in pipeline.axes:
-        value = axis.values[index[axis.name]]
-        if isinstance(value, bool):
-            text = str(value).lower()
-        elif isinstance(value, str) or not isinstance(value, tuple):
-            text = str(value) if isinstance(value, str) else repr(value)
-        else:
-            text = label(value)
-        parts.append(f"{axis.name}={text}")
-    return ",".join(parts)
 
 
 def pipeline_file(pipeline: Pipeline) -> str:

@@ -31,17 +31,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return int(chosen.command(chosen))
     except (PipelineError, StoreError) as error:
-        print(error, file=sys.stderr)
+        _tell(error)
         return 2
     except SweepError as error:
-        print(error, file=sys.stderr)
+        _tell(error)
         return 1
     except KeyboardInterrupt:
-        print("stopped; the same command continues", file=sys.stderr)
+        without = " without --overwrite" if getattr(chosen, "overwrite", False) else ""
+        print(f"stopped; the same command{without} continues", file=sys.stderr)
         return 130
     except BrokenPipeError:
         sys.stderr.close()
         return 1
+
+
+def _tell(error: SweepError) -> None:
+    """Print an error's lines, without what would control the terminal."""
+    from sweep.plan.faults import plain  # noqa: PLC0415
+
+    for line in str(error).splitlines():
+        print(plain(line, LONGEST_LINE), file=sys.stderr)
+
+
+LONGEST_LINE = 2000
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -327,6 +339,7 @@ def _repro(chosen: argparse.Namespace) -> int:
     if not 0 < chosen.time_limit < math.inf:
         raise StoreError(f"--time-limit {chosen.time_limit}: expected seconds above 0")
     from sweep.engine.reproduction import reproduce  # noqa: PLC0415
+    from sweep.plan.faults import plain  # noqa: PLC0415
     from sweep.plan.one_cell import coordinates_text  # noqa: PLC0415
     from sweep.report.scene_drawing import draw_scene  # noqa: PLC0415
     from sweep.report.scene_values import value_lines  # noqa: PLC0415
@@ -349,7 +362,8 @@ def _repro(chosen: argparse.Namespace) -> int:
     print(f"took {took}")
     for failure in again.failures:
         kind = "ended its process" if failure.crashed else "raised"
-        print(f"{failure.stage}: {kind}: {failure.text.strip()}")
+        print(f"{failure.stage}: {kind}:")
+        print("\n".join(plain(line, 1000) for line in failure.text.strip().splitlines()))
     if again.image is None:
         print("no image: rendering it fails here")
     else:
@@ -470,13 +484,16 @@ def _verify(chosen: argparse.Namespace) -> int:
     if chosen.json:
         _print_json(dataclasses.asdict(found))
         return 1 if found.damage else 0
+    from sweep.plan.faults import plain  # noqa: PLC0415
+
     for what, listed in (("repaired", found.repaired), ("damaged", found.damage)):
         for damage in listed[:MOST_LINES]:
-            print(f"{what:9} {damage.where}: {damage.what}")
+            print(f"{what:9} {plain(damage.where, 300)}: {plain(damage.what, 300)}")
         if len(listed) > MOST_LINES:
             print(f"{what:9} and {len(listed) - MOST_LINES:,} more; --json lists all")
     if found.left_over:
-        print(f"{len(found.left_over):,} files are no part of it, such as {found.left_over[0]}; "
+        example = plain(found.left_over[0])
+        print(f"{len(found.left_over):,} files are no part of it, such as {example}; "
               "--repair deletes them")
     again = f"{found.sampled} scenes computed again" if found.sampled else (
         f"no scene computed again ({found.not_sampled})"
@@ -494,6 +511,7 @@ def _verify(chosen: argparse.Namespace) -> int:
 
 def _status(chosen: argparse.Namespace) -> int:
     from sweep.engine.progress import status  # noqa: PLC0415
+    from sweep.plan.faults import plain  # noqa: PLC0415
 
     state = status(chosen.store)
     if chosen.json:
@@ -502,7 +520,7 @@ def _status(chosen: argparse.Namespace) -> int:
     if state.finished:
         what = "finished"
     elif state.writer is not None:
-        what = f"being written by {state.writer}"
+        what = f"being written by {plain(state.writer)}"
     else:
         what = "stopped; `sweep run` continues it"
     print(f"{state.title}: {what}")
@@ -517,7 +535,7 @@ def _status(chosen: argparse.Namespace) -> int:
         print(f"  time left   {_duration(state.seconds_left)}")
     for kind, cells in (("crashed", state.crashed), ("failed", state.failed)):
         for cell in cells[:MOST_LINES]:
-            print(f"  {kind:11} --at {cell.at}  {cell.stage}: {cell.reason}")
+            print(f"  {kind:11} --at {cell.at}  {cell.stage}: {plain(cell.reason, 300)}")
         if len(cells) > MOST_LINES:
             print(f"  {kind:11} and more; --json lists the first 1,000")
     return 0

@@ -22,9 +22,17 @@ class PipelineError(SweepError):
         super().__init__("\n".join(faults))
         self.faults = tuple(faults)
 
+    def __reduce__(self) -> tuple[type[PipelineError], tuple[tuple[str, ...]]]:
+        """Return how it is made anew in another process."""
+        return PipelineError, (self.faults,)
+
 
 class StoreError(SweepError):
     """A store that cannot be written, read or continued as asked."""
+
+
+class StoreReplacedError(StoreError):
+    """A store that is no longer where a run had it: another run's is there, or nothing."""
 
 
 class RunError(SweepError):

@@ -87,6 +87,16 @@ class Failure:
     crashed: bool = False
 
 
+MOST_TOLD = 1000
+"""Failures whose traceback is kept; of the others only the last line is."""
+
+
+def _told(failures: Sequence[Failure]) -> str:
+    """Return the text of the exception that is being handled."""
+    text = traceback.format_exc()
+    return text if len(failures) < MOST_TOLD else text.strip().rpartition("\n")[2]
+
+
 @dataclass(slots=True)
 class CellsResult:
     """What N scene cells gave.
@@ -382,7 +392,7 @@ def search(
                 try:
                     note((row, *find(seen, dictionary[row], sides[row])))
                 except Exception:
-                    failures.append(Failure(row, "detection", traceback.format_exc(), k))
+                    failures.append(Failure(row, "detection", _told(failures), k))
                     hit.failed.append(row)
                 now = clock()
                 row_s[row] += now - start
@@ -447,7 +457,7 @@ def _rendered(
             try:
                 images += render_all(scenes, one, boxes[one], windows[one])
             except Exception:
-                failures.append(Failure(row, "scene", traceback.format_exc()))
+                failures.append(Failure(row, "scene", _told(failures)))
                 images.append(None)
         return images
 
@@ -512,7 +522,7 @@ def _estimated(
             try:
                 parts.append(estimator(seen.take(np.array([i]))))
             except Exception:
-                failures.append(Failure(int(rows[i]), "estimation", traceback.format_exc()))
+                failures.append(Failure(int(rows[i]), "estimation", _told(failures)))
                 parts.append(Estimates.none(1, Estimate.failed))
         return Estimates.joined(parts)
 

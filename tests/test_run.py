@@ -17,8 +17,8 @@ import xarray as xr
 import zarr
 
 import sweep
-from sweep.engine.lock import KEY
-from sweep.engine.manifest import put
+from sweep.engine.lock import KEY, locked
+from sweep.engine.manifest import get, put
 from sweep.engine.runner import execute
 from sweep.engine.store import committed, create_store, open_store, remove_store
 from sweep.engine.task import compute_block
@@ -221,6 +221,29 @@ def test_grown_grid_reuses_what_there_is_bit_for_bit(settings, undisturbed, tmp_
     assert sum(part["estimates"] for part in computed) == total - shared
 
 
+def test_bound_is_reused_with_its_flag(tmp_path):
+    text = """
+        pose = { side_px = 30, jitter_px = 0.5 }
+        axes.trial = %d
+        [scene]
+        black = 40
+        white = 220
+        background = 120
+        noise_grey = 2
+        bound = "known_blur"
+    """
+    old, new, fresh = (str(tmp_path / f"{name}.zarr") for name in ("old", "new", "fresh"))
+    by_hand(old, Pipeline.from_text(text % 2), (2,))
+    grown = Pipeline.from_text(text % 4)
+    by_hand(fresh, grown, (4,))
+    store = create_store(new, grown, (2,))
+    computed = [compute_block(new, store.run_id, block, (old,))["computed"]["scenes"]
+                for block in store.blocks]
+    assert computed == [0, 2]
+    assert (sweep.open(fresh).bound == 1).all()
+    assert same(new, fresh)
+
+
 def test_halves_of_a_grid_are_joined(pipeline, undisturbed, tmp_path):
     halves = []
     for name, tilts in (("left", "[0]"), ("right", "[50]")):
@@ -293,6 +316,14 @@ def test_store_in_use_is_refused_and_a_dead_lock_is_not(pipeline, tmp_path):
     put(store.place, KEY, {**here, "pid": ended.pid})
     assert execute(pipeline, url, workers=1).computed_blocks == 1
     assert not (Path(url) / KEY).exists()
+
+
+def test_lock_that_was_taken_over_is_left_to_its_holder(pipeline, tmp_path):
+    store = create_store(str(tmp_path / "taken.zarr"), pipeline, (2, 4, 2, 3))
+    theirs = {"token": "x", "host": socket.gethostname(), "pid": os.getpid(), "beat": time.time()}
+    with locked(store):
+        put(store.place, KEY, theirs)
+    assert get(store.place, KEY) == theirs
 
 
 def test_silent_scheduler_is_given_up(pipeline, tmp_path, monkeypatch):

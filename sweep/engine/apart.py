@@ -1,7 +1,7 @@
 """Functions called in a child process, which may die of them.
 
-``python -m sweep.engine.apart`` is the child: it reads calls from its standard input and writes
-results to its standard output.
+The child reads calls from its standard input and writes results to its standard output. Nothing
+else is unpickled than what these two processes of one program tell each other.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Child:
     def __init__(self) -> None:
         self._given_up = False
         self._process = subprocess.Popen(  # noqa: S603  (this program)
-            [sys.executable, "-c", _START, json.dumps(sys.path)],
+            [sys.executable, "-P", "-c", _START, json.dumps(sys.path)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             env={**os.environ, **SINGLE_THREADED},
             start_new_session=True,  # a terminal's Ctrl-C is the caller's to act on
@@ -81,7 +81,7 @@ class Child:
         try:
             _send(self._process.stdin, (function, arguments, limit_s))
             raised, result = _receive(self._process.stdout)
-        except (EOFError, BrokenPipeError, pickle.UnpicklingError):
+        except (EOFError, OSError, ValueError, pickle.UnpicklingError):
             raise DiedError(self._end(time.monotonic() - started, limit_s)) from None
         finally:
             stuck.cancel()

@@ -7,7 +7,8 @@ scene that never returns keeps within it:
 - 3 T/16: pieces of it in a child, cut in 64 up to three times, T/16 each (:data:`PIECE`);
 - T/8 + T/16 + ... : the parts of the scene that is left, searched and solved one by one
   (:data:`PART`), each limit half of that before it once one has run out;
-- the rest: compiled code is loaded by the first call in each child (:data:`LOADING`).
+- the rest: the first call in each child has more (:data:`LOADING`); while code is compiled or
+  loaded, no limit runs.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.engine.apart import Child, DiedError, RaisedError
+from sweep.errors import RunError
 from sweep.kernel import CellsResult, Failure, joined, run_cells
 from sweep.measure.flags import Detection, Estimate, Flipped
 from sweep.plan.parameters import Stage
@@ -31,6 +33,12 @@ WHOLE, PIECE, PART = 1 / 4, 1 / 16, 1 / 8
 
 LOADING, LOADING_S = 1 / 16, 15.0
 """What the first call in a child has more: this share of the limit, or so many seconds."""
+
+SHORTEST_S = 1.0
+"""What a part of a scene has in any case."""
+
+HOLD_S = 300.0
+"""How long a child may take to start and to take the pipeline."""
 
 PIECES = 64
 """Into how many pieces what ended a process is cut."""
@@ -52,15 +60,22 @@ class _Careful:
 
     def __init__(self, pipeline: Pipeline, limit_s: float) -> None:
         self._pipeline = pipeline
-        self._limit_s = limit_s
+        self.limit_s = limit_s
         self._child: Child | None = None
 
     def __call__(self, share: float, *arguments: Any) -> CellsResult:
-        limit_s = share * self._limit_s
+        limit_s = share * self.limit_s
         if self._child is None:
-            self._child = Child()
-            self._child.call(_hold, self._pipeline, limit_s=self._limit_s)
-            limit_s += min(LOADING * self._limit_s, LOADING_S)
+            child = Child()
+            try:
+                child.call(_hold, self._pipeline, limit_s=HOLD_S)
+            except (DiedError, RaisedError) as error:
+                child.close()
+                raise RunError(
+                    f"a child process ended before it computed anything: {error}"
+                ) from None
+            self._child = child
+            limit_s += min(LOADING * self.limit_s, LOADING_S)
         try:
             result: CellsResult = self._child.call(_run_held, *arguments, limit_s=limit_s)
         except DiedError:
@@ -134,7 +149,7 @@ def _one(
                 return False
             except DiedError as death:
                 endless = str(death).startswith("time")
-                share = share / 2 if endless else share
+                share = max(share / 2, SHORTEST_S / careful.limit_s) if endless else share
                 # A process may also be killed from outside; twice is no chance.
                 if endless or last:
                     lost.append(Failure(0, stage, str(death), setting, estimator, crashed=True))

@@ -108,11 +108,12 @@ UNMEASURED_S = 0.01
 """What a scene is taken to cost where measuring it ended the process."""
 
 
-def calibrate_apart(pipeline: Pipeline, budget_s: float, limit_s: float) -> Calibration:
+def calibrate_apart(
+    child: Child, pipeline: Pipeline, budget_s: float, limit_s: float
+) -> Calibration:
     """Measure as :func:`calibrate` does, in a child process: a scene may end it."""
     try:
-        with Child() as child:
-            measured: Calibration = child.call(calibrate, pipeline, budget_s, limit_s=limit_s)
+        measured: Calibration = child.call(calibrate, pipeline, budget_s, limit_s=limit_s)
     except (DiedError, RaisedError):
         return Calibration(UNMEASURED_S, 0.0, 0, (0.0,) * len(scene_axes(pipeline)))
     return measured

@@ -143,7 +143,7 @@ def threads(client: Client) -> int:
     RunError
         Where the scheduler went away.
     """
-    gone = RunError("the scheduler went away; the same command continues once one runs again")
+    gone = RunError("the scheduler went away")
     if client.scheduler is None or client.status != "running":
         raise gone
     try:
@@ -275,10 +275,14 @@ async def _ask_each(client: Client, pipeline: Pipeline) -> dict[str, dict[str, A
         asyncio.ensure_future(client.run(fingerprint, pipeline, workers=[worker]))
         for worker in await client.nthreads()
     ]
+    if not asked:
+        raise TimeoutError
     done, _ = await asyncio.wait(
         asked, timeout=FIRST_ANSWER_S, return_when=asyncio.FIRST_COMPLETED
     )
     if not done:
+        for one in asked:
+            one.cancel()
         raise TimeoutError
     done, late = await asyncio.wait(asked, timeout=ANSWER_S)
     for one in late:

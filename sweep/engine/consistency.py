@@ -83,6 +83,9 @@ def contradiction(
     scene = names["marker_area_px"]
     away = tuple(k for k, name in enumerate(names["detection"]) if name not in scene)
     known = np.asarray(np.any(~np.isin(values["detection"], LOST), axis=away))
+    asked = pipeline.fixed.get("bound", "none") != "none"
+    if asked and ((values["bound"] == Bound.not_run) & known).any():
+        return "bound: not run"
     for name in ("true_rvec", "true_tvec_m", "marker_area_px"):
         if not _inner(np.isfinite(values[name]), known, np.all)[known].all():
             return f"{name}: no number"

@@ -107,6 +107,11 @@ class DigestingStore(WrapperStore[Store]):
         await super().delete(key)
         self.digests.pop(key, None)
 
+    async def delete_dir(self, prefix: str) -> None:
+        """Delete a folder."""
+        self._see_that_it_is_inside(f"{prefix}/x")
+        await super().delete_dir(prefix)
+
     def _see_that_it_is_inside(self, key: str) -> None:
         if self._root is None:
             return

@@ -119,7 +119,7 @@ def failure_table(cells: Sequence[FailedCell], counts: Mapping[str, int]) -> xr.
         {name: column(name) for name in ("at", "kind", "stage", "text")},
         attrs={
             "long_name": "scenes that raised or ended their process",
-            "rows_kept": f"the first {MOST_ROWS} of each kind",
+            "rows_kept": f"at most {MOST_ROWS} of each kind, and {MOST_PER_BLOCK} of a block",
             **{f"{kind}_cells": count for kind, count in counts.items()},
         },
     )

@@ -64,7 +64,8 @@ def locked(store: RunStore) -> Iterator[None]:
         done.set()
         heart.join()
         with contextlib.suppress(Exception):
-            sync(place.delete(KEY))
+            if (get(place, KEY) or {}).get("token") == mine["token"]:
+                sync(place.delete(KEY))
 
 
 def refuse_if_held(url: str, place: Store) -> None:

@@ -68,8 +68,11 @@ def read_manifest(store: Store) -> tuple[Manifest | None, list[str]]:
         try:
             if content is None or content.pop("digest") != _own(content):
                 raise ValueError(key)
-            found.append(Manifest(dict(content["attributes"]), dict(content["files"])))
-        except (KeyError, TypeError, ValueError):
+            files = {key: int(value) for key, value in content["files"].items()}
+            if any("\0" in key or ".." in key or key.startswith("/") for key in files):
+                raise ValueError("a key outside the store")
+            found.append(Manifest(dict(content["attributes"]), files))
+        except (AttributeError, KeyError, TypeError, ValueError):
             unsound.append(key)
     if len(found) == 2 and found[0] != found[1]:
         # A kill came between the two: the first is the later.

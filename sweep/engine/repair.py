@@ -78,6 +78,8 @@ def repair(
             close(store)
     after = Check(url, "r").verdict(0)
     after.sampled, after.not_sampled = before.sampled, before.not_sampled
+    # What no block can be blamed for is not mended by computing blocks again.
+    after.damage += [damage for damage in before.damage if damage.where == "sample"]
     left = {damage.where for damage in after.damage}
     after.repaired = [damage for damage in before.damage if damage.where not in left]
     return after

@@ -140,7 +140,7 @@ def _index(pipeline: Pipeline, at: str) -> dict[str, int]:
             told = nearest(name, names) or f"; there are {', '.join(names) or 'none'}"
             faults.append(f"--at {name}: no axis of the store{told}")
         elif value in axis.values:
-            index[name] = list(axis.values).index(value)
+            index[name] = axis.values.index(value)
         else:
             known = ", ".join(str(each) for each in axis.values[:6])
             more = f", ... {axis.values[-1]}" if len(axis) > 6 else ""

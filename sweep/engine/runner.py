@@ -11,12 +11,13 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any
 
+from sweep.engine.apart import Child
 from sweep.engine.calibration import block_extents, calibrate_apart
 from sweep.engine.closing import close, lost
 from sweep.engine.failures import MOST_ROWS
@@ -38,7 +39,7 @@ from sweep.engine.store import (
     remove_store,
 )
 from sweep.engine.task import TIME_LIMIT_S, compute_block
-from sweep.errors import RunError, StoreError
+from sweep.errors import RunError, StoreError, StoreReplacedError
 from sweep.measure.flags import Detection
 from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline
@@ -158,7 +159,7 @@ def execute(
                 f"{url}: damaged: finished, but {done} of {len(opened.blocks)} blocks are there; "
                 "`sweep verify --repair` mends it"
             )
-        return _summary(opened, [], time.perf_counter() - started)
+        return _summary(opened, {}, time.perf_counter() - started)
     sources = [place(os.fspath(old)) for old in reuse]
     for source in sources:
         if source == place(url):
@@ -168,12 +169,19 @@ def execute(
         check_place(url)
     with Interrupts() as interrupts, ThreadPoolExecutor(1) as beside:
         # Compiling and measuring in a child while the workers' processes come up.
-        measuring = None if opened is not None else beside.submit(
-            calibrate_apart, pipeline, CALIBRATION_S, CALIBRATION_SHARE * time_limit_s
+        calibrator = None if opened is not None else Child()
+        measuring = None if calibrator is None else beside.submit(
+            calibrate_apart, calibrator, pipeline, CALIBRATION_S, CALIBRATION_SHARE * time_limit_s
         )
-        with _cluster(pipeline, workers, scheduler) as client:
-            beside.submit(importlib.import_module, "xarray")  # needed at the end
+        with contextlib.ExitStack() as stack:
+            if calibrator is not None:
+                stack.callback(calibrator.close)
+            client = stack.enter_context(_cluster(pipeline, workers, scheduler))
             if measuring is not None:
+                while not measuring.done():
+                    interrupts.check()
+                    wait([measuring], timeout=POLL_S)
+                interrupts.check()
                 count = max(_threads(client), 1)
                 extents = block_extents(pipeline, measuring.result(), count, block_s)
                 if overwrite and exists(url):
@@ -181,14 +189,16 @@ def execute(
                 opened = create_store(url, pipeline, extents)
             if opened is None:
                 raise AssertionError(url)
-            with locked(opened), failing_while_running():
+            beside.submit(importlib.import_module, "xarray")  # needed at the end
+            command = "the same command without --overwrite" if overwrite else "the same command"
+            with locked(opened), _failing_while_running(command):
                 done_before = committed(opened)
                 todo = (k for k in range(len(opened.blocks)) if k not in done_before)
-                receipts_seen = _Run(opened, client, sources, time_limit_s, interrupts).compute(
+                computed = _Run(opened, client, sources, time_limit_s, interrupts).compute(
                     todo, done_before, on_progress
                 )
                 close(opened)
-    return _summary(open_store(url), receipts_seen, time.perf_counter() - started)
+    return _summary(open_store(url), computed, time.perf_counter() - started)
 
 
 def recompute(
@@ -208,18 +218,21 @@ def recompute(
     with (
         Interrupts() as interrupts,
         _cluster(store.pipeline, workers, None) as client,
-        failing_while_running(),
+        _failing_while_running("the same command"),
     ):
         _Run(store, client, [], time_limit_s, interrupts).compute(numbers, set(), None)
 
 
 @contextlib.contextmanager
-def failing_while_running() -> Iterator[None]:
-    """Tell what a store refuses while it is written as what it is: a run that could not go on."""
+def _failing_while_running(command: str) -> Iterator[None]:
+    """Tell that a run could not go on, and by which command it does."""
     try:
         yield
-    except StoreError as error:
-        raise RunError(f"{error}; the same command continues") from None
+    except StoreReplacedError as error:
+        raise RunError(str(error)) from None
+    except (RunError, StoreError) as error:
+        first, *others = str(error).splitlines()
+        raise RunError("\n".join([f"{first}; {command} continues", *others])) from None
 
 
 def _cluster(
@@ -283,10 +296,10 @@ class _Run:
     def compute(
         self, numbers: Iterable[int], done: set[int],
         on_progress: Callable[[Progress], None] | None,
-    ) -> list[dict[str, int]]:
+    ) -> Mapping[str, int]:
         """Compute blocks by their numbers; ``done`` are those that are committed.
 
-        Returns for each block that was run how many scenes, detections and estimates it computed.
+        Returns how many blocks, scenes, detections and estimates were computed.
         """
         todo = iter(numbers)
         progress = Progress(0, self._store.pipeline.size(Stage.scene), 0)
@@ -294,7 +307,7 @@ class _Run:
             self._count(progress, receipt)
         if on_progress is not None:
             on_progress(progress)
-        computed: list[dict[str, int]] = []
+        computed: Counter[str] = Counter()
         faults: list[str] = []
         room = _Room(self._client)
         for number in itertools.islice(todo, room()):
@@ -309,7 +322,7 @@ class _Run:
             number = self._flying.pop(future)
             if future.status == "finished":
                 receipt = future.result()
-                computed.append(receipt["computed"])
+                computed.update({"blocks": 1, **receipt["computed"]})
                 self._count(progress, receipt)
                 if on_progress is not None:
                     on_progress(progress)
@@ -321,7 +334,7 @@ class _Run:
                     self._submit(following)
         if faults:
             raise RunError(
-                f"{self._store.url}: {len(faults)} blocks failed; run again to continue\n"
+                f"{self._store.url}: {len(faults)} blocks failed\n"
                 + "\n".join(f"  {fault}" for fault in faults)
             )
         return computed
@@ -342,7 +355,7 @@ class _Run:
 
         if future.status in ("cancelled", "lost"):
             raise RunError(
-                "the scheduler went away; the same command continues once one runs again"
+                "the scheduler went away"
             )
         error = future.exception()
         if isinstance(error, StoreError):
@@ -380,13 +393,12 @@ class _Room:
                 self._blocks, self._seen = WINDOW * there, self._asked
         if time.monotonic() > self._seen + LONELY_S:
             raise RunError(
-                f"there have been no workers for {LONELY_S:.0f} s; start some, and the same "
-                "command continues"
+                f"there have been no workers for {LONELY_S:.0f} s; start some"
             )
         return self._blocks
 
 
-def _summary(store: RunStore, computed: Sequence[Mapping[str, int]], seconds: float) -> Summary:
+def _summary(store: RunStore, computed: Mapping[str, int], seconds: float) -> Summary:
     """Tell of a finished store what was counted when it was closed."""
     counts = store.about["counts"]
     missing = lost(counts["detection"], counts["estimate"])
@@ -397,9 +409,9 @@ def _summary(store: RunStore, computed: Sequence[Mapping[str, int]], seconds: fl
         results=math.prod(len(axis) for axis in store.pipeline.axes),
         detected=counts["detection"][Detection.detected],
         blocks=len(store.blocks),
-        computed_blocks=len(computed),
-        computed_scenes=sum(block["scenes"] for block in computed),
-        computed_estimates=sum(block["estimates"] for block in computed),
+        computed_blocks=computed.get("blocks", 0),
+        computed_scenes=computed.get("scenes", 0),
+        computed_estimates=computed.get("estimates", 0),
         seconds=round(seconds, 3),
         **missing,
     )

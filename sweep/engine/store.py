@@ -21,7 +21,7 @@ import time
 import uuid
 import warnings
 import weakref
-from collections.abc import AsyncIterator, Iterable, Iterator, Mapping
+from collections.abc import AsyncIterator, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -40,8 +40,9 @@ from sweep.engine.digesting import DigestingStore
 from sweep.engine.layout import RECEIPTS, PlannedArray, planned_arrays
 from sweep.engine.manifest import Manifest, parsed, put, read_manifest, write_manifest
 from sweep.engine.provenance import environment, fingerprint
-from sweep.errors import StoreError
+from sweep.errors import StoreError, StoreReplacedError
 from sweep.plan.grid import Block, Blocks, scene_axes
+from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.template import TEMPLATE, Variable
 
@@ -157,7 +158,7 @@ def _checked_url(url: str) -> str:
     """Return a store's url; StoreError where it holds what must not be kept or shown."""
     if is_remote(url):
         scheme, _, rest = url.partition("://")
-        if "@" in rest.partition("/")[0] or "?" in rest or "#" in rest:
+        if any(sign in rest for sign in ("@", "?", "#", "://", "::")):
             raise StoreError(
                 f"{scheme}://...: a store's name is shown and written down: expected no "
                 "credentials or options in it; the environment has them (AWS_ACCESS_KEY_ID, ...)"
@@ -349,15 +350,21 @@ async def _listed(place: Store, prefix: str) -> list[str]:
 
 
 def tidy(store: RunStore) -> None:
-    """Delete what killed processes left among a local store's groups; nobody else may write it.
+    """Delete what killed processes left in a local store; nobody else may write it.
 
-    Zarr warns of files that it does not know there; elsewhere they are harmless.
+    Zarr warns of files that it does not know among its groups; elsewhere they are harmless.
     """
     if is_remote(store.url):
         return
+    root = Path(store.url).resolve()
     for folder in ("", *GROUPS, *(f"{name}/*" for name in GROUPS)):
-        for path in Path(store.url).glob(f"{folder}/*.partial".lstrip("/")):
-            path.unlink(missing_ok=True)
+        for path in root.glob(f"{folder}/*.partial".lstrip("/")):
+            if path.parent.resolve().is_relative_to(root):
+                path.unlink(missing_ok=True)
+    done = committed(store)
+    for mark in sync(_listed(store.place, BEGUN)):
+        if mark.isdecimal() and int(mark) in done:
+            sync(store.place.delete(f"{BEGUN}/{mark}"))
 
 
 def check_place(url: str) -> None:
@@ -404,21 +411,23 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
             building = _beside(url, "new")
             try:
                 _lay_out(LocalStore(building), pipeline, extents, run_id)
-                building.rename(url)
+                building.rename(Path(url).resolve())
             finally:
                 shutil.rmtree(building, ignore_errors=True)
     return open_store(url, "r+")
 
 
 def _beside(url: str, ending: str) -> Path:
-    """Return an unused path in the folder of a local store."""
-    return Path(url).with_name(f".{Path(url).name}.{uuid.uuid4().hex[:8]}.{ending}")
+    """Return an unused path in the folder of a local store, which may lie behind a link."""
+    path = Path(url).resolve()
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.{ending}")
 
 
 def _tidy_beside(url: str) -> None:
     """Delete what killed processes left of stores that they were making or deleting here."""
+    real = Path(url).resolve()
     for ending, age_s in (("deleted", 0.0), ("new", ABANDONED_S)):
-        for path in Path(url).parent.glob(f".{glob.escape(Path(url).name)}.*.{ending}"):
+        for path in real.parent.glob(f".{glob.escape(real.name)}.*.{ending}"):
             with contextlib.suppress(OSError):
                 if path.stat().st_mtime <= time.time() - age_s:
                     shutil.rmtree(path, ignore_errors=True)
@@ -475,7 +484,7 @@ def remove_store(url: str) -> None:
             return
         # Out of the way at once, then at leisure: a kill between leaves no half a store.
         doomed = _beside(url, "deleted")
-        Path(url).rename(doomed)
+        Path(url).resolve().rename(doomed)
         shutil.rmtree(doomed, ignore_errors=True)
 
 
@@ -536,6 +545,8 @@ def write_block(
     number = store.blocks.number(block)
     with telling(store.url, "written"):
         _see_that_it_is_ours(store)
+        if sync(store.place.exists(f"{RECEIPTS}/c/{number}")):
+            return  # another worker was given it too, perhaps of another processor
         for variable in TEMPLATE:
             array = store.array(variable.name)
             array[region(variable, store.pipeline, block)] = values[variable.name]
@@ -546,6 +557,7 @@ def write_block(
             separators=(",", ":"),
         )
         store.array(RECEIPTS)[number : number + 1] = np.array([content], dtype=object)
+        store.place.digests.pop(f"{RECEIPTS}/c/{number}", None)
         with contextlib.suppress(FileNotFoundError):
             sync(store.place.delete(f"{BEGUN}/{number}"))
 
@@ -580,7 +592,9 @@ def _see_that_it_is_ours(store: RunStore) -> None:
         except (KeyError, FileNotFoundError):
             there = None
     if there != store.run_id:
-        raise StoreError(f"{store.url}: replaced by another run while this one was going on")
+        raise StoreReplacedError(
+            f"{store.url}: replaced by another run, or moved, while this one was going on"
+        )
 
 
 def committed(store: RunStore) -> set[int]:
@@ -605,7 +619,10 @@ def receipts(
         some = ordered[start : start + 1000]
         try:
             texts = np.asarray(store.array(RECEIPTS).oindex[np.array(some)]).tolist()
-            contents = [parsed_receipt(store, text) for text in texts]
+            contents = [
+                parsed_receipt(store, number, text)
+                for number, text in zip(some, texts, strict=True)
+            ]
         except (ValueError, AttributeError, KeyError, TypeError, OSError) as error:
             raise StoreError(
                 f"{store.url}: damaged receipts among blocks {some[0]} to {some[-1]} ({error}); "
@@ -614,14 +631,61 @@ def receipts(
         yield from zip(some, contents, strict=True)
 
 
-def parsed_receipt(store: RunStore, text: str) -> dict[str, Any]:
-    """Return a receipt's content; ValueError where it is not one of this run."""
-    content = json.loads(text)
+def parsed_receipt(store: RunStore, number: int, text: str) -> dict[str, Any]:
+    """Return the content of a block's receipt; ValueError where it is not one of this run."""
+    try:
+        content = json.loads(text)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
     if not isinstance(content, dict) or not content.keys() >= REQUIRED:
         raise ValueError("incomplete")
     if content["run_id"] != store.run_id:
         raise ValueError("of another run")
+    scenes = len(store.blocks[number])
+    searches = store.pipeline.size(Stage.detection)
+    estimates = searches * store.pipeline.size(Stage.estimation)
+    seconds, failures = content["seconds"], content["failures"]
+    right = (
+        content["scenes"] == scenes
+        and _are_counts(content["detection"], scenes * searches)
+        and _are_counts(content["estimate"], scenes * estimates)
+        and _are_counts(content["digests"], None) and len(content["digests"]) == len(TEMPLATE)
+        and isinstance(content["written"], (int, float))
+        and isinstance(content["processor"], str)
+        and isinstance(seconds, dict)
+        and all(
+            isinstance(seconds.get(name), list) and len(seconds[name]) in (0, length)
+            and all(isinstance(value, (int, float)) for value in seconds[name])
+            for name, length in (("scene", 1), ("detection", searches), ("estimation", estimates))
+        )
+        and isinstance(failures, list)
+        and all(_is_failure(failure, scenes, searches, estimates) for failure in failures)
+    )
+    if not right:
+        raise ValueError("not a receipt of this block")
     return content
+
+
+def _are_counts(values: Any, total: int | None) -> bool:
+    return (
+        isinstance(values, list) and all(type(value) is int and value >= 0 for value in values)
+        and (total is None or sum(values) == total)
+    )
+
+
+def _is_failure(failure: Any, scenes: int, searches: int, estimates: int) -> bool:
+    def number(name: str, count: int) -> bool:
+        value = failure.get(name)
+        return type(value) is int and 0 <= value < count
+
+    return (
+        isinstance(failure, dict) and number("scene", scenes)
+        and failure.get("kind") in ("failed", "crashed")
+        and failure.get("stage") in ("scene", "detection", "estimation")
+        and (failure.get("setting") is None or number("setting", searches))
+        and (failure.get("estimator") is None or number("estimator", estimates // searches))
+        and isinstance(failure.get("text"), str)
+    )
 
 
 def finish(store: RunStore, groups: Mapping[str, xr.Dataset], counts: dict[str, Any]) -> None:
@@ -644,7 +708,7 @@ def _write_groups(
         # Consolidated metadata is not part of the Zarr 3 specification; xarray reads it, and
         # warns where it is missing.
         warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
-        old = tuple(path for name in groups for path in sync(_arrays_in(store, name)))
+        old = tuple(path for name in groups for path in sync(_arrays_in(store, name, files)))
         files = {
             key: value for key, value in files.items()
             if key not in ("zarr.json", *(f"{name}/zarr.json" for name in groups))
@@ -663,7 +727,7 @@ def _write_groups(
             )
         zarr.consolidate_metadata(store.place, zarr_format=3)
         digests = {
-            key: value for key, value in store.place.digests.items()
+            key: value for key, value in list(store.place.digests.items())
             if any(key.startswith(f"{name}/") for name in groups)
         }
         files |= digests
@@ -676,13 +740,14 @@ def _write_groups(
         write_manifest(store.place, Manifest(dict(root["attributes"]), files))
 
 
-async def _arrays_in(store: RunStore, name: str) -> list[str]:
-    """Return the paths in a group that are not groups themselves."""
+async def _arrays_in(store: RunStore, name: str, known: Collection[str]) -> list[str]:
+    """Return the paths of a group's arrays, and of those by ``known`` keys that are damaged."""
     paths = []
     for child in await _listed(store.place, name):
         path = f"{name}/{child}"
         document = await store.place.get(f"{path}/zarr.json", default_buffer_prototype())
-        if child != "zarr.json" and (parsed(document) or {}).get("node_type") != "group":
+        kind = (parsed(document) or {}).get("node_type")
+        if kind == "array" or (kind is None and f"{path}/zarr.json" in known):
             paths.append(path)
     return paths
 

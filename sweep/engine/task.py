@@ -150,7 +150,7 @@ def _merged(variable: Variable, computed: dict[str, NDArray[Any]], taken: Taken)
     new, old = computed[variable.name], taken.values[variable.name]
     flag = {Stage.detection: "detection", Stage.estimation: "estimate"}.get(variable.stage)
     if flag is None:
-        missing = np.isnan(new)
+        missing = new == variable.fill if variable.flags is not None else np.isnan(new)
     else:
         missing = computed[flag] == 0
         missing = missing.reshape(missing.shape + (1,) * (new.ndim - missing.ndim))

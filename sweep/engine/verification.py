@@ -279,10 +279,8 @@ class Check:
         if contents[0] is not None:
             try:
                 text = np.asarray(store.array(RECEIPTS)[number : number + 1]).tolist()[0]
-                receipt = parsed_receipt(store, text)
-                written = list(receipt["digests"])
-                if len(written) != len(TEMPLATE):
-                    raise ValueError(len(written))
+                receipt = parsed_receipt(store, number, text)
+                written = receipt["digests"]
             except Exception:
                 # Whatever decoding a damaged chunk raises.
                 faults[keys[0]], written = CHANGED, None

@@ -9,8 +9,11 @@ import os
 import threading
 import time
 from collections.abc import Iterator
+from typing import Any
 
-_lock = threading.Lock()
+import numba.core.event
+
+_lock = threading.RLock()
 _deadlines: dict[int, float] = {}
 _numbers = itertools.count()
 _nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -21,7 +24,8 @@ def ending_after(limit_s: float) -> Iterator[None]:
     """End this process where the body takes longer than ``limit_s`` seconds.
 
     The clock is ``faulthandler``'s: a thread of C that needs no lock of the interpreter, so that
-    compiled code that never returns is ended too. Several threads may have limits at a time.
+    compiled code that never returns is ended too. It stands still while Numba compiles or loads
+    code, which takes a minute where nothing is cached. Several threads may have limits at a time.
     """
     number = next(_numbers)
     with _lock:
@@ -36,8 +40,35 @@ def ending_after(limit_s: float) -> Iterator[None]:
 
 
 def _arm() -> None:
-    if not _deadlines:
+    if not _deadlines or _Compiling.depth:
         faulthandler.cancel_dump_traceback_later()
         return
     left = max(min(_deadlines.values()) - time.monotonic(), 0.001)
     faulthandler.dump_traceback_later(left, exit=True, file=_nowhere)
+
+
+class _Compiling(numba.core.event.Listener):
+    """Stops the clock while code is compiled; one compilation may begin others."""
+
+    depth = 0
+    began = 0.0
+
+    def on_start(self, event: object) -> None:  # noqa: ARG002
+        with _lock:
+            if not _Compiling.depth:
+                _Compiling.began = time.monotonic()
+            _Compiling.depth += 1
+            _arm()
+
+    def on_end(self, event: object) -> None:  # noqa: ARG002
+        with _lock:
+            _Compiling.depth -= 1
+            if not _Compiling.depth:
+                took = time.monotonic() - _Compiling.began
+                for number in _deadlines:
+                    _deadlines[number] += took
+            _arm()
+
+
+_register: Any = numba.core.event.register
+_register("numba:compile", _Compiling())

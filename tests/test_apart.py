@@ -1,0 +1,79 @@
+"""Calls in a child process: it may raise, die, stall, or print, and the caller goes on."""
+
+import copy
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from sweep.engine.apart import Child, DiedError, RaisedError
+from sweep.errors import PipelineError, StoreError
+from sweep.plan.pipeline import Pipeline
+
+
+def test_child_calls_functions_and_tells_what_they_raise():
+    with Child() as child:
+        assert child.call(pow, 2, 10, limit_s=60) == 1024
+        with pytest.raises(RaisedError, match="ZeroDivisionError"):
+            child.call(divmod, 1, 0, limit_s=60)
+        with pytest.raises(PipelineError) as told:
+            child.call(Pipeline.from_text, "[pose]\nroll = 1", limit_s=60)
+        assert len(told.value.faults) == 2
+        # It lives on, and what is printed does not get among its answers.
+        assert child.call(os.system, "echo noise", limit_s=60) == 0
+        large = np.arange(3_000_000.0)
+        np.testing.assert_array_equal(child.call(np.negative, large, limit_s=60), -large)
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "limit_s", "how"),
+    [
+        (signal.raise_signal, (signal.SIGSEGV,), 60, "SIGSEGV"),
+        (os.abort, (), 60, "SIGABRT"),
+        (signal.raise_signal, (signal.SIGKILL,), 60, "SIGKILL"),
+        (os._exit, (3,), 60, "exit status 3"),
+        (time.sleep, (600,), 0.5, "time limit of 0.5 s"),
+        # It keeps the interpreter's lock.
+        (pow, (3, 10**9), 0.5, "time limit of 0.5 s"),
+    ],
+    ids=["segmentation fault", "abort", "out of memory", "exit", "sleep", "endless"],
+)
+def test_child_that_dies_says_how(function, arguments, limit_s, how):
+    with Child() as child, pytest.raises(DiedError, match=how):
+        child.call(function, *arguments, limit_s=limit_s)
+
+
+def test_child_that_is_gone_is_told_too():
+    child = Child()
+    child.close()
+    with pytest.raises(DiedError):
+        child.call(pow, 2, 2, limit_s=60)
+
+
+def test_child_runs_nothing_that_lies_in_the_current_folder(tmp_path):
+    for name in ("json", "pickle", "enum", "numpy"):
+        (tmp_path / f"{name}.py").write_text("open('ran', 'w').close()\n")
+    script = tmp_path / "script" / "call.py"
+    script.parent.mkdir()
+    script.write_text(
+        "from sweep.engine.apart import Child\n"
+        "with Child() as child:\n"
+        "    print(child.call(pow, 2, 3, limit_s=60))\n"
+    )
+    ran = subprocess.run(
+        [sys.executable, script], cwd=tmp_path, capture_output=True, text=True, check=True,
+        timeout=120,
+    )
+    assert ran.stdout == "8\n"
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize("error", [PipelineError(["one", "two"]), StoreError("one line")])
+def test_errors_cross_processes_as_they_are(error):
+    with Child() as child:
+        again = child.call(copy.copy, error, limit_s=60)
+    assert (type(again), str(again), again.__dict__) == (type(error), str(error), error.__dict__)

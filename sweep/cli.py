@@ -10,6 +10,7 @@ import argparse
 import dataclasses
 import json
 import math
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -535,7 +536,8 @@ def _status(chosen: argparse.Namespace) -> int:
         print(f"  time left   {_duration(state.seconds_left)}")
     for kind, cells in (("crashed", state.crashed), ("failed", state.failed)):
         for cell in cells[:MOST_LINES]:
-            print(f"  {kind:11} --at {cell.at}  {cell.stage}: {plain(cell.reason, 300)}")
+            at = shlex.quote(cell.at)
+            print(f"  {kind:11} --at {at}  {cell.stage}: {plain(cell.reason, 300)}")
         if len(cells) > MOST_LINES:
             print(f"  {kind:11} and more; --json lists the first 1,000")
     return 0

@@ -75,10 +75,20 @@ class PlannedArray:
             stop = min(start + self.chunks[0], self.shape[0])
             yield slice(start, stop), self.values(start, stop)
 
+    def value_keys(self) -> set[str]:
+        """Return the keys of its chunks, where its values are the pipeline's."""
+        if self.values is None:
+            return set()
+        if not self.shape:
+            return {f"{self.path}/c"}
+        rest = "/0" * (len(self.shape) - 1)
+        count = -(-self.shape[0] // self.chunks[0])
+        return {f"{self.path}/c/{k}{rest}" for k in range(count)}
+
     def misfit(self, array: zarr.Array[Any]) -> str:
         """Return in what an array that is there differs from this one; empty where in nothing.
 
-        Its attributes are not looked at.
+        Of its attributes only their names are looked at, and the units: some change what is read.
         """
         metadata = array.metadata
         if metadata.zarr_format != 3:
@@ -106,9 +116,16 @@ class PlannedArray:
         for name, value in expected.items():
             if there[name] != value:
                 return f"{name} {there[name]}, expected {value}"
-        serializer = metadata.codecs[0].to_dict()["name"]
-        if serializer != ("vlen-utf8" if self.dtype == "string" else "bytes"):
-            return f"serializer {serializer}"
+        serializer = metadata.codecs[0].to_dict()
+        if serializer["name"] != ("vlen-utf8" if self.dtype == "string" else "bytes"):
+            return f"serializer {serializer['name']}"
+        if "big" in str(serializer.get("configuration")):
+            return "serializer big-endian, expected little"
+        foreign = sorted(dict(array.attrs).keys() - self.attributes.keys())
+        if foreign:
+            return f"attribute {foreign[0]}, which no store of sweep has"
+        if array.attrs.get("units") != self.attributes.get("units"):
+            return f"units {array.attrs.get('units')}, expected {self.attributes.get('units')}"
         if self.fill is not None and not _equal(metadata.fill_value, self.fill):
             return f"fill value {metadata.fill_value}, expected {self.fill}"
         return ""

@@ -32,8 +32,12 @@ class Manifest:
 
 def put(store: Store, key: str, content: dict[str, Any]) -> None:
     """Write a small JSON document beside the arrays."""
-    encoded = json.dumps(content, separators=(",", ":")).encode()
-    sync(store.set(key, cpu.Buffer.from_bytes(encoded)))
+    sync(store.set(key, cpu.Buffer.from_bytes(encoded(content))))
+
+
+def encoded(content: dict[str, Any]) -> bytes:
+    """Return a JSON document's bytes."""
+    return json.dumps(content, separators=(",", ":")).encode()
 
 
 def get(store: Store, key: str) -> dict[str, Any] | None:
@@ -56,7 +60,7 @@ def write_manifest(store: Store, manifest: Manifest) -> None:
     """Write a store's manifest and its copy."""
     content = {"attributes": manifest.attributes, "files": manifest.files}
     for key in KEYS:
-        put(store, key, {**content, "digest": _own(content)})
+        put(store, key, {**content, "digest": digest(encoded(content))})
 
 
 def read_manifest(store: Store) -> tuple[Manifest | None, list[str]]:
@@ -64,9 +68,13 @@ def read_manifest(store: Store) -> tuple[Manifest | None, list[str]]:
     found: list[Manifest] = []
     unsound = []
     for key in KEYS:
-        content = get(store, key)
+        buffer = sync(store.get(key, default_buffer_prototype()))
+        content = parsed(buffer)
         try:
-            if content is None or content.pop("digest") != _own(content):
+            # To the letter: another spelling of the same is damage too.
+            if buffer is None or content is None or encoded(content) != buffer.to_bytes():
+                raise ValueError(key)
+            if content.pop("digest") != digest(encoded(content)):
                 raise ValueError(key)
             files = {key: int(value) for key, value in content["files"].items()}
             if any("\0" in key or ".." in key or key.startswith("/") for key in files):
@@ -78,7 +86,3 @@ def read_manifest(store: Store) -> tuple[Manifest | None, list[str]]:
         # A kill came between the two: the first is the later.
         unsound.append(KEYS[1])
     return (found[0] if found else None), unsound
-
-
-def _own(content: dict[str, Any]) -> int:
-    return digest(json.dumps(content, separators=(",", ":"), sort_keys=True).encode())

@@ -20,9 +20,9 @@ from sweep.engine.verification import (
     Check,
     Verdict,
     computable,
-    coordinate_keys,
     root_document,
 )
+from sweep.errors import StoreError
 
 MEASURED = ("cost/tradeoff", "cost/renderers")
 """Groups of which no receipt tells: where they are damaged they go, to be measured again."""
@@ -50,6 +50,11 @@ def repair(
     store, place = check.store, check.place
     numbers = sorted({damage.block for damage in before.damage if damage.block is not None})
     wrong = {damage.where for damage in before.damage if damage.block is None}
+    if RECEIPTS in wrong:
+        raise StoreError(
+            f"{url}: its arrays are of another grid than its pipeline; `sweep run --overwrite` "
+            "computes it again"
+        )
     if numbers:
         computable(store)
     with locked(store):
@@ -60,12 +65,13 @@ def repair(
                 if wrong & {key, key.removesuffix("/zarr.json")}:
                     sync(place.set(key, content))
             for planned in check.planned:
-                if planned.values is not None and wrong & {planned.path, *coordinate_keys(planned)}:
+                if planned.values is not None and wrong & {planned.path, *planned.value_keys()}:
                     planned.create(store.group)
             for group in MEASURED:
                 if any(key.startswith(f"{group}/") for key in wrong):
                     sync(place.delete_dir(group))
-            for key in (*before.left_over, *(key for key in wrong if key.startswith("cost/"))):
+            remade = [key for key in wrong if key.startswith(("cost/", "failures/"))]
+            for key in (*before.left_over, *remade):
                 with contextlib.suppress(FileNotFoundError):
                     sync(place.delete(key))
             write_manifest(place, _recorded(store, check.planned))

@@ -36,7 +36,7 @@ from zarr.core.sync import sync
 from zarr.storage import FsspecStore, LocalStore
 
 from sweep.compilation import processor
-from sweep.engine.digesting import DigestingStore
+from sweep.engine.digesting import DigestingStore, is_special
 from sweep.engine.layout import RECEIPTS, PlannedArray, planned_arrays
 from sweep.engine.manifest import Manifest, parsed, put, read_manifest, write_manifest
 from sweep.engine.provenance import environment, fingerprint
@@ -60,6 +60,18 @@ REQUIRED = {
     "digests",
 }
 """What every receipt holds."""
+
+UNREADABLE = (
+    AttributeError, KeyError, TypeError, ValueError, RecursionError, OSError,
+    zarr.errors.BaseZarrError,
+)
+"""What reading a document of something else, a damaged or a forged one may raise."""
+
+RECORDED = {
+    "format": int, "name": str, "folder": str, "run_id": str, "block": list, "fingerprint": dict,
+    "environment": dict, "finished": bool,
+}
+"""What is recorded of every run, and its types."""
 
 GROUPS = ("commits", "cost", "failures")
 """The groups of a store."""
@@ -147,7 +159,7 @@ def _is_foreign(error: Exception) -> bool:
     return type(error).__module__.partition(".")[0] not in ("sweep", "zarr", "builtins", "numpy")
 
 
-def _reason(error: Exception) -> str:
+def _reason(error: BaseException) -> str:
     """Return in a line why; what a remote store's library says is never quoted at length."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
@@ -255,7 +267,7 @@ def open_store(url: str, mode: str = "r") -> RunStore:
         attributes = dict(_open_group(place, mode).attrs)
     except PermissionError as error:
         raise StoreError(f"{url}: cannot be read: {_reason(error)}") from None
-    except (KeyError, TypeError, ValueError, OSError, zarr.errors.BaseZarrError):
+    except UNREADABLE:
         if read_manifest(place)[0] is None:
             raise StoreError(_something_else(url)) from None
         raise StoreError(f"{url}: damaged: zarr.json; `sweep verify --repair` mends it") from None
@@ -280,6 +292,13 @@ def store_of(
                 f"{url}: store format {about['format']}, this version of sweep has {FORMAT}; "
                 "run its pipeline into a new store"
             )
+        for key, kind in RECORDED.items():
+            if not isinstance(about[key], kind):
+                raise TypeError(key)
+        if about["finished"]:
+            for name in ("detection", "estimate"):
+                if not _are_counts(about["counts"][name], None):
+                    raise TypeError(name)
         pipeline = Pipeline.from_text(
             str(attributes["pipeline"]), name=about["name"], source=f"{url} (its pipeline)",
             folder=about["folder"], files=about["fingerprint"]["files"],
@@ -294,7 +313,7 @@ def store_of(
             raise ValueError(about["run_id"])
         group = _open_group(place, mode)
         return RunStore(url, group, pipeline, about["run_id"], Blocks(lengths, extents))
-    except (KeyError, TypeError, ValueError, OSError, zarr.errors.BaseZarrError):
+    except UNREADABLE:
         raise StoreError(_something_else(url)) from None
 
 
@@ -500,7 +519,7 @@ def recorded_about(url: str, place: DigestingStore) -> dict[str, Any]:
     try:
         attributes = _open_group(place, "r").attrs if manifest is None else manifest.attributes
         return dict(cast("dict[str, Any]", attributes["sweep"]))
-    except (KeyError, TypeError, ValueError, OSError, zarr.errors.BaseZarrError):
+    except UNREADABLE:
         raise StoreError(_something_else(url)) from None
 
 
@@ -763,9 +782,19 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
     store = open_store(os.fspath(url))
     import xarray as xr  # noqa: PLC0415  (slow to import, and workers do without)
 
-    dataset: xr.Dataset = xr.open_zarr(store.source, consolidated=False, zarr_format=3)
-    # NumPy's strings of any length are new, and much of xarray and pandas does without them.
-    texts = {name: (value.dims, value.to_numpy().astype(object), value.attrs)
-             for name, value in dataset.coords.items() if value.dtype.kind == "T"}
+    if not is_remote(store.url):
+        for planned in planned_arrays(store.pipeline, store.blocks.extents):
+            for key in planned.value_keys():
+                if is_special(Path(store.url, key)):
+                    raise StoreError(f"{store.url}: {key} is not a file")
+    try:
+        dataset: xr.Dataset = xr.open_zarr(store.source, consolidated=False, zarr_format=3)
+        # NumPy's strings of any length are new, and much of xarray and pandas does without them.
+        texts = {name: (value.dims, value.to_numpy().astype(object), value.attrs)
+                 for name, value in dataset.coords.items() if value.dtype.kind == "T"}
+    except (*UNREADABLE, RuntimeError) as error:
+        raise StoreError(
+            f"{store.url}: damaged ({_reason(error)}); `sweep verify --repair` mends it"
+        ) from None
     ordered = [variable.name for variable in TEMPLATE if variable.name in dataset]
     return dataset.assign_coords(texts)[ordered]

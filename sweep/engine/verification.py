@@ -133,6 +133,7 @@ class Check:
         self.manifest, unsound = read_manifest(self.place)
         self._damage = [Damage(key, "unreadable or out of date") for key in unsound]
         self._bytes = 0
+        self._grid_fits = True
         self.store = store_of(url, self.place, self._attributes(url), mode)
         self.planned = planned_arrays(self.store.pipeline, self.store.blocks.extents)
 
@@ -165,6 +166,8 @@ class Check:
         left -= {"zarr.json", *KEYS} | self._check_files()
         sound: dict[int, str] = {}
         expected = range(len(store.blocks)) if store.finished else sorted(done)
+        if not self._grid_fits:
+            expected = []  # the blocks that the pipeline says are not those of the arrays
         with ThreadPoolExecutor(THREADS) as pool:
             # A window of them at a time: their number may be large.
             for start in range(0, len(expected), WINDOW):
@@ -232,16 +235,37 @@ class Check:
             if f"{name}/zarr.json" in right:
                 self.place.instead[f"{name}/zarr.json"] = right[f"{name}/zarr.json"]
         known = set(recorded) | {"commits/zarr.json"}
+        self._grid_fits = RECEIPTS not in wrong
+        consolidated = self._consolidated()
         for planned in self.planned:
-            own = {f"{planned.path}/zarr.json", *coordinate_keys(planned)}
+            own = {f"{planned.path}/zarr.json", *planned.value_keys()}
             known |= own
-            if not wrong & {planned.path, *own} and (fault := self._misfit(planned)):
+            if wrong & {planned.path, *own}:
+                continue
+            if fault := self._misfit(planned):
                 self._damage.append(Damage(planned.path, fault))
+                continue
+            document = f"{planned.path}/zarr.json"
+            if consolidated is not None and consolidated.get(planned.path) != parsed(
+                sync(self.place.get(document, default_buffer_prototype()))
+            ):
+                consolidated = None
+                self._damage.append(
+                    Damage("zarr.json", f"its copy of {document} is not that document")
+                )
         if self.manifest is None:
             known |= {
                 key for key in sync(self._listed()) if key.startswith(("cost/", "failures/"))
             }
         return known
+
+    def _consolidated(self) -> dict[str, Any] | None:
+        """Return the copy of all arrays' documents that the root has; None where it has none."""
+        root = parsed(sync(self.place.get("zarr.json", default_buffer_prototype()))) or {}
+        try:
+            return dict(root["consolidated_metadata"]["metadata"])
+        except (KeyError, TypeError, ValueError):
+            return None
 
     def _misfit(self, planned: PlannedArray) -> str:
         """Return in what an array is not as the pipeline says, beside its schema."""
@@ -417,13 +441,3 @@ def root_document(manifest: Manifest) -> bytes:
     content = {"zarr_format": 3, "node_type": "group", "attributes": manifest.attributes}
     return json.dumps(content).encode()
 
-
-def coordinate_keys(planned: PlannedArray) -> set[str]:
-    """Return the keys of the chunks of an array whose values are the pipeline's."""
-    if planned.values is None:
-        return set()
-    if not planned.shape:
-        return {f"{planned.path}/c"}
-    rest = "/0" * (len(planned.shape) - 1)
-    count = -(-planned.shape[0] // planned.chunks[0])
-    return {f"{planned.path}/c/{k}{rest}" for k in range(count)}

@@ -87,7 +87,7 @@ def at_text(place: Mapping[str, Any]) -> str:
 def _written(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
-    return label(value)
+    return label(value).replace(", ", ",") if isinstance(value, tuple) else label(value)
 
 
 def coordinates_text(pipeline: Pipeline, chosen: Pipeline) -> str:

@@ -1,0 +1,703 @@
+"""Verify and repair: every damage is named, exactly it is mended, and a sound store is sound."""
+
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+from zlib import crc32
+
+import numpy as np
+import pytest
+import zarr
+from conftest import lengths
+from test_poison import Poison, poisoned
+from test_run import by_hand
+
+from sweep.cli import main
+from sweep.engine.closing import close
+from sweep.engine.manifest import Manifest, write_manifest
+from sweep.engine.repair import repair
+from sweep.engine.store import begin_block, create_store, open_store, place_of
+from sweep.engine.task import compute_block
+from sweep.engine.verification import verify
+from sweep.errors import StoreError
+from sweep.plan.grid import scene_axes
+from sweep.plan.pipeline import Pipeline
+
+TEXT = """
+title = "Größen, klein"
+seed = 7
+[marker]
+size_m = 0.04
+[pose]
+jitter_px = 0.5
+azimuth_deg = { uniform = [0, 360] }
+[scene]
+background = 128
+[axes]
+side_px = [30, 60, 4]
+cornerRefinementMethod = ["none", "subpix"]
+solver = ["ippe_square", "iterative"]
+trial = 5
+"""
+"""Markers of 4 px are not found: the last blocks have no numbers."""
+
+EXTENTS = (2, 2)
+"""Blocks 0 to 5 are 2 x 3: side_px 30 and 60, then 4; trials 0 and 1, 2 and 3, then 4."""
+
+FAILED = Poison(12, "scene", "raise")
+"""A scene of block 4."""
+
+FAILED_BLOCK = 4
+
+RECEIPT = "commits/receipt/c"
+MANIFEST, COPY = "commits/receipt/manifest.json", "commits/receipt/manifest-copy.json"
+
+KINDS = {
+    "chunk": ("corner_error_px/c/0/0/0/0/0", 0),
+    "chunk of an edge block": ("translation_error_m/c/1/0/0/2/0", 5),
+    "chunk without numbers": ("nees/c/0/0/0/1", 1),
+    "chunk of flags": ("estimate/c/1/0/0/0", 3),
+    "receipt": (f"{RECEIPT}/2", 2),
+    "coordinate": ("side_px/c/0", None),
+    "coordinate that follows": ("distance_m/c/0", None),
+    "labels of an axis": ("solver/c/0", None),
+    "labels of a dimension": ("xyz/c/0", None),
+    "metadata of a variable": ("detection/zarr.json", None),
+    "metadata of a coordinate": ("trial/zarr.json", None),
+    "metadata of labels": ("corner/zarr.json", None),
+    "metadata of the commits": ("commits/zarr.json", None),
+    "metadata of the receipts": ("commits/receipt/zarr.json", None),
+    "metadata of the costs": ("cost/zarr.json", None),
+    "metadata of a cost": ("cost/estimation_s/zarr.json", None),
+    "chunk of a cost": ("cost/scene_s/c/0", None),
+    "metadata of the failures": ("failures/zarr.json", None),
+    "chunk of the failures": ("failures/text/c/0", None),
+    "root": ("zarr.json", None),
+    "manifest": (MANIFEST, None),
+    "copy of the manifest": (COPY, None),
+}
+"""Kind of file -> the key of one, and its block."""
+
+
+def flip(path, generator):
+    content = bytearray(path.read_bytes())
+    content[generator.randrange(len(content))] ^= 1 << generator.randrange(8)
+    path.write_bytes(content)
+
+
+def spoil(path, generator):
+    """Put another value in place of one byte."""
+    content = bytearray(path.read_bytes())
+    k = generator.randrange(len(content))
+    content[k] = generator.choice([value for value in range(256) if value != content[k]])
+    path.write_bytes(content)
+
+
+def cut(keep):
+    def shorten(path, _):
+        content = path.read_bytes()
+        path.write_bytes(content[: keep(len(content))])
+
+    return shorten
+
+
+MANNERS = {
+    "one bit": flip,
+    "deleted": lambda path, _: path.unlink(),
+    "half": cut(lambda size: size // 2),
+    "nothing left": cut(lambda _: 0),
+    "one byte short": cut(lambda size: size - 1),
+}
+
+
+@pytest.fixture(scope="session")
+def pipeline():
+    return Pipeline.from_text(TEXT, name="small")
+
+
+@contextmanager
+def poison(log, poisons=(FAILED,)):
+    """Have children of this process poisoned."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in poisoned(poisons, log).items():
+            patch.setenv(name, value)
+        yield
+
+
+@pytest.fixture(scope="session")
+def sound(pipeline, tmp_path_factory):
+    """A finished store with a scene that raised; nobody writes to it."""
+    folder = tmp_path_factory.mktemp("sound")
+    url = str(folder / "sound.zarr")
+    store = create_store(url, pipeline, EXTENTS)
+    for number, block in enumerate(store.blocks):
+        if number == FAILED_BLOCK:
+            # What was begun before is computed in a child, which is poisoned.
+            begin_block(store, block)
+            with poison(folder / "notes.jsonl"):
+                compute_block(url, store.run_id, block)
+        else:
+            compute_block(url, store.run_id, block)
+    close(store)
+    return Path(url)
+
+
+@pytest.fixture
+def copied(sound, tmp_path):
+    return Path(shutil.copytree(sound, tmp_path / "copied.zarr"))
+
+
+@pytest.fixture
+def here(monkeypatch, tmp_path):
+    """Repair in this process, without a cluster; returns the numbers that were computed again."""
+    computed = []
+
+    def recompute(store, numbers, **_):
+        for number in numbers:
+            computed.append(number)
+            with poison(tmp_path / "notes.jsonl"):
+                if number == FAILED_BLOCK:
+                    begin_block(store, store.blocks[number])
+                compute_block(store.url, store.run_id, store.blocks[number])
+
+    monkeypatch.setattr("sweep.engine.repair.recompute", recompute)
+    return computed
+
+
+def files(url):
+    """Return the paths of a store's files below it."""
+    return sorted(path.relative_to(url).as_posix() for path in Path(url).rglob("*")
+                  if path.is_file())
+
+
+INNER = {
+    "corner_error_px": 2, "true_rvec": 1, "true_tvec_m": 1, "translation_error_m": 1,
+    "rotation_error_rad": 1, "bound_std": 1, "predicted_std": 1,
+}
+"""How many dimensions a variable has that are no axes."""
+
+
+def block_of(key):
+    """Return the number of the block of a file of ``sound``; None where it is no block's."""
+    name, middle, rest = key.partition("/c/")
+    position = [int(part) for part in rest.split("/")] if middle else []
+    if name == "commits/receipt" and middle:
+        return position[0]
+    if not position or name.startswith(("cost", "failures")) or len(position) == 1:
+        return None
+    # side_px is the first axis; the trial comes after the treatments, where there are any.
+    return 3 * position[0] + position[-1 - INNER.get(name, 0)]
+
+
+def arrays(url):
+    """Return every array's values of a store by path, but for what is timed; with plain Zarr."""
+    group = zarr.open_group(str(url), mode="r", zarr_format=3, use_consolidated=False)
+    return {
+        path: np.asarray(member[...]) for path, member in group.members(max_depth=None)
+        if isinstance(member, zarr.Array) and not path.startswith(("cost/", "commits/"))
+    }
+
+
+def see_same(url, other):
+    """Assert that two stores hold the same values, bit for bit."""
+    ours, theirs = arrays(url), arrays(other)
+    assert ours.keys() == theirs.keys()
+    for path, values in ours.items():
+        there = theirs[path]
+        assert (values.dtype, values.shape) == (there.dtype, there.shape), path
+        if values.dtype.kind == "f":
+            bits = f"u{values.itemsize}"
+            assert (values.view(bits) == there.view(bits)).all(), path
+        else:
+            assert (values == there).all(), path
+
+
+def states(url, keys):
+    """Return what tells whether a file was written, for those of ``keys`` that are a block's."""
+    found = {}
+    for key in files(url):
+        if key in keys and block_of(key) is not None:
+            state = (Path(url) / key).stat()
+            found[key] = (state.st_ino, state.st_mtime_ns, state.st_size)
+    return found
+
+
+def named(verdict):
+    return {(damage.where, damage.block) for damage in verdict.damage}
+
+
+def see_repaired(url, sound, wanted, here):
+    """Repair; assert that all that was wrong is named and mended, and nothing else touched."""
+    before = states(url, files(sound))
+    blocks = {block for _, block in wanted if block is not None}
+    mended = repair(str(url), 0)
+    assert {(damage.where, damage.block) for damage in mended.repaired} == wanted
+    assert (mended.damage, mended.left_over) == ([], [])
+    assert sorted(here) == sorted(blocks)
+    after = states(url, files(sound))
+    untouched = {key for key in files(sound) if block_of(key) not in {None, *blocks}}
+    assert {key: before[key] for key in untouched} == {key: after[key] for key in untouched}
+    again = verify(str(url), 0)
+    assert (again.damage, again.left_over) == ([], [])
+    assert again.files == len(files(url)) == len(files(sound))
+    assert files(url) == files(sound)
+    see_same(url, sound)
+
+
+def reseal(url):
+    """Make the manifest fit the files that are there, as one who forges a store would."""
+    url = Path(url)
+    recorded = json.loads((url / MANIFEST).read_text())["files"]
+    attributes = json.loads((url / "zarr.json").read_text())["attributes"]
+    there = {key: crc32((url / key).read_bytes()) for key in recorded if (url / key).exists()}
+    write_manifest(place_of(str(url), "r+"), Manifest(attributes, there))
+
+
+def edit_receipt(url, number, change):
+    """Change a receipt's content; its checksums are right afterwards."""
+    array = zarr.open_array(f"{url}/commits/receipt", mode="r+", zarr_format=3)
+    content = json.loads(str(np.asarray(array[number])))
+    changed = change(content)
+    text = changed if isinstance(changed, str) else json.dumps(changed or content)
+    array[number : number + 1] = np.array([text], dtype=object)
+
+
+def edit_values(url, name, change, *, digests_too=False):
+    """Change a variable's values through Zarr; with ``digests_too`` the receipts tell of them."""
+    array = zarr.open_array(f"{url}/{name}", mode="r+", zarr_format=3)
+    array[...] = change(np.asarray(array[...]))
+    if not digests_too:
+        return
+    order = [
+        "true_rvec", "true_tvec_m", "marker_area_px", "bound", "bound_std", "bound_kappa",
+        "mirror_distance", "detection", "corner_error_px", "estimate", "translation_error_m",
+        "rotation_error_rad", "rotation_error_deg", "normal_error_deg", "reprojection_error_px",
+        "alternative_rotation_error_deg", "alternative_reprojection_error_px", "predicted_std",
+        "nees", "residual_variance_ratio", "flipped",
+    ]
+
+    def told(content):
+        content["digests"][order.index(name)] = crc32((Path(url) / key).read_bytes())
+
+    for key in files(url):
+        if key.startswith(f"{name}/c/"):
+            edit_receipt(url, block_of(key), told)
+
+
+def test_sound_store_is_sound_and_every_file_is_accounted_for(sound):
+    before = {key: (sound / key).stat().st_mtime_ns for key in files(sound)}
+    found = verify(str(sound), 0)
+    assert (found.damage, found.repaired, found.left_over) == ([], [], [])
+    assert (found.finished, found.blocks, found.blocks_done) == (True, 6, 6)
+    assert found.files == len(before)
+    assert {key: (sound / key).stat().st_mtime_ns for key in files(sound)} == before
+
+
+def test_recomputed_sample_of_a_sound_store_agrees_to_the_bit(sound, tmp_path):
+    with poison(tmp_path / "notes.jsonl"):
+        found = verify(str(sound), 40)
+    assert (found.damage, found.not_sampled) == ([], "")
+    assert 8 <= found.sampled <= 15
+
+
+def test_file_is_named_when_it_alone_is_damaged(sound, copied):
+    generator = random.Random(1)
+    chosen = generator.sample(list(KINDS.values()), 6)  # all of them: the long test below
+    for number, (key, block) in enumerate(chosen):
+        manner = list(MANNERS.values())[number % len(MANNERS)]
+        manner(copied / key, generator)
+        assert named(verify(str(copied), 0)) == {(key, block)}
+        shutil.copy2(sound / key, copied / key)
+    assert verify(str(copied), 0).damage == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("manner", MANNERS.values(), ids=MANNERS)
+@pytest.mark.parametrize(("key", "block"), KINDS.values(), ids=KINDS)
+def test_one_damage_is_named_and_mended_alone(key, block, manner, sound, copied, here):
+    manner(copied / key, random.Random(key))
+    assert named(verify(str(copied), 0)) == {(key, block)}
+    see_repaired(copied, sound, {(key, block)}, here)
+
+
+@pytest.mark.parametrize(
+    "manner",
+    [pytest.param(manner, id=name, marks=() if number < 3 else pytest.mark.long)
+     for number, (name, manner) in enumerate(MANNERS.items())],
+)
+def test_many_damages_at_once_are_named_and_mended(manner, sound, copied, here):
+    generator = random.Random(2)
+    # One of root, manifest and copy must be left to tell what the others held.
+    wanted = {place for kind, place in KINDS.items() if kind != "copy of the manifest"}
+    for key, _ in sorted(wanted, key=str):
+        manner(copied / key, generator)
+    assert named(verify(str(copied), 0)) == wanted
+    see_repaired(copied, sound, wanted, here)
+
+
+def test_both_manifests_can_be_lost_or_the_root_but_not_all_three(sound, copied, here):
+    (copied / MANIFEST).unlink()
+    (copied / COPY).write_bytes(b"{}")
+    wanted = {(MANIFEST, None), (COPY, None)}
+    assert named(verify(str(copied), 0)) == wanted
+    see_repaired(copied, sound, wanted, here)
+    for key in (MANIFEST, COPY, "zarr.json"):
+        (copied / key).write_bytes(b"{")
+    for function in (verify, repair):
+        with pytest.raises(StoreError) as told:
+            function(str(copied), 0)
+        assert str(told.value).startswith(f"{copied}: ")
+        assert "\n" not in str(told.value)
+
+
+def test_a_letter_of_the_manifest_that_changes_no_meaning_is_damage(copied):
+    # The title's umlaut is written as an escape, of which Python reads small and capital letters.
+    for key in (MANIFEST, COPY):
+        text = (copied / key).read_text()
+        assert "\\u00f6" in text
+        (copied / key).write_text(text.replace("\\u00f6", "\\u00F6", 1))
+        assert named(verify(str(copied), 0)) == {(key, None)}
+        (copied / key).write_text(text)
+
+
+def test_sound_chunks_in_wrong_places_and_edited_ones_are_named(sound, copied, here, tmp_path):
+    wanted = set()
+    # Two exchanged.
+    one, other = (copied / f"rotation_error_deg/c/0/0/0/{k}" for k in (0, 1))
+    content = one.read_bytes()
+    assert content != other.read_bytes()
+    one.write_bytes(other.read_bytes())
+    other.write_bytes(content)
+    wanted |= {(f"rotation_error_deg/c/0/0/0/{k}", k) for k in (0, 1)}
+    # A chunk and a receipt of another store.
+    elsewhere = tmp_path / "other.zarr"
+    by_hand(str(elsewhere), Pipeline.from_text(TEXT, ["seed=8"], name="small"), EXTENTS)
+    taken = {("corner_error_px/c/0/0/2/0/0", 2), (f"{RECEIPT}/3", 3)}
+    for key, _ in taken:
+        shutil.copy(elsewhere / key, copied / key)
+    wanted |= taken
+
+    # A number edited through Zarr, so that the codec's checksum fits.
+    edit_values(copied, "marker_area_px", lambda values: values + (np.arange(5) == 4))
+    wanted |= {("marker_area_px/c/0/2", 2), ("marker_area_px/c/1/2", 5)}
+    assert named(verify(str(copied), 0)) == wanted
+    see_repaired(copied, sound, wanted, here)
+
+
+def test_receipt_of_another_block_tells_of_that_block_alone(sound, copied, here):
+    shutil.copy(copied / RECEIPT / "0", copied / RECEIPT / "1")
+    found = named(verify(str(copied), 0))
+    assert found
+    assert {block for _, block in found} == {1}
+    assert {block_of(key) for key, _ in found} == {1}
+    see_repaired(copied, sound, found, here)
+
+
+def test_what_is_no_part_of_the_store_is_told_and_deleted(sound, copied, here):
+    extra = [
+        f"{RECEIPT}/6", f"{RECEIPT}/4000", f"{RECEIPT}/00", f"{RECEIPT}/x",
+        "detection/c/0/0/0.0123456789ab.partial", "detection/c/7/0/0", "cost/0123.partial",
+        "commits/receipt/begun/3",
+    ]
+    for key in extra:
+        (copied / key).parent.mkdir(exist_ok=True, parents=True)
+        shutil.copy(copied / RECEIPT / "0", copied / key)
+    found = verify(str(copied), 0)
+    assert found.damage == []
+    assert set(found.left_over) == set(extra)
+    see_repaired(copied, sound, set(), here)
+
+
+def forged(name, where, value):
+    """Return a variable, a change of it at a place, and the block of the place."""
+    def change(values):
+        values[where] = value
+        return values
+
+    return name, change, 3 * (where[0] // 2) + where[-1 - INNER.get(name, 0)] // 2
+
+
+FORGED = {
+    "a number is gone": forged("corner_error_px", (0, 0, 0, 1, 1), np.nan),
+    "a number is infinite": forged("rotation_error_deg", (0, 0, 0, 0), np.inf),
+    "a number of nothing": forged("rotation_error_deg", (2, 0, 0, 0), 1.0),
+    "a corner of nothing": forged("corner_error_px", (2, 0, 0, 3, 0), 0.5),
+    "found, without corners": forged("detection", (2, 0, 0), 1),
+    "not found, with corners": forged("detection", (0, 0, 0), 4),
+    "a flag that is none": forged("estimate", (0, 0, 0, 0), 77),
+    "a number without a bound": forged("bound_std", (0, 0, 0), 1.0),
+    "flipped, without a pose": forged("flipped", (2, 0, 0, 0), 2),
+    "no truth": forged("true_tvec_m", (0, 2, 0), np.nan),
+    "not run": forged("estimate", (0, 0, 0, 0), 0),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "block"), FORGED.values(), ids=FORGED
+)
+def test_flags_and_numbers_that_disagree_are_named_though_every_checksum_fits(
+    name, change, block, copied
+):
+    edit_values(copied, name, change, digests_too=True)
+    damage = verify(str(copied), 0).damage
+    assert {one.block for one in damage} == {block}
+    assert any(word in damage[0].what for word in (name, "detection", "estimate"))
+
+
+def test_forged_block_is_computed_again_and_no_other(sound, copied, here):
+    name, change, _ = FORGED["a number is gone"]
+    edit_values(copied, name, change, digests_too=True)
+    (damage,) = verify(str(copied), 0).damage
+    see_repaired(copied, sound, {(damage.where, 0)}, here)
+
+
+def test_attributes_and_coordinates_that_were_changed_are_named_and_mended(
+    sound, copied, here
+):
+    group = zarr.open_group(str(copied), mode="r+", zarr_format=3, use_consolidated=False)
+    group["detection"].attrs["long_name"] = "something else"
+    group["side_px"].attrs["units"] = "m"
+    group.attrs["title"] = "Another"
+    group["side_px"][1] = 61.0
+    group["solver"][:] = np.array(["p3p", "sqpnp"], dtype=object)
+    wanted = {
+        (key, None) for key in (
+            "detection/zarr.json", "side_px/zarr.json", "zarr.json", "side_px/c/0", "solver/c/0",
+        )
+    }
+    assert named(verify(str(copied), 0)) == wanted
+    see_repaired(copied, sound, wanted, here)
+    assert json.loads((copied / "zarr.json").read_text())["attributes"]["title"] == (
+        "Größen, klein"
+    )
+    for key in ("detection/zarr.json", "side_px/zarr.json"):
+        assert json.loads((copied / key).read_text()) == json.loads((sound / key).read_text())
+
+
+def test_coordinates_and_attributes_are_checked_though_the_manifest_fits(sound, copied, here):
+    zarr.open_array(f"{copied}/side_px", mode="r+")[1] = 61.0
+    zarr.open_array(f"{copied}/xyz", mode="r+")[:] = np.array(["x", "z", "y"], dtype=object)
+    zarr.open_array(f"{copied}/detection", mode="r+").attrs["flag_meanings"] = "one two"
+    reseal(copied)
+    wanted = {("side_px", None), ("xyz", None), ("detection", None)}
+    assert named(verify(str(copied), 0)) == wanted
+    see_repaired(copied, sound, wanted, here)
+
+
+def test_metadata_in_one_place_is_checked_though_the_manifest_fits(copied):
+    # xarray.open_zarr reads these in place of the arrays' own.
+    root = json.loads((copied / "zarr.json").read_text())
+    root["consolidated_metadata"]["metadata"]["detection"]["attributes"]["flag_meanings"] = "a b"
+    (copied / "zarr.json").write_text(json.dumps(root))
+    reseal(copied)
+    assert "zarr.json" in {damage.where for damage in verify(str(copied), 0).damage}
+
+
+def test_unfinished_store_is_sound_and_goes_on_after_a_repair(pipeline, sound, tmp_path, here):
+    url = tmp_path / "begun.zarr"
+    store = create_store(str(url), pipeline, EXTENTS)
+    found = verify(str(url), 5)
+    assert (found.damage, found.left_over, found.blocks_done) == ([], [], 0)
+    assert (found.finished, found.sampled) == (False, 0)
+    for number in (0, 3, 5):
+        compute_block(str(url), store.run_id, store.blocks[number])
+    # Two that a killed worker left: one begun, one torn.
+    begin_block(store, store.blocks[1])
+    (url / "detection/c/0/0/2").parent.mkdir(parents=True, exist_ok=True)
+    (url / "detection/c/0/0/2").write_bytes(b"torn")
+    found = verify(str(url), 0)
+    assert (found.damage, found.left_over, found.blocks_done) == ([], [], 3)
+    flip(url / "true_rvec/c/1/0/0", random.Random(3))
+    (url / "xyz/c/0").unlink()
+    assert named(verify(str(url), 0)) == {("true_rvec/c/1/0/0", 3), ("xyz/c/0", None)}
+    mended = repair(str(url), 0)
+    assert (mended.damage, here, mended.blocks_done) == ([], [3], 3)
+    for number in (2, 4, 1):
+        if number == FAILED_BLOCK:
+            begin_block(store, store.blocks[number])
+        with poison(tmp_path / "notes.jsonl"):
+            compute_block(str(url), store.run_id, store.blocks[number])
+    close(open_store(str(url), "r+"))
+    found = verify(str(url), 0)
+    assert (found.damage, found.finished, found.files) == ([], True, len(files(sound)))
+    see_same(url, sound)
+
+
+def test_deleted_receipt_of_an_unfinished_store_is_a_block_to_be_computed(pipeline, tmp_path):
+    url = tmp_path / "begun.zarr"
+    by_hand(str(url), pipeline, EXTENTS)
+    (url / RECEIPT / "2").unlink()
+    found = verify(str(url), 0)
+    assert (found.damage, found.left_over, found.blocks_done) == ([], [], 5)
+
+
+def test_finished_store_without_a_receipt_is_not_run_but_told_how_to_mend(
+    copied, tmp_path, capsys
+):
+    (tmp_path / "small.toml").write_text(TEXT)
+    (copied / RECEIPT / "3").unlink()
+    assert main(["run", str(tmp_path / "small.toml"), "--store", str(copied)]) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.count("\n") == 1
+    assert "sweep verify" in told.err
+    assert "--repair" in told.err
+
+
+def test_exit_status_and_json_tell_what_there_is(sound, copied, tmp_path, capsys):
+    assert main(["verify", str(tmp_path / "none.zarr")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert main(["verify", str(sound), "--sample", "-1"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert main(["verify", str(sound), "--sample", "0"]) == 0
+    assert "sound" in capsys.readouterr().out
+    key = "reprojection_error_px/c/0/0/0/2"
+    flip(copied / key, random.Random(4))
+    assert main(["verify", str(copied), "--sample", "0"]) == 1
+    told = capsys.readouterr().out
+    assert key in told
+    assert "damaged" in told
+    assert main(["verify", str(copied), "--sample", "0", "--json"]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert [(one["where"], one["block"]) for one in told["damage"]] == [(key, 2)]
+    # With a cluster, as a user repairs.
+    before = states(copied, files(sound))
+    assert main(["verify", str(copied), "--repair", "--sample", "0", "--workers", "1",
+                 "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [(one["where"], one["block"]) for one in told["repaired"]] == [(key, 2)]
+    assert told["damage"] == []
+    after = states(copied, files(sound))
+    assert {block_of(name) for name in before if before[name] != after[name]} == {2}
+    see_same(copied, sound)
+    assert main(["verify", str(copied), "--sample", "0"]) == 0
+
+
+ELSEWHERE = {
+    "NPY_DISABLE_CPU_FEATURES": "X86_V4", "OPENCV_CPU_DISABLE": "AVX2",
+    "OPENBLAS_CORETYPE": "Nehalem",
+}
+"""Environment in which the libraries take the routines of an older processor."""
+
+VERIFY_EACH = """
+import json, sys
+from sweep.compilation import processor
+from sweep.engine.verification import verify
+
+told = {"processor": processor()}
+for url in sys.argv[1:]:
+    found = verify(url, 40)
+    told[url] = [found.sampled, [[one.where, one.what, one.block] for one in found.damage]]
+print(json.dumps(told))
+"""
+
+
+def elsewhere(urls, log):
+    """Verify stores as a machine with an older processor would."""
+    ran = subprocess.run(
+        [sys.executable, "-c", VERIFY_EACH, *map(str, urls)], check=True, capture_output=True,
+        text=True, timeout=120, env={**poisoned([FAILED], log), **ELSEWHERE},
+    )
+    return json.loads(ran.stdout)
+
+
+@pytest.mark.long
+def test_numbers_beyond_the_tolerance_are_told_on_this_and_on_another_processor(
+    sound, copied, tmp_path
+):
+    edit_values(copied, "rotation_error_rad", lambda values: 1.01 * values, digests_too=True)
+    assert verify(str(copied), 0).damage == []
+    with poison(tmp_path / "notes.jsonl"):
+        damage = verify(str(copied), 40).damage
+    assert damage
+    assert all(one.where.startswith("--at ") for one in damage)
+    assert all("rotation_error_rad" in one.what for one in damage)
+    told = elsewhere([sound, copied], tmp_path / "notes.jsonl")
+    receipt = json.loads(str(zarr.open_array(f"{sound}/commits/receipt", mode="r")[0]))
+    assert told["processor"] != receipt["processor"]
+    sampled, damage = told[str(sound)]
+    assert sampled >= 8
+    assert damage == []
+    sampled, damage = told[str(copied)]
+    assert sampled >= 8
+    assert damage
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "name",
+    ["true_rvec", "true_tvec_m", "marker_area_px", "corner_error_px", "translation_error_m",
+     "rotation_error_rad", "rotation_error_deg", "normal_error_deg", "reprojection_error_px",
+     "alternative_rotation_error_deg", "alternative_reprojection_error_px"],
+)
+def test_every_variable_that_is_scaled_is_told(name, copied, tmp_path):
+    edit_values(copied, name, lambda values: 1.01 * values, digests_too=True)
+    with poison(tmp_path / "notes.jsonl"):
+        assert verify(str(copied), 40).damage
+    assert elsewhere([copied], tmp_path / "notes.jsonl")[str(copied)][1], name
+
+
+SMALL = Path(__file__).parent.parent / "pipelines"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, id=path.stem)
+     for path in (*sorted(SMALL.glob("*.toml")), *sorted((SMALL / "extremes").glob("*.toml")))],
+)
+def test_stores_of_all_pipelines_are_sound(path, tmp_path):
+    text, settings = path.read_text(), []
+    pipeline = Pipeline.from_text(text, name=path.stem, folder=path.parent)
+    for axis in pipeline.axes:
+        if axis.name == "trial":
+            settings.append("trial=1")
+        elif len(axis) > 6 and isinstance(axis.values[0], (int, float)):
+            chosen = [axis.values[k] for k in np.linspace(0, len(axis) - 1, 4).astype(int)]
+            settings.append(f"{axis.name}={chosen}".replace("True", "true"))
+    pipeline = Pipeline.from_text(text, settings, name=path.stem, folder=path.parent)
+    lengths_ = tuple(len(axis) for axis in scene_axes(pipeline))
+    if np.prod(lengths_, dtype=np.int64) > 3000:
+        pytest.skip("many poses")
+    url = str(tmp_path / "store.zarr")
+    store = by_hand(url, pipeline, tuple(-(-length // 2) for length in lengths_))
+    close(store)
+    found = verify(url, 20)
+    assert (found.damage, found.left_over) == ([], [])
+    assert found.files == len(files(url))
+
+
+@lengths(8, 80)
+def test_random_damages_are_all_found_and_all_mended(count, sound, tmp_path, here):
+    seed = int(os.environ.get("SWEEP_SEED", random.SystemRandom().randrange(1 << 32)
+                              if count > 8 else "20"))
+    print(f"seed {seed}")
+    generator = random.Random(seed)
+    manners = [spoil] * 50 + [MANNERS["deleted"]] * 20 + [
+        cut(generator.randrange)
+    ] * 10
+    generator.shuffle(manners)
+    every = files(sound)
+    found_in_all = 0
+    for round_, start in enumerate(range(0, count, 8)):
+        url = Path(shutil.copytree(sound, tmp_path / f"{round_}.zarr"))
+        assert verify(str(url), 0).damage == []
+        while True:
+            chosen = generator.sample(every, 8)
+            if not {"zarr.json", MANIFEST, COPY} <= set(chosen):
+                break
+        here.clear()
+        wanted = {(key, block_of(key)) for key in chosen}
+        for key, manner in zip(chosen, manners[start : start + 8], strict=True):
+            manner(url / key, generator)
+        assert named(verify(str(url), 0)) == wanted
+        found_in_all += len(wanted)
+        see_repaired(url, sound, wanted, here)
+        shutil.rmtree(url)
+    assert found_in_all == count
+    print(f"{count} damages among {len(every)} files: all found, all mended")

@@ -621,7 +621,7 @@ def test_poses_that_are_missing_are_told(tmp_path):
     url = made(tmp_path, ODD["no draws"], "lost")
     output = tmp_path / "report.html"
     chunks_of(url, "detection")[0].unlink()
-    again = "`sweep run` with --overwrite makes the store again\n"
+    again = "`sweep verify --repair` mends it\n"
     assert command("report", url, "-o", output)[::2] == (
         2, f"{url}: 1 pose is missing; {again}")
     chunks_of(url, "estimate")[-1].unlink()
@@ -641,10 +641,10 @@ def test_a_damaged_store_is_told_in_one_line(loaded, tmp_path, monkeypatch):
 
     for k, (damage, message) in enumerate((
         (flip, "cannot be read: "),
-        (lambda url: (Path(url) / "detection/zarr.json").write_text("{"), "cannot be read: "),
-        (lambda url: shutil.rmtree(Path(url) / "marker_area_px"), "no marker_area_px;"),
-        (lambda url: shutil.rmtree(Path(url) / "side_px"), "no coordinate side_px;"),
-        (lambda url: shutil.rmtree(Path(url) / "solver"), "no coordinate solver;"),
+        (lambda url: (Path(url) / "detection/zarr.json").write_text("{"), "detection: unreadable"),
+        (lambda url: shutil.rmtree(Path(url) / "marker_area_px"), "marker_area_px: missing;"),
+        (lambda url: shutil.rmtree(Path(url) / "side_px"), "side_px: missing;"),
+        (lambda url: shutil.rmtree(Path(url) / "solver"), "solver: missing;"),
     )):
         url = made(tmp_path, ODD["no draws"], f"damaged{k}")
         damage(url)

@@ -18,6 +18,7 @@ from pathlib import Path
 import zarr.storage._local as local
 
 from sweep.engine.closing import close
+from sweep.engine.lock import locked
 from sweep.engine.store import create_store, open_store
 from sweep.engine.task import compute_block
 from sweep.kernel import run_cells
@@ -35,9 +36,11 @@ def block(url, file, number):
 
 
 def closing(url, file, number):
-    """Close one of several complete stores."""
+    """Close one of several complete stores, as a run does."""
     del file
-    close(open_store(f"{url}/{number}.zarr", "r+"))
+    store = open_store(f"{url}/{number}.zarr", "r+")
+    with locked(store):
+        close(store)
 
 
 def creating(url, file, number):

@@ -302,7 +302,8 @@ class Chaos:
             self._see_it_finished(client)
 
 
-@lengths(3, 200)
+@pytest.mark.long
+@pytest.mark.parametrize("count", [6, 200])
 def test_kills_at_random_instants_change_no_bit_and_lose_no_block(count, tmp_path):
     trials = SHORT_TRIALS if count < 100 else LONG_TRIALS
     pipeline, path, reference = prepared(tmp_path, GRID % trials, "undisturbed")
@@ -390,9 +391,9 @@ def test_kill_between_any_two_writes_of_a_block_loses_that_block_alone(count, sm
     print(f"killed at {len(chosen) - 1} of {total} instants of a block")
 
 
-@lengths(3, 1000)
+@pytest.mark.long
 def test_kill_between_any_two_writes_of_closing_leaves_no_half_finished_store(
-    count, small, tmp_path
+    small, tmp_path
 ):
     pipeline, path, reference = small
     folder = tmp_path / "closing"
@@ -404,7 +405,7 @@ def test_kill_between_any_two_writes_of_closing_leaves_no_half_finished_store(
     complete(0)
     total = instants_of("closing", folder, path, 0)
     whole(str(folder / "0.zarr"), pipeline, reference)
-    instants = [[1 + k, at] for k, at in enumerate(some(total, count))]
+    instants = [[1 + k, at] for k, at in enumerate(range(total + 1))]
     for number, _ in instants:
         complete(number)
     with pieces("closing", folder, path, "SIGKILL", instants):
@@ -539,6 +540,7 @@ def test_run_on_a_full_disk_says_so_in_a_line_and_continues_when_there_is_room(
     whole(url, pipeline, reference)
 
 
+@pytest.mark.long
 def test_read_only_store_is_told_in_a_line_and_continued_when_it_can_be_written(
     small, disk, tmp_path
 ):

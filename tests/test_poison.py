@@ -365,13 +365,14 @@ def test_scenes_that_end_their_process_are_found_and_no_other_is_touched(
     assert "is finished" in again.stdout
 
 
+@pytest.mark.long
 def test_scene_that_never_returns_is_found_within_the_time_limit(pipeline, clean, tmp_path):
     url = str(tmp_path / "poisoned.zarr")
     # It keeps the interpreter's lock, so that no other thread of its process can act.
     poisons = [Poison(47, "detection", "hold", SUBPIX)]
     store = create_store(url, pipeline, EXTENTS)
     ran, seconds, log = run_poisoned(
-        tmp_path, TEXT, poisons, "--workers", 2, "--time-limit", 30, "--json"
+        tmp_path, TEXT, poisons, "--workers", 2, "--time-limit", 16, "--json"
     )
     assert (ran.returncode, ran.stderr) == (0, "")
     assert differing(url, clean, pipeline, poisons) == {}
@@ -380,6 +381,7 @@ def test_scene_that_never_returns_is_found_within_the_time_limit(pipeline, clean
     see_status(url, pipeline, poisons)
 
 
+@pytest.mark.long
 def test_poison_in_the_sample_that_is_measured_ends_no_client(pipeline, clean, tmp_path):
     # A new store: of a grid as small as this every scene is in the sample.
     poisons = [Poison(33, "scene", "segv")]

@@ -498,6 +498,7 @@ def test_metadata_in_one_place_is_checked_though_the_manifest_fits(copied):
     assert "zarr.json" in {damage.where for damage in verify(str(copied), 0).damage}
 
 
+@pytest.mark.long
 def test_unfinished_store_is_sound_and_goes_on_after_a_repair(pipeline, sound, tmp_path, here):
     url = tmp_path / "begun.zarr"
     store = create_store(str(url), pipeline, EXTENTS)
@@ -549,6 +550,7 @@ def test_finished_store_without_a_receipt_is_not_run_but_told_how_to_mend(
     assert "--repair" in told.err
 
 
+@pytest.mark.long
 def test_exit_status_and_json_tell_what_there_is(sound, copied, tmp_path, capsys):
     assert main(["verify", str(tmp_path / "none.zarr")]) == 2
     assert capsys.readouterr().err.count("\n") == 1

@@ -89,12 +89,10 @@ def failed_cells(store: RunStore, number: int, receipt: Mapping[str, Any]) -> It
 
 def _place(pipeline: Pipeline, block: Block, failure: Mapping[str, Any]) -> dict[str, Any]:
     """Return the value along each axis that a failure's cell has."""
-    place: dict[str, Any] = {}
-    axes = scene_axes(pipeline)
-    if axes:
-        within = np.unravel_index(failure["scene"], block.shape)
-        for axis, start, index in zip(axes, block.starts, within, strict=True):
-            place[axis.name] = axis.values[start + int(index)]
+    place = {
+        axis.name: axis.values[index]
+        for axis, index in zip(scene_axes(pipeline), block.cell(failure["scene"]), strict=True)
+    }
     for key, stage in (("setting", Stage.detection), ("estimator", Stage.estimation)):
         if failure[key] is not None:
             place |= _treatment(pipeline.axes_of(stage), failure[key])

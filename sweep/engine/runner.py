@@ -56,7 +56,7 @@ POLL_S = 0.2
 CALIBRATION_S = 0.6
 
 CALIBRATION_SHARE = 1 / 8
-"""Of a block's time limit: how long measuring may take, compiling included."""
+"""Of a block's time limit: how long measuring may take."""
 
 ASK_EACH_S = 1.0
 """How often the cluster is asked how many threads it has."""

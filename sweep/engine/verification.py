@@ -361,7 +361,9 @@ class Check:
             return 0, "the scenes that were drawn had ended their process"
         indices = [
             np.array(index, dtype=np.intp)
-            for index in zip(*(grid_index(store, *cell) for cell in cells), strict=True)
+            for index in zip(
+                *(store.blocks[number].cell(scene) for number, scene in cells), strict=True
+            )
         ]
         shape = (len(cells), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
         again = run_cells_apart(pipeline, indices, np.ones(shape, dtype=bool), TIME_LIMIT_S)
@@ -379,7 +381,7 @@ class Check:
             there = stored[cell]
             at = at_text({
                 axis.name: axis.values[k]
-                for axis, k in zip(axes, grid_index(store, *cell), strict=True)
+                for axis, k in zip(axes, store.blocks[cell[0]].cell(cell[1]), strict=True)
             })
             if sound[cell[0]] == processor():
                 told = difference(here, there)
@@ -399,21 +401,12 @@ class Check:
         return len(cells), ""
 
     def _stored(self, number: int, scene: int) -> dict[str, NDArray[Any]]:
-        index = grid_index(self.store, number, scene)
+        index = self.store.blocks[number].cell(scene)
         one = Block(index, tuple(k + 1 for k in index))
         return {
             v.name: np.asarray(self.store.array(v.name)[region(v, self.store.pipeline, one)])
             for v in TEMPLATE
         }
-
-
-def grid_index(store: RunStore, number: int, scene: int) -> tuple[int, ...]:
-    """Return where a scene of a block lies along each scene axis."""
-    block = store.blocks[number]
-    if not block.shape:
-        return ()
-    within = np.unravel_index(scene, block.shape)
-    return tuple(start + int(k) for start, k in zip(block.starts, within, strict=True))
 
 
 def computable(store: RunStore) -> Pipeline:

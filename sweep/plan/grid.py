@@ -43,6 +43,13 @@ class Block:
     def __len__(self) -> int:
         return math.prod(self.shape)
 
+    def cell(self, scene: int) -> tuple[int, ...]:
+        """Return where one of its scenes lies along each scene axis, the last axis fastest."""
+        if not self.shape:
+            return ()
+        within = np.unravel_index(scene, self.shape)
+        return tuple(start + int(k) for start, k in zip(self.starts, within, strict=True))
+
     def __str__(self) -> str:
         pairs = zip(self.starts, self.stops, strict=True)
         return ",".join(f"{a}-{b}" for a, b in pairs) or "all"

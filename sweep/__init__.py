@@ -6,7 +6,7 @@ import os
 from typing import TYPE_CHECKING, Any
 
 from sweep.errors import PipelineError, RunError, StoreError, SweepError
-from sweep.plan.pipeline import Pipeline
+from sweep.plan.experiment import Pipeline
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -17,10 +17,10 @@ __all__ = ["Pipeline", "PipelineError", "RunError", "StoreError", "SweepError", 
 def run(pipeline: Pipeline, store: str | os.PathLike[str] | None = None, **options: Any) -> Any:
     """Run a pipeline into a store and return its results, an ``xarray.Dataset``, lazily.
 
-    ``options`` are those of :func:`sweep.engine.runner.execute`. Call it under
+    ``options`` are those of :func:`sweep.execution.runner.execute`. Call it under
     ``if __name__ == "__main__":`` in a script: the workers are processes that import it.
     """
-    from sweep.engine.runner import execute  # noqa: PLC0415  (dask is slow to import)
+    from sweep.execution.runner import execute  # noqa: PLC0415  (dask is slow to import)
 
     return open(execute(pipeline, store, **options).store)
 
@@ -33,6 +33,6 @@ def open(store: str | os.PathLike[str]) -> xr.Dataset:  # noqa: A001  (as xarray
     StoreError
         Where there is no store of sweep.
     """
-    from sweep.engine.store import open_dataset  # noqa: PLC0415  (xarray is slow to import)
+    from sweep.store.lifecycle import open_dataset  # noqa: PLC0415  (xarray is slow to import)
 
     return open_dataset(store)

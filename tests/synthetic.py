@@ -5,8 +5,8 @@ As a preload of Dask workers (``dask_setup``), and in the client by :func:`insta
 
 import numpy as np
 
-from sweep.kernel import CellsResult
-from sweep.plan.template import TEMPLATE
+from sweep.evaluation.cells import CellsResult
+from sweep.plan.schema import SCHEMA
 
 
 def synthetic_cells(pipeline, indices, need=None):  # noqa: ARG001
@@ -16,7 +16,7 @@ def synthetic_cells(pipeline, indices, need=None):  # noqa: ARG001
     for axis, index in zip(pipeline.axes, indices, strict=True):
         ramp = ramp * len(axis) + index
     columns = {}
-    for variable in TEMPLATE:
+    for variable in SCHEMA:
         values = np.ones((count, *variable.inner_shape), dtype=variable.dtype)
         if variable.flags is None:
             values *= (ramp % 1000).reshape(-1, *[1] * len(variable.inner_shape))
@@ -26,11 +26,11 @@ def synthetic_cells(pipeline, indices, need=None):  # noqa: ARG001
 
 
 def install():
-    import sweep.engine.calibration  # noqa: PLC0415
-    import sweep.engine.task  # noqa: PLC0415
+    import sweep.execution.block_task  # noqa: PLC0415
+    import sweep.execution.calibration  # noqa: PLC0415
 
-    sweep.engine.calibration.run_cells = synthetic_cells
-    sweep.engine.task.run_cells = synthetic_cells
+    sweep.execution.calibration.run_cells = synthetic_cells
+    sweep.execution.block_task.run_cells = synthetic_cells
 
 
 def dask_setup(worker):  # noqa: ARG001

@@ -18,7 +18,7 @@ from test_analysis_reference import perfect
 
 from sweep.analysis import compare, detection_limit, error_statistics, marker_ranking
 from sweep.analysis.intervals import jeffreys, wilson
-from sweep.measure.flags import Detection, Estimate, Flipped
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
 # Rates, exactly: Brown, Cai and DasGupta, Statistical Science 16(2), 2001 (BCD).
 
@@ -181,7 +181,7 @@ def test_quantiles_are_covered_at_least_as_often_as_they_say(lost, count):
     vectors[..., 2] = rng.random(tuple(sizes.values())) * widths * rng.choice([-1, 1])
     results = simulated(rng, sizes, vectors)
     missed = rng.random(tuple(sizes.values())) < lost
-    results["estimate"].values[missed] = Estimate.solver_failed
+    results["estimate"].values[missed] = EstimateStatus.solver_failed
     results["flipped"].values[missed] = Flipped.no_estimate
     told = error_statistics(results, ["regime"]).compute()
     for name, share in (("median", 0.5), ("p95", 0.95), ("p99", 0.99)):
@@ -348,7 +348,7 @@ def test_a_planted_weak_id_is_found(ids, fallen, count):
 def test_what_is_not_seen_is_never_weak():
     rng = np.random.default_rng(29)
     results, _ = ranked(rng, 1, 5, np.full((5, 3), 0.9))
-    results["detection"][{"marker_id": 2}] = Detection.not_visible
+    results["detection"][{"marker_id": 2}] = DetectionStatus.not_visible
     told = marker_ranking(results.isel(regime=0)).compute()
     assert told["looked_for"].values.tolist() == [60, 60, 0, 60, 60]
     assert not told["weak"].values[2]

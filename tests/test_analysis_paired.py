@@ -35,7 +35,7 @@ from test_analysis_reference import (
 
 from sweep.analysis import compare, detection_limit, detection_rate, marker_ranking
 from sweep.errors import StoreError
-from sweep.measure.flags import Detection, Estimate, Flipped
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
 
 def with_detected(results, hits):
@@ -43,12 +43,14 @@ def with_detected(results, hits):
     out = results.copy(deep=True)
     dims = results["detection"].dims
     detected = xr.DataArray(np.broadcast_to(hits, results["detection"].shape), dims=dims)
-    out["detection"] = (dims, np.where(detected, Detection.detected, Detection.no_candidate)
-                        .astype(np.uint8))
+    out["detection"] = (
+        dims,
+        np.where(detected, DetectionStatus.detected, DetectionStatus.no_candidate).astype(np.uint8),
+    )
     estimated = results["estimate"]
     seen = xr.broadcast(detected, estimated.drop_vars(estimated.coords))[0]
     seen = seen.transpose(*estimated.dims)
-    for name, yes, no in (("estimate", Estimate.solved, Estimate.no_detection),
+    for name, yes, no in (("estimate", EstimateStatus.solved, EstimateStatus.no_detection),
                           ("flipped", Flipped.not_flipped, Flipped.no_estimate)):
         out[name] = (seen.dims, np.where(seen, yes, no).astype(np.uint8))
     for name in ("rotation_error_rad", "translation_error_m", "rotation_error_deg"):
@@ -195,7 +197,7 @@ def test_of_two_ids_looked_for_alike_the_p_value_is_that_of_cochran_mantel_and_h
     told = marker_ranking(results).compute()
     tables = []
     for tilt in range(3):
-        hits = [(results["detection"].values[m, tilt] == Detection.detected).sum()
+        hits = [(results["detection"].values[m, tilt] == DetectionStatus.detected).sum()
                 for m in range(2)]
         tables.append(np.array([[hits[0], 60 - hits[0]], [hits[1], 60 - hits[1]]]))
     found = contingency.StratifiedTable(tables).test_null_odds(correction=True)
@@ -540,7 +542,9 @@ def test_limits_are_those_of_the_pooled_rates(per):
     sizes = {"side_px": 5, "tilt_deg": 3, "noise_grey": 2, "marker_id": 2, "trial": 30}
     chance = np.array([0.1, 0.4, 0.8, 0.95, 1.0]).reshape(5, 1, 1, 1, 1)
     results = with_detected(perfect(rng, sizes), rng.random(tuple(sizes.values())) < chance)
-    results["detection"].values[rng.random(tuple(sizes.values())) < 0.1] = Detection.not_visible
+    results["detection"].values[rng.random(tuple(sizes.values())) < 0.1] = (
+        DetectionStatus.not_visible
+    )
     rates = detection_rate(results, (*per, "side_px")).compute()
     for rate_ in (0.5, 0.75, 0.9):
         told = detection_limit(results, rate_, per=per).compute()
@@ -563,7 +567,7 @@ def test_all_that_is_looked_for_may_be_found_with_pooled_settings(settings):
     results = perfect(np.random.default_rng(18), {
         "regime": trials, "side_px": 2, "trial": trials, "cornerRefinementMethod": settings})
     for missing in range(trials):
-        results["detection"].values[missing, :, :missing, 0] = Detection.not_run
+        results["detection"].values[missing, :, :missing, 0] = DetectionStatus.not_run
     assert (detection_rate(results, ["regime"])["detection_rate_high"] == 1).all()
     alike = compare(results, results, ["regime"])
     assert (alike["detection_difference"] == 0).all()

@@ -17,8 +17,8 @@ from statsmodels.stats import proportion
 
 from sweep.analysis import detection_rate, error_statistics, failure_composition, flip_rate
 from sweep.errors import StoreError
-from sweep.measure.flags import Detection, Estimate, Flipped
-from sweep.plan.pipeline import Pipeline
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.plan.experiment import Pipeline
 
 VALUES = {
     "dictionary": ["DICT_4X4_50", "DICT_6X6_50"],
@@ -113,8 +113,8 @@ def perfect(rng, sizes, *, rotation=None, position=None):
             "true_rvec": ((*scene, "xyz"), rng.normal(size=truth.shape)),
             "true_tvec_m": ((*scene, "xyz"), truth),
             "marker_area_px": (scene, rng.uniform(100, 1000, shapes[scene])),
-            "detection": flags(detected, Detection.detected),
-            "estimate": flags(estimated, Estimate.solved),
+            "detection": flags(detected, DetectionStatus.detected),
+            "estimate": flags(estimated, EstimateStatus.solved),
             "flipped": flags(estimated, Flipped.not_flipped),
             "rotation_error_rad": ((*estimated, "xyz"), rotation),
             "translation_error_m": ((*estimated, "xyz"), np.asarray(position, dtype=np.float32)),
@@ -129,31 +129,35 @@ def with_every_flag(rng, results, *, good=0.6):
     """Return the dataset with poses that went wrong in every way the kernel knows."""
     out = results.copy(deep=True)
     shape = out["detection"].shape
-    kinds = np.array(list(Detection), dtype=np.uint8)
+    kinds = np.array(list(DetectionStatus), dtype=np.uint8)
     out["detection"].values[...] = np.where(
-        rng.random(shape) < good, Detection.detected, rng.choice(kinds, shape)
+        rng.random(shape) < good, DetectionStatus.detected, rng.choice(kinds, shape)
     )
     seen = xr.broadcast(out["detection"], out["estimate"])[0]
     seen = seen.transpose(*out["estimate"].dims).values
     shape = seen.shape
-    kinds = [kind for kind in Estimate if kind not in (Estimate.not_run, Estimate.no_detection)]
-    estimate = np.where(rng.random(shape) < good, Estimate.solved,
+    kinds = [
+        kind
+        for kind in EstimateStatus
+        if kind not in (EstimateStatus.not_run, EstimateStatus.no_detection)
+    ]
+    estimate = np.where(rng.random(shape) < good, EstimateStatus.solved,
                         rng.choice(np.array(kinds, dtype=np.uint8), shape))
-    estimate[seen != Detection.detected] = Estimate.no_detection
-    estimate[seen == Detection.not_run] = Estimate.not_run
-    estimate[seen == Detection.crashed] = Estimate.crashed
-    solved = estimate == Estimate.solved
+    estimate[seen != DetectionStatus.detected] = EstimateStatus.no_detection
+    estimate[seen == DetectionStatus.not_run] = EstimateStatus.not_run
+    estimate[seen == DetectionStatus.crashed] = EstimateStatus.crashed
+    solved = estimate == EstimateStatus.solved
     out["estimate"].values[...] = estimate
     out["flipped"].values[...] = np.where(
         solved, np.where(rng.random(shape) < 0.2, Flipped.flipped, Flipped.not_flipped),
-        np.where(estimate == Estimate.not_run, Flipped.not_run, Flipped.no_estimate),
+        np.where(estimate == EstimateStatus.not_run, Flipped.not_run, Flipped.no_estimate),
     )
-    kept = solved | (estimate == Estimate.not_explained)  # its pose is kept beside the flag
+    kept = solved | (estimate == EstimateStatus.not_explained)  # its pose is kept beside the flag
     for name in ("rotation_error_rad", "translation_error_m", "rotation_error_deg"):
         errors = out[name].values
         errors[~kept] = np.nan
-        errors[estimate == Estimate.not_explained] *= 50
-    nothing = (seen == Detection.not_run).all(
+        errors[estimate == EstimateStatus.not_explained] *= 50
+    nothing = (seen == DetectionStatus.not_run).all(
         axis=tuple(k for k, name in enumerate(out["estimate"].dims)
                    if name in OF_DETECTION + OF_ESTIMATION))
     out["true_tvec_m"].values[nothing] = np.nan
@@ -202,20 +206,20 @@ def poses(results, of, per=(), bins=None):
 
 def looked_for(pose):
     return pose["detection"] not in {
-        Detection.not_run, Detection.not_visible, Detection.not_modelled
+        DetectionStatus.not_run, DetectionStatus.not_visible, DetectionStatus.not_modelled
     }
 
 
 def is_run(pose):
-    return pose["detection"] != Detection.not_run
+    return pose["detection"] != DetectionStatus.not_run
 
 
 def is_detected(pose):
-    return pose["detection"] == Detection.detected
+    return pose["detection"] == DetectionStatus.detected
 
 
 def is_solved(pose):
-    return pose["estimate"] == Estimate.solved
+    return pose["estimate"] == EstimateStatus.solved
 
 
 def is_unflipped(pose):
@@ -432,8 +436,8 @@ OUTCOMES = (*OF_LOOKED_FOR, "not_visible", "not_modelled", "not_run")
 
 def outcome(pose):
     if is_detected(pose):
-        return Estimate(pose["estimate"]).name
-    return Detection(pose["detection"]).name
+        return EstimateStatus(pose["estimate"]).name
+    return DetectionStatus(pose["detection"]).name
 
 
 def expected_composition(found):
@@ -639,7 +643,7 @@ def test_bins_are_those_of_plain_loops(function, of, expected, grid, per, bins):
 
 def test_a_value_on_an_edge_is_in_the_bin_above_and_on_the_last_in_none():
     results = mixed({"trial": 6}, 8).isel(trial=slice(6))
-    results["detection"].values[...] = Detection.detected
+    results["detection"].values[...] = DetectionStatus.detected
     results["marker_area_px"].values[...] = [0.0, 1.0, 2.0, 3.0, np.nan, 2.5]
     told = detection_rate(results, bins={"marker_area_px": [1.0, 2.0, 3.0]})
     assert told["looked_for"].values.tolist() == [1, 2]
@@ -680,8 +684,8 @@ def test_what_was_not_run_changes_nothing_but_its_own_count(function):
     # An unfinished store: trials that were never reached are fill values.
     short = GRIDS["draws"].isel(trial=slice(50))
     longer = GRIDS["draws"].isel(trial=slice(80)).copy(deep=True)
-    longer["detection"][{"trial": slice(50, None)}] = Detection.not_run
-    longer["estimate"][{"trial": slice(50, None)}] = Estimate.not_run
+    longer["detection"][{"trial": slice(50, None)}] = DetectionStatus.not_run
+    longer["estimate"][{"trial": slice(50, None)}] = EstimateStatus.not_run
     longer["flipped"][{"trial": slice(50, None)}] = Flipped.not_run
     for name in longer.data_vars:
         if longer[name].dtype.kind == "f":
@@ -739,8 +743,8 @@ def test_a_single_pose_is_a_dataset_too(function, of, expected):
 @FUNCTIONS_OF_ONE
 def test_where_nothing_was_looked_for_nothing_is_said(function):
     results = GRIDS["plain"].copy(deep=True)
-    results["detection"].values[...] = Detection.not_visible
-    results["estimate"].values[...] = Estimate.no_detection
+    results["detection"].values[...] = DetectionStatus.not_visible
+    results["estimate"].values[...] = EstimateStatus.no_detection
     results["flipped"].values[...] = Flipped.no_estimate
     for per in ((), ("distance_m",)):
         for name, array in function(results, per).compute().data_vars.items():
@@ -801,7 +805,7 @@ def test_what_was_cut_away_was_not_run():
 def test_a_draw_with_more_solved_settings_counts_more():
     # Kish 1965: 10 draws with 30 settings each and 90 with one are worth 19 draws, not 100.
     results = perfect(np.random.default_rng(1), {"trial": 100, "solver": 30})
-    results["estimate"].values[10:, 1:] = Estimate.solver_failed
+    results["estimate"].values[10:, 1:] = EstimateStatus.solver_failed
     told = flip_rate(results)
     assert told["solved"] == 10 * 30 + 90
     assert told["draws"] == (10 * 30 + 90) ** 2 // (10 * 30**2 + 90) == 16

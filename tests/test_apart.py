@@ -10,9 +10,9 @@ import time
 import numpy as np
 import pytest
 
-from sweep.engine.apart import Child, DiedError, RaisedError
 from sweep.errors import PipelineError, StoreError
-from sweep.plan.pipeline import Pipeline
+from sweep.isolation.child_process import Child, DiedError, RaisedError
+from sweep.plan.experiment import Pipeline
 
 
 def test_child_calls_functions_and_tells_what_they_raise():
@@ -60,7 +60,7 @@ def test_child_runs_nothing_that_lies_in_the_current_folder(tmp_path):
     script = tmp_path / "script" / "call.py"
     script.parent.mkdir()
     script.write_text(
-        "from sweep.engine.apart import Child\n"
+        "from sweep.isolation.child_process import Child\n"
         "with Child() as child:\n"
         "    print(child.call(pow, 2, 3, limit_s=60))\n"
     )

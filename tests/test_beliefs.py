@@ -39,15 +39,15 @@ import pytest
 from conftest import lengths
 from scipy import stats
 
-from sweep.kernel import believed, run_block
+from sweep.evaluation.cells import believed, run_block
 from sweep.measure.accuracy import pose_error
-from sweep.measure.flags import Detection, Estimate
+from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.measure.solver import SOLVERS, estimate
 from sweep.model.scene import build_scenes
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices, estimators, scene_axes, scene_values
 from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.template import TEMPLATE
+from sweep.plan.schema import SCHEMA
 
 GUARDED = tuple(name for name in SOLVERS if name != "epnp")  # epnp cannot be guarded
 LEAST_SQUARES = ("iterative", "sqpnp")
@@ -140,7 +140,7 @@ def test_wrong_size_scales_the_translation_and_leaves_the_rotation_alone(count, 
     truths = Estimated(text, noise=noise)
     wrong = Estimated(text, [f"believed_size_m={sizes}"], noise)
     for (truth, right, _), at in zip(truths, range(len(GUARDED)), strict=True):
-        assert (right.status == Estimate.solved).all()
+        assert (right.status == EstimateStatus.solved).all()
         for k, size in enumerate(sizes):
             estimator = wrong.estimators[at * len(sizes) + k]
             found = wrong.estimates[at * len(sizes) + k]
@@ -197,7 +197,7 @@ def assert_parallel_law(estimated):
                 estimator.believed_cy_px, estimator.believed_size_m,
             ), strict=True)
         ]
-        assert (found.status == Estimate.solved).all(), estimator
+        assert (found.status == EstimateStatus.solved).all(), estimator
         assert_translation(
             found.translation, parallel_law(estimated.scenes, *beliefs), estimator
         )
@@ -371,7 +371,7 @@ def test_wrong_fx_alone_is_shared_by_least_squares_and_tilts_what_ippe_sees(erro
     )
     ratio = min(1 + error, 1 / (1 + error))
     for estimator, found, miss in estimated:
-        assert (found.status == Estimate.solved).all()
+        assert (found.status == EstimateStatus.solved).all()
         if estimator.solver in LEAST_SQUARES:
             # To first order: the rest is at most error².
             expected = np.tile([0, 0, distance * (1 + error / 2)], (4, 1))
@@ -590,8 +590,8 @@ def test_beliefs_move_detected_markers_as_they_move_exact_ones(count):
     sizes, centres, focal = [0.09, 0.1, 0.12], [309.5, 319.5, 322.5], [594.0, 600.0, 612.0]
 
     grid = run(SEEN + axes + f"believed_size_m = {sizes}\nbelieved_cx_px = {centres}\n")
-    assert (grid["detection"] == Detection.detected).all()
-    assert (grid["estimate"] == Estimate.solved).all()
+    assert (grid["detection"] == DetectionStatus.detected).all()
+    assert (grid["estimate"] == EstimateStatus.solved).all()
     found, _ = translations(grid)
     assert found.shape == (count, len(GUARDED), 3, 3, 3)
     tilted = np.array([solver in IPPE for solver in GUARDED])[:, None]
@@ -672,7 +672,7 @@ def unset():
 def test_believing_the_truth_gives_the_bits_of_believing_nothing(belief, unset):
     names = TRUTH if belief == "all" else [belief]
     believing = run(EVERYTHING, [f"{name}={TRUTH[name]}" for name in names])
-    assert (unset["estimate"] == Estimate.solved).any()
+    assert (unset["estimate"] == EstimateStatus.solved).any()
     for name, expected in unset.items():
         np.testing.assert_array_equal(believing[name], expected, err_msg=name)
 
@@ -708,9 +708,9 @@ BELIEFS = {
 @pytest.mark.parametrize("settings", BELIEFS.values(), ids=BELIEFS)
 def test_beliefs_change_no_draw_no_image_and_no_detection(settings, unset):
     believing = run(EVERYTHING, settings)
-    seen = [variable.name for variable in TEMPLATE if variable.stage < Stage.estimation]
+    seen = [variable.name for variable in SCHEMA if variable.stage < Stage.estimation]
     assert set(seen) >= {"true_rvec", "true_tvec_m", "detection", "corner_error_px"}
-    assert (unset["detection"] == Detection.detected).any()
+    assert (unset["detection"] == DetectionStatus.detected).any()
     for name in seen:
         np.testing.assert_array_equal(believing[name], unset[name], err_msg=name)
     different = believing["translation_error_m"]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import sweep
-from sweep.kernel import run_cells
+from sweep.evaluation.cells import run_cells
 from sweep.measure.bit_reading import (
     cell_mixing,
     lone_cells,
@@ -21,7 +21,7 @@ from sweep.measure.bit_reading import (
     wrong_cells,
 )
 from sweep.measure.detector import DetectorSetting
-from sweep.measure.flags import Detection
+from sweep.measure.flags import DetectionStatus
 from sweep.model.marker import modules
 from sweep.plan.grid import Block, block_indices, scene_axes
 
@@ -139,11 +139,11 @@ def test_sweep_loses_an_id_with_lone_cells_at_its_dip_and_none_without():
     shape = tuple(len(axis) for axis in scene_axes(pipeline))
     cells = run_cells(pipeline, block_indices(Block((0,) * len(shape), shape)))
     flags = cells.columns["detection"][0].reshape(shape)
-    lost = (flags != Detection.detected).mean(axis=(1, 2))
+    lost = (flags != DetectionStatus.detected).mean(axis=(1, 2))
     print(f"lost of IDs 6 and 7: {lost}")
     assert lost[0] == 0
     assert lost[1] > 0.05
-    assert set(np.unique(flags[1])) == {Detection.detected, Detection.rejected}
+    assert set(np.unique(flags[1])) == {DetectionStatus.detected, DetectionStatus.rejected}
 
 
 @pytest.mark.long

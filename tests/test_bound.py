@@ -23,15 +23,15 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 from test_exact_image import DICTIONARIES, LENSES, modules_of, values, visible
 
-from sweep.kernel import run_cells, visibility_flags
-from sweep.measure.bound import BACKGROUND_MARGIN_PX, FARTHEST_MIRROR, Bound, bounds
-from sweep.measure.flags import Detection
+from sweep.evaluation.cells import run_cells, visibility_flags
+from sweep.measure.bound import BACKGROUND_MARGIN_PX, FARTHEST_MIRROR, BoundStatus, bounds
+from sweep.measure.flags import DetectionStatus
 from sweep.measure.likelihood import plane_of, state_of
 from sweep.model.coverage import accumulate, sum_levels
 from sweep.model.effects import Effects
 from sweep.model.extent import marker_boxes
 from sweep.model.scene import build_scenes
-from sweep.plan.pipeline import Pipeline
+from sweep.plan.experiment import Pipeline
 
 NEUTRAL = {field.name: field.default for field in dataclasses.fields(Effects)}
 LENS_BY_COUNT = {len(lens): lens for lens in LENSES}
@@ -239,7 +239,7 @@ def drawn(count, seed, sides=(8, 150), max_tilt=80, **given):
         if not visible(value):
             continue
         scenes = build_scenes(value, 1)
-        if visibility_flags(scenes)[0] == Detection.not_run:
+        if visibility_flags(scenes)[0] == DetectionStatus.not_run:
             found.append(value)
     return found
 
@@ -258,7 +258,7 @@ STEPS_PX = (5e-6, 1e-6, 3e-7, 1e-7, 3e-5)
 def sharp_difference(value, enough=SHARP_TOLERANCE / 10):
     drawing = Drawing(value)
     found = drawing.found()
-    assert found.status.tolist() == [Bound.given], value
+    assert found.status.tolist() == [BoundStatus.given], value
     differences = []
     for moved_px in STEPS_PX:
         expected = np.sqrt(np.diag(drawing.covariance(moved_px)))
@@ -303,7 +303,7 @@ def whole(value):
 def smooth_difference(value, unknown_blur, moved_px):
     drawing = Drawing(value, unknown_blur)
     found = drawing.found()
-    assert found.status.tolist() == [Bound.given], value
+    assert found.status.tolist() == [BoundStatus.given], value
     expected = np.sqrt(np.diag(drawing.covariance(moved_px)))
     return np.abs(found.std[0] / expected - 1).max()
 
@@ -519,7 +519,7 @@ def checked(found):
     """The flag of one scene; a number stands beside ``given`` only, NaN beside all others."""
     (status,) = found.status.tolist()
     numbers = np.concatenate([found.std[0], found.kappa])
-    if status == Bound.given:
+    if status == BoundStatus.given:
         assert np.isfinite(numbers).all()
         assert (numbers >= 0).all()
         assert not found.mirror_distance[0] <= 0
@@ -527,7 +527,7 @@ def checked(found):
     else:
         assert np.isnan(numbers).all()
         assert np.isnan(found.mirror_distance).all()
-    return Bound(status)
+    return BoundStatus(status)
 
 
 def asked(value, unknown_blur=False):
@@ -547,27 +547,27 @@ background = 120
 """
 
 FLAGS = {
-    Bound.given: [
+    BoundStatus.given: [
         [], ["noise_grey=0.5"], ["noise_grey=17.5"], ["gain=0.5"], ["blur_px=1"],
         ["black=4", "white=251", "background=251"], ["window=full"], ["renderer=warp"],
         ["renderer=supersample-2"], ["distortion=[-0.2, 0.05, 0, 0]"], ["gain=1.14"],
     ],
-    Bound.no_noise: [["noise_grey=0"], ["noise_grey=0.49"], ["noise_grey=0", "blur_px=1"]],
-    Bound.no_contrast: [
+    BoundStatus.no_noise: [["noise_grey=0"], ["noise_grey=0.49"], ["noise_grey=0", "blur_px=1"]],
+    BoundStatus.no_contrast: [
         ["black=120", "white=120"], ["black=120", "white=120", "blur_px=1"],
         ["side_px=0.001"], ["side_px=4000", "tilt_deg=0", "quiet_zone_modules=0"],
     ],
-    Bound.clipped: [
+    BoundStatus.clipped: [
         ["black=3.9"], ["white=251.1"], ["background=3"], ["noise_grey=17.6"], ["noise_grey=21"],
         ["gain=1.15"], ["gain=0.05"], ["noise_grey=1e6"], ["gain=1e6"],
     ],
-    Bound.not_in_model: [
+    BoundStatus.not_in_model: [
         ["exposure_s=0.01", "velocity_x_m_s=0.1"], ["full_well_e=10000"], ["vignetting=4"],
         ["illumination_gradient=0.3"], ["occlusion=0.1"], ["bit_depth=12"],
         ["aperture_mm=2", "focus_distance_m=0.5"], ["vignetting=4", "noise_grey=0"],
         ["vignetting=4", "black=0"],
     ],
-    Bound.not_visible: [
+    BoundStatus.not_visible: [
         ["bearing_x_deg=40"], ["tilt_deg=120"], ["tilt_deg=90"], ["side_px=900", "tilt_deg=89",
         "bearing_y_deg=40"], ["distortion=[-0.5, 0, 0, 0]", "bearing_x_deg=36", "side_px=120"],
         ["tilt_deg=120", "noise_grey=0", "vignetting=4"],
@@ -599,8 +599,8 @@ def test_every_flag_stands_beside_its_scenes_and_a_number_beside_given_only(
     if not any(setting.startswith("noise_grey") for setting in settings):
         settings = [*settings, "noise_grey=2"]
     flag, *numbers = told(f"bound={bound}", *settings)
-    assert Bound(flag) == expected
-    if expected == Bound.given:
+    assert BoundStatus(flag) == expected
+    if expected == BoundStatus.given:
         assert np.isfinite(numbers[0]).all()
         assert np.isfinite(numbers[1])
     else:
@@ -610,7 +610,7 @@ def test_every_flag_stands_beside_its_scenes_and_a_number_beside_given_only(
 def test_bound_is_not_run_unless_asked_for():
     for settings in ([], ["bound=none"], ["bound=none", "bearing_x_deg=40"]):
         flag, *numbers = told("noise_grey=2", *settings)
-        assert Bound(flag) == Bound.not_run
+        assert BoundStatus(flag) == BoundStatus.not_run
         assert all(np.isnan(number).all() for number in numbers)
 
 
@@ -618,7 +618,7 @@ def test_bound_on_a_background_image_is_not_in_its_model(tmp_path):
     path = tmp_path / "grey.png"
     cv2.imwrite(str(path), np.full((480, 640), 120, dtype=np.uint8))
     flag, *numbers = told("bound=known_blur", "noise_grey=2", f'background="{path}"')
-    assert Bound(flag) == Bound.not_in_model
+    assert BoundStatus(flag) == BoundStatus.not_in_model
     assert all(np.isnan(number).all() for number in numbers)
 
 
@@ -656,7 +656,7 @@ def test_bound_grows_as_the_noise_and_its_rounding():
 def test_estimating_the_blur_costs_something_and_gains_nothing():
     for value in drawn(12, 8, sides=(10, 25), blur_px=0.7):
         known_blur, unknown_blur = asked(value), asked(value, unknown_blur=True)
-        if known_blur.status[0] == unknown_blur.status[0] == Bound.given:
+        if known_blur.status[0] == unknown_blur.status[0] == BoundStatus.given:
             assert (unknown_blur.std >= known_blur.std * (1 - 1e-9)).all()
 
 
@@ -669,7 +669,7 @@ def test_equal_images_have_equal_bounds_of_rotation_and_shifts_in_proportion(til
     base = asked(scene(**given, size_m=1.0))
     for size_m in (1e-9, 1e-3, 0.3, 1e3, 1e9):
         found = asked(scene(**given, size_m=size_m))
-        assert checked(found) == Bound.given
+        assert checked(found) == BoundStatus.given
         # Positions scale inexactly: their last bits move edges by 1e-13 px.
         np.testing.assert_allclose(found.std[0, :3], base.std[0, :3], rtol=1e-9)
         np.testing.assert_allclose(found.std[0, 3:], base.std[0, 3:] * size_m, rtol=1e-9)
@@ -728,8 +728,8 @@ def test_fewer_pixels_than_unknowns_give_no_bound():
             quiet_zone_modules=float(rng.choice([0, 1])), shift_u_px=rng.uniform(-4, 4),
             shift_v_px=rng.uniform(-4, 4),
         )
-        if visibility_flags(build_scenes(value, 1))[0] == Detection.not_run:
-            given += checked(asked(value)) == Bound.given
+        if visibility_flags(build_scenes(value, 1))[0] == DetectionStatus.not_run:
+            given += checked(asked(value)) == BoundStatus.given
     assert given == 0
 
 
@@ -745,7 +745,7 @@ def test_pose_that_hangs_on_a_level_seen_in_two_pixels_has_no_bound():
         shift_v_px=-14.317569667549655,
     ))
     assert np.sqrt(np.diag(drawing.covariance(5e-6)))[:3].min() > 1000
-    assert checked(drawing.found()) == Bound.no_contrast
+    assert checked(drawing.found()) == BoundStatus.no_contrast
 
 
 def test_plane_of_a_state_is_what_places_the_marker():

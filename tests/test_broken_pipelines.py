@@ -5,7 +5,7 @@ import pytest
 
 from sweep.cli import main
 from sweep.errors import PipelineError
-from sweep.plan.pipeline import Pipeline
+from sweep.plan.experiment import Pipeline
 
 # What is wrong, the file, and what its message must hold: file, key, value, what was expected.
 BROKEN = {

@@ -18,12 +18,12 @@ import xarray as xr
 from conftest import lengths
 from test_run import by_hand, same
 
-from sweep.engine.store import committed, create_store, open_store, receipts
-from sweep.engine.task import compute_block
 from sweep.errors import StoreError
+from sweep.execution.block_task import compute_block
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
 from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
+from sweep.store.lifecycle import committed, create_store, open_store, receipts
 
 SEED = 20_261
 
@@ -50,8 +50,8 @@ SHORT_TRIALS, LONG_TRIALS = 250, 1500
 
 CLIENT = """
 import sys
-from sweep.engine.runner import execute
-from sweep.plan.pipeline import Pipeline
+from sweep.execution.runner import execute
+from sweep.plan.experiment import Pipeline
 
 if __name__ == "__main__":
     pipeline, store, scheduler = sys.argv[1:]
@@ -76,7 +76,7 @@ def started(arguments, **options):
 def command(*arguments, timeout=300, **options):
     """Run the command line; end whatever it leaves behind."""
     with started(
-        ["-m", "sweep.cli", *arguments],
+        ["-m", "sweep", *arguments],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options,
     ) as running:
         out, err = running.communicate(timeout=timeout)
@@ -626,7 +626,7 @@ def test_disk_that_becomes_read_only_during_a_run_is_told_in_a_line(disk, tmp_pa
     disk.remount("size=256m")
     store = create_store(url, pipeline, (1, 1, 10))
     with started(
-        ["-m", "sweep.cli", "run", path, "--store", url, "--workers", 2],
+        ["-m", "sweep", "run", path, "--store", url, "--workers", 2],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path,
     ) as running:
         deadline = time.monotonic() + 120

@@ -4,7 +4,7 @@ import socket
 
 import psutil
 
-from sweep.engine.cluster import embedded
+from sweep.execution.cluster import embedded
 
 
 def test_embedded_cluster_listens_on_loopback_only_and_needs_no_certain_port(capfd):

@@ -10,23 +10,23 @@ from conftest import lengths
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sweep.kernel import run_block
+from sweep.evaluation.cells import run_block
 from sweep.measure.detector import (
     ALIGNMENT_PX,
+    MIN_WINDOW_PX,
     REFINEMENTS,
-    SMALLEST_WINDOW_PX,
     Detector,
     DetectorSetting,
     margin_px,
     windows,
 )
-from sweep.measure.flags import Detection
+from sweep.measure.flags import DetectionStatus
 from sweep.model.extent import marker_boxes
 from sweep.model.marker import dictionary_names, marker_count, module_count
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices, detector_settings, scene_axes, scene_values
-from sweep.plan.pipeline import Pipeline
 
 FIELDS = {field.name: field.default for field in dataclasses.fields(DetectorSetting)}
 
@@ -188,7 +188,7 @@ def test_every_dictionary_is_rendered_and_found_with_its_id_and_rotation(diction
     )
     block = Block((0,) * 3, tuple(len(axis) for axis in scene_axes(pipeline)))
     values = run_block(pipeline, block).values
-    assert (values["detection"] == Detection.detected).all()
+    assert (values["detection"] == DetectionStatus.detected).all()
     # Unrefined corners are whole pixels just within the true ones: half a pixel, plus one for
     # an edge that rounding of the roll's sine moves across a pixel's centre.
     assert np.abs(values["corner_error_px"]).max() <= 1.5
@@ -229,9 +229,9 @@ def test_windows_hold_the_box_and_its_margin_and_stay_in_the_frame(count):
         assert (stop >= np.minimum(box[2:] + margin, frame)).all()
         assert (start % ALIGNMENT_PX == 0).all()
         assert ((stop % ALIGNMENT_PX == 0) | (stop == frame)).all()
-        assert (stop - start >= np.minimum(SMALLEST_WINDOW_PX, frame)).all()
+        assert (stop - start >= np.minimum(MIN_WINDOW_PX, frame)).all()
         # And no more than that: what is added is alignment, or reaches the smallest window.
-        smallest = SMALLEST_WINDOW_PX + ALIGNMENT_PX
+        smallest = MIN_WINDOW_PX + ALIGNMENT_PX
         wanted = np.minimum(box[2:] + margin, frame) - np.maximum(box[:2] - margin, 0)
         assert (stop - start < np.maximum(wanted + 2 * ALIGNMENT_PX, smallest)).all()
 

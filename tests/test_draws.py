@@ -5,10 +5,10 @@ import pytest
 from conftest import lengths
 from scipy import stats
 
-from sweep.kernel import run_block
+from sweep.evaluation.cells import run_block
 from sweep.model.scene import build_scenes
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, Blocks, block_indices, scene_axes, scene_values
-from sweep.plan.pipeline import Pipeline
 
 DRAWN = """
 seed = 2020

@@ -28,17 +28,17 @@ from test_exact_image import (
 )
 
 from sweep.errors import PipelineError
-from sweep.inspection import look
-from sweep.kernel import run_cells
-from sweep.measure.flags import Detection
+from sweep.evaluation.cells import run_cells
+from sweep.evaluation.inspection import look
+from sweep.measure.flags import DetectionStatus
 from sweep.model.effects import SWITCHES, Effects
 from sweep.model.exposure import defocus_px, marker_exposure
 from sweep.model.extent import marker_boxes, not_modelled
 from sweep.model.renderers import marker_levels, render_all
 from sweep.model.scene import build_scenes
+from sweep.plan.cell_selection import cell
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_values
-from sweep.plan.one_cell import cell
-from sweep.plan.pipeline import Pipeline
 
 NEUTRAL = {field.name: field.default for field in dataclasses.fields(Effects)}
 WIDTH, HEIGHT, FOCAL = 64, 48, 80.0
@@ -1013,7 +1013,7 @@ def test_flags_tell_a_pose_whose_motion_has_no_image():
     text = "[pose]\nside_px = 40\n[scene]\nvelocity_z_m_s = -1\nexposure_s = 10\n"
     found = run_cells(Pipeline.from_text(text), [])
     assert not found.failures
-    assert found.columns["detection"][0].tolist() == [Detection.not_modelled]
+    assert found.columns["detection"][0].tolist() == [DetectionStatus.not_modelled]
 
 
 def test_scene_does_not_depend_on_the_others_of_its_block():
@@ -1051,4 +1051,4 @@ velocity_x_m_s = 0.1
 [axes]
 exposure_s = [0, 0.01]
 """)
-    assert look(cell(pipeline, "")).detection is Detection.detected
+    assert look(cell(pipeline, "")).detection is DetectionStatus.detected

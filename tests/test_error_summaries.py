@@ -12,7 +12,7 @@ from scipy import stats
 from sweep.analysis.comparisons import renderer_bias
 from sweep.analysis.error_summaries import covariance_trust, efficiency, error_statistics
 from sweep.errors import StoreError
-from sweep.measure.flags import Detection, Estimate, Flipped
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
 INNER = {"corner": 4, "xy": 2, "xyz": 3, "pose_parameter": 6}
 LABELS = {
@@ -49,10 +49,10 @@ def measured(
     return dataset(
         scene, detector, estimator,
         true_tvec_m=((*scene, "xyz"), truth),
-        detection=(detected, np.full(shape[: len(detected)], Detection.detected, np.uint8)),
+        detection=(detected, np.full(shape[: len(detected)], DetectionStatus.detected, np.uint8)),
         corner_error_px=((*detected, "corner", "xy"),
                          rng.normal(0, 0.1, (*shape[: len(detected)], 4, 2)).astype("f4")),
-        estimate=(estimated, np.full(shape, Estimate.solved, np.uint8)),
+        estimate=(estimated, np.full(shape, EstimateStatus.solved, np.uint8)),
         flipped=(estimated, np.full(shape, Flipped.not_flipped, np.uint8)),
         rotation_error_rad=((*estimated, "xyz"), rotation),
         translation_error_m=((*estimated, "xyz"), error),
@@ -64,21 +64,23 @@ def measured(
 def with_flags_of_every_kind(rng, results):
     """Return the dataset with poses that went wrong in every way, mostly detected and solved."""
     out = results.copy(deep=True)
-    kinds = [Detection.detected] * 12 + list(Detection)
+    kinds = [DetectionStatus.detected] * 12 + list(DetectionStatus)
     out["detection"].values[...] = rng.choice(kinds, results["detection"].shape)
     seen, _ = xr.broadcast(out["detection"], out["estimate"])
     seen = seen.transpose(*out["estimate"].dims).values
-    solved = rng.choice([Estimate.solved] * 8 + list(Estimate), seen.shape)
-    estimate = np.where(seen == Detection.detected, solved, Estimate.no_detection)
-    estimate[seen == Detection.not_run] = Estimate.not_run
+    solved = rng.choice([EstimateStatus.solved] * 8 + list(EstimateStatus), seen.shape)
+    estimate = np.where(seen == DetectionStatus.detected, solved, EstimateStatus.no_detection)
+    estimate[seen == DetectionStatus.not_run] = EstimateStatus.not_run
     out["estimate"].values[...] = estimate
     mirrored = rng.choice([Flipped.not_flipped] * 4 + [Flipped.flipped], seen.shape)
     out["flipped"].values[...] = np.where(
-        estimate == Estimate.solved, mirrored, Flipped.no_estimate
+        estimate == EstimateStatus.solved, mirrored, Flipped.no_estimate
     )
-    out["corner_error_px"] = out["corner_error_px"].where(out["detection"] == Detection.detected)
+    out["corner_error_px"] = out["corner_error_px"].where(
+        out["detection"] == DetectionStatus.detected
+    )
     for name in ("rotation_error_rad", "translation_error_m", "nees"):
-        out[name] = out[name].where(out["estimate"] == Estimate.solved)
+        out[name] = out[name].where(out["estimate"] == EstimateStatus.solved)
     out["nees"] = out["nees"].where(out["nees"] > 3)
     out["bound_std"] = out["bound_std"].where(out["bound_std"].isel(pose_parameter=0) > 0.003)
     return out
@@ -101,12 +103,12 @@ def poses(results, **kept):
 
 def looked_for(pose):
     return pose["detection"] not in {
-        Detection.not_run, Detection.not_visible, Detection.not_modelled
+        DetectionStatus.not_run, DetectionStatus.not_visible, DetectionStatus.not_modelled
     }
 
 
 def is_solved(pose):
-    return pose["estimate"] == Estimate.solved
+    return pose["estimate"] == EstimateStatus.solved
 
 
 def is_unflipped(pose):
@@ -144,12 +146,18 @@ def expected_summary(found):
     unflipped = [pose for pose in solved if is_unflipped(pose)]
     out = {
         "looked_for": len(aimed),
-        "detection_rate": sum(p["detection"] == Detection.detected for p in aimed) / len(aimed),
+        "detection_rate": sum(p["detection"] == DetectionStatus.detected for p in aimed)
+        / len(aimed),
         "solved_rate": len(solved) / len(aimed),
         "flip_rate": (len(solved) - len(unflipped)) / len(solved),
-        "rotation_bias_deg": math.degrees(math.hypot(
-            *(math.fsum(p["rotation_error_rad"][k] for p in unflipped) / len(unflipped)
-              for k in range(3)))),
+        "rotation_bias_deg": math.degrees(
+            math.hypot(
+                *(
+                    math.fsum(p["rotation_error_rad"][k] for p in unflipped) / len(unflipped)
+                    for k in range(3)
+                )
+            )
+        ),
         "range_bias_percent": math.fsum(map(percent, unflipped)) / len(unflipped),
     }
     for error, name, unit in ((degrees, "rotation", "deg"), (percent, "range", "percent")):
@@ -211,8 +219,8 @@ def test_lazy_arrays_give_the_same(mixed):
 def test_a_share_that_was_not_solved_makes_quantiles_infinite():
     rng = np.random.default_rng(2)
     results = measured(rng, {"trial": 100}, {}, {})
-    results["estimate"].values[:3] = Estimate.no_detection
-    results["detection"].values[:3] = Detection.rejected
+    results["estimate"].values[:3] = EstimateStatus.no_detection
+    results["detection"].values[:3] = DetectionStatus.rejected
     summary = error_statistics(results, [])
     assert np.isfinite(summary["rotation_p95_deg"])
     assert summary["rotation_p95_deg_high"] == np.inf
@@ -222,8 +230,8 @@ def test_a_share_that_was_not_solved_makes_quantiles_infinite():
 
 def test_nothing_seen_says_nothing():
     results = measured(np.random.default_rng(3))
-    results["detection"].values[...] = Detection.not_visible
-    results["estimate"].values[...] = Estimate.no_detection
+    results["detection"].values[...] = DetectionStatus.not_visible
+    results["estimate"].values[...] = EstimateStatus.no_detection
     summary = error_statistics(results, ["solver"])
     assert (summary["looked_for"] == 0).all()
     assert (summary["solved"] == 0).all()
@@ -296,8 +304,8 @@ def test_the_rotation_bias_ends_at_students_and_scheffes_distance():
 
 def test_a_cell_with_a_single_draw_gets_the_pooled_variance():
     results = measured(np.random.default_rng(5), {"marker_id": 3, "trial": 4}, {}, {})
-    results["detection"].values[0, 1:] = Detection.not_run
-    results["estimate"].values[0, 1:] = Estimate.not_run
+    results["detection"].values[0, 1:] = DetectionStatus.not_run
+    results["estimate"].values[0, 1:] = EstimateStatus.not_run
     cells = [[percent(pose) for pose in poses(results, marker_id=k)] for k in range(3)]
     alone = cells[0][:1]
     mean, error, freedom = stratified(cells[1:])
@@ -319,8 +327,8 @@ def test_where_nothing_was_drawn_there_is_no_interval(mixed, how):
     else:
         results = mixed.copy(deep=True)
     if how == "one pose a cell":
-        results["detection"].values[:, :, 1:] = Detection.not_run
-        results["estimate"].values[:, :, 1:] = Estimate.not_run
+        results["detection"].values[:, :, 1:] = DetectionStatus.not_run
+        results["estimate"].values[:, :, 1:] = EstimateStatus.not_run
     tables = (error_statistics(results, [*kept, "solver"]), efficiency(results, [*kept, "solver"]),
               covariance_trust(results, [*kept, "solver"]))
     for table in tables:
@@ -338,7 +346,7 @@ def test_rates_have_wilsons_interval(mixed):
     found = [pose for pose in poses(mixed, refinement=1, solver=1) if looked_for(pose)]
     solved = [pose for pose in found if is_solved(pose)]
     for name, of, hits in (
-        ("detection_rate", found, sum(p["detection"] == Detection.detected for p in found)),
+        ("detection_rate", found, sum(p["detection"] == DetectionStatus.detected for p in found)),
         ("solved_rate", found, len(solved)),
         ("flip_rate", solved, len(solved) - sum(map(is_unflipped, solved))),
     ):
@@ -443,8 +451,8 @@ def test_misses_at_random_widen_what_cells_of_other_means_leave_unsure(count):
         relative=0.01 * (rng.normal(size=shape) + offsets[:, None]),
     )
     missed = rng.random(shape) > chances[:, None]
-    results["detection"].values[missed] = Detection.no_candidate
-    results["estimate"].values[missed] = Estimate.no_detection
+    results["detection"].values[missed] = DetectionStatus.no_candidate
+    results["estimate"].values[missed] = EstimateStatus.no_detection
     summary = error_statistics(results, ["regime"])
     mean = (offsets * chances).sum() / chances.sum()
     mean_square = ((offsets**2 + 1) * chances).sum() / chances.sum()
@@ -612,7 +620,7 @@ def test_renderers_are_compared_pose_by_pose():
         pairs = list(zip(poses(results, renderer=r, refinement=d, solver=s),
                          poses(results, renderer=1, refinement=d, solver=s), strict=True))
         aimed = [(a, b) for a, b in pairs if looked_for(a) and looked_for(b)]
-        seen = [[p["detection"] == Detection.detected for p in pair] for pair in aimed]
+        seen = [[p["detection"] == DetectionStatus.detected for p in pair] for pair in aimed]
         shifts = [a["corner_error_px"].astype(float) - b["corner_error_px"]
                   for (a, b), both in zip(aimed, seen, strict=True) if all(both)]
         ranges = [percent(a) - percent(b) for a, b in aimed if is_solved(a) and is_solved(b)]
@@ -632,13 +640,15 @@ def test_renderers_are_compared_pose_by_pose():
 
 def test_what_one_renderer_has_not_run_is_no_draw():
     results = measured(np.random.default_rng(19), {"renderer": 2, "marker_id": 3, "trial": 9})
-    results["estimate"].values[:, :, ::3] = Estimate.no_detection  # so that draws without count
-    results["detection"].values[:, :, ::3] = Detection.rejected
+    results["estimate"].values[:, :, ::3] = (
+        EstimateStatus.no_detection
+    )  # so that draws without count
+    results["detection"].values[:, :, ::3] = DetectionStatus.rejected
     short = renderer_bias(results.isel(trial=slice(5)), reference="0.0")
-    results["detection"].values[0, :, 5:] = Detection.not_run
-    results["estimate"].values[0, :, 5:] = Estimate.not_run
-    results["detection"].values[1, :, 8:] = Detection.not_run
-    results["estimate"].values[1, :, 8:] = Estimate.not_run
+    results["detection"].values[0, :, 5:] = DetectionStatus.not_run
+    results["estimate"].values[0, :, 5:] = EstimateStatus.not_run
+    results["detection"].values[1, :, 8:] = DetectionStatus.not_run
+    results["estimate"].values[1, :, 8:] = EstimateStatus.not_run
     xr.testing.assert_allclose(renderer_bias(results, reference="0.0"), short, rtol=1e-12)
     flipped = results.assign_coords(renderer=["b", "a"])
     assert (renderer_bias(flipped, "a")["range_bias_percent_low"].sel(renderer="b").values

@@ -18,13 +18,13 @@ from benchmarks.extremes import (
 )
 from conftest import lengths
 
-from sweep.kernel import Failure
-from sweep.measure.flags import Detection, Estimate, Flipped
+from sweep.evaluation.cells import Failure
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
 
 PATHS = {path.stem: path for path in FILES}
-MOST_SCENES = 300
+MAX_SCENES = 300
 SUBPIX = "cornerRefinementMethod=subpix"
 
 
@@ -45,7 +45,7 @@ def along(result, variable, axis):
     return np.moveaxis(values, place, 0).reshape(len(axes[place]), -1)
 
 
-@lengths(8, MOST_SCENES)
+@lengths(8, MAX_SCENES)
 @pytest.mark.parametrize("name", PATHS)
 def test_all_that_is_detected_or_solved_is_finite_and_nothing_is_raised_or_printed(name, count):
     assert broken_promises(measured(Pipeline.from_toml(PATHS[name]), count)) == []
@@ -55,7 +55,7 @@ def test_all_that_is_detected_or_solved_is_finite_and_nothing_is_raised_or_print
 def test_every_regime_is_small_and_has_every_refinement_and_every_solver(name):
     pipeline = Pipeline.from_toml(PATHS[name])
     assert pipeline.title
-    assert pipeline.size(Stage.scene) <= MOST_SCENES
+    assert pipeline.size(Stage.scene) <= MAX_SCENES
     assert pipeline.values_of("cornerRefinementMethod") == REFINEMENTS
     assert pipeline.values_of("solver") == SOLVERS
 
@@ -157,7 +157,7 @@ def test_every_regime_has_its_flags():
 )
 def test_regime_is_flagged_as_expected(name, settings, expected):
     flags = np.unique(regime(name, "solver=ippe_square", *settings).values["detection"])
-    assert {Detection(flag).name for flag in flags} == {*expected.split()}
+    assert {DetectionStatus(flag).name for flag in flags} == {*expected.split()}
 
 
 def relative_errors(result):
@@ -176,7 +176,7 @@ def test_the_same_image_in_millimetres_and_kilometres_gives_the_same_relative_er
     result = regime("scale", "guarded=true")
     assert result.pipeline.axes_of(Stage.scene)[0].name == "size_m"
     assert result.pipeline.values_of("size_m")[::3] == (1e-3, 1e3)
-    assert (result.values["estimate"] == Estimate.solved).all()
+    assert (result.values["estimate"] == EstimateStatus.solved).all()
     for what, error in zip(("translation", "rotation"), relative_errors(result), strict=True):
         assert np.abs(error).max() > 1e-3  # there is something to compare
         apart = np.abs(error - error[:1]).max(axis=(0, 2, 3))
@@ -188,16 +188,16 @@ def test_the_same_image_in_millimetres_and_kilometres_gives_the_same_relative_er
 @pytest.mark.parametrize("name", ["tilt_zero", "half_turn"])
 def test_guarded_solvers_do_not_notice_where_a_rotation_has_two_vectors(name):
     result = regime(name, "guarded=true", SUBPIX)
-    assert (result.values["estimate"] == Estimate.solved).all()
+    assert (result.values["estimate"] == EstimateStatus.solved).all()
     # Corners of sub-pixel refinement are off by up to 0.3 px of 60.
     assert result.values["rotation_error_deg"].max() < 1.0
     plain = regime(name, "guarded=false", "solver=['ippe', 'ippe_square']", SUBPIX)
-    assert (plain.values["estimate"] == Estimate.solver_failed).any()
+    assert (plain.values["estimate"] == EstimateStatus.solver_failed).any()
 
 
 def test_of_a_pair_on_the_planar_ambiguity_one_is_flipped_and_neither_is_anything_else():
     result = regime("planar_ambiguity", "fx_px=50000", "side_px=[30, 60]", SUBPIX)
-    assert (result.values["estimate"] == Estimate.solved).all()
+    assert (result.values["estimate"] == EstimateStatus.solved).all()
     flipped = along(result, "flipped", "solver") == Flipped.flipped
     print(f"\nflipped: {dict(zip(SOLVERS, flipped.mean(axis=1).round(2).tolist(), strict=True))}")
     assert (np.abs(flipped.mean(axis=1) - 0.5) < 0.15).all()
@@ -209,8 +209,8 @@ def test_of_a_pair_on_the_planar_ambiguity_one_is_flipped_and_neither_is_anythin
 
 
 def test_corners_outside_the_image_of_the_believed_lens_are_not_solved():
-    for bearing, expected in (("[0, 5, 10, 15]", {Estimate.solved}),
-                              ("[22, 25]", {Estimate.solver_failed})):
+    for bearing, expected in (("[0, 5, 10, 15]", {EstimateStatus.solved}),
+                              ("[22, 25]", {EstimateStatus.solver_failed})):
         result = regime("lens_believed", f"bearing_x_deg={bearing}", SUBPIX)
         assert {*np.unique(result.values["estimate"])} == expected
 

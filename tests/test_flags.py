@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
-from sweep.kernel import run_block
-from sweep.measure.finding import classify
-from sweep.measure.flags import Detection, Estimate, Flipped
+from sweep.evaluation.cells import run_block
+from sweep.measure.classify import classify
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.template import TEMPLATE
+from sweep.plan.schema import SCHEMA
 
 PLAIN = """
 seed = 9
@@ -36,27 +36,27 @@ def flags(*settings, folder="."):
 
 
 SCENES = {
-    Detection.detected: {
+    DetectionStatus.detected: {
         "frontal": [],
         "tilted": ["tilt_deg=60", "roll_deg=200"],
         "cut in the quiet zone": ["bearing_x_deg=28"],
     },
-    Detection.no_candidate: {
+    DetectionStatus.no_candidate: {
         "too small": ["side_px=4"],
         "no contrast": ["black=128", "white=128"],
         "only a corner in the frame": ["bearing_x_deg=32.5"],
     },
-    Detection.rejected: {
+    DetectionStatus.rejected: {
         "modules too small": ["side_px=10", "bearing_x_deg=1.03"],
         "grey where the detector wants black": ["side_px=60", "markerBorderBits=3"],
     },
-    Detection.wrong_id: {
+    DetectionStatus.wrong_id: {
         # Turned by half a turn, this marker of the original dictionary is itself.
         "rotation cannot be told": [
             "dictionary=DICT_ARUCO_ORIGINAL", "marker_id=1023", "roll_deg=180"
         ],
     },
-    Detection.not_visible: {
+    DetectionStatus.not_visible: {
         "right of the frame": ["bearing_x_deg=40"],
         "above the frame": ["bearing_y_deg=-35"],
         "beyond a corner of the frame": ["bearing_x_deg=33", "bearing_y_deg=26.5", "roll_deg=45"],
@@ -66,7 +66,7 @@ SCENES = {
             "side_px=900", "tilt_deg=89", "bearing_y_deg=40", "bearing_x_deg=0"
         ],
     },
-    Detection.not_modelled: {
+    DetectionStatus.not_modelled: {
         # x (1 - r²/2) turns back at r = 0.82, which is 39 degrees from the axis.
         "the lens folds at the marker": ["distortion=[-0.5, 0, 0, 0]", "bearing_x_deg=45"],
         "the lens folds within the marker": [
@@ -89,7 +89,9 @@ def test_flag_is_reached_by_a_real_scene(expected, settings):
 
 
 def test_every_flag_of_detection_has_a_scene():
-    assert {*SCENES, Detection.not_run, Detection.failed, Detection.crashed} == {*Detection}
+    assert {*SCENES, DetectionStatus.not_run, DetectionStatus.failed, DetectionStatus.crashed} == {
+        *DetectionStatus
+    }
 
 
 def test_marker_misread_with_much_error_correction_is_a_wrong_id():
@@ -122,8 +124,8 @@ def written(folder, *markers):
 def test_clutter_that_decodes_where_the_marker_is_counts_as_a_wrong_id(tmp_path):
     # ID 5's centre module is white, and so is the surround of the marker that lies on it.
     around = written(tmp_path, (5, 210, 215, 135))
-    assert flags(around, "side_px=6", "marker_id=7", folder=tmp_path) == [Detection.wrong_id]
-    assert flags("background=255", "side_px=6", "marker_id=7") == [Detection.rejected]
+    assert flags(around, "side_px=6", "marker_id=7", folder=tmp_path) == [DetectionStatus.wrong_id]
+    assert flags("background=255", "side_px=6", "marker_id=7") == [DetectionStatus.rejected]
 
 
 FAR_MARKERS = [
@@ -134,7 +136,11 @@ FAR_MARKERS = [
 @pytest.mark.parametrize("marker_id", [3, 11], ids=["other ID", "same ID"])
 def test_false_marker_elsewhere_in_the_frame_changes_no_flag(tmp_path, marker_id):
     alone = flags("background=255", "marker_id=11", *FAR_MARKERS)
-    assert {*alone} >= {Detection.detected, Detection.rejected, Detection.no_candidate}
+    assert {*alone} >= {
+        DetectionStatus.detected,
+        DetectionStatus.rejected,
+        DetectionStatus.no_candidate,
+    }
     beside = written(tmp_path, (marker_id, 100, 30, 40), (marker_id, 60, 550, 300))
     assert flags(beside, "marker_id=11", *FAR_MARKERS, folder=tmp_path) == alone
 
@@ -162,7 +168,7 @@ def test_every_variable_has_the_shape_of_the_template_even_without_axes():
     for settings in ([], ["tilt_deg=[0, 30]"], ["solver=['p3p', 'ippe']"]):
         pipeline = Pipeline.from_text(PLAIN, settings)
         values = run(pipeline)
-        for variable in TEMPLATE:
+        for variable in SCHEMA:
             assert values[variable.name].shape == variable.shape(pipeline), variable.name
             assert values[variable.name].dtype == variable.dtype, variable.name
 
@@ -174,22 +180,22 @@ ALTERNATIVES = ("alternative_rotation_error_deg", "alternative_reprojection_erro
 
 def test_numbers_exist_exactly_where_the_flags_say_so():
     values = run(Pipeline.from_text(MIXED))
-    assert {Detection(flag).name for flag in np.unique(values["detection"])} >= {
+    assert {DetectionStatus(flag).name for flag in np.unique(values["detection"])} >= {
         "detected", "rejected", "no_candidate", "not_visible", "not_modelled"
     }
     assert {*np.unique(values["estimate"])} == {
-        Estimate.solved, Estimate.no_detection, Estimate.solver_failed
+        EstimateStatus.solved, EstimateStatus.no_detection, EstimateStatus.solver_failed
     }
     assert np.isfinite(values["true_rvec"]).all()
     assert np.isfinite(values["true_tvec_m"]).all()
 
-    detected = values["detection"] == Detection.detected
+    detected = values["detection"] == DetectionStatus.detected
     assert np.isfinite(values["corner_error_px"][detected]).all()
     assert np.isnan(values["corner_error_px"][~detected]).all()
-    assert (values["estimate"][~detected] == Estimate.no_detection).all()
-    assert (values["estimate"][detected] != Estimate.no_detection).all()
+    assert (values["estimate"][~detected] == EstimateStatus.no_detection).all()
+    assert (values["estimate"][detected] != EstimateStatus.no_detection).all()
 
-    solved = values["estimate"] == Estimate.solved
+    solved = values["estimate"] == EstimateStatus.solved
     for name in ERRORS:
         assert np.isfinite(values[name][solved]).all(), name
         assert np.isnan(values[name][~solved]).all(), name
@@ -228,18 +234,18 @@ def classified(*found, truth=SQUARE, marker_id=7):
     flag, corners = classify(
         truth[None], np.array([marker_id]), [search_result(0, *found)], ORIGIN[:1]
     )
-    return Detection(flag[0]), corners[0]
+    return DetectionStatus(flag[0]), corners[0]
 
 
 def test_nothing_found_is_no_candidate():
     flag, corners = classified()
-    assert flag == Detection.no_candidate
+    assert flag == DetectionStatus.no_candidate
     assert np.isnan(corners).all()
 
 
 def test_right_marker_is_detected_with_its_own_corners():
     flag, corners = classified((7, SQUARE + 0.5))
-    assert flag == Detection.detected
+    assert flag == DetectionStatus.detected
     np.testing.assert_array_equal(corners, SQUARE + 0.5)
 
 
@@ -247,32 +253,32 @@ def test_right_marker_is_detected_with_its_own_corners():
 def test_what_lies_elsewhere_never_counts(found_id):
     for shift in ([21.0, 0.0], [0.0, -21.0], [300.0, 200.0]):
         flag, corners = classified((found_id, SQUARE + shift))
-        assert flag == Detection.no_candidate
+        assert flag == DetectionStatus.no_candidate
         assert np.isnan(corners).all()
 
 
 @pytest.mark.parametrize("turn", [1, 2, 3])
 def test_wrong_rotation_is_a_wrong_id(turn):
     flag, corners = classified((7, np.roll(SQUARE, turn, axis=0)))
-    assert flag == Detection.wrong_id
+    assert flag == DetectionStatus.wrong_id
     assert np.isnan(corners).all()
 
 
 def test_other_id_there_is_a_wrong_id_and_outweighs_a_rejected_candidate():
-    assert classified((3, SQUARE))[0] == Detection.wrong_id
-    assert classified((3, SQUARE), (REJECTED_ID, SQUARE))[0] == Detection.wrong_id
-    assert classified((REJECTED_ID, SQUARE), (3, SQUARE))[0] == Detection.wrong_id
+    assert classified((3, SQUARE))[0] == DetectionStatus.wrong_id
+    assert classified((3, SQUARE), (REJECTED_ID, SQUARE))[0] == DetectionStatus.wrong_id
+    assert classified((REJECTED_ID, SQUARE), (3, SQUARE))[0] == DetectionStatus.wrong_id
 
 
 def test_rejected_candidate_there_is_rejected():
-    assert classified((REJECTED_ID, SQUARE))[0] == Detection.rejected
-    assert classified((REJECTED_ID, SQUARE), (7, SQUARE + 50))[0] == Detection.rejected
+    assert classified((REJECTED_ID, SQUARE))[0] == DetectionStatus.rejected
+    assert classified((REJECTED_ID, SQUARE), (7, SQUARE + 50))[0] == DetectionStatus.rejected
 
 
 def test_right_marker_outweighs_everything_else_there():
     others = [(3, SQUARE), (REJECTED_ID, SQUARE), (7, np.roll(SQUARE, 1, axis=0))]
     for found in ([(7, SQUARE), *others], [*others, (7, SQUARE)]):
-        assert classified(*found)[0] == Detection.detected
+        assert classified(*found)[0] == DetectionStatus.detected
 
 
 def test_of_two_right_ones_the_nearest_counts():
@@ -283,9 +289,9 @@ def test_of_two_right_ones_the_nearest_counts():
 
 def test_truth_may_be_seen_turned_and_tilted():
     truth = np.array([[120.0, 90.0], [150.0, 118.0], [118.0, 131.0], [95.0, 115.0]])
-    assert classified((7, truth + 0.3), truth=truth)[0] == Detection.detected
+    assert classified((7, truth + 0.3), truth=truth)[0] == DetectionStatus.detected
     # In the bounding box, but not in the quadrilateral.
-    assert classified((7, truth * 0.1 + [85, 82]), truth=truth)[0] == Detection.no_candidate
+    assert classified((7, truth * 0.1 + [85, 82]), truth=truth)[0] == DetectionStatus.no_candidate
 
 
 def test_scenes_are_told_apart():
@@ -294,5 +300,9 @@ def test_scenes_are_told_apart():
         search_result(2, (3, SQUARE + 200)), search_result(0, (2, SQUARE), (REJECTED_ID, SQUARE)),
     ]
     flag, corners = classify(truth, np.array([1, 2, 3]), found, ORIGIN)
-    assert flag.tolist() == [Detection.wrong_id, Detection.no_candidate, Detection.detected]
+    assert flag.tolist() == [
+        DetectionStatus.wrong_id,
+        DetectionStatus.no_candidate,
+        DetectionStatus.detected,
+    ]
     np.testing.assert_array_equal(np.isnan(corners).all(axis=(1, 2)), [True, True, False])

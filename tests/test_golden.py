@@ -4,13 +4,13 @@ import hashlib
 
 import numpy as np
 
-from sweep.engine.provenance import NUMBERS_VERSION
 from sweep.measure.solver import estimate
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_values
-from sweep.plan.pipeline import Pipeline
+from sweep.store.provenance import NUMBERS_VERSION
 
 TEXT = """
 seed = 11

@@ -23,19 +23,19 @@ from conftest import lengths
 from mpmath import mp, mpf
 
 import sweep
-from sweep import kernel
-from sweep.kernel import run_block, search, visibility_flags
+from sweep.evaluation import cells as kernel
+from sweep.evaluation.cells import run_block, search, visibility_flags
 from sweep.measure import accuracy
 from sweep.measure.accuracy import pose_error
 from sweep.measure.detector import DetectorSetting, margin_px
-from sweep.measure.flags import Detection, Estimate
+from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.measure.solver import SOLVERS, estimate
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.pose import rotation_of_vector, vector_of_rotation
 from sweep.model.scene import build_scenes
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
-from sweep.plan.pipeline import Pipeline
 
 FOCAL_PX = 1600 / 3
 SQUARE = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5, -0.5, 0]])
@@ -254,7 +254,7 @@ def check_visibility(scenes):
         "nij,nkj->nki", scenes.rotation, scenes.size_m[:, None, None] * SQUARE
     ) + scenes.translation[:, None]
     behind = (corners[..., 2] <= 0).any(axis=1)
-    missed = behind & (visibility_flags(scenes) != Detection.not_visible)
+    missed = behind & (visibility_flags(scenes) != DetectionStatus.not_visible)
     print(f"\n{behind.sum()} of {len(scenes)} markers reach behind the camera; "
           f"{missed.sum()} of them would be looked for")
     assert behind.sum() > 100
@@ -269,9 +269,9 @@ def test_marker_that_reaches_behind_the_camera_is_not_visible(monkeypatch):
     some = Pipeline.from_text(AROUND_THE_CAMERA, ["side_px=[1000, 2000]", "trial=1"])
     result = run_block(some, whole(some))
     assert not result.failures
-    unseen = result.values["detection"] == Detection.not_visible
+    unseen = result.values["detection"] == DetectionStatus.not_visible
     assert unseen.sum() > 20
-    assert (result.values["estimate"][unseen] == Estimate.no_detection).all()
+    assert (result.values["estimate"][unseen] == EstimateStatus.no_detection).all()
     assert np.isnan(result.values["translation_error_m"][unseen]).all()
     monkeypatch.setattr(Cameras, "project", opencv_project)
     with pytest.raises(AssertionError):
@@ -326,8 +326,8 @@ def our_solve(guarded):
         estimates = estimate(
             corners, cameras(count), np.full(count, 0.05), solver, guarded, 0.25
         )
-        solved = estimates.status == Estimate.solved
-        assert (estimates.status[~solved] == Estimate.solver_failed).all()
+        solved = estimates.status == EstimateStatus.solved
+        assert (estimates.status[~solved] == EstimateStatus.solver_failed).all()
         return solved, estimates.rotation, estimates.translation
 
     return solve
@@ -462,7 +462,7 @@ def check_lens(solver, guarded, scenes):
     )
     angle = np.degrees(pose_error(
         estimates.rotation, estimates.translation, scenes.rotation, scenes.translation
-    ).rotation_angle_rad)[visibility_flags(scenes) == Detection.not_run]
+    ).rotation_angle_rad)[visibility_flags(scenes) == DetectionStatus.not_run]
     print(f"\n{solver}, {'guarded' if guarded else 'plain'}: {(~(angle < 0.01)).sum()} of "
           f"{len(angle)} off by more than 0.01 degrees, by up to {np.nanmax(angle):.2g}")
     assert (angle < 0.01).all()
@@ -521,7 +521,7 @@ def half_windows(corners, modules, share=0.3, largest=5):
 
 def check_refined(start, refined, modules):
     """Hold refined corners to lie within 0.3 modules (at least 1 px) of where they started."""
-    rows = start.flags == Detection.detected
+    rows = start.flags == DetectionStatus.detected
     moved = np.abs(refined.corners - start.corners)[rows].max(axis=2)
     limit = half_windows(start.corners[rows], modules[rows])[:, None]
     beyond = moved > limit * (1 + 1e-6)  # float32
@@ -542,7 +542,7 @@ def test_refined_corners_stay_near_their_start_and_change_no_flag(count):
     scenes = scenes_of(Pipeline.from_text(SMALL_AND_TILTED.format(count=count)))
     start = searched(scenes)
     refined = searched(scenes, cornerRefinementMethod="subpix")
-    rows = start.flags == Detection.detected
+    rows = start.flags == DetectionStatus.detected
     np.testing.assert_array_equal(refined.flags, start.flags)
     assert np.isfinite(refined.corners[rows]).all()
     assert np.isnan(refined.corners[~rows]).all()
@@ -581,7 +581,7 @@ def test_refined_corners_in_window_and_frame_differ_in_small_modules_only(count)
     window, frame = (
         searched(scenes, full, cornerRefinementMethod="subpix") for full in (False, True)
     )
-    rows = (window.flags == Detection.detected) & (frame.flags == Detection.detected)
+    rows = (window.flags == DetectionStatus.detected) & (frame.flags == DetectionStatus.detected)
     # OpenCV finds candidates not quite alike wherever the same pixels lie: test_window.py.
     assert (window.flags != frame.flags).sum() <= max(1, 1e-3 * len(scenes))
     limit = half_windows(start.corners[rows], scenes.modules[rows])[:, None]

@@ -14,9 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sweep.errors import PipelineError
-from sweep.plan.faults import LONGEST_LINE, MOST_FAULTS, shown
-from sweep.plan.one_cell import cell
-from sweep.plan.pipeline import Pipeline
+from sweep.messages import MAX_FAULTS, MAX_LINE_LENGTH, shown
+from sweep.plan.cell_selection import cell
+from sweep.plan.experiment import Pipeline
 
 POSE = "[pose]\ndistance_m = 1\n"
 AXES = POSE + "jitter_px = 1\n[axes]\n"
@@ -29,8 +29,8 @@ def faults_of(read, *arguments, **options):
     with pytest.raises(PipelineError) as told:
         read(*arguments, **options)
     lines = str(told.value).split("\n")
-    assert len(lines) <= MOST_FAULTS + 1
-    assert all(line.isprintable() and 0 < len(line) <= LONGEST_LINE for line in lines)
+    assert len(lines) <= MAX_FAULTS + 1
+    assert all(line.isprintable() and 0 < len(line) <= MAX_LINE_LENGTH for line in lines)
     return lines
 
 
@@ -223,7 +223,7 @@ def test_any_text_is_a_pipeline_or_is_refused(text):
 ))
 def test_any_value_is_shown_in_a_short_line(value):
     assert shown(value).isprintable()
-    assert len(shown(value)) <= LONGEST_LINE
+    assert len(shown(value)) <= MAX_LINE_LENGTH
 
 
 # Files.
@@ -336,7 +336,7 @@ def test_a_command_refuses_in_one_line_and_writes_nothing_else(command, name, tm
     (tmp_path / "deep.toml").write_text("a" + ".a" * 100_000 + " = 1")
     before = sorted(tmp_path.iterdir())
     done = subprocess.run(
-        [sys.executable, "-m", "sweep.cli", command, name], cwd=tmp_path, timeout=60,
+        [sys.executable, "-m", "sweep", command, name], cwd=tmp_path, timeout=60,
         capture_output=True, text=True, check=False,
     )
     assert (done.returncode, done.stdout) == (2, "")

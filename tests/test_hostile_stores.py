@@ -23,14 +23,14 @@ from test_verify import COPY, MANIFEST, arrays, edit_receipt, files, reseal, see
 
 import sweep
 from sweep.cli import main
-from sweep.engine.closing import close
-from sweep.engine.progress import status
-from sweep.engine.repair import repair
-from sweep.engine.store import create_store, open_store
-from sweep.engine.task import compute_block
-from sweep.engine.verification import verify
 from sweep.errors import SweepError
-from sweep.plan.pipeline import Pipeline
+from sweep.execution.block_task import compute_block
+from sweep.execution.finalize import close
+from sweep.execution.status import status
+from sweep.integrity.repair import repair
+from sweep.integrity.verification import verify
+from sweep.plan.experiment import Pipeline
+from sweep.store.lifecycle import create_store, open_store
 
 TEXT = """
 title = "Small"
@@ -84,7 +84,7 @@ def here(monkeypatch):
         for number in numbers:
             compute_block(store.url, store.run_id, store.blocks[number])
 
-    monkeypatch.setattr("sweep.engine.repair.recompute", recompute)
+    monkeypatch.setattr("sweep.integrity.repair.recompute", recompute)
 
 
 def see_line(error):
@@ -641,8 +641,8 @@ def bomb(size):
 MEMORY = """
 import resource, sys
 import sweep
-from sweep.engine.progress import status
-from sweep.engine.verification import verify
+from sweep.execution.status import status
+from sweep.integrity.verification import verify
 from sweep.errors import SweepError
 
 def used():

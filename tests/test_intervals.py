@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpmath import mp, mpf
 
-from sweep.analysis.intervals import LARGEST_N, MANY, jeffreys, wilson
+from sweep.analysis.intervals import MANY, MAX_N, jeffreys, wilson
 
 METHODS = pytest.mark.parametrize("interval", [wilson, jeffreys])
 LEVELS = (1e-6, 0.5, 0.9, 0.95, 0.999, 1 - 1e-9)
@@ -49,8 +49,8 @@ def exact_wilson(successes, n, level):
 @lengths(30, 3000)
 def test_wilson_keeps_its_digits_up_to_a_million_billion(count):
     rng = np.random.default_rng(1)
-    cases = [(s, n) for n in (1, 2, 10, 10**3, 10**9, LARGEST_N) for s in edges(n)]
-    cases += [drawn_counts(rng, LARGEST_N) for _ in range(count)]
+    cases = [(s, n) for n in (1, 2, 10, 10**3, 10**9, MAX_N) for s in edges(n)]
+    cases += [drawn_counts(rng, MAX_N) for _ in range(count)]
     worst = 0.0
     for i, (successes, n) in enumerate(cases):
         level = LEVELS[i % len(LEVELS)]
@@ -132,7 +132,7 @@ def root(a, b, tail, near):
 
 @pytest.mark.parametrize("n", [
     pytest.param(n, marks=[pytest.mark.long] if n > 10**3 else [], id=f"{n:.0e}")
-    for n in (1, 2, 10, 10**3, 10**6, 10**8, 10**9, 10**12, LARGEST_N)
+    for n in (1, 2, 10, 10**3, 10**6, 10**8, 10**9, 10**12, MAX_N)
 ])
 def test_jeffreys_keeps_its_digits_at_the_edges(n):
     worst = max(error for successes in edges(n) for error in jeffreys_errors(successes, n, 0.95))
@@ -145,7 +145,7 @@ def test_jeffreys_keeps_its_digits_for_any_counts_and_levels(count):
     rng = np.random.default_rng(2)
     worst = 0.0
     for i in range(count):
-        successes, n = drawn_counts(rng, LARGEST_N)
+        successes, n = drawn_counts(rng, MAX_N)
         found = jeffreys_errors(successes, n, LEVELS[i % len(LEVELS)])
         worst = max(worst, *found, 0.0)
     print(f"{count} intervals: worst {worst:.1e}")
@@ -171,7 +171,7 @@ def test_nothing_seen_says_nothing(interval):
 @METHODS
 @pytest.mark.parametrize("level", LEVELS)
 def test_none_and_all_of_n_end_exactly_at_zero_and_one(interval, level):
-    n = np.array([1, 2, 7, 1000, 10**9, LARGEST_N])
+    n = np.array([1, 2, 7, 1000, 10**9, MAX_N])
     low, high = interval(0, n, level)
     assert (low == 0.0).all()
     assert ((high > 0) & (high < 1)).all()

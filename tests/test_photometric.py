@@ -20,11 +20,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2, norm
 
-import sweep.kernel
-from sweep.kernel import run_cells
-from sweep.measure.bound import Bound
-from sweep.measure.estimation import Estimates, Sightings
-from sweep.measure.flags import Detection, Estimate, Flipped
+import sweep.evaluation.cells
+from sweep.evaluation.cells import run_cells
+from sweep.measure.bound import BoundStatus
+from sweep.measure.estimation import Detections, Estimates
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.measure.likelihood import (
     SETTLED,
     fit,
@@ -36,7 +36,7 @@ from sweep.measure.likelihood import (
 )
 from sweep.measure.photometric import Photometric, _windows, explains
 from sweep.model.derivatives import LEVELS, POSE
-from sweep.plan.pipeline import Pipeline
+from sweep.plan.experiment import Pipeline
 
 ALARM = 1e-8
 """False alarm probability of one comparison; the short tests have less than a hundred."""
@@ -89,9 +89,9 @@ class Cell:
         self.columns = columns = {
             name: parts[0] for name, parts in run(trials, *settings, seed=seed).columns.items()
         }
-        self.detected = columns["detection"] == Detection.detected
+        self.detected = columns["detection"] == DetectionStatus.detected
         self.estimate = columns["estimate"][self.detected]
-        self.solved = columns["estimate"] == Estimate.solved
+        self.solved = columns["estimate"] == EstimateStatus.solved
         errors = [columns["rotation_error_rad"], columns["translation_error_m"]]
         self.deviations = (np.concatenate(errors, axis=1) / columns["bound_std"])[self.solved]
         self.nees = columns["nees"][self.solved]
@@ -101,7 +101,7 @@ class Cell:
 
     @property
     def converged(self):
-        return float((self.estimate != Estimate.not_converged).mean())
+        return float((self.estimate != EstimateStatus.not_converged).mean())
 
     @property
     def ratio(self):
@@ -138,7 +138,7 @@ def assert_gaussian(cells):
 def assert_converged(cells):
     """Assert that not more fits than chance allows fail to converge, were 0.5 % to."""
     estimate = np.concatenate([cell.estimate for cell in cells])
-    failed = np.count_nonzero(estimate == Estimate.not_converged)
+    failed = np.count_nonzero(estimate == EstimateStatus.not_converged)
     assert failed <= binom.isf(ALARM, len(estimate), 0.005)
 
 
@@ -172,7 +172,7 @@ class Kept:
 def kept(monkeypatch, inner):
     """Put an estimator in the place of those that pipelines ask for; return it, recording."""
     keeper = Kept(inner)
-    monkeypatch.setattr(sweep.kernel, "build", lambda _: keeper)
+    monkeypatch.setattr(sweep.evaluation.cells, "build", lambda _: keeper)
     return keeper
 
 
@@ -241,7 +241,7 @@ def test_fits_converge_and_explain_the_pixels(regular):
     assert_converged(cells)
     # Five standard deviations: 6e-7 a Gaussian, 1e-4 with the skewness of small images' variance.
     estimate = np.concatenate([cell.estimate for cell in cells])
-    assert np.count_nonzero(estimate == Estimate.not_explained) <= binom.isf(
+    assert np.count_nonzero(estimate == EstimateStatus.not_explained) <= binom.isf(
         ALARM, len(estimate), 1e-4
     )
     assert not any(cell.grossly_wrong.any() for cell in cells)
@@ -299,7 +299,7 @@ def test_the_bound_is_attained_where_blur_is_estimated():
 def test_a_known_blur_is_no_model_error():
     cell = Cell(60, "side_px=25", "blur_px=0.7", seed=8)
     assert_gaussian([cell])
-    assert (cell.estimate == Estimate.solved).mean() > 0.98
+    assert (cell.estimate == EstimateStatus.solved).mean() > 0.98
 
 
 def test_more_starts_find_no_higher_minimum():
@@ -310,7 +310,7 @@ def test_more_starts_find_no_higher_minimum():
     # A fit ends within 1e-4 of its minimum's chi-square, of some hundred degrees of freedom.
     assert (four[both] <= two[both] + 1e-6).all()
     estimates = result.columns["estimate"]
-    failed = [np.count_nonzero(flags == Estimate.not_converged) for flags in estimates]
+    failed = [np.count_nonzero(flags == EstimateStatus.not_converged) for flags in estimates]
     assert max(failed) <= binom.isf(ALARM, len(two), 0.005)
 
 
@@ -347,10 +347,10 @@ def test_a_start_whose_coarse_fit_went_astray_does_not_hide_the_best_minimum(
 @pytest.mark.parametrize("scene", [("side_px=50", "tilt_deg=45"), ("side_px=100", "tilt_deg=20")])
 def test_without_noise_the_corners_are_far_surpassed(scene):
     columns = run(30, *scene, "noise_grey=0", "solver=['ippe', 'photometric']", seed=11).columns
-    found = columns["detection"][0] == Detection.detected
+    found = columns["detection"][0] == DetectionStatus.detected
     assert found.all()
-    assert (columns["bound"][0] == Bound.no_noise).all()
-    assert (columns["estimate"][1] == Estimate.solved).all()
+    assert (columns["bound"][0] == BoundStatus.no_noise).all()
+    assert (columns["estimate"][1] == EstimateStatus.solved).all()
     assert (columns["residual_variance_ratio"][1] < 1).all()
     # Rounding is what is left: 0.04 to 0.1 of the uniform law's variance. Of the corners' errors
     # it is less than a hundredth in range and a fiftieth in angle in the median (seeded).
@@ -406,11 +406,11 @@ def test_what_is_not_in_the_model_is_flagged_and_keeps_its_pose(effect, tmp_path
     ground = np.random.default_rng(0).integers(0, 256, (480, 640)).astype(np.uint8)
     cv2.imwrite(str(tmp_path / "ground.png"), cv2.GaussianBlur(ground, (0, 0), 2))
     columns = run(25, *effect, seed=13, folder=tmp_path).columns
-    found = columns["detection"][0] == Detection.detected
+    found = columns["detection"][0] == DetectionStatus.detected
     estimate = columns["estimate"][0][found]
     assert len(estimate) >= 20
-    assert np.isin(estimate, [Estimate.not_explained, Estimate.not_converged]).all()
-    posed = columns["estimate"][0] == Estimate.not_explained
+    assert np.isin(estimate, [EstimateStatus.not_explained, EstimateStatus.not_converged]).all()
+    posed = columns["estimate"][0] == EstimateStatus.not_explained
     assert posed.sum() >= 0.8 * len(estimate)
     assert np.isfinite(columns["translation_error_m"][0][posed]).all()
     assert (columns["residual_variance_ratio"][0][posed] > 1).all()
@@ -420,9 +420,9 @@ def test_what_is_not_in_the_model_is_flagged_and_keeps_its_pose(effect, tmp_path
 def test_a_wrong_belief_of_noise_is_flagged_and_costs_no_pose():
     columns = run(60, "believed_noise_grey=[2, 1, 4]", seed=14).columns
     right, low, high = columns["estimate"]
-    assert (right == Estimate.solved).sum() > 57
-    assert (low == Estimate.not_explained).all()
-    assert (high == Estimate.not_explained).all()
+    assert (right == EstimateStatus.solved).sum() > 57
+    assert (low == EstimateStatus.not_explained).all()
+    assert (high == EstimateStatus.not_explained).all()
     # (2² + 1/12) over (1² + 1/12) and over (4² + 1/12), but for where the fit stops.
     ratio = columns["residual_variance_ratio"]
     assert ratio[1] / ratio[0] == pytest.approx(49 / 13, rel=1e-4)
@@ -436,7 +436,7 @@ def test_a_wrong_belief_of_noise_is_flagged_and_costs_no_pose():
 def test_a_wrong_belief_of_the_size_scales_the_range_and_is_explained():
     columns = run(60, "believed_size_m=[0.05, 0.0505]", seed=15).columns
     assert (columns["estimate"][0] == columns["estimate"][1]).all()
-    assert (columns["estimate"][1] == Estimate.solved).sum() > 57
+    assert (columns["estimate"][1] == EstimateStatus.solved).sum() > 57
     right, wrong = (part + columns["true_tvec_m"][0] for part in columns["translation_error_m"])
     assert wrong == pytest.approx(1.01 * right, rel=1e-9, abs=1e-9)
     assert columns["rotation_error_rad"][1] == pytest.approx(
@@ -452,7 +452,7 @@ def test_a_wrong_belief_of_the_blur_can_be_estimated_away():
         "estimate_blur=true", seed=16,
     ).columns
     for estimate in columns["estimate"]:
-        assert (estimate == Estimate.solved).sum() >= 19
+        assert (estimate == EstimateStatus.solved).sum() >= 19
     first = columns["translation_error_m"][0]
     std = columns["predicted_std"][0][:, 3:]
     for other in columns["translation_error_m"][1:]:
@@ -533,7 +533,7 @@ def test_scenes_do_not_depend_on_how_many_are_computed_in_one_call(whole):
 
 @pytest.mark.parametrize("frames", [0.5, 1, 3.5, 39])
 def test_scenes_do_not_depend_on_how_many_images_are_kept(whole, frames, monkeypatch):
-    monkeypatch.setattr(sweep.kernel, "KEPT_PX", int(frames * 640 * 480))
+    monkeypatch.setattr(sweep.evaluation.cells, "KEPT_PX", int(frames * 640 * 480))
     result = run(40, *MIXED, seed=17)
     assert_same_columns(result.columns, whole.columns)
     assert result.row_seconds.shape == (40,)
@@ -542,7 +542,7 @@ def test_scenes_do_not_depend_on_how_many_images_are_kept(whole, frames, monkeyp
 
 @pytest.mark.parametrize("kept_px", [1 << 26, 5 * 640 * 480])
 def test_scenes_do_not_depend_on_which_others_are_needed(whole, kept_px, monkeypatch):
-    monkeypatch.setattr(sweep.kernel, "KEPT_PX", kept_px)
+    monkeypatch.setattr(sweep.evaluation.cells, "KEPT_PX", kept_px)
     need = np.random.default_rng(18).random((40, 2, 2)) < 0.4
     need[10:16] = False
     columns = pieces([12], need)
@@ -551,14 +551,14 @@ def test_scenes_do_not_depend_on_which_others_are_needed(whole, kept_px, monkeyp
         for name in ("estimate", "translation_error_m", "predicted_std", "nees", "flipped"):
             one, other = columns[name][number], whole.columns[name][number]
             assert same(one[asked], other[asked])
-        assert (columns["estimate"][number][~asked] == Estimate.not_run).all()
+        assert (columns["estimate"][number][~asked] == EstimateStatus.not_run).all()
         assert (columns["flipped"][number][~asked] == Flipped.not_run).all()
         assert np.isnan(columns["nees"][number][~asked]).all()
     for k in range(2):
         asked = need[:, k].any(axis=1)
         for name in ("detection", "corner_error_px"):
             assert same(columns[name][k][asked], whole.columns[name][k][asked])
-        assert (columns["detection"][k][~asked] == Detection.not_run).all()
+        assert (columns["detection"][k][~asked] == DetectionStatus.not_run).all()
 
 
 def test_a_treatment_does_not_depend_on_the_others(whole):
@@ -589,8 +589,8 @@ def test_a_mixture_of_scenes_is_as_each_of_them():
 
 def test_scenes_without_a_marker_found_have_no_estimate():
     columns = run(10, "side_px=3", seed=21).columns
-    assert (columns["detection"][0] != Detection.detected).all()
-    assert (columns["estimate"][0] == Estimate.no_detection).all()
+    assert (columns["detection"][0] != DetectionStatus.detected).all()
+    assert (columns["estimate"][0] == EstimateStatus.no_detection).all()
 
 
 # Estimators of one's own.
@@ -602,7 +602,7 @@ class Nothing:
         self.needs_images = needs_images
 
     def __call__(self, sightings):
-        return Estimates.none(len(sightings.corners), Estimate.solver_failed)
+        return Estimates.none(len(sightings.corners), EstimateStatus.solver_failed)
 
 
 BELIEFS = (
@@ -615,14 +615,14 @@ def test_an_estimator_of_one_s_own_gets_what_is_believed_and_seen(monkeypatch):
     keeper = kept(monkeypatch, Nothing(needs_images=True))
     cut = run(12, *BELIEFS, seed=22)
     columns = cut.columns
-    found = columns["detection"][0] == Detection.detected
+    found = columns["detection"][0] == DetectionStatus.detected
     assert found.sum() >= 10
     assert (columns["estimate"][0] == np.where(
-        found, Estimate.solver_failed, Estimate.no_detection
+        found, EstimateStatus.solver_failed, EstimateStatus.no_detection
     )).all()
     assert np.isnan(columns["nees"][0]).all()
     seen, = keeper.seen
-    assert isinstance(seen, Sightings)
+    assert isinstance(seen, Detections)
     n = found.sum()
     assert seen.corners.shape == (n, 4, 2)
     assert (seen.noise_grey == np.full(n, 3.0)).all()
@@ -700,19 +700,19 @@ class Superstitious:
 
 @pytest.mark.parametrize("frames", [200, 4])
 def test_an_estimator_that_raises_costs_one_scene_only(monkeypatch, frames):
-    monkeypatch.setattr(sweep.kernel, "KEPT_PX", frames * 640 * 480)
+    monkeypatch.setattr(sweep.evaluation.cells, "KEPT_PX", frames * 640 * 480)
     settings = ("side_px=25",)
     keeper = kept(monkeypatch, Photometric(refined=False, spread_free=False))
     healthy = run(15, *settings, seed=26).columns
     abscissae = np.concatenate([seen.corners[:, 0, 0] for seen in keeper.seen])
-    rows = np.flatnonzero(healthy["detection"][0] == Detection.detected)
+    rows = np.flatnonzero(healthy["detection"][0] == DetectionStatus.detected)
     victim = rows[9]
-    monkeypatch.setattr(sweep.kernel, "build", lambda _: Superstitious(abscissae[9]))
+    monkeypatch.setattr(sweep.evaluation.cells, "build", lambda _: Superstitious(abscissae[9]))
     result = run_cells(pipeline(*settings, seed=26), [np.arange(15)])
     failure, = result.failures
     assert (failure.scene, failure.stage) == (victim, "estimation")
     assert "not this one" in failure.text
-    assert result.columns["estimate"][0][victim] == Estimate.failed
+    assert result.columns["estimate"][0][victim] == EstimateStatus.failed
     assert np.isnan(result.columns["nees"][0][victim])
     others = np.arange(15) != victim
     for name in ("estimate", "translation_error_m", "nees", "predicted_std"):
@@ -754,8 +754,8 @@ def test_nonsense_is_not_solved(monkeypatch):
     other = dataclasses.replace(seen, markers=[("DICT_5X5_50", 1, 1.0)] * 5)
     for nonsense in (point, beside, plain, turned, mirrored, other):
         estimates = estimator(nonsense)
-        assert (estimates.status != Estimate.solved).all()
-        posed = estimates.status == Estimate.not_explained
+        assert (estimates.status != EstimateStatus.solved).all()
+        posed = estimates.status == EstimateStatus.not_explained
         assert np.isnan(estimates.translation[~posed]).all()
         assert np.isfinite(estimates.translation[posed]).all()
         assert np.isnan(estimates.covariance[~posed]).all()
@@ -818,7 +818,7 @@ class Tally:
         self.astray += astray
         self.kinds[kind] = self.kinds.get(kind, 0) + 1
         self.missed += [(name, what) for what in missed]
-        unexplained = np.count_nonzero(cell.estimate == Estimate.not_explained)
+        unexplained = np.count_nonzero(cell.estimate == EstimateStatus.not_explained)
         print(
             f"{name} | {found:.3f} | {kind} | {cell.kappa:.3f} | {nearest:.1f} | "
             f"{ratio.min():.3f}-{ratio.max():.3f} | {ratio[5]:.2f} | {bias:.3f} | {nees:.2f} | "

@@ -16,13 +16,13 @@ import pytest
 import xarray as xr
 from test_run import by_hand
 
-from sweep.engine.store import committed, create_store, open_store
-from sweep.measure.flags import Detection, Estimate, Flipped
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.plan.cell_selection import cell as cell_at
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
-from sweep.plan.one_cell import cell as cell_at
 from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.template import TEMPLATE
+from sweep.plan.schema import SCHEMA
+from sweep.store.lifecycle import committed, create_store, open_store
 
 POISONED = Path(__file__).parent / "poisoned"
 
@@ -94,7 +94,7 @@ def notes(log):
 def command(*arguments, timeout=300, **options):
     """Run the command line; end whatever it leaves behind."""
     with subprocess.Popen(
-        [sys.executable, "-m", "sweep.cli", *map(str, arguments)],
+        [sys.executable, "-m", "sweep", *map(str, arguments)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
         **options,
     ) as running:
@@ -118,7 +118,7 @@ def expected(reference, pipeline, poisons):
 
     The flags are those of the stage that is hit; the stages after it have nothing to work on.
     """
-    values = {v.name: reference[v.name].to_numpy().copy() for v in TEMPLATE}
+    values = {v.name: reference[v.name].to_numpy().copy() for v in SCHEMA}
     changed = {name: np.zeros(array.shape, dtype=bool) for name, array in values.items()}
     for poison in poisons:
         named = dict(poison.setting + poison.solver)
@@ -129,14 +129,14 @@ def expected(reference, pipeline, poisons):
         first = {"truth": Stage.scene, "scene": Stage.detection, "detection": Stage.detection,
                  "estimation": Stage.estimation}[poison.stage]
         flags = {
-            "detection": Detection.crashed if poison.deadly else Detection.failed,
-            "estimate": Estimate.no_detection,
+            "detection": DetectionStatus.crashed if poison.deadly else DetectionStatus.failed,
+            "estimate": EstimateStatus.no_detection,
             "flipped": Flipped.no_estimate,
             "bound": 0,
         }
         if first is Stage.estimation:
-            flags["estimate"] = Estimate.crashed if poison.deadly else Estimate.failed
-        for v in TEMPLATE:
+            flags["estimate"] = EstimateStatus.crashed if poison.deadly else EstimateStatus.failed
+        for v in SCHEMA:
             if v.stage >= first:
                 where = tuple(at.get(name, slice(None)) for name in v.dimensions(pipeline))
                 values[v.name][where] = np.nan if v.flags is None else flags[v.name]
@@ -174,8 +174,8 @@ def numbers(reference, pipeline, poisons):
     """Return how many detections and estimates are flagged crashed and failed."""
     values, _ = expected(reference, pipeline, poisons)
     return {
-        flag: int((values["detection"] == Detection[flag]).sum()
-                  + (values["estimate"] == Estimate[flag]).sum())
+        flag: int((values["detection"] == DetectionStatus[flag]).sum()
+                  + (values["estimate"] == EstimateStatus[flag]).sum())
         for flag in ("crashed", "failed")
     }
 
@@ -254,7 +254,7 @@ def clean(pipeline, tmp_path_factory):
     by_hand(url, pipeline, tuple(len(axis) for axis in scene_axes(pipeline)))
     with xr.open_zarr(url, consolidated=False) as opened:
         loaded = opened.load()
-        assert (loaded.estimate == Estimate.solved).all()
+        assert (loaded.estimate == EstimateStatus.solved).all()
         return loaded
 
 
@@ -273,9 +273,9 @@ def run_poisoned(tmp_path, text, poisons, *options, timeout=300):
 INERT = """
 import hashlib, sys
 import numpy as np
-from sweep.kernel import run_cells
+from sweep.evaluation.cells import run_cells
 from sweep.plan.grid import Block, block_indices
-from sweep.plan.pipeline import Pipeline
+from sweep.plan.experiment import Pipeline
 
 pipeline = Pipeline.from_text(open(sys.argv[1]).read())
 block = Block((0, 0, 0), (1, 1, 20))

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from sweep.cli import main
-from sweep.inspection import look
-from sweep.plan.one_cell import cell
+from sweep.evaluation.inspection import look
+from sweep.plan.cell_selection import cell
+from sweep.plan.experiment import Pipeline
 from sweep.plan.parameter_reference import reference
 from sweep.plan.parameters import PARAMETERS, Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.template import TEMPLATE
+from sweep.plan.schema import SCHEMA
 
 TOP = Path(__file__).parent.parent
 README = (TOP / "README.md").read_text()
@@ -37,7 +37,7 @@ def test_both_commands_are_one_line_each():
 
 
 def test_every_variable_is_explained():
-    for variable in TEMPLATE:
+    for variable in SCHEMA:
         assert f"`{variable.name}`" in README
 
 
@@ -57,7 +57,7 @@ def test_pipeline_in_the_readme_is_sound():
 
 def test_first_analysis_runs_on_the_smoke_pipeline(tmp_path):
     ran = subprocess.run(
-        [sys.executable, "-m", "sweep.cli", "run", str(TOP / "pipelines" / "smoke.toml")],
+        [sys.executable, "-m", "sweep", "run", str(TOP / "pipelines" / "smoke.toml")],
         cwd=tmp_path, capture_output=True, text=True, check=False,
     )
     assert ran.returncode == 0, ran.stderr

@@ -20,12 +20,12 @@ import pytest
 import trustme
 
 from sweep.cli import main
-from sweep.engine.cluster import external
-from sweep.engine.store import committed, open_store
 from sweep.errors import StoreError
-from sweep.kernel import run_block
+from sweep.evaluation.cells import run_block
+from sweep.execution.cluster import external
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
-from sweep.plan.pipeline import Pipeline
+from sweep.store.lifecycle import committed, open_store
 
 TIMEOUT_S = 240.0
 
@@ -49,9 +49,9 @@ MANY = "[axes]\ntrial = 5000\ndistance_m = [0.05, 0.08]\n[pose]\njitter_px = 0.5
 
 RUN = """
 import sys
-from sweep.engine.runner import execute
+from sweep.execution.runner import execute
 from sweep.errors import StoreError, SweepError
-from sweep.plan.pipeline import Pipeline
+from sweep.plan.experiment import Pipeline
 
 if __name__ == "__main__":
     path, store, scheduler = sys.argv[1:]
@@ -89,7 +89,7 @@ def python(*arguments, **options):
 
 
 def sweep_command(*arguments, **options):
-    return python("-m", "sweep.cli", *arguments, **options)
+    return python("-m", "sweep", *arguments, **options)
 
 
 def expected(text):
@@ -477,7 +477,7 @@ def test_tls_scheduler_that_refuses_is_told_in_a_line(certificates, tmp_path):
 
 
 def test_server_that_never_answers_is_given_up(monkeypatch):
-    monkeypatch.setattr("sweep.engine.cluster.ANSWER_S", 0.5)
+    monkeypatch.setattr("sweep.execution.cluster.ANSWER_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
         with pytest.raises(StoreError, match="no answer within"), external(

@@ -25,22 +25,22 @@ from sweep.analysis import (
     failure_composition,
 )
 from sweep.analysis.statistics import IntervalOf
-from sweep.engine.closing import close
-from sweep.engine.store import create_store, open_dataset, open_store, write_group
-from sweep.engine.task import compute_block
 from sweep.errors import StoreError
-from sweep.measure.flags import Detection, Estimate
+from sweep.execution.block_task import compute_block
+from sweep.execution.finalize import close
+from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.renderers import background_image
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
-from sweep.plan.pipeline import Pipeline
 from sweep.report import gallery
-from sweep.report import subject as subjects
+from sweep.report import report_data as subjects
 from sweep.report.answer import _best, answer
 from sweep.report.figures import figures_of
 from sweep.report.gallery import scenes_of
-from sweep.report.subject import Grouping, Subject, texts_of
+from sweep.report.report_data import Grouping, Subject, texts_of
 from sweep.report.table import number
-from sweep.report.writing import write_report
+from sweep.report.write_report import write_report
+from sweep.store.lifecycle import create_store, open_dataset, open_store, write_group
 
 CAMERA = """
 seed = 7
@@ -318,8 +318,8 @@ def test_each_treatment_is_paired_with_the_first(full, page):
 
 def test_the_answer_is_that_of_plain_arithmetic(full, page):
     results = open_dataset(full).load()
-    detected = 100 * float((results["detection"] == Detection.detected).mean())
-    solved = results["estimate"] == Estimate.solved
+    detected = 100 * float((results["detection"] == DetectionStatus.detected).mean())
+    solved = results["estimate"] == EstimateStatus.solved
     ordered = np.sort(results["rotation_error_deg"].where(solved, np.inf).values.ravel())
     median = ordered[math.ceil(len(ordered) / 2) - 1]
     paragraph = re.search(r'<p class="answer">(.*?)</p>', page)[1]
@@ -334,7 +334,7 @@ def test_the_answer_s_numbers_have_their_own_denominators(full, page, tmp_path):
     paragraph = re.search(r'<p class="answer">(.*?)</p>', page)[1]
     assert (f"looked for {results.detection.size} times, with 2 settings of the detector together,"
             in paragraph)
-    solved = 100 * float((results["estimate"] == Estimate.solved).mean())
+    solved = 100 * float((results["estimate"] == EstimateStatus.solved).mean())
     assert (f"solved in {number(solved)} % of {results.estimate.size} results, with 4 treatments "
             "together." in paragraph)
     assert f"to {number(100 * float(error_statistics(results)['solved_rate_high']))} %, of " + str(
@@ -415,7 +415,7 @@ def test_bins_are_the_same_whether_a_store_is_loaded_or_read_in_pieces(full, mon
 def test_scenes_are_those_with_the_smallest_and_largest_errors(full, monkeypatch):
     subject = opened(full)
     results = subject.results.load()
-    solved = results["rotation_error_deg"].where(results["estimate"] == Estimate.solved)
+    solved = results["rotation_error_deg"].where(results["estimate"] == EstimateStatus.solved)
     for piece in (10**9, 50):
         monkeypatch.setattr(gallery, "PIECE", piece)
         chosen = dict(gallery._chosen(results if piece > 50 else opened(full).results))
@@ -427,7 +427,7 @@ def test_scenes_are_those_with_the_smallest_and_largest_errors(full, monkeypatch
         assert found["worst"] == float(solved.max())
         median = float(np.nanmedian(solved))
         assert found["median rotation error of the solved"] == pytest.approx(median, rel=0.1)
-        for flag in (Detection.rejected, Detection.no_candidate):
+        for flag in (DetectionStatus.rejected, DetectionStatus.no_candidate):
             assert bool((results["detection"] == flag).any()) == any(
                 title.startswith(flag.name.replace("_", " ")) for title in chosen)
 
@@ -463,7 +463,7 @@ def test_a_scene_that_is_not_what_the_store_holds_is_told(full):
 def test_a_crashed_scene_is_not_rendered_and_a_lost_background_is_told(full, tmp_path):
     subject = opened(full)
     results = subject.results.load()
-    results["detection"][0, 0, 0] = Detection.crashed
+    results["detection"][0, 0, 0] = DetectionStatus.crashed
     problems = {title: scene.problem for scene in scenes_of(subject) for title in scene.titles}
     assert problems["crashed: the process died"].startswith("Not drawn")
     background = tmp_path / "wall.png"
@@ -671,7 +671,7 @@ def test_a_report_is_whole_or_not_there(full, tmp_path, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sweep.report.writing.page", interrupted)
+    monkeypatch.setattr("sweep.report.write_report.page", interrupted)
     with pytest.raises(KeyboardInterrupt):
         write_report(opened(full), output)
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]

@@ -15,12 +15,12 @@ import zarr
 from test_poison import Poison, command, poisoned
 
 from sweep.cli import main
-from sweep.engine.closing import close
-from sweep.engine.failures import MOST_CHARACTERS, recorded
-from sweep.engine.store import begin_block, create_store, open_store
-from sweep.engine.task import compute_block
-from sweep.kernel import Failure
-from sweep.plan.pipeline import Pipeline
+from sweep.evaluation.cells import Failure
+from sweep.execution.block_task import compute_block
+from sweep.execution.finalize import close
+from sweep.plan.experiment import Pipeline
+from sweep.store.failures import MAX_CHARACTERS, recorded
+from sweep.store.lifecycle import begin_block, create_store, open_store
 
 TEXT = """
 title = "Scenes to be seen again"
@@ -260,7 +260,7 @@ def test_table_of_failures_tells_where_what_and_why(finished):
 
 def test_table_of_failures_is_bounded_and_all_are_counted(copied, monkeypatch):
     # Twenty rows in each receipt, of both kinds; the bound is made small.
-    monkeypatch.setattr("sweep.engine.closing.MOST_ROWS", 25)
+    monkeypatch.setattr("sweep.execution.finalize.MAX_ROWS", 25)
     row = {"scene": 1, "stage": "scene", "setting": None, "estimator": None, "text": "Error: x"}
     array = zarr.open_array(f"{copied}/commits/receipt", mode="r+")
     for number in range(4):
@@ -276,7 +276,7 @@ def test_table_of_failures_is_bounded_and_all_are_counted(copied, monkeypatch):
 
 
 def test_receipts_keep_a_bounded_number_of_rows_and_the_end_of_a_long_traceback():
-    text = "first" + "x" * 10 * MOST_CHARACTERS + "last"
+    text = "first" + "x" * 10 * MAX_CHARACTERS + "last"
     failures = [Failure(k, "scene", text, crashed=bool(k % 2)) for k in range(1000)]
     rows = list(range(5000, 6000))
     kept = recorded(failures, rows, {"failed": 1000, "crashed": 7})
@@ -289,7 +289,9 @@ def test_receipts_keep_a_bounded_number_of_rows_and_the_end_of_a_long_traceback(
 
 
 def test_no_more_than_a_thousand_rows_of_each_kind_are_kept():
-    from sweep.engine import closing, failures, task  # noqa: PLC0415
+    from sweep.execution import block_task as task  # noqa: PLC0415
+    from sweep.execution import finalize as closing  # noqa: PLC0415
+    from sweep.store import failures  # noqa: PLC0415
 
-    assert failures.MOST_ROWS == closing.MOST_ROWS == 1000
+    assert failures.MAX_ROWS == closing.MAX_ROWS == 1000
     assert task.ROOM == {"failed": 1000, "crashed": 1000}

@@ -17,16 +17,16 @@ import xarray as xr
 import zarr
 
 import sweep
-from sweep.engine.lock import KEY, locked
-from sweep.engine.manifest import get, put
-from sweep.engine.runner import execute
-from sweep.engine.store import committed, create_store, open_store, remove_store
-from sweep.engine.task import compute_block
 from sweep.errors import StoreError
-from sweep.kernel import run_block
+from sweep.evaluation.cells import run_block
+from sweep.execution.block_task import compute_block
+from sweep.execution.runner import execute
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, Blocks, scene_axes
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.template import TEMPLATE
+from sweep.plan.schema import SCHEMA
+from sweep.store.lifecycle import committed, create_store, open_store, remove_store
+from sweep.store.lock import KEY, locked
+from sweep.store.manifest import get, put
 
 TEXT = """
 title = "A small grid with every kind of axis"
@@ -86,7 +86,7 @@ def same(a, b):
 def sweep_command(*arguments, **options):
     """Run the command line in a process of its own."""
     return subprocess.run(
-        [sys.executable, "-m", "sweep.cli", *map(str, arguments)],
+        [sys.executable, "-m", "sweep", *map(str, arguments)],
         capture_output=True, text=True, check=False, timeout=300, **options,
     )
 
@@ -327,7 +327,7 @@ def test_lock_that_was_taken_over_is_left_to_its_holder(pipeline, tmp_path):
 
 
 def test_silent_scheduler_is_given_up(pipeline, tmp_path, monkeypatch):
-    monkeypatch.setattr("sweep.engine.cluster.ANSWER_S", 0.5)
+    monkeypatch.setattr("sweep.execution.cluster.ANSWER_S", 0.5)
     with pytest.raises(StoreError, match=r"--scheduler tcp://127\.0\.0\.1:9: no answer within"):
         execute(pipeline, tmp_path / "none.zarr", scheduler="tcp://127.0.0.1:9")
     assert not (tmp_path / "none.zarr").exists()
@@ -356,7 +356,7 @@ LONG = "[axes]\ntrial = 40000\ndistance_m = [0.05, 0.08]\n[pose]\njitter_px = 0.
 def test_interrupted_run_says_how_to_go_on_and_goes_on(tmp_path):
     path = tmp_path / "long.toml"
     path.write_text(LONG)
-    command = [sys.executable, "-m", "sweep.cli", "run", str(path), "--workers", "2"]
+    command = [sys.executable, "-m", "sweep", "run", str(path), "--workers", "2"]
     with subprocess.Popen(
         command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         start_new_session=True,
@@ -397,8 +397,8 @@ def test_running_scheduler_with_two_workers_gives_the_same(pipeline, undisturbed
 def test_template_says_what_the_kernel_makes(pipeline):
     lengths = tuple(len(axis) for axis in scene_axes(pipeline))
     result = run_block(pipeline, Block((0,) * len(lengths), lengths))
-    assert list(result.values) == [variable.name for variable in TEMPLATE]
-    for variable in TEMPLATE:
+    assert list(result.values) == [variable.name for variable in SCHEMA]
+    for variable in SCHEMA:
         values = result.values[variable.name]
         assert values.shape == variable.shape(pipeline)
         assert values.dtype == np.dtype(variable.dtype)
@@ -421,8 +421,8 @@ def test_blocks_cover_the_grid_once_and_are_listed_lazily():
 def test_workers_with_other_versions_are_refused(pipeline, tmp_path, monkeypatch):
     from distributed import LocalCluster  # noqa: PLC0415
 
-    from sweep.engine import cluster as connecting  # noqa: PLC0415
-    from sweep.engine.provenance import fingerprint  # noqa: PLC0415
+    from sweep.execution import cluster as connecting  # noqa: PLC0415
+    from sweep.store.provenance import fingerprint  # noqa: PLC0415
 
     async def elsewhere(_, given):
         return {"tcp://worker": {**fingerprint(given), "opencv": "0.0"}}
@@ -542,7 +542,7 @@ def test_progress_is_shown_on_a_terminal(tmp_path):
     path.write_text(TEXT)
     ours, theirs = pty.openpty()
     with subprocess.Popen(
-        [sys.executable, "-m", "sweep.cli", "run", str(path), "--workers", "1"],
+        [sys.executable, "-m", "sweep", "run", str(path), "--workers", "1"],
         cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=theirs,
         env={**os.environ, "TERM": "xterm", "COLUMNS": "100"},
     ) as running:

@@ -12,15 +12,15 @@ from scipy import stats
 from test_window import outcomes_elsewhere
 
 from sweep.errors import PipelineError
-from sweep.kernel import search, search_windows, single_thread, visibility_flags
+from sweep.evaluation.cells import search, search_windows, single_thread, visibility_flags
 from sweep.measure.detector import REFINEMENTS, DetectorSetting
-from sweep.measure.flags import Detection
+from sweep.measure.flags import DetectionStatus
 from sweep.model import sensor
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import marker_levels, render_all
 from sweep.model.scene import build_scenes
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes, scene_values
-from sweep.plan.pipeline import Pipeline
 
 UNLIKELY = 1e-6
 FAR = 5.5
@@ -350,7 +350,7 @@ def both_searches(count, setting):
         indices = list(np.unravel_index(cells, shape))
         return build_scenes(scene_values(pipeline, indices), len(cells))
 
-    seen = np.flatnonzero(visibility_flags(built(order)) == Detection.not_run)[:count]
+    seen = np.flatnonzero(visibility_flags(built(order)) == DetectionStatus.not_run)[:count]
     assert len(seen) == count
     scenes = built(order[seen])
     single_thread()
@@ -371,7 +371,7 @@ def test_window_finds_what_the_frame_holds_under_noise(count, refinement):
     windows = search_windows(scenes, marker_boxes(scenes), setting, np.zeros(count, dtype=bool))
     assert (windows[:, 2:] - windows[:, :2] < scenes.frame).any()
     exceptions = np.flatnonzero(windowed.flags != framed.flags)
-    both = (windowed.flags == Detection.detected) & (framed.flags == Detection.detected)
+    both = (windowed.flags == DetectionStatus.detected) & (framed.flags == DetectionStatus.detected)
     difference = np.abs(windowed.corners - framed.corners)[both].max(axis=(1, 2))
     print(
         f"\n{refinement}: {count} poses, {both.sum()} detected, {len(exceptions)} exceptions "

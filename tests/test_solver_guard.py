@@ -9,7 +9,7 @@ from conftest import lengths
 from scipy.spatial.transform import Rotation
 
 from sweep.measure.accuracy import pose_error
-from sweep.measure.flags import Estimate
+from sweep.measure.flags import EstimateStatus
 from sweep.measure.solver import SOLVERS, estimate
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
@@ -84,7 +84,7 @@ def wrong(view, estimates):
     with np.errstate(invalid="ignore"):
         exact = estimates.reprojection_px < 1e-6  # where the mirror is no worse than the truth
     mirror = degrees_between(estimates.rotation, view.mirrored()) < 0.01
-    return ~(right | (mirror & exact)) | (estimates.status != Estimate.solved)
+    return ~(right | (mirror & exact)) | (estimates.status != EstimateStatus.solved)
 
 
 @lengths(45, 15)
@@ -133,7 +133,7 @@ def test_relative_errors_are_the_same_at_millimetres_and_kilometres(solver):
     corners = views[1].corners + noise[: len(views[1])]
     small, middle, large = (view.estimates(solver, guarded=True, corners=corners)
                             for view in views)
-    assert (middle.status == Estimate.solved).all()
+    assert (middle.status == EstimateStatus.solved).all()
     assert degrees_between(middle.rotation, views[1].rotation).max() > 0.05  # noise does something
     for view, estimates in ((views[0], small), (views[2], large)):
         np.testing.assert_array_equal(estimates.status, middle.status)
@@ -223,9 +223,9 @@ def test_garbage_is_solved_in_front_of_the_camera_or_not_at_all(count, guarded, 
         estimates = estimate(
             corners, cameras(count, lens), np.full(count, 0.05), solver, guarded, 0.25
         )
-        solved = estimates.status == Estimate.solved
+        solved = estimates.status == EstimateStatus.solved
         told = f"{solver} on {kind}"
-        assert (solved | (estimates.status == Estimate.solver_failed)).all(), told
+        assert (solved | (estimates.status == EstimateStatus.solver_failed)).all(), told
         points = in_space(estimates.rotation, estimates.translation, 0.05)
         assert np.isfinite(points[solved]).all(), told
         assert (points[solved][..., 2] > 0).all(), told

@@ -10,9 +10,9 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sweep.analysis.pareto import CRITERIA, UNITS, advice, digits, mark_front, pareto_front
 from sweep.report.trade_figure import draw_trade
 from sweep.report.trade_table import WIDEST, as_json, table_markdown, table_text
+from sweep.tradeoff.pareto import CRITERIA, UNITS, advice, digits, mark_front, pareto_front
 
 P95 = "rotation_p95_deg"
 SOLVERS = ("ippe_square", "ippe", "iterative", "sqpnp", "ap3p")

@@ -18,17 +18,18 @@ import xarray as xr
 from scipy import stats
 
 from sweep import cli
-from sweep.engine import paired_costs, tradeoff
-from sweep.engine.closing import close
-from sweep.engine.interrupts import Interrupts
-from sweep.engine.paired_costs import FEWEST_ROUNDS, NARROW, in_turns, median_interval
-from sweep.engine.progress import status
-from sweep.engine.runner import execute
-from sweep.engine.store import create_store
-from sweep.engine.task import compute_block
+from sweep.execution.block_task import compute_block
+from sweep.execution.finalize import close
+from sweep.execution.runner import execute
+from sweep.execution.status import status
+from sweep.isolation.interrupts import Interrupts
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
-from sweep.plan.pipeline import Pipeline
 from sweep.report.trade_table import as_json
+from sweep.store.lifecycle import create_store
+from sweep.tradeoff import measurement as tradeoff
+from sweep.tradeoff import paired_timing as paired_costs
+from sweep.tradeoff.paired_timing import MIN_ROUNDS, NARROW, in_turns, median_interval
 
 CAMERA = """
 seed = 3
@@ -92,7 +93,7 @@ TREATMENTS = [
 def _few_scenes():
     """Measure costs on few scenes: what is told is the same, and sooner."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(paired_costs, "MOST_SCENES", 4)
+        patch.setattr(paired_costs, "MAX_SCENES", 4)
         yield
 
 
@@ -472,24 +473,24 @@ def to_first(seconds):
 def test_rounds_end_when_every_ratio_is_known(clock):
     parts = [clock.part(k, lambda _, k=k: 1.0 + k) for k in range(3)]
     seconds = in_turns(parts, to_first, math.inf, Interrupts())
-    assert seconds.tolist() == [[1.0, 2.0, 3.0]] * FEWEST_ROUNDS
+    assert seconds.tolist() == [[1.0, 2.0, 3.0]] * MIN_ROUNDS
 
 
 def test_rounds_go_on_until_the_widest_ratio_is_narrow(clock):
     noise = np.random.default_rng(1).lognormal(0, 0.05, 2000)
     parts = [clock.part(0, lambda _: 1.0), clock.part(1, lambda call: 2.0 * noise[call])]
     seconds = in_turns(parts, to_first, math.inf, Interrupts())
-    assert FEWEST_ROUNDS < len(seconds) < 2000 - 1
+    assert MIN_ROUNDS < len(seconds) < 2000 - 1
 
     def width(count):
         value, low, high = median_interval(to_first(seconds[:count]))
         return ((high - low) / value).max()
 
     assert width(len(seconds)) <= NARROW
-    assert all(width(count) > NARROW for count in range(FEWEST_ROUNDS, len(seconds)))
+    assert all(width(count) > NARROW for count in range(MIN_ROUNDS, len(seconds)))
 
 
-@pytest.mark.parametrize(("limit", "rounds"), [(100.0, 33), (1.0, FEWEST_ROUNDS)])
+@pytest.mark.parametrize(("limit", "rounds"), [(100.0, 33), (1.0, MIN_ROUNDS)])
 def test_rounds_end_at_the_limit_but_not_before_there_are_enough(clock, limit, rounds):
     parts = [clock.part(0, lambda _: 1.0), clock.part(1, lambda call: 1.0 + 2.0 * (call % 2))]
     # Rounds of 2 and 4 s by turns, the first of which warms up: 34 rounds take 102 s.
@@ -497,7 +498,7 @@ def test_rounds_end_at_the_limit_but_not_before_there_are_enough(clock, limit, r
 
 
 def test_rounds_end_at_the_most_rounds(clock, monkeypatch):
-    monkeypatch.setattr(paired_costs, "MOST_ROUNDS", 50)
+    monkeypatch.setattr(paired_costs, "MAX_ROUNDS", 50)
     parts = [clock.part(0, lambda _: 1.0), clock.part(1, lambda call: 1.0 + call % 2)]
     assert len(in_turns(parts, to_first, math.inf, Interrupts())) == 49
 
@@ -505,7 +506,7 @@ def test_rounds_end_at_the_most_rounds(clock, monkeypatch):
 def test_a_ratio_that_does_not_exist_does_not_hold_up_the_rounds(clock):
     parts = [clock.part(k, lambda _: 1.0) for k in range(2)]
     seconds = in_turns(parts, lambda spent: to_first(spent) * [1.0, np.nan], math.inf, Interrupts())
-    assert len(seconds) == FEWEST_ROUNDS
+    assert len(seconds) == MIN_ROUNDS
 
 
 def test_the_first_round_warms_up(clock):
@@ -516,14 +517,14 @@ def test_the_first_round_warms_up(clock):
 def test_each_round_has_every_part_once_in_an_order_of_its_own(clock):
     count = 6
     in_turns([clock.part(k, lambda _: 1.0) for k in range(count)], to_first, math.inf, Interrupts())
-    rounds = np.reshape(clock.order, (FEWEST_ROUNDS + 1, count))
+    rounds = np.reshape(clock.order, (MIN_ROUNDS + 1, count))
     assert (np.sort(rounds) == np.arange(count)).all()
     # 13 of 720 orders: that two of them are the same is no fault, that half are would be.
     assert len(np.unique(rounds, axis=0)) > len(rounds) // 2
     assert len(np.unique(rounds[:, 0])) > 1
 
 
-@pytest.mark.parametrize("count", [6, FEWEST_ROUNDS, 13, 60, 1999])
+@pytest.mark.parametrize("count", [6, MIN_ROUNDS, 13, 60, 1999])
 def test_the_medians_interval_is_the_narrowest_of_order_statistics_that_covers(count):
     value, low, high = median_interval(np.random.default_rng(0).permutation(count).astype(float))
     assert value == (count - 1) / 2
@@ -535,7 +536,7 @@ def test_the_medians_interval_is_the_narrowest_of_order_statistics_that_covers(c
     assert coverage(low) >= 0.95 > coverage(low + 1)
 
 
-@pytest.mark.parametrize("count", [FEWEST_ROUNDS, 41])
+@pytest.mark.parametrize("count", [MIN_ROUNDS, 41])
 def test_the_medians_interval_covers_in_a_simulation(count):
     times = 20_000
     values = np.random.default_rng(7).exponential(size=(count, times))
@@ -560,7 +561,7 @@ def test_two_measurements_agree(tmp_path):
         one = str(tmp_path / f"{number}.zarr")
         shutil.copytree(url, one)
         done = subprocess.run(
-            [sys.executable, "-m", "sweep.cli", "tradeoff", one, "--seconds", "20", "--json"],
+            [sys.executable, "-m", "sweep", "tradeoff", one, "--seconds", "20", "--json"],
             capture_output=True, text=True, check=True, timeout=300,
         )
         found.append(json.loads(done.stdout))

@@ -18,15 +18,15 @@ from test_poison import Poison, poisoned
 from test_run import by_hand
 
 from sweep.cli import main
-from sweep.engine.closing import close
-from sweep.engine.manifest import Manifest, write_manifest
-from sweep.engine.repair import repair
-from sweep.engine.store import begin_block, create_store, open_store, place_of
-from sweep.engine.task import compute_block
-from sweep.engine.verification import verify
 from sweep.errors import StoreError
+from sweep.execution.block_task import compute_block
+from sweep.execution.finalize import close
+from sweep.integrity.repair import repair
+from sweep.integrity.verification import verify
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
-from sweep.plan.pipeline import Pipeline
+from sweep.store.lifecycle import begin_block, create_store, open_store, place_of
+from sweep.store.manifest import Manifest, write_manifest
 
 TEXT = """
 title = "Größen, klein"
@@ -165,7 +165,7 @@ def here(monkeypatch, tmp_path):
                     begin_block(store, store.blocks[number])
                 compute_block(store.url, store.run_id, store.blocks[number])
 
-    monkeypatch.setattr("sweep.engine.repair.recompute", recompute)
+    monkeypatch.setattr("sweep.integrity.repair.recompute", recompute)
     return computed
 
 
@@ -589,7 +589,7 @@ ELSEWHERE = {
 VERIFY_EACH = """
 import json, sys
 from sweep.compilation import processor
-from sweep.engine.verification import verify
+from sweep.integrity.verification import verify
 
 told = {"processor": processor()}
 for url in sys.argv[1:]:

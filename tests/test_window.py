@@ -6,15 +6,21 @@ import pytest
 from conftest import lengths
 
 from sweep.errors import PipelineError
-from sweep.kernel import run_block, search, search_windows, single_thread, visibility_flags
+from sweep.evaluation.cells import (
+    run_block,
+    search,
+    search_windows,
+    single_thread,
+    visibility_flags,
+)
 from sweep.measure.detector import REFINEMENTS, DetectorSetting, full_frame_reason
-from sweep.measure.flags import Detection
+from sweep.measure.flags import DetectionStatus
 from sweep.model.extent import marker_boxes
 from sweep.model.marker import opencv_dictionary
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, detector_settings, scene_axes, scene_values
-from sweep.plan.pipeline import Pipeline
 
 SCENES = """
 seed = 11
@@ -48,7 +54,7 @@ def visible_scenes(count, width=640, height=480, settings=()):
         return build_scenes(scene_values(pipeline, indices), len(cells))
 
     candidates = order[: count * 5 // 4 + 20]
-    seen = np.flatnonzero(visibility_flags(built(candidates)) == Detection.not_run)
+    seen = np.flatnonzero(visibility_flags(built(candidates)) == DetectionStatus.not_run)
     assert len(seen) >= count
     return built(candidates[seen[:count]])
 
@@ -116,7 +122,7 @@ def compare(count, width, height, refinement):
     scenes = visible_scenes(count, width, height)
     windowed, framed = both_searches(scenes, setting)
     exceptions = np.flatnonzero(windowed.flags != framed.flags)
-    both = (windowed.flags == Detection.detected) & (framed.flags == Detection.detected)
+    both = (windowed.flags == DetectionStatus.detected) & (framed.flags == DetectionStatus.detected)
     difference = np.abs(windowed.corners - framed.corners)[both].max(axis=(1, 2))
     median, high, worst = np.quantile(difference, [0.5, 0.99, 1.0])
     cut = (scenes.outline_px < -0.5) | (scenes.outline_px > scenes.frame[:, None] - 0.5)
@@ -225,7 +231,7 @@ def test_window_finds_what_the_frame_holds_under_other_settings(count, given):
     scenes = visible_scenes(count)
     windowed, framed = both_searches(scenes, setting)
     assert (windowed.flags != framed.flags).sum() <= 0.001 * count
-    both = (windowed.flags == Detection.detected) & (framed.flags == Detection.detected)
+    both = (windowed.flags == DetectionStatus.detected) & (framed.flags == DetectionStatus.detected)
     difference = np.abs(windowed.corners - framed.corners)[both]
     exact = full_frame_reason(setting) is not None or setting.cornerRefinementMethod == "none"
     # As above: one float32 ulp of the frame's width for apriltag's corners.
@@ -262,7 +268,7 @@ def test_adding_a_setting_with_a_larger_window_changes_no_other_setting():
         run_block(Pipeline.from_text(PAIRED, settings), Block((0, 0), (3, 12))).values
         for settings in ((), ("adaptiveThreshWinSizeMax=[61, 23]",))
     )
-    assert (alone["detection"] == Detection.detected).any()
+    assert (alone["detection"] == DetectionStatus.detected).any()
     for name, expected in alone.items():
         found = beside[name]
         if found.shape != expected.shape:

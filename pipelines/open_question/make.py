@@ -27,7 +27,7 @@ import sweep
 from sweep.analysis import compare
 from sweep.measure.bit_reading import STAYS_LOST, lone_cells, predicted_rate, reading_of
 from sweep.measure.detector import DetectorSetting
-from sweep.measure.flags import Detection
+from sweep.measure.flags import DetectionStatus
 from sweep.model.marker import module_count, modules, opencv_dictionary
 
 FOLDER = Path(__file__).parent
@@ -123,7 +123,7 @@ def swept(
 
 def measured(results: xr.Dataset, dictionary: str) -> Rates:
     """Return the detection rates of a sweep."""
-    found = (results["detection"] == Detection.detected).mean("trial")
+    found = (results["detection"] == DetectionStatus.detected).mean("trial")
     return Rates(
         results["side_px"].to_numpy().round(1), results["marker_id"].to_numpy(),
         found.transpose("side_px", "marker_id").to_numpy(), module_count(dictionary),
@@ -175,9 +175,9 @@ def dictionaries(trials: int | None, workers: int | None) -> None:
         what, count = title(pipeline), len(truth.ids)
         shown.append((what, truth, model))
         read = results["detection"].sel(side_px=slice(2.1 * truth.modules - 1e-9, None))
-        counts = {flag: int((read == flag).sum()) for flag in Detection}
+        counts = {flag: int((read == flag).sum()) for flag in DetectionStatus}
         flags.append([what, f"{read.size:,}", *(f"{counts[flag]:,}" for flag in (
-            Detection.rejected, Detection.no_candidate, Detection.wrong_id))])
+            DetectionStatus.rejected, DetectionStatus.no_candidate, DetectionStatus.wrong_id))])
         found = list(pairs(model, truth))
         check += [[f"{what}: {one.said}", *pair.cells(count)] for pair in found] or [
             [f"{what}: {one.said}", "none / none", *["-"] * 5]]
@@ -247,7 +247,7 @@ def setting_row(
     """Return a row of the table of settings."""
     one = results.sel({name: value})
     sides = one["side_px"].to_numpy()
-    lost = (one["detection"] != Detection.detected).mean(["marker_id", "trial"]).to_numpy()
+    lost = (one["detection"] != DetectionStatus.detected).mean(["marker_id", "trial"]).to_numpy()
     detecting = name in {field.name for field in dataclasses.fields(DetectorSetting)}
     model = None
     if name in READ_BY_MODEL:
@@ -266,7 +266,7 @@ def setting_row(
         + ("" if model is None else f" ({100 * (1 - model.rates[within]).mean():.1f})")
         for within in cells
     ]
-    wrong = int((one["detection"] == Detection.wrong_id).sum())
+    wrong = int((one["detection"] == DetectionStatus.wrong_id).sum())
     p_value = "-"
     if detecting and value != default:
         p = float(compare(results.sel({name: default}), one)["detection_p_value"])

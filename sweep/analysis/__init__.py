@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from sweep.analysis.comparisons import compare, renderer_bias
+from sweep.analysis.detection_limits import detection_limit
 from sweep.analysis.error_summaries import covariance_trust, efficiency, error_statistics
-from sweep.analysis.limits import detection_limit
 from sweep.analysis.ranking import marker_ranking
 from sweep.analysis.rates import detection_rate, failure_composition, flip_rate
 

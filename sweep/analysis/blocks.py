@@ -29,12 +29,12 @@ from dask.optimization import cull
 from dask.utils import ensure_dict
 from numpy.typing import NDArray
 
-from sweep.analysis.poses import INSIDE, Poses
+from sweep.analysis.pose_view import INSIDE, Poses
 from sweep.analysis.states import State, combined, every_nth, folded, interleaved, scattered
-from sweep.analysis.statistics import Found, OneLook, Output, Statistic
+from sweep.analysis.statistics import Found, Output, SinglePass, Statistic
 from sweep.errors import StoreError
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
-from sweep.plan.template import LABELS, TEMPLATE
+from sweep.plan.schema import LABELS, SCHEMA
 
 NEEDED = ("detection", "estimate", "flipped", "rotation_error_rad", "translation_error_m",
           "true_tvec_m")
@@ -46,7 +46,7 @@ Read = Callable[[], list[NDArray[Any]]]
 """What computes the arrays of a block."""
 Bins = Mapping[str, Sequence[float]]
 
-LARGEST_BLOCK = 1 << 18
+MAX_BLOCK = 1 << 18
 """Poses in a block of a dataset that is in memory."""
 FAN_IN = 16
 """States that are merged at once."""
@@ -54,7 +54,7 @@ FAN_IN = 16
 
 def axes_of(results: xr.Dataset) -> list[str]:
     """Return the axes of the template's variables, in their order."""
-    dims = [str(dim) for v in TEMPLATE if v.name in results for dim in results[v.name].dims]
+    dims = [str(dim) for v in SCHEMA if v.name in results for dim in results[v.name].dims]
     return [dim for dim in dict.fromkeys(dims) if dim not in LABELS]
 
 
@@ -141,7 +141,7 @@ class Layout:
         return found
 
 
-def streamed(
+def aggregate(
     results: xr.Dataset,
     needed: Mapping[str, xr.DataArray],
     kept: Sequence[str],
@@ -232,9 +232,9 @@ def _chunked(dataset: xr.Dataset, layout: Layout, *, lazy: bool) -> xr.Dataset:
     if not lazy:
         lengths, size = {}, math.prod(dataset.sizes[name] for name in _axes(layout, dataset))
         for name in (*layout.cells, *layout.draws, *layout.kept):
-            if name in dataset.sizes and size > LARGEST_BLOCK:
+            if name in dataset.sizes and size > MAX_BLOCK:
                 length = dataset.sizes[name]
-                lengths[name] = max(1, length * LARGEST_BLOCK // size)
+                lengths[name] = max(1, length * MAX_BLOCK // size)
                 size = size // length * lengths[name]
         return dataset.chunk({str(name): lengths.get(str(name), -1) for name in dataset.dims})
     whole = {name: -1 for name in dataset.dims if name in LABELS or name in layout.settings}
@@ -306,7 +306,7 @@ def _tables(
     known = [layer.add(functools.partial(_between, statistics), layer.merged(states))
              for states in looks]
     finish = functools.partial(_finish, statistics)
-    if all(isinstance(statistic, OneLook) for statistic in statistics):
+    if all(isinstance(statistic, SinglePass) for statistic in statistics):
         return layer, [layer.add(finish, of_first) for of_first in known]
     looks = _looks(layer, reading, layout, lengths, functools.partial(_second, layout, statistics),
                    known)
@@ -342,14 +342,14 @@ def _looks(
     return found
 
 
-Look = list[tuple[State, State]]
+SceneInspection = list[tuple[State, State]]
 """The states of a block and of its cells, for each statistic."""
 
 
 def _first(
     layout: Layout, statistics: Sequence[Statistic], sizes: Mapping[str, int],
     read: Read,
-) -> Look:
+) -> SceneInspection:
     arrays = layout.arranged(read(), sizes)
     return _joined([
         _in_their_cells([s.first(poses) for s in statistics], cells)
@@ -360,7 +360,7 @@ def _first(
 def _second(
     layout: Layout, statistics: Sequence[Statistic], sizes: Mapping[str, int],
     read: Read, known: list[State],
-) -> Look:
+) -> SceneInspection:
     arrays = layout.arranged(read(), sizes)
     return _joined([
         _in_their_cells(
@@ -388,14 +388,14 @@ def _in_bins(layout: Layout, arrays: Arrays) -> Iterator[tuple[Any, Masks | None
         yield layout.view(part), cells
 
 
-def _in_their_cells(look: Look, cells: Masks | None) -> Look:
+def _in_their_cells(look: SceneInspection, cells: Masks | None) -> SceneInspection:
     """Return the states of some cells as those of all."""
     if cells is None:
         return look
     return [(pooled, scattered(state, cells)) for pooled, state in look]
 
 
-def _joined(looks: list[Look]) -> Look:
+def _joined(looks: list[SceneInspection]) -> SceneInspection:
     """Return what was seen in the bins as one."""
     return [
         (interleaved([pooled for pooled, _ in each]), interleaved([cells for _, cells in each]))
@@ -403,7 +403,7 @@ def _joined(looks: list[Look]) -> Look:
     ]
 
 
-def _folded(parts: list[Look]) -> list[State]:
+def _folded(parts: list[SceneInspection]) -> list[State]:
     """Return the states of some cells, of all their draws."""
     return [
         combined([pooled for pooled, _ in each]) | folded(combined([cells for _, cells in each]))

@@ -10,9 +10,9 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import special
 
-from sweep.analysis.blocks import Arrays, Bins, axes_of, fingerprint_of, kept_of, streamed
+from sweep.analysis.blocks import Arrays, Bins, aggregate, axes_of, fingerprint_of, kept_of
 from sweep.analysis.intervals import wilson
-from sweep.analysis.poses import QUANTITIES, Poses, Quantity, errors, norm_squared
+from sweep.analysis.pose_view import QUANTITIES, Poses, Quantity, errors, norm_squared
 from sweep.analysis.statistics import (
     Count,
     Draws,
@@ -25,9 +25,9 @@ from sweep.analysis.statistics import (
 )
 from sweep.errors import StoreError
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS, Stage
-from sweep.plan.template import TEMPLATE
+from sweep.plan.schema import SCHEMA
+from sweep.typing import Floats
 
-Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Masks = NDArray[np.bool_]
 
@@ -119,7 +119,7 @@ def compare(
         lambda pair: pair.compared & pair.differing))
     for quantity in QUANTITIES:
         statistics += _differences(quantity)
-    table = streamed(first, needed, kept, statistics, bins, Pair)
+    table = aggregate(first, needed, kept, statistics, bins, Pair)
     return table.assign(_tested(table)).drop_vars("drawn")
 
 
@@ -262,7 +262,7 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
     others = results.isel(renderer=renderers.index(reference), drop=True)
 
     def kept(name: str) -> list[str]:
-        scene = {str(dim) for v in TEMPLATE if v.stage is Stage.scene and v.name in results
+        scene = {str(dim) for v in SCHEMA if v.stage is Stage.scene and v.name in results
                  for dim in results[v.name].dims}
         return ["renderer", *(str(dim) for dim in results[name].dims if dim not in scene)]
 
@@ -279,7 +279,7 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
         moved = np.subtract(pair.second["rotation"], pair.first["rotation"], dtype=np.float64)
         return norm_squared(np.degrees(moved))[..., None]
 
-    table = streamed(
+    table = aggregate(
         results, _both(corners(others), corners(results)), kept("detection"),
         [
             Rate("detection_disagreement", "differing of compared",
@@ -293,7 +293,7 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
         ],
         view=Pair,
     )
-    return table.drop_vars("draws").assign(streamed(
+    return table.drop_vars("draws").assign(aggregate(
         results, _both(errors(others), errors(results)), kept("estimate"),
         [
             Mean("range_bias_percent",

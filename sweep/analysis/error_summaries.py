@@ -15,8 +15,8 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import special
 
-from sweep.analysis.blocks import Bins, kept_of, streamed
-from sweep.analysis.poses import QUANTITIES, Poses, Quantity, errors, norm_squared, relative
+from sweep.analysis.blocks import Bins, aggregate, kept_of
+from sweep.analysis.pose_view import QUANTITIES, Poses, Quantity, errors, norm_squared, relative
 from sweep.analysis.rates import DETECTION_RATE, FLIP_RATE, SOLVED_RATE
 from sweep.analysis.statistics import (
     LEVEL,
@@ -30,9 +30,9 @@ from sweep.analysis.statistics import (
     StandardDeviation,
     Statistic,
 )
-from sweep.plan.template import XYZ
+from sweep.plan.schema import XYZ
+from sweep.typing import Floats
 
-Floats = NDArray[np.float64]
 Masks = NDArray[np.bool_]
 
 DEGREES_OF_FREEDOM = 6  # of a pose
@@ -109,7 +109,7 @@ def error_statistics(
     for quantity in QUANTITIES:
         statistics += statistics_of(quantity, with_reason=quantity is QUANTITIES[0])
     kept = kept_of(results, per)
-    return streamed(results, errors(results), kept, statistics, bins)
+    return aggregate(results, errors(results), kept, statistics, bins)
 
 
 def efficiency(
@@ -147,7 +147,7 @@ def efficiency(
     }
     statistics = [statistic for quantity, bound_squared in bounds.items()
                   for statistic in _with_its_bound(quantity, bound_squared)]
-    table = streamed(results, needed, kept, statistics, bins)
+    table = aggregate(results, needed, kept, statistics, bins)
     found: dict[str, xr.DataArray] = {}
     for quantity in bounds:
         least, meaning = table[quantity.named("bound")], f"RMS bound over RMS {quantity.words}"
@@ -241,7 +241,7 @@ def covariance_trust(
             Rate(f"joint {at}", "within the region of used", within, used, joint),
         ]
     needed = errors(results) | {"nees": nees}
-    table = streamed(results, needed, kept, statistics)
+    table = aggregate(results, needed, kept, statistics)
     level = xr.DataArray(nominal, dims="level", attrs={
         "long_name": "nominal probability of the covariance's region", "units": "1"})
 

@@ -7,12 +7,12 @@ Brown, Cai and DasGupta, "Interval Estimation for a Binomial Proportion", Statis
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import special
 
-Floats = NDArray[np.float64]
+from sweep.typing import Floats
 
-LARGEST_N = 10**15  # up to here n, n - successes and successes + 1/2 are exact in doubles
+MAX_N = 10**15  # up to here n, n - successes and successes + 1/2 are exact in doubles
 # With as many successes and failures, the Cornish-Fisher expansion is right to 3e-12; scipy's
 # inverse is off by up to 7e-12 below that, and by up to 1e-8 far above.
 MANY = 3e6
@@ -73,12 +73,12 @@ def _checked(
     successes, n = np.broadcast_arrays(
         np.asarray(successes, dtype=np.float64), np.asarray(n, dtype=np.float64)
     )
-    good = (successes >= 0) & (successes <= n) & (n <= LARGEST_N)
+    good = (successes >= 0) & (successes <= n) & (n <= MAX_N)
     bad = ~(good & (np.floor(successes) == successes) & (np.floor(n) == n))
     if bad.any():
         raise ValueError(
             f"successes = {successes[bad][0]:.17g}, n = {n[bad][0]:.17g}: "
-            f"give whole numbers with 0 <= successes <= n <= {LARGEST_N:.0e}"
+            f"give whole numbers with 0 <= successes <= n <= {MAX_N:.0e}"
         )
     return successes, n, float(level)
 

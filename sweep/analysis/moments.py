@@ -18,7 +18,8 @@ import numpy as np
 from numpy.lib.array_utils import normalize_axis_tuple
 from numpy.typing import ArrayLike, NDArray
 
-Floats = NDArray[np.float64]
+from sweep.typing import Floats
+
 Integers = NDArray[np.int64]
 
 

@@ -6,20 +6,18 @@ from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy import special, stats
 
 from sweep.analysis.blocks import axes_of, kept_of, listed
 from sweep.analysis.rates import detection_rate
 from sweep.errors import StoreError
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
-
-Floats = NDArray[np.float64]
+from sweep.typing import Floats
 
 SIGNIFICANCE = 0.05
 """Chance that any ID at all is called weak, or strong, where all are alike."""
 
-LEAST_SKEWNESS = 1e-6
+MIN_SKEWNESS = 1e-6
 """Below it the gamma distribution is normal to 1e-6, and its functions lose digits."""
 
 
@@ -123,7 +121,7 @@ def two_sided(deviation: Floats, variance: Floats, third: Floats) -> Floats:
         skewness = np.abs(third) / variance**1.5
         shape, scale = 4.0 / skewness**2, np.sqrt(variance) * skewness / 2.0
         upper, lower = sign * deviation - 0.5, sign * deviation + 0.5
-        symmetric = skewness < LEAST_SKEWNESS
+        symmetric = skewness < MIN_SKEWNESS
         above = np.where(
             symmetric, special.ndtr(-upper / np.sqrt(variance)),
             special.gammaincc(shape, np.maximum(upper, -shape * scale) / scale + shape))

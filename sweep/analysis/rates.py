@@ -9,10 +9,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sweep.analysis.blocks import Bins, kept_of, streamed
-from sweep.analysis.poses import Poses, detections, estimates
+from sweep.analysis.blocks import Bins, aggregate, kept_of
+from sweep.analysis.pose_view import Poses, detections, estimates
 from sweep.analysis.statistics import Rate
-from sweep.measure.flags import Detection, Estimate
+from sweep.measure.flags import DetectionStatus, EstimateStatus
 
 DETECTION_RATE = Rate(
     "detection_rate", "detected of looked_for", lambda poses: poses.detected,
@@ -75,7 +75,7 @@ def _rate(
     needed = estimates(results) if rate is FLIP_RATE else detections(results)
     full = Rate(rate.name, rate.meaning, rate.successes, rate.used, counts=counts,
                 with_jeffreys=True)
-    return streamed(results, needed, kept, [full], bins)
+    return aggregate(results, needed, kept, [full], bins)
 
 
 OUTCOMES = (
@@ -93,10 +93,10 @@ def outcome_of(outcome: str, poses: Poses) -> NDArray[np.bool_]:
     The detection's flag tells where the marker was not detected, the estimate's where it was.
     """
     ends = np.zeros(poses.estimate.shape, dtype=bool)
-    if outcome in Detection.__members__:
-        ends |= poses.inside & (poses.detection == Detection[outcome])
-    if outcome in Estimate.__members__:
-        ends |= poses.detected & (poses.estimate == Estimate[outcome])
+    if outcome in DetectionStatus.__members__:
+        ends |= poses.inside & (poses.detection == DetectionStatus[outcome])
+    if outcome in EstimateStatus.__members__:
+        ends |= poses.detected & (poses.estimate == EstimateStatus[outcome])
     return ends
 
 
@@ -122,7 +122,7 @@ def failure_composition(
              counts=((f"of {outcome}", ""), (f"count {outcome}", "")))
         for outcome in OUTCOMES
     ]
-    table = streamed(results, estimates(results), kept, rates, bins)
+    table = aggregate(results, estimates(results), kept, rates, bins)
     found = {}
     for name, begin, end, meaning in (
         ("count", "count ", "", "poses that ended so"),

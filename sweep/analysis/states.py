@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.analysis import tallies
+from sweep.analysis import radix_histogram as tallies
 from sweep.analysis.moments import Moments, merged
-from sweep.analysis.tallies import Tally
+from sweep.analysis.radix_histogram import Tally
 
 Masks = NDArray[np.bool_]
 State = dict[str, Any]

@@ -20,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from sweep.analysis import tallies
+from sweep.analysis import radix_histogram as tallies
 from sweep.analysis.intervals import jeffreys, wilson
 from sweep.analysis.moments import Moments
 from sweep.analysis.states import State
-from sweep.plan.template import cf_attributes
+from sweep.plan.schema import cf_attributes
+from sweep.typing import Floats
 
-Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Masks = NDArray[np.bool_]
 Found = dict[str, NDArray[Any]]
@@ -185,7 +185,7 @@ def in_draws(hits: Integers, n: Integers, draws: Integers) -> tuple[Integers, In
 
 # The records.
 
-class OneLook:
+class SinglePass:
     """What is known after one look: where all statistics are so, there is no second."""
 
     def between(self, first: State) -> State:
@@ -198,7 +198,7 @@ class OneLook:
 
 
 @dataclass(frozen=True)
-class Count(OneLook):
+class Count(SinglePass):
     """How many poses there are of a kind."""
 
     name: str
@@ -239,7 +239,7 @@ class Draws(Count):
 
 
 @dataclass(frozen=True)
-class Rate(OneLook):
+class Rate(SinglePass):
     """The share of ``used`` that are ``successes``, with Wilson's interval of a level.
 
     Pooled settings see the same draws: n of the interval is the number of draws, `draws_of`, and

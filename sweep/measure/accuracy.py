@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model.pose import angle_between, mirrored, vector_of_rotation
-
-Floats = NDArray[np.float64]
+from sweep.typing import Floats
 
 
 @dataclass(frozen=True, slots=True)

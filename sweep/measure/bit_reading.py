@@ -29,12 +29,12 @@ from numpy.typing import NDArray
 
 from sweep.measure.detector import DetectorSetting
 from sweep.model.marker import opencv_dictionary
+from sweep.typing import Floats
 
 STAYS_LOST = 0.4
 """Share of what the first quadrilateral loses that further ones do not find: the one fitted number,
 to DICT_5X5_50 with the renderer ``warp``, a black surround and the default settings."""
 
-Floats = NDArray[np.float64]
 Bits = NDArray[np.bool_]
 
 

@@ -13,11 +13,11 @@ from sweep.compilation import compiled
 from sweep.measure.likelihood import (
     BACKGROUND_MARGIN_PX,
     FIRST_LEVEL,
-    LEAST_NOISE,
-    LEAST_SPREAD_PX,
+    MIN_NOISE,
+    MIN_SPREAD_PX,
     SETTLED,
     SPREAD,
-    Sight,
+    MarkerView,
     curvature,
     fit,
     mirrored_state,
@@ -34,8 +34,7 @@ from sweep.model.declaration import parameter
 from sweep.model.derivatives import POSE
 from sweep.model.effects import NEUTRAL
 from sweep.model.scene import Scenes
-
-Floats = NDArray[np.float64]
+from sweep.typing import Floats
 
 CLIPPING_DEVIATIONS = 2.0
 """Standard deviations that every grey level must keep from the ends of the scale."""
@@ -61,7 +60,7 @@ class BoundSetting:
     )
 
 
-class Bound(IntEnum):
+class BoundStatus(IntEnum):
     """What became of the bound."""
 
     not_run = 0
@@ -85,7 +84,7 @@ class Bounds:
     Attributes
     ----------
     status
-        (N,) :class:`Bound`.
+        (N,) :class:`BoundStatus`.
     std
         (N, 6) least standard deviations of an unbiased estimate: rotation about the camera's x, y
         and z in radians, position along them in metres.
@@ -104,7 +103,7 @@ class Bounds:
 
 @compiled
 def curvature_at_truth(
-    state: Floats, sight: Sight, height: int, width: int, spread_free: bool
+    state: Floats, sight: MarkerView, height: int, width: int, spread_free: bool
 ) -> tuple[Floats, bool]:
     """Return the Cramér-Rao bound's covariance (6, 6), and whether there is one."""
     free = POSE + 1 if spread_free else POSE
@@ -133,7 +132,7 @@ def depth_nonlinearity(covariance: Floats, state: Floats) -> float:
 
 @compiled
 def mirror_chi_square(
-    state: Floats, sight: Sight, height: int, width: int, spread_free: bool
+    state: Floats, sight: MarkerView, height: int, width: int, spread_free: bool
 ) -> float:
     """Return the noise-free chi-square of the minimum that is reached from the mirrored pose.
 
@@ -168,7 +167,7 @@ def bounds(
     (1993), section 3.9, with analytic derivatives (:mod:`sweep.model.derivatives`).
     """
     count = len(rows)
-    status = np.full(count, Bound.given, dtype=np.uint8)
+    status = np.full(count, BoundStatus.given, dtype=np.uint8)
     std, kappa, mirror = np.full((count, POSE), np.nan), *np.full((2, count), np.nan)
     frames = scenes.frame[rows]
     low = np.maximum(boxes[:, :2] - BACKGROUND_MARGIN_PX, 0)
@@ -184,12 +183,12 @@ def bounds(
             name not in MODELLED for name in scenes.active(row)
         )
         if unmodelled:
-            status[i] = Bound.not_in_model
-        elif noise < LEAST_NOISE:
-            status[i] = Bound.no_noise
+            status[i] = BoundStatus.not_in_model
+        elif noise < MIN_NOISE:
+            status[i] = BoundStatus.no_noise
         elif levels.min() < margin or levels.max() > 255 - margin:
-            status[i] = Bound.clipped
-        if status[i] != Bound.given:
+            status[i] = BoundStatus.clipped
+        if status[i] != BoundStatus.given:
             continue
         cameras = scenes.cameras
         sight = sight_of(
@@ -199,11 +198,11 @@ def bounds(
         state = state_of(scenes.rotation[row], scenes.translation[row], blur, levels)
         width, height = (high[i] - low[i]).tolist()
         if unknown_blur:
-            state[SPREAD] = max(state[SPREAD], LEAST_SPREAD_PX)
+            state[SPREAD] = max(state[SPREAD], MIN_SPREAD_PX)
         covariance, found = curvature_at_truth(state, sight, height, width, unknown_blur)
         # Half a turn is no knowledge: rounding has made a singular problem a regular one.
         if not found or np.diag(covariance)[:3].max() > math.pi**2:
-            status[i] = Bound.no_contrast
+            status[i] = BoundStatus.no_contrast
             continue
         std[i] = np.sqrt(np.diag(covariance))
         kappa[i] = depth_nonlinearity(covariance, state)

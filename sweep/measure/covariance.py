@@ -11,8 +11,7 @@ from sweep.model.camera import Cameras
 from sweep.model.derivatives import POSE, velocity
 from sweep.model.marker import marker_corners
 from sweep.model.pose import placed
-
-Floats = NDArray[np.float64]
+from sweep.typing import Floats
 
 
 def corner_covariance(

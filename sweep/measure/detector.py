@@ -151,7 +151,7 @@ class DetectorSetting:
 ALIGNMENT_PX = 4
 """Windows begin and end at multiples of this: the tiles of the apriltag search are 4 px wide."""
 
-SMALLEST_WINDOW_PX = 8
+MIN_WINDOW_PX = 8
 
 
 def full_frame_reason(setting: DetectorSetting) -> str | None:
@@ -208,11 +208,11 @@ def windows(
     start = (boxes[:, :2] - margin) // ALIGNMENT_PX * ALIGNMENT_PX
     stop = -((-boxes[:, 2:] - margin) // ALIGNMENT_PX) * ALIGNMENT_PX
     start = np.maximum(start, 0)
-    stop = np.maximum(stop, start + SMALLEST_WINDOW_PX)
+    stop = np.maximum(stop, start + MIN_WINDOW_PX)
     over = stop - np.minimum(stop, frame)
     start = np.where(
-        (over > 0) & (stop - over - start < SMALLEST_WINDOW_PX),
-        np.maximum(frame - SMALLEST_WINDOW_PX, 0) // ALIGNMENT_PX * ALIGNMENT_PX,
+        (over > 0) & (stop - over - start < MIN_WINDOW_PX),
+        np.maximum(frame - MIN_WINDOW_PX, 0) // ALIGNMENT_PX * ALIGNMENT_PX,
         start,
     )
     return np.concatenate([start, stop - over], axis=1)
@@ -225,7 +225,7 @@ Found = tuple[
 in 4, None where n is 0; and corners of what was rejected."""
 
 
-Search = Callable[[NDArray[np.uint8]], Found]
+SearchFunction = Callable[[NDArray[np.uint8]], Found]
 
 
 class Detector:
@@ -242,14 +242,14 @@ class Detector:
             elif value == getattr(defaults, field.name):
                 continue
             setattr(self._parameters, field.name, value)
-        self._searches: dict[tuple[str, int, int], Search] = {}
+        self._searches: dict[tuple[str, int, int], SearchFunction] = {}
 
     def find(self, image: NDArray[np.uint8], dictionary: str, frame_side: int) -> Found:
         """Search an image (h, w): a window of a frame whose larger side is ``frame_side``."""
         key = dictionary, max(image.shape), frame_side
         return (self._searches.get(key) or self._search(*key))(image)
 
-    def _search(self, dictionary: str, side: int, frame_side: int) -> Search:
+    def _search(self, dictionary: str, side: int, frame_side: int) -> SearchFunction:
         """Return OpenCV's search for images whose larger side is ``side``; one a size is kept.
 
         The perimeter limits, which OpenCV takes relative to the image that it is given and turns
@@ -263,6 +263,6 @@ class Detector:
         parameters.minMarkerPerimeterRate, parameters.maxMarkerPerimeterRate = low, high
         detector = cv2.aruco.ArucoDetector(opencv_dictionary(dictionary), parameters)
         # OpenCV's stubs know neither the element types nor that there may be no ids.
-        search = cast("Search", detector.detectMarkers)
+        search = cast("SearchFunction", detector.detectMarkers)
         self._searches[dictionary, side, frame_side] = search
         return search

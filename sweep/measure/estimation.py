@@ -10,15 +10,14 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.measure.flags import Estimate
+from sweep.measure.flags import EstimateStatus
 from sweep.model.camera import Cameras
 from sweep.model.marker import MarkerKey
-
-Floats = NDArray[np.float64]
+from sweep.typing import Floats
 
 
 @dataclass(frozen=True, slots=True)
-class Sightings:
+class Detections:
     """N detected markers, with all that is believed of them.
 
     Attributes
@@ -44,9 +43,9 @@ class Sightings:
     images: Sequence[NDArray[np.uint8]]
     origins: NDArray[np.int64]
 
-    def take(self, rows: NDArray[np.intp]) -> Sightings:
+    def take(self, rows: NDArray[np.intp]) -> Detections:
         """Return the sightings of the given rows."""
-        return Sightings(
+        return Detections(
             self.corners[rows], self.cameras.take(rows), self.size_m[rows], self.noise_grey[rows],
             self.blur_px[rows], [self.markers[row] for row in rows],
             [self.images[row] for row in rows] if len(self.images) else [], self.origins[rows],
@@ -75,7 +74,7 @@ class Estimates:
     """(N,) variance of the pixels' residuals over what noise and rounding make"""
 
     @staticmethod
-    def none(count: int, status: Estimate) -> Estimates:
+    def none(count: int, status: EstimateStatus) -> Estimates:
         """Return ``count`` estimates that do not exist, all with one status."""
         shapes = ((3, 3), (3,), (), (3, 3), (), (6, 6), ())
         return Estimates(
@@ -92,7 +91,7 @@ class Estimates:
         )
 
 
-class EstimatorProtocol(Protocol):
+class PoseEstimator(Protocol):
     """Anything that makes poses of sightings: from corners, or from the pixels as well."""
 
     @property
@@ -100,6 +99,6 @@ class EstimatorProtocol(Protocol):
         """Whether sightings must carry their images."""
         ...
 
-    def __call__(self, sightings: Sightings) -> Estimates:
+    def __call__(self, sightings: Detections) -> Estimates:
         """Return one estimate a sighting; where there is none, its status says why."""
         ...

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 
 
-class Detection(IntEnum):
+class DetectionStatus(IntEnum):
     """What the detector made of the marker.
 
     "There" means: the quadrilateral's centre lies inside the true quadrilateral.
@@ -30,7 +30,7 @@ class Detection(IntEnum):
     """The process died."""
 
 
-class Estimate(IntEnum):
+class EstimateStatus(IntEnum):
     """What the solver made of the corners."""
 
     not_run = 0

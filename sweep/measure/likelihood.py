@@ -18,8 +18,7 @@ from sweep.compilation import compiled
 from sweep.model.derivatives import LEVELS, POSE, differentiate, normal_equations
 from sweep.model.marker import MarkerKey, edges, module_count
 from sweep.model.pose import rotations, vectors
-
-Floats = NDArray[np.float64]
+from sweep.typing import Floats
 
 STATE = 16
 """Length of a state: rotation (9, row by row), translation (3), point spread, levels (3)."""
@@ -27,18 +26,18 @@ STATE = 16
 SPREAD, FIRST_LEVEL = 12, 13
 """Where in a state the point spread and the levels are."""
 
-LEAST_SPREAD_PX = 0.1
+MIN_SPREAD_PX = 0.1
 """The sharpest point spread that is estimated; a sharper one is none, and stays so."""
 
-LARGEST_TURN = 0.3
-LARGEST_SHIFT = 0.1
+MAX_TURN = 0.3
+MAX_SHIFT = 0.1
 """Largest step: radians, and share of the distance."""
 
 SETTLED, NEARLY_SETTLED = 1e-4, 1e-2
 """Squared standard deviations that an undamped step may still go: then it is the last. Where the
 second minimum has just vanished steps get ever shorter: the larger will do for these."""
 
-LEAST_NOISE = 0.5
+MIN_NOISE = 0.5
 """Grey levels of noise below which quantisation is no noise of its own, uniform and independent."""
 
 QUANTISATION_VARIANCE = 1 / 12
@@ -51,7 +50,7 @@ PATIENCE = 2
 """Steps in a row that must foresee an end above what is worth while, to give up."""
 
 
-class Sight(NamedTuple):
+class MarkerView(NamedTuple):
     """What is known of an image beside its pixels: the marker, its size, and the camera.
 
     ``ends`` (E, 4) and ``sides`` (E, 2) are the marker's edges, ``corner`` (2,) the least and the
@@ -91,12 +90,12 @@ def work_space(height: int, width: int) -> Work:
 def sight_of(
     marker: MarkerKey, size_m: float, view: Floats, lens: Floats, distorted: bool,
     corner: NDArray[np.int64], variance: float,
-) -> Sight:
+) -> MarkerView:
     """Return what is known of a marker's image whose first pixel is ``corner`` (2,)."""
     outlines, modules = edges(*marker), module_count(marker[0])
     local = view.copy()
     local[2:] -= corner
-    return Sight(
+    return MarkerView(
         outlines.ends, outlines.sides, np.array([-marker[2], modules + marker[2]]),
         float(modules), float(size_m), local, lens, bool(distorted), float(variance),
     )
@@ -152,7 +151,7 @@ def solve_positive(matrix: Floats, right: Floats) -> bool:
 
 
 @compiled
-def plane_of(state: Floats, sight: Sight) -> Floats:
+def plane_of(state: Floats, sight: MarkerView) -> Floats:
     """Return what takes module coordinates to the camera frame (3, 3), as ``Scenes.plane``."""
     module, half = sight.size_m / sight.modules, 0.5 * sight.size_m
     plane = np.empty((3, 3))
@@ -164,7 +163,7 @@ def plane_of(state: Floats, sight: Sight) -> Floats:
 
 
 @compiled
-def is_before_camera(state: Floats, sight: Sight) -> bool:
+def is_before_camera(state: Floats, sight: MarkerView) -> bool:
     """Tell whether the marker faces the camera, with all of its outline in front of it."""
     plane = plane_of(state, sight)
     facing = 0.0
@@ -180,7 +179,7 @@ def is_before_camera(state: Floats, sight: Sight) -> bool:
 
 @compiled
 def curvature(
-    image: Floats, state: Floats, sight: Sight, work: Work, spread_free: bool,
+    image: Floats, state: Floats, sight: MarkerView, work: Work, spread_free: bool,
     information: Floats, gradient: Floats,
 ) -> float:
     """Solve for the levels at a state; write the Fisher information of what else is free.
@@ -243,8 +242,8 @@ def moved_state(state: Floats, step: Floats, most: float) -> Floats:
     """Return the state after a step, shortened to the largest turn and shift times ``most``."""
     turn = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
     shift = math.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
-    shrink = min(1.0, most * LARGEST_TURN / max(turn, 1e-300))
-    shrink = min(shrink, most * LARGEST_SHIFT / max(shift, 1e-300))
+    shrink = min(1.0, most * MAX_TURN / max(turn, 1e-300))
+    shrink = min(shrink, most * MAX_SHIFT / max(shift, 1e-300))
     moved = state.copy()
     rotation = rotations(shrink * step[:3].copy().reshape(1, 3))[0]
     for i in range(3):
@@ -258,13 +257,13 @@ def moved_state(state: Floats, step: Floats, most: float) -> Floats:
         # At most to four times the variance, or a quarter of it, and a third of a pixel more.
         wanted = min(squared + shrink * step[POSE], 4.0 * squared + 0.1)
         wanted = max(wanted, 0.25 * squared)
-        moved[SPREAD] = math.sqrt(wanted) if wanted >= LEAST_SPREAD_PX**2 else 0.0
+        moved[SPREAD] = math.sqrt(wanted) if wanted >= MIN_SPREAD_PX**2 else 0.0
     return moved
 
 
 @compiled
 def fit(
-    image: Floats, square_sum: float, state: Floats, sight: Sight, work: Work,
+    image: Floats, square_sum: float, state: Floats, sight: MarkerView, work: Work,
     spread_free: bool, most_steps: int, settled: float, worth: float, information: Floats,
 ) -> tuple[float, bool]:
     """Move ``state`` to the nearest maximum of the likelihood.
@@ -345,13 +344,13 @@ def binned(image: Floats) -> Floats:
 
 
 @compiled
-def binned_sight(sight: Sight) -> Sight:
+def binned_sight(sight: MarkerView) -> MarkerView:
     """Return the sight of an image of 2 x 2 pixels' means: the exact model holds for it too."""
     view = np.empty(4)
     for k in range(2):
         view[k] = 0.5 * sight.intrinsics[k]
         view[2 + k] = 0.5 * (sight.intrinsics[2 + k] + 0.5) - 0.5
-    return Sight(
+    return MarkerView(
         sight.ends, sight.sides, sight.corner, sight.modules, sight.size_m, view, sight.lens,
         sight.distorted, 0.25 * sight.variance,
     )

@@ -15,19 +15,18 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sweep.compilation import compiled
-from sweep.measure.estimation import Estimates, Sightings
-from sweep.measure.flags import Estimate
+from sweep.measure.estimation import Detections, Estimates
+from sweep.measure.flags import EstimateStatus
 from sweep.measure.likelihood import (
     BACKGROUND_MARGIN_PX,
-    LEAST_NOISE,
+    MIN_NOISE,
     NEARLY_SETTLED,
     SETTLED,
     SPREAD,
     STATE,
-    Sight,
+    MarkerView,
     Work,
     binned,
     binned_sight,
@@ -45,8 +44,7 @@ from sweep.measure.likelihood import (
 from sweep.measure.solver import both_planar_solutions, reprojection_errors_px
 from sweep.model.derivatives import LEVELS, POSE
 from sweep.model.marker import module_count
-
-Floats = NDArray[np.float64]
+from sweep.typing import Floats
 
 COARSE_STEPS = 15
 FINE_STEPS = 30
@@ -66,7 +64,7 @@ EXCESS = 5.0
 
 @compiled
 def coarse_fit(
-    coarse: Floats, total: float, state: Floats, sight: Sight, work: Work, spread_free: bool,
+    coarse: Floats, total: float, state: Floats, sight: MarkerView, work: Work, spread_free: bool,
     worth: float,
 ) -> float:
     """Fit a state to the means of 2 x 2 pixels, whose point spread is half as wide."""
@@ -94,7 +92,7 @@ def is_settled(chi_square: Floats, states: Floats, k: int) -> bool:
 
 @compiled
 def locate(
-    image: Floats, starts: Floats, sight: Sight, spread_free: bool, information: Floats
+    image: Floats, starts: Floats, sight: MarkerView, spread_free: bool, information: Floats
 ) -> tuple[Floats, float, bool, Floats, float]:
     """Return the most likely pose, and the next minimum.
 
@@ -188,7 +186,7 @@ def explains(chi_square: float, freedom: int, noise_grey: float) -> bool:
     of rounding, which are smaller wherever the levels are whole numbers: only an excess counts.
     """
     away = (chi_square / freedom - 1.0) * math.sqrt(freedom / 2.0)
-    return abs(away) <= EXCESS if noise_grey >= LEAST_NOISE else away <= EXCESS
+    return abs(away) <= EXCESS if noise_grey >= MIN_NOISE else away <= EXCESS
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,10 +205,10 @@ class Photometric:
         """Pixels are what it fits."""
         return True
 
-    def __call__(self, sightings: Sightings) -> Estimates:
+    def __call__(self, sightings: Detections) -> Estimates:
         """Return the poses, with the covariances of the likelihood's own curvature."""
         count = len(sightings.corners)
-        out = Estimates.none(count, Estimate.solver_failed)
+        out = Estimates.none(count, EstimateStatus.solver_failed)
         sets = [sightings.corners]
         if self.refined:
             sets.append(_refined(sightings))
@@ -242,11 +240,11 @@ class Photometric:
             if not math.isfinite(chi_square) or freedom < 1:
                 continue
             if not reached:
-                out.status[i] = Estimate.not_converged
+                out.status[i] = EstimateStatus.not_converged
                 continue
             out.status[i] = (
-                Estimate.solved if explains(chi_square, freedom, noise)
-                else Estimate.not_explained
+                EstimateStatus.solved if explains(chi_square, freedom, noise)
+                else EstimateStatus.not_explained
             )
             out.rotation[i], out.translation[i] = state[:9].reshape(3, 3), state[9:12]
             out.alternative_rotation[i] = other[:9].reshape(3, 3)
@@ -268,7 +266,7 @@ class Photometric:
         return np.asarray(states[np.isfinite(states).all(axis=1)])
 
     @staticmethod
-    def _reprojection_px(state: Floats, sightings: Sightings, i: int) -> float:
+    def _reprojection_px(state: Floats, sightings: Detections, i: int) -> float:
         one = np.array([i])
         return float(
             reprojection_errors_px(
@@ -278,7 +276,7 @@ class Photometric:
         )
 
 
-def _windows(sightings: Sightings) -> list[list[int]]:
+def _windows(sightings: Detections) -> list[list[int]]:
     """Return what is fitted of each image: left, top, right, bottom around the quiet zone.
 
     A share of the corners' extent as wide as the quiet zone, and half of that for perspective.
@@ -295,7 +293,7 @@ def _windows(sightings: Sightings) -> list[list[int]]:
     return windows
 
 
-def _refined(sightings: Sightings) -> Floats:
+def _refined(sightings: Detections) -> Floats:
     """Return the corners (N, 4, 2) after ``cv2.cornerSubPix``, its window OpenCV's for markers."""
     refined = sightings.corners.copy()
     for i, image in enumerate(sightings.images):

@@ -11,14 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.measure.covariance import corner_covariance
-from sweep.measure.estimation import Estimates, Sightings
-from sweep.measure.flags import Estimate
+from sweep.measure.estimation import Detections, Estimates
+from sweep.measure.flags import EstimateStatus
 from sweep.model.camera import Cameras
 from sweep.model.declaration import parameter
 from sweep.model.marker import marker_corners
 from sweep.model.pose import placed, rotation_of_vector
-
-Floats = NDArray[np.float64]
+from sweep.typing import Floats
 
 SOLVERS = {
     "ippe": cv2.SOLVEPNP_IPPE,
@@ -34,7 +33,7 @@ BELIEVED = "as the estimator believes it (default: the truth)"
 
 
 @dataclass(frozen=True, slots=True)
-class Estimator:
+class EstimatorSetting:
     """How the pose is computed from the corners, and what is believed of camera and marker."""
 
     solver: str = parameter(
@@ -127,7 +126,9 @@ def estimate(
         reprojection[~solved[:, 0], k] = np.nan
     count = len(corners)
     return Estimates(
-        status=np.where(solved[:, 0], Estimate.solved, Estimate.solver_failed).astype(np.uint8),
+        status=np.where(solved[:, 0], EstimateStatus.solved, EstimateStatus.solver_failed).astype(
+            np.uint8
+        ),
         rotation=rotation[:, 0],
         translation=translation[:, 0],
         reprojection_px=reprojection[:, 0],
@@ -142,14 +143,14 @@ def estimate(
 class CornerSolver:
     """OpenCV's solvers as estimators: poses from corners alone."""
 
-    setting: Estimator
+    setting: EstimatorSetting
 
     @property
     def needs_images(self) -> bool:
         """Corners are all that it looks at."""
         return False
 
-    def __call__(self, sightings: Sightings) -> Estimates:
+    def __call__(self, sightings: Detections) -> Estimates:
         """Return the poses, with covariances where the corners' noise is told."""
         setting = self.setting
         found = estimate(

@@ -153,7 +153,7 @@ def _add_projected(
 REACH = 5.0
 """Standard deviations at which the point spread ends; 6e-7 of it lies beyond."""
 
-SHORTEST_PANEL_PX = 0.015
+MIN_PANEL_PX = 0.015
 
 NODES = (0.1127016653792583, 0.5, 0.8872983346207417)
 WEIGHTS = (0.2777777777777778, 0.4444444444444444, 0.2777777777777778)
@@ -257,7 +257,7 @@ def _add_spread(
     reach = REACH * sigma + 0.5
     height, width = cover.shape[0], cover.shape[1] - 2
     length = math.hypot(xb - xa, yb - ya)
-    panels = math.ceil(length / max(1.5 * sigma, SHORTEST_PANEL_PX))
+    panels = math.ceil(length / max(1.5 * sigma, MIN_PANEL_PX))
     dy = (yb - ya) / panels
     steps = np.empty(width)
     for panel in range(panels):

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.model.coverage import (
+    MIN_PANEL_PX,
     NODES,
     REACH,
-    SHORTEST_PANEL_PX,
     WEIGHTS,
     accumulate,
     bent,
@@ -32,8 +32,7 @@ from sweep.model.coverage import (
     spread_below,
 )
 from sweep.model.lens import distort, jacobian
-
-Floats = NDArray[np.float64]
+from sweep.typing import Floats
 
 POSE = 6
 """Parameters of a pose; the point spread, where its slope is asked for, is one more."""
@@ -107,7 +106,7 @@ def _add_spread(
     height, width = place.shape
     reach = REACH * sigma + 0.5
     dx, dy = xb - xa, yb - ya
-    panels = math.ceil(math.hypot(dx, dy) / max(1.5 * sigma, SHORTEST_PANEL_PX))
+    panels = math.ceil(math.hypot(dx, dy) / max(1.5 * sigma, MIN_PANEL_PX))
     most = int(2 * reach) + 3
     near, slope = np.empty((2, most)), np.empty((2, most))
     normal = 1.0 / (sigma * math.sqrt(2.0 * math.pi))

@@ -13,15 +13,14 @@ from sweep.model.extent import corner_depths, outline_modules, path_px, spread_p
 from sweep.model.marker import edges, occluded_edges
 from sweep.model.motion import moved, outline_extent
 from sweep.model.scene import Box, Scenes
-
-Floats = NDArray[np.float64]
+from sweep.typing import Floats
 
 SHARP_PANEL_PX = 3 / 16
 """Path of a corner between groups of three instants: kinks of the mean over the exposure then
 cost at most 0.12 grey levels."""
 
-MOST_PANELS = 4093
-MOST_ROW_PANELS = 509
+MAX_PANELS = 4093
+MAX_ROW_PANELS = 509
 """Most panels of an exposure, and of each row's; primes, so that no turn falls in with them."""
 
 SHARPEST_PX = 0.05
@@ -56,7 +55,7 @@ def marker_exposure(scenes: Scenes, row: int, box: Box, levels: Floats) -> Float
     exposure_s, row_time_s, velocity = (0.0, 0.0, np.zeros(6)) if motion is None else motion
     for image, sigma in zip(images, spread, strict=True):
         panel = max(SHARP_PANEL_PX, 1.5 * sigma)
-        panels = math.ceil(min(path / panel, MOST_PANELS if row_time_s == 0 else MOST_ROW_PANELS))
+        panels = math.ceil(min(path / panel, MAX_PANELS if row_time_s == 0 else MAX_ROW_PANELS))
         _expose(
             cover, outline, outlines.ends, outlines.sides, levels, plane, scenes.translation[row],
             scenes.cameras.view[row], scenes.cameras.lenses[row],

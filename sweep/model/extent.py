@@ -14,8 +14,7 @@ from sweep.model.marker import marker_corners
 from sweep.model.motion import MEANINGLESS, UNSEEN, row_times, track
 from sweep.model.pose import placed
 from sweep.model.scene import Box, Scenes
-
-Floats = NDArray[np.float64]
+from sweep.typing import Floats
 
 WARP_PX_PER_MODULE = 10
 """Resolution of the bitmap that the ``warp`` renderer maps (the paper's)."""
@@ -98,7 +97,7 @@ def _warp_extent(scenes: Scenes, rows: NDArray[np.intp]) -> tuple[Floats, Floats
     return low, high
 
 
-FEWEST_INSTANTS, MOST_INSTANTS = 65, 8193
+MIN_INSTANTS, MAX_INSTANTS = 65, 8193
 """Instants at which a moving marker is looked at for its extent; a step is added all around."""
 
 _COARSE_TURN = math.pi / 8
@@ -129,8 +128,8 @@ def _exposed_extent(
     height = int(scenes.frame[row, 1])
     begin, end = row_times(0, height, height, exposure_s, row_time_s)
     turn = float(np.linalg.norm(velocity[3:])) * (end - begin)
-    wanted = max(FEWEST_INSTANTS, (end - begin) / row_time_s if row_time_s > 0 else 0.0)
-    count = int(min(max(wanted, 2 * turn / _COARSE_TURN), MOST_INSTANTS))
+    wanted = max(MIN_INSTANTS, (end - begin) / row_time_s if row_time_s > 0 else 0.0)
+    count = int(min(max(wanted, 2 * turn / _COARSE_TURN), MAX_INSTANTS))
     times = np.linspace(begin, end, count)
     cameras = scenes.cameras
     extents, states = track(
@@ -207,7 +206,7 @@ def path_px(scenes: Scenes, row: int, box: Box) -> float:
     for line in (box[1], (box[1] + box[3]) // 2, box[3] - 1):
         times = np.linspace(
             *row_times(line, line + 1, int(scenes.frame[row, 1]), exposure_s, row_time_s),
-            FEWEST_INSTANTS,
+            MIN_INSTANTS,
         )
         extents, states = track(
             scenes.plane[row], scenes.translation[row], still, cameras.view[row],

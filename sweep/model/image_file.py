@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-MOST_PIXELS = 500_000_000
+MAX_PIXELS = 500_000_000
 """The largest image that is read; also the largest frame that is rendered whole."""
 
 HEADER_BYTES = 1_000_000
@@ -21,7 +21,7 @@ HEADER_BYTES = 1_000_000
 BYTES_PER_PIXEL = 8
 """The most that a pixel takes in a file, beside the header: four channels of 16 bits."""
 
-LONGEST_PATH = 4096
+MAX_PATH_LENGTH = 4096
 
 JPEG = b"\xff\xd8\xff"
 """How such a file begins."""
@@ -38,7 +38,7 @@ def read_regular(path: str | Path, most: int) -> bytes:
     OSError, ValueError
         Where there is no such file, it cannot be read, or is no regular file.
     """
-    if len(str(path)) > LONGEST_PATH:
+    if len(str(path)) > MAX_PATH_LENGTH:
         raise ValueError("File name too long")
     if not stat.S_ISREG(Path(path).stat().st_mode):
         raise ValueError("Is a directory" if Path(path).is_dir() else "Not a regular file")
@@ -59,8 +59,8 @@ def image_size(path: str) -> tuple[int, int]:
     if size is None:
         raise ValueError("not an image that OpenCV can read: a PNG, JPEG, BMP or PGM")
     width, height = size
-    if not 0 < width * height <= MOST_PIXELS:
-        raise ValueError(f"{width} x {height}; at most {MOST_PIXELS:,} pixels are read")
+    if not 0 < width * height <= MAX_PIXELS:
+        raise ValueError(f"{width} x {height}; at most {MAX_PIXELS:,} pixels are read")
     if total > BYTES_PER_PIXEL * width * height + HEADER_BYTES:
         raise ValueError(f"{total:,} bytes are too many for an image of {width} x {height}")
     return width, height

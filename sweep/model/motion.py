@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.model.lens import distort, jacobian
-
-Floats = NDArray[np.float64]
+from sweep.typing import Floats
 
 
 @compiled

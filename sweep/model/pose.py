@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.model.declaration import parameter
-
-Floats = NDArray[np.float64]
+from sweep.typing import Floats
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,8 @@ from sweep.model.declaration import parameter
 from sweep.model.effects import NEUTRAL, SWITCHES, VELOCITIES, Effects, is_on
 from sweep.model.marker import MarkerKey, marker_corners, module_count
 from sweep.model.pose import placed, rotation_of_angles
+from sweep.typing import Floats
 
-Floats = NDArray[np.float64]
 Key = TypeVar("Key")
 Box = tuple[int, int, int, int]
 """Left, top, right, bottom in pixels of the frame; half-open."""

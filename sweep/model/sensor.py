@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.model.coverage import ROUNDING_SNAP
-from sweep.model.mixing import mixed
+from sweep.model.splitmix import mixed
 
 _PIXEL_STEP = np.uint64(0x9E3779B97F4A7C15)
 _DRAW_STEP = np.uint64(0xD1342543DE82EF95)

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.plan.faults import shown
+from sweep.messages import shown
 from sweep.plan.parameters import PARAMETERS, Parameter, Stage
 
 TRIAL = "trial"
 """The axis of repeated draws; a scene dimension with coordinates 0, 1, 2, ..."""
 
-MOST_VALUES = 10**9
+MAX_VALUES = 10**9
 """The longest axis (``range`` and ``trial``; they are never written out)."""
 
-MOST_LISTED = 10**6
+MAX_LISTED = 10**6
 """The longest axis of any other form; also the most values of all such axes together."""
 
 
@@ -108,13 +108,13 @@ AXIS_FORMS = {
 DISTRIBUTION_FORMS = {"uniform": "[a, b] with a < b", "normal": "[mean, sd] with sd > 0"}
 
 
-LONGEST_WORD = 60
+MAX_WORD_LENGTH = 60
 """Words beyond this length are like no known one."""
 
 
 def nearest(word: str, known: Sequence[str]) -> str:
     """Return "; did you mean ...?" for the nearest known word, or nothing."""
-    if len(word) > LONGEST_WORD:
+    if len(word) > MAX_WORD_LENGTH:
         return ""
     close = [name for name in known if word and name.startswith(word)]
     close = close or difflib.get_close_matches(word, known, n=1, cutoff=0.5)
@@ -155,12 +155,12 @@ def parse_distribution(parameter: Parameter, table: dict[str, Any]) -> Distribut
 
 def parse_trial(value: Any) -> Axis:
     """Return the axis that ``trial = N`` stands for; ValueError where N is no count."""
-    if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= MOST_VALUES:
-        raise ValueError(f"a whole number from 1 to {MOST_VALUES:,}: how many draws")
+    if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= MAX_VALUES:
+        raise ValueError(f"a whole number from 1 to {MAX_VALUES:,}: how many draws")
     return Axis(TRIAL, range(value))
 
 
-def parse_axis(parameter: Parameter, given: Any, room: int = MOST_LISTED) -> Axis:
+def parse_axis(parameter: Parameter, given: Any, room: int = MAX_LISTED) -> Axis:
     """Return the axis that a list or a table such as ``{ geom = [0.05, 1, 40] }`` stands for.
 
     It lists ``room`` values at most. ValueError with what was expected where it cannot be one.
@@ -217,7 +217,7 @@ def _bounded(values: Sequence[Any], room: int) -> Sequence[Any]:
 
 
 def _too_many() -> ValueError:
-    return ValueError(f"at most {MOST_LISTED:,} values, all axes together")
+    return ValueError(f"at most {MAX_LISTED:,} values, all axes together")
 
 
 def _expand(form: str, ends: list[Any], room: int) -> Sequence[Any]:
@@ -235,8 +235,8 @@ def _expand(form: str, ends: list[Any], room: int) -> Sequence[Any]:
         if any(abs(end) > 2**62 for end in ends):
             raise wanted
         values = range(*ends)
-        if len(values) > MOST_VALUES:
-            raise ValueError(f"at most {MOST_VALUES:,} values")
+        if len(values) > MAX_VALUES:
+            raise ValueError(f"at most {MAX_VALUES:,} values")
         return values
     if len(ends) != 3:
         raise wanted

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion, intrinsics
-from sweep.model.mixing import mixed
+from sweep.model.splitmix import mixed
 from sweep.plan.axes import Distribution
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
 

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.measure.detector import DetectorSetting
-from sweep.measure.solver import Estimator
+from sweep.measure.solver import EstimatorSetting
 from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion, intrinsics
 from sweep.model.effects import RANDOM, is_on
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.draws import bits, geometry_keys, uniform
+from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import PARAMETERS, Stage
-from sweep.plan.pipeline import Pipeline
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -205,9 +205,9 @@ def detector_settings(pipeline: Pipeline) -> list[DetectorSetting]:
     ]
 
 
-def estimators(pipeline: Pipeline) -> list[Estimator]:
+def estimators(pipeline: Pipeline) -> list[EstimatorSetting]:
     """Return the estimators of the grid, in the order of its estimation axes."""
     return [
-        Estimator(**_setting(pipeline, "estimator", chosen))
+        EstimatorSetting(**_setting(pipeline, "estimator", chosen))
         for chosen in combinations(pipeline.axes_of(Stage.estimation))
     ]

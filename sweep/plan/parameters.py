@@ -12,7 +12,7 @@ from typing import Any
 
 from sweep.measure.bound import BoundSetting
 from sweep.measure.detector import DetectorSetting
-from sweep.measure.solver import Estimator
+from sweep.measure.solver import EstimatorSetting
 from sweep.model.camera import Camera
 from sweep.model.declaration import Declaration
 from sweep.model.effects import Effects
@@ -37,7 +37,7 @@ SECTIONS: dict[str, tuple[tuple[type, ...], Stage]] = {
     "pose": ((Pose,), Stage.scene),
     "scene": ((Scene, Effects, BoundSetting), Stage.scene),
     "detector": ((DetectorSetting,), Stage.detection),
-    "estimator": ((Estimator,), Stage.estimation),
+    "estimator": ((EstimatorSetting,), Stage.estimation),
 }
 """Section of a pipeline file -> the dataclasses that declare its parameters, and their stage."""
 

@@ -6,17 +6,17 @@ import re
 import tomllib
 from typing import Any
 
-from sweep.plan.faults import plain
+from sweep.messages import plain
 
-MOST_BYTES = 250_000
+MAX_BYTES = 250_000
 """The largest text that is read."""
 
-MOST_PARTS = 8
+MAX_PARTS = 8
 """The most parts of a dotted key: reading them takes time that grows with their square."""
 
 _PART = r"""(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(
-    rf"(?<![A-Za-z0-9_\\-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MOST_PARTS}}}"
+    rf"(?<![A-Za-z0-9_\\-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MAX_PARTS}}}"
 )
 _BARE = re.compile(r"[A-Za-z][A-Za-z0-9_.+-]*(/[A-Za-z0-9_.+-]+)*")
 
@@ -27,10 +27,10 @@ def read_document(text: str) -> dict[str, Any]:
         size = len(text.encode())
     except UnicodeEncodeError as error:
         raise ValueError(f"expected UTF-8: character {error.start} is not") from None
-    if size > MOST_BYTES:
-        raise ValueError(f"expected at most {MOST_BYTES:,} bytes")
+    if size > MAX_BYTES:
+        raise ValueError(f"expected at most {MAX_BYTES:,} bytes")
     if _LONG_KEY.search(text):
-        raise ValueError(f"not TOML: expected keys of at most {MOST_PARTS} parts")
+        raise ValueError(f"not TOML: expected keys of at most {MAX_PARTS} parts")
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -10,23 +10,23 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import detection_limit, detection_rate, error_statistics
-from sweep.analysis.limits import Limit
+from sweep.analysis.detection_limits import Limit
 from sweep.analysis.statistics import IntervalOf
 from sweep.errors import StoreError
 from sweep.plan.parameters import Stage
 from sweep.report.figure import ends_of, sentences
-from sweep.report.subject import TILT, Subject, stacked, text_of
+from sweep.report.report_data import TILT, Subject, stacked, text_of
 from sweep.report.table import Table, cells, number
 from sweep.report.treatment_figures import treatment_grouping
 
 SEEN = 0.9
 """The detection rate that counts as seen."""
 
-MOST_LIMITS = 3
+MAX_LIMITS = 3
 """Limits that the paragraph names."""
 
 
-MOST_RIVALS = 3
+MAX_RIVALS = 3
 """Treatments that the paragraph names as not told apart from the best."""
 
 NEVER = "never"
@@ -168,9 +168,9 @@ def _best(subject: Subject) -> str:
         name for k, name in enumerate(names)
         if k != best and not math.isnan(median[k]) and low[k] <= high[best]
     ]
-    listed = ", ".join(rivals[:MOST_RIVALS])
-    if len(rivals) > MOST_RIVALS:
-        listed += f" and {len(rivals) - MOST_RIVALS:,} more"
+    listed = ", ".join(rivals[:MAX_RIVALS])
+    if len(rivals) > MAX_RIVALS:
+        listed += f" and {len(rivals) - MAX_RIVALS:,} more"
     return sentences(
         f"Of the treatments {names[best]} has the smallest median rotation error, "
         f"{_degrees(float(median[best]))}{between}, and solves "
@@ -198,7 +198,7 @@ def _seen_sentence(seen: Seen) -> str:
         f"{f'{where}: ' if where else ''}{side}{f' ({distance})' if distance else ''}"
         for where, side, distance in limits
     ]
-    text = "; ".join(listed) if len(listed) <= MOST_LIMITS else (
+    text = "; ".join(listed) if len(listed) <= MAX_LIMITS else (
         f"{listed[0]}, to {listed[-1]} (the table below has all)")
     told = f"{start}{share} from this side in the image on: {text}."
     return told[0].upper() + told[1:]
@@ -266,7 +266,7 @@ def _errors_table(errors: xr.Dataset) -> Table:
 
 def _limits_table(seen: Seen) -> list[Table]:
     limits = seen.limits
-    if len(limits) <= MOST_LIMITS:
+    if len(limits) <= MAX_LIMITS:
         return []
     wide = 3 if any(limit.distance for limit in limits) else 2
     settings = f", {seen.settings}" if seen.settings else ""

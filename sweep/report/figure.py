@@ -7,19 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from sweep.analysis.statistics import IntervalOf
-from sweep.report.ink import Panel
-from sweep.report.marks import Series
-from sweep.report.subject import Subject, labels_of
+from sweep.report.charts import Series
+from sweep.report.report_data import Subject, labels_of
 from sweep.report.table import Table
-
-Floats = NDArray[np.float64]
+from sweep.report.theme import Panel
+from sweep.typing import Floats
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class RenderedFigure:
     """A figure of one store, ready to be put on a page.
 
     ``svg``, where there is one, is a whole drawing that stands in place of panels; its files are
@@ -44,7 +42,7 @@ class FigureKind:
 
     name: str
     applies: Callable[[Subject], bool]
-    show: Callable[[Subject], Shown]
+    show: Callable[[Subject], RenderedFigure]
     covers: Callable[[Subject], Sequence[str]] = lambda _: ()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from sweep.report.figure import FigureKind
+from sweep.report.report_data import Subject
 from sweep.report.scene_figures import (
     DETECTION,
     ERRORS_BY_SIZE,
@@ -14,7 +15,6 @@ from sweep.report.scene_figures import (
     RANKING,
     effect_of,
 )
-from sweep.report.subject import Subject
 from sweep.report.treatment_figures import BOUND, COMPARED, TRADE, TREATMENTS
 
 KINDS: tuple[FigureKind, ...] = (

@@ -20,20 +20,21 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.errors import SweepError
-from sweep.inspection import Look, look
-from sweep.measure.flags import Detection, Estimate, Flipped
-from sweep.plan.one_cell import at_text, cell, coordinates_text
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.template import TEMPLATE
-from sweep.report.scene_drawing import LINE_HEIGHT, LONGEST_SIDE, draw_scene
-from sweep.report.subject import AREA, NEEDED, Subject, reading
+from sweep.evaluation.inspection import SceneInspection, look
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.plan.cell_selection import at_text, cell, coordinates_text
+from sweep.plan.experiment import Pipeline
+from sweep.plan.schema import SCHEMA
+from sweep.report.report_data import AREA, NEEDED, Subject, reading
+from sweep.report.scene_drawing import LINE_HEIGHT, MAX_SIDE, draw_scene
 from sweep.report.table import number
+from sweep.typing import Floats
 
 PIECE = 2_000_000
 """Results that are read at once."""
 
 BINS = 1200
-SMALLEST_ERROR, LARGEST_ERROR = 1e-9, 180.0
+MIN_ERROR, MAX_ERROR = 1e-9, 180.0
 """Degrees; the median is known to one of the bins between them, 2 % wide."""
 
 ANOTHER_POSE_DEG = 5.0
@@ -43,9 +44,16 @@ MARGIN = 0.35
 """Of the marker's side, shown around it."""
 
 FAILURES = (
-    Detection.wrong_id, Detection.rejected, Detection.no_candidate, Detection.failed,
-    Detection.crashed, Estimate.solver_failed, Estimate.not_converged, Estimate.not_explained,
-    Estimate.failed, Estimate.crashed,
+    DetectionStatus.wrong_id,
+    DetectionStatus.rejected,
+    DetectionStatus.no_candidate,
+    DetectionStatus.failed,
+    DetectionStatus.crashed,
+    EstimateStatus.solver_failed,
+    EstimateStatus.not_converged,
+    EstimateStatus.not_explained,
+    EstimateStatus.failed,
+    EstimateStatus.crashed,
 )
 WORDS = {
     "wrong_id": "decoded as another ID", "rejected": "a candidate that could not be decoded",
@@ -56,8 +64,6 @@ WORDS = {
 }
 
 Index = dict[str, int]
-Floats = NDArray[np.float64]
-
 
 @dataclass(frozen=True, slots=True)
 class Scene:
@@ -149,7 +155,7 @@ def _scan(results: xr.Dataset) -> _Found:
                 for dim, indices in zip(dims, np.nonzero(mask), strict=True)
             }
 
-        solved = (estimate == Estimate.solved) & np.isfinite(error)
+        solved = (estimate == EstimateStatus.solved) & np.isfinite(error)
         index = where(solved)
         errors = error[solved].astype(np.float64)
         found.offer("best", -errors, index)
@@ -162,7 +168,7 @@ def _scan(results: xr.Dataset) -> _Found:
         _count(found, errors, index)
         detected = piece["detection"].broadcast_like(piece["estimate"]).transpose(*dims).values
         for flag in FAILURES:
-            flagged = (detected if isinstance(flag, Detection) else estimate) == flag
+            flagged = (detected if isinstance(flag, DetectionStatus) else estimate) == flag
             # The larger the marker, the more surprising.
             found.offer(f"{type(flag).__name__} {flag.name}", area[flagged], where(flagged))
     for name in ("failed", "crashed"):  # told once, by the stage where it happened
@@ -172,8 +178,8 @@ def _scan(results: xr.Dataset) -> _Found:
 
 
 def _count(found: _Found, errors: Floats, index: Mapping[str, NDArray[np.intp]]) -> None:
-    clipped = np.clip(errors, SMALLEST_ERROR, LARGEST_ERROR)
-    share = np.log(clipped / SMALLEST_ERROR) / math.log(LARGEST_ERROR / SMALLEST_ERROR)
+    clipped = np.clip(errors, MIN_ERROR, MAX_ERROR)
+    share = np.log(clipped / MIN_ERROR) / math.log(MAX_ERROR / MIN_ERROR)
     bins, first, counts = np.unique(
         np.minimum((share * BINS).astype(np.int64), BINS - 1), return_index=True,
         return_counts=True)
@@ -237,11 +243,11 @@ def pipeline_file(pipeline: Pipeline) -> str:
     return shlex.quote(f"{pipeline.name}.toml")
 
 
-def _picture(seen: Look) -> NDArray[np.uint8]:
+def _picture(seen: SceneInspection) -> NDArray[np.uint8]:
     """Return the drawn scene without the caption, cut to the marker and its surroundings."""
     cut = _cut(seen)
     height, width = cut.image.shape
-    scale = max(1, min(LONGEST_SIDE // max(height, width), 24))
+    scale = max(1, min(MAX_SIDE // max(height, width), 24))
     page = draw_scene(cut, "")
     # The caption of a picture that stands alone is not needed: a page says more, as text.
     bottom = page.shape[0] - (LINE_HEIGHT * 3 + 20)
@@ -249,7 +255,7 @@ def _picture(seen: Look) -> NDArray[np.uint8]:
     return np.ascontiguousarray(page[:bottom, left : left + width * scale])
 
 
-def _cut(seen: Look) -> Look:
+def _cut(seen: SceneInspection) -> SceneInspection:
     corners = seen.true_corners
     left, top, right, bottom = seen.window
     if not np.isfinite(corners).all():
@@ -266,18 +272,18 @@ def _cut(seen: Look) -> Look:
 
 
 def _flags(stored: xr.Dataset) -> str:
-    detection = Detection(int(stored["detection"]))
-    estimate = Estimate(int(stored["estimate"]))
+    detection = DetectionStatus(int(stored["detection"]))
+    estimate = EstimateStatus(int(stored["estimate"]))
     names = [detection.name]
-    if estimate not in {Estimate.solved, Estimate.no_detection, Estimate.not_run}:
+    if estimate not in {EstimateStatus.solved, EstimateStatus.no_detection, EstimateStatus.not_run}:
         names.append(estimate.name)
     return ", ".join(name.replace("_", " ") for name in dict.fromkeys(names))
 
 
-def _told(seen: Look) -> str:
+def _told(seen: SceneInspection) -> str:
     """Return what was found, and how far off it is, in words."""
     parts = [seen.detection.name.replace("_", " "), f"area {number(seen.area_px)} px\u00b2"]
-    if seen.detection is Detection.detected and seen.estimate is not Estimate.solved:
+    if seen.detection is DetectionStatus.detected and seen.estimate is not EstimateStatus.solved:
         parts.append(seen.estimate.name.replace("_", " "))
     rotation = seen.errors["rotation_error_deg"]
     if math.isfinite(rotation):
@@ -289,18 +295,18 @@ def _told(seen: Look) -> str:
     return ", ".join(parts)
 
 
-def _differences(seen: Look, stored: xr.Dataset) -> str:
+def _differences(seen: SceneInspection, stored: xr.Dataset) -> str:
     """Return where a scene looked at again is not what the store holds; empty where it is."""
     told: list[str] = []
     pairs: Sequence[tuple[str, Any, Any]] = [
-        ("detection", Detection(int(stored["detection"])), seen.detection),
-        ("estimate", Estimate(int(stored["estimate"])), seen.estimate),
+        ("detection", DetectionStatus(int(stored["detection"])), seen.detection),
+        ("estimate", EstimateStatus(int(stored["estimate"])), seen.estimate),
     ]
     told += [
         f"{name} is {now.name}, in the store {then.name}"
         for name, then, now in pairs if then != now
     ]
-    scalars = [v.name for v in TEMPLATE if v.inner == () and v.name in seen.errors]
+    scalars = [v.name for v in SCHEMA if v.inner == () and v.name in seen.errors]
     for name in (scalars if not told else []):
         # The store holds single precision.
         then, now = float(stored[name]), float(np.float32(seen.errors[name]))

@@ -7,14 +7,14 @@ from pathlib import Path
 from urllib.parse import quote
 
 from sweep.report.answer import Answer
-from sweep.report.figure import Shown
+from sweep.report.figure import RenderedFigure
 from sweep.report.gallery import Scene
-from sweep.report.ink import write_panels
 from sweep.report.provenance_facts import Provenance
 from sweep.report.table import markdown_text
+from sweep.report.theme import write_panels
 
 
-def write_figure(shown: Shown, folder: Path) -> None:
+def write_figure(shown: RenderedFigure, folder: Path) -> None:
     """Write a figure as NAME.svg and NAME.png in a folder."""
     if shown.write is not None:
         for suffix in ("svg", "png"):
@@ -24,7 +24,7 @@ def write_figure(shown: Shown, folder: Path) -> None:
 
 
 def markdown(
-    title: str, found: Answer, made: Provenance, figures: Sequence[Shown],
+    title: str, found: Answer, made: Provenance, figures: Sequence[RenderedFigure],
     scenes: Iterable[Scene], folder: Path, shown_folder: str,
 ) -> str:
     """Return the report as Markdown; pictures of scenes are written into ``folder``.

@@ -7,12 +7,12 @@ from collections.abc import Iterable, Sequence
 from html import escape
 
 from sweep.report.answer import Answer
-from sweep.report.figure import Shown
+from sweep.report.figure import RenderedFigure
 from sweep.report.gallery import Scene
-from sweep.report.ink import panel_svg
 from sweep.report.page_style import STYLE
 from sweep.report.provenance_facts import Provenance
 from sweep.report.scene_drawing import AXES, FOUND, OTHER, REJECTED, TRUTH, Colour
+from sweep.report.theme import panel_svg
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 """A browser refuses, and tells on its console, whatever the page would ask of a network."""
@@ -25,7 +25,7 @@ LEGEND: tuple[tuple[str, Colour], ...] = (
 
 
 def page(
-    title: str, found: Answer, made: Provenance, figures: Sequence[Shown],
+    title: str, found: Answer, made: Provenance, figures: Sequence[RenderedFigure],
     scenes: Iterable[Scene],
 ) -> str:
     """Return the report as HTML."""
@@ -75,7 +75,7 @@ def _tiles(found: Answer) -> str:
     return f'<dl class="tiles">\n{tiles}\n</dl>'
 
 
-def _contents(figures: Sequence[Shown], *, scenes: bool) -> str:
+def _contents(figures: Sequence[RenderedFigure], *, scenes: bool) -> str:
     links = [(figure.name, figure.title) for figure in figures]
     links = [("source", "Where the numbers come from"), *links]
     if scenes:
@@ -107,7 +107,7 @@ href="data:application/toml;base64,{file}">{escape(made.file)}</a>.</p>
 {"".join(table.html() for table in found.tables)}"""
 
 
-def _figure(shown: Shown) -> str:
+def _figure(shown: RenderedFigure) -> str:
     if shown.svg is not None:
         drawing = (f'<div class="whole" tabindex="0" role="group" '
                    f'aria-label="{escape(shown.title)}">{shown.svg(shown.name)}</div>')

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sweep.report.ink import css_variables
+from sweep.report.theme import css_variables
 
 STYLE = f"""
 :root {{ color-scheme: light dark; {css_variables(dark=False)}

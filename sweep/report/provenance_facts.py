@@ -13,7 +13,7 @@ from typing import Any
 from sweep.plan.axes import TRIAL, Axis, label
 from sweep.plan.parameters import PARAMETERS
 from sweep.report.gallery import pipeline_file
-from sweep.report.subject import Subject, texts_of
+from sweep.report.report_data import Subject, texts_of
 from sweep.report.table import Table
 
 

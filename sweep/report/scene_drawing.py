@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.inspection import Look
+from sweep.evaluation.inspection import SceneInspection
 
 Colour = tuple[int, int, int]
 
@@ -20,17 +20,17 @@ PAPER: Colour = (255, 255, 255)
 INK: Colour = (40, 40, 40)
 FAINT: Colour = (110, 110, 110)
 
-LONGEST_SIDE = 900
-SMALLEST_SIDE = 560
+MAX_SIDE = 900
+MIN_SIDE = 560
 LINE_HEIGHT = 26
 SHIFT = 4
 """Fractional bits of the drawn coordinates."""
 
 
-def draw_scene(look: Look, title: str) -> NDArray[np.uint8]:
+def draw_scene(look: SceneInspection, title: str) -> NDArray[np.uint8]:
     """Return a scene's picture (H, W, 3), blue-green-red, enlarged, with a caption below it."""
     height, width = look.image.shape
-    scale = max(1, min(LONGEST_SIDE // max(height, width), 24))
+    scale = max(1, min(MAX_SIDE // max(height, width), 24))
     enlarged = cv2.resize(
         look.image, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST
     )
@@ -72,7 +72,7 @@ def draw_scene(look: Look, title: str) -> NDArray[np.uint8]:
     return _captioned(canvas, look, title)
 
 
-def _captioned(canvas: NDArray[np.uint8], look: Look, title: str) -> NDArray[np.uint8]:
+def _captioned(canvas: NDArray[np.uint8], look: SceneInspection, title: str) -> NDArray[np.uint8]:
     """Return the picture with its legend and figures below it."""
     lines = [(title, INK), (_figures(look), INK)]
     legend = [("truth", TRUTH)]
@@ -85,7 +85,7 @@ def _captioned(canvas: NDArray[np.uint8], look: Look, title: str) -> NDArray[np.
     if np.isfinite(look.axes_px).all():
         legend += [("x", AXES[0]), ("y", AXES[1]), ("z", AXES[2])]
     widest = max(_text_width(text) for text, _ in lines) + 32
-    width = max(canvas.shape[1], SMALLEST_SIDE, widest)
+    width = max(canvas.shape[1], MIN_SIDE, widest)
     height = canvas.shape[0] + LINE_HEIGHT * 3 + 20
     page = np.full((height, width, 3), PAPER, dtype=np.uint8)
     left = (width - canvas.shape[1]) // 2
@@ -114,7 +114,7 @@ def _text_width(text: str) -> int:
     return int(cv2.getTextSize(text, FONT, FONT_SCALE, 1)[0][0])
 
 
-def _figures(look: Look) -> str:
+def _figures(look: SceneInspection) -> str:
     """Return what was found, and how far off it is, in one line."""
     parts = [look.detection.name.replace("_", " "), f"area {look.area_px:.4g} px2"]
     if look.errors["rotation_error_deg"] == look.errors["rotation_error_deg"]:

@@ -12,18 +12,7 @@ from sweep.analysis import (
     flip_rate,
     marker_ranking,
 )
-from sweep.report.figure import (
-    FigureKind,
-    Shown,
-    ends_of,
-    lower,
-    of_how_many,
-    on_intervals,
-    sentences,
-    series_of,
-)
-from sweep.report.ink import Panel
-from sweep.report.marks import (
+from sweep.report.charts import (
     Series,
     draw_dots,
     draw_lines,
@@ -31,7 +20,17 @@ from sweep.report.marks import (
     draw_stack,
     rows_height,
 )
-from sweep.report.subject import (
+from sweep.report.figure import (
+    FigureKind,
+    RenderedFigure,
+    ends_of,
+    lower,
+    of_how_many,
+    on_intervals,
+    sentences,
+    series_of,
+)
+from sweep.report.report_data import (
     AREA,
     IDS,
     MANY_SIZES,
@@ -43,6 +42,7 @@ from sweep.report.subject import (
     labels_of,
 )
 from sweep.report.table import Table, cells, table_of
+from sweep.report.theme import Panel
 
 ERRORS = {
     "solved, %": ("solved_rate", 100.0),
@@ -68,7 +68,7 @@ WIDE_FROM = 8
 
 # Detection against size.
 
-def _detection(subject: Subject) -> Shown:
+def _detection(subject: Subject) -> RenderedFigure:
     axis = subject.size_axis
     areas = axis is None or subject.length(axis) >= MANY_SIZES
     along = AREA if areas else str(axis)
@@ -77,7 +77,7 @@ def _detection(subject: Subject) -> Shown:
     by = TILT if subject.tilted else None
     lines = series_of(found, along, "detection_rate", by, 100)
     label = subject.label(along)
-    return Shown(
+    return RenderedFigure(
         "detection", f"How often the marker is found, by {_short_name(along)}",
         sentences(
             f"Share of the poses looked for in which the marker is detected, against its "
@@ -96,7 +96,7 @@ def _detection(subject: Subject) -> Shown:
 
 # Errors against size.
 
-def _errors(subject: Subject) -> Shown:
+def _errors(subject: Subject) -> RenderedFigure:
     along = str(subject.size)
     grouping = subject.by_tilt() + subject.along(along)
     found = subject.of(error_statistics, grouping)
@@ -110,7 +110,7 @@ def _errors(subject: Subject) -> Shown:
             lambda axes: draw_lines(axes, lines, (label, f"{lower(title)}, {unit}")),
         )
 
-    return Shown(
+    return RenderedFigure(
         "errors", f"How large the error is, by {_short_name(along)}",
         sentences(
             f"Error of the estimated pose against the marker's {_long_name(along)}"
@@ -155,10 +155,10 @@ def _map_panel(
     )
 
 
-def _maps(subject: Subject) -> Shown:
+def _maps(subject: Subject) -> RenderedFigure:
     grouping = _map_grouping(subject)
     found = subject.of(error_statistics, grouping)
-    return Shown(
+    return RenderedFigure(
         "maps", f"Detection and rotation error over {_short_name(str(subject.size_axis))} and tilt",
         sentences(
             "Detection rate in percent, and 95 % quantile of the rotation error in degrees, in "
@@ -172,10 +172,10 @@ def _maps(subject: Subject) -> Shown:
     )
 
 
-def _flips(subject: Subject) -> Shown:
+def _flips(subject: Subject) -> RenderedFigure:
     grouping = _map_grouping(subject)
     found = subject.of(flip_rate, grouping)
-    return Shown(
+    return RenderedFigure(
         "flips", f"Flips to the mirrored pose over {_short_name(str(subject.size_axis))} and tilt",
         sentences(
             "Share of the solved poses that are nearer to the mirror of the truth than to the "
@@ -209,7 +209,7 @@ def _failure_axis(subject: Subject) -> str | None:
     return max(names, key=influence)
 
 
-def _failures(subject: Subject) -> Shown:
+def _failures(subject: Subject) -> RenderedFigure:
     axis = _failure_axis(subject)
     grouping = subject.along(axis, STACKED_BARS) if axis else Grouping()
     found = subject.of(failure_composition, grouping)
@@ -241,7 +241,7 @@ def _failures(subject: Subject) -> Shown:
         [name, looked_for[k], *(column[k] for column in columns.values())]
         for k, name in enumerate(names)
     ]
-    return Shown(
+    return RenderedFigure(
         "failures", "What became of the poses",
         sentences(
             "Shares of the poses looked for" + (f", by {_long_name(axis)}" if axis else "")
@@ -260,7 +260,7 @@ def _failures(subject: Subject) -> Shown:
 
 # Marker IDs.
 
-def _ranking(subject: Subject) -> Shown:
+def _ranking(subject: Subject) -> RenderedFigure:
     found = subject.once("marker_ranking", lambda: marker_ranking(subject.results))
     dims = [name for name in ("dictionary", IDS) if name in found["detection_rate"].dims]
     flat = found.stack(marker=dims, create_index=False)
@@ -289,7 +289,7 @@ def _ranking(subject: Subject) -> Shown:
         panels.append(Panel(
             "All IDs", "Line of the detection rates of all IDs, in increasing order.",
             lambda axes: draw_lines(axes, [line], ("rank", "detected, %"), share=True)))
-    return Shown(
+    return RenderedFigure(
         "ranking", "Marker IDs, the weakest first",
         sentences(
             f"Detection rate of each ID{' of each dictionary' if len(dims) > 1 else ''}; the small "
@@ -323,7 +323,7 @@ def effect_of(name: str) -> FigureKind:
                       lambda subject: _effect(subject, name), lambda _: (name,))
 
 
-def _effect(subject: Subject, name: str) -> Shown:
+def _effect(subject: Subject, name: str) -> RenderedFigure:
     axis = subject.pipeline.axis(name)
     numeric = axis is not None and is_numeric(axis)
     grouping = subject.along(name, 40 if numeric else WEAKEST)
@@ -344,7 +344,7 @@ def _effect(subject: Subject, name: str) -> Shown:
                                             f"{lower(title)}, {unit}", share=share),
                      height=rows_height(len(names)))
 
-    return Shown(
+    return RenderedFigure(
         f"effect-{name}", f"The effect of {name}",
         sentences(
             f"Detection rate, and median and 95 % quantile of the rotation error, by {name}"

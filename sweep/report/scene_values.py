@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from sweep.plan.template import TEMPLATE, Variable
+from sweep.plan.schema import SCHEMA, Variable
 
 NAME_WIDTH, VALUE_WIDTH = 34, 44
 
@@ -17,7 +17,7 @@ def value_lines(
 ) -> list[str]:
     """Return a line for each variable: its value here, its unit, and the store's if it differs."""
     lines = []
-    for variable in TEMPLATE:
+    for variable in SCHEMA:
         value = here[variable.name]
         line = f"  {variable.name:{NAME_WIDTH}} {_text(variable, value):{VALUE_WIDTH}}"
         line += f" {variable.units}"

@@ -9,10 +9,10 @@ from html import escape
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.pareto import digits, interval
-from sweep.report.subject import label_of, labels_of
+from sweep.report.report_data import label_of, labels_of
+from sweep.tradeoff.pareto import digits, interval
 
-MOST_ROWS = 300
+MAX_ROWS = 300
 """Rows that a page shows of a table."""
 
 ONE_LINE = 28
@@ -41,7 +41,7 @@ class Table:
                 else f"<td{self._side(k)}>{escape(text)}</td>"
                 for k, text in enumerate(row)
             ) + "</tr>"
-            for row in self.rows[:MOST_ROWS]
+            for row in self.rows[:MAX_ROWS]
         )
         return (
             f'<div class="scroll" role="region" tabindex="0" aria-label="{escape(self.caption)}">'
@@ -54,7 +54,7 @@ class Table:
         lines = [
             [_cell(text) for text in self.headings],
             ["---:" if self._side(k).endswith('"n"') else "---" for k in range(len(self.headings))],
-            *([_cell(text) for text in row] for row in self.rows[:MOST_ROWS]),
+            *([_cell(text) for text in row] for row in self.rows[:MAX_ROWS]),
         ]
         table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
         return f"{markdown_text(self._caption())}\n\n{table}"
@@ -69,9 +69,9 @@ class Table:
         return ' class="text"' if long else ""
 
     def _caption(self) -> str:
-        if len(self.rows) <= MOST_ROWS:
+        if len(self.rows) <= MAX_ROWS:
             return self.caption
-        return f"{self.caption} (the first {MOST_ROWS} of {len(self.rows):,} rows)"
+        return f"{self.caption} (the first {MAX_ROWS} of {len(self.rows):,} rows)"
 
 
 def markdown_text(text: str) -> str:

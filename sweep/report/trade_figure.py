@@ -19,15 +19,15 @@ from matplotlib.textpath import text_to_path
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from matplotlib.transforms import Bbox
 
-from sweep.analysis.pareto import (
+from sweep.tradeoff.pareto import (
     UNITS,
     Booleans,
-    Floats,
     by_regime,
     heading_of,
     interval,
     mark_front,
 )
+from sweep.typing import Floats
 
 # Okabe and Ito's palette, told apart by the colour-blind; without yellow, too faint for a line.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")

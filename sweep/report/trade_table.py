@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.pareto import (
+from sweep.tradeoff.pareto import (
     UNITS,
     by_regime,
     digits,

@@ -12,25 +12,25 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import compare, efficiency, error_statistics
-from sweep.analysis.pareto import advice, by_regime, mark_front
-from sweep.measure.bound import Bound
+from sweep.measure.bound import BoundStatus
+from sweep.report.charts import Series, draw_dots, draw_map, rows_height
 from sweep.report.figure import (
     FigureKind,
-    Shown,
+    RenderedFigure,
     ends_of,
     lower,
     of_how_many,
     on_intervals,
     sentences,
 )
-from sweep.report.ink import STYLE, Panel, inline
-from sweep.report.marks import Series, draw_dots, draw_map, rows_height
+from sweep.report.report_data import TILT, Grouping, Subject, labels_of, stacked
 from sweep.report.scene_figures import ERRORS
-from sweep.report.subject import TILT, Grouping, Subject, labels_of, stacked
 from sweep.report.table import Table, cells
+from sweep.report.theme import STYLE, Panel, inline
 from sweep.report.trade_figure import draw_trade
+from sweep.tradeoff.pareto import advice, by_regime, mark_front
 
-MOST_TREATMENTS = 30
+MAX_TREATMENTS = 30
 SIZE_COLUMNS = 12
 
 CRITERION = "rotation_p95_deg"
@@ -42,7 +42,7 @@ def treatment_grouping(subject: Subject) -> Grouping:
     kept: list[str] = []
     count = 1
     for name in sorted(subject.treatments, key=subject.length):
-        if count * subject.length(name) > MOST_TREATMENTS and kept:
+        if count * subject.length(name) > MAX_TREATMENTS and kept:
             break
         kept.append(name)
         count *= subject.length(name)
@@ -54,7 +54,7 @@ def treatment_grouping(subject: Subject) -> Grouping:
     else:
         grouping = Grouping()
     for name in ordered:
-        grouping += subject.along(name, MOST_TREATMENTS, binned=False)
+        grouping += subject.along(name, MAX_TREATMENTS, binned=False)
     return grouping
 
 
@@ -72,7 +72,7 @@ def _dot_panel(
     )
 
 
-def _treatments(subject: Subject) -> Shown:
+def _treatments(subject: Subject) -> RenderedFigure:
     grouping = treatment_grouping(subject)
     names, found = stacked(subject.of(error_statistics, grouping), grouping.dims)
     panels = [
@@ -89,7 +89,7 @@ def _treatments(subject: Subject) -> Shown:
         panels.append(panel)
         notes += note
     columns = {"looked for": ("looked_for", 1.0)} | ERRORS
-    return Shown(
+    return RenderedFigure(
         "treatments", f"Treatments compared: {', '.join(grouping.dims)}",
         sentences(
             "Share of the poses looked for that are solved, and the median errors, of each "
@@ -147,14 +147,14 @@ PAIRED = {
 }
 
 
-def _paired(subject: Subject) -> Shown:
+def _paired(subject: Subject) -> RenderedFigure:
     grouping = treatment_grouping(subject)
     results = subject.results.isel({name: list(some) for name, some in grouping.chosen})
     found = subject.once("paired", lambda: compare(
         _first_everywhere(results, grouping.dims), results, grouping.dims))
     names, together = stacked(found, grouping.dims)
     others = together.isel(treatment=slice(1, None))
-    return Shown(
+    return RenderedFigure(
         "paired", f"Each treatment against the first: {names[0]}",
         sentences(
             f"Differences from {names[0]}, on the same scenes: detection rate in percentage "
@@ -191,11 +191,11 @@ def _has_bound(subject: Subject) -> bool:
     if "bound" not in subject.results:
         return False
     found = subject.once("bound given", lambda: xr.Dataset(
-        {"given": (subject.results["bound"] == Bound.given).any()}))
+        {"given": (subject.results["bound"] == BoundStatus.given).any()}))
     return bool(found["given"])
 
 
-def _bound(subject: Subject) -> Shown:
+def _bound(subject: Subject) -> RenderedFigure:
     grouping = treatment_grouping(subject)
     along = subject.size_axis or (TILT if subject.tilted else None)
     sizes = subject.along(along, SIZE_COLUMNS) if along else Grouping()
@@ -222,7 +222,7 @@ def _bound(subject: Subject) -> Shown:
             for key in ("rotation_over_bound", "range_over_bound"))]
         for k, name in enumerate(names) for j, column in enumerate(columns)
     ]
-    return Shown(
+    return RenderedFigure(
         "bound", "How far from the accuracy bound",
         sentences(
             "RMSE over the Cram\u00e9r-Rao bound, of the solved poses that are not flipped and "
@@ -248,7 +248,7 @@ def _over_bound(found: xr.Dataset) -> xr.Dataset:
 
 # What accuracy costs.
 
-def _trade(subject: Subject) -> Shown:
+def _trade(subject: Subject) -> RenderedFigure:
     if subject.trade is None:
         raise KeyError("cost/tradeoff")
     trade = subject.trade.drop_attrs(deep=False)  # the page says the title
@@ -289,7 +289,7 @@ def _trade(subject: Subject) -> Shown:
                 draw_trade(trade, criterion, path)
             return inline(path.read_text(encoding="utf-8"), alt, prefix, clipped=True)
 
-    return Shown(
+    return RenderedFigure(
         "trade", "What accuracy costs",
         sentences(
             f"Cost of detection and estimation, ms a frame, against {criterion}, of each "

@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sweep.engine.store import create_store, region
-from sweep.measure.flags import Detection, Estimate, Flipped
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.template import TEMPLATE
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.plan.experiment import Pipeline
+from sweep.plan.schema import SCHEMA
+from sweep.store.lifecycle import create_store, region
 
 GRID = """
 seed = 1
@@ -81,7 +81,7 @@ def write_store(folder, poses):
     store = create_store(
         str(Path(folder) / f"{poses}.zarr"), pipeline, (*EXTENTS, min(TRIALS_A_CHUNK, trials)))
     rng = np.random.default_rng(1)
-    variables = {variable.name: variable for variable in TEMPLATE}
+    variables = {variable.name: variable for variable in SCHEMA}
     for block in store.blocks:
         for name, values in chunk(rng, pipeline, block).items():
             variable = variables[name]
@@ -106,8 +106,8 @@ def chunk(rng, pipeline, block):
         errors[~solved] = np.nan
     angle = np.degrees(np.sqrt((rotation**2).sum(axis=-1)))
     of_solvers = {
-        "estimate": np.where(solved, Estimate.solved, np.where(
-            found[..., None], Estimate.solver_failed, Estimate.no_detection)),
+        "estimate": np.where(solved, EstimateStatus.solved, np.where(
+            found[..., None], EstimateStatus.solver_failed, EstimateStatus.no_detection)),
         "flipped": np.where(flipped, Flipped.flipped, np.where(
             solved, Flipped.not_flipped, Flipped.no_estimate)),
         "rotation_error_rad": rotation, "translation_error_m": position,
@@ -116,7 +116,7 @@ def chunk(rng, pipeline, block):
     return {
         "true_tvec_m": np.stack([0 * depth, 0 * depth, depth], axis=-1),
         "marker_area_px": sides**2 * rng.uniform(0.9, 1.0, scene),
-        "detection": np.where(found, Detection.detected, Detection.no_candidate),
+        "detection": np.where(found, DetectionStatus.detected, DetectionStatus.no_candidate),
     } | {name: np.moveaxis(values, 4, 3) for name, values in of_solvers.items()}
 
 

@@ -20,13 +20,13 @@ from pathlib import Path
 
 import numpy as np
 
-from sweep.engine.calibration import calibrate
-from sweep.engine.cluster import default_workers
-from sweep.engine.forecasting import forecast
-from sweep.engine.runner import execute
-from sweep.kernel import run_block, run_cells
+from sweep.evaluation.cells import run_block, run_cells
+from sweep.execution.calibration import calibrate
+from sweep.execution.cluster import default_workers
+from sweep.execution.forecast import forecast
+from sweep.execution.runner import execute
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
-from sweep.plan.pipeline import Pipeline
 
 GRID = """
 seed = 1

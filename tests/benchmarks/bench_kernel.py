@@ -12,15 +12,21 @@ from unittest import mock
 import cv2
 import numpy as np
 
-from sweep.kernel import run_cells, search_windows, single_thread, visibility_flags, whole_frames
+from sweep.evaluation.cells import (
+    run_cells,
+    search_windows,
+    single_thread,
+    visibility_flags,
+    whole_frames,
+)
 from sweep.measure.detector import Detector
-from sweep.measure.flags import Detection
+from sweep.measure.flags import DetectionStatus
 from sweep.model import coverage
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render_all
 from sweep.model.scene import build_scenes
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings, scene_values
-from sweep.plan.pipeline import Pipeline
 
 SIZES = ((640, 480), (1920, 1080), (4000, 3000))
 POSES = {640: 1000, 1920: 400, 4000: 150}
@@ -166,7 +172,7 @@ def main():
         setting = detector_settings(pipeline)[0]
         boxes = marker_boxes(scenes)
         cut = search_windows(scenes, boxes, setting, whole_frames(values, poses))
-        rows = np.flatnonzero(visibility_flags(scenes) == Detection.not_run)
+        rows = np.flatnonzero(visibility_flags(scenes) == DetectionStatus.not_run)
         camera = scenes.cameras.matrix(0)
         marker = cv2.aruco.generateImageMarker(
             cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50), 0, 70

@@ -9,15 +9,15 @@ import time
 
 import numpy as np
 
-from sweep.kernel import search, sightings, single_thread, whole_frames
+from sweep.evaluation.cells import search, sightings, single_thread, whole_frames
 from sweep.measure.bound import curvature_at_truth
-from sweep.measure.flags import Detection
+from sweep.measure.flags import DetectionStatus
 from sweep.measure.likelihood import BACKGROUND_MARGIN_PX, noise_variance, sight_of, state_of
 from sweep.measure.photometric import Photometric
 from sweep.model.extent import marker_boxes
 from sweep.model.scene import build_scenes
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings, estimators, scene_values
-from sweep.plan.pipeline import Pipeline
 
 SCENES = 120
 TEXT = f"""
@@ -68,7 +68,7 @@ def measured(side, tilt):
         scenes, np.ones((SCENES, 1), dtype=bool), detector_settings(pipeline),
         whole_frames(values, SCENES), [], keep=True,
     )
-    rows = np.flatnonzero(found[0].flags == Detection.detected)
+    rows = np.flatnonzero(found[0].flags == DetectionStatus.detected)
     seen = sightings(estimators(pipeline)[0], values, scenes, found[0], rows)
     return (
         best_ms(lambda: curvature_at_truth(state, sight, height, width, False), 1, 50),

@@ -14,15 +14,15 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from sweep.engine import task
-from sweep.engine.closing import close
-from sweep.engine.store import create_store
-from sweep.engine.verification import verify
-from sweep.kernel import CellsResult
-from sweep.measure.flags import Detection, Estimate, Flipped
+from sweep.evaluation.cells import CellsResult
+from sweep.execution import block_task as task
+from sweep.execution.finalize import close
+from sweep.integrity.verification import verify
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.template import TEMPLATE
+from sweep.plan.schema import SCHEMA
+from sweep.store.lifecycle import create_store
 
 GRID = """
 [pose]
@@ -42,13 +42,13 @@ def noisy_cells(pipeline, indices, need=None):  # noqa: ARG001
     solved = generator.random(count) < 0.9
     flags = {
         "bound": np.zeros(count),
-        "detection": np.where(solved, Detection.detected, Detection.rejected),
-        "estimate": np.where(solved, Estimate.solved, Estimate.no_detection),
+        "detection": np.where(solved, DetectionStatus.detected, DetectionStatus.rejected),
+        "estimate": np.where(solved, EstimateStatus.solved, EstimateStatus.no_detection),
         "flipped": np.where(solved, Flipped.not_flipped, Flipped.no_estimate),
     }
     absent = ("bound_", "mirror", "predicted", "nees", "residual")
     columns = {}
-    for variable in TEMPLATE:
+    for variable in SCHEMA:
         if variable.flags is not None:
             values = flags[variable.name]
         else:
@@ -95,7 +95,7 @@ def main():
         ratio = statistics.median(ours / theirs for theirs, ours in pairs)
         print(f"plain read {plain:.2f} s, verify {checked:.2f} s, ratio {ratio:.2f} "
               f"({', '.join(f'{ours / theirs:.2f}' for theirs, ours in pairs)})")
-        command = [sys.executable, "-m", "sweep.cli", "run", str(path), "--store", url]
+        command = [sys.executable, "-m", "sweep", "run", str(path), "--store", url]
         waits = [
             timed(lambda: subprocess.run(command, check=True, capture_output=True))
             for _ in range(ROUNDS)

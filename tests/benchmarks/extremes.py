@@ -20,12 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
-from sweep.kernel import Failure, run_cells
-from sweep.measure.flags import Detection, Estimate, Flipped
+from sweep.evaluation.cells import Failure, run_cells
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices, detector_settings, estimators, scene_axes
 from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.template import TEMPLATE
+from sweep.plan.schema import SCHEMA
 
 FILES = sorted((Path(__file__).parents[2] / "pipelines" / "extremes").glob("*.toml"))
 REFINEMENTS = ("none", "subpix", "contour", "apriltag")
@@ -86,7 +86,7 @@ def measured(pipeline, count=None):
     with all_that_is_printed() as printed, warnings.catch_warnings():
         warnings.simplefilter("error")
         cells = run_cells(pipeline, indices)
-        columns = {v.name: np.stack(cells.columns[v.name]).astype(v.dtype) for v in TEMPLATE}
+        columns = {v.name: np.stack(cells.columns[v.name]).astype(v.dtype) for v in SCHEMA}
     settings = pipeline.size(Stage.detection)
     leading = {
         Stage.scene: (),
@@ -95,7 +95,7 @@ def measured(pipeline, count=None):
     }
     values = {
         v.name: columns[v.name].reshape(*leading[v.stage], *columns[v.name].shape[1:])
-        for v in TEMPLATE
+        for v in SCHEMA
     }
     return Measured(pipeline, values, cells.failures, printed)
 
@@ -140,27 +140,30 @@ def broken_promises(result):
 
     def finite(name):
         kept = values[name]
-        inner = tuple(range(-len(next(v.inner for v in TEMPLATE if v.name == name)), 0))
+        inner = tuple(range(-len(next(v.inner for v in SCHEMA if v.name == name)), 0))
         return np.isfinite(kept).all(axis=inner), np.isnan(kept).all(axis=inner)
 
     detection, estimate = values["detection"], values["estimate"]
-    detected = detection == Detection.detected
-    solved = estimate == Estimate.solved
+    detected = detection == DetectionStatus.detected
+    solved = estimate == EstimateStatus.solved
     promise("the truth is finite", np.isfinite(values["true_rvec"]).all(axis=1)
             & np.isfinite(values["true_tvec_m"]).all(axis=1))
     promise("a search ends in one of six ways",
-            (detection >= Detection.detected) & (detection <= Detection.not_modelled))
-    for flag in (Detection.not_visible, Detection.not_modelled):
+            (detection >= DetectionStatus.detected) & (detection <= DetectionStatus.not_modelled))
+    for flag in (DetectionStatus.not_visible, DetectionStatus.not_modelled):
         promise(f"{flag.name} is of the scene, whatever searches it",
                 (detection == flag).all(axis=0) == (detection == flag).any(axis=0))
     there, absent = finite("corner_error_px")
     promise("corners are finite where detected, and absent elsewhere",
             np.where(detected, there, absent))
 
-    promise("what is detected is solved, or failed to be",
-            np.isin(estimate, [Estimate.solved, Estimate.solver_failed]) == detected[:, None])
+    promise(
+        "what is detected is solved, or failed to be",
+        np.isin(estimate, [EstimateStatus.solved, EstimateStatus.solver_failed])
+        == detected[:, None],
+    )
     promise("what is not detected is not estimated",
-            (estimate == Estimate.no_detection) == ~detected[:, None])
+            (estimate == EstimateStatus.no_detection) == ~detected[:, None])
     for name in ERRORS:
         there, absent = finite(name)
         promise(f"{name} is finite where solved, and absent elsewhere",
@@ -190,7 +193,7 @@ def percent(share):
 
 def detection_cell(flags):
     """Return the share of detected ones, and what became of most others."""
-    counts = Counter(Detection(flag).name for flag in flags.tolist())
+    counts = Counter(DetectionStatus(flag).name for flag in flags.tolist())
     cell = percent(counts.pop("detected", 0) / len(flags))
     if counts:
         name, count = counts.most_common(1)[0]
@@ -202,7 +205,7 @@ def solver_cell(detected, estimate, error_deg, flipped):
     """Return the median and worst error, and the shares that failed or are flipped if any."""
     if not detected.any():
         return "-"
-    solved = estimate == Estimate.solved
+    solved = estimate == EstimateStatus.solved
     cell = "-"
     if solved.any():
         cell = f"{figures(np.median(error_deg[solved]))} / {figures(error_deg[solved].max())}"
@@ -241,7 +244,7 @@ def tables(results):
                 ])
                 seen = searched
             d = by_refinement[REFINEMENT]
-            detected = values["detection"][d] == Detection.detected
+            detected = values["detection"][d] == DetectionStatus.detected
             solutions.append([regime, str(detected.sum())] + [
                 solver_cell(detected, *(values[variable][d, by_solver[solver]] for variable in
                                         ("estimate", "rotation_error_deg", "flipped")))
@@ -274,7 +277,7 @@ def main():
     print("\n".join(estimated))
     counts = np.sum([
         (result.scenes, result.values["detection"].size,
-         np.count_nonzero(result.values["estimate"] == Estimate.solved))
+         np.count_nonzero(result.values["estimate"] == EstimateStatus.solved))
         for _, result in results
     ], axis=0)
     print("\n{:,} scenes, {:,} searches, {:,} poses solved: ".format(*counts)

@@ -71,11 +71,11 @@ WAYS = {
 def _kind():
     """Return what this process is: worker, child, client or other."""
     words = " ".join(sys.orig_argv)
-    if "sweep.engine.apart" in words:
+    if "sweep.isolation.child_process" in words:
         return "child"
     if "--multiprocessing-fork" in words:
         return "worker"
-    if "sweep.cli" in words:
+    if "-m sweep " in words:
         return "client"
     return "other"
 
@@ -215,7 +215,7 @@ class _Finder(importlib.abc.MetaPathFinder):
         self._given = poisons, log
 
     def find_spec(self, name, path=None, target=None):
-        if name != "sweep.kernel":
+        if name != "sweep.evaluation.cells":
             return None
         spec = importlib.machinery.PathFinder.find_spec(name, path, target)
         load = spec.loader.exec_module

@@ -1,0 +1,201 @@
+"""From how far a marker is still seen: the smallest side with a detection rate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from sweep.analysis.blocks import axes_of, fingerprint_of, kept_of, listed
+from sweep.analysis.intervals import wilson
+from sweep.analysis.rates import detection_rate
+from sweep.analysis.statistics import LEVEL, in_draws
+from sweep.errors import StoreError, SweepError
+from sweep.model.camera import VIEW_PARAMETERS, intrinsics
+from sweep.model.marker import module_count
+from sweep.plan.experiment import Pipeline
+from sweep.plan.parameters import PARAMETERS
+from sweep.plan.schema import cf_attributes
+from sweep.typing import Floats
+
+Integers = NDArray[np.int64]
+Masks = NDArray[np.bool_]
+
+SIZE_AXES = ("side_px", "distance_m")
+
+
+class Limit(IntEnum):
+    """Whether the rate is reached within the grid."""
+
+    not_run = 0
+    found = 1
+    never = 2
+    """Not even at the largest side."""
+    always = 3
+    """Already at the smallest side: the limit may lie below it."""
+
+
+def detection_limit(
+    results: xr.Dataset, rate: float = 0.9, per: Sequence[str] | None = None
+) -> xr.Dataset:
+    """Return the smallest side of the black square that is seen often enough: dimensions (*per).
+
+    ``per`` are the dimensions that are kept: the tilt, where there are several, if none are named.
+
+    ``side_px`` is the side in pixels, were the square parallel to the image, from which on, at
+    all larger sides of the grid, the detection rate is at least ``rate``: so a dip at a larger
+    side counts. ``side_px_below`` is the grid's next smaller side, where it is not: the grid tells
+    no more. ``side_px_per_module`` is the same per module, of ``dictionary``; a dimension of that
+    name is always kept. ``distance_m`` stands beside it where that is the grid's axis.
+    ``limit`` tells whether there is one (`Limit`); ``side_px`` is infinite for never.
+
+    The interval is that of the limit on the grid, at 95 %: from ``side_px_high`` on Wilson's lower
+    ends are at least ``rate``, and from ``side_px_low`` on all upper ends are. Only the one side
+    below the limit can make the high end too small, any above it the low end too large: the upper
+    ends are those of all sides together (Bonferroni). A low end of 0 says that the limit may lie
+    below the grid, an infinite high end that it may lie above; where nothing was drawn both are
+    NaN.
+
+    Needs a dimension ``side_px`` or ``distance_m``; of the camera and the marker's size, what is
+    no dimension or coordinate is taken from the pipeline in the attributes. Lazy where ``results``
+    is. Raises ``StoreError`` where that is not there, or where a side is not the same over what is
+    pooled; ``ValueError`` for a rate outside (0, 1].
+    """
+    if not 0.0 < rate <= 1.0:
+        raise ValueError(f"rate = {rate}: give a number above 0 and at most 1, for instance 0.9")
+    axis = next((name for name in SIZE_AXES if name in axes_of(results)), None)
+    if axis is None:
+        there = ", ".join(axes_of(results)) or "none"
+        raise StoreError(f"side_px or distance_m: no such dimension; there are {there}")
+    dictionaries = ["dictionary"] if "dictionary" in axes_of(results) else []
+    if per is None:
+        per = [name for name in ("tilt_deg",) if name in axes_of(results)]
+    kept = kept_of(results, (*listed(per), *dictionaries))
+    for name in (axis, "trial"):
+        if name in kept:
+            raise StoreError(f"{name}: the limit is over this dimension; it cannot be kept")
+    sides = _sides(results, axis)
+    strange = [str(dim) for dim in sides.dims if dim not in (*kept, axis)]
+    if strange:
+        raise StoreError(f"{', '.join(strange)}: sides differ over this dimension; keep it (per)")
+    table = detection_rate(results, (*kept, axis))
+    n, draws, hits = (table[name] for name in ("looked_for", "draws", "detected"))
+    drawn = table["detection_rate_low"].notnull()
+    counts = [array.chunk({axis: -1}) if array.chunks else array
+              for array in (hits, n, draws, drawn)]
+    found = xr.apply_ufunc(
+        _limit, sides, *counts, kwargs={"rate": rate}, dask="parallelized",
+        input_core_dims=[[axis]] * 5, output_core_dims=[[]] * 5, output_dtypes=[np.float64] * 5,
+    )
+    named = dict(zip(("side_px", "side_px_low", "side_px_high", "side_px_below"), found[:4],
+                     strict=True))
+    words = {
+        "side_px": f"smallest side from which on the detection rate is at least {rate:g}",
+        "side_px_low": "lower end of the 95 % interval: smallest side",
+        "side_px_high": "upper end of the 95 % interval: smallest side",
+        "side_px_below": "the grid's next smaller side",
+    }
+    out = {name: array.assign_attrs(long_name=words[name], units="px")
+           for name, array in named.items()}
+    count = _modules(results)
+    out |= {
+        name.replace("px", "px_per_module"): (named[name] / count).assign_attrs(
+            long_name=f"{words[name]}, per module", units="px")
+        for name in ("side_px", "side_px_low", "side_px_high")
+    }
+    if axis == "distance_m":
+        scale = (sides * results["distance_m"]).isel(distance_m=0, drop=True)
+        out["distance_m"] = (scale / named["side_px"]).assign_attrs(
+            long_name="the distance of that side", units="m")
+    out["limit"] = found[4].astype(np.uint8).assign_attrs(
+        cf_attributes("whether the rate is reached within the grid", flags=Limit))
+    return xr.Dataset({name: array.transpose(*kept) for name, array in out.items()})
+
+
+def _limit(
+    sides: Floats, hits: Integers, n: Integers, draws: Integers, drawn: Masks, rate: float
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Return side, low, high, next smaller side and flag; all arrays are (..., sides)."""
+    sides = np.broadcast_to(sides, n.shape)
+    order = np.argsort(-sides, axis=-1, kind="stable")  # the largest first
+    sides = np.take_along_axis(sides, order, axis=-1)
+    hits, n, draws = (np.take_along_axis(each, order, axis=-1) for each in (hits, n, draws))
+    drawn = np.take_along_axis(drawn, order, axis=-1)
+    there = n > 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reached = hits / n >= rate
+    # Of draws, rounded outwards, as in `Rate`.
+    fewest, most = in_draws(hits, n, draws)
+    joint = 1.0 - (1.0 - LEVEL) / sides.shape[-1]
+    surely = wilson(fewest, draws)[0] >= rate
+    possibly = wilson(most, draws, joint)[1] >= rate
+
+    def smallest(holds: Masks, none: float) -> tuple[Floats, Masks]:
+        """Return the smallest side down to which it holds, and whether it holds for all."""
+        steady = np.logical_and.accumulate(holds | ~there, axis=-1) & there
+        side = np.where(steady, sides, np.inf).min(axis=-1, initial=np.inf)
+        return np.where(steady.any(axis=-1), side, none), (steady == there).all(axis=-1)
+
+    side, always = smallest(reached, np.inf)
+    high, _ = smallest(surely, np.inf)
+    low, everywhere = smallest(possibly, np.inf)
+    low = np.where(everywhere, 0.0, low)
+    smaller = np.where(there & (sides < side[..., None]), sides, -np.inf).max(
+        axis=-1, initial=-np.inf)
+    empty = ~there.any(axis=-1)
+    flag = np.select([empty, always, np.isinf(side)], [Limit.not_run, Limit.always, Limit.never],
+                     Limit.found)
+    unknown = ~(drawn | ~there).all(axis=-1) | empty
+    return (np.where(empty, np.nan, side), np.where(unknown, np.nan, low),
+            np.where(unknown, np.nan, high), np.where(np.isinf(smaller), np.nan, smaller),
+            flag.astype(np.float64))
+
+
+def _sides(results: xr.Dataset, axis: str) -> xr.DataArray:
+    """Return the sides in pixels, over the axis and whatever else they depend on."""
+    if axis not in results.coords:
+        raise StoreError(f"{axis}: has no coordinate, of which the sides are made")
+    if axis == "side_px":
+        return _positive(results["side_px"].astype(np.float64))
+    values = {name: _value(results, name) for name in (*VIEW_PARAMETERS, "size_m")}
+    fx = xr.DataArray(intrinsics(*(values[name] for name in VIEW_PARAMETERS))[0])
+    sides: xr.DataArray = fx * values["size_m"] / results["distance_m"]
+    return _positive(sides.astype(np.float64))
+
+
+def _positive(sides: xr.DataArray) -> xr.DataArray:
+    if not (np.isfinite(sides) & (sides > 0)).all():
+        raise StoreError("sides must be finite and above 0 px: see the coordinates of the size, "
+                         "the distance and the camera")
+    return sides
+
+
+def _modules(results: xr.Dataset) -> Any:
+    """Return the modules along the black square's side, by dictionary."""
+    names = _value(results, "dictionary")
+    if isinstance(names, xr.DataArray):
+        counts = [module_count(str(name)) for name in np.atleast_1d(names.values)]
+        return xr.DataArray(np.reshape(counts, names.shape), names.coords, names.dims)
+    return module_count(names)
+
+
+def _value(results: xr.Dataset, name: str) -> Any:
+    """Return a parameter's value, or its values over the dimensions that it has."""
+    if name in results.coords:
+        return results[name].reset_coords(drop=True)
+    try:
+        files = fingerprint_of(results).get("files", {})
+        pipeline = Pipeline.from_text(results.attrs["pipeline"], files=files)
+    except (KeyError, SweepError):
+        raise StoreError(f"{name}: neither a coordinate, nor is there a pipeline in the "
+                         "attributes that tells it") from None
+    if pipeline.axis(name) is not None:
+        raise StoreError(f"{name}: varies in this store, but the dataset lacks its coordinate")
+    value = pipeline.fixed.get(name, PARAMETERS[name].default)
+    if value is not None and not isinstance(value, (int, float, str)):
+        raise StoreError(f"{name}: is drawn, so that a side is no number of the grid")
+    return value

@@ -1,1 +1,0 @@
-"""Blocks, the Dask run, the Zarr store. Nothing here knows of OpenCV."""

@@ -1,0 +1,149 @@
+"""One scene looked at closely, as ``sweep show`` draws it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.errors import RunError
+from sweep.evaluation.cells import (
+    believed,
+    run_cells,
+    search_windows,
+    single_thread,
+    visibility_flags,
+    whole_frames,
+)
+from sweep.measure.detector import Detector
+from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.model.extent import marker_boxes
+from sweep.model.pose import placed, rotation_of_vector
+from sweep.model.renderers import render
+from sweep.model.scene import Scenes, build_scenes
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import detector_settings, estimators, scene_values
+from sweep.plan.parameters import Stage
+from sweep.plan.schema import SCHEMA
+from sweep.typing import Floats
+
+
+@dataclass(frozen=True, slots=True)
+class SceneInspection:
+    """One scene looked at closely, as ``sweep show`` draws it.
+
+    Attributes
+    ----------
+    image
+        (h, w) grey levels of ``window``: left, top, right, bottom in the frame.
+    true_corners
+        (4, 2) px.
+    decoded, rejected
+        What the detector found: (ID, corners (4, 2)) and corners (4, 2), px.
+    detection, estimate
+        What became of it.
+    corners
+        (4, 2) px of the marker where it was detected, else NaN.
+    axes_px
+        (4, 2) images of the origin and of the ends of x, y and z (half a side long) of the
+        estimated pose; NaN where there is none.
+    errors
+        Name -> value of the template's scalar error variables.
+    """
+
+    image: NDArray[np.uint8]
+    window: tuple[int, int, int, int]
+    true_corners: Floats
+    area_px: float
+    decoded: list[tuple[int, Floats]]
+    rejected: list[Floats]
+    detection: DetectionStatus
+    estimate: EstimateStatus
+    corners: Floats
+    axes_px: Floats
+    errors: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class _Rendered:
+    """A pipeline's one scene: its parameters, itself, its image and the image's window."""
+
+    values: dict[str, Any]
+    scenes: Scenes
+    boxes: NDArray[np.int64]
+    unseen: NDArray[np.bool_]
+    window: tuple[int, int, int, int]
+    image: NDArray[np.uint8]
+
+
+def _rendered(pipeline: Pipeline, *, whole_frame: bool) -> _Rendered:
+    indices = [np.zeros(1, dtype=np.intp) for _ in pipeline.axes_of(Stage.scene)]
+    values = scene_values(pipeline, indices)
+    scenes = build_scenes(values, 1)
+    boxes = marker_boxes(scenes)
+    full = whole_frames(values, 1) | whole_frame
+    unseen = visibility_flags(scenes) != DetectionStatus.not_run
+    setting = detector_settings(pipeline)[0]
+    left, top, right, bottom = search_windows(scenes, boxes, setting, full | unseen)[0].tolist()
+    drawn = np.zeros_like(boxes[0]) if unseen[0] else boxes[0]
+    window = (left, top, right, bottom)
+    return _Rendered(values, scenes, boxes, unseen, window, render(scenes, 0, drawn, window))
+
+
+def picture(pipeline: Pipeline, *, whole_frame: bool = False) -> NDArray[np.uint8]:
+    """Return the image (h, w) of a pipeline's one scene; nothing is searched in it."""
+    single_thread()
+    return _rendered(pipeline, whole_frame=whole_frame).image
+
+
+def look(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInspection:
+    """Return a close look at a pipeline's one scene: every axis but ``trial`` must be fixed."""
+    single_thread()
+    indices = [np.zeros(1, dtype=np.intp) for _ in pipeline.axes_of(Stage.scene)]
+    result = run_cells(pipeline, indices)
+    if result.failures:
+        raise RunError(result.failures[0].text.strip().splitlines()[-1])
+    seen = _rendered(pipeline, whole_frame=whole_frame)
+    values, scenes, image, (left, top, _, _) = seen.values, seen.scenes, seen.image, seen.window
+    setting, estimator = detector_settings(pipeline)[0], estimators(pipeline)[0]
+    # Searched in its own window, as in a run, even where the whole frame is shown.
+    searched = search_windows(scenes, seen.boxes, setting, whole_frames(values, 1) | seen.unseen)
+    x0, y0, x1, y1 = searched[0].tolist()
+    found, ids, rejected = Detector(setting).find(
+        image[y0 - top : y1 - top, x0 - left : x1 - left],
+        scenes.dictionary[0],
+        int(scenes.frame[0].max()),
+    )
+    origin = np.array([x0, y0], dtype=np.float64)
+    columns = {name: parts[0][0] for name, parts in result.columns.items()}
+    corners = scenes.corners_px[0] + columns["corner_error_px"]
+    axes_px = np.full((4, 2), np.nan)
+    if columns["estimate"] == EstimateStatus.solved:
+        cameras, size = believed(estimator, values, scenes)
+        vector = columns["rotation_error_rad"]
+        rotation = rotation_of_vector(vector) @ scenes.rotation[0]
+        position = scenes.translation[0] + columns["translation_error_m"]
+        ends = np.concatenate([np.zeros((1, 3)), np.eye(3)]) * size[0] / 2
+        axes_px = cameras.project(placed(ends[None], rotation[None], position[None]))[0]
+    return SceneInspection(
+        image=image,
+        window=seen.window,
+        true_corners=scenes.corners_px[0],
+        area_px=float(columns["marker_area_px"]),
+        decoded=[
+            (int(marker_id), quad[0] + origin)
+            for marker_id, quad in zip(() if ids is None else ids.ravel(), found, strict=True)
+        ],
+        rejected=[quad[0] + origin for quad in rejected],
+        detection=DetectionStatus(int(columns["detection"])),
+        estimate=EstimateStatus(int(columns["estimate"])),
+        corners=corners,
+        axes_px=axes_px,
+        errors={
+            v.name: float(np.linalg.norm(columns[v.name]))
+            for v in SCHEMA
+            if v.flags is None and v.inner in ((), ("xyz",)) and v.stage is Stage.estimation
+        },
+    )

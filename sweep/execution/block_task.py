@@ -1,0 +1,159 @@
+"""What a worker does: compute one block, write it, and return a receipt."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from sweep.errors import StoreError
+from sweep.evaluation.cells import CellsResult, run_cells, shaped
+from sweep.execution.reuse import ReusedCells, Source, match, take
+from sweep.isolation.crash_isolation import WHOLE, run_cells_isolated
+from sweep.isolation.watchdog import ending_after
+from sweep.plan.experiment import Pipeline, file_digest
+from sweep.plan.grid import Block, block_indices
+from sweep.plan.parameters import Stage
+from sweep.plan.schema import SCHEMA, Variable
+from sweep.store.failures import MAX_ROWS, recorded
+from sweep.store.lifecycle import RunStore, begin_block, open_store, write_block
+from sweep.store.provenance import fingerprint
+
+TIME_LIMIT_S = 600.0
+"""Seconds after which a block is taken for endless, the search for its endless scene included."""
+
+ROOM: dict[str, int] = {"failed": MAX_ROWS, "crashed": MAX_ROWS}
+
+
+@lru_cache(maxsize=4)
+def _opened(url: str, run_id: str) -> RunStore:
+    """Open a store once in each process, and see that its numbers can be made here."""
+    store = open_store(url, "r+")
+    if store.run_id != run_id:
+        raise StoreError(f"{url}: replaced by another run while this one was going on")
+    here, there = fingerprint(store.pipeline), store.fingerprint
+    for key, value in there.items():
+        if here.get(key) != value:
+            raise StoreError(
+                f"a worker has {key} {here.get(key)}, the store was begun with {value}; "
+                "install the same version on every machine"
+            )
+    for path, digest in there["files"].items():
+        if file_digest(Path(store.pipeline.folder) / path) != digest:
+            raise StoreError(
+                f"{path}: not in {store.pipeline.folder} on a worker as it was when the run began; "
+                "every machine needs the same file there"
+            )
+    # A committed chunk exists even where it is all fill value: a missing one is a deleted one.
+    zarr.config.set({"array.write_empty_chunks": True})
+    return store
+
+
+@lru_cache(maxsize=16)
+def _source(url: str, run_id: str, old: str) -> Source:
+    """Match an old store to the new grid once in each process."""
+    return match(_opened(url, run_id).pipeline, open_store(old))
+
+
+def compute_block(
+    url: str,
+    run_id: str,
+    block: Block,
+    reuse: Sequence[str] = (),
+    time_limit_s: float = TIME_LIMIT_S,
+    room: Mapping[str, int] = ROOM,
+) -> dict[str, Any]:
+    """Compute, write and commit one block; return its receipt (also when it is run twice).
+
+    Cells that the stores ``reuse`` have are taken from there. A block that was begun before and
+    not committed may have ended its process: it is computed in a child, where what does so is
+    found. ``room`` bounds the rows of failures that the receipt keeps of each kind.
+    """
+    start = time.perf_counter()
+    store = _opened(url, run_id)
+    begun_before = begin_block(store, block)
+    pipeline = store.pipeline
+    shape = (len(block), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
+    taken: ReusedCells | None = None
+    need = np.ones(shape, dtype=bool)
+    if reuse:
+        taken = take(pipeline, block, [_source(url, run_id, old) for old in reuse])
+        need = ~taken.have.reshape(shape)
+    # Scenes of which nothing is missing are not even rendered.
+    rows = np.flatnonzero(need.any(axis=(1, 2)))
+    cells = None
+    if len(rows):
+        indices = [index[rows] for index in block_indices(block)]
+        if not begun_before:
+            # What raises for a block as a whole is found as what ends its process is.
+            with ending_after(WHOLE * time_limit_s), contextlib.suppress(Exception):
+                cells = run_cells(pipeline, indices, need[rows])
+        if cells is None:
+            cells = run_cells_isolated(pipeline, indices, need[rows], time_limit_s)
+    values = {
+        v.name: shaped(v, pipeline, block, _columns(v, cells, rows, pipeline, len(block)))
+        for v in SCHEMA
+    }
+    if taken is not None:
+        values = {v.name: _merged(v, values, taken) for v in SCHEMA}
+    receipt = {
+        "scenes": len(block),
+        "computed": {
+            "scenes": len(rows),
+            "detections": int(need.any(axis=2).sum()),
+            "estimates": int(need.sum()),
+        },
+        "detection": np.bincount(values["detection"].ravel()).tolist(),
+        "estimate": np.bincount(values["estimate"].ravel()).tolist(),
+        "seconds": cells.seconds if cells is not None else _NO_SECONDS,
+        "failures": recorded(cells.failures if cells is not None else [], rows.tolist(), room),
+        "wall_s": time.perf_counter() - start,
+        "written": time.time(),
+    }
+    write_block(store, block, values, receipt)
+    return receipt
+
+
+_NO_SECONDS: dict[str, list[float]] = {"scene": [], "detection": [], "estimation": []}
+"""What a block cost of which nothing was computed."""
+
+
+def _columns(
+    variable: Variable, cells: CellsResult | None, rows: NDArray[np.intp], pipeline: Pipeline,
+    count: int,
+) -> list[NDArray[Any]]:
+    """Return a variable's columns (N, ...) per treatment: what ``rows`` gave, fill elsewhere."""
+    if cells is not None and len(rows) == count:
+        return cells.columns[variable.name]
+    stages = [stage for stage in Stage if Stage.scene < stage <= variable.stage]
+    columns = []
+    for k in range(pipeline.size(*stages)):
+        whole = np.full((count, *variable.inner_shape), variable.fill, dtype=variable.dtype)
+        if cells is not None:
+            whole[rows] = cells.columns[variable.name][k]
+        columns.append(whole)
+    return columns
+
+
+def _merged(
+    variable: Variable, computed: dict[str, NDArray[Any]], taken: ReusedCells
+) -> NDArray[Any]:
+    """Return a variable with what was taken in place of what was not computed.
+
+    Only whole cells are either: the flags of the variable's stage tell which.
+    """
+    new, old = computed[variable.name], taken.values[variable.name]
+    flag = {Stage.detection: "detection", Stage.estimation: "estimate"}.get(variable.stage)
+    if flag is None:
+        missing = new == variable.fill if variable.flags is not None else np.isnan(new)
+    else:
+        missing = computed[flag] == 0
+        missing = missing.reshape(missing.shape + (1,) * (new.ndim - missing.ndim))
+    return np.where(missing, old, new).astype(variable.dtype)

@@ -1,0 +1,84 @@
+"""What a run leaves when its last block is there: costs, failures, and counts of flags."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.plan.axes import Axis
+from sweep.plan.parameters import Stage
+from sweep.store.failures import MAX_ROWS, FailedCell, failed_cells, failure_table
+from sweep.store.lifecycle import RunStore, committed, finish, receipts
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+def close(store: RunStore) -> None:
+    """Close a complete store: what its receipts tell is gathered, and it is marked finished."""
+    blocks: list[tuple[int, dict[str, Any]]] = []
+    cells: list[FailedCell] = []
+    kept: Counter[str] = Counter()
+    counts = {"detection": [0] * len(DetectionStatus), "estimate": [0] * len(EstimateStatus)}
+    for number, receipt in receipts(store, committed(store)):
+        if receipt["seconds"]["scene"]:
+            blocks.append((number, receipt["seconds"]))
+        for name, totals in counts.items():
+            for flag, count in enumerate(receipt[name]):
+                totals[flag] += count
+        for cell in failed_cells(store, number, receipt):
+            kept[cell.kind] += 1
+            if kept[cell.kind] <= MAX_ROWS:
+                cells.append(cell)
+    groups = {"cost": _cost(store, blocks)}
+    if cells:
+        groups["failures"] = failure_table(cells, lost(counts["detection"], counts["estimate"]))
+    finish(store, groups, counts)
+
+
+def lost(detection: list[int], estimate: list[int]) -> dict[str, int]:
+    """Return how many cells failed and crashed, from counts of their flags."""
+    def count(flags: list[int], flag: int) -> int:
+        return flags[flag] if len(flags) > flag else 0
+
+    return {
+        kind: count(detection, DetectionStatus[kind]) + count(estimate, EstimateStatus[kind])
+        for kind in ("crashed", "failed")
+    }
+
+
+def _cost(store: RunStore, blocks: list[tuple[int, dict[str, Any]]]) -> xr.Dataset:
+    """Return the cost group: seconds per stage and treatment for each block."""
+    import xarray as xr  # noqa: PLC0415  (slow to import, and often not needed)
+
+    pipeline = store.pipeline
+    settings = list(pipeline.axes_of(Stage.detection))
+    both = [*settings, *pipeline.axes_of(Stage.estimation)]
+
+    def shaped(values: list[Any], axes: list[Axis]) -> Any:
+        return np.asarray(values, dtype=np.float64).reshape(
+            (len(blocks), *(len(axis) for axis in axes))
+        )
+
+    return xr.Dataset(
+        {
+            "scene_s": (("block",), shaped([s["scene"][0] for _, s in blocks], [])),
+            "detection_s": (
+                ("block", *(axis.name for axis in settings)),
+                shaped([s["detection"] for _, s in blocks], settings),
+            ),
+            "estimation_s": (
+                ("block", *(axis.name for axis in both)),
+                shaped([s["estimation"] for _, s in blocks], both),
+            ),
+        },
+        coords={
+            "block": [number for number, _ in blocks],
+            **{axis.name: axis.coordinates().astype(object)
+               if axis.coordinates().dtype.kind == "T" else axis.coordinates() for axis in both},
+        },
+        attrs={"long_name": "seconds per stage and treatment for each block"},
+    )

@@ -1,0 +1,268 @@
+"""Finished cells of other stores, taken into a new one: grids grow, halves are joined.
+
+A cell is reusable where the fingerprint and all its parameter values agree. What is asked of an
+old store is decided cell by cell from its receipts and flags; the old store is only read.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.errors import StoreError
+from sweep.plan.axes import TRIAL, Axis
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import Block, scene_axes
+from sweep.plan.parameters import PARAMETERS, Stage
+from sweep.plan.schema import SCHEMA, Variable
+from sweep.store.lifecycle import RunStore, committed
+from sweep.store.provenance import fingerprint
+
+MISSING = -1
+"""Stands for the index of a value that the old grid does not have."""
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """An old store, and where each new axis' values lie in it.
+
+    Attributes
+    ----------
+    old_index
+        New axis -> (length,) index along the old axis of that name, or ``MISSING``; 0 where the
+        old store had the value fixed.
+    pinned
+        Old axes that the new grid does not have -> the index of the value that it has fixed.
+    done
+        Numbers of the old store's committed blocks.
+    """
+
+    store: RunStore
+    old_index: dict[str, NDArray[np.int64]]
+    pinned: dict[str, int]
+    done: frozenset[int]
+
+
+def match(pipeline: Pipeline, store: RunStore) -> Source:
+    """Find a new grid's cells in an old store.
+
+    Raises
+    ------
+    StoreError
+        Where no cell can be taken: another fingerprint, or parameters that never agree.
+    """
+    old = store.pipeline
+    mine, theirs = fingerprint(pipeline), store.fingerprint
+    # A file that only one of them refers to is a value that only one of them has.
+    shared = mine["files"].keys() & theirs["files"].keys()
+    for one in (mine, theirs):
+        one["files"] = {path: one["files"][path] for path in sorted(shared)}
+    faults = [
+        f"{key}: the store has {json.dumps(theirs.get(key))}, this run {json.dumps(mine.get(key))}"
+        for key in sorted({*mine, *theirs})
+        if mine.get(key) != theirs.get(key)
+    ]
+    old_index: dict[str, NDArray[np.int64]] = {}
+    pinned: dict[str, int] = {}
+    for name in (*PARAMETERS, TRIAL):
+        new_axis, old_axis = pipeline.axis(name), old.axis(name)
+        new_values = _values(pipeline, name, new_axis)
+        old_values = _values(old, name, old_axis)
+        if new_values is None or old_values is None:
+            if pipeline.distributions.get(name) != old.distributions.get(name):
+                faults.append(f"{name}: drawn in one and not, or otherwise, in the other")
+            continue
+        where = _indices(new_values, old_values)
+        if not (where != MISSING).any():
+            faults.append(
+                f"{name}: the store has {_some(old_values)}, this run {_some(new_values)}"
+            )
+        if new_axis is not None:
+            old_index[name] = where
+        if old_axis is not None and new_axis is None:
+            pinned[name] = int(where[0])
+    if faults:
+        listed = "\n".join(f"  {fault}" for fault in faults)
+        raise StoreError(f"{store.url}: nothing of it can be reused\n{listed}")
+    return Source(store, old_index, pinned, frozenset(committed(store)))
+
+
+def _values(pipeline: Pipeline, name: str, axis: Axis | None) -> Sequence[Any] | None:
+    """Return a parameter's values; None where it is drawn."""
+    if axis is not None:
+        return axis.values
+    if name == TRIAL:
+        return (0,)
+    return None if name in pipeline.distributions else (pipeline.fixed[name],)
+
+
+def _indices(wanted: Sequence[Any], there: Sequence[Any]) -> NDArray[np.int64]:
+    if isinstance(wanted, range) and isinstance(there, range):
+        low, step = there.start, there.step
+        values = np.arange(wanted.start, wanted.stop, wanted.step, dtype=np.int64)
+        index, off = np.divmod(values - low, step)
+        return np.where((off == 0) & (index >= 0) & (index < len(there)), index, MISSING)
+    if isinstance(there, range):
+        found = [there.index(value) if value in there else MISSING for value in wanted]
+        return np.array(found, dtype=np.int64)
+    known = {value: i for i, value in enumerate(there)}
+    return np.array([known.get(value, MISSING) for value in wanted], dtype=np.int64)
+
+
+def _some(values: Sequence[Any]) -> str:
+    shown = ", ".join(str(value) for value in values[:4])
+    return shown if len(values) <= 4 else f"{shown}, ... ({len(values):,} values)"
+
+
+@dataclass(slots=True)
+class ReusedCells:
+    """What old stores gave of a block: values in the template's dimensions, fill where nothing.
+
+    ``have`` (N, detector settings, estimators) tells what need not be computed.
+    """
+
+    values: dict[str, NDArray[Any]]
+    have: NDArray[np.bool_]
+
+
+def take(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> ReusedCells:
+    """Read a block's reusable cells from old stores; the first that has a cell gives it."""
+    axes = scene_axes(pipeline)
+    cuts = {
+        axis.name: slice(start, stop)
+        for axis, start, stop in zip(axes, block.starts, block.stops, strict=True)
+    }
+    treatments = [*pipeline.axes_of(Stage.detection), *pipeline.axes_of(Stage.estimation)]
+    order = [axis.name for axis in (*axes, *treatments)]
+    shape = {
+        **dict(zip((axis.name for axis in axes), block.shape, strict=True)),
+        **{axis.name: len(axis) for axis in treatments},
+    }
+    values = {
+        v.name: np.full(
+            [shape[n] for n in v.dimensions(pipeline) if n in shape] + list(v.inner_shape),
+            v.fill, dtype=v.dtype,
+        )
+        for v in SCHEMA
+    }
+    have = np.zeros([shape[name] for name in order], dtype=bool)
+    for source in sources:
+        _take_from(source, pipeline, cuts, order, values, have)
+    settings = pipeline.size(Stage.detection)
+    return ReusedCells(values, have.reshape(len(block), settings, -1))
+
+
+def _take_from(
+    source: Source,
+    pipeline: Pipeline,
+    cuts: dict[str, slice],
+    order: list[str],
+    values: dict[str, NDArray[Any]],
+    have: NDArray[np.bool_],
+) -> None:
+    """Add one old store's cells to ``values``, and note them in ``have`` (dimensions ``order``)."""
+    places: dict[str, NDArray[np.int64]] = {}
+    indices: dict[str, NDArray[np.int64]] = {}
+    for name in order:
+        where = source.old_index[name][cuts.get(name, slice(None))]
+        places[name] = np.flatnonzero(where != MISSING)
+        indices[name] = where[places[name]]
+        if len(places[name]) == 0:
+            return
+    ready = _committed_cells(source, order, places, indices)
+    if not ready.any():
+        return
+    old = {
+        v.name: _read(source, pipeline, v, indices) for v in SCHEMA
+    }
+    # A cell is there where it was committed and its flags say that it was run.
+    estimate = next(v for v in SCHEMA if v.name == "estimate")
+    names = [name for name in estimate.dimensions(pipeline) if name in places]
+    flags = np.transpose(old["estimate"], [names.index(name) for name in order])
+    fresh = ready & (flags != 0) & ~have[np.ix_(*(places[name] for name in order))]
+    if not fresh.any():
+        return
+    have[np.ix_(*(places[name] for name in order))] |= fresh
+    for variable in SCHEMA:
+        names = [name for name in variable.dimensions(pipeline) if name in places]
+        # Where any treatment of a scene (or of a detection) is taken, so is what it shares.
+        away = tuple(k for k, name in enumerate(order) if name not in names)
+        chosen = fresh.any(axis=away)
+        kept = [name for name in order if name in names]
+        chosen = np.transpose(chosen, [kept.index(name) for name in names])
+        target = values[variable.name]
+        grid = np.ix_(*(places[name] for name in names)) if names else ...
+        part = target[grid]
+        part[chosen] = old[variable.name][chosen]
+        target[grid] = part
+
+
+def _committed_cells(
+    source: Source,
+    order: list[str],
+    places: dict[str, NDArray[np.int64]],
+    indices: dict[str, NDArray[np.int64]],
+) -> NDArray[np.bool_]:
+    """Tell for each candidate cell (dimensions ``order``) whether its old block is committed."""
+    store = source.store
+    blocks = store.blocks
+    along: list[NDArray[np.int64]] = []
+    names = []
+    for axis in scene_axes(store.pipeline):
+        names.append(axis.name)
+        if axis.name in source.pinned:
+            along.append(np.array([source.pinned[axis.name]]))
+        else:
+            along.append(indices[axis.name])
+    numbers = [
+        index // extent for index, extent in zip(along, blocks.extents, strict=True)
+    ]
+    ready = np.zeros([len(index) for index in along], dtype=bool)
+    for chosen in itertools.product(*(np.unique(number) for number in numbers)):
+        starts = tuple(int(c) * e for c, e in zip(chosen, blocks.extents, strict=True))
+        if blocks.number(Block(starts, starts)) in source.done:
+            ready[np.ix_(*(n == c for n, c in zip(numbers, chosen, strict=True)))] = True
+    # Old dimensions that are pinned go; new ones that the old store had fixed come, length 1.
+    for k in reversed(range(len(names))):
+        if names[k] in source.pinned:
+            ready = ready.take(0, axis=k)
+            del names[k]
+    full = ready.transpose([names.index(name) for name in order if name in names])
+    for k, name in enumerate(order):
+        if name not in names:
+            full = np.expand_dims(full, k)
+    return np.array(np.broadcast_to(full, [len(places[name]) for name in order]))
+
+
+def _read(
+    source: Source, pipeline: Pipeline, variable: Variable, indices: dict[str, NDArray[np.int64]]
+) -> NDArray[Any]:
+    """Read an old variable at ``indices``, in the new grid's dimensions."""
+    array = source.store.array(variable.name)
+    names = list(variable.dimensions(source.store.pipeline))
+    selection: list[Any] = []
+    for name in names:
+        if name in variable.inner:
+            selection.append(slice(None))
+        elif name in source.pinned:
+            selection.append(np.array([source.pinned[name]]))
+        else:
+            selection.append(indices[name])
+    part = np.asarray(array.oindex[tuple(selection)]) if names else np.asarray(array[...])
+    for k in reversed(range(len(names))):
+        if names[k] in source.pinned:
+            part = part.take(0, axis=k)
+            del names[k]
+    wanted = list(variable.dimensions(pipeline))
+    part = part.transpose([names.index(name) for name in wanted if name in names])
+    for k, name in enumerate(wanted):
+        if name not in names:
+            part = np.expand_dims(part, k)
+    shape = [len(indices[n]) if n in indices else part.shape[k] for k, n in enumerate(wanted)]
+    return np.array(np.broadcast_to(part, shape))

@@ -1,0 +1,90 @@
+"""How far a store is: what is done, flags counted, rate, time left; also while it is written."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.plan.parameters import Stage
+from sweep.store.failures import MAX_ROWS, FailedCell, failed_cells
+from sweep.store.lifecycle import committed, open_store, receipts
+from sweep.store.lock import holder
+
+RATE_BLOCKS = 50
+"""The rate is that of this many blocks, the last to be written."""
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """A store's state; flags are counted from the receipts of its committed blocks."""
+
+    store: str
+    title: str
+    finished: bool
+    writer: str | None
+    blocks: int
+    blocks_done: int
+    poses: int
+    poses_done: int
+    detection: dict[str, int]
+    estimate: dict[str, int]
+    poses_per_s: float | None
+    seconds_left: float | None
+    crashed: list[FailedCell]
+    failed: list[FailedCell]
+
+
+def status(url: str) -> Status:
+    """Return the state of a store.
+
+    Raises
+    ------
+    StoreError
+        Where there is none.
+    """
+    store = open_store(url)
+    detection: Counter[str] = Counter()
+    estimate: Counter[str] = Counter()
+    written: list[tuple[float, int]] = []
+    cells: dict[str, list[FailedCell]] = {"crashed": [], "failed": []}
+    done = poses = 0
+    for number, receipt in receipts(store, committed(store)):
+        done += 1
+        poses += receipt["scenes"]
+        for flags, counts, counter in (
+            (DetectionStatus, receipt["detection"], detection),
+            (EstimateStatus, receipt["estimate"], estimate),
+        ):
+            for flag, count in zip(flags, counts, strict=False):
+                counter[flag.name] += count
+        written.append((receipt["written"], receipt["scenes"]))
+        for cell in failed_cells(store, number, receipt):
+            if len(cells[cell.kind]) < MAX_ROWS:
+                cells[cell.kind].append(cell)
+    total = store.pipeline.size(Stage.scene)
+    held = holder(store.place)
+    rate = _rate(written)
+    return Status(
+        store=url,
+        title=store.pipeline.title or store.pipeline.name,
+        finished=store.finished,
+        writer=f"process {held.get('pid')} on {held.get('host')}" if held else None,
+        blocks=len(store.blocks),
+        blocks_done=done,
+        poses=total,
+        poses_done=poses,
+        detection={name: count for name, count in detection.items() if count},
+        estimate={name: count for name, count in estimate.items() if count},
+        poses_per_s=rate,
+        seconds_left=(total - poses) / rate if rate and held else None,
+        **cells,
+    )
+
+
+def _rate(written: list[tuple[float, int]]) -> float | None:
+    """Return poses per second over the last blocks; None where too few are there."""
+    last = sorted(written)[-RATE_BLOCKS:]
+    if len(last) < 2 or last[-1][0] <= last[0][0]:
+        return None
+    return sum(scenes for _, scenes in last[1:]) / (last[-1][0] - last[0][0])

@@ -1,0 +1,1 @@
+"""Verification, repair and reproduction of stores."""

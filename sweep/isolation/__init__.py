@@ -1,0 +1,1 @@
+"""Child processes, time limits, crash isolation and interrupts."""

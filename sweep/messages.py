@@ -1,0 +1,87 @@
+"""What is wrong with a pipeline, in lines that are few, short and printable.
+
+A file's names and values are quoted in them, and the file may be anyone's: what is quoted is cut,
+and its control characters are escaped, so that it neither forges a line nor reaches a terminal.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from sweep.errors import PipelineError
+
+MAX_FAULTS = 20
+"""Faults that are told; the others are counted."""
+
+MAX_QUOTE_LENGTH = 120
+MAX_LINE_LENGTH = 1000
+
+
+def refusal(faults: Sequence[str]) -> PipelineError:
+    """Return the error that tells of ``faults``, a line each."""
+    lines = [plain(fault, MAX_LINE_LENGTH) for fault in faults[:MAX_FAULTS]]
+    if len(faults) > MAX_FAULTS:
+        lines.append(f"... and {len(faults) - MAX_FAULTS:,} faults more")
+    return PipelineError(lines)
+
+
+def plain(text: object, most: int = MAX_QUOTE_LENGTH) -> str:
+    """Return text on one line, without control characters, cut where it is long."""
+    text = str(text)
+    cut = text if len(text) <= most else text[: most - 3] + "..."
+    if cut.isprintable():
+        return cut
+    return "".join(c if c.isprintable() else _escape(c) for c in cut)
+
+
+def _escape(character: str) -> str:
+    short = {"\n": "\\n", "\t": "\\t", "\r": "\\r"}.get(character)
+    code = ord(character)
+    return short or (f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}")
+
+
+def shown(value: Any) -> str:
+    """Return a value as TOML would have it, cut where it is long; only that much is written out."""
+    text = ""
+    for piece in _pieces(value):
+        text += piece
+        if len(text) > MAX_QUOTE_LENGTH:
+            break
+    return plain(text)
+
+
+def _pieces(value: Any) -> Iterator[str]:
+    if isinstance(value, dict):
+        yield "{"
+        for number, (key, item) in enumerate(value.items()):
+            yield f"{', ' if number else ''}{_key(str(key))} = "
+            yield from _pieces(item)
+        yield "}"
+    elif isinstance(value, (list, tuple)):
+        yield "["
+        for number, item in enumerate(value):
+            yield ", " if number else ""
+            yield from _pieces(item)
+        yield "]"
+    elif isinstance(value, str):
+        yield _quoted(value)
+    elif isinstance(value, bool):
+        yield str(value).lower()
+    elif isinstance(value, int):
+        # Python writes no more than 4300 decimal digits.
+        yield str(value) if value.bit_length() < 10_000 else f"{value:#x}"
+    elif hasattr(value, "isoformat"):
+        yield value.isoformat().replace("+00:00", "Z")
+    else:
+        yield str(value)
+
+
+def _quoted(text: str) -> str:
+    short = itertools.islice(text, MAX_QUOTE_LENGTH + 1)
+    return '"' + "".join("\\" + c if c in '"\\' else plain(c) for c in short) + '"'
+
+
+def _key(key: str) -> str:
+    return key if key.isascii() and key.replace("-", "_").isidentifier() else _quoted(key)

@@ -1,0 +1,125 @@
+"""Which parts of the model and the measurement a pipeline needs, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sweep.measure.detector import (
+    NOISE_MARGIN_PX,
+    UNEVEN_LIGHT_CONSTANT,
+    full_frame_reason,
+    margin_px,
+)
+from sweep.model.camera import canonical_distortion
+from sweep.model.effects import RANDOM, SWITCHES, is_on
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import detector_settings
+from sweep.plan.parameters import PARAMETERS
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A part of the work: what it is, whether it runs, and the reason.
+
+    ``switch`` is the parameter that switches an effect on.
+    """
+
+    name: str
+    active: bool
+    reason: str
+    switch: str = ""
+
+
+EFFECTS = {
+    "occlusion": "occlusion",
+    "illumination_gradient": "uneven light",
+    "exposure_s": "motion blur",
+    "row_time_s": "rolling shutter",
+    "blur_px": "optical blur",
+    "aperture_mm": "defocus",
+    "vignetting": "vignetting",
+    "full_well_e": "shot noise",
+    "gain": "gain",
+    "noise_grey": "grey noise",
+    "bit_depth": "bit depth",
+}
+"""Switch of an effect -> its name, in physical order."""
+
+
+def _effect(pipeline: Pipeline, name: str, switch: str) -> Part:
+    off = "not given" if SWITCHES[switch] is None else f"{SWITCHES[switch]:g}"
+    if switch in pipeline.distributions:
+        return Part(name, True, f"{switch} is drawn: {pipeline.distributions[switch]}", switch)
+    values = [value for value in pipeline.values_of(switch) if is_on(switch, value)]
+    if not values:
+        return Part(name, False, f"{switch} is {off}", switch)
+    low, high = min(values), max(values)
+    extent = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+    return Part(name, True, f"{switch} is {extent}", switch)
+
+
+def parts(pipeline: Pipeline) -> list[Part]:
+    """Return every optional part, active or not."""
+    lens = pipeline.any_value("distortion", lambda value: len(canonical_distortion(value)) > 0)
+    draws = [*pipeline.distributions]
+    if pipeline.any_value("jitter_px", lambda value: value > 0):
+        draws.append("jitter_px")
+    draws += [
+        name for name in RANDOM
+        if name not in draws and pipeline.any_value(name, lambda value: value > 0)
+    ]
+    renderers = sorted(set(pipeline.values_of("renderer")))
+    image = pipeline.any_value("background", lambda value: isinstance(value, str))
+    asked = pipeline.any_value("window", lambda value: value == "full")
+    settings = detector_settings(pipeline)
+    whole = sorted({reason for s in settings if (reason := full_frame_reason(s)) is not None})
+    gain = max([1.0, *(value for value in pipeline.values_of("gain"))])
+    uneven = any(
+        pipeline.any_value(name, lambda value: value != 0) or name in pipeline.distributions
+        for name in ("illumination_gradient", "vignetting")
+    )
+    if uneven and any(s.adaptiveThreshConstant < UNEVEN_LIGHT_CONSTANT * gain for s in settings):
+        whole.append("adaptiveThreshConstant is low for uneven light")
+    if image:
+        whole.append("the background is an image: clutter near the marker may change what is found")
+    if asked:
+        whole.append('window = "full"')
+    random = any(name in draws for name in RANDOM)
+    noise = f", and {NOISE_MARGIN_PX} more for noise" if random else ""
+    margins = sorted({margin_px(setting) for setting in settings})
+    guarded = pipeline.any_value("guarded", bool)
+    beliefs = [
+        name for name in PARAMETERS
+        if name.startswith("believed_") and pipeline.fixed.get(name, "varies") is not None
+    ]
+    bounds = sorted(set(pipeline.values_of("bound")) - {"none"})
+    pixels = "photometric" in pipeline.values_of("solver")
+    return [
+        Part("lens distortion", lens, "distortion is given" if lens else "distortion is empty"),
+        Part("random draws", bool(draws), ", ".join(draws) if draws else "nothing is random"),
+        Part("background image", image, "background names a file" if image else "a level"),
+        Part(
+            "window", not (asked or image),
+            f"{', '.join(str(m) for m in margins)} px around what the marker can influence{noise}"
+            if not (asked or image) else "the full frame",
+        ),
+        Part("full frame", bool(whole), "; ".join(whole) if whole else "no setting needs it"),
+        Part("renderer", True, ", ".join(renderers)),
+        *(_effect(pipeline, name, switch) for switch, name in EFFECTS.items()),
+        Part(
+            "solver guard", guarded,
+            "guarded = true" if guarded else "guarded = false: plain cv2.solvePnP",
+        ),
+        Part(
+            "accuracy bound", bool(bounds),
+            f"bound is {', '.join(bounds)}" if bounds else "bound is none",
+        ),
+        Part(
+            "pixels kept", pixels,
+            "solver photometric fits them" if pixels else "no estimator looks at them",
+        ),
+        Part(
+            "mistaken beliefs", bool(beliefs),
+            ", ".join(beliefs) if beliefs else "the estimator knows the truth of camera and size",
+        ),
+    ]

@@ -1,0 +1,1 @@
+"""The Zarr store: layout, life cycle, blocks, receipts, checksums, lock and provenance."""

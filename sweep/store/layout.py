@@ -1,0 +1,254 @@
+"""What the store of a pipeline consists of: its arrays, and the values of its coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import google_crc32c
+import numcodecs.zstd
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from zarr.codecs import Crc32cCodec, ZstdCodec
+from zarr.core.buffer import cpu, default_buffer_prototype
+from zarr.core.dtype import parse_dtype
+from zarr.core.sync import sync
+from zarr.storage import MemoryStore
+
+from sweep.model.camera import VIEW_PARAMETERS
+from sweep.plan.axes import Axis
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import Blocks, resolve_distance, scene_axes
+from sweep.plan.schema import LABELS, SCHEMA, Variable
+
+RECEIPTS = "commits/receipt"
+"""Array of the blocks' receipts by number, JSON, a chunk each; empty where not committed."""
+
+COORDINATE_CHUNK = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedArray:
+    """One array of a store.
+
+    Attributes
+    ----------
+    values
+        Gives its values in [start, stop) along the first dimension; None where blocks or receipts
+        are written there later.
+    """
+
+    path: str
+    shape: tuple[int, ...]
+    chunks: tuple[int, ...]
+    dtype: str
+    dimensions: tuple[str, ...]
+    fill: Any = None
+    attributes: dict[str, Any] = field(default_factory=dict)
+    values: Callable[[int, int], NDArray[Any]] | None = None
+
+    def create(self, group: zarr.Group) -> None:
+        """Create the array and write its values."""
+        array = self.create_empty(group)
+        for where, values in self.pieces():
+            array[where] = values
+
+    def create_empty(self, group: zarr.Group) -> zarr.Array[Any]:
+        """Create the array without values."""
+        given = {} if self.fill is None else {"fill_value": self.fill}
+        return group.create_array(
+            self.path, shape=self.shape, chunks=self.chunks, dtype=self.dtype,
+            dimension_names=self.dimensions, compressors=_codecs(), attributes=self.attributes,
+            overwrite=True, **given,
+        )
+
+    def pieces(self) -> Iterator[tuple[Any, NDArray[Any]]]:
+        """Yield its values, and where they go, chunk by chunk along the first dimension."""
+        if self.values is None:
+            return
+        if not self.shape:
+            yield ..., self.values(0, 0)
+            return
+        for start in range(0, self.shape[0], self.chunks[0]):
+            stop = min(start + self.chunks[0], self.shape[0])
+            yield slice(start, stop), self.values(start, stop)
+
+    def value_keys(self) -> set[str]:
+        """Return the keys of its chunks, where its values are the pipeline's."""
+        if self.values is None:
+            return set()
+        if not self.shape:
+            return {f"{self.path}/c"}
+        rest = "/0" * (len(self.shape) - 1)
+        count = -(-self.shape[0] // self.chunks[0])
+        return {f"{self.path}/c/{k}{rest}" for k in range(count)}
+
+    def misfit(self, array: zarr.Array[Any]) -> str:
+        """Return in what an array that is there differs from this one; empty where in nothing.
+
+        Of its attributes only their names are looked at, and the units: some change what is read.
+        """
+        metadata = array.metadata
+        if metadata.zarr_format != 3:
+            return "Zarr format 2, expected 3"
+        expected = {
+            "shape": self.shape,
+            "chunks": self.chunks,
+            "dtype": np.dtype(_dtype(self.dtype)),
+            "dimensions": self.dimensions,
+            "codecs": [codec.to_dict() for codec in _codecs()],
+            "chunk keys": ("default", "/"),
+        }
+        codecs = [codec.to_dict() for codec in metadata.codecs[1:]]
+        keys = metadata.chunk_key_encoding.to_dict()
+        there = {
+            "shape": array.shape,
+            "chunks": array.chunks if not array.shards else ("shards", array.shards),
+            "dtype": array.dtype,
+            "dimensions": tuple(metadata.dimension_names or ()),
+            "codecs": codecs,
+            "chunk keys": (
+                keys["name"], cast("dict[str, Any]", keys.get("configuration", {})).get("separator")
+            ),
+        }
+        for name, value in expected.items():
+            if there[name] != value:
+                return f"{name} {there[name]}, expected {value}"
+        serializer = metadata.codecs[0].to_dict()
+        if serializer["name"] != ("vlen-utf8" if self.dtype == "string" else "bytes"):
+            return f"serializer {serializer['name']}"
+        if "big" in str(serializer.get("configuration")):
+            return "serializer big-endian, expected little"
+        foreign = sorted(dict(array.attrs).keys() - self.attributes.keys())
+        if foreign:
+            return f"attribute {foreign[0]}, which no store of sweep has"
+        if array.attrs.get("units") != self.attributes.get("units"):
+            return f"units {array.attrs.get('units')}, expected {self.attributes.get('units')}"
+        if self.fill is not None and not _equal(metadata.fill_value, self.fill):
+            return f"fill value {metadata.fill_value}, expected {self.fill}"
+        return ""
+
+
+def _dtype(name: str) -> Any:
+    return parse_dtype(name, zarr_format=3).to_native_dtype()
+
+
+def _equal(a: Any, b: Any) -> bool:
+    return bool(a == b or (a != a and b != b))  # noqa: PLR0124  (NaN)
+
+
+def _codecs() -> list[Any]:
+    """Return the codecs of every array: a damaged chunk fails its checksum when it is read."""
+    return [ZstdCodec(level=3), Crc32cCodec()]
+
+
+def decoded_chunk(content: bytes, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Return the values of a stored chunk of numbers.
+
+    Raises
+    ------
+    ValueError, RuntimeError
+        Where it fails its checksum, or is of another size.
+    """
+    body, checksum = content[:-4], content[-4:]
+    if google_crc32c.value(body) != int.from_bytes(checksum, "little"):
+        raise ValueError("checksum")
+    values = np.empty(shape, dtype=dtype.newbyteorder("<"))
+    # Into memory of the right size, whatever the content says that it needs.
+    if numcodecs.zstd.decompress(body, values.reshape(-1)).nbytes != values.nbytes:
+        raise ValueError("size")
+    return values
+
+
+def planned_arrays(pipeline: Pipeline, extents: tuple[int, ...]) -> list[PlannedArray]:
+    """Return the arrays of a pipeline's store whose chunks are blocks of ``extents``."""
+    scene_extent = dict(zip((axis.name for axis in scene_axes(pipeline)), extents, strict=True))
+    planned = [_axis(axis) for axis in pipeline.axes]
+    used = {name for variable in SCHEMA for name in variable.inner}
+    planned += [_labels(name, LABELS[name], {}) for name in sorted(used)]
+    planned += _distance(pipeline)
+    planned += [_variable(variable, pipeline, scene_extent) for variable in SCHEMA]
+    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
+    planned.append(
+        PlannedArray(RECEIPTS, (len(Blocks(lengths, extents)),), (1,), "string", ("block",))
+    )
+    return planned
+
+
+def _variable(
+    variable: Variable, pipeline: Pipeline, scene_extent: dict[str, int]
+) -> PlannedArray:
+    names, shape = variable.dimensions(pipeline), variable.shape(pipeline)
+    chunks = tuple(
+        scene_extent.get(name, length) for name, length in zip(names, shape, strict=True)
+    )
+    return PlannedArray(
+        variable.name, shape, chunks, variable.dtype, names, variable.fill, variable.attributes()
+    )
+
+
+def _axis(axis: Axis) -> PlannedArray:
+    attributes: dict[str, Any] = {"long_name": axis.meaning}
+    if axis.unit:
+        attributes["units"] = axis.unit
+    if axis.labelled:
+        return _labels(axis.name, axis.coordinates().tolist(), attributes)
+    return PlannedArray(
+        axis.name, (len(axis),), (min(len(axis), COORDINATE_CHUNK),),
+        axis.coordinates(0, 1).dtype.str.lstrip("<>|="), (axis.name,), None, attributes,
+        axis.coordinates,
+    )
+
+
+def _labels(name: str, labels: Any, attributes: dict[str, Any]) -> PlannedArray:
+    values = np.array(list(labels), dtype=object)
+    return PlannedArray(
+        name, values.shape, values.shape, "string", (name,), None, attributes,
+        lambda start, stop: values[start:stop],
+    )
+
+
+def _distance(pipeline: Pipeline) -> list[PlannedArray]:
+    """Return ``distance_m`` as a coordinate where it follows from ``side_px``."""
+    sides = pipeline.values_of("side_px")
+    if not sides or sides[0] is None:
+        return []
+    names = (*VIEW_PARAMETERS, "size_m", "side_px")
+    axes = [axis for axis in scene_axes(pipeline) if axis.name in names]
+    grids = np.meshgrid(
+        *(np.array(axis.values, dtype=np.float64) for axis in axes), indexing="ij", sparse=True
+    )
+    values = {**{name: pipeline.fixed.get(name) for name in names},
+              **{axis.name: grid for axis, grid in zip(axes, grids, strict=True)}}
+    resolve_distance(values)
+    distance = np.broadcast_to(
+        np.asarray(values["distance_m"], dtype=np.float64), tuple(len(axis) for axis in axes)
+    )
+    return [
+        PlannedArray(
+            "distance_m", distance.shape, distance.shape, "f8",
+            tuple(axis.name for axis in axes), None,
+            {"long_name": "depth of the marker's centre along the optical axis", "units": "m"},
+            lambda start, stop: distance[start:stop] if distance.ndim else distance,
+        )
+    ]
+
+
+def documents(planned: Iterable[PlannedArray]) -> dict[str, cpu.Buffer]:
+    """Return the metadata documents of a store of these arrays by key, but for the root's."""
+    memory = MemoryStore()
+    group = zarr.open_group(memory, mode="w", zarr_format=3)
+    for array in planned:
+        array.create_empty(group)
+
+    async def gather() -> dict[str, cpu.Buffer]:
+        found = {}
+        async for key in memory.list_prefix(""):
+            content = await memory.get(key, default_buffer_prototype())
+            if key.endswith("/zarr.json") and content is not None:
+                found[key] = cpu.Buffer.from_bytes(content.to_bytes())
+        return found
+
+    return sync(gather())

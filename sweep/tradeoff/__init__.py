@@ -1,0 +1,1 @@
+"""Accuracy against cost: paired timing, measurement and the Pareto front."""

@@ -1,0 +1,296 @@
+"""What accuracy costs: a finished store's treatments, with what they cost and how good they are."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from sweep.analysis import covariance_trust, efficiency, error_statistics, renderer_bias
+from sweep.errors import StoreError
+from sweep.isolation.interrupts import Interrupts
+from sweep.measure.estimators import build
+from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.plan.axes import TRIAL, Axis, nearest
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import combinations, estimators
+from sweep.plan.parameters import Stage
+from sweep.store.lifecycle import open_dataset, open_store, write_group
+from sweep.store.lock import locked
+from sweep.store.provenance import differences
+from sweep.tradeoff.paired_timing import (
+    PROCESS_SHARE,
+    measure,
+    measure_renderers,
+    median_interval,
+    sample_cells,
+    whole_frames_of,
+)
+
+Interval = tuple[Any, Any, Any]
+"""Values and the ends of their intervals, arrays of one shape."""
+
+REFERENCE = "exact"
+"""The renderer that others are compared with, where several are in a grid."""
+
+
+def measure_trade(
+    url: str, per: Sequence[str] = (), limit_s: float = 60.0
+) -> tuple[xr.Dataset, xr.Dataset | None]:
+    """Measure the trade of a finished store, and write it to its group ``cost/tradeoff``.
+
+    A treatment is a combination of detector and estimator settings. Each has its costs, measured
+    for at most ``limit_s`` seconds (`sweep.tradeoff.paired_timing.measure`), and its accuracy in
+    the store (:func:`sweep.analysis.error_statistics`), for each combination of the
+    values of the scene axes ``per``; the first one is the baseline. Where renderers are an axis,
+    the treatments are those on ``exact`` images, and a second dataset tells what other renderers
+    change (``cost/renderers``); else that is None.
+
+    Raises
+    ------
+    StoreError
+        Where there is no finished store, or ``per`` names no axis of its scenes.
+    """
+    store = open_store(url, "r+")
+    if not store.finished:
+        raise StoreError(f"{url}: unfinished; `sweep run` continues it")
+    stored, results = store.pipeline, open_dataset(url)
+    per = list(dict.fromkeys(per))
+    _check(url, stored, results, per)
+    # What is measured here must be what was run: the same versions, the same files.
+    pipeline = Pipeline.from_text(stored.text, name=stored.name, source=url, folder=stored.folder)
+    lines = differences(pipeline, stored, store.fingerprint)
+    if lines:
+        raise StoreError("\n".join([f"{url}: its costs cannot be measured here:", *lines]))
+    fidelity = None
+    with locked(store), Interrupts() as interrupts:
+        if "renderer" in results.dims:
+            names = [str(name) for name in results["renderer"].values.tolist()]
+            fidelity = _fidelity(pipeline, results, names, limit_s / 4, interrupts)
+            pipeline = dataclasses.replace(
+                pipeline, fixed={**pipeline.fixed, "renderer": REFERENCE},
+                axes=tuple(axis for axis in pipeline.axes if axis.name != "renderer"),
+            )
+            results = results.sel(renderer=REFERENCE, drop=True)
+        trade = _trade(pipeline, results, per, limit_s, interrupts)
+        if fidelity is not None:
+            write_group(store, "cost/renderers", fidelity)
+        write_group(store, "cost/tradeoff", trade)
+    return trade, fidelity
+
+
+def _check(url: str, pipeline: Pipeline, results: xr.Dataset, per: Sequence[str]) -> None:
+    """Raise StoreError where a trade cannot be told apart by the axes ``per``."""
+    axes = [axis.name for axis in pipeline.axes_of(Stage.scene) if axis.name != TRIAL]
+    for name in per:
+        if name == TRIAL:
+            raise StoreError("--per trial: trials are draws, of which the intervals speak")
+        if name not in axes:
+            known = nearest(name, axes) or f"; there are {', '.join(axes) or 'none'}"
+            raise StoreError(f"--per {name}: no axis of the scene{known}")
+    if results["estimate"].size == 0:
+        raise StoreError(f"{url}: there are no results")
+    if "renderer" in per:
+        raise StoreError("--per renderer: renderers are compared with exact in any case")
+    if "renderer" in axes and REFERENCE not in results["renderer"].values.tolist():
+        raise StoreError(
+            f"{url}: renderers are compared with {REFERENCE}, which is not among them: "
+            "add it to the axis"
+        )
+
+
+def _trade(
+    pipeline: Pipeline, results: xr.Dataset, per: Sequence[str], limit_s: float,
+    interrupts: Interrupts,
+) -> xr.Dataset:
+    axes = [*pipeline.axes_of(Stage.detection), *pipeline.axes_of(Stage.estimation)]
+    settings = [axis.name for axis in axes]
+    kept = [*per, *settings]
+    found = xr.merge(
+        [
+            error_statistics(results, kept),
+            efficiency(results, kept),
+            covariance_trust(results, kept, scale=_corner_noise_scale(pipeline, results, per)),
+            _bound(results, per),
+        ],
+        compat="no_conflicts", join="exact",
+    ).compute()
+    trade = _flattened(found, axes)
+    lengths = [results.sizes[name] for name in per]
+    regimes = list(np.ndindex(*lengths))
+    costs = measure(
+        pipeline,
+        [
+            _harmless(pipeline, results, [
+                sample_cells(pipeline, dict(zip(per, regime, strict=True)), len(regimes))
+            ])[0]
+            for regime in regimes
+        ],
+        limit_s, interrupts,
+    )
+    treatments = trade.sizes["treatment"]
+
+    def add(name: str, meaning: str, unit: str, interval: Interval) -> None:
+        shaped = [np.asarray(end).reshape(*lengths, treatments) for end in interval]
+        _add(trade, (*per, "treatment"), name, meaning, unit, shaped)
+
+    total = costs.total
+    add("cost_ms", "detection and estimation of a frame", "ms", median_interval(1e3 * total))
+    add("cost_ratio", "cost over the baseline's", "1", _of_any_process(costs.ratio))
+    each = np.broadcast_to(costs.detection[..., None], total.shape)
+    add("detection_ms", "detection of a frame", "ms", median_interval(1e3 * each))
+    add("estimation_ms", "estimation of a frame", "ms", median_interval(1e3 * costs.estimation))
+    whole = whole_frames_of(pipeline)
+    trade.attrs = {
+        "title": pipeline.title or pipeline.name,
+        "poses": pipeline.size(Stage.scene),
+        "window": "full" if all(whole) else "auto" if not any(whole) else "mixed",
+        "baseline": str(trade["treatment"].values[0]),
+        "rounds": len(total),
+        "frames": int(costs.frames.sum()),
+        "covariance": "of the solvers with the corners' noise as it was measured in each regime; "
+                      "of photometric from its likelihood",
+    }
+    return trade
+
+
+def _harmless(
+    pipeline: Pipeline, results: xr.Dataset, samples: list[list[NDArray[np.intp]]]
+) -> list[list[NDArray[np.intp]]]:
+    """Return samples of cells with others in place of those that ended their process in the run.
+
+    Samples are paired: what goes in one goes in all.
+    """
+    names = [axis.name for axis in pipeline.axes_of(Stage.scene)]
+    dead = np.zeros(len(samples[0][0]) if names else 1, dtype=bool)
+    for indices in samples:
+        at = {name: xr.DataArray(index, dims="cell")
+              for name, index in zip(names, indices, strict=True)}
+        for name, flag in (
+            ("detection", DetectionStatus.crashed),
+            ("estimate", EstimateStatus.crashed),
+        ):
+            crashed = results[name].isel(at) == flag
+            dead |= crashed.any([dim for dim in crashed.dims if dim != "cell"]).to_numpy()
+    if dead.all():
+        raise StoreError("each scene that would be timed ended its process in the run")
+    alive = np.resize(np.flatnonzero(~dead), len(dead))
+    rows = np.where(dead, alive, np.arange(len(dead)))
+    return [[index[rows] for index in indices] for indices in samples]
+
+
+def _add(
+    table: xr.Dataset, dims: Sequence[str], name: str, meaning: str, unit: str,
+    interval: Sequence[Any],
+) -> None:
+    """Add a variable and the ends of its 95 % interval to a dataset."""
+    for ending, words, values in zip(
+        ("", "_low", "_high"),
+        ("", ", lower end of the 95 % interval", ", upper end of the 95 % interval"),
+        interval, strict=True,
+    ):
+        table[name + ending] = (dims, values, {"long_name": meaning + words, "units": unit})
+
+
+def _of_any_process(ratio: NDArray[np.float64]) -> Interval:
+    """Return the median ratio of rounds (R, ...) with the interval of what any process measures.
+
+    That of the baseline is 1, whatever the process.
+    """
+    value, low, high = median_interval(ratio)
+    spare = np.where(high > low, PROCESS_SHARE * value, 0.0)
+    return value, low - spare, high + spare
+
+
+def _label(name: str, value: Any) -> str:
+    return value if isinstance(value, str) else f"{name} {value}"
+
+
+def _flattened(found: xr.Dataset, axes: Sequence[Axis]) -> xr.Dataset:
+    """Return a dataset whose dimensions of settings are one, ``treatment``, with labels."""
+    labels = [
+        " · ".join(_label(name, value) for name, value in chosen.items()) or "as set"
+        for chosen in combinations(axes)
+    ]
+    if not axes:
+        return found.expand_dims(treatment=labels)
+    flat = found.stack(treatment=[axis.name for axis in axes], create_index=False)
+    return flat.assign_coords(treatment=("treatment", labels))
+
+
+def _bound(results: xr.Dataset, per: Sequence[str]) -> xr.Dataset:
+    """Return the RMS bound of rotation and range over the poses that have one."""
+    bound = results["bound_std"].astype(np.float64).load()
+    over = [dim for dim in bound.dims if dim not in (*per, "pose_parameter")]
+    turns = bound.sel(pose_parameter=[f"rotation_{axis}" for axis in "xyz"])
+    turn = (turns**2).sum("pose_parameter", skipna=False).mean(over) ** 0.5
+    depth = bound.sel(pose_parameter="translation_z", drop=True) / results["true_tvec_m"].sel(
+        xyz="z", drop=True
+    ).load()
+    shift = (depth**2).mean(over) ** 0.5
+    return xr.Dataset(
+        {
+            "bound_rotation_deg": (turn * (180 / np.pi)).assign_attrs(
+                long_name="RMS bound of the rotation error", units="degree"),
+            "bound_range_percent": (100 * shift).assign_attrs(
+                long_name="RMS bound of the depth error, of the true depth", units="percent"),
+        }
+    )
+
+
+def _corner_noise_scale(
+    pipeline: Pipeline, results: xr.Dataset, per: Sequence[str]
+) -> xr.DataArray:
+    """Return what turns squared deviations under the assumed corner noise into the measured one's.
+
+    1 for estimators that make their covariance of something else.
+    """
+    error = results["corner_error_px"].astype(np.float64)
+    searched = [axis.name for axis in pipeline.axes_of(Stage.detection)]
+    over = [dim for dim in error.dims if dim not in (*per, *searched)]
+    measured = (error**2).mean(over).compute()
+    axes = pipeline.axes_of(Stage.estimation)
+    assumed = np.array(
+        [
+            np.nan if one.corner_noise_px is None else one.corner_noise_px
+            for one in estimators(pipeline)
+        ]
+    )
+    other = np.array([build(one).needs_images for one in estimators(pipeline)])
+    shape = [len(axis) for axis in axes]
+    names = [axis.name for axis in axes]
+
+    def over_estimators(values: NDArray[Any]) -> xr.DataArray:
+        return xr.DataArray(values.reshape(shape), dims=names,
+                            coords={name: results[name] for name in names})
+
+    scale = over_estimators(assumed) ** 2 / measured
+    return scale.where(~over_estimators(other), 1.0)
+
+
+def _fidelity(
+    pipeline: Pipeline, results: xr.Dataset, names: Sequence[str], limit_s: float,
+    interrupts: Interrupts,
+) -> xr.Dataset:
+    """Return what each renderer costs, and what it changes against exact images."""
+    samples = _harmless(pipeline, results, [
+        sample_cells(pipeline, {"renderer": number}, len(names)) for number in range(len(names))
+    ])
+    at = names.index(REFERENCE)
+    seconds, errors = measure_renderers(pipeline, samples, at, limit_s, interrupts)
+    changed = renderer_bias(results, REFERENCE).compute()
+    _add(changed, ("renderer",), "render_ms", "rendering of an image", "ms",
+         median_interval(1e3 * seconds))
+    _add(changed, ("renderer",), "render_ratio", "cost over that of exact", "1",
+         _of_any_process(seconds / seconds[:, at : at + 1]))
+    for name, meaning, values in (
+        ("grey_rms", "RMS difference of the marker's pixels from the exact image's", errors[0]),
+        ("grey_max", "largest difference from the exact image", errors[1]),
+    ):
+        changed[name] = ("renderer", values, {"long_name": meaning, "units": "grey level"})
+    changed.attrs = {"title": pipeline.title or pipeline.name, "reference": REFERENCE}
+    return changed

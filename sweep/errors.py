@@ -27,6 +27,33 @@ class PipelineError(SweepError):
         return PipelineError, (self.faults,)
 
 
+class ArgumentError(SweepError, ValueError):
+    """An argument of a function that cannot be; the commands name their flag in its place.
+
+    Parameters
+    ----------
+    argument
+        Python's name of the argument, such as ``time_limit_s``.
+    value
+        What was given.
+    problem
+        What is wrong, or what was expected instead: "expected seconds above 0".
+
+    Examples
+    --------
+    >>> print(ArgumentError("workers", 0, "expected at least 1"))
+    workers = 0: expected at least 1
+    """
+
+    def __init__(self, argument: str, value: object, problem: str) -> None:
+        super().__init__(f"{argument} = {value}: {problem}")
+        self.argument, self.value, self.problem = argument, value, problem
+
+    def __reduce__(self) -> tuple[type[ArgumentError], tuple[str, object, str]]:
+        """Return how it is made anew in another process."""
+        return ArgumentError, (self.argument, self.value, self.problem)
+
+
 class StoreError(SweepError):
     """A store that cannot be written, read or continued as asked."""
 

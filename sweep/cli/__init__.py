@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from sweep.errors import PipelineError, StoreError, SweepError
+from sweep.errors import ArgumentError, PipelineError, StoreError, SweepError
 
 if TYPE_CHECKING:
     from sweep.execution.runner import Progress
@@ -31,6 +31,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = parser.parse_args(arguments)
     try:
         return int(chosen.command(chosen))
+    except ArgumentError as error:
+        flag = FLAGS.get(error.argument, error.argument.replace("_", "-"))
+        _tell(SweepError(f"--{flag} {error.value}: {error.problem}"))
+        return 2
     except (PipelineError, StoreError) as error:
         _tell(error)
         return 2
@@ -55,6 +59,9 @@ def _tell(error: SweepError) -> None:
 
 
 MAX_LINE_LENGTH = 2000
+
+FLAGS = {"time_limit_s": "time-limit", "limit_s": "seconds"}
+"""Argument of a function -> its flag, where that is no translation of ``_`` to ``-``."""
 
 
 def _parser() -> argparse.ArgumentParser:

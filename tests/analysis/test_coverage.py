@@ -13,8 +13,8 @@ import xarray as xr
 from conftest import lengths
 from scipy import stats
 from statsmodels.stats import proportion
-from test_analysis_paired import holm, with_detected
-from test_analysis_reference import perfect
+from test_paired import holm, with_detected
+from test_reference import perfect
 
 from sweep.analysis import compare, detection_limit, error_statistics, marker_ranking
 from sweep.analysis.intervals import jeffreys, wilson

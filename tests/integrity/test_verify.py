@@ -644,7 +644,7 @@ def test_every_variable_that_is_scaled_is_told(name, copied, tmp_path):
     assert elsewhere([copied], tmp_path / "notes.jsonl")[str(copied)][1], name
 
 
-SMALL = Path(__file__).parent.parent / "pipelines"
+SMALL = Path(__file__).parents[2] / "pipelines"
 
 
 @pytest.mark.long

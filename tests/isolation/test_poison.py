@@ -24,7 +24,7 @@ from sweep.plan.parameters import Stage
 from sweep.plan.schema import SCHEMA
 from sweep.store.lifecycle import committed, create_store, open_store
 
-POISONED = Path(__file__).parent / "poisoned"
+POISONED = Path(__file__).parents[1] / "support" / "poisoned"
 
 TEXT = """
 title = "Scenes of which some are poisoned"

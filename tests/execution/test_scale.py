@@ -16,7 +16,7 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.parameters import Stage
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1] / "support"
 
 GRID = """
 [pose]

@@ -27,7 +27,7 @@ from sweep.store.lifecycle import committed, create_store, open_store, receipts
 
 SEED = 20_261
 
-INSTANTS = Path(__file__).parent / "poisoned" / "instants.py"
+INSTANTS = Path(__file__).parents[1] / "support" / "poisoned" / "instants.py"
 
 GRID = """
 title = "A grid of many small blocks"

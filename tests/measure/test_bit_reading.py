@@ -25,7 +25,7 @@ from sweep.measure.flags import DetectionStatus
 from sweep.model.marker import modules
 from sweep.plan.grid import Block, block_indices, scene_axes
 
-PIPELINES = Path(__file__).parents[1] / "pipelines"
+PIPELINES = Path(__file__).parents[2] / "pipelines"
 DICTIONARY = "DICT_5X5_50"
 WITH_THE_DIP = {0, 2, 4, 7}
 """Of IDs 0-9 of DICT_5X5_50."""

@@ -9,7 +9,7 @@ import xarray as xr
 from dask.callbacks import Callback
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
-from test_analysis_reference import INNER, mixed
+from test_reference import INNER, mixed
 
 from sweep.analysis import (
     compare,

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from test_report import FULL, command, made
 
-PIPELINES = Path(__file__).parents[1] / "pipelines"
+PIPELINES = Path(__file__).parents[2] / "pipelines"
 BROWSER = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 

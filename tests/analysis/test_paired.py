@@ -9,7 +9,7 @@ import xarray as xr
 from scipy import stats
 from statsmodels.stats import contingency_tables as contingency
 from statsmodels.stats import multitest
-from test_analysis_reference import (
+from test_reference import (
     FX,
     GRIDS,
     QUANTITIES,

@@ -7,11 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 from sweep.errors import PipelineError, RunError, StoreError, SweepError
 from sweep.plan.experiment import Pipeline
+from sweep.version import __version__
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Pipeline", "PipelineError", "RunError", "StoreError", "SweepError", "open", "run"]
+__all__ = [
+    "Pipeline", "PipelineError", "RunError", "StoreError", "SweepError", "__version__", "open",
+    "run",
+]
 
 
 def run(pipeline: Pipeline, store: str | os.PathLike[str] | None = None, **options: Any) -> Any:

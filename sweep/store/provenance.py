@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sweep.plan.experiment import Pipeline
+from sweep.version import __version__
 
 NUMBERS_VERSION = 3
 """Raised whenever the numbers change; a test with golden digests fails when one forgets."""
@@ -34,7 +35,7 @@ def fingerprint(pipeline: Pipeline) -> dict[str, Any]:
 def environment() -> dict[str, str]:
     """Return what is recorded beside the fingerprint: sweep's version, Python, the CPU."""
     return {
-        "sweep": importlib.metadata.version("sweep"),
+        "sweep": __version__,
         "python": platform.python_version(),
         "cpu": _cpu(),
     }

@@ -575,9 +575,8 @@ def shaped(
     variable: Variable, pipeline: Pipeline, block: Block, parts: list[NDArray[Any]]
 ) -> NDArray[Any]:
     """Return a variable in the template's dimensions from one array (N, ...) per treatment."""
-    stages = [stage for stage in Stage if Stage.scene < stage <= variable.stage]
     outer = pipeline.axes_of(Stage.scene)
-    treatment = [axis for stage in stages for axis in pipeline.axes_of(stage)]
+    treatment = variable.treatment_axes(pipeline)
     stacked = np.stack(parts, axis=1).astype(variable.dtype)
     shaped = stacked.reshape(
         (*block.shape, *(len(axis) for axis in treatment), *variable.inner_shape)

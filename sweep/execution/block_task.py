@@ -132,9 +132,8 @@ def _columns(
     """Return a variable's columns (N, ...) per treatment: what ``rows`` gave, fill elsewhere."""
     if cells is not None and len(rows) == count:
         return cells.columns[variable.name]
-    stages = [stage for stage in Stage if Stage.scene < stage <= variable.stage]
     columns = []
-    for k in range(pipeline.size(*stages)):
+    for k in range(variable.treatments(pipeline)):
         whole = np.full((count, *variable.inner_shape), variable.fill, dtype=variable.dtype)
         if cells is not None:
             whole[rows] = cells.columns[variable.name][k]

@@ -197,8 +197,7 @@ def _nothing(pipeline: Pipeline) -> CellsResult:
     columns: dict[str, list[NDArray[Any]]] = {}
     sizes: dict[Stage, int] = {}
     for variable in SCHEMA:
-        stages = [stage for stage in Stage if Stage.scene < stage <= variable.stage]
-        sizes[variable.stage] = pipeline.size(*stages)
+        sizes[variable.stage] = variable.treatments(pipeline)
         columns[variable.name] = [
             np.full((1, *variable.inner_shape), variable.fill, dtype=variable.dtype)
             for _ in range(sizes[variable.stage])

@@ -9,8 +9,8 @@ import xarray as xr
 from dask.callbacks import Callback
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
-from test_reference import INNER, mixed
 
+from support.small_datasets import INNER, mixed
 from sweep.analysis import (
     compare,
     detection_limit,

@@ -10,12 +10,12 @@ import math
 import numpy as np
 import pytest
 import xarray as xr
-from conftest import lengths
 from scipy import stats
 from statsmodels.stats import proportion
-from test_paired import holm, with_detected
-from test_reference import perfect
 
+from support.comparisons import holm, with_detected
+from support.lengths import lengths
+from support.small_datasets import perfect
 from sweep.analysis import compare, detection_limit, error_statistics, marker_ranking
 from sweep.analysis.intervals import jeffreys, wilson
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped

@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 import xarray as xr
-from conftest import lengths
 from scipy import stats
 
+from support.lengths import lengths
 from sweep.analysis.comparisons import renderer_bias
 from sweep.analysis.error_summaries import covariance_trust, efficiency, error_statistics
 from sweep.errors import StoreError

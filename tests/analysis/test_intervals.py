@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 import pytest
-from conftest import lengths
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpmath import mp, mpf
 
+from support.lengths import lengths
 from sweep.analysis.intervals import MANY, MAX_N, jeffreys, wilson
 
 METHODS = pytest.mark.parametrize("interval", [wilson, jeffreys])

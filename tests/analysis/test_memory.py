@@ -1,13 +1,8 @@
 """Memory of the analyses does not grow with the store."""
 
-import sys
-from pathlib import Path
-
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-
-from bench_analysis import CALLS, measured, write_store
+from benchmarks.bench_analysis import CALLS, measured, write_store
 
 
 @pytest.fixture(scope="module")

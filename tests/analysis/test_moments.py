@@ -5,11 +5,11 @@ import itertools
 
 import numpy as np
 import pytest
-from conftest import lengths
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpmath import mp, mpf
 
+from support.lengths import lengths
 from sweep.analysis.moments import Moments, merged
 
 # offset, spread: what is left of the spread is exact in the doubles, be it only three bits.

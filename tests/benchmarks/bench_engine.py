@@ -10,6 +10,7 @@ import importlib.util
 import itertools
 import json
 import multiprocessing
+import os
 import resource
 import statistics
 import subprocess
@@ -230,10 +231,12 @@ def what_one_would_pick():
             script = Path(folder) / f"{package}_run.py"
             indented = "\n".join(f"    {line}" for line in body.splitlines())
             script.write_text(COMMON.format(body=indented))
+            path = os.pathsep.join(
+                filter(None, [str(Path(__file__).parent), os.environ.get("PYTHONPATH")]))
             ran = subprocess.run(
                 [sys.executable, str(script), str(workers), str(count), folder],
                 capture_output=True, text=True, check=False,
-                env={"PYTHONPATH": str(Path(__file__).parent), "PATH": "/usr/bin:/bin",
+                env={"PYTHONPATH": path, "PATH": "/usr/bin:/bin",
                      "OPENCV_FOR_THREADS_NUM": "1"},
             )
             if ran.returncode:

@@ -36,9 +36,9 @@ import itertools
 
 import numpy as np
 import pytest
-from conftest import lengths
 from scipy import stats
 
+from support.lengths import lengths
 from sweep.evaluation.cells import believed, run_block
 from sweep.measure.accuracy import pose_error
 from sweep.measure.flags import DetectionStatus, EstimateStatus

@@ -8,6 +8,7 @@ import os
 
 import numpy as np
 import pytest
+
 from benchmarks.extremes import (
     FILES,
     REFINEMENTS,
@@ -16,8 +17,7 @@ from benchmarks.extremes import (
     broken_promises,
     measured,
 )
-from conftest import lengths
-
+from support.lengths import lengths
 from sweep.evaluation.cells import Failure
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.experiment import Pipeline

@@ -5,9 +5,9 @@ import functools
 import cv2
 import numpy as np
 import pytest
-from conftest import lengths
 from scipy.spatial.transform import Rotation
 
+from support.lengths import lengths
 from sweep.evaluation.cells import run_block
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render

@@ -15,9 +15,9 @@ from pathlib import Path
 import psutil
 import pytest
 import xarray as xr
-from conftest import lengths
-from test_run import by_hand, same
 
+from support.lengths import lengths
+from support.stores import by_hand, same
 from sweep.errors import StoreError
 from sweep.execution.block_task import compute_block
 from sweep.plan.experiment import Pipeline

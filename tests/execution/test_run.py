@@ -17,6 +17,7 @@ import xarray as xr
 import zarr
 
 import sweep
+from support.stores import by_hand, same
 from sweep.errors import StoreError
 from sweep.evaluation.cells import run_block
 from sweep.execution.block_task import compute_block
@@ -60,27 +61,6 @@ def undisturbed(pipeline, tmp_path_factory):
     lengths = tuple(len(axis) for axis in scene_axes(pipeline))
     by_hand(url, pipeline, lengths)
     return url
-
-
-def by_hand(url, pipeline, extents):
-    """Compute a store in this process, without a cluster."""
-    store = create_store(url, pipeline, extents)
-    for block in store.blocks:
-        compute_block(url, store.run_id, block)
-    return store
-
-
-def same(a, b):
-    """Tell whether two stores hold the same decoded values, bit for bit."""
-    with xr.open_zarr(a, consolidated=False) as one, xr.open_zarr(b, consolidated=False) as other:
-        assert set(one.variables) == set(other.variables)
-        for name in one.variables:
-            x, y = one[name].to_numpy(), other[name].to_numpy()
-            if x.dtype.kind == "f":
-                x, y = x.view(f"u{x.itemsize}"), y.view(f"u{y.itemsize}")
-            if not (x == y).all():
-                return False
-    return True
 
 
 def sweep_command(*arguments, **options):

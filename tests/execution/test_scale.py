@@ -57,7 +57,8 @@ class CountingStore(WrapperStore[LocalStore]):
 
 def run_synthetic(folder, trials):
     """Run a grid of 10,000 x ``trials`` poses on a scheduler process with two workers."""
-    environment = {**os.environ, "PYTHONPATH": str(HERE)}
+    path = os.pathsep.join(filter(None, [str(HERE), os.environ.get("PYTHONPATH")]))
+    environment = {**os.environ, "PYTHONPATH": path}
     pipeline, store = folder / f"grid{trials}.toml", folder / f"{trials}.zarr"
     pipeline.write_text(GRID % trials)
     address = folder / f"address{trials}.json"

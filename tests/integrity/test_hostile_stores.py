@@ -17,11 +17,11 @@ import google_crc32c
 import numpy as np
 import pytest
 import zarr
-from conftest import lengths
-from test_run import by_hand
-from test_verify import COPY, MANIFEST, arrays, edit_receipt, files, reseal, see_same
 
 import sweep
+from support.lengths import lengths
+from support.store_files import COPY, MANIFEST, arrays, edit_receipt, files, reseal, see_same
+from support.stores import by_hand
 from sweep.cli import main
 from sweep.errors import SweepError
 from sweep.execution.block_task import compute_block

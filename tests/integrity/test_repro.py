@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
-from test_poison import Poison, command, poisoned
 
+from support.poison import Poison, command, poisoned
 from sweep.cli import main
 from sweep.evaluation.cells import Failure
 from sweep.execution.block_task import compute_block

@@ -13,10 +13,11 @@ from zlib import crc32
 import numpy as np
 import pytest
 import zarr
-from conftest import lengths
-from test_poison import Poison, poisoned
-from test_run import by_hand
 
+from support.lengths import lengths
+from support.poison import Poison, poisoned
+from support.store_files import COPY, MANIFEST, edit_receipt, files, reseal, see_same
+from support.stores import by_hand
 from sweep.cli import main
 from sweep.errors import StoreError
 from sweep.execution.block_task import compute_block
@@ -25,8 +26,7 @@ from sweep.integrity.repair import repair
 from sweep.integrity.verification import verify
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
-from sweep.store.lifecycle import begin_block, create_store, open_store, place_of
-from sweep.store.manifest import Manifest, write_manifest
+from sweep.store.lifecycle import begin_block, create_store, open_store
 
 TEXT = """
 title = "Größen, klein"
@@ -55,7 +55,6 @@ FAILED = Poison(12, "scene", "raise")
 FAILED_BLOCK = 4
 
 RECEIPT = "commits/receipt/c"
-MANIFEST, COPY = "commits/receipt/manifest.json", "commits/receipt/manifest-copy.json"
 
 KINDS = {
     "chunk": ("corner_error_px/c/0/0/0/0/0", 0),
@@ -169,12 +168,6 @@ def here(monkeypatch, tmp_path):
     return computed
 
 
-def files(url):
-    """Return the paths of a store's files below it."""
-    return sorted(path.relative_to(url).as_posix() for path in Path(url).rglob("*")
-                  if path.is_file())
-
-
 INNER = {
     "corner_error_px": 2, "true_rvec": 1, "true_tvec_m": 1, "translation_error_m": 1,
     "rotation_error_rad": 1, "bound_std": 1, "predicted_std": 1,
@@ -192,29 +185,6 @@ def block_of(key):
         return None
     # side_px is the first axis; the trial comes after the treatments, where there are any.
     return 3 * position[0] + position[-1 - INNER.get(name, 0)]
-
-
-def arrays(url):
-    """Return every array's values of a store by path, but for what is timed; with plain Zarr."""
-    group = zarr.open_group(str(url), mode="r", zarr_format=3, use_consolidated=False)
-    return {
-        path: np.asarray(member[...]) for path, member in group.members(max_depth=None)
-        if isinstance(member, zarr.Array) and not path.startswith(("cost/", "commits/"))
-    }
-
-
-def see_same(url, other):
-    """Assert that two stores hold the same values, bit for bit."""
-    ours, theirs = arrays(url), arrays(other)
-    assert ours.keys() == theirs.keys()
-    for path, values in ours.items():
-        there = theirs[path]
-        assert (values.dtype, values.shape) == (there.dtype, there.shape), path
-        if values.dtype.kind == "f":
-            bits = f"u{values.itemsize}"
-            assert (values.view(bits) == there.view(bits)).all(), path
-        else:
-            assert (values == there).all(), path
 
 
 def states(url, keys):
@@ -247,24 +217,6 @@ def see_repaired(url, sound, wanted, here):
     assert again.files == len(files(url)) == len(files(sound))
     assert files(url) == files(sound)
     see_same(url, sound)
-
-
-def reseal(url):
-    """Make the manifest fit the files that are there, as one who forges a store would."""
-    url = Path(url)
-    recorded = json.loads((url / MANIFEST).read_text())["files"]
-    attributes = json.loads((url / "zarr.json").read_text())["attributes"]
-    there = {key: crc32((url / key).read_bytes()) for key in recorded if (url / key).exists()}
-    write_manifest(place_of(str(url), "r+"), Manifest(attributes, there))
-
-
-def edit_receipt(url, number, change):
-    """Change a receipt's content; its checksums are right afterwards."""
-    array = zarr.open_array(f"{url}/commits/receipt", mode="r+", zarr_format=3)
-    content = json.loads(str(np.asarray(array[number])))
-    changed = change(content)
-    text = changed if isinstance(changed, str) else json.dumps(changed or content)
-    array[number : number + 1] = np.array([text], dtype=object)
 
 
 def edit_values(url, name, change, *, digests_too=False):

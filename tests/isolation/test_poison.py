@@ -1,21 +1,17 @@
 """Poison: a scene that ends or stalls the process that computes it costs itself and no other."""
 
-import dataclasses
 import json
-import os
 import re
-import signal
 import subprocess
 import sys
 import time
-from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
-from test_run import by_hand
 
+from support.poison import RAISES, Poison, command, poisoned
+from support.stores import by_hand
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.cell_selection import cell as cell_at
 from sweep.plan.experiment import Pipeline
@@ -23,8 +19,6 @@ from sweep.plan.grid import scene_axes
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import SCHEMA
 from sweep.store.lifecycle import committed, create_store, open_store
-
-POISONED = Path(__file__).parents[1] / "support" / "poisoned"
 
 TEXT = """
 title = "Scenes of which some are poisoned"
@@ -52,26 +46,6 @@ EXTENTS = (1, 1, 20)
 
 SIGNALS = {"segv": "SIGSEGV", "abort": "SIGABRT", "kill": "SIGKILL"}
 ENDLESS = ("sleep", "spin", "hold")
-RAISES = ("raise", "memory")
-
-
-@dataclasses.dataclass(frozen=True)
-class Poison:
-    """What one scene does: to detectors with ``setting``, to estimators with ``solver``."""
-
-    cell: int
-    stage: str
-    how: str
-    setting: tuple = ()
-    solver: tuple = ()
-
-    @property
-    def deadly(self):
-        return self.how not in RAISES
-
-    def written(self):
-        return {**dataclasses.asdict(self), "setting": dict(self.setting),
-                "solver": dict(self.solver)}
 
 
 SUBPIX = (("cornerRefinementMethod", "subpix"),)
@@ -79,31 +53,9 @@ ITERATIVE = (("solver", "iterative"),)
 IPPE = (("solver", "ippe_square"),)
 
 
-def poisoned(poisons, log):
-    """Return the environment in which the commands are poisoned."""
-    given = {"log": str(log), "poisons": [poison.written() for poison in poisons]}
-    path = os.pathsep.join(filter(None, [str(POISONED), os.environ.get("PYTHONPATH")]))
-    return {**os.environ, "PYTHONPATH": path, "SWEEP_POISON": json.dumps(given)}
-
-
 def notes(log):
     """Return what the poisoned processes noted."""
     return [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
-
-
-def command(*arguments, timeout=300, **options):
-    """Run the command line; end whatever it leaves behind."""
-    with subprocess.Popen(
-        [sys.executable, "-m", "sweep", *map(str, arguments)],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        **options,
-    ) as running:
-        try:
-            out, err = running.communicate(timeout=timeout)
-        finally:
-            with suppress(ProcessLookupError):
-                os.killpg(running.pid, signal.SIGKILL)
-    return subprocess.CompletedProcess(running.args, running.returncode, out, err)
 
 
 def scene_index(pipeline, cell):

@@ -17,12 +17,12 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from conftest import lengths
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
-from test_exact_image import DICTIONARIES, LENSES, modules_of, values, visible
 
+from support.exact_image import DICTIONARIES, LENSES, modules_of, values, visible
+from support.lengths import lengths
 from sweep.evaluation.cells import run_cells, visibility_flags
 from sweep.measure.bound import BACKGROUND_MARGIN_PX, FARTHEST_MIRROR, BoundStatus, bounds
 from sweep.measure.flags import DetectionStatus

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
-from test_exact_image import LENSES
 
+from support.exact_image import LENSES
 from sweep.measure.covariance import corner_covariance, squared_deviations
 from sweep.measure.likelihood import mirrored_state, solve_positive, state_of, turn_between
 from sweep.model.camera import Cameras

@@ -6,10 +6,10 @@ import json
 import cv2
 import numpy as np
 import pytest
-from conftest import lengths
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from support.lengths import lengths
 from sweep.evaluation.cells import run_block
 from sweep.measure.detector import (
     ALIGNMENT_PX,

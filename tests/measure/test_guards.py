@@ -19,10 +19,10 @@ import cv2
 import mpmath
 import numpy as np
 import pytest
-from conftest import lengths
 from mpmath import mp, mpf
 
 import sweep
+from support.lengths import lengths
 from sweep.evaluation import cells as kernel
 from sweep.evaluation.cells import run_block, search, visibility_flags
 from sweep.measure import accuracy

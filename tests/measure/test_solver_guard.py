@@ -5,9 +5,9 @@ import itertools
 import cv2
 import numpy as np
 import pytest
-from conftest import lengths
 from scipy.spatial.transform import Rotation
 
+from support.lengths import lengths
 from sweep.measure.accuracy import pose_error
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.solver import SOLVERS, estimate

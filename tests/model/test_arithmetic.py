@@ -9,9 +9,9 @@ import itertools
 import cv2
 import numpy as np
 import pytest
-from conftest import lengths
 from mpmath import mp, mpf
-from test_projection import (
+
+from support.fifty_digits import (
     AXES,
     INVERTED,
     LENSES,
@@ -22,7 +22,7 @@ from test_projection import (
     rotation_about,
     values,
 )
-
+from support.lengths import lengths
 from sweep.measure.accuracy import pose_error
 from sweep.model import lens
 from sweep.model.camera import Cameras

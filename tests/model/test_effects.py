@@ -11,11 +11,11 @@ import time
 
 import numpy as np
 import pytest
-from conftest import lengths
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
-from test_exact_image import (
+
+from support.exact_image import (
     LENSES,
     add_clipped,
     clipped_image,
@@ -26,7 +26,7 @@ from test_exact_image import (
     vertices_of,
     visible,
 )
-
+from support.lengths import lengths
 from sweep.errors import PipelineError
 from sweep.evaluation.cells import run_cells
 from sweep.evaluation.inspection import look

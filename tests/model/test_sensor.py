@@ -7,10 +7,10 @@ more each. With ``-s`` a row: effect | reference | cases | worst error | toleran
 import numba
 import numpy as np
 import pytest
-from conftest import lengths
 from scipy import stats
-from test_window import outcomes_elsewhere
 
+from support.lengths import lengths
+from support.windows import outcomes_elsewhere
 from sweep.errors import PipelineError
 from sweep.evaluation.cells import search, search_windows, single_thread, visibility_flags
 from sweep.measure.detector import REFINEMENTS, DetectorSetting

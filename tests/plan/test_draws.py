@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from conftest import lengths
 from scipy import stats
 
+from support.lengths import lengths
 from sweep.evaluation.cells import run_block
 from sweep.model.scene import build_scenes
 from sweep.plan.experiment import Pipeline

@@ -2,7 +2,6 @@
 
 import base64
 import contextlib
-import io
 import math
 import os
 import re
@@ -16,7 +15,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from sweep import cli
+from support.reports import CAMERA, FULL, command, made
 from sweep.analysis import (
     compare,
     detection_limit,
@@ -26,12 +25,9 @@ from sweep.analysis import (
 )
 from sweep.analysis.statistics import IntervalOf
 from sweep.errors import StoreError
-from sweep.execution.block_task import compute_block
-from sweep.execution.finalize import close
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.renderers import background_image
 from sweep.plan.experiment import Pipeline
-from sweep.plan.grid import scene_axes
 from sweep.report import gallery
 from sweep.report import report_data as subjects
 from sweep.report.answer import _best, answer
@@ -40,38 +36,7 @@ from sweep.report.gallery import scenes_of
 from sweep.report.report_data import Grouping, Subject, texts_of
 from sweep.report.table import number
 from sweep.report.write_report import write_report
-from sweep.store.lifecycle import create_store, open_dataset, open_store, write_group
-
-CAMERA = """
-seed = 7
-[camera]
-width_px = 160
-height_px = 120
-fx_px = 150
-[marker]
-size_m = 0.05
-"""
-
-FULL = f"""
-title = "All <axes> & \\"kinds\\" of $figures$"
-{CAMERA}
-[pose]
-jitter_px = 0.5
-azimuth_deg = {{ uniform = [0, 360] }}
-[scene]
-black = 40
-white = 220
-background = 120
-noise_grey = 4
-bound = "known_blur"
-[axes]
-marker_id = [0, 7, 23]
-side_px = [7, 14, 40]
-tilt_deg = [0, 50]
-cornerRefinementMethod = ["none", "subpix"]
-solver = ["ippe_square", "photometric"]
-trial = 4
-"""
+from sweep.store.lifecycle import open_dataset, open_store, write_group
 
 ODD = {
     "single pose": f"{CAMERA}[pose]\nside_px = 40\n",
@@ -93,33 +58,9 @@ ODD = {
 }
 
 
-def made(folder, text, name, *, finished=True, settings=()):
-    """Compute a store in this process, without a cluster; return its place."""
-    url = str(folder / f"{name}.zarr")
-    pipeline = Pipeline.from_text(text, settings, name=name)
-    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
-    store = create_store(url, pipeline, tuple(-(-length // 2) for length in lengths))
-    for block in list(store.blocks)[: None if finished else 1]:
-        compute_block(url, store.run_id, block)
-    if finished:
-        close(store)
-    return url
-
-
 def opened(url, trade=None):
     store = open_store(url)
     return Subject(url, open_dataset(url), store.pipeline, store.about, trade)
-
-
-def command(*arguments):
-    """Run a command in this process; return its exit status, output and error output."""
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            code = cli.main(list(map(str, arguments)))
-        except SystemExit as stopped:
-            code = stopped.code
-    return code, out.getvalue(), err.getvalue()
 
 
 @pytest.fixture(scope="module")

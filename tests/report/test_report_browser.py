@@ -7,7 +7,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from test_report import FULL, command, made
+
+from support.reports import FULL, command, made
 
 PIPELINES = Path(__file__).parents[2] / "pipelines"
 BROWSER = next(

@@ -1,0 +1,1 @@
+"""Helpers that several test modules share; nothing of tests/ is imported by another test."""

@@ -1,0 +1,393 @@
+"""Small datasets of poses and the analysis of them by plain loops and SciPy's distributions."""
+
+import functools
+import itertools
+import math
+from collections import Counter
+
+import numpy as np
+import xarray as xr
+from scipy import special, stats
+
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+
+VALUES = {
+    "dictionary": ["DICT_4X4_50", "DICT_6X6_50"],
+    "marker_id": [3, 7, 11, 20, 31],
+    "tilt_deg": [0.0, 30.0, 60.0, 75.0],
+    "side_px": [12.0, 20.0, 35.0, 60.0, 100.0, 150.0],
+    "distance_m": [0.2, 0.4, 0.8, 1.6],
+    "noise_grey": [1.0, 4.0],
+    "trial": list(range(200)),
+    "cornerRefinementMethod": ["none", "subpix", "contour", "apriltag"],
+    "solver": ["ippe", "iterative", "sqpnp"],
+}
+GEOMETRY = ("dictionary", "marker_id", "tilt_deg", "side_px", "distance_m")
+OF_DETECTION, OF_ESTIMATION = ("cornerRefinementMethod",), ("solver",)
+INNER = {"xyz": ["x", "y", "z"]}
+
+TEXT = """seed = {seed}
+[camera]
+width_px = 640
+height_px = 480
+sensor_width_mm = 4.8
+sensor_height_mm = 3.6
+focal_length_mm = 4.0
+[marker]
+size_m = 0.04
+{dictionary}
+[pose]
+jitter_px = 0.5
+{size}
+[axes]
+{axes}
+"""
+FX = 4.0 / 4.8 * 640
+SIZE_M = 0.04
+
+ALL = {"dictionary": 2, "marker_id": 2, "tilt_deg": 2, "side_px": 2, "noise_grey": 2, "trial": 3,
+       "cornerRefinementMethod": 2, "solver": 2}
+PLAIN = {"trial": 12, "distance_m": 3, "marker_id": 4}
+DRAWS = {"marker_id": 2, "tilt_deg": 2, "trial": 200}
+
+
+def coordinates_of(sizes):
+    """Return the values of axes of these sizes; the first of each, or more of the same kind."""
+    found = {}
+    for name, size in sizes.items():
+        listed = VALUES.get(name, [])
+        found[name] = listed[:size] if size <= len(listed) else list(range(size))
+    return found
+
+
+def pipeline_text(sizes, seed=1):
+    """Return the text of a pipeline with axes of these sizes."""
+    values = coordinates_of({name: size for name, size in sizes.items() if name != "regime"})
+    axes = [f"{name} = {len(some) if name == 'trial' else list(some)!r}".replace("'", '"')
+            for name, some in values.items()]
+    sized = "side_px" in values or "distance_m" in values
+    return TEXT.format(
+        seed=seed, axes="\n".join(axes), size="" if sized else "distance_m = 0.5",
+        dictionary="" if "dictionary" in values else 'dictionary = "DICT_5X5_50"',
+    )
+
+
+def dims_of(sizes, stage):
+    """Return the axes of a stage, in order: of the scene, with detection, with estimation."""
+    left_out = {"scene": OF_DETECTION + OF_ESTIMATION, "detection": OF_ESTIMATION,
+                "estimation": ()}[stage]
+    return tuple(name for name in sizes if name not in left_out)
+
+
+def perfect(rng, sizes, *, rotation=None, position=None):
+    """Return a dataset of poses that are all solved; errors (..., xyz) in radians and metres."""
+    scene, detected, estimated = (
+        dims_of(sizes, stage) for stage in ("scene", "detection", "estimation")
+    )
+    shapes = {dims: tuple(sizes[name] for name in dims) for dims in (scene, detected, estimated)}
+    depth = rng.uniform(0.5, 2.0, shapes[scene])
+    truth = np.stack([0.1 * depth, 0.2 * depth, depth], axis=-1)
+    if rotation is None:
+        rotation = rng.normal([0.004, -0.002, 0.003], 0.01, (*shapes[estimated], 3))
+    if position is None:
+        position = rng.normal([0.001, 0.002, 0.008], [0.002, 0.001, 0.01], rotation.shape)
+    rotation = np.asarray(rotation, dtype=np.float32)
+    size = np.linalg.norm(rotation.astype(np.float64), axis=-1)
+
+    def flags(dims, value):
+        return dims, np.full(shapes[dims], value, dtype=np.uint8)
+
+    return xr.Dataset(
+        {
+            "true_rvec": ((*scene, "xyz"), rng.normal(size=truth.shape)),
+            "true_tvec_m": ((*scene, "xyz"), truth),
+            "marker_area_px": (scene, rng.uniform(100, 1000, shapes[scene])),
+            "detection": flags(detected, DetectionStatus.detected),
+            "estimate": flags(estimated, EstimateStatus.solved),
+            "flipped": flags(estimated, Flipped.not_flipped),
+            "rotation_error_rad": ((*estimated, "xyz"), rotation),
+            "translation_error_m": ((*estimated, "xyz"), np.asarray(position, dtype=np.float32)),
+            "rotation_error_deg": (estimated, np.degrees(size).astype(np.float32)),
+        },
+        coordinates_of(sizes) | INNER,
+        {"pipeline": pipeline_text(sizes)},
+    )
+
+
+def with_every_flag(rng, results, *, good=0.6):
+    """Return the dataset with poses that went wrong in every way the kernel knows."""
+    out = results.copy(deep=True)
+    shape = out["detection"].shape
+    kinds = np.array(list(DetectionStatus), dtype=np.uint8)
+    out["detection"].values[...] = np.where(
+        rng.random(shape) < good, DetectionStatus.detected, rng.choice(kinds, shape)
+    )
+    seen = xr.broadcast(out["detection"], out["estimate"])[0]
+    seen = seen.transpose(*out["estimate"].dims).values
+    shape = seen.shape
+    kinds = [
+        kind
+        for kind in EstimateStatus
+        if kind not in (EstimateStatus.not_run, EstimateStatus.no_detection)
+    ]
+    estimate = np.where(rng.random(shape) < good, EstimateStatus.solved,
+                        rng.choice(np.array(kinds, dtype=np.uint8), shape))
+    estimate[seen != DetectionStatus.detected] = EstimateStatus.no_detection
+    estimate[seen == DetectionStatus.not_run] = EstimateStatus.not_run
+    estimate[seen == DetectionStatus.crashed] = EstimateStatus.crashed
+    solved = estimate == EstimateStatus.solved
+    out["estimate"].values[...] = estimate
+    out["flipped"].values[...] = np.where(
+        solved, np.where(rng.random(shape) < 0.2, Flipped.flipped, Flipped.not_flipped),
+        np.where(estimate == EstimateStatus.not_run, Flipped.not_run, Flipped.no_estimate),
+    )
+    kept = solved | (estimate == EstimateStatus.not_explained)  # its pose is kept beside the flag
+    for name in ("rotation_error_rad", "translation_error_m", "rotation_error_deg"):
+        errors = out[name].values
+        errors[~kept] = np.nan
+        errors[estimate == EstimateStatus.not_explained] *= 50
+    nothing = (seen == DetectionStatus.not_run).all(
+        axis=tuple(k for k, name in enumerate(out["estimate"].dims)
+                   if name in OF_DETECTION + OF_ESTIMATION))
+    out["true_tvec_m"].values[nothing] = np.nan
+    out["marker_area_px"].values[nothing] = np.nan
+    return out
+
+
+def mixed(sizes, seed=1, **options):
+    rng = np.random.default_rng(seed)
+    return with_every_flag(rng, perfect(rng, sizes), **options)
+
+
+def poses(results, of, per=(), bins=None):
+    """Return {kept indices: poses} by plain loops; a pose is its values, cell, draw and setting.
+
+    ``of`` is the variable that says which dimensions a pose has.
+    """
+    bins = bins or {}
+    axes = [name for name in results[of].dims if name not in INNER]
+    axes += [name for name in per if name not in axes]
+    arrays = {name: ([dim for dim in array.dims if dim not in INNER],
+                     array.transpose(..., *(d for d in array.dims if d in INNER)).values)
+              for name, array in results.variables.items()
+              if set(array.dims) <= {*axes, *INNER} and name not in INNER}
+    kept = [range(results.sizes[name]) for name in per]
+    kept += [range(len(edges) - 1) for edges in bins.values()]
+    groups = {index: [] for index in itertools.product(*kept)}
+    for index in itertools.product(*(range(results.sizes[name]) for name in axes)):
+        at = dict(zip(axes, index, strict=True))
+        pose = {name: values[tuple(at[dim] for dim in dims)]
+                for name, (dims, values) in arrays.items()}
+        here = [at[name] for name in per]
+        for name, edges in bins.items():
+            here += [k for k in range(len(edges) - 1) if edges[k] <= pose[name] < edges[k + 1]]
+        if len(here) < len(per) + len(bins):
+            continue  # outside of the bins
+        pooled = [name for name in axes if name not in per]
+        pose["at"] = index
+        pose["cell"] = tuple(at[name] for name in pooled if name in GEOMETRY)
+        pose["draw"] = at["trial"] if "trial" in pooled else 0
+        groups[tuple(here)].append(pose)
+    return groups
+
+
+def looked_for(pose):
+    return pose["detection"] not in {
+        DetectionStatus.not_run, DetectionStatus.not_visible, DetectionStatus.not_modelled
+    }
+
+
+def is_run(pose):
+    return pose["detection"] != DetectionStatus.not_run
+
+
+def is_detected(pose):
+    return pose["detection"] == DetectionStatus.detected
+
+
+def is_solved(pose):
+    return pose["estimate"] == EstimateStatus.solved
+
+
+def degrees(pose):
+    return np.degrees(pose["rotation_error_rad"].astype(np.float64))
+
+
+def percent(pose):
+    return np.array([100.0 * float(pose["translation_error_m"][2])
+                     / float(pose["true_tvec_m"][2])])
+
+
+def metres(pose):
+    return pose["translation_error_m"].astype(np.float64)
+
+
+QUANTITIES = {"rotation": ("deg", degrees), "range": ("percent", percent),
+              "position": ("m", metres)}
+"""Quantity -> unit, and the error as a vector."""
+SHARES = {"median": 50, "p95": 95, "p99": 99}
+
+
+def length(vector):
+    return math.hypot(*np.asarray(vector).tolist())
+
+
+def draws_by_cell(found):
+    """Return {cell: draws} of a list of poses."""
+    cells = {}
+    for pose in found:
+        cells.setdefault(pose["cell"], set()).add(pose["draw"])
+    return cells
+
+
+def draws_in(found):
+    """Return what poses are worth in draws, Kish's effective number; their number if m is equal."""
+    sizes = Counter((pose["cell"], pose["draw"]) for pose in found).values()
+    return sum(sizes) ** 2 // max(1, sum(size**2 for size in sizes))
+
+
+def freedom_in(found):
+    """Return the number of draws beyond the first of each cell; 0: nothing was drawn."""
+    return sum(len(draws) - 1 for draws in draws_by_cell(found).values())
+
+
+def rate(name, of, hits, method="wilson"):
+    """Return a rate and its interval, the successes scaled outwards to draws."""
+    n, draws = len(of), draws_in(of)
+    out = {name: hits / n if n else math.nan}
+    stem = name if method == "wilson" else f"{name}_{method}"
+    if freedom_in(of) == 0:
+        return out | {f"{stem}_low": math.nan, f"{stem}_high": math.nan}
+    ends = wilson if method == "wilson" else jeffreys
+    return out | {f"{stem}_low": ends(hits * draws // n, draws)[0],
+                  f"{stem}_high": ends(math.ceil(hits * draws / n), draws)[1]}
+
+
+@functools.cache
+def wilson(successes, n):
+    """Brown, Cai and DasGupta 2001, eq. 4."""
+    z = stats.norm.ppf(0.975)
+    p = successes / n
+    centre = (successes + z**2 / 2) / (n + z**2)
+    half = z * math.sqrt(n) / (n + z**2) * math.sqrt(p * (1 - p) + z**2 / (4 * n))
+    return (0.0 if successes == 0 else centre - half), (1.0 if successes == n else centre + half)
+
+
+@functools.cache
+def jeffreys(successes, n):
+    """Brown, Cai and DasGupta 2001, section 3.1.3."""
+    low, high = stats.beta.ppf([0.025, 0.975], successes + 0.5, n - successes + 0.5)
+    return (0.0 if successes == 0 else low), (1.0 if successes == n else high)
+
+
+def mean_of(pairs, run):
+    """Return mean, standard error and degrees of freedom; ``pairs`` of a used pose and its value.
+
+    ``run`` are the poses whose draws make the sample: Cochran 1977, sections 6.11 and 5A.14.
+    """
+    if not pairs:
+        return math.nan, math.nan, math.nan
+    n = len(pairs)
+    mean = math.fsum(value for _, value in pairs) / n
+    most = freedom_in([pose for pose, _ in pairs])
+    if most == 0:
+        return mean, math.nan, math.nan
+    sums = {(cell, draw): 0.0 for cell, draws in draws_by_cell(run).items() for draw in draws}
+    for pose, value in pairs:
+        sums[pose["cell"], pose["draw"]] += value - mean
+    terms, m2, freedom, alone = [], 0.0, 0, 0
+    for cell, draws in draws_by_cell(run).items():
+        of_cell = np.array([sums[cell, draw] for draw in draws])
+        if len(of_cell) == 1:
+            alone += 1
+            continue
+        terms.append((len(of_cell) * np.var(of_cell, ddof=1), len(of_cell) - 1))
+        m2 += np.var(of_cell) * len(of_cell)
+        freedom += len(of_cell) - 1
+    spread = math.fsum(term for term, _ in terms)
+    weighed = math.fsum(term**2 / (f + 2) for term, f in terms)
+    welch = spread**2 / weighed - 2 if weighed else math.inf
+    return mean, math.sqrt(spread + alone * m2 / freedom) / n, min(welch, most)
+
+
+def students(freedom):
+    return special.stdtrit(freedom, 0.975)  # what stats.t.ppf is, without its checks
+
+
+def student(mean, error, freedom):
+    half = error * students(freedom)
+    return mean, mean - half, mean + half
+
+
+def exponential(mean, error, freedom):
+    """Student's interval of the logarithm, by the delta method."""
+    if mean == 0 or math.isnan(error):
+        return student(mean, error, freedom)
+    with np.errstate(over="ignore"):
+        factor = np.exp(error / mean * students(freedom))
+    return mean, mean / factor, mean * factor
+
+
+def root_mean_square(vectors, run):
+    """Return the RMS of ``[(pose, vector)]``."""
+    pairs = [(pose, length(vector) ** 2) for pose, vector in vectors]
+    return tuple(math.sqrt(end) for end in exponential(*mean_of(pairs, run)))
+
+
+def mean_vector(vectors):
+    return np.array([math.fsum(part) / len(vectors)
+                     for part in zip(*(v.tolist() for _, v in vectors), strict=True)])
+
+
+def spread(vectors, run):
+    """Return the standard deviation about the mean vector, with n - 1."""
+    if len(vectors) < 2:
+        return math.nan, math.nan, math.nan
+    centre = mean_vector(vectors)
+    factor = math.sqrt(len(vectors) / (len(vectors) - 1))
+    around = [(pose, vector - centre) for pose, vector in vectors]
+    return tuple(factor * end for end in root_mean_square(around, run))
+
+
+def named(name, interval):
+    return dict(zip((name, f"{name}_low", f"{name}_high"), interval, strict=True))
+
+
+def tolerance(name):
+    """Return the relative tolerance of a variable: store values are rounded to float32."""
+    if any(f"_{label}_" in name for label in SHARES):
+        return 2e-7
+    return 1e-9 if name.split()[0].endswith(("_low", "_high")) else 1e-12
+
+
+def assert_values(found, expected, where):
+    wrong = []
+    for name, value in expected.items():
+        number = found[name].item()
+        if isinstance(value, int):
+            assert found[name].dtype.kind in "iu", name
+            right = number == value
+        else:
+            right = (number == value or (math.isnan(value) and math.isnan(number))
+                     or abs(number - value) <= tolerance(name) * abs(value) + 1e-14)
+        if not right:
+            wrong.append(f"{name}: {number!r}, expected {value!r}")
+    assert not wrong, f"{where}: " + "; ".join(wrong)
+
+
+def assert_agrees(told, at, expected):
+    here = told.isel(at)
+    assert_values({name: here[name].values for name in expected}, expected, at)
+
+
+GRIDS = {
+    "all": mixed(ALL),
+    "plain": mixed(PLAIN, 2),
+    "draws": mixed(DRAWS, 3, good=0.97),
+    "no trial": mixed({"marker_id": 3, "side_px": 3, "cornerRefinementMethod": 2}, 4),
+    "one trial": mixed({"trial": 1, "tilt_deg": 3}, 5),
+    "only trial": mixed({"trial": 60}, 6),
+    "small": mixed({name: 1 if name in ("dictionary", "marker_id") else 2 for name in ALL}, 10),
+    "treatments first": mixed(
+        {"solver": 2, "trial": 5, "cornerRefinementMethod": 2, "distance_m": 3}, 7),
+}

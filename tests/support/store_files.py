@@ -1,0 +1,60 @@
+"""The files of a store, and damage to them that its checksums do not show."""
+
+import json
+from pathlib import Path
+from zlib import crc32
+
+import numpy as np
+import zarr
+
+from sweep.store.lifecycle import place_of
+from sweep.store.manifest import Manifest, write_manifest
+
+MANIFEST, COPY = "commits/receipt/manifest.json", "commits/receipt/manifest-copy.json"
+
+
+def files(url):
+    """Return the paths of a store's files below it."""
+    return sorted(path.relative_to(url).as_posix() for path in Path(url).rglob("*")
+                  if path.is_file())
+
+
+def arrays(url):
+    """Return every array's values of a store by path, but for what is timed; with plain Zarr."""
+    group = zarr.open_group(str(url), mode="r", zarr_format=3, use_consolidated=False)
+    return {
+        path: np.asarray(member[...]) for path, member in group.members(max_depth=None)
+        if isinstance(member, zarr.Array) and not path.startswith(("cost/", "commits/"))
+    }
+
+
+def see_same(url, other):
+    """Assert that two stores hold the same values, bit for bit."""
+    ours, theirs = arrays(url), arrays(other)
+    assert ours.keys() == theirs.keys()
+    for path, values in ours.items():
+        there = theirs[path]
+        assert (values.dtype, values.shape) == (there.dtype, there.shape), path
+        if values.dtype.kind == "f":
+            bits = f"u{values.itemsize}"
+            assert (values.view(bits) == there.view(bits)).all(), path
+        else:
+            assert (values == there).all(), path
+
+
+def reseal(url):
+    """Make the manifest fit the files that are there, as one who forges a store would."""
+    url = Path(url)
+    recorded = json.loads((url / MANIFEST).read_text())["files"]
+    attributes = json.loads((url / "zarr.json").read_text())["attributes"]
+    there = {key: crc32((url / key).read_bytes()) for key in recorded if (url / key).exists()}
+    write_manifest(place_of(str(url), "r+"), Manifest(attributes, there))
+
+
+def edit_receipt(url, number, change):
+    """Change a receipt's content; its checksums are right afterwards."""
+    array = zarr.open_array(f"{url}/commits/receipt", mode="r+", zarr_format=3)
+    content = json.loads(str(np.asarray(array[number])))
+    changed = change(content)
+    text = changed if isinstance(changed, str) else json.dumps(changed or content)
+    array[number : number + 1] = np.array([text], dtype=object)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.measure.accuracy import pose_error, rotation_difference
-from sweep.measure.bound import BoundStatus, bounds
+from sweep.measure.bound import bounds
 from sweep.measure.classify import classify
 from sweep.measure.covariance import squared_deviations
 from sweep.measure.detector import (
@@ -38,7 +38,7 @@ from sweep.measure.detector import (
 )
 from sweep.measure.estimation import Detections, Estimates, PoseEstimator
 from sweep.measure.estimators import build
-from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.measure.solver import EstimatorSetting
 from sweep.model.camera import Cameras
 from sweep.model.derivatives import POSE

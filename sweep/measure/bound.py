@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
+from sweep.measure.flags import BoundStatus
 from sweep.measure.likelihood import (
     BACKGROUND_MARGIN_PX,
     FIRST_LEVEL,
@@ -58,23 +58,6 @@ class BoundSetting:
         "unknown: none; known_blur: the point spread is known; unknown_blur: it is estimated too",
         choices=("none", "known_blur", "unknown_blur"),
     )
-
-
-class BoundStatus(IntEnum):
-    """What became of the bound."""
-
-    not_run = 0
-    given = 1
-    no_noise = 2
-    """Noise below half a grey level: rounding rules then, and it is no noise."""
-    no_contrast = 3
-    """Nothing in the image changes with some part of the pose, or next to nothing."""
-    clipped = 4
-    """A grey level lies within two standard deviations of the scale's ends."""
-    not_in_model = 5
-    """An effect is active that the bound's model of the image has not."""
-    not_visible = 6
-    """The marker is not visible, or not modelled."""
 
 
 @dataclass(frozen=True, slots=True)

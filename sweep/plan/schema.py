@@ -13,8 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sweep.measure.bound import BoundStatus
-from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.axes import Axis
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import compare, efficiency, error_statistics
-from sweep.measure.bound import BoundStatus
+from sweep.measure.flags import BoundStatus
 from sweep.report.charts import Series, draw_dots, draw_map, rows_height
 from sweep.report.figure import (
     FigureKind,

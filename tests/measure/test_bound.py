@@ -24,8 +24,8 @@ from scipy.special import ndtr
 from support.exact_image import DICTIONARIES, LENSES, modules_of, values, visible
 from support.lengths import lengths
 from sweep.evaluation.cells import run_cells, visibility_flags
-from sweep.measure.bound import BACKGROUND_MARGIN_PX, FARTHEST_MIRROR, BoundStatus, bounds
-from sweep.measure.flags import DetectionStatus
+from sweep.measure.bound import BACKGROUND_MARGIN_PX, FARTHEST_MIRROR, bounds
+from sweep.measure.flags import BoundStatus, DetectionStatus
 from sweep.measure.likelihood import plane_of, state_of
 from sweep.model.coverage import accumulate, sum_levels
 from sweep.model.effects import Effects

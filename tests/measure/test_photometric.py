@@ -22,9 +22,8 @@ from scipy.stats import binom, chi2, norm
 
 import sweep.evaluation.cells
 from sweep.evaluation.cells import run_cells
-from sweep.measure.bound import BoundStatus
 from sweep.measure.estimation import Detections, Estimates
-from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.measure.likelihood import (
     SETTLED,
     fit,

@@ -14,7 +14,7 @@ import itertools
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -41,6 +41,7 @@ from sweep.measure.estimators import build
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.measure.solver import EstimatorSetting
 from sweep.model.camera import Cameras
+from sweep.model.columns import Column, map_columns
 from sweep.model.derivatives import POSE
 from sweep.model.extent import (
     areas_px,
@@ -271,7 +272,7 @@ def joined(parts: Sequence[CellsResult]) -> CellsResult:
 
 
 def _bounded(
-    values: dict[str, Any], scenes: Scenes, visibility: NDArray[np.uint8]
+    values: Mapping[str, Column], scenes: Scenes, visibility: NDArray[np.uint8]
 ) -> dict[str, NDArray[Any]]:
     """Return the bound's variables, for the scenes that ask for it."""
     count = len(scenes)
@@ -281,7 +282,7 @@ def _bounded(
         "bound_kappa": np.broadcast_to(np.nan, count),
         "mirror_distance": np.broadcast_to(np.nan, count),
     }
-    asked = np.broadcast_to(np.array(values["bound"]), count)
+    asked = values["bound"].broadcast(count, np.str_)
     if (asked == "none").all():
         return out
     out = {name: column.copy() for name, column in out.items()}
@@ -295,16 +296,13 @@ def _bounded(
     return out
 
 
-def whole_frames(values: dict[str, Any], count: int) -> NDArray[np.bool_]:
-    """Tell (N,) which scenes are rendered as whole frames: as asked, or on a background image."""
-    whole = np.zeros(count, dtype=bool)
-    for name, test in (
-        ("window", lambda value: value == "full"),
-        ("background", lambda value: isinstance(value, str)),
-    ):
-        given = values[name]
-        whole |= [test(value) for value in given] if isinstance(given, list) else test(given)
-    return whole
+def whole_frames(values: Mapping[str, Column], count: int) -> NDArray[np.bool_]:
+    """Return (N,) which scenes are rendered as whole frames: as asked, or on a background image."""
+    whole = map_columns(
+        lambda window, background: window == "full" or isinstance(background, str),
+        [values["window"], values["background"]],
+    )
+    return whole.broadcast(count, np.bool_)
 
 
 def visibility_flags(scenes: Scenes) -> NDArray[np.uint8]:
@@ -464,17 +462,15 @@ def _rendered(
 
 
 def believed(
-    estimator: EstimatorSetting, values: dict[str, Any], scenes: Scenes
+    estimator: EstimatorSetting, values: Mapping[str, Column], scenes: Scenes
 ) -> tuple[Cameras, Floats]:
     """Return cameras and sizes (N,) as the estimator believes them."""
     view, size = scenes.cameras.view, scenes.size_m
     lenses, distorted = scenes.cameras.lenses, scenes.cameras.distorted
-    drawn = {name: values[name] for name in values if name.startswith("believed_")}
 
     def belief(name: str) -> Any:
-        own = getattr(estimator, name)
-        column = drawn.get(name)
-        return column if isinstance(column, np.ndarray) else own
+        drawn = name in values and not values[name].constant
+        return values[name].values if drawn else getattr(estimator, name)
 
     for k, name in enumerate(("fx_px", "fy_px", "cx_px", "cy_px")):
         value = belief(f"believed_{name}")
@@ -491,7 +487,7 @@ def believed(
 
 
 def sightings(
-    estimator: EstimatorSetting, values: dict[str, Any], scenes: Scenes, found: SearchResult,
+    estimator: EstimatorSetting, values: Mapping[str, Column], scenes: Scenes, found: SearchResult,
     rows: NDArray[np.intp],
 ) -> Detections:
     """Return what an estimator gets of the scenes ``rows`` (n,), as it believes them."""

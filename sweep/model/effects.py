@@ -9,8 +9,6 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from sweep.model.declaration import parameter
 
 
@@ -131,10 +129,5 @@ RANDOM = ("noise_grey", "full_well_e")
 
 
 def is_on(name: str, value: Any) -> bool:
-    """Tell whether a switch, one value or one for each scene, has any but its neutral value."""
-    off = SWITCHES[name]
-    if isinstance(value, np.ndarray):
-        return off is None or bool((value != off).any())
-    if isinstance(value, list):
-        return any(item != off for item in value)
-    return bool(value != off)
+    """Return whether a switch has another than its neutral value."""
+    return bool(value != SWITCHES[name])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,8 +13,9 @@ from numpy.typing import NDArray
 
 from sweep.model import lens as lens_model
 from sweep.model.camera import VIEW_PARAMETERS, Cameras, intrinsics
+from sweep.model.columns import Column, map_columns
 from sweep.model.declaration import parameter
-from sweep.model.effects import NEUTRAL, SWITCHES, VELOCITIES, Effects, is_on
+from sweep.model.effects import NEUTRAL, SWITCHES, VELOCITIES, Effects
 from sweep.model.marker import MarkerKey, marker_corners, module_count
 from sweep.model.pose import placed, rotation_of_angles
 from sweep.typing import Floats
@@ -149,33 +149,31 @@ class Scenes:
         return effect["exposure_s"], effect["row_time_s"], velocity
 
 
+_NEUTRAL_COLUMNS = {name: Column.of(value) for name, value in NEUTRAL.items()}
+
+
 def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
-    """Return ``count`` scenes from parameter values, each one value for all or one a scene.
+    """Return ``count`` scenes from parameter values.
 
     ``values`` has every parameter of camera, marker, pose and scene (``distance_m`` resolved,
-    ``distortion`` canonical) and ``shift_u_px``, ``shift_v_px``: the drawn jitter.
+    ``distortion`` canonical) and ``shift_u_px``, ``shift_v_px``: the drawn jitter. Each is a
+    :class:`Column`, or what :meth:`Column.of` makes one of.
     """
-    values = {**NEUTRAL, **values}
+    values = {**_NEUTRAL_COLUMNS, "noise_key": 0, **values}
+
+    def column(name: str) -> Column:
+        return Column.of(values[name])
 
     def numbers(name: str) -> Floats:
-        column = np.asarray(values[name], dtype=np.float64)  # None becomes NaN
-        return np.ascontiguousarray(np.broadcast_to(column, (count,)))
+        return column(name).broadcast(count)
 
     def mapped(function: Callable[..., Any], *names: str) -> list[Any]:
-        """Return a function of some values for each scene, called once where all are the same."""
-        given = [values[name] for name in names]
-        if not any(isinstance(value, (list, np.ndarray)) for value in given):
-            return [function(*given)] * count
-        each = [
-            value if isinstance(value, (list, np.ndarray)) else itertools.repeat(value)
-            for value in given
-        ]
-        return [function(*row) for row in itertools.islice(zip(*each, strict=False), count)]
+        return map_columns(function, [column(name) for name in names]).listed(count)
 
     fx, fy, cx, cy = (
         np.broadcast_to(np.asarray(number, dtype=np.float64), (count,))
         for number in intrinsics(
-            *(None if values[name] is None else numbers(name) for name in VIEW_PARAMETERS)
+            *(None if column(name).missing else numbers(name) for name in VIEW_PARAMETERS)
         )
     )
     lenses, lens = distinct(mapped(tuple, "distortion"))
@@ -235,13 +233,13 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
         axis=1,
     )
     effects, affected = None, np.zeros(count, dtype=bool)
-    if any(is_on(name, values[name]) for name in SWITCHES):
+    if any(column(name).differs_from(off) for name, off in SWITCHES.items()):
         effects = {
             field.name: numbers(field.name) for field in dataclasses.fields(Effects)
         }
         for name, off in SWITCHES.items():
-            column = effects[name]
-            affected |= ~np.isnan(column) if off is None else column != off
+            strength = effects[name]
+            affected |= ~np.isnan(strength) if off is None else strength != off
     plain = np.array(
         mapped(lambda name, level: name == "exact" and not isinstance(level, str),
                "renderer", "background"), dtype=bool,
@@ -263,11 +261,11 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
         corners_px=corners_px,
         outline_px=outline_px,
         renderer=mapped(str, "renderer"),
-        background=mapped(lambda level: level, "background"),
+        background=column("background").listed(count),
         plain=plain & ~affected,
         effects=effects,
         affected=affected,
-        noise_key=values.get("noise_key", np.zeros(count, dtype=np.uint64)),
+        noise_key=column("noise_key").broadcast(count, np.uint64),
     )
 
 

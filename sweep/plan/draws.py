@@ -9,6 +9,7 @@ order and on which grid, does not matter; nor do renderer, window, levels, detec
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from hashlib import blake2b
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion, intrinsics
+from sweep.model.columns import Column, map_columns
 from sweep.model.splitmix import mixed
 from sweep.plan.axes import Distribution
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
@@ -44,61 +46,48 @@ def _text(value: Any) -> str:
     return f"{float(value) + 0.0:.12g}"
 
 
-def _texts(name: str, value: Any, default: Any) -> str | list[str]:
-    """Return "name=value", empty where the value is the default; a list where scenes differ."""
+def _texts(name: str, column: Column, default: Any) -> Column:
+    """Return "name=value" of each value, empty where it is the default."""
     left_out = None if default is None else _text(default)
 
-    def labelled(item: Any) -> str:
-        text = _text(item)
+    @cache
+    def labelled(value: Any) -> str:
+        text = _text(value)
         return "" if text == left_out else f"{name}={text}"
 
-    if not isinstance(value, (np.ndarray, list)):
-        return labelled(value)
-    items = value.tolist() if isinstance(value, np.ndarray) else value
-    known = {item: labelled(item) for item in dict.fromkeys(items)}
-    return [known[item] for item in items]
+    return column.map(labelled)
 
 
 def geometry_keys(
-    values: Mapping[str, Any], distributions: Mapping[str, Distribution], count: int
+    values: Mapping[str, Column], distributions: Mapping[str, Distribution], count: int
 ) -> NDArray[np.uint64]:
     """Return the hashed geometry keys (count,) of scenes.
 
-    ``values`` has every parameter of camera, marker and pose that is not drawn, one value for
-    all scenes or one each, with ``distance_m`` resolved from ``side_px``.
+    ``values`` has every parameter of camera, marker and pose that is not drawn, with
+    ``distance_m`` resolved from ``side_px``.
     """
-    fx, fy, cx, cy = intrinsics(*(values[name] for name in VIEW_PARAMETERS))
-    columns: dict[str, str | list[str]] = {
-        name: _texts(name, value, default)
-        for name, value, default in (
-            ("fx_px", fx, _DEFAULT_VIEW["fx_px"]),
-            ("fy_px", fy, _DEFAULT_VIEW["fy_px"]),
-            ("distortion", values["distortion"], ()),
-        )
+    fx, fy, cx, cy = map(Column.of, intrinsics(*(values[name].values for name in VIEW_PARAMETERS)))
+    columns = {
+        "fx_px": _texts("fx_px", fx, _DEFAULT_VIEW["fx_px"]),
+        "fy_px": _texts("fy_px", fy, _DEFAULT_VIEW["fy_px"]),
+        "distortion": _texts("distortion", values["distortion"], ()),
     }
-    for name, length in (("cx_px", "width_px"), ("cy_px", "height_px")):
-        if values[name] is not None:
-            given = _texts(name, cx if name == "cx_px" else cy, None)
-            middles = _texts(name, (values[length] - 1) / 2, None)
-            pairs = zip(_each(given, count), _each(middles, count), strict=True)
-            columns[name] = ["" if text == middle else text for text, middle in pairs]
+    for name, centre, length in (("cx_px", cx, "width_px"), ("cy_px", cy, "height_px")):
+        if not values[name].missing:
+            middle = Column.of((values[length].values - 1) / 2)
+            columns[name] = map_columns(
+                lambda text, default: "" if text == default else text,
+                [_texts(name, centre, None), _texts(name, middle, None)],
+            )
     for name in _PLAIN:
-        if name not in distributions and values.get(name) is not None:
+        if name not in distributions and name in values and not values[name].missing:
             columns[name] = _texts(name, values[name], PARAMETERS[name].default)
     for name, distribution in distributions.items():
         if PARAMETERS[name].section in GEOMETRY_SECTIONS:
-            columns[name] = f"{name}={distribution}"
-    used = [columns[name] for name in sorted(columns) if any(columns[name])]
-    if all(isinstance(column, str) for column in used):
-        return np.full(count, _hash("|".join(column for column in used if isinstance(column, str))))
-    texts = zip(*(_each(column, count) for column in used), strict=True)
-    keys = ["|".join(filter(None, parts)) for parts in texts]
-    known = {key: _hash(key) for key in dict.fromkeys(keys)}
-    return np.array([known[key] for key in keys], dtype=np.uint64)
-
-
-def _each(texts: str | list[str], count: int) -> list[str]:
-    return [texts] * count if isinstance(texts, str) else texts
+            columns[name] = Column.of(f"{name}={distribution}")
+    used = [columns[name] for name in sorted(columns) if columns[name].differs_from("")]
+    joined = map_columns(lambda *texts: "|".join(filter(None, texts)), used)
+    return joined.map(cache(_hash)).broadcast(count, np.uint64)
 
 
 def _hash(text: str) -> np.uint64:

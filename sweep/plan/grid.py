@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,8 @@ from numpy.typing import NDArray
 from sweep.measure.detector import DetectorSetting
 from sweep.measure.solver import EstimatorSetting
 from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion, intrinsics
-from sweep.model.effects import RANDOM, is_on
+from sweep.model.columns import Column
+from sweep.model.effects import RANDOM, SWITCHES
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.draws import bits, geometry_keys, uniform
 from sweep.plan.experiment import Pipeline
@@ -102,77 +104,86 @@ def scene_axes(pipeline: Pipeline) -> tuple[Axis, ...]:
     return pipeline.axes_of(Stage.scene)
 
 
-def _column(axis: Axis, indices: NDArray[np.intp]) -> Any:
-    """Return an axis' values at indices (N,): an array of numbers, or a list of anything else."""
+def _column(axis: Axis, indices: NDArray[np.intp]) -> Column:
+    """Return an axis' values at indices (N,)."""
     low, high = int(indices.min()), int(indices.max()) + 1
     part = axis.values[low:high]
     if isinstance(part, range):
-        return part.start + part.step * (indices - low)
+        return Column.of(part.start + part.step * (indices - low))
     if isinstance(part[0], (int, float)) and not any(isinstance(v, (bool, str)) for v in part):
-        return np.asarray(part, dtype=np.float64)[indices - low]
-    return [part[i] for i in (indices - low).tolist()]
+        return Column.of(np.asarray(part, dtype=np.float64)[indices - low])
+    return Column.of([part[i] for i in (indices - low).tolist()])
 
 
-def scene_values(pipeline: Pipeline, indices: Sequence[NDArray[np.intp]]) -> dict[str, Any]:
-    """Return every parameter's values for scenes at ``indices`` (N,) along each scene axis.
+def scene_values(
+    pipeline: Pipeline, indices: Sequence[NDArray[np.intp]]
+) -> dict[str, Column]:
+    """Return the scene parameters' values for scenes at ``indices`` (N,) along each scene axis.
 
-    One value where it is the same for all, else (N,) values; drawn ones are drawn.
-    ``distance_m`` is resolved, lenses are canonical, images are absolute paths, and
-    ``shift_u_px``, ``shift_v_px`` are the jitter.
+    Random ones are drawn (those of later stages too), ``distance_m`` is resolved, lenses are
+    canonical, images are absolute paths, and ``shift_u_px``, ``shift_v_px`` are the jitter.
     """
     axes = scene_axes(pipeline)
     count = len(indices[0]) if axes else 1
-    values: dict[str, Any] = dict(pipeline.fixed)
+    values = {
+        name: Column(value, constant=True)
+        for name, value in pipeline.fixed.items() if PARAMETERS[name].stage is Stage.scene
+    }
     trials = np.zeros(count, dtype=np.int64)
     for axis, index in zip(axes, indices, strict=True):
         column = _column(axis, index)
         if axis.name == TRIAL:
-            trials = np.asarray(column, dtype=np.int64)
+            trials = column.broadcast(count, np.int64)
         else:
             values[axis.name] = column
-    distortion = values["distortion"]
-    values["distortion"] = (
-        [canonical_distortion(lens) for lens in distortion]
-        if isinstance(distortion, list) else canonical_distortion(distortion)
-    )
-    background = values.get("background")
-    values["background"] = (
-        [_absolute(pipeline, value) for value in background]
-        if isinstance(background, list) else _absolute(pipeline, background)
-    )
+    values["distortion"] = values["distortion"].map(canonical_distortion)
     drawn = pipeline.distributions
+    if "background" not in drawn:
+        values["background"] = values["background"].map(partial(_absolute, pipeline.folder))
     if "distance_m" not in drawn and "side_px" not in drawn:
-        resolve_distance(values)
-    jitter = np.asarray(values["jitter_px"], dtype=np.float64)
-    values["shift_u_px"] = values["shift_v_px"] = 0.0
-    noisy = any(name in drawn or is_on(name, values[name]) for name in RANDOM)
+        _resolve_distance(values)
+    jitter = np.asarray(values["jitter_px"].values, dtype=np.float64)
+    values["shift_u_px"] = values["shift_v_px"] = Column.of(0.0)
+    noisy = any(name in drawn or values[name].differs_from(SWITCHES[name]) for name in RANDOM)
     if not drawn and not noisy and not (jitter > 0).any():
         return values
     keys = geometry_keys(values, drawn, count)
     for name, distribution in drawn.items():
-        values[name] = distribution.at(uniform(pipeline.seed, name, keys, trials))
+        values[name] = Column.of(distribution.at(uniform(pipeline.seed, name, keys, trials)))
     if "side_px" in drawn:
-        resolve_distance(values)
+        _resolve_distance(values)
     if (jitter > 0).any():
         for name in ("shift_u_px", "shift_v_px"):
             draw = uniform(pipeline.seed, name, keys, trials)
-            values[name] = jitter * (2 * draw - 1)
+            values[name] = Column.of(jitter * (2 * draw - 1))
     if noisy:
-        values["noise_key"] = bits(pipeline.seed, "noise", keys, trials)
+        values["noise_key"] = Column.of(bits(pipeline.seed, "noise", keys, trials))
     return values
 
 
-def _absolute(pipeline: Pipeline, value: Any) -> Any:
-    if not isinstance(value, str):
-        return value
-    return str((Path(pipeline.folder) / value).resolve())
+def _absolute(folder: str, background: Any) -> Any:
+    """Return an image's absolute path; a grey level as it is."""
+    return str((Path(folder) / background).resolve()) if isinstance(background, str) else background
 
 
-def resolve_distance(values: dict[str, Any]) -> None:
-    """Turn ``side_px`` into ``distance_m``: fx · size / side."""
-    if values.get("side_px") is not None:
-        fx = intrinsics(*(values[name] for name in VIEW_PARAMETERS))[0]
-        values["distance_m"] = fx * values["size_m"] / values["side_px"]
+def _resolve_distance(values: dict[str, Column]) -> None:
+    """Turn ``side_px`` into ``distance_m`` if it is given."""
+    if "side_px" in values and not values["side_px"].missing:
+        numbers = {name: values[name].values for name in DISTANCE_PARAMETERS}
+        values["distance_m"] = Column.of(distance_of_side(numbers))
+
+
+DISTANCE_PARAMETERS = (*VIEW_PARAMETERS, "size_m", "side_px")
+"""The parameters that :func:`distance_of_side` needs."""
+
+
+def distance_of_side(values: Mapping[str, Any]) -> Any:
+    """Return the distance in m at which the black square's side is ``side_px`` long.
+
+    ``fx · size / side``; ``values`` has numbers or arrays for :data:`DISTANCE_PARAMETERS`.
+    """
+    fx = intrinsics(*(values[name] for name in VIEW_PARAMETERS))[0]
+    return fx * values["size_m"] / values["side_px"]
 
 
 def block_indices(block: Block) -> list[NDArray[np.intp]]:

@@ -17,10 +17,9 @@ from zarr.core.dtype import parse_dtype
 from zarr.core.sync import sync
 from zarr.storage import MemoryStore
 
-from sweep.model.camera import VIEW_PARAMETERS
 from sweep.plan.axes import Axis
 from sweep.plan.experiment import Pipeline
-from sweep.plan.grid import Blocks, resolve_distance, scene_axes
+from sweep.plan.grid import DISTANCE_PARAMETERS, Blocks, distance_of_side, scene_axes
 from sweep.plan.schema import LABELS, SCHEMA, Variable
 
 RECEIPTS = "commits/receipt"
@@ -215,16 +214,14 @@ def _distance(pipeline: Pipeline) -> list[PlannedArray]:
     sides = pipeline.values_of("side_px")
     if not sides or sides[0] is None:
         return []
-    names = (*VIEW_PARAMETERS, "size_m", "side_px")
-    axes = [axis for axis in scene_axes(pipeline) if axis.name in names]
+    axes = [axis for axis in scene_axes(pipeline) if axis.name in DISTANCE_PARAMETERS]
     grids = np.meshgrid(
         *(np.array(axis.values, dtype=np.float64) for axis in axes), indexing="ij", sparse=True
     )
-    values = {**{name: pipeline.fixed.get(name) for name in names},
+    values = {**{name: pipeline.fixed.get(name) for name in DISTANCE_PARAMETERS},
               **{axis.name: grid for axis, grid in zip(axes, grids, strict=True)}}
-    resolve_distance(values)
     distance = np.broadcast_to(
-        np.asarray(values["distance_m"], dtype=np.float64), tuple(len(axis) for axis in axes)
+        np.asarray(distance_of_side(values), dtype=np.float64), tuple(len(axis) for axis in axes)
     )
     return [
         PlannedArray(

@@ -484,7 +484,7 @@ def test_spread_of_the_size_is_that_of_the_distance(count):
     estimated = Estimated(
         DRAWN, [f"trial={count}", "believed_size_m={normal=[0.1, 0.002]}"]
     )
-    drawn = estimated.values["believed_size_m"]
+    drawn = estimated.values["believed_size_m"].values
     for estimator, found, _ in estimated:
         expected = estimated.scenes.translation * (drawn / 0.1)[:, None]
         assert_translation(found.translation, expected, estimator)
@@ -498,8 +498,8 @@ def test_spread_of_the_principal_point_is_that_of_the_marker_sideways(count):
     ])
     for estimator, found, error in estimated:
         expected = parallel_law(
-            estimated.scenes, 600, 600, estimated.values["believed_cx_px"],
-            estimated.values["believed_cy_px"], 0.1,
+            estimated.scenes, 600, 600, estimated.values["believed_cx_px"].values,
+            estimated.values["believed_cy_px"].values, 0.1,
         )
         assert_translation(found.translation, expected, estimator)
         assert error.rotation_angle_rad.max() < ROTATION_RAD, estimator
@@ -521,7 +521,7 @@ def test_spread_of_the_focal_lengths_is_that_of_the_distance(count):
     estimated = Estimated(DRAWN, [f"trial={count}", *(
         f"believed_f{axis}_px={{normal=[600, {deviation}]}}" for axis in "xy"
     )])
-    x, y = (estimated.values[f"believed_f{axis}_px"] / 600 - 1 for axis in "xy")
+    x, y = (estimated.values[f"believed_f{axis}_px"].values / 600 - 1 for axis in "xy")
     for estimator, found, _ in estimated:
         z = found.translation[:, 2] / 0.25 - 1
         if estimator.solver in LEAST_SQUARES:
@@ -545,7 +545,7 @@ def test_drawn_beliefs_are_the_same_for_all_solvers_and_independent_of_one_anoth
     for one in drawn:
         name = one.split("=")[0]
         np.testing.assert_array_equal(
-            Estimated(DRAWN, [one]).values[name], both.values[name]
+            Estimated(DRAWN, [one]).values[name].values, both.values[name].values
         )
 
 

@@ -43,7 +43,7 @@ def drawn(*settings, text=DRAWN, order=ORDER, take=None):
     others = tuple(0 if name not in order else slice(None) for name in axes)
     table = {}
     for name in QUANTITIES:
-        grid = np.broadcast_to(values[name], len(block)).reshape(block.shape)[others]
+        grid = values[name].broadcast(len(block)).reshape(block.shape)[others]
         grid = np.moveaxis(grid, range(len(kept)), [order.index(name) for name in kept])
         table[name] = grid[take] if take else grid
     return table
@@ -185,14 +185,15 @@ def test_jitter_moves_the_undistorted_projection_of_the_centre_by_the_shift(dist
     block = whole(pipeline)
     values = scene_values(pipeline, block_indices(block))
     truth = run_block(pipeline, block).values["true_tvec_m"].reshape(-1, 3)
-    expected = np.tan(np.radians(np.stack([values["bearing_x_deg"], np.full(len(block), -4.0)])))
-    shift = np.stack([values["shift_u_px"], values["shift_v_px"]])
+    bearings = [values["bearing_x_deg"].values, np.full(len(block), -4.0)]
+    expected = np.tan(np.radians(np.stack(bearings)))
+    shift = np.stack([values["shift_u_px"].values, values["shift_v_px"].values])
     # 1e-10 px: a few roundings of coordinates of some hundred pixels.
     for axis, (focal, centre) in enumerate(((700.0, 300.25), (650.0, 260.0))):
         pixel = focal * truth[:, axis] / truth[:, 2] + centre
         unshifted = focal * expected[axis] + centre
         np.testing.assert_allclose(pixel - unshifted, shift[axis], rtol=0, atol=1e-10)
-    np.testing.assert_array_equal(truth[:, 2], values["distance_m"])
+    np.testing.assert_array_equal(truth[:, 2], values["distance_m"].values)
     assert np.abs(shift).max() <= 0.5
     assert np.abs(shift).max() > 0.4
 
@@ -226,7 +227,7 @@ def test_values_of_a_block_are_those_of_the_whole_grid_cut(extents):
         values = scene_values(pipeline, block_indices(block))
         for name in QUANTITIES:
             np.testing.assert_array_equal(
-                values[name].reshape(block.shape), expected[name][part], err_msg=name
+                values[name].values.reshape(block.shape), expected[name][part], err_msg=name
             )
         covered += len(block)
     assert covered == len(whole(pipeline))

@@ -6,6 +6,7 @@ and its control characters are escaped, so that it neither forges a line nor rea
 
 from __future__ import annotations
 
+import difflib
 import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -85,3 +86,23 @@ def _quoted(text: str) -> str:
 
 def _key(key: str) -> str:
     return key if key.isascii() and key.replace("-", "_").isidentifier() else _quoted(key)
+
+
+def label(value: Any) -> str:
+    """Return a value that is no plain number as a coordinate shows it: "[-0.3, 0.1, 0, 0]"."""
+    if isinstance(value, tuple):
+        return "[" + ", ".join(f"{item!r}" for item in value) + "]"
+    return value if isinstance(value, str) else repr(value)
+
+
+MAX_WORD_LENGTH = 60
+"""Words beyond this length are like no known one."""
+
+
+def nearest(word: str, known: Sequence[str]) -> str:
+    """Return "; did you mean ...?" for the nearest known word, or nothing."""
+    if len(word) > MAX_WORD_LENGTH:
+        return ""
+    close = [name for name in known if word and name.startswith(word)]
+    close = close or difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    return f"; did you mean {close[0]}?" if close else ""

@@ -13,8 +13,8 @@ from sweep.cli import main
 from sweep.evaluation.inspection import look
 from sweep.plan.cell_selection import cell
 from sweep.plan.experiment import Pipeline
-from sweep.plan.parameter_reference import reference
 from sweep.plan.parameters import PARAMETERS, Stage
+from sweep.plan.reference import TABLES
 from sweep.plan.schema import SCHEMA
 
 TOP = Path(__file__).parent.parent
@@ -28,7 +28,7 @@ def block_after(marker, language):
 
 
 def test_reference_of_parameters_is_that_of_the_declarations():
-    assert reference().strip() in README, "python -m sweep.plan.parameter_reference"
+    assert TABLES["parameters"]() in README
 
 
 def test_both_commands_are_one_line_each():

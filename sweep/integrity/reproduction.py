@@ -16,8 +16,7 @@ from sweep.evaluation.inspection import SceneInspection, look, picture
 from sweep.integrity.tolerances import departure, difference, outside
 from sweep.isolation.child_process import Child, DiedError, RaisedError
 from sweep.isolation.crash_isolation import run_cells_isolated
-from sweep.messages import plain, refusal
-from sweep.plan.axes import nearest
+from sweep.messages import nearest, plain, refusal
 from sweep.plan.cell_selection import at_text, cell, places
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.messages import shown
+from sweep.messages import label, nearest, shown
 from sweep.plan.parameters import PARAMETERS, Parameter, Stage
 
 TRIAL = "trial"
@@ -68,13 +67,6 @@ class Axis:
         return np.array(part, dtype=type(self.values[0]))
 
 
-def label(value: Any) -> str:
-    """Return a value that is no plain number as a coordinate shows it: "[-0.3, 0.1, 0, 0]"."""
-    if isinstance(value, tuple):
-        return "[" + ", ".join(f"{item!r}" for item in value) + "]"
-    return value if isinstance(value, str) else repr(value)
-
-
 @dataclass(frozen=True, slots=True)
 class Distribution:
     """A parameter that is drawn per trial: ``uniform`` on [a, b] or ``normal`` (mean a, sd b)."""
@@ -106,19 +98,6 @@ AXIS_FORMS = {
     "values": "a list",
 }
 DISTRIBUTION_FORMS = {"uniform": "[a, b] with a < b", "normal": "[mean, sd] with sd > 0"}
-
-
-MAX_WORD_LENGTH = 60
-"""Words beyond this length are like no known one."""
-
-
-def nearest(word: str, known: Sequence[str]) -> str:
-    """Return "; did you mean ...?" for the nearest known word, or nothing."""
-    if len(word) > MAX_WORD_LENGTH:
-        return ""
-    close = [name for name in known if word and name.startswith(word)]
-    close = close or difflib.get_close_matches(word, known, n=1, cutoff=0.5)
-    return f"; did you mean {close[0]}?" if close else ""
 
 
 def parse_distribution(parameter: Parameter, table: dict[str, Any]) -> Distribution:

@@ -7,8 +7,8 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from sweep.messages import MAX_FAULTS, plain, refusal
-from sweep.plan.axes import TRIAL, Axis, label, nearest
+from sweep.messages import MAX_FAULTS, label, nearest, plain, refusal
+from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.experiment import Pipeline, fixed_at
 from sweep.plan.parameters import PARAMETERS
 from sweep.plan.toml_text import read_value

@@ -15,7 +15,7 @@ import tomlkit
 import tomlkit.items
 
 from sweep.measure.detector import DetectorSetting
-from sweep.messages import MAX_FAULTS, plain, refusal, shown
+from sweep.messages import MAX_FAULTS, nearest, plain, refusal, shown
 from sweep.model.effects import GEOMETRIC, RANDOM, VELOCITIES, is_on
 from sweep.model.image_file import MAX_PIXELS, image_size, read_image, read_regular
 from sweep.model.marker import marker_count
@@ -25,7 +25,6 @@ from sweep.plan.axes import (
     TRIAL,
     Axis,
     Distribution,
-    nearest,
     parse_axis,
     parse_distribution,
     parse_trial,

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
+from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flag, Flipped
 from sweep.plan.axes import Axis
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
@@ -140,7 +140,7 @@ class Variable:
     meaning: str
     units: str = ""
     inner: tuple[str, ...] = ()
-    flags: type[IntEnum] | None = None
+    flags: type[Flag] | None = None
     present_when: FlagRule | None = None
     tolerance: Tolerance | None = None
     since_format: int = 2

@@ -10,7 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sweep.plan.axes import TRIAL, Axis, label
+from sweep.messages import label
+from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.parameters import PARAMETERS
 from sweep.report.gallery import pipeline_file
 from sweep.report.report_data import Subject, texts_of

@@ -15,7 +15,8 @@ from sweep.errors import StoreError
 from sweep.isolation.interrupts import Interrupts
 from sweep.measure.estimators import build
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.plan.axes import TRIAL, Axis, nearest
+from sweep.messages import nearest
+from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import combinations, estimators
 from sweep.plan.parameters import Stage

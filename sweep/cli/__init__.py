@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Self
 from sweep.errors import ArgumentError, PipelineError, StoreError, SweepError
 
 if TYPE_CHECKING:
-    from sweep.execution.runner import Progress
+    from sweep.execution.progress import Progress
     from sweep.plan.experiment import Pipeline
 
 # Heavy packages are imported by the commands that need them: `sweep --help` is quick.
@@ -206,7 +206,7 @@ def _run(chosen: argparse.Namespace) -> int:
         summary = execute(
             pipeline, chosen.store, workers=chosen.workers, scheduler=chosen.scheduler,
             reuse=chosen.reuse, overwrite=chosen.overwrite, time_limit_s=chosen.time_limit,
-            on_progress=bar,
+            progress=bar,
         )
     if chosen.json:
         _print_json(dataclasses.asdict(summary))
@@ -261,12 +261,12 @@ class _Bar:
 
 def _plan(chosen: argparse.Namespace) -> int:
     pipeline = _read(chosen)
-    from sweep.execution.forecast import forecast_apart  # noqa: PLC0415
+    from sweep.execution.forecast import forecast_isolated  # noqa: PLC0415
     from sweep.plan.active_parts import parts  # noqa: PLC0415
 
     listed = parts(pipeline)
     switches = [part.switch for part in listed if part.switch and part.active]
-    expected, costs = forecast_apart(pipeline, chosen.workers, switches)
+    expected, costs = forecast_isolated(pipeline, chosen.workers, switches)
     if chosen.json:
         _print_json(
             {
@@ -418,7 +418,7 @@ def _tradeoff(chosen: argparse.Namespace) -> int:
         from sweep.plan.experiment import Pipeline  # noqa: PLC0415
 
         with _Bar() as bar:
-            store = execute(Pipeline.from_toml(store), None, on_progress=bar).store
+            store = execute(Pipeline.from_toml(store), None, progress=bar).store
     trade, renderers = measure_trade(store, chosen.per, chosen.seconds)
     if output is not None:
         from sweep.report.trade_figure import draw_trade  # noqa: PLC0415

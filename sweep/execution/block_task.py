@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sweep.errors import StoreError
 from sweep.evaluation.cells import CellsResult, run_cells, shaped
+from sweep.execution.limits import TIME_LIMIT_S
 from sweep.execution.reuse import ReusedCells, Source, match, take
 from sweep.isolation.crash_isolation import WHOLE, run_cells_isolated
 from sweep.isolation.watchdog import ending_after
@@ -26,10 +27,8 @@ from sweep.store.failures import MAX_ROWS, recorded
 from sweep.store.lifecycle import RunStore, begin_block, open_store, write_block
 from sweep.store.provenance import fingerprint
 
-TIME_LIMIT_S = 600.0
-"""Seconds after which a block is taken for endless, the search for its endless scene included."""
-
-ROOM: dict[str, int] = {"failed": MAX_ROWS, "crashed": MAX_ROWS}
+FAILURE_QUOTA: Mapping[str, int] = {"failed": MAX_ROWS, "crashed": MAX_ROWS}
+"""Rows of failures that a receipt may hold of each kind."""
 
 
 @lru_cache(maxsize=4)
@@ -68,13 +67,30 @@ def compute_block(
     block: Block,
     reuse: Sequence[str] = (),
     time_limit_s: float = TIME_LIMIT_S,
-    room: Mapping[str, int] = ROOM,
+    quota: Mapping[str, int] = FAILURE_QUOTA,
 ) -> dict[str, Any]:
-    """Compute, write and commit one block; return its receipt (also when it is run twice).
+    """Compute, write and commit one block; return its receipt, also if it is run twice.
 
-    Cells that the stores ``reuse`` have are taken from there. A block that was begun before and
-    not committed may have ended its process: it is computed in a child, where what does so is
-    found. ``room`` bounds the rows of failures that the receipt keeps of each kind.
+    A block that was begun before and not committed may have ended its process: it is computed in a
+    child process, where the scenes that crash or never return are isolated.
+
+    Parameters
+    ----------
+    url, run_id
+        The store, and the run that it must still belong to.
+    block
+        What to compute.
+    reuse
+        Stores whose finished cells are read instead of computed.
+    time_limit_s
+        Block timeout in seconds.
+    quota
+        Rows of failures that the receipt may hold of each kind.
+
+    Raises
+    ------
+    StoreError
+        If the store was replaced or cannot be written, or its numbers cannot be made here.
     """
     start = time.perf_counter()
     store = _opened(url, run_id)
@@ -113,7 +129,7 @@ def compute_block(
         "detection": np.bincount(values["detection"].ravel()).tolist(),
         "estimate": np.bincount(values["estimate"].ravel()).tolist(),
         "seconds": cells.seconds if cells is not None else _NO_SECONDS,
-        "failures": recorded(cells.failures if cells is not None else [], rows.tolist(), room),
+        "failures": recorded(cells.failures if cells is not None else [], rows.tolist(), quota),
         "wall_s": time.perf_counter() - start,
         "written": time.time(),
     }

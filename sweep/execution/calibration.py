@@ -10,6 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.evaluation.cells import run_cells
+from sweep.execution.limits import (
+    BLOCK_S,
+    BLOCKS_PER_WORKER,
+    MAX_BLOCK_BYTES,
+    MAX_BLOCK_SCENES,
+    MIN_BLOCK_S,
+)
 from sweep.isolation.child_process import Child, DiedError, RaisedError
 from sweep.plan.axes import Axis
 from sweep.plan.experiment import Pipeline
@@ -25,15 +32,6 @@ LONG_BATCH_S = 0.06
 
 MAX_BATCHES = 40
 
-BLOCK_S = 2.0
-"""Work in a block: a task costs the scheduler about 1.6 ms, a lost block costs its work."""
-
-MIN_BLOCK_S = 0.1
-BLOCKS_PER_WORKER = 6
-"""With little work, blocks are cut smaller so that every worker has some to do to the end."""
-
-MAX_BLOCK_BYTES = 256_000_000
-MAX_BLOCK_SCENES = 200_000
 UNEVEN = 0.25
 """Axes whose two halves differ in cost by more than this share are kept whole where possible."""
 
@@ -108,7 +106,7 @@ UNMEASURED_S = 0.01
 """What a scene is taken to cost where measuring it ended the process."""
 
 
-def calibrate_apart(
+def calibrate_isolated(
     child: Child, pipeline: Pipeline, budget_s: float, limit_s: float
 ) -> Calibration:
     """Measure as :func:`calibrate` does, in a child process: a scene may end it."""

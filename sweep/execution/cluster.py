@@ -1,48 +1,38 @@
-"""Where blocks are computed: an embedded cluster on this machine, or one that is running."""
+"""The cluster that computes blocks: embedded, by a scheduler's address, or the caller's own.
+
+The caller's process is left as it was: an embedded cluster's settings hold while it starts, Dask's
+loggers are silenced while this package's own client lives, and a client or cluster of the caller is
+only used. No client here becomes Dask's default.
+"""
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import importlib
 import logging
 import os
 import signal
-import ssl
-from collections.abc import Coroutine, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
-from urllib.parse import urlsplit
+from collections.abc import Iterator
+from typing import Any, Protocol, runtime_checkable
 
 import dask
-from distributed import Client, LocalCluster, Security, fire_and_forget
-from distributed.comm.core import CommClosedError, connect
-from distributed.comm.registry import backends
-from distributed.core import send_recv
+from distributed import Client, LocalCluster, fire_and_forget
 
-from sweep.errors import RunError, StoreError
+from sweep.errors import ArgumentError, RunError
+from sweep.execution.distributed_internals import thread_counts
+from sweep.execution.limits import ANSWER_S, NO_WORKERS_TIMEOUT_S, THREAD_COUNT_TIMEOUT_S
+from sweep.execution.scheduler_connection import connect_to_scheduler
+from sweep.execution.worker_versions import check_workers
 from sweep.isolation.child_process import SINGLE_THREADED
 from sweep.isolation.interrupts import in_main_thread
 from sweep.plan.experiment import Pipeline
-from sweep.store.provenance import fingerprint
-
-ANSWER_S = 10.0
-"""How long a scheduler, and then its first worker, may take to answer."""
-
-FIRST_ANSWER_S = 60.0
-"""How long all workers may take to say their versions, for which they import this package."""
-
-ASKING_S = 2.0
-"""How long a run waits to hear how many workers there are."""
-
-ENCRYPTED = ("tls://", "wss://")
 
 WORKER_ENVIRONMENT = {
     **SINGLE_THREADED,
     "MALLOC_TRIM_THRESHOLD_": "268435456",
     "MALLOC_MMAP_THRESHOLD_": "268435456",
 }
-"""One thread a worker, and images' memory kept between scenes rather than given back."""
+"""One thread a worker; images' memory is kept between scenes rather than given back."""
 
 QUIET_DASK_CONFIG: dict[str, Any] = {
     "distributed.worker.memory.terminate": False,
@@ -53,10 +43,17 @@ QUIET_DASK_CONFIG: dict[str, Any] = {
     "distributed.admin.system-monitor.interval": "5s",
     "distributed.scheduler.active-memory-manager.start": False,
 }
-"""The cluster watches itself less often: with Dask's defaults two idle workers, their scheduler
-and client take 0.12 of a core, so 0.01, and nothing here shows what is watched."""
+"""The cluster monitors itself less often: with Dask's defaults two idle workers, their scheduler
+and client take 0.12 of a core, so 0.01, and nothing here shows what is monitored."""
 
-QUIET = logging.CRITICAL
+
+@runtime_checkable
+class Cluster(Protocol):
+    """A cluster object: LocalCluster, SLURMCluster, KubeCluster, ..."""
+
+    @property
+    def scheduler_address(self) -> str:
+        """The address of its scheduler."""
 
 
 def default_workers() -> int:
@@ -67,33 +64,60 @@ def default_workers() -> int:
 
 
 @contextlib.contextmanager
+def connected(
+    pipeline: Pipeline, *, workers: int | None = None, scheduler: str | None = None,
+    client: Client | Cluster | None = None,
+) -> Iterator[Client]:
+    """Return a client of a cluster whose workers make the same numbers as this process.
+
+    Parameters
+    ----------
+    pipeline
+        What is to be computed.
+    workers
+        Processes of the embedded cluster, which is started if no other is given (default: the
+        available processors).
+    scheduler
+        Address of a running scheduler.
+    client
+        The caller's client, which stays open, or cluster object, of which a client is made and
+        closed.
+
+    Raises
+    ------
+    ArgumentError
+        If the cluster cannot be used.
+    """
+    if scheduler is not None:
+        cluster = external(scheduler, pipeline)
+    elif client is not None:
+        cluster = borrowed(client, pipeline)
+    else:
+        cluster = embedded(workers or default_workers())
+    with cluster as connection:
+        yield connection
+
+
+@contextlib.contextmanager
 def embedded(workers: int) -> Iterator[Client]:
     """Start a cluster of ``workers`` single-threaded processes on this machine; end it quietly.
 
     It listens on the loopback interface only.
     """
-    _hush()
     settings = {"distributed.nanny.pre-spawn-environ": WORKER_ENVIRONMENT, **QUIET_DASK_CONFIG}
-    # Ctrl-C reaches every process of the terminal; the workers leave it to the client.
-    before = signal.getsignal(signal.SIGINT) if in_main_thread() else None
-    if before is not None:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        with dask.config.set(settings):
+    with silenced_dask_loggers():
+        with _ignored_interrupts(), dask.config.set(settings):
             cluster = LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1",
-                dashboard_address="127.0.0.1:0", silence_logs=QUIET,
+                dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL,
                 scheduler_kwargs={"dashboard": False},
             )
-    finally:
-        if before is not None:
-            signal.signal(signal.SIGINT, before)
-    with cluster, Client(cluster, set_as_default=False) as client:
-        # The workers import their packages while the caller measures.
-        fire_and_forget(
-            [client.submit(_warm, workers=[worker], pure=False) for worker in client.nthreads()]
-        )
-        yield client
+        with cluster, Client(cluster, set_as_default=False) as client:
+            # The workers import their packages while the caller measures.
+            fire_and_forget(
+                [client.submit(_warm, workers=[worker], pure=False) for worker in client.nthreads()]
+            )
+            yield client
 
 
 def _warm() -> None:
@@ -103,198 +127,128 @@ def _warm() -> None:
 
 @contextlib.contextmanager
 def external(address: str, pipeline: Pipeline) -> Iterator[Client]:
-    """Connect to a running scheduler whose workers make the same numbers as this process.
-
-    Where its address begins with ``tls://``, Dask's own configuration names the certificates.
+    """Connect to a running scheduler by its address.
 
     Raises
     ------
-    StoreError
-        Where it does not answer or refuses, has no workers, or a worker has other versions; each
+    ArgumentError
+        If it does not answer or refuses, has no workers, or a worker has other versions; each
         within a bounded time.
     """
-    _hush()
-    if not _is_address(address):
-        raise StoreError(f"--scheduler {address}: expected an address such as tcp://host:8786")
-    with _telling_why(address):
-        # Dask's client waits without end for a handshake, so that comes first, and alone.
-        kind = _apart(_kind(address))
-        if kind != "Scheduler":
-            raise StoreError(f"--scheduler {address}: a {kind} answers there, not a scheduler")
-        client = Client(address, timeout=ANSWER_S, set_as_default=False)
-    with client:
+    with silenced_dask_loggers(), connect_to_scheduler(address) as client:
         try:
             client.wait_for_workers(1, timeout=ANSWER_S)
         except TimeoutError:
-            raise StoreError(
-                f"--scheduler {address}: no workers; start some with `dask worker {address}`"
+            raise ArgumentError(
+                "scheduler", address, f"no workers; start some with `dask worker {address}`"
             ) from None
         except OSError:
-            raise _went_away(address) from None
-        _refuse_other_versions(client, address, pipeline)
+            raise ArgumentError("scheduler", address, "it went away") from None
+        check_workers(client, pipeline, "scheduler", address)
         yield client
 
 
-def threads(client: Client) -> int:
-    """Return how many threads the workers of a cluster have; 0 while nobody says.
+@contextlib.contextmanager
+def borrowed(client: Client | Cluster, pipeline: Pipeline) -> Iterator[Client]:
+    """Use the caller's client, or a new client of the caller's cluster object.
+
+    Raises
+    ------
+    ArgumentError
+        If it is neither, is closed or asynchronous, has no workers, or a worker has other versions.
+    """
+    if isinstance(client, str) or not isinstance(client, (Client, Cluster)):
+        raise ArgumentError(
+            "client", client,
+            "expected a distributed.Client or a cluster object such as LocalCluster; "
+            "the address of a scheduler is given as scheduler",
+        )
+    if getattr(client, "asynchronous", False):
+        raise ArgumentError("client", _name(client), "it is asynchronous; expected one that is not")
+    with contextlib.ExitStack() as stack:
+        if isinstance(client, Client):
+            connection = client
+        else:
+            try:
+                connection = stack.enter_context(
+                    Client(client, timeout=ANSWER_S, set_as_default=False)
+                )
+            except (OSError, RuntimeError, ValueError) as error:
+                raise ArgumentError("client", _name(client), f"cannot connect: {error}") from None
+        if connection.status != "running":
+            raise ArgumentError("client", _name(client), f"it is {connection.status}")
+        _await_worker(connection, _name(client))
+        check_workers(connection, pipeline, "client", _name(client))
+        yield connection
+
+
+def _name(client: Client | Cluster) -> str:
+    """Return what a message calls a client or cluster: its type, and the scheduler's address."""
+    scheduler = client.scheduler if isinstance(client, Client) else client.scheduler_address
+    return f"{type(client).__name__}({getattr(scheduler, 'address', scheduler)})"
+
+
+def _await_worker(client: Client, name: str) -> None:
+    """Wait for a worker by submitting a task, so that a cluster that adapts to work starts one."""
+    task = client.submit(os.getpid, pure=False)
+    try:
+        task.result(timeout=NO_WORKERS_TIMEOUT_S)
+    except TimeoutError:
+        raise ArgumentError(
+            "client", name, f"no workers within {NO_WORKERS_TIMEOUT_S:.0f} s; start some"
+        ) from None
+    except Exception as error:
+        raise ArgumentError("client", name, f"its workers compute nothing: {error}") from None
+    finally:
+        task.cancel()
+
+
+def thread_count(client: Client) -> int:
+    """Return how many threads the workers of a cluster have; 0 if the scheduler is too busy.
 
     Raises
     ------
     RunError
-        Where the scheduler went away.
+        If the scheduler went away.
     """
-    gone = RunError("the scheduler went away")
-    if client.scheduler is None or client.status != "running":
-        raise gone
     try:
-        counts: dict[str, int] = client.sync(client.scheduler.ncores, callback_timeout=ASKING_S)
+        return sum(thread_counts(client, THREAD_COUNT_TIMEOUT_S).values())
     except TimeoutError:
-        return 0  # it is stalled, or busy
+        return 0
     except OSError:
-        raise gone from None
-    return sum(counts.values())
-
-
-def _is_address(address: str) -> bool:
-    try:
-        parts = urlsplit(address)
-        return parts.scheme in backends and bool(parts.hostname and parts.port)
-    except ValueError:
-        return False
-
-
-def _went_away(address: str) -> StoreError:
-    return StoreError(f"--scheduler {address}: it went away")
-
-
-async def _kind(address: str) -> str:
-    """Return what answers at an address: Scheduler, Worker, Nanny."""
-    options = _connection_options(address)
-    async with asyncio.timeout(ANSWER_S):
-        comm = await connect(address, timeout=ANSWER_S, **options)
-        try:
-            identity: dict[str, Any] = await send_recv(comm, op="identity")
-        finally:
-            comm.abort()
-    return str(identity["type"])
-
-
-def _apart(question: Coroutine[Any, Any, str]) -> str:
-    """Return what a coroutine does, also where the caller is in an event loop, as notebooks are."""
-    with ThreadPoolExecutor(1) as beside:
-        return beside.submit(asyncio.run, question).result()
-
-
-def _connection_options(address: str) -> dict[str, Any]:
-    """Return how Dask's configuration says to connect, its certificates among it."""
-    try:
-        options: dict[str, Any] = Security().get_connection_args("client")
-    except OSError as error:
-        raise StoreError(
-            f"--scheduler {address}: the certificates that Dask's configuration names under "
-            f"distributed.comm.tls cannot be read: {_short(error)}"
-        ) from None
-    if address.startswith(ENCRYPTED) and options.get("ssl_context") is None:
-        raise StoreError(
-            f"--scheduler {address}: no certificates; name them in Dask's configuration, "
-            "distributed.comm.tls.ca-file, .client.cert and .client.key"
-        )
-    return options
+        raise RunError("the scheduler went away") from None
 
 
 @contextlib.contextmanager
-def _telling_why(address: str) -> Iterator[None]:
-    """Raise StoreError for what goes wrong while a connection is made."""
+def _ignored_interrupts() -> Iterator[None]:
+    """Ignore Ctrl-C: processes that are started meanwhile do so for good, and leave it to us."""
+    before = signal.getsignal(signal.SIGINT) if in_main_thread() else None
+    if before is None:  # another thread, or a handler that was not installed from Python
+        yield
+        return
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
-    except (CommClosedError, ssl.SSLError, ValueError) as error:
-        # Which side closes first, and with which words, is a matter of chance.
-        if address.startswith(ENCRYPTED):
-            why = (
-                f"TLS failed ({_short(error)}); is it a TLS scheduler, and are its "
-                "certificate and the one here signed by the same CA?"
-            )
-        else:
-            why = "it closed the connection; does it expect tls://?"
-    except OSError:
-        why = f"no answer within {ANSWER_S:.0f} s; is `dask scheduler` running there?"
-    except RuntimeError as error:
-        why = str(error)  # Dask's configuration requires encryption
-    else:
-        return
-    raise StoreError(f"--scheduler {address}: {why}") from None
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
-def _short(error: BaseException) -> str:
-    """Return what OpenSSL or the system said, in a few words."""
-    cause: BaseException | None = error
-    while cause is not None and not isinstance(cause, ssl.SSLError):
-        cause = cause.__cause__ or cause.__context__
-    if isinstance(cause, ssl.SSLCertVerificationError):
-        return str(cause.verify_message)
-    if isinstance(cause, ssl.SSLError) and cause.reason:
-        return cause.reason.lower().replace("_", " ")
-    if isinstance(error, OSError) and error.strerror and not isinstance(error, CommClosedError):
-        return str(error.strerror)
-    return "the connection was closed"
-
-
-def _refuse_other_versions(client: Client, address: str, pipeline: Pipeline) -> None:
-    mine = fingerprint(pipeline)
-    try:
-        answers = client.sync(_ask_each, client, pipeline)
-    except TimeoutError:
-        raise StoreError(
-            f"--scheduler {address}: none of its workers answers within {FIRST_ANSWER_S:.0f} s"
-        ) from None
-    except OSError:
-        raise _went_away(address) from None
-    except Exception as error:
-        raise StoreError(
-            f"--scheduler {address}: its workers cannot run sweep: {error}; install it there"
-        ) from None
-    lines = sorted(
-        f"  {worker}: {key} {theirs.get(key)}, here {mine[key]}"
-        for worker, theirs in answers.items()
-        for key in mine
-        if theirs.get(key) != mine[key]
-    )
-    if lines:
-        raise StoreError(
-            f"--scheduler {address}: workers with other versions; install the same everywhere\n"
-            + "\n".join(lines)
-        )
-
-
-async def _ask_each(client: Client, pipeline: Pipeline) -> dict[str, dict[str, Any]]:
-    """Return the fingerprint of each worker; those that are stalled are left out.
-
-    A worker that is not asked here compares itself with the store when it gets its first block.
-    """
-    asked = [
-        asyncio.ensure_future(client.run(fingerprint, pipeline, workers=[worker]))
-        for worker in await client.nthreads()
-    ]
-    if not asked:
-        raise TimeoutError
-    done, _ = await asyncio.wait(
-        asked, timeout=FIRST_ANSWER_S, return_when=asyncio.FIRST_COMPLETED
-    )
-    if not done:
-        for one in asked:
-            one.cancel()
-        raise TimeoutError
-    done, late = await asyncio.wait(asked, timeout=ANSWER_S)
-    for one in late:
-        one.cancel()
-    return {worker: theirs for one in done for worker, theirs in one.result().items()}
-
-
-def _hush() -> None:
-    """Keep distributed from narrating: what matters is told as errors of this package.
+@contextlib.contextmanager
+def silenced_dask_loggers() -> Iterator[None]:
+    """Silence the loggers of Dask while the body runs: this package's errors say what matters.
 
     Dask gives some of the loggers below its own a level and a handler of theirs.
     """
-    for name in ("distributed", *logging.Logger.manager.loggerDict):
-        if name.partition(".")[0] in ("distributed", "tornado"):
-            logging.getLogger(name).setLevel(QUIET)
+    loggers = [
+        logger for name, logger in list(logging.Logger.manager.loggerDict.items())
+        if name.partition(".")[0] in ("distributed", "tornado")
+        and isinstance(logger, logging.Logger)
+    ]
+    before = {logger: logger.level for logger in loggers}
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for logger, level in before.items():
+            logger.setLevel(level)

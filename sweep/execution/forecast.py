@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sweep.errors import RunError, StoreError
+from sweep.errors import ArgumentError, RunError
 from sweep.evaluation.cells import run_cells
 from sweep.execution.calibration import block_extents, calibrate, sample
 from sweep.execution.cluster import default_workers
-from sweep.execution.runner import CALIBRATION_S
+from sweep.execution.limits import CALIBRATION_S, PLAN_LIMIT_S
 from sweep.isolation.child_process import Child, DiedError, RaisedError
 from sweep.model.effects import SWITCHES
 from sweep.plan.experiment import Pipeline
@@ -95,11 +95,7 @@ def _without(pipeline: Pipeline, switch: str) -> Pipeline:
     )
 
 
-PLAN_LIMIT_S = 600.0
-"""Seconds that all measuring may take; a scene that never returns would have it go on for ever."""
-
-
-def forecast_apart(
+def forecast_isolated(
     pipeline: Pipeline, workers: int | None, switches: Sequence[str]
 ) -> tuple[Forecast, dict[str, float]]:
     """Return :func:`forecast` and :func:`effect_costs`, measured in a child process.
@@ -129,7 +125,7 @@ def forecast(pipeline: Pipeline, workers: int | None = None) -> Forecast:
     if workers is None:
         workers = default_workers()
     if workers < 1:
-        raise StoreError(f"--workers {workers}: expected at least 1")
+        raise ArgumentError("workers", workers, "expected at least 1")
     calibration = calibrate(pipeline, CALIBRATION_S)
     extents = block_extents(pipeline, calibration, workers)
     blocks = Blocks(tuple(len(axis) for axis in scene_axes(pipeline)), extents)

@@ -8,8 +8,8 @@ from zarr.core.buffer import cpu, default_buffer_prototype
 from zarr.core.sync import sync
 
 from sweep.errors import StoreError
-from sweep.execution.block_task import TIME_LIMIT_S
 from sweep.execution.finalize import close
+from sweep.execution.limits import TIME_LIMIT_S
 from sweep.execution.runner import recompute
 from sweep.integrity.verification import (
     SAMPLE,

@@ -16,7 +16,7 @@ from zarr.core.sync import sync
 from sweep.compilation import processor
 from sweep.errors import StoreError, SweepError
 from sweep.evaluation.cells import shaped
-from sweep.execution.block_task import TIME_LIMIT_S
+from sweep.execution.limits import TIME_LIMIT_S
 from sweep.integrity.consistency import contradiction
 from sweep.integrity.tolerances import MAX_OUTSIDE, departure, difference, outside
 from sweep.isolation.crash_isolation import run_cells_isolated

@@ -1,0 +1,52 @@
+"""What this package uses of Dask's ``distributed`` beyond its documented interface.
+
+Checked with versions 2025.1 to 2026.8. Everything else of this package uses public names only, so
+that a new version of ``distributed`` can break a run in this module alone.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from distributed import Client
+from distributed.comm.core import CommClosedError, connect
+from distributed.comm.registry import backends
+from distributed.core import send_recv
+
+__all__ = ["CommClosedError", "is_known_protocol", "peer_type", "thread_counts"]
+
+
+def is_known_protocol(scheme: str) -> bool:
+    """Return whether Dask can connect to addresses that begin with ``scheme``: tcp, tls, ..."""
+    return scheme in backends
+
+
+async def peer_type(address: str, timeout_s: float, options: dict[str, Any]) -> str:
+    """Return the type of server at an address: Scheduler, Worker, Nanny.
+
+    ``options`` are Dask's connection arguments, such as ``ssl_context``.
+    """
+    comm = await connect(address, timeout=timeout_s, **options)
+    try:
+        identity: dict[str, Any] = await send_recv(comm, op="identity")
+    finally:
+        comm.abort()
+    return str(identity["type"])
+
+
+def thread_counts(client: Client, timeout_s: float) -> dict[str, int]:
+    """Return the number of threads of each worker, by address.
+
+    ``Client.nthreads`` returns the same, but cannot be given a timeout.
+
+    Raises
+    ------
+    TimeoutError
+        If the scheduler does not answer in time.
+    OSError
+        If the client is not connected.
+    """
+    if client.scheduler is None or client.status != "running":
+        raise CommClosedError("not connected")
+    counts: dict[str, int] = client.sync(client.scheduler.ncores, callback_timeout=timeout_s)
+    return counts

@@ -1,0 +1,205 @@
+"""Which blocks are in flight: how many at a time, which is submitted next, which again.
+
+A bounded window of blocks is on the cluster at a time, so that the memory of client and scheduler
+does not grow with the grid. Workers write the blocks; the client receives and counts receipts.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import time
+import uuid
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from distributed import Client, Future, KilledWorker
+
+from sweep.errors import RunError, StoreError
+from sweep.execution.block_task import compute_block
+from sweep.execution.cluster import thread_count
+from sweep.execution.limits import (
+    BLOCKS_PER_THREAD,
+    MAX_DEATHS,
+    MAX_FAILED_BLOCKS,
+    NO_WORKERS_TIMEOUT_S,
+    POLL_S,
+    THREAD_COUNT_INTERVAL_S,
+    TIME_LIMIT_S,
+)
+from sweep.execution.progress import Progress, ProgressReport
+from sweep.isolation.interrupts import Interrupts
+from sweep.measure.flags import DetectionStatus
+from sweep.plan.parameters import Stage
+from sweep.store.failures import MAX_ROWS
+from sweep.store.lifecycle import RunStore, receipts
+
+
+class InFlightLimit:
+    """How many blocks may be in flight: grows and shrinks with the cluster."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+        self._asked = 0.0
+        self._blocks = BLOCKS_PER_THREAD
+        self._last_worker = time.monotonic()
+
+    def blocks(self) -> int:
+        """Return the number of blocks that may be in flight now.
+
+        Raises
+        ------
+        RunError
+            If the scheduler went away, or there have been no workers for a minute.
+        """
+        if time.monotonic() > self._asked + THREAD_COUNT_INTERVAL_S:
+            threads = thread_count(self._client)
+            self._asked = time.monotonic()
+            if threads:
+                self._blocks, self._last_worker = BLOCKS_PER_THREAD * threads, self._asked
+        if time.monotonic() > self._last_worker + NO_WORKERS_TIMEOUT_S:
+            raise RunError(
+                f"there have been no workers for {NO_WORKERS_TIMEOUT_S:.0f} s; start some"
+            )
+        return self._blocks
+
+
+class BlocksInFlight:
+    """Submits blocks of a store to a cluster and collects their receipts.
+
+    Parameters
+    ----------
+    store
+        A store of which this process holds the lock.
+    client
+        The cluster's client.
+    url
+        The store's address as every worker understands it.
+    sources
+        Addresses of the stores whose finished cells are reused.
+    time_limit_s
+        Block timeout in seconds.
+    interrupts
+        Entered; checked between blocks.
+    """
+
+    def __init__(
+        self, store: RunStore, client: Client, url: str, sources: Sequence[str] = (),
+        time_limit_s: float = TIME_LIMIT_S, *, interrupts: Interrupts,
+    ) -> None:
+        self._store = store
+        self._client = client
+        self._url = url
+        self._sources = sources
+        self._time_limit_s = time_limit_s
+        self._interrupts = interrupts
+        self._finished: SimpleQueue[Future[Any]] = SimpleQueue()
+        self._numbers: dict[Future[Any], int] = {}
+        self._failures = Counter({"failed": 0, "crashed": 0})
+        self._deaths: Counter[int] = Counter()
+
+    def compute(
+        self, numbers: Iterable[int], done: AbstractSet[int] = frozenset(),
+        report: ProgressReport | None = None,
+    ) -> Mapping[str, int]:
+        """Compute blocks by their numbers; ``done`` are those that are committed already.
+
+        Returns how many blocks, scenes, detections and estimates were computed.
+
+        Raises
+        ------
+        RunError
+            If blocks failed, the scheduler went away, or there are no workers.
+        StoreError
+            If a worker cannot write the store.
+        """
+        try:
+            return self._compute(iter(numbers), done, report)
+        finally:
+            self._cancel()
+
+    def _compute(
+        self, waiting: Iterator[int], done: AbstractSet[int],
+        report: ProgressReport | None,
+    ) -> Mapping[str, int]:
+        progress = Progress(0, self._store.pipeline.size(Stage.scene), 0)
+        for _, receipt in receipts(self._store, done):
+            progress = self._counted(progress, receipt)
+        if report is not None:
+            report(progress)
+        computed: Counter[str] = Counter()
+        failed: list[str] = []
+        limit = InFlightLimit(self._client)
+        for number in itertools.islice(waiting, limit.blocks()):
+            self._submit(number)
+        while self._numbers:
+            self._interrupts.check()
+            most = limit.blocks()
+            try:
+                future = self._finished.get(timeout=POLL_S)
+            except Empty:
+                continue
+            number = self._numbers.pop(future)
+            if future.status == "finished":
+                receipt = future.result()
+                computed.update({"blocks": 1, **receipt["computed"]})
+                progress = self._counted(progress, receipt)
+                if report is not None:
+                    report(progress)
+            elif (reason := self._failure(number, future)) is not None:
+                failed.append(reason)
+            future.release()
+            if len(failed) < MAX_FAILED_BLOCKS:
+                for following in itertools.islice(waiting, max(most - len(self._numbers), 0)):
+                    self._submit(following)
+        if failed:
+            raise RunError(
+                f"{self._store.url}: {len(failed)} blocks failed\n"
+                + "\n".join(f"  {reason}" for reason in failed)
+            )
+        return computed
+
+    def _submit(self, number: int) -> None:
+        block = self._store.blocks[number]
+        quota = {kind: max(MAX_ROWS - count, 0) for kind, count in self._failures.items()}
+        future = self._client.submit(
+            compute_block, self._url, self._store.run_id, block, self._sources,
+            self._time_limit_s, quota, pure=False, key=f"block-{block}-{uuid.uuid4().hex[:8]}",
+        )
+        self._numbers[future] = number
+        future.add_done_callback(self._finished.put)
+
+    def _failure(self, number: int, future: Future[Any]) -> str | None:
+        """Return why a block failed; None if it was submitted again."""
+        if future.status in ("cancelled", "lost"):
+            raise RunError("the scheduler went away")
+        error = future.exception()
+        if isinstance(error, StoreError):
+            raise error
+        if isinstance(error, KilledWorker) and self._deaths[number] < MAX_DEATHS:
+            # A block that ends its process is computed in isolation when it is begun again, but
+            # it may have been queued behind one, or its workers were killed from outside.
+            self._deaths[number] += 1
+            self._submit(number)
+            return None
+        return f"block {self._store.blocks[number]}: {type(error).__name__}: {error}"
+
+    def _cancel(self) -> None:
+        """Take back what is still in flight; a caller's cluster outlives the run."""
+        if self._numbers and self._client.status == "running":
+            with contextlib.suppress(OSError, TimeoutError):
+                self._client.cancel(list(self._numbers))
+        self._numbers.clear()
+
+    def _counted(self, progress: Progress, receipt: Mapping[str, Any]) -> Progress:
+        """Return the progress after one more block; count its failures."""
+        self._failures.update(failure["kind"] for failure in receipt["failures"])
+        counts = receipt["detection"]
+        detected = DetectionStatus.detected
+        return Progress(
+            progress.done + receipt["scenes"], progress.total,
+            progress.detected + (counts[detected] if len(counts) > detected else 0),
+        )

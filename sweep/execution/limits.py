@@ -1,0 +1,66 @@
+"""The limits of a run: blocks in flight, seconds, retries, sizes; each with its reason.
+
+Limits of other packages stay with what they limit: the shares of a block's time that the search
+for a crashing scene may use in :mod:`sweep.isolation.crash_isolation`, the failures that a store
+keeps in :mod:`sweep.store.failures`. This module imports nothing.
+"""
+
+from __future__ import annotations
+
+# Blocks in flight (`sweep.execution.in_flight`)
+
+BLOCKS_PER_THREAD = 3
+"""Blocks in flight per worker thread: enough that none waits, few enough that none pile up."""
+
+MAX_DEATHS = 10
+"""How often a block is submitted again after its worker died."""
+
+MAX_FAILED_BLOCKS = 10
+"""Failed blocks after which no more are submitted."""
+
+POLL_S = 0.2
+"""How often a run that waits for blocks checks for Ctrl-C."""
+
+# Time limits
+
+TIME_LIMIT_S = 600.0
+"""Block timeout in seconds; the search for a scene that never returns keeps within it."""
+
+CALIBRATION_S = 0.6
+"""Seconds spent on measuring what scenes cost before blocks are cut."""
+
+CALIBRATION_SHARE = 1 / 8
+"""Share of a block's time limit after which the measurement is abandoned."""
+
+PLAN_LIMIT_S = 600.0
+"""Time limit of all measurements of a forecast; a scene that never returns would block it."""
+
+# The cluster (`sweep.execution.cluster`)
+
+ANSWER_S = 10.0
+"""How long a scheduler, and then its first worker, may take to answer."""
+
+VERSIONS_S = 60.0
+"""How long all workers may take to report their versions, for which they import this package."""
+
+THREAD_COUNT_INTERVAL_S = 1.0
+"""How often the scheduler is asked how many worker threads it has."""
+
+THREAD_COUNT_TIMEOUT_S = 2.0
+"""How long a run waits for that answer."""
+
+NO_WORKERS_TIMEOUT_S = 60.0
+"""How long a run waits for a first worker, or for another after the last one left."""
+
+# The size of blocks (`sweep.execution.calibration`)
+
+BLOCK_S = 2.0
+"""Work in a block: a task costs the scheduler about 1.6 ms, a lost block costs its work."""
+
+MIN_BLOCK_S = 0.1
+
+BLOCKS_PER_WORKER = 6
+"""With little work, blocks are cut smaller so that every worker has some until the end."""
+
+MAX_BLOCK_BYTES = 256_000_000
+MAX_BLOCK_SCENES = 200_000

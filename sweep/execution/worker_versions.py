@@ -1,0 +1,98 @@
+"""Whether the workers of a cluster that is running can compute a pipeline as this process would."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+from typing import Any
+
+from distributed import Client
+
+from sweep.errors import ArgumentError
+from sweep.execution.limits import ANSWER_S, VERSIONS_S
+from sweep.plan.experiment import Pipeline
+from sweep.store.provenance import fingerprint
+
+
+def check_workers(client: Client, pipeline: Pipeline, argument: str, value: str) -> None:
+    """Check that workers have the versions that this process has, and processes of their own.
+
+    Workers that are stalled are left out: a worker that was not checked compares its versions with
+    the store's when it gets its first block.
+
+    Parameters
+    ----------
+    client
+        A client of a scheduler that has workers.
+    pipeline
+        The pipeline; the digests of the files that it refers to are compared too.
+    argument, value
+        The argument by which the cluster was given, for messages.
+
+    Raises
+    ------
+    ArgumentError
+        If a worker has other versions, cannot import this package, or is a thread of this process;
+        if none answers, or the scheduler went away.
+    """
+    own_versions, own_process = _worker_identity(pipeline)
+    try:
+        identities = client.sync(_worker_identities, client, pipeline)
+    except TimeoutError:
+        raise ArgumentError(
+            argument, value, f"none of its workers answers within {VERSIONS_S:.0f} s"
+        ) from None
+    except OSError:
+        raise ArgumentError(argument, value, "the scheduler went away") from None
+    except Exception as error:
+        raise ArgumentError(
+            argument, value, f"its workers cannot run sweep: {error}; install it there"
+        ) from None
+    if any(process == own_process for _, process in identities.values()):
+        raise ArgumentError(
+            argument, value,
+            "its workers are threads of this process, which a scene may end; "
+            "start it with processes=True",
+        )
+    lines = sorted(
+        f"  {worker}: {key} {versions.get(key)}, here {own_versions[key]}"
+        for worker, (versions, _) in identities.items()
+        for key in own_versions
+        if versions.get(key) != own_versions[key]
+    )
+    if lines:
+        raise ArgumentError(
+            argument, value,
+            "workers with other versions; install the same everywhere\n" + "\n".join(lines),
+        )
+
+
+def _worker_identity(pipeline: Pipeline) -> tuple[dict[str, Any], tuple[str, int]]:
+    """Return the versions that numbers depend on in this process, and which process it is."""
+    return fingerprint(pipeline), (socket.gethostname(), os.getpid())
+
+
+async def _worker_identities(
+    client: Client, pipeline: Pipeline
+) -> dict[str, tuple[dict[str, Any], tuple[str, int]]]:
+    """Return :func:`_worker_identity` of each worker by address; without those that are stalled."""
+    questions = [
+        asyncio.ensure_future(client.run(_worker_identity, pipeline, workers=[worker]))
+        for worker in await client.nthreads()
+    ]
+    if not questions:
+        raise TimeoutError
+    done, _ = await asyncio.wait(
+        questions, timeout=VERSIONS_S, return_when=asyncio.FIRST_COMPLETED
+    )
+    if not done:
+        for question in questions:
+            question.cancel()
+        raise TimeoutError
+    done, late = await asyncio.wait(questions, timeout=ANSWER_S)
+    for question in late:
+        question.cancel()
+    return {
+        worker: identity for question in done for worker, identity in question.result().items()
+    }

@@ -20,7 +20,7 @@ import pytest
 import trustme
 
 from sweep.cli import main
-from sweep.errors import StoreError
+from sweep.errors import ArgumentError, StoreError
 from sweep.evaluation.cells import run_block
 from sweep.execution.cluster import external
 from sweep.plan.experiment import Pipeline
@@ -450,7 +450,7 @@ def test_tls_scheduler_that_refuses_is_told_in_a_line(certificates, tmp_path):
             "distributed.comm.tls.client.cert": str(settings["cert"]),
             "distributed.comm.tls.client.key": str(settings["key"]),
         } if settings else {}
-        with dask.config.set(configuration), pytest.raises(StoreError) as error, external(
+        with dask.config.set(configuration), pytest.raises(ArgumentError) as error, external(
             address, pipeline
         ):
             pass
@@ -477,10 +477,10 @@ def test_tls_scheduler_that_refuses_is_told_in_a_line(certificates, tmp_path):
 
 
 def test_server_that_never_answers_is_given_up(monkeypatch):
-    monkeypatch.setattr("sweep.execution.cluster.ANSWER_S", 0.5)
+    monkeypatch.setattr("sweep.execution.scheduler_connection.ANSWER_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
-        with pytest.raises(StoreError, match="no answer within"), external(
+        with pytest.raises(ArgumentError, match="no answer within"), external(
             address, Pipeline.from_text(SMALL)
         ):
             pass
@@ -488,9 +488,9 @@ def test_server_that_never_answers_is_given_up(monkeypatch):
 
 @pytest.mark.parametrize("address", ["nowhere", "tcp://", "tcp://a:b", "tcp://a", "foo://a:1"])
 def test_what_is_no_address_is_told(address):
-    with pytest.raises(StoreError, match="expected an address such as tcp://host:8786"), external(
-        address, Pipeline.from_text(SMALL)
-    ):
+    with pytest.raises(
+        ArgumentError, match="expected an address such as tcp://host:8786"
+    ), external(address, Pipeline.from_text(SMALL)):
         pass
 
 
@@ -580,7 +580,7 @@ def test_run_ends_with_its_scheduler_and_continues_on_another(many, tmp_path):
             assert running.poll() is None, log.read_text()
             cluster.scheduler.kill()
             assert running.wait(TIMEOUT_S) == 1
-    assert re.fullmatch(r".*the scheduler went away; the same command continues.*\n",
+    assert re.fullmatch(r".*the scheduler went away; run it again to continue.*\n",
                         log.read_text())
     done = blocks_done(url)
     assert done >= 2

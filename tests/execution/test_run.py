@@ -18,7 +18,7 @@ import zarr
 
 import sweep
 from support.stores import by_hand, same
-from sweep.errors import StoreError
+from sweep.errors import ArgumentError, StoreError
 from sweep.evaluation.cells import run_block
 from sweep.execution.block_task import compute_block
 from sweep.execution.runner import execute
@@ -307,8 +307,10 @@ def test_lock_that_was_taken_over_is_left_to_its_holder(pipeline, tmp_path):
 
 
 def test_silent_scheduler_is_given_up(pipeline, tmp_path, monkeypatch):
-    monkeypatch.setattr("sweep.execution.cluster.ANSWER_S", 0.5)
-    with pytest.raises(StoreError, match=r"--scheduler tcp://127\.0\.0\.1:9: no answer within"):
+    monkeypatch.setattr("sweep.execution.scheduler_connection.ANSWER_S", 0.5)
+    with pytest.raises(
+        ArgumentError, match=r"^scheduler = tcp://127\.0\.0\.1:9: no answer within"
+    ):
         execute(pipeline, tmp_path / "none.zarr", scheduler="tcp://127.0.0.1:9")
     assert not (tmp_path / "none.zarr").exists()
 
@@ -401,19 +403,20 @@ def test_blocks_cover_the_grid_once_and_are_listed_lazily():
 def test_workers_with_other_versions_are_refused(pipeline, tmp_path, monkeypatch):
     from distributed import LocalCluster  # noqa: PLC0415
 
-    from sweep.execution import cluster as connecting  # noqa: PLC0415
+    from sweep.execution import worker_versions  # noqa: PLC0415
     from sweep.store.provenance import fingerprint  # noqa: PLC0415
 
     async def elsewhere(_, given):
-        return {"tcp://worker": {**fingerprint(given), "opencv": "0.0"}}
+        return {"tcp://worker": ({**fingerprint(given), "opencv": "0.0"}, ("elsewhere", 1))}
 
     with LocalCluster(
         n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0",
         silence_logs=50,
     ) as cluster:
-        monkeypatch.setattr(connecting, "_ask_each", elsewhere)
-        with pytest.raises(StoreError, match=r"tcp://worker: opencv 0\.0, here"):
-            execute(pipeline, tmp_path / "other.zarr", scheduler=cluster.scheduler_address)
+        monkeypatch.setattr(worker_versions, "_worker_identities", elsewhere)
+        for given in ({"scheduler": cluster.scheduler_address}, {"client": cluster}):
+            with pytest.raises(ArgumentError, match=r"tcp://worker: opencv 0\.0, here"):
+                execute(pipeline, tmp_path / "other.zarr", **given)
     assert not (tmp_path / "other.zarr").exists()
 
 
@@ -430,10 +433,11 @@ def test_workers_refuse_a_store_that_was_begun_with_other_versions(pipeline, tmp
 def test_nothing_is_overwritten_by_a_run_that_cannot_be(pipeline, tmp_path):
     url = str(tmp_path / "kept.zarr")
     by_hand(url, pipeline, (2, 4, 2, 3))
-    for options in (
-        {"reuse": [url]}, {"reuse": [str(tmp_path / "none.zarr")]}, {"scheduler": "nowhere"},
+    for options, error in (
+        ({"reuse": [url]}, ArgumentError), ({"reuse": [str(tmp_path / "none.zarr")]}, StoreError),
+        ({"scheduler": "nowhere"}, ArgumentError), ({"client": "nowhere"}, ArgumentError),
     ):
-        with pytest.raises(StoreError):
+        with pytest.raises(error):
             execute(pipeline, url, overwrite=True, **options)
         assert len(committed(open_store(url))) == 1
 

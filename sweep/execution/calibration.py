@@ -17,7 +17,7 @@ from sweep.execution.limits import (
     MAX_BLOCK_SCENES,
     MIN_BLOCK_S,
 )
-from sweep.isolation.child_process import Child, DiedError, RaisedError
+from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.plan.axes import Axis
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
@@ -112,7 +112,7 @@ def calibrate_isolated(
     """Measure as :func:`calibrate` does, in a child process: a scene may end it."""
     try:
         measured: Calibration = child.call(calibrate, pipeline, budget_s, limit_s=limit_s)
-    except (DiedError, RaisedError):
+    except (ChildDiedError, ChildRaisedError):
         return Calibration(UNMEASURED_S, 0.0, 0, (0.0,) * len(scene_axes(pipeline)))
     return measured
 

@@ -17,7 +17,7 @@ from sweep.evaluation.cells import run_cells
 from sweep.execution.calibration import block_extents, calibrate, sample
 from sweep.execution.cluster import default_workers
 from sweep.execution.limits import CALIBRATION_S, PLAN_LIMIT_S
-from sweep.isolation.child_process import Child, DiedError, RaisedError
+from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.model.effects import SWITCHES
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
@@ -111,7 +111,7 @@ def forecast_isolated(
             costs: dict[str, float] = child.call(
                 effect_costs, pipeline, switches, expected.pose_s, limit_s=PLAN_LIMIT_S
             )
-    except (DiedError, RaisedError) as error:
+    except (ChildDiedError, ChildRaisedError) as error:
         why = str(error).strip().splitlines()[-1]
         raise RunError(
             f"a scene that was measured ended its process ({why}); `sweep run` finds it, and "

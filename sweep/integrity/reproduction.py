@@ -14,7 +14,7 @@ from sweep.errors import RunError
 from sweep.evaluation.cells import Failure
 from sweep.evaluation.inspection import SceneInspection, look, picture
 from sweep.integrity.tolerances import departure, difference, outside
-from sweep.isolation.child_process import Child, DiedError, RaisedError
+from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.messages import nearest, plain, refusal
 from sweep.plan.cell_selection import at_text, cell, places
@@ -185,7 +185,7 @@ def _looked(
                 seen = child.call(
                     partial(function, one, whole_frame=whole_frame), limit_s=limit_s
                 )
-        except (DiedError, RaisedError, RunError):
+        except (ChildDiedError, ChildRaisedError, RunError):
             continue
         return (seen, seen.image) if function is look else (None, seen)
     return None, None

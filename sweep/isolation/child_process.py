@@ -1,7 +1,7 @@
-"""Functions called in a child process, which may die of them.
+"""Function calls in a child process, which may crash or never return.
 
-The child reads calls from its standard input and writes results to its standard output. Nothing
-else is unpickled than what these two processes of one program tell each other.
+The child reads calls from its standard input and writes results to its standard output. Only what
+these two processes of one program send each other is unpickled.
 """
 
 from __future__ import annotations
@@ -33,24 +33,43 @@ SINGLE_THREADED = {
 """Parallelism is over blocks: a process computes on one thread."""
 
 GRACE_S = 30.0
-"""How long after its limit a child that does not even end itself is killed."""
+"""How long after its limit a child that did not end itself is killed."""
 
 _LENGTH = struct.Struct("<Q")
 
 
-class DiedError(Exception):
-    """A child process ended; the message says how: "SIGSEGV", "time limit of 5 s"."""
+class ChildDiedError(Exception):
+    """A child process ended during a call.
+
+    Parameters
+    ----------
+    how
+        How it ended: "SIGSEGV", "exit status 3", "time limit of 5 s".
+    timed_out
+        Whether it ended because its time limit ran out.
+    """
+
+    def __init__(self, how: str, *, timed_out: bool = False) -> None:
+        super().__init__(how)
+        self.timed_out = timed_out
 
 
-class RaisedError(Exception):
-    """A call raised in the child; the message is the traceback."""
+class ChildRaisedError(Exception):
+    """A call raised in the child process; the message is the traceback."""
 
 
 class Child:
-    """A child process that calls functions, one at a time."""
+    """A child process that calls functions, one at a time.
+
+    Examples
+    --------
+    >>> with Child() as child:
+    ...     child.call(pow, 2, 10, limit_s=60)
+    1024
+    """
 
     def __init__(self) -> None:
-        self._given_up = False
+        self._killed_late = False
         self._process = subprocess.Popen(  # noqa: S603  (this program)
             [sys.executable, "-P", "-c", _START, json.dumps(sys.path)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
@@ -65,43 +84,52 @@ class Child:
         self.close()
 
     def call(self, function: Callable[..., Any], *arguments: Any, limit_s: float) -> Any:
-        """Call a function of a module there and return what it returns.
+        """Call a function of a module in the child and return its result.
+
+        Parameters
+        ----------
+        function, *arguments
+            What is called; it is pickled, so a function of a module.
+        limit_s
+            Time limit in seconds; it stands still while code is compiled.
 
         Raises
         ------
-        DiedError
-            Where the child died of it, or it took longer than ``limit_s`` seconds.
-        RaisedError
-            Where it raised; the errors that reach a user are raised as they are.
+        ChildDiedError
+            If the child crashed, or the call took longer than ``limit_s`` seconds.
+        ChildRaisedError
+            If the call raised; a `SweepError` is raised as it is.
         """
         started = time.monotonic()
-        stuck = threading.Timer(limit_s + GRACE_S, self._give_up)
-        stuck.daemon = True
-        stuck.start()
+        killer = threading.Timer(limit_s + GRACE_S, self._kill_late)
+        killer.daemon = True
+        killer.start()
         try:
             _send(self._process.stdin, (function, arguments, limit_s))
             raised, result = _receive(self._process.stdout)
         except (EOFError, OSError, ValueError, pickle.UnpicklingError):
-            raise DiedError(self._end(time.monotonic() - started, limit_s)) from None
+            raise self._death(time.monotonic() - started, limit_s) from None
         finally:
-            stuck.cancel()
+            killer.cancel()
         if raised:
-            raise result if isinstance(result, SweepError) else RaisedError(result)
+            raise result if isinstance(result, SweepError) else ChildRaisedError(result)
         return result
 
-    def _give_up(self) -> None:
-        self._given_up = True
+    def _kill_late(self) -> None:
+        self._killed_late = True
         self._process.kill()
 
-    def _end(self, took_s: float, limit_s: float) -> str:
+    def _death(self, took_s: float, limit_s: float) -> ChildDiedError:
+        """Return the error that says how the process ended; wait until it did."""
         code = self._process.wait()
         self.close()
-        if self._given_up or (code == 1 and took_s >= limit_s):
-            return f"time limit of {limit_s:.3g} s"
+        # The child ends itself with status 1 (`watchdog.ending_after`).
+        if self._killed_late or (code == 1 and took_s >= limit_s):
+            return ChildDiedError(f"time limit of {limit_s:.3g} s", timed_out=True)
         if code < 0:
             with contextlib.suppress(ValueError):
-                return signal.Signals(-code).name
-        return f"exit status {code}"
+                return ChildDiedError(signal.Signals(-code).name)
+        return ChildDiedError(f"exit status {code}")
 
     def close(self) -> None:
         """End the child."""
@@ -120,11 +148,11 @@ _START = (
 
 
 def serve() -> None:
-    """Answer calls until the caller is gone."""
-    # What libraries print must not get among the answers.
+    """Answer calls until the caller closes the pipe; what the child process runs."""
+    # What libraries print must not mix with the answers.
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    # Where memory runs out, this process is the one to go.
+    # If memory runs out, the system kills this process first.
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000")
     while True:

@@ -1,14 +1,14 @@
-"""Scenes that end their process or never return, found by bisection in a child process.
+"""Scenes that crash their process or never return, isolated in child processes.
 
-What is left of a block is computed all the same. A block has a time limit T; the search for one
-scene that never returns keeps within it:
+The rest of the block is computed all the same. A block has a time limit T; isolating one scene that
+never returns keeps within it:
 
-- T/4: the block in its worker, before it is taken for endless (:data:`WHOLE`);
-- 3 T/16: pieces of it in a child, cut in 64 up to three times, T/16 each (:data:`PIECE`);
-- T/8 + T/16 + ... : the parts of the scene that is left, searched and solved one by one
-  (:data:`PART`), each limit half of that before it once one has run out;
-- the rest: the first call in each child has more (:data:`LOADING`); while code is compiled or
-  loaded, no limit runs.
+- T/4: the block in its worker, before that ends itself (:data:`WHOLE`);
+- 3 T/16: pieces of the block in a child, cut in 64 up to three times, T/16 each (:data:`PIECE`);
+- T/8 + T/16 + ... : the parts of the scene that remains, one by one (:data:`PART`): rendering, each
+  detector setting, each estimator; the limit is halved each time one runs out;
+- the rest: the first call in each child has more time (:data:`LOADING`); no limit runs while code
+  is compiled or loaded.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from numpy.typing import NDArray
 
 from sweep.errors import RunError
 from sweep.evaluation.cells import CellsResult, Failure, joined, run_cells
-from sweep.isolation.child_process import Child, DiedError, RaisedError
+from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import SCHEMA
 
 WHOLE, PIECE, PART = 1 / 4, 1 / 16, 1 / 8
-"""Shares of a block's time limit: for itself, for a piece of it, for a part of a scene."""
+"""Shares of a block's time limit: for the block, for a piece of it, for a part of a scene."""
 
 LOADING, LOADING_S = 1 / 16, 15.0
-"""What the first call in a child has more: this share of the limit, or so many seconds."""
+"""Additional time of the first call in a child: a share of the limit, at most so many seconds."""
 
 MIN_S = 1.0
-"""What a part of a scene has in any case."""
+"""Least time limit of a part of a scene."""
 
 HOLD_S = 300.0
-"""How long a child may take to start and to take the pipeline."""
+"""How long a child may take to start and to unpickle the pipeline."""
 
 PIECES = 64
-"""Into how many pieces what ended a process is cut."""
+"""Into how many pieces a group of scenes is cut that crashed a process."""
 
 _held: list[Pipeline] = []
-"""In the child: the pipeline whose cells are asked for."""
+"""In the child: the pipeline whose cells are computed."""
 
 
 def _hold(pipeline: Pipeline) -> None:
@@ -55,21 +55,30 @@ def _run_held(*arguments: Any) -> CellsResult:
     return run_cells(_held[0], *arguments)
 
 
-class _Careful:
-    """Computes cells of one pipeline in a child, and starts another where one died."""
+class _IsolatedCells:
+    """Computes cells of a pipeline in a child process; starts another after a crash."""
 
     def __init__(self, pipeline: Pipeline, limit_s: float) -> None:
         self._pipeline = pipeline
         self.limit_s = limit_s
         self._child: Child | None = None
 
-    def __call__(self, share: float, *arguments: Any) -> CellsResult:
+    def run(self, share: float, *arguments: Any) -> CellsResult:
+        """Call ``run_cells`` with a share of the time limit.
+
+        Raises
+        ------
+        ChildDiedError, ChildRaisedError
+            If the child crashed, ran out of time, or raised.
+        RunError
+            If a child cannot be started.
+        """
         limit_s = share * self.limit_s
         if self._child is None:
             child = Child()
             try:
                 child.call(_hold, self._pipeline, limit_s=HOLD_S)
-            except (DiedError, RaisedError) as error:
+            except (ChildDiedError, ChildRaisedError) as error:
                 child.close()
                 raise RunError(
                     f"a child process ended before it computed anything: {error}"
@@ -78,12 +87,13 @@ class _Careful:
             limit_s += min(LOADING * self.limit_s, LOADING_S)
         try:
             result: CellsResult = self._child.call(_run_held, *arguments, limit_s=limit_s)
-        except DiedError:
+        except ChildDiedError:
             self._child = None
             raise
         return result
 
     def close(self) -> None:
+        """End the child process."""
         if self._child is not None:
             self._child.close()
 
@@ -94,106 +104,145 @@ def run_cells_isolated(
     need: NDArray[np.bool_],
     limit_s: float,
 ) -> CellsResult:
-    """Compute cells as `sweep.evaluation.cells.run_cells` does, whatever they do to their process.
+    """Compute cells as `sweep.evaluation.cells.run_cells` does, also if they crash their process.
 
-    What ends a child process is flagged ``crashed``, what raises for all its scenes ``failed``: the
-    search with a setting, or what an estimator makes of it. Everything else keeps its values, to
-    the bit.
+    A detection or estimate that crashes a child process is flagged ``crashed``, one that raises
+    ``failed``. All others have the same values as in one call, bit for bit.
+
+    Parameters
+    ----------
+    pipeline
+        What is computed.
+    indices
+        (N,) indices of the scenes along each scene axis.
+    need
+        (N, detector settings, estimators): the cells that are computed.
+    limit_s
+        Time limit of the block in seconds, divided as the module's docstring says.
+
+    Raises
+    ------
+    RunError
+        If no child process can be started.
     """
-    careful = _Careful(pipeline, limit_s)
+    isolated = _IsolatedCells(pipeline, limit_s)
     done: dict[int, CellsResult] = {}
-    todo = deque(_cut(np.arange(len(need))))
+    waiting = deque(_pieces(np.arange(len(need))))
     try:
-        while todo:
-            rows = todo.popleft()
+        while waiting:
+            rows = waiting.popleft()
             chosen = [index[rows] for index in indices]
             try:
-                done[int(rows[0])] = careful(PIECE, chosen, need[rows])
-            except (DiedError, RaisedError):
+                done[int(rows[0])] = isolated.run(PIECE, chosen, need[rows])
+            except (ChildDiedError, ChildRaisedError):
                 if len(rows) > 1:
-                    todo.extendleft(reversed(_cut(rows)))
+                    waiting.extendleft(reversed(_pieces(rows)))
                 else:
-                    done[int(rows[0])] = _one(careful, pipeline, chosen, need[rows])
+                    scene = _Scene(isolated, pipeline, chosen, need[rows])
+                    done[int(rows[0])] = scene.compute()
     finally:
-        careful.close()
+        isolated.close()
     return joined([done[start] for start in sorted(done)])
 
 
-def _cut(rows: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+def _pieces(rows: NDArray[np.intp]) -> list[NDArray[np.intp]]:
     return list(np.array_split(rows, min(PIECES, len(rows))))
 
 
-def _one(
-    careful: _Careful,
-    pipeline: Pipeline,
-    chosen: Sequence[NDArray[np.intp]],
-    need: NDArray[np.bool_],
-) -> CellsResult:
-    """Compute what can be computed of a scene that ends its process, or raises as a whole."""
-    _, settings, estimators = need.shape
-    share = PART
-    lost: list[Failure] = []
+class _Scene:
+    """One scene that crashes its process, never returns, or raises as a whole.
 
-    def works(stage: str, setting: int | None = None, estimator: int | None = None) -> bool:
-        nonlocal share
-        solve, search = np.zeros_like(need), np.zeros((1, settings), dtype=bool)
+    Its parts are tried one after another, each in addition to those that it depends on: rendering,
+    each detector setting, each estimator. Those that work are then computed together.
+    """
+
+    def __init__(
+        self, isolated: _IsolatedCells, pipeline: Pipeline, indices: Sequence[NDArray[np.intp]],
+        need: NDArray[np.bool_],
+    ) -> None:
+        self._isolated = isolated
+        self._pipeline = pipeline
+        self._indices = indices
+        self._need = need
+        self._share = PART
+        self._failures: list[Failure] = []
+
+    def compute(self) -> CellsResult:
+        """Return the scene's cells; those that do not work are flagged."""
+        need = self._need
+        searched, solved = np.zeros_like(need[..., 0]), np.zeros_like(need)
+        rendered = self._works("scene")
+        for k in np.flatnonzero(need[0].any(axis=1)).tolist() if rendered else ():
+            searched[0, k] = self._works("detection", k)
+            for j in np.flatnonzero(need[0, k]).tolist() if searched[0, k] else ():
+                solved[0, k, j] = self._works("estimation", k, j)
+        result = None
+        if rendered:
+            try:
+                # Each part returns, so that together they have all the time.
+                result = self._isolated.run(1.0, self._indices, solved, searched)
+            except (ChildDiedError, ChildRaisedError) as error:
+                # Each part works alone, but not all of them together.
+                died = isinstance(error, ChildDiedError)
+                self._failures.append(Failure(0, "scene", str(error), crashed=died))
+                rendered, searched[:], solved[:] = False, False, False
+        if result is None:
+            result = _empty_result(self._pipeline)
+        self._flag(result, searched, solved, rendered=rendered)
+        result.failures += self._failures
+        return result
+
+    def _works(self, stage: str, setting: int | None = None, estimator: int | None = None) -> bool:
+        """Return whether a part of the scene can be computed; note why if it cannot."""
+        solve, search = np.zeros_like(self._need), np.zeros_like(self._need[..., 0])
         if estimator is not None:
             solve[0, setting, estimator] = True
         elif setting is not None:
             search[0, setting] = True
         for last in (False, True):
             try:
-                careful(share, chosen, solve, search)
-            except RaisedError as error:
-                lost.append(Failure(0, stage, str(error), setting, estimator))
+                self._isolated.run(self._share, self._indices, solve, search)
+            except ChildRaisedError as error:
+                self._failures.append(Failure(0, stage, str(error), setting, estimator))
                 return False
-            except DiedError as death:
-                endless = str(death).startswith("time")
-                share = max(share / 2, MIN_S / careful.limit_s) if endless else share
+            except ChildDiedError as death:
+                if death.timed_out:
+                    self._share = max(self._share / 2, MIN_S / self._isolated.limit_s)
                 # A process may also be killed from outside; twice is no chance.
-                if endless or last:
-                    lost.append(Failure(0, stage, str(death), setting, estimator, crashed=True))
+                if death.timed_out or last:
+                    self._failures.append(
+                        Failure(0, stage, str(death), setting, estimator, crashed=True)
+                    )
                     return False
             else:
                 return True
         raise AssertionError(stage)
 
-    asked = np.flatnonzero(need[0].any(axis=1)).tolist()
-    whole = works("scene")
-    searched = np.zeros((1, settings), dtype=bool)
-    solved = np.zeros_like(need)
-    for k in asked if whole else ():
-        searched[0, k] = works("detection", k)
-        for j in np.flatnonzero(need[0, k]).tolist() if searched[0, k] else ():
-            solved[0, k, j] = works("estimation", k, j)
-    try:
-        # None of what is asked here is endless: it has all the time.
-        result = careful(1.0, chosen, solved, searched) if whole else _nothing(pipeline)
-    except (DiedError, RaisedError) as error:
-        # Each part is harmless alone, but not all of them together.
-        died = isinstance(error, DiedError)
-        lost.append(Failure(0, "scene", str(error), crashed=died))
-        whole, searched[:], solved[:] = False, False, False
-        result = _nothing(pipeline)
-    crashed = {(one.setting, one.estimator): one.crashed for one in lost}
-    for k in asked:
-        if not searched[0, k]:
-            died = crashed[k, None] if whole else crashed[None, None]
-            result.columns["detection"][k][:] = (
-                DetectionStatus.crashed if died else DetectionStatus.failed
-            )
-        for j in np.flatnonzero(need[0, k] & ~solved[0, k]).tolist():
-            flag = EstimateStatus.no_detection
-            if searched[0, k]:
-                flag = EstimateStatus.crashed if crashed[k, j] else EstimateStatus.failed
-            result.columns["estimate"][k * estimators + j][:] = flag
-            result.columns["flipped"][k * estimators + j][:] = Flipped.no_estimate
-    result.failures += lost
-    return result
+    def _flag(
+        self, result: CellsResult, searched: NDArray[np.bool_], solved: NDArray[np.bool_], *,
+        rendered: bool,
+    ) -> None:
+        """Flag the needed cells that were not ``searched`` or not ``solved``."""
+        _, _, estimators = self._need.shape
+        crashed = {
+            (failure.setting, failure.estimator): failure.crashed for failure in self._failures
+        }
+        for k in np.flatnonzero(self._need[0].any(axis=1)).tolist():
+            if not searched[0, k]:
+                died = crashed[k, None] if rendered else crashed[None, None]
+                result.columns["detection"][k][:] = (
+                    DetectionStatus.crashed if died else DetectionStatus.failed
+                )
+            for j in np.flatnonzero(self._need[0, k] & ~solved[0, k]).tolist():
+                status = EstimateStatus.no_detection
+                if searched[0, k]:
+                    status = EstimateStatus.crashed if crashed[k, j] else EstimateStatus.failed
+                result.columns["estimate"][k * estimators + j][:] = status
+                result.columns["flipped"][k * estimators + j][:] = Flipped.no_estimate
 
 
-def _nothing(pipeline: Pipeline) -> CellsResult:
-    """Return the result of a scene of which nothing is known."""
+def _empty_result(pipeline: Pipeline) -> CellsResult:
+    """Return the result of one scene of which no cell was computed."""
     columns: dict[str, list[NDArray[Any]]] = {}
     sizes: dict[Stage, int] = {}
     for variable in SCHEMA:

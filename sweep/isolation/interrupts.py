@@ -9,16 +9,18 @@ from typing import Any, Self
 
 
 def in_main_thread() -> bool:
-    """Tell whether this is the thread that signals arrive in."""
+    """Return whether this is the thread in which Python handles signals."""
     return threading.current_thread() is threading.main_thread()
 
 
 class Interrupts:
-    """While it is entered, Ctrl-C is noted, and raised where :meth:`check` is called.
+    """While this context is entered, Ctrl-C is noted, and raised by :meth:`check`.
 
-    KeyboardInterrupt anywhere in a client's machinery can leave one of its locks taken, and the
-    process hangs while it closes the cluster. The second Ctrl-C is raised at once all the same.
-    Outside the main thread, where no signals arrive, it does nothing.
+    KeyboardInterrupt inside a client's code can leave one of its locks taken, and the process then
+    hangs while it closes the cluster. The second Ctrl-C is raised at once.
+
+    The caller's handler is restored at the end. Nothing is done outside the main thread, where no
+    signals arrive, and if the caller ignores Ctrl-C or handles it outside Python.
     """
 
     def __init__(self) -> None:
@@ -26,7 +28,7 @@ class Interrupts:
         self._before: Any = None
 
     def __enter__(self) -> Self:
-        if in_main_thread():
+        if in_main_thread() and signal.getsignal(signal.SIGINT) not in (None, signal.SIG_IGN):
             self._before = signal.signal(signal.SIGINT, self._note)
         return self
 
@@ -41,6 +43,6 @@ class Interrupts:
         self._noted = True
 
     def check(self) -> None:
-        """Raise KeyboardInterrupt where Ctrl-C has been noted."""
+        """Raise KeyboardInterrupt if Ctrl-C has been noted."""
         if self._noted:
             raise KeyboardInterrupt

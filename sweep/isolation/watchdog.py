@@ -1,4 +1,4 @@
-"""Time limits that hold whatever the code does: the process ends when one runs out."""
+"""Time limits that end the process, also if compiled code never returns."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ import numba.core.event
 _lock = threading.RLock()
 _deadlines: dict[int, float] = {}
 _numbers = itertools.count()
-_nowhere = os.open(os.devnull, os.O_WRONLY)
+_devnull = os.open(os.devnull, os.O_WRONLY)
 
 
 @contextlib.contextmanager
 def ending_after(limit_s: float) -> Iterator[None]:
-    """End this process where the body takes longer than ``limit_s`` seconds.
+    """End this process, with exit status 1, if the body takes longer than ``limit_s`` seconds.
 
     The clock is ``faulthandler``'s: a thread of C that needs no lock of the interpreter, so that
-    compiled code that never returns is ended too. It stands still while Numba compiles or loads
-    code, which takes a minute where nothing is cached. Several threads may have limits at a time.
+    compiled code that never returns is ended too. The clock stands still while Numba compiles or
+    loads code, which takes a minute if nothing is cached. Several threads may have limits at once.
     """
     number = next(_numbers)
     with _lock:
@@ -44,7 +44,7 @@ def _arm() -> None:
         faulthandler.cancel_dump_traceback_later()
         return
     left = max(min(_deadlines.values()) - time.monotonic(), 0.001)
-    faulthandler.dump_traceback_later(left, exit=True, file=_nowhere)
+    faulthandler.dump_traceback_later(left, exit=True, file=_devnull)
 
 
 class _Compiling(numba.core.event.Listener):

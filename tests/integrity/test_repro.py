@@ -294,4 +294,4 @@ def test_no_more_than_a_thousand_rows_of_each_kind_are_kept():
     from sweep.store import failures  # noqa: PLC0415
 
     assert failures.MAX_ROWS == closing.MAX_ROWS == 1000
-    assert task.ROOM == {"failed": 1000, "crashed": 1000}
+    assert task.FAILURE_QUOTA == {"failed": 1000, "crashed": 1000}

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from sweep.errors import PipelineError, StoreError
-from sweep.isolation.child_process import Child, DiedError, RaisedError
+from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.plan.experiment import Pipeline
 
 
 def test_child_calls_functions_and_tells_what_they_raise():
     with Child() as child:
         assert child.call(pow, 2, 10, limit_s=60) == 1024
-        with pytest.raises(RaisedError, match="ZeroDivisionError"):
+        with pytest.raises(ChildRaisedError, match="ZeroDivisionError"):
             child.call(divmod, 1, 0, limit_s=60)
         with pytest.raises(PipelineError) as told:
             child.call(Pipeline.from_text, "[pose]\nroll = 1", limit_s=60)
@@ -43,14 +43,14 @@ def test_child_calls_functions_and_tells_what_they_raise():
     ids=["segmentation fault", "abort", "out of memory", "exit", "sleep", "endless"],
 )
 def test_child_that_dies_says_how(function, arguments, limit_s, how):
-    with Child() as child, pytest.raises(DiedError, match=how):
+    with Child() as child, pytest.raises(ChildDiedError, match=how):
         child.call(function, *arguments, limit_s=limit_s)
 
 
 def test_child_that_is_gone_is_told_too():
     child = Child()
     child.close()
-    with pytest.raises(DiedError):
+    with pytest.raises(ChildDiedError):
         child.call(pow, 2, 2, limit_s=60)
 
 

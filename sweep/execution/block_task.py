@@ -19,7 +19,8 @@ from sweep.execution.limits import TIME_LIMIT_S
 from sweep.execution.reuse import ReusedCells, Source, match, take
 from sweep.isolation.crash_isolation import WHOLE, run_cells_isolated
 from sweep.isolation.watchdog import ending_after
-from sweep.plan.experiment import Pipeline, file_digest
+from sweep.plan.background_files import file_digest
+from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import SCHEMA, Variable

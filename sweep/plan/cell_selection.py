@@ -9,7 +9,7 @@ from typing import Any
 
 from sweep.messages import MAX_FAULTS, label, nearest, plain, refusal
 from sweep.plan.axes import TRIAL, Axis
-from sweep.plan.experiment import Pipeline, fixed_at
+from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import PARAMETERS
 from sweep.plan.toml_text import read_value
 
@@ -34,7 +34,7 @@ def cell(pipeline: Pipeline, at: str) -> Pipeline:
     for name, other in (("distance_m", "side_px"), ("side_px", "distance_m")):
         if name in named and other not in named:
             chosen.pop(other, None)
-    return dataclasses.replace(fixed_at(pipeline, chosen), axes=axes)
+    return dataclasses.replace(pipeline.fixed_at(chosen), axes=axes)
 
 
 def places(at: str) -> dict[str, Any]:

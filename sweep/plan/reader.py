@@ -1,0 +1,181 @@
+"""Keys of a pipeline document: each is checked on its own, and all faults are gathered."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sweep.messages import MAX_FAULTS, nearest, plain, shown
+from sweep.plan.axes import (
+    MAX_LISTED,
+    TRIAL,
+    Axis,
+    Distribution,
+    parse_axis,
+    parse_distribution,
+    parse_trial,
+)
+from sweep.plan.parameters import PARAMETERS, SECTIONS
+
+MAX_TITLE_LENGTH = 200
+
+HEADER = ("title", "seed")
+"""Keys that stand above the sections."""
+
+
+@dataclass(slots=True)
+class Reading:
+    """What a document says, as far as it could be read, and its faults.
+
+    Attributes
+    ----------
+    document
+        The document, as TOML has it: tables are dictionaries.
+    source
+        The name that messages begin with.
+    folder
+        Where relative paths start.
+    known_files
+        Path as written -> SHA-256 of files that are not looked at; None to look at them.
+    title, seed, fixed, distributions, axes, files
+        As :class:`sweep.plan.experiment.Pipeline` has them; ``axes`` by name.
+    given
+        Names of the parameters that the document has, even with a value that cannot be.
+    faults
+        One line each: source, key, value, expectation.
+    """
+
+    document: Mapping[str, Any]
+    source: str
+    folder: Path
+    known_files: Mapping[str, str] | None
+    title: str = ""
+    seed: int = 0
+    fixed: dict[str, Any] = field(default_factory=dict)
+    distributions: dict[str, Distribution] = field(default_factory=dict)
+    axes: dict[str, Axis] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)
+    given: set[str] = field(default_factory=set)
+    faults: list[str] = field(default_factory=list)
+
+    def fault(self, key: str, value: Any, expected: str) -> None:
+        """Note a fault of a key's value."""
+        self.faults.append(f"{self.source}: {plain(key)} = {shown(value)}: expected {expected}")
+
+    def unknown(self, key: str, problem: str, word: str, known: Sequence[str]) -> None:
+        """Note an unknown key, with the nearest known one if the line will be printed."""
+        hint = nearest(word, known) if len(self.faults) < MAX_FAULTS else ""
+        self.faults.append(f"{self.source}: {plain(key)}: {problem}{hint}")
+
+    def values(self, name: str) -> Sequence[Any]:
+        """Return the values of a parameter on the grid; empty if it is drawn or at fault."""
+        if name in self.axes:
+            return self.axes[name].values
+        return (self.fixed[name],) if name in self.fixed else ()
+
+    def written(self, name: str) -> Any:
+        """Return the value that the document gives a parameter, for messages."""
+        for section in (*SECTIONS, "axes"):
+            table = self.document.get(section)
+            if isinstance(table, dict) and name in table:
+                return table[name]
+        return self.fixed.get(name)
+
+
+def read_keys(
+    document: Mapping[str, Any], source: str, folder: Path,
+    known_files: Mapping[str, str] | None = None,
+) -> Reading:
+    """Return what the keys of a document say, each checked on its own (as :class:`Reading`)."""
+    reading = Reading(document, source, folder, known_files)
+    _read_header(reading)
+    known = [*HEADER, *SECTIONS, "axes"]
+    for key, value in document.items():
+        if key in HEADER:
+            continue
+        if key == "axes" or key in SECTIONS:
+            if not isinstance(value, dict):
+                reading.fault(key, value, f"a table: [{key}]")
+        elif key in PARAMETERS:
+            reading.fault(key, value, f"it under [{PARAMETERS[key].section}]")
+        else:
+            kind = "a section" if isinstance(value, dict) else "a key"
+            reading.unknown(key, f"unknown; expected {kind} of {', '.join(known)}", key, known)
+    for section in SECTIONS:
+        _read_section(reading, section)
+    _read_axes(reading)
+    for parameter in PARAMETERS.values():
+        if parameter.name not in reading.given:
+            reading.fixed[parameter.name] = parameter.default
+    return reading
+
+
+def _read_header(reading: Reading) -> None:
+    line = f"a string: one line of at most {MAX_TITLE_LENGTH} characters"
+    title = reading.document.get("title", "")
+    if not isinstance(title, str) or len(title) > MAX_TITLE_LENGTH or not title.isprintable():
+        reading.fault("title", title, line)
+    else:
+        reading.title = title
+    seed = reading.document.get("seed", 0)
+    if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**63:
+        reading.fault("seed", seed, "a whole number from 0 to 2^63 - 1")
+    else:
+        reading.seed = seed
+
+
+def _read_section(reading: Reading, section: str) -> None:
+    table = reading.document.get(section, {})
+    if not isinstance(table, dict):
+        return
+    names = [p.name for p in PARAMETERS.values() if p.section == section]
+    for key, value in table.items():
+        path = f"{section}.{key}"
+        if key not in names:
+            home = section_of(key)
+            hint = f"; it belongs under [{home}]" if home else ""
+            reading.unknown(path, f"unknown key{hint}", "" if home else key, names)
+            continue
+        parameter = PARAMETERS[key]
+        reading.given.add(key)
+        try:
+            if isinstance(value, dict):
+                reading.distributions[key] = parse_distribution(parameter, value)
+            else:
+                reading.fixed[key] = parameter.check(value)
+        except ValueError as error:
+            reading.fault(path, value, str(error))
+
+
+def section_of(name: str) -> str:
+    """Return the section that a parameter belongs under; empty for an unknown name."""
+    if name == TRIAL:
+        return "axes"
+    return PARAMETERS[name].section if name in PARAMETERS else ""
+
+
+def _read_axes(reading: Reading) -> None:
+    table = reading.document.get("axes", {})
+    if not isinstance(table, dict):
+        return
+    quota = MAX_LISTED
+    for key, value in table.items():
+        path = f"axes.{key}"
+        try:
+            if key == TRIAL:
+                reading.axes[key] = parse_trial(value)
+            elif key not in PARAMETERS:
+                reading.unknown(path, "unknown parameter", key, [*PARAMETERS, TRIAL])
+            elif key in reading.given:
+                section = PARAMETERS[key].section
+                reading.fault(
+                    path, value, f"it once: {section}.{key} is given too; delete one of them"
+                )
+            else:
+                reading.given.add(key)
+                axis = reading.axes[key] = parse_axis(PARAMETERS[key], value, quota)
+                quota -= 0 if isinstance(axis.values, range) else len(axis)
+        except ValueError as error:
+            reading.fault(path, value, str(error))

@@ -1,0 +1,213 @@
+"""Rules across the keys of a pipeline: each is a function that adds its faults to a reading.
+
+A parameter whose own value is at fault is passed over: its fault is known already.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from sweep.measure.detector import DetectorSetting
+from sweep.model.effects import GEOMETRIC, RANDOM, VELOCITIES, is_on
+from sweep.model.image_file import MAX_PIXELS
+from sweep.model.marker import marker_count
+from sweep.plan.axes import TRIAL
+from sweep.plan.background_files import check_backgrounds
+from sweep.plan.parameters import PARAMETERS, Stage
+from sweep.plan.reader import Reading
+
+MAX_POSES = 10**12
+"""The largest grid."""
+
+MAX_TREATMENTS = 10_000
+"""The most configurations: they are listed, and each has its share of every block."""
+
+
+def distance_or_side(reading: Reading) -> None:
+    """Demand ``distance_m`` or ``side_px``, not both."""
+    distance, side = "distance_m" in reading.given, "side_px" in reading.given
+    if distance and side:
+        reading.fault(
+            "side_px", reading.written("side_px"),
+            "distance_m or side_px, not both; delete one of them",
+        )
+    if not distance and not side:
+        reading.faults.append(
+            f"{reading.source}: pose: expected distance_m or side_px, fixed or under [axes]"
+        )
+
+
+def camera_in_one_unit(reading: Reading) -> None:
+    """Demand a camera in pixels or in millimetres, not in both."""
+    in_mm = [
+        name for name in ("sensor_width_mm", "sensor_height_mm", "focal_length_mm")
+        if name in reading.given
+    ]
+    for name in ("fx_px", "fy_px"):
+        if name in reading.given and in_mm:
+            reading.fault(
+                name, reading.written(name),
+                f"a camera in pixels or in millimetres, not both; delete it or "
+                f"{', '.join(in_mm)}",
+            )
+    if "fy_px" in reading.given and "fx_px" not in reading.given:
+        reading.fault("fy_px", reading.written("fy_px"), "fx_px beside it")
+
+
+def ids_in_dictionary(reading: Reading) -> None:
+    """Demand that every ID of the grid exists in every dictionary of the grid."""
+    ids = reading.values("marker_id")
+    if not ids:
+        return
+    largest = max(ids[0], ids[-1]) if isinstance(ids, range) else max(ids)
+    for dictionary in reading.values("dictionary"):
+        count = marker_count(dictionary)
+        if largest >= count:
+            reading.fault(
+                "marker_id", reading.written("marker_id"),
+                f"IDs from 0 to {count - 1}, which is what {dictionary} has",
+            )
+
+
+def is_active(reading: Reading, switch: str) -> bool:
+    """Return whether a switch has, or was meant to have, another than its neutral value."""
+    values = reading.values(switch)
+    if not values:
+        return switch in reading.given
+    return any(is_on(switch, value) for value in values)
+
+
+def motion_needs_time(reading: Reading) -> None:
+    """Demand a velocity beside an exposure or row time, and the other way round."""
+    moving = [
+        name for name in VELOCITIES
+        if name in reading.distributions
+        or any(reading.values(name) or [name in reading.given])
+    ]
+    for name in ("exposure_s", "row_time_s"):
+        if is_active(reading, name) and not reading.given.intersection(VELOCITIES):
+            reading.fault(
+                f"scene.{name}", reading.written(name),
+                f"a velocity beside it: {', '.join(VELOCITIES)}",
+            )
+    for name in moving:
+        if not reading.given.intersection(("exposure_s", "row_time_s")):
+            reading.fault(
+                f"scene.{name}", reading.written(name), "exposure_s or row_time_s beside it"
+            )
+
+
+def effects_need_partners(reading: Reading) -> None:
+    """Demand the parameters without which an effect's parameter has no meaning."""
+    for name, other in (
+        ("aperture_mm", "focus_distance_m"), ("focus_distance_m", "aperture_mm"),
+        ("read_noise_e", "full_well_e"),
+    ):
+        off = PARAMETERS[name].default
+        given = name in reading.distributions or any(v != off for v in reading.values(name))
+        if given and other not in reading.given:
+            reading.fault(f"scene.{name}", reading.written(name), f"{other} beside it")
+
+
+def effects_need_the_exact_renderer(reading: Reading) -> None:
+    """Demand the renderer ``exact`` for effects that act on edges."""
+    others = [name for name in reading.values("renderer") if name != "exact"]
+    for name in GEOMETRIC:
+        if others and is_active(reading, name):
+            reading.fault(
+                f"scene.{name}", reading.written(name),
+                f"renderer = exact; {others[0]} does not have it",
+            )
+
+
+def threshold_windows_in_order(reading: Reading) -> None:
+    """Demand that the largest threshold window is not below the smallest."""
+    low, high = "adaptiveThreshWinSizeMin", "adaptiveThreshWinSizeMax"
+    smallest, largest = reading.values(low), reading.values(high)
+    if smallest and largest and max(smallest) > min(largest):
+        reading.fault(high, reading.written(high), f"at least {low}")
+
+
+def fields_of_the_installed_opencv(reading: Reading) -> None:
+    """Demand detector fields that the installed OpenCV has."""
+    for name in reading.given & DetectorSetting.missing_fields():
+        reading.fault(
+            f"detector.{name}", reading.written(name), "a field that the installed OpenCV has"
+        )
+
+
+def something_random_to_repeat(reading: Reading) -> None:
+    """Demand a random quantity if there is more than one trial."""
+    trials = len(reading.axes[TRIAL]) if TRIAL in reading.axes else 1
+    jitter = reading.values("jitter_px")
+    noisy = any(is_active(reading, name) for name in RANDOM)
+    if trials > 1 and not reading.distributions and jitter and max(jitter) == 0 and not noisy:
+        reading.fault(
+            "axes.trial", trials,
+            "something random to repeat: jitter_px above 0, noise, or a distribution",
+        )
+
+
+def size_of_the_grid(reading: Reading) -> None:
+    """Limit the number of poses and of configurations."""
+    lengths = {axis: len(axis) for axis in reading.axes.values()}
+    poses = math.prod(lengths.values())
+    if poses > MAX_POSES:
+        reading.faults.append(
+            f"{reading.source}: axes: {min(poses, 10**300):.3g} poses: expected at most "
+            f"{MAX_POSES:.0e}"
+        )
+    treatments = math.prod(
+        length for axis, length in lengths.items() if axis.stage is not Stage.scene
+    )
+    if treatments > MAX_TREATMENTS:
+        reading.faults.append(
+            f"{reading.source}: axes: {min(treatments, 10**300):.3g} detector settings times "
+            f"estimators: expected at most {MAX_TREATMENTS:,}"
+        )
+
+
+def size_of_whole_frames(reading: Reading) -> None:
+    """Refuse settings that search the whole frame if the frame is too large."""
+    frame = max(reading.values("width_px") or (0,)) * max(reading.values("height_px") or (0,))
+    if frame <= MAX_PIXELS:
+        return
+    if "full" in reading.values("window"):
+        reading.fault(
+            "scene.window", reading.written("window"),
+            f"auto, for a frame of more than {MAX_PIXELS:,} pixels",
+        )
+    for name, is_whole in (
+        ("useAruco3Detection", bool),
+        ("adaptiveThreshConstant", lambda value: value < 1),
+        ("aprilTagQuadDecimate", lambda value: value > 1),
+    ):
+        if any(is_whole(value) for value in reading.values(name)):
+            reading.fault(
+                f"detector.{name}", reading.written(name),
+                f"what needs no whole frame, for one of more than {MAX_PIXELS:,} pixels",
+            )
+
+
+RULES: tuple[Callable[[Reading], None], ...] = (
+    distance_or_side,
+    camera_in_one_unit,
+    ids_in_dictionary,
+    motion_needs_time,
+    effects_need_partners,
+    effects_need_the_exact_renderer,
+    threshold_windows_in_order,
+    check_backgrounds,
+    fields_of_the_installed_opencv,
+    something_random_to_repeat,
+    size_of_the_grid,
+    size_of_whole_frames,
+)
+"""Every rule, in the order of their messages."""
+
+
+def check_rules(reading: Reading) -> None:
+    """Add the faults of all rules to a reading."""
+    for rule in RULES:
+        rule(reading)

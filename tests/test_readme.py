@@ -1,9 +1,6 @@
 """What the README shows is what the project does."""
 
 import re
-import subprocess
-import sys
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -13,22 +10,20 @@ from sweep.cli import main
 from sweep.evaluation.inspection import look
 from sweep.plan.cell_selection import cell
 from sweep.plan.experiment import Pipeline
-from sweep.plan.parameters import PARAMETERS, Stage
-from sweep.plan.reference import TABLES
-from sweep.plan.schema import SCHEMA
+from sweep.plan.parameters import Stage
 
 TOP = Path(__file__).parent.parent
 README = (TOP / "README.md").read_text()
 
 
 def block_after(marker, language):
-    found = re.search(rf"<!-- {marker} -->\n```{language}\n(.*?)```", README, re.DOTALL)
-    assert found, marker
-    return found[1]
+    block = re.search(rf"<!-- {marker} -->\n```{language}\n(.*?)```", README, re.DOTALL)
+    assert block, marker
+    return block[1]
 
 
-def test_reference_of_parameters_is_that_of_the_declarations():
-    assert TABLES["parameters"]() in README
+def test_front_page_is_short():
+    assert len(README.splitlines()) <= 150
 
 
 def test_both_commands_are_one_line_each():
@@ -36,53 +31,11 @@ def test_both_commands_are_one_line_each():
         assert block_after(marker, "sh").strip().count("\n") == 0
 
 
-def test_every_variable_is_explained():
-    for variable in SCHEMA:
-        assert f"`{variable.name}`" in README
-
-
 @pytest.mark.parametrize("path", sorted((TOP / "pipelines").glob("*.toml")), ids=lambda p: p.stem)
 def test_every_pipeline_is_sound(path):
     pipeline = Pipeline.from_toml(path)
     assert pipeline.title
     assert pipeline.size(*Stage) > 1
-
-
-def test_pipeline_in_the_readme_is_sound():
-    text = re.search(r"```toml\n(.*?)```", README, re.DOTALL)[1]
-    parsed = tomllib.loads(text)
-    assert set(parsed["axes"]) - {"trial"} <= set(PARAMETERS)
-    assert Pipeline.from_text(text).size(*Stage) == 2 * 4 * 8 * 2 * 5
-
-
-def test_first_analysis_runs_on_the_smoke_pipeline(tmp_path):
-    ran = subprocess.run(
-        [sys.executable, "-m", "sweep", "run", str(TOP / "pipelines" / "smoke.toml")],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-    )
-    assert ran.returncode == 0, ran.stderr
-    assert 'xarray.open_zarr("runs/smoke.zarr")' in ran.stdout
-    code = block_after("analysis", "python")
-    assert len(code.strip().splitlines()) == 5
-    shown = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-    assert shown.returncode == 0, shown.stderr
-    assert "tilt_deg" in shown.stdout
-    answered = subprocess.run(
-        [sys.executable, "-c", block_after("answers", "python")], cwd=tmp_path,
-        capture_output=True, text=True, check=False,
-    )
-    assert answered.returncode == 0, answered.stderr
-    for name in ("detection_rate_low", "rotation_p95_deg", "per_module", "p_adjusted"):
-        assert name in answered.stdout
-
-
-def test_every_link_of_the_readme_leads_somewhere():
-    links = re.findall(r"\]\((?!https?:)([^)#]+)\)|src=\"([^\"]+)\"", README)
-    assert links
-    for link in links:
-        assert (TOP / "".join(link)).exists(), link
 
 
 def test_show_draws_a_scene_or_its_plain_image(tmp_path, capsys):

@@ -1,0 +1,234 @@
+"""What the guides show is what the project does: blocks run, links lead somewhere, tables hold.
+
+A comment before a block says what is done with it: ``<!-- not run: why -->`` (its syntax and its
+flags are checked), ``<!-- file: NAME -->`` (it is written, for the blocks that follow), any other
+or none (it runs).
+"""
+
+import ast
+import contextlib
+import io
+import re
+import shlex
+import subprocess
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from support.room_picture import PICTURE, drawn
+from sweep.cli import main
+from sweep.plan.experiment import Pipeline
+from sweep.plan.parameters import PARAMETERS, SECTIONS, Stage
+from sweep.plan.reference import TABLES, outdated_tables
+
+TOP = Path(__file__).parent.parent
+FOLDERS = ("pipelines", "sweep", "tests", "notebooks")
+GUIDES = [TOP / "README.md", *sorted(
+    path for folder in FOLDERS for path in (TOP / folder).rglob("README.md"))]
+NAMES = [str(path.relative_to(TOP)) for path in GUIDES]
+ROOMS_WITH_A_GUIDE = ("analysis", "execution", "integrity", "measure", "tradeoff")
+BLOCK = re.compile(r"(?:<!-- ([^\n]*?) -->\n)?```(\w*)\n(.*?)```", re.DOTALL)
+
+SHOWN = {
+    "analysis": ["tilt_deg", "distance_m"],
+    "answers": ["detection_rate_low", "rotation_p95_deg", "per_module", "p_adjusted"],
+    "tutorial": ["side_px_high", "subpix", "range_rmse_ratio_low"],
+}
+"""What the block with a comment prints, among other things."""
+
+
+class Block(NamedTuple):
+    guide: str
+    comment: str
+    language: str
+    text: str
+
+    @property
+    def runs(self):
+        """Whether it is run here; CI runs the README's two commands in a fresh clone."""
+        return not self.comment.startswith(("not run", "run", "test"))
+
+
+def blocks_of(path):
+    return [Block(str(path.relative_to(TOP)), *match.groups(default=""))
+            for match in BLOCK.finditer(path.read_text())]
+
+
+BLOCKS = [block for path in GUIDES for block in blocks_of(path)]
+
+
+def commands_of(block):
+    """Return the commands of a shell block, as lists of words."""
+    lines = block.text.replace("\\\n", " ").splitlines()
+    words = [shlex.split(line, comments=True) for line in lines]
+    return [[Path(line[0]).name, *line[1:]] for line in words if line]
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory):
+    """A folder as a clone is, in which the main job has been run."""
+    folder = tmp_path_factory.mktemp("clone")
+    for name in FOLDERS:
+        (folder / name).symlink_to(TOP / name)
+    with contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()) as output:
+        assert main(["run", "pipelines/smoke.toml", "--workers", "1"]) == 0
+    assert 'xarray.open_zarr("runs/smoke.zarr")' in output.getvalue()
+    return folder
+
+
+def test_every_room_that_a_user_reads_about_has_a_guide():
+    for room in ROOMS_WITH_A_GUIDE:
+        assert f"sweep/{room}/README.md" in NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_blocks_of_a_guide_run_in_their_order(name, workspace, monkeypatch, capsys):
+    monkeypatch.chdir(workspace)
+    for block in blocks_of(TOP / name):
+        if block.language == "toml":
+            assert Pipeline.from_text(block.text).size(*Stage) > 1
+        if block.comment.startswith("file: "):
+            Path(block.comment.removeprefix("file: ")).write_text(block.text)
+        elif block.runs and block.language == "python":
+            capsys.readouterr()
+            exec(compile(block.text, name, "exec"), {"__name__": "__main__"})  # noqa: S102
+            output = capsys.readouterr().out
+            for shown in SHOWN.get(block.comment, ()):
+                assert shown in output
+        elif block.runs and block.language == "sh":
+            for command, *arguments in commands_of(block):
+                assert command == "sweep", "other commands are not run: say why"
+                assert main(arguments) == 0, (arguments, capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    "block", [block for block in BLOCKS if block.language == "python" and not block.runs],
+    ids=lambda block: block.guide)
+def test_python_that_is_not_run_has_the_right_syntax(block):
+    ast.parse(block.text)
+
+
+@pytest.mark.parametrize(
+    "block", [block for block in BLOCKS if block.language == "sh"],
+    ids=lambda block: block.guide)
+def test_commands_have_the_right_syntax_and_flags_that_exist(block, capsys):
+    checked = subprocess.run(
+        ["bash", "-n"], input=block.text, capture_output=True, text=True, check=False)
+    assert checked.returncode == 0, checked.stderr
+    for command, *arguments in commands_of(block):
+        if command == "sweep":
+            flags_exist(arguments, capsys)
+
+
+def flags_exist(arguments, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main([arguments[0], "--help"])
+    helped = capsys.readouterr().out
+    for argument in arguments[1:]:
+        if re.fullmatch(r"--?[a-z][a-z-]*", argument):
+            assert re.search(rf"(?<![\w-]){argument}\b", helped), argument
+
+
+def test_blocks_are_of_languages_that_are_held():
+    assert {block.language for block in BLOCKS} <= {"sh", "python", "toml", "text", "markdown"}
+
+
+def test_list_of_commands_names_each_command_and_flag(capsys):
+    usage, = (block.text for block in BLOCKS
+              if block.language == "text" and block.text.startswith("sweep run"))
+    for line in usage.splitlines():
+        flags = re.findall(r"--[a-z-]+", line)
+        flags_exist([line.split()[1], *flags], capsys)
+    with pytest.raises(SystemExit, match="0"):
+        main(["--help"])
+    commands = {line.split()[1] for line in usage.splitlines()}
+    assert commands <= set(re.findall(r"[a-z]+", capsys.readouterr().out))
+
+
+def cells(row):
+    return len(re.split(r"(?<!\\)\|", row.strip().strip("|")))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_tables_are_whole(name):
+    """A renderer ends a table at the first line that is no row."""
+    text = BLOCK.sub("", (TOP / name).read_text())
+    for table in re.findall(r"(?:^\|[^\n]*\n)+", text, re.MULTILINE):
+        heading, rule, *rows = table.splitlines()
+        assert re.fullmatch(r"\|( -+:? \|)+", rule), table
+        assert rows, heading
+        assert {cells(row) for row in rows} == {cells(heading)} == {cells(rule)}, heading
+
+
+def anchors(text):
+    """Return the anchors of a page's headings, as code hosts make them."""
+    headings = re.findall(r"^#+ (.*)$", BLOCK.sub("", text), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("name", [*NAMES, "CHANGELOG.md"])
+def test_links_lead_somewhere(name):
+    text = (TOP / name).read_text()
+    links = re.findall(r"\]\((?!https?:)([^)\s]+)\)|src=\"(?!https?:)([^\"]+)\"", text)
+    for link in links:
+        path, _, anchor = "".join(link).partition("#")
+        target = (TOP / name).parent / path if path else TOP / name
+        assert target.exists(), link
+        if anchor:
+            assert anchor in anchors(target.read_text()), link
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_files_and_tests_that_are_named_exist(name):
+    """Commands behind measured figures can be run, and name tests that there are."""
+    text = (TOP / name).read_text()
+    for path in re.findall(r"(?<![\w/.])(?:tests|notebooks|pipelines)/[\w/]+\.(?:py|toml)", text):
+        assert (TOP / path).exists(), path
+    for path, words in re.findall(r"(tests/[\w/]+\.py) -k (\"[^\"]+\"|\w+)", text):
+        tests = " ".join(re.findall(r"def (test_\w+)", (TOP / path).read_text()))
+        assert any(word in tests for word in words.strip('"').split(" or ")), (path, words)
+
+
+def test_files_and_names_of_the_architecture_exist():
+    text = (TOP / "sweep" / "README.md").read_text()
+    rooms = {path.name for path in (TOP / "sweep").iterdir()}
+    paths = re.findall(r"`((?:\w+/)*\w*\.py|\w+/)`", text)
+    assert len(paths) > 20
+    for path in paths:
+        assert (TOP / "sweep" / path).exists() or (TOP / path).exists() or (
+            "/" not in path and list((TOP / "sweep").glob(f"*/{path}"))), path
+    assert {path.partition("/")[0] for path in paths if path.endswith("/")} <= rooms
+    sources = "".join(path.read_text() for folder in ("sweep", "tests")
+                      for path in (TOP / folder).rglob("*.py"))
+    for name in re.findall(r"`([A-Za-z]+_\w+|[A-Z][a-z]+[A-Z]\w+)`", text):
+        assert re.search(rf"\b{name}\b", sources), name
+
+
+def test_glossary_is_short():
+    text = (TOP / "sweep" / "README.md").read_text().partition("## Glossary")[2]
+    words = re.findall(r"^\| (\w+) \|", text.partition("\n## ")[0], re.MULTILINE)[1:]
+    assert words == sorted(words)
+    assert 10 < len(words) <= 25
+
+
+def test_parameters_variables_flags_solvers_and_effects_are_those_of_the_declarations():
+    names = []
+    for path in GUIDES:
+        text = path.read_text()
+        assert not outdated_tables(text), f"python -m sweep.plan.reference {path}"
+        names += re.findall("<!-- table: (.*) -->", text)
+    parts = {f"parameters.{section}" for section in SECTIONS}
+    parts |= {name for name in TABLES if name.startswith("flags.")}
+    assert set(names) | parts >= set(TABLES)
+    guide = (TOP / "pipelines" / "README.md").read_text()
+    assert all(f"\n| `{name}` |" in guide for name in PARAMETERS)
+
+
+def test_first_analysis_is_five_lines():
+    analysis, = (block for block in BLOCKS if block.comment == "analysis")
+    assert len(analysis.text.strip().splitlines()) == 5
+
+
+def test_picture_of_the_rooms_is_that_of_the_imports():
+    assert PICTURE.read_text() == drawn(), "python tests/support/room_picture.py"

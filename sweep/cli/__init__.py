@@ -449,7 +449,8 @@ def _report(chosen: argparse.Namespace) -> int:
 
     from sweep.report.report_data import Subject, reading  # noqa: PLC0415
     from sweep.report.write_report import write_report  # noqa: PLC0415
-    from sweep.store.lifecycle import committed, open_dataset, open_store  # noqa: PLC0415
+    from sweep.store.blocks import committed  # noqa: PLC0415
+    from sweep.store.lifecycle import open_dataset, open_store  # noqa: PLC0415
 
     for option, given in (("-o", chosen.output), ("--figures", chosen.figures)):
         if given is not None and not given.strip():
@@ -470,7 +471,7 @@ def _report(chosen: argparse.Namespace) -> int:
                 store.source, group="cost/tradeoff", consolidated=False, zarr_format=3
             ).load()
         results = open_dataset(store.url)
-    subject = Subject(store.url, results, store.pipeline, store.about, trade)
+    subject = Subject(store.url, results, store.pipeline, store.run_metadata, trade)
     count = write_report(subject, output, form, figures)
     print(f"{output}: {count} figures, {_bytes(output.stat().st_size)}")
     return 0

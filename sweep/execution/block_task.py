@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 
+from sweep.compilation import processor
 from sweep.errors import StoreError
 from sweep.evaluation.cells import CellsResult, run_cells, shaped
 from sweep.execution.limits import TIME_LIMIT_S
@@ -24,9 +24,12 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import SCHEMA, Variable
+from sweep.store.blocks import begin_block, write_block
 from sweep.store.failures import MAX_ROWS, recorded
-from sweep.store.lifecycle import RunStore, begin_block, open_store, write_block
+from sweep.store.lifecycle import open_store
 from sweep.store.provenance import fingerprint
+from sweep.store.receipt import Receipt
+from sweep.store.run_store import RunStore
 
 FAILURE_QUOTA: Mapping[str, int] = {"failed": MAX_ROWS, "crashed": MAX_ROWS}
 """Rows of failures that a receipt may hold of each kind."""
@@ -51,8 +54,6 @@ def _opened(url: str, run_id: str) -> RunStore:
                 f"{path}: not in {store.pipeline.folder} on a worker as it was when the run began; "
                 "every machine needs the same file there"
             )
-    # A committed chunk exists even where it is all fill value: a missing one is a deleted one.
-    zarr.config.set({"array.write_empty_chunks": True})
     return store
 
 
@@ -69,7 +70,7 @@ def compute_block(
     reuse: Sequence[str] = (),
     time_limit_s: float = TIME_LIMIT_S,
     quota: Mapping[str, int] = FAILURE_QUOTA,
-) -> dict[str, Any]:
+) -> Receipt:
     """Compute, write and commit one block; return its receipt, also if it is run twice.
 
     A block that was begun before and not committed may have ended its process: it is computed in a
@@ -120,20 +121,22 @@ def compute_block(
     }
     if taken is not None:
         values = {v.name: _merged(v, values, taken) for v in SCHEMA}
-    receipt = {
-        "scenes": len(block),
-        "computed": {
+    receipt = Receipt(
+        run_id=store.run_id,
+        processor=processor(),
+        scenes=len(block),
+        computed={
             "scenes": len(rows),
             "detections": int(need.any(axis=2).sum()),
             "estimates": int(need.sum()),
         },
-        "detection": np.bincount(values["detection"].ravel()).tolist(),
-        "estimate": np.bincount(values["estimate"].ravel()).tolist(),
-        "seconds": cells.seconds if cells is not None else _NO_SECONDS,
-        "failures": recorded(cells.failures if cells is not None else [], rows.tolist(), quota),
-        "wall_s": time.perf_counter() - start,
-        "written": time.time(),
-    }
+        detection=np.bincount(values["detection"].ravel()).tolist(),
+        estimate=np.bincount(values["estimate"].ravel()).tolist(),
+        seconds=cells.seconds if cells is not None else _NO_SECONDS,
+        failures=recorded(cells.failures if cells is not None else [], rows.tolist(), quota),
+        wall_s=time.perf_counter() - start,
+        written=time.time(),
+    )
     write_block(store, block, values, receipt)
     return receipt
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,8 +11,10 @@ import numpy as np
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plan.axes import Axis
 from sweep.plan.parameters import Stage
+from sweep.store.blocks import committed, receipts
 from sweep.store.failures import MAX_ROWS, FailedCell, failed_cells, failure_table
-from sweep.store.lifecycle import RunStore, committed, finish, receipts
+from sweep.store.lifecycle import finish
+from sweep.store.run_store import RunStore
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -19,16 +22,16 @@ if TYPE_CHECKING:
 
 def close(store: RunStore) -> None:
     """Close a complete store: what its receipts tell is gathered, and it is marked finished."""
-    blocks: list[tuple[int, dict[str, Any]]] = []
+    blocks: list[tuple[int, Mapping[str, Sequence[float]]]] = []
     cells: list[FailedCell] = []
     kept: Counter[str] = Counter()
     counts = {"detection": [0] * len(DetectionStatus), "estimate": [0] * len(EstimateStatus)}
     for number, receipt in receipts(store, committed(store)):
-        if receipt["seconds"]["scene"]:
-            blocks.append((number, receipt["seconds"]))
-        for name, totals in counts.items():
-            for flag, count in enumerate(receipt[name]):
-                totals[flag] += count
+        if receipt.seconds["scene"]:
+            blocks.append((number, receipt.seconds))
+        for name, flags in (("detection", receipt.detection), ("estimate", receipt.estimate)):
+            for flag, count in enumerate(flags):
+                counts[name][flag] += count
         for cell in failed_cells(store, number, receipt):
             kept[cell.kind] += 1
             if kept[cell.kind] <= MAX_ROWS:
@@ -50,7 +53,9 @@ def lost(detection: list[int], estimate: list[int]) -> dict[str, int]:
     }
 
 
-def _cost(store: RunStore, blocks: list[tuple[int, dict[str, Any]]]) -> xr.Dataset:
+def _cost(
+    store: RunStore, blocks: Sequence[tuple[int, Mapping[str, Sequence[float]]]]
+) -> xr.Dataset:
     """Return the cost group: seconds per stage and treatment for each block."""
     import xarray as xr  # noqa: PLC0415  (slow to import, and often not needed)
 

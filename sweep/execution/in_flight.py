@@ -34,8 +34,10 @@ from sweep.execution.progress import Progress, ProgressReport
 from sweep.isolation.interrupts import Interrupts
 from sweep.measure.flags import DetectionStatus
 from sweep.plan.parameters import Stage
+from sweep.store.blocks import receipts
 from sweep.store.failures import MAX_ROWS
-from sweep.store.lifecycle import RunStore, receipts
+from sweep.store.receipt import Receipt
+from sweep.store.run_store import RunStore
 
 
 class InFlightLimit:
@@ -145,7 +147,7 @@ class BlocksInFlight:
             number = self._numbers.pop(future)
             if future.status == "finished":
                 receipt = future.result()
-                computed.update({"blocks": 1, **receipt["computed"]})
+                computed.update({"blocks": 1, **receipt.computed})
                 progress = self._counted(progress, receipt)
                 if report is not None:
                     report(progress)
@@ -194,12 +196,12 @@ class BlocksInFlight:
                 self._client.cancel(list(self._numbers))
         self._numbers.clear()
 
-    def _counted(self, progress: Progress, receipt: Mapping[str, Any]) -> Progress:
+    def _counted(self, progress: Progress, receipt: Receipt) -> Progress:
         """Return the progress after one more block; count its failures."""
-        self._failures.update(failure["kind"] for failure in receipt["failures"])
-        counts = receipt["detection"]
+        self._failures.update(failure.kind for failure in receipt.failures)
+        counts = receipt.detection
         detected = DetectionStatus.detected
         return Progress(
-            progress.done + receipt["scenes"], progress.total,
+            progress.done + receipt.scenes, progress.total,
             progress.detected + (counts[detected] if len(counts) > detected else 0),
         )

@@ -21,8 +21,9 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
 from sweep.plan.parameters import PARAMETERS, Stage
 from sweep.plan.schema import SCHEMA, Variable
-from sweep.store.lifecycle import RunStore, committed
+from sweep.store.blocks import committed
 from sweep.store.provenance import fingerprint
+from sweep.store.run_store import RunStore
 
 MISSING = -1
 """Stands for the index of a value that the old grid does not have."""
@@ -67,6 +68,11 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
         f"{key}: the store has {json.dumps(theirs.get(key))}, this run {json.dumps(mine.get(key))}"
         for key in sorted({*mine, *theirs})
         if mine.get(key) != theirs.get(key)
+    ]
+    present = {variable.name for variable in store.variables}
+    faults += [
+        f"{variable.name}: not a variable of the store's format {store.format}"
+        for variable in SCHEMA if variable.name not in present
     ]
     old_index: dict[str, NDArray[np.int64]] = {}
     pinned: dict[str, int] = {}

@@ -24,20 +24,12 @@ from sweep.isolation.interrupts import Interrupts
 from sweep.measure.flags import DetectionStatus
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
-from sweep.store.lifecycle import (
-    RunStore,
-    check_place,
-    committed,
-    create_store,
-    exists,
-    is_remote,
-    open_store,
-    place_of,
-    recorded_about,
-    remove_store,
-)
+from sweep.store.blocks import committed
+from sweep.store.lifecycle import create_store, open_store, read_run_metadata, remove_store
+from sweep.store.locations import check_writable, exists, is_remote, open_storage
 from sweep.store.lock import locked, refuse_if_held
 from sweep.store.provenance import differences
+from sweep.store.run_store import RunStore
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -150,7 +142,7 @@ def execute(
         return _summary_of_complete(unfinished, started)
     sources = _matching_sources(url, pipeline, reuse)
     if unfinished is None:
-        check_place(url)
+        check_writable(url)
 
     from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
 
@@ -225,12 +217,12 @@ def _store_to_continue(url: str, pipeline: Pipeline, overwrite: bool) -> RunStor
         return None
     if overwrite:
         # It is deleted once everything else is known to work, just before the new one is made.
-        files = place_of(url, "r+")
-        recorded_about(url, files)
-        refuse_if_held(url, files)
+        storage = open_storage(url, "r+")
+        read_run_metadata(url, storage)
+        refuse_if_held(url, storage)
         return None
     store = open_store(url, "r+")
-    refuse_if_held(url, store.place)
+    refuse_if_held(url, store.storage)
     lines = differences(pipeline, store.pipeline, store.fingerprint)
     if lines:
         listed = "\n".join(f"  {line}" for line in lines)
@@ -331,7 +323,7 @@ def _continuable_errors(without: str = "") -> Iterator[None]:
 
 def _summary(store: RunStore, computed: Mapping[str, int], seconds: float) -> Summary:
     """Return the summary of a finished store from the counts that it recorded."""
-    counts = store.about["counts"]
+    counts = store.run_metadata["counts"]
     missing = lost(counts["detection"], counts["estimate"])
     return Summary(
         store=store.url,

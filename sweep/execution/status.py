@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plan.parameters import Stage
+from sweep.store.blocks import committed, receipts
 from sweep.store.failures import MAX_ROWS, FailedCell, failed_cells
-from sweep.store.lifecycle import committed, open_store, receipts
+from sweep.store.lifecycle import open_store
 from sweep.store.lock import holder
 
 RATE_BLOCKS = 50
@@ -51,19 +52,19 @@ def status(url: str) -> Status:
     done = poses = 0
     for number, receipt in receipts(store, committed(store)):
         done += 1
-        poses += receipt["scenes"]
+        poses += receipt.scenes
         for flags, counts, counter in (
-            (DetectionStatus, receipt["detection"], detection),
-            (EstimateStatus, receipt["estimate"], estimate),
+            (DetectionStatus, receipt.detection, detection),
+            (EstimateStatus, receipt.estimate, estimate),
         ):
             for flag, count in zip(flags, counts, strict=False):
                 counter[flag.name] += count
-        written.append((receipt["written"], receipt["scenes"]))
+        written.append((receipt.written, receipt.scenes))
         for cell in failed_cells(store, number, receipt):
             if len(cells[cell.kind]) < MAX_ROWS:
                 cells[cell.kind].append(cell)
     total = store.pipeline.size(Stage.scene)
-    held = holder(store.place)
+    held = holder(store.storage)
     rate = _rate(written)
     return Status(
         store=url,

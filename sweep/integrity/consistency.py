@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.experiment import Pipeline
 from sweep.plan.schema import SCHEMA
+from sweep.store.receipt import Receipt
 
 POSED = (EstimateStatus.solved, EstimateStatus.not_explained)
 """Estimates that have a pose."""
@@ -39,7 +40,7 @@ ONLY = {
 
 
 def contradiction(
-    pipeline: Pipeline, values: Mapping[str, NDArray[Any]], receipt: Mapping[str, Any]
+    pipeline: Pipeline, values: Mapping[str, NDArray[Any]], receipt: Receipt
 ) -> str:
     """Return the first thing in which a block contradicts itself; empty where there is none.
 
@@ -50,8 +51,8 @@ def contradiction(
             unknown = ~np.isin(values[variable.name], [int(flag) for flag in variable.flags])
             if unknown.any():
                 return f"{variable.name}: unknown flag {values[variable.name][unknown][0]}"
-    for name in ("detection", "estimate"):
-        if np.bincount(values[name].ravel()).tolist() != receipt[name]:
+    for name, counts in (("detection", receipt.detection), ("estimate", receipt.estimate)):
+        if np.bincount(values[name].ravel()).tolist() != list(counts):
             return f"{name}: flags other than were counted when it was written"
     present = {
         "bound": values["bound"] == BoundStatus.given,

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 
-from zarr.core.buffer import cpu, default_buffer_prototype
-from zarr.core.sync import sync
+from zarr.buffer import cpu, default_buffer_prototype
 
 from sweep.errors import StoreError
 from sweep.execution.finalize import close
@@ -18,11 +17,15 @@ from sweep.integrity.verification import (
     computable,
     root_document,
 )
+from sweep.store.blocks import drop_block
 from sweep.store.checksums import digest
 from sweep.store.layout import RECEIPTS, PlannedArray, documents
-from sweep.store.lifecycle import RunStore, drop_block, open_store, telling
+from sweep.store.lifecycle import open_store
+from sweep.store.locations import translate_errors
 from sweep.store.lock import locked
 from sweep.store.manifest import Manifest, write_manifest
+from sweep.store.run_store import RunStore
+from sweep.store.zarr_sync import sync
 
 MEASURED = ("cost/tradeoff", "cost/renderers")
 """Groups of which no receipt tells: where they are damaged they go, to be measured again."""
@@ -58,7 +61,7 @@ def repair(
     if numbers:
         computable(store)
     with locked(store):
-        with telling(url, "written"):
+        with translate_errors(url, "written"):
             if "zarr.json" in wrong and check.manifest is not None:
                 sync(place.set("zarr.json", cpu.Buffer.from_bytes(root_document(check.manifest))))
             for key, content in documents(check.planned).items():
@@ -97,10 +100,10 @@ def _recorded(store: RunStore, planned: list[PlannedArray]) -> Manifest:
 
     async def gather() -> dict[str, int]:
         files = {}
-        async for key in store.place.list_prefix(""):
+        async for key in store.storage.list_prefix(""):
             if key.startswith((*blocks, f"{RECEIPTS}/")) and key != f"{RECEIPTS}/zarr.json":
                 continue
-            content = await store.place.get(key, default_buffer_prototype())
+            content = await store.storage.get(key, default_buffer_prototype())
             if content is not None:
                 files[key] = digest(content.to_bytes())
         return files

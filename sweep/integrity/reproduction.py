@@ -22,8 +22,10 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import SCHEMA
-from sweep.store.lifecycle import RunStore, committed, open_store, receipts
+from sweep.store.blocks import committed, receipts
+from sweep.store.lifecycle import open_store
 from sweep.store.provenance import differences
+from sweep.store.run_store import RunStore
 
 Values = dict[str, NDArray[Any]]
 
@@ -172,7 +174,7 @@ def _stored(store: RunStore, index: dict[str, int]) -> tuple[Values | None, bool
             index.get(name, slice(None)) for name in variable.dimensions(store.pipeline)
         )
         values[variable.name] = np.asarray(store.array(variable.name)[where])
-    return values, receipt["processor"] == processor()
+    return values, receipt.processor == processor()
 
 
 def _looked(

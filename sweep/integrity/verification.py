@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from zarr.core.buffer import cpu, default_buffer_prototype
-from zarr.core.sync import sync
+from zarr.buffer import cpu, default_buffer_prototype
 
 from sweep.compilation import processor
 from sweep.errors import StoreError, SweepError
@@ -26,6 +25,7 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import SCHEMA, Variable
+from sweep.store.blocks import BEGUN, chunk_key, committed, parsed_receipt, region
 from sweep.store.checksums import digest
 from sweep.store.layout import (
     RECEIPTS,
@@ -34,20 +34,15 @@ from sweep.store.layout import (
     documents,
     planned_arrays,
 )
-from sweep.store.lifecycle import (
-    BEGUN,
-    RunStore,
-    chunk_key,
-    committed,
-    parsed_receipt,
-    place_of,
-    region,
-    schema_faults,
-    store_of,
-)
+from sweep.store.lifecycle import store_of
+from sweep.store.locations import open_storage
 from sweep.store.lock import holder
 from sweep.store.manifest import KEYS, Manifest, parsed, read_manifest
 from sweep.store.provenance import differences, environment
+from sweep.store.receipt import Receipt
+from sweep.store.run_store import RunStore
+from sweep.store.schema_check import schema_faults
+from sweep.store.zarr_sync import sync
 
 THREADS, WINDOW = 4, 256
 """Blocks that are read and decoded at a time, and that are under way."""
@@ -129,7 +124,7 @@ class Check:
     """One look through a store; ``mode`` "r+" to mend it afterwards."""
 
     def __init__(self, url: str, mode: str) -> None:
-        self.place = place_of(url, mode)
+        self.place = open_storage(url, mode)
         self.manifest, unsound = read_manifest(self.place)
         self._damage = [Damage(key, "unreadable or out of date") for key in unsound]
         self._bytes = 0
@@ -154,7 +149,7 @@ class Check:
                 f"{url}: zarr.json and the manifest are damaged: what it held cannot be told; "
                 "`sweep run --overwrite` computes it again"
             )
-        self.place.instead["zarr.json"] = cpu.Buffer.from_bytes(root_document(self.manifest))
+        self.place.substitutes["zarr.json"] = cpu.Buffer.from_bytes(root_document(self.manifest))
         return self.manifest.attributes
 
     def verdict(self, sample: int) -> IntegrityReport:
@@ -224,7 +219,7 @@ class Check:
                 wrong.add(key)
                 self._damage.append(Damage(key, "missing" if content is None else "changed"))
                 if key in right:
-                    self.place.instead[key] = right[key]
+                    self.place.substitutes[key] = right[key]
             else:
                 self._bytes += len(content)
         for name, fault in schema_faults(self.store).items():
@@ -233,7 +228,7 @@ class Check:
             wrong.add(name)
             self._damage.append(Damage(name, fault))
             if f"{name}/zarr.json" in right:
-                self.place.instead[f"{name}/zarr.json"] = right[f"{name}/zarr.json"]
+                self.place.substitutes[f"{name}/zarr.json"] = right[f"{name}/zarr.json"]
         known = set(recorded) | {"commits/zarr.json"}
         self._grid_fits = RECEIPTS not in wrong
         consolidated = self._consolidated()
@@ -270,7 +265,7 @@ class Check:
     def _misfit(self, planned: PlannedArray) -> str:
         """Return in what an array is not as the pipeline says, beside its schema."""
         array = self.store.array(planned.path)
-        same_sweep = self.store.about["environment"].get("sweep") == environment()["sweep"]
+        same_sweep = self.store.run_metadata["environment"].get("sweep") == environment()["sweep"]
         if same_sweep and dict(array.attrs) != planned.attributes:
             return "its attributes are not as they should be"
         try:
@@ -298,33 +293,30 @@ class Check:
             key: "missing" for key, content in zip(keys, contents, strict=True) if content is None
         }
         size = sum(len(content) for content in contents if content is not None)
-        receipt: dict[str, Any] = {}
-        written: list[int] | None = None
+        receipt: Receipt | None = None
         if contents[0] is not None:
             try:
                 text = np.asarray(store.array(RECEIPTS)[number : number + 1]).tolist()[0]
                 receipt = parsed_receipt(store, number, text)
-                written = receipt["digests"]
             except Exception:
                 # Whatever decoding a damaged chunk raises.
-                faults[keys[0]], written = CHANGED, None
+                faults[keys[0]] = CHANGED
         values: dict[str, NDArray[Any]] = {}
-        for k, (variable, key) in enumerate(zip(SCHEMA, keys[1:], strict=True)):
-            content = contents[k + 1]
+        for variable, key, content in zip(SCHEMA, keys[1:], contents[1:], strict=True):
             if content is None:
                 continue
-            if written is not None and digest(content) != written[k]:
+            if receipt is not None and digest(content) != receipt.digests[variable.name]:
                 faults[key] = CHANGED
                 continue
             try:
                 values[variable.name] = self._decoded(content, variable, block)
             except (ValueError, RuntimeError):
                 faults[key] = CHANGED
-        if not faults:
+        if not faults and receipt is not None:
             against = contradiction(store.pipeline, values, receipt)
             if against:
                 faults[f"block {block}"] = against
-        return _Checked(number, faults, size, str(receipt.get("processor")))
+        return _Checked(number, faults, size, receipt.processor if receipt is not None else "")
 
     def _decoded(self, content: bytes, variable: Variable, block: Block) -> NDArray[Any]:
         """Return a chunk's values within the grid; ValueError where it fails its checksum."""

@@ -24,7 +24,7 @@ from sweep.report.report_data import AREA, Subject, reading
 
 FORMATS = ("html", "md")
 PICTURES = (".svg", ".png")
-MENDED = "`sweep verify --repair` mends it"
+MENDED = "`sweep verify --repair` repairs it"
 
 
 def check_output(

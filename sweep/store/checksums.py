@@ -1,4 +1,4 @@
-"""A Zarr store that notes the digest of what goes through it, and never writes elsewhere."""
+"""A Zarr storage that records the digests of its contents and never writes outside its folder."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any, Self
 from zlib import crc32
 
+from zarr.abc.buffer import Buffer, BufferPrototype
 from zarr.abc.store import ByteRequest, Store
-from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
-from zarr.core.sync import sync
+from zarr.buffer import default_buffer_prototype
 from zarr.storage import LocalStore, WrapperStore
+
+from sweep.store.zarr_sync import sync
 
 
 def digest(content: bytes | memoryview) -> int:
@@ -22,7 +24,7 @@ def digest(content: bytes | memoryview) -> int:
 
 
 def is_special(path: Path) -> bool:
-    """Tell whether a path is neither a file nor a folder: reading a pipe would never end."""
+    """Return whether a path is neither a file nor a folder: reading a pipe would never end."""
     try:
         mode = path.stat().st_mode
     except OSError:
@@ -31,32 +33,44 @@ def is_special(path: Path) -> bool:
 
 
 class DigestingStore(WrapperStore[Store]):
-    """A store beside which the digests of the keys that were written or read whole are kept.
+    """A storage that records the digest of every key that is written, or read completely.
 
-    A local one refuses keys whose folder is a link that leads out of it. ``instead`` has what is
-    read in place of keys that are damaged, until they are written; ``keeps`` is kept alive as long
-    as the store.
+    A local one refuses keys whose folder is a link that leads out of it.
+
+    Parameters
+    ----------
+    store
+        The storage itself.
+    keep_alive
+        An object that lives as long as this one, such as a folder that is held open.
+
+    Attributes
+    ----------
+    digests
+        Key -> CRC-32 of its content.
+    substitutes
+        Key -> content that is read in place of a damaged one, until the key is written.
     """
 
-    def __init__(self, store: Store, keeps: object = None) -> None:
+    def __init__(self, store: Store, keep_alive: object = None) -> None:
         super().__init__(store)
-        self._keeps = keeps
+        self._keep_alive = keep_alive
         self.digests: dict[str, int] = {}
-        self.instead: dict[str, Buffer] = {}
+        self.substitutes: dict[str, Buffer] = {}
         self._root = store.root if isinstance(store, LocalStore) else None
 
     def contents(self, keys: Sequence[str]) -> list[bytes | None]:
-        """Return what is stored under keys, None where nothing is; from any thread."""
+        """Return the contents of keys, None for missing ones; from any thread."""
         if self._root is None:
             return sync(self._contents(keys))
-        found: list[bytes | None] = []
+        contents: list[bytes | None] = []
         for key in keys:
             path = Path(self._root, key)
             try:
-                found.append(None if is_special(path) else path.read_bytes())
+                contents.append(None if is_special(path) else path.read_bytes())
             except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
-                found.append(None)
-        return found
+                contents.append(None)
+        return contents
 
     async def _contents(self, keys: Sequence[str]) -> list[bytes | None]:
         async def content(key: str) -> bytes | None:
@@ -67,20 +81,20 @@ class DigestingStore(WrapperStore[Store]):
 
     @property
     def below(self) -> Store:
-        """The store itself."""
+        """The storage itself."""
         return self._store
 
     def _with_store(self, store: Store) -> Self:
-        new = type(self)(store, self._keeps)
-        new.digests, new.instead = self.digests, self.instead
+        new = type(self)(store, self._keep_alive)
+        new.digests, new.substitutes = self.digests, self.substitutes
         return new
 
     async def get(
         self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
-        """Return what is under a key, and note its digest."""
-        if key in self.instead:
-            return self.instead[key]
+        """Return a key's content, and record its digest."""
+        if key in self.substitutes:
+            return self.substitutes[key]
         if self._root is not None and is_special(Path(self._root, key)):
             return None
         content = await super().get(key, prototype, byte_range)
@@ -89,30 +103,30 @@ class DigestingStore(WrapperStore[Store]):
         return content
 
     async def set(self, key: str, value: Buffer) -> None:
-        """Write under a key, and note its digest."""
-        self._see_that_it_is_inside(key)
+        """Write a key, and record its digest."""
+        self._check_inside(key)
         await super().set(key, value)
-        self.instead.pop(key, None)
+        self.substitutes.pop(key, None)
         self.digests[key] = _digest_of(value)
 
     async def set_if_not_exists(self, key: str, value: Buffer) -> None:
-        """Write under a key where nothing is there, and note the digest of what is."""
-        self._see_that_it_is_inside(key)
+        """Write a key unless it exists, and record the digest of its content."""
+        self._check_inside(key)
         await super().set_if_not_exists(key, value)
         await self.get(key, default_buffer_prototype())
 
     async def delete(self, key: str) -> None:
         """Delete a key."""
-        self._see_that_it_is_inside(key)
+        self._check_inside(key)
         await super().delete(key)
         self.digests.pop(key, None)
 
     async def delete_dir(self, prefix: str) -> None:
         """Delete a folder."""
-        self._see_that_it_is_inside(f"{prefix}/x")
+        self._check_inside(f"{prefix}/x")
         await super().delete_dir(prefix)
 
-    def _see_that_it_is_inside(self, key: str) -> None:
+    def _check_inside(self, key: str) -> None:
         if self._root is None:
             return
         root = os.path.realpath(self._root)

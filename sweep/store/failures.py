@@ -1,4 +1,4 @@
-"""Scenes that raised or ended their process: where they lie on the grid, and why."""
+"""Cells whose computation raised or whose process died: their coordinates, and the reason."""
 
 from __future__ import annotations
 
@@ -13,34 +13,35 @@ from sweep.plan.cell_selection import at_text
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
 from sweep.plan.parameters import Stage
-from sweep.store.lifecycle import RunStore
+from sweep.store.receipt import Receipt, RecordedFailure
+from sweep.store.run_store import RunStore
 
 if TYPE_CHECKING:
     import xarray as xr
 
 MAX_ROWS = 1000
-"""Rows of each kind (failed, crashed) that a store keeps; beyond, they are counted by flags."""
+"""Rows of each kind (failed, crashed) that a store keeps; the flags count all of them."""
 
 MAX_PER_BLOCK = 100
 
 MAX_CHARACTERS = 4000
-"""Of a traceback, of which the end is kept."""
+"""Characters that are kept of a traceback: its end."""
 
 
 @dataclass(frozen=True, slots=True)
 class FailedCell:
-    """One row of the table: a scene, or a treatment of it.
+    """One row of the table of failures: a scene, or a scene with a configuration.
 
     Attributes
     ----------
     at
         Its coordinates, as ``sweep repro --at`` takes them.
     kind
-        "failed" (it raised) or "crashed" (it ended its process).
+        "failed" (it raised) or "crashed" (its process died).
     stage
         "scene", "detection" or "estimation".
     text
-        The traceback, or how the process ended.
+        The traceback, or how the process died.
     """
 
     at: str
@@ -55,51 +56,52 @@ class FailedCell:
         return lines[-1] if lines else ""
 
 
-def recorded(failures: Sequence[Any], rows: Sequence[int], room: Mapping[str, int]) -> list[Any]:
-    """Return what a receipt keeps of a block's failures: at most ``room`` of each kind.
+def recorded(
+    failures: Sequence[Any], rows: Sequence[int], quota: Mapping[str, int]
+) -> tuple[RecordedFailure, ...]:
+    """Return the failures that a block's receipt keeps: at most ``quota`` of each kind.
 
-    ``rows`` gives the scene of the block for each scene that was computed.
+    ``rows`` gives the number within the block of each scene that was computed.
     """
-    kept: list[dict[str, Any]] = []
-    left = {kind: min(count, MAX_PER_BLOCK) for kind, count in room.items()}
+    kept: list[RecordedFailure] = []
+    left = {kind: min(count, MAX_PER_BLOCK) for kind, count in quota.items()}
     for failure in failures:
         kind = "crashed" if failure.crashed else "failed"
         if left[kind] <= 0:
             continue
         left[kind] -= 1
-        kept.append(
-            {
-                "scene": int(rows[failure.scene]), "kind": kind, "stage": failure.stage,
-                "setting": failure.setting, "estimator": failure.estimator,
-                "text": failure.text[-MAX_CHARACTERS:],
-            }
-        )
-    return kept
+        kept.append(RecordedFailure(
+            int(rows[failure.scene]), kind, failure.stage, failure.setting, failure.estimator,
+            failure.text[-MAX_CHARACTERS:],
+        ))
+    return tuple(kept)
 
 
-def failed_cells(store: RunStore, number: int, receipt: Mapping[str, Any]) -> Iterator[FailedCell]:
-    """Yield what a block's receipt tells of its failures."""
+def failed_cells(store: RunStore, number: int, receipt: Receipt) -> Iterator[FailedCell]:
+    """Yield the failures that a block's receipt holds."""
     block = store.blocks[number]
-    for failure in receipt["failures"]:
-        yield FailedCell(
-            at_text(_place(store.pipeline, block, failure)), failure["kind"], failure["stage"],
-            failure["text"],
-        )
+    for failure in receipt.failures:
+        coordinates = _coordinates(store.pipeline, block, failure)
+        yield FailedCell(at_text(coordinates), failure.kind, failure.stage, failure.text)
 
 
-def _place(pipeline: Pipeline, block: Block, failure: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the value along each axis that a failure's cell has."""
-    place = {
+def _coordinates(
+    pipeline: Pipeline, block: Block, failure: RecordedFailure
+) -> dict[str, Any]:
+    """Return the value of each axis, in the pipeline's order, that a failure's cell has."""
+    values = {
         axis.name: axis.values[index]
-        for axis, index in zip(scene_axes(pipeline), block.cell(failure["scene"]), strict=True)
+        for axis, index in zip(scene_axes(pipeline), block.cell(failure.scene), strict=True)
     }
-    for key, stage in (("setting", Stage.detection), ("estimator", Stage.estimation)):
-        if failure[key] is not None:
-            place |= _treatment(pipeline.axes_of(stage), failure[key])
-    return {axis.name: place[axis.name] for axis in pipeline.axes if axis.name in place}
+    for number, stage in (
+        (failure.setting, Stage.detection), (failure.estimator, Stage.estimation),
+    ):
+        if number is not None:
+            values |= _configuration(pipeline.axes_of(stage), number)
+    return {axis.name: values[axis.name] for axis in pipeline.axes if axis.name in values}
 
 
-def _treatment(axes: Sequence[Axis], number: int) -> dict[str, Any]:
+def _configuration(axes: Sequence[Axis], number: int) -> dict[str, Any]:
     if not axes:
         return {}
     index = np.unravel_index(number, [len(axis) for axis in axes])
@@ -107,7 +109,7 @@ def _treatment(axes: Sequence[Axis], number: int) -> dict[str, Any]:
 
 
 def failure_table(cells: Sequence[FailedCell], counts: Mapping[str, int]) -> xr.Dataset:
-    """Return the table of failures, and how many cells of each kind there are in all."""
+    """Return the table of failures, with the total number of cells of each kind."""
     import xarray as xr  # noqa: PLC0415  (slow to import)
 
     def column(name: str) -> tuple[tuple[str], Any]:

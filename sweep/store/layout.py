@@ -1,4 +1,4 @@
-"""What the store of a pipeline consists of: its arrays, and the values of its coordinates."""
+"""The layout of a store: its arrays, their metadata, and the values of its coordinates."""
 
 from __future__ import annotations
 
@@ -11,19 +11,35 @@ import numcodecs.zstd
 import numpy as np
 import zarr
 from numpy.typing import NDArray
+from zarr.buffer import cpu, default_buffer_prototype
 from zarr.codecs import Crc32cCodec, ZstdCodec
-from zarr.core.buffer import cpu, default_buffer_prototype
-from zarr.core.dtype import parse_dtype
-from zarr.core.sync import sync
+from zarr.dtype import parse_dtype
 from zarr.storage import MemoryStore
 
 from sweep.plan.axes import Axis
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import DISTANCE_PARAMETERS, Blocks, distance_of_side, scene_axes
-from sweep.plan.schema import LABELS, SCHEMA, Variable
+from sweep.plan.schema import LABELS, Variable, variables_of
+from sweep.store.zarr_sync import sync
+
+FORMAT = 3
+"""Version of the layout of the stores that are created."""
+
+FORMATS = range(2, FORMAT + 1)
+"""Versions that can be read and continued; 2 is that of sweep 0.5.
+
+A store keeps its format; it lacks the variables that a later format introduced.
+"""
 
 RECEIPTS = "commits/receipt"
-"""Array of the blocks' receipts by number, JSON, a chunk each; empty where not committed."""
+"""Array of the blocks' receipts by number, JSON, a chunk each; empty unless committed."""
+
+DECODING_ATTRIBUTES = {
+    "_ARRAY_DIMENSIONS", "_Encoding", "_FillValue", "_Unsigned", "add_offset", "bounds",
+    "calendar", "cell_measures", "coordinates", "dtype", "formula_terms", "grid_mapping",
+    "missing_value", "scale_factor", "valid_max", "valid_min", "valid_range",
+}
+"""Attributes by which xarray and other readers of CF data change the values that they return."""
 
 COORDINATE_CHUNK = 1 << 20
 
@@ -34,9 +50,13 @@ class PlannedArray:
 
     Attributes
     ----------
+    path
+        Its path in the store.
+    shape, chunks, dtype, dimensions, fill, attributes
+        Its metadata; ``fill`` is None for Zarr's default.
     values
-        Gives its values in [start, stop) along the first dimension; None where blocks or receipts
-        are written there later.
+        Returns its values in [start, stop) along the first dimension; None for an array to which
+        blocks or receipts are written later.
     """
 
     path: str
@@ -51,20 +71,20 @@ class PlannedArray:
     def create(self, group: zarr.Group) -> None:
         """Create the array and write its values."""
         array = self.create_empty(group)
-        for where, values in self.pieces():
-            array[where] = values
+        for part, values in self.pieces():
+            array[part] = values
 
     def create_empty(self, group: zarr.Group) -> zarr.Array[Any]:
         """Create the array without values."""
-        given = {} if self.fill is None else {"fill_value": self.fill}
+        options = {} if self.fill is None else {"fill_value": self.fill}
         return group.create_array(
             self.path, shape=self.shape, chunks=self.chunks, dtype=self.dtype,
             dimension_names=self.dimensions, compressors=_codecs(), attributes=self.attributes,
-            overwrite=True, **given,
+            overwrite=True, **options,
         )
 
     def pieces(self) -> Iterator[tuple[Any, NDArray[Any]]]:
-        """Yield its values, and where they go, chunk by chunk along the first dimension."""
+        """Yield an index and the values there, chunk by chunk along the first dimension."""
         if self.values is None:
             return
         if not self.shape:
@@ -75,7 +95,7 @@ class PlannedArray:
             yield slice(start, stop), self.values(start, stop)
 
     def value_keys(self) -> set[str]:
-        """Return the keys of its chunks, where its values are the pipeline's."""
+        """Return the keys of the chunks whose values follow from the pipeline."""
         if self.values is None:
             return set()
         if not self.shape:
@@ -85,9 +105,10 @@ class PlannedArray:
         return {f"{self.path}/c/{k}{rest}" for k in range(count)}
 
     def misfit(self, array: zarr.Array[Any]) -> str:
-        """Return in what an array that is there differs from this one; empty where in nothing.
+        """Return how a stored array differs from this one; empty if it does not.
 
-        Of its attributes only their names are looked at, and the units: some change what is read.
+        Of the attributes, only those are compared that change the values which readers return:
+        another version of sweep may write others, or word them otherwise.
         """
         metadata = array.metadata
         if metadata.zarr_format != 3:
@@ -102,7 +123,7 @@ class PlannedArray:
         }
         codecs = [codec.to_dict() for codec in metadata.codecs[1:]]
         keys = metadata.chunk_key_encoding.to_dict()
-        there = {
+        stored = {
             "shape": array.shape,
             "chunks": array.chunks if not array.shards else ("shards", array.shards),
             "dtype": array.dtype,
@@ -113,16 +134,16 @@ class PlannedArray:
             ),
         }
         for name, value in expected.items():
-            if there[name] != value:
-                return f"{name} {there[name]}, expected {value}"
+            if stored[name] != value:
+                return f"{name} {stored[name]}, expected {value}"
         serializer = metadata.codecs[0].to_dict()
         if serializer["name"] != ("vlen-utf8" if self.dtype == "string" else "bytes"):
             return f"serializer {serializer['name']}"
         if "big" in str(serializer.get("configuration")):
             return "serializer big-endian, expected little"
-        foreign = sorted(dict(array.attrs).keys() - self.attributes.keys())
-        if foreign:
-            return f"attribute {foreign[0]}, which no store of sweep has"
+        decoding = dict(array.attrs).keys() & DECODING_ATTRIBUTES
+        if foreign := sorted(decoding - self.attributes.keys()):
+            return f"attribute {foreign[0]}: not one of a sweep store"
         if array.attrs.get("units") != self.attributes.get("units"):
             return f"units {array.attrs.get('units')}, expected {self.attributes.get('units')}"
         if self.fill is not None and not _equal(metadata.fill_value, self.fill):
@@ -139,7 +160,7 @@ def _equal(a: Any, b: Any) -> bool:
 
 
 def _codecs() -> list[Any]:
-    """Return the codecs of every array: a damaged chunk fails its checksum when it is read."""
+    """Return the codecs of every array; a damaged chunk fails its checksum when it is read."""
     return [ZstdCodec(level=3), Crc32cCodec()]
 
 
@@ -149,26 +170,29 @@ def decoded_chunk(content: bytes, dtype: np.dtype[Any], shape: tuple[int, ...]) 
     Raises
     ------
     ValueError, RuntimeError
-        Where it fails its checksum, or is of another size.
+        If it fails its checksum, or is of another size.
     """
     body, checksum = content[:-4], content[-4:]
     if google_crc32c.value(body) != int.from_bytes(checksum, "little"):
         raise ValueError("checksum")
     values = np.empty(shape, dtype=dtype.newbyteorder("<"))
-    # Into memory of the right size, whatever the content says that it needs.
+    # Into memory of the right size, whatever size the content declares.
     if numcodecs.zstd.decompress(body, values.reshape(-1)).nbytes != values.nbytes:
         raise ValueError("size")
     return values
 
 
-def planned_arrays(pipeline: Pipeline, extents: tuple[int, ...]) -> list[PlannedArray]:
+def planned_arrays(
+    pipeline: Pipeline, extents: tuple[int, ...], store_format: int = FORMAT
+) -> list[PlannedArray]:
     """Return the arrays of a pipeline's store whose chunks are blocks of ``extents``."""
+    variables = variables_of(store_format)
     scene_extent = dict(zip((axis.name for axis in scene_axes(pipeline)), extents, strict=True))
     planned = [_axis(axis) for axis in pipeline.axes]
-    used = {name for variable in SCHEMA for name in variable.inner}
+    used = {name for variable in variables for name in variable.inner}
     planned += [_labels(name, LABELS[name], {}) for name in sorted(used)]
     planned += _distance(pipeline)
-    planned += [_variable(variable, pipeline, scene_extent) for variable in SCHEMA]
+    planned += [_variable(variable, pipeline, scene_extent) for variable in variables]
     lengths = tuple(len(axis) for axis in scene_axes(pipeline))
     planned.append(
         PlannedArray(RECEIPTS, (len(Blocks(lengths, extents)),), (1,), "string", ("block",))
@@ -210,7 +234,7 @@ def _labels(name: str, labels: Any, attributes: dict[str, Any]) -> PlannedArray:
 
 
 def _distance(pipeline: Pipeline) -> list[PlannedArray]:
-    """Return ``distance_m`` as a coordinate where it follows from ``side_px``."""
+    """Return ``distance_m`` as a coordinate if it follows from ``side_px``."""
     sides = pipeline.values_of("side_px")
     if not sides or sides[0] is None:
         return []
@@ -234,18 +258,18 @@ def _distance(pipeline: Pipeline) -> list[PlannedArray]:
 
 
 def documents(planned: Iterable[PlannedArray]) -> dict[str, cpu.Buffer]:
-    """Return the metadata documents of a store of these arrays by key, but for the root's."""
+    """Return the metadata documents of a store with these arrays by key, except the root's."""
     memory = MemoryStore()
     group = zarr.open_group(memory, mode="w", zarr_format=3)
     for array in planned:
         array.create_empty(group)
 
     async def gather() -> dict[str, cpu.Buffer]:
-        found = {}
+        contents = {}
         async for key in memory.list_prefix(""):
             content = await memory.get(key, default_buffer_prototype())
             if key.endswith("/zarr.json") and content is not None:
-                found[key] = cpu.Buffer.from_bytes(content.to_bytes())
-        return found
+                contents[key] = cpu.Buffer.from_bytes(content.to_bytes())
+        return contents
 
     return sync(gather())

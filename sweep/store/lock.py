@@ -1,4 +1,4 @@
-"""One writer a store: a lock that a dead client does not hold for ever."""
+"""The lock of a store: one writer at a time; a stale lock is ignored."""
 
 from __future__ import annotations
 
@@ -12,19 +12,21 @@ from collections.abc import Iterator
 from typing import Any
 
 from zarr.abc.store import Store
-from zarr.core.sync import sync
 
 from sweep.errors import StoreError
 from sweep.store.layout import RECEIPTS
-from sweep.store.lifecycle import RunStore, telling, tidy
+from sweep.store.lifecycle import tidy
+from sweep.store.locations import translate_errors
 from sweep.store.manifest import get, put
+from sweep.store.run_store import RunStore
+from sweep.store.zarr_sync import sync
 
 KEY = f"{RECEIPTS}/lock.json"
 BEAT_S = 5.0
-"""How often a writer says that it lives."""
+"""Seconds between two heartbeats of a writer."""
 
 SILENCE_S = 30.0
-"""After this long without a word a writer is taken for dead."""
+"""Seconds without a heartbeat after which a lock is stale."""
 
 
 @contextlib.contextmanager
@@ -34,26 +36,26 @@ def locked(store: RunStore) -> Iterator[None]:
     Raises
     ------
     StoreError
-        Where another living client holds it, or it cannot be written.
+        If another client holds it, or it cannot be written.
     """
-    place = store.place
-    refuse_if_held(store.url, place)
+    storage = store.storage
+    refuse_if_held(store.url, storage)
     mine = {"token": uuid.uuid4().hex, "host": socket.gethostname(), "pid": os.getpid()}
-    with telling(store.url, "written"):
-        put(place, KEY, {**mine, "beat": time.time()})
-        held = get(place, KEY)
+    with translate_errors(store.url, "written"):
+        put(storage, KEY, {**mine, "beat": time.time()})
+        held = get(storage, KEY)
     if held is None or held.get("token") != mine["token"]:
         raise StoreError(_held(store.url, held or {}))
     done = threading.Event()
 
     def beat() -> None:
         while not done.wait(BEAT_S):
-            # Whatever a disk or a server says now, the next beat may be heard.
+            # Whatever error a disk or a server reports now, the next beat may succeed.
             with contextlib.suppress(Exception):
-                now = get(place, KEY)
-                if now is not None and now.get("token") != mine["token"]:
+                current = get(storage, KEY)
+                if current is not None and current.get("token") != mine["token"]:
                     return  # taken over while this process slept
-                put(place, KEY, {**mine, "beat": time.time()})
+                put(storage, KEY, {**mine, "beat": time.time()})
 
     heart = threading.Thread(target=beat, daemon=True, name="store lock")
     heart.start()
@@ -64,23 +66,23 @@ def locked(store: RunStore) -> Iterator[None]:
         done.set()
         heart.join()
         with contextlib.suppress(Exception):
-            if (get(place, KEY) or {}).get("token") == mine["token"]:
-                sync(place.delete(KEY))
+            if (get(storage, KEY) or {}).get("token") == mine["token"]:
+                sync(storage.delete(KEY))
 
 
-def refuse_if_held(url: str, place: Store) -> None:
-    """Raise StoreError where a living client writes the store."""
-    held = holder(place)
+def refuse_if_held(url: str, storage: Store) -> None:
+    """Raise StoreError if a living client holds the store."""
+    held = holder(storage)
     if held is not None:
         raise StoreError(_held(url, held))
 
 
-def holder(place: Store) -> dict[str, Any] | None:
-    """Return who holds a store: host and pid; None where nobody living does."""
-    held = get(place, KEY)
+def holder(storage: Store) -> dict[str, Any] | None:
+    """Return the host and pid of the client that holds a store; None if the lock is stale."""
+    held = get(storage, KEY)
     if held is None:
         return None
-    # Either sign of death will do: a number is soon another process', and clocks differ.
+    # Either sign of death suffices: pids are reused, and clocks differ.
     if held.get("host") == socket.gethostname() and not _alive(held.get("pid")):
         return None
     beat = held.get("beat")
@@ -103,5 +105,5 @@ def _alive(pid: Any) -> bool:
 def _held(url: str, held: dict[str, Any]) -> str:
     return (
         f"{url}: process {held.get('pid')} on {held.get('host')} is writing it; "
-        "wait for it, or take another --store"
+        "wait for it, or choose another --store"
     )

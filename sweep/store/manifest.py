@@ -1,8 +1,8 @@
-"""The manifest: digests of a store's files that are no block's, and a copy of its attributes.
+"""The manifest: digests of the files outside the blocks, and a copy of the store's attributes.
 
-With the digests that receipts hold, every stored byte is accounted for, so that damage is found
-wherever it is; and what no block tells, such as the pipeline, is there twice. The manifest itself
-is written twice and carries its own digest.
+Together with the digests in the receipts, it covers every stored byte, so that damage is found
+wherever it occurs; and the attributes, which no block could restore, are stored twice. The
+manifest itself is written twice and carries its own digest.
 """
 
 from __future__ import annotations
@@ -11,20 +11,21 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
+from zarr.abc.buffer import Buffer
 from zarr.abc.store import Store
-from zarr.core.buffer import Buffer, cpu, default_buffer_prototype
-from zarr.core.sync import sync
+from zarr.buffer import cpu, default_buffer_prototype
 
 from sweep.store.checksums import digest
 from sweep.store.layout import RECEIPTS
+from sweep.store.zarr_sync import sync
 
 KEYS = (f"{RECEIPTS}/manifest.json", f"{RECEIPTS}/manifest-copy.json")
-"""Where the manifest lies: in the receipts' folder, where Zarr looks for chunks alone."""
+"""Keys of the manifest and its copy: in the receipts' folder, where Zarr expects only chunks."""
 
 
 @dataclass(slots=True)
 class Manifest:
-    """What is recorded of a store: its attributes, and the digests of its files by key."""
+    """A store's attributes, and the digests of its files by key."""
 
     attributes: dict[str, Any]
     files: dict[str, int]
@@ -41,12 +42,12 @@ def encoded(content: dict[str, Any]) -> bytes:
 
 
 def get(store: Store, key: str) -> dict[str, Any] | None:
-    """Read a small JSON document; None where it is not there or is torn."""
+    """Return a small JSON document's content; None if it is missing or torn."""
     return parsed(sync(store.get(key, default_buffer_prototype())))
 
 
 def parsed(buffer: Buffer | None) -> dict[str, Any] | None:
-    """Return a JSON document's content; None where there is none or it is torn."""
+    """Return a JSON document's content; None if it is missing or torn."""
     if buffer is None:
         return None
     try:
@@ -64,14 +65,14 @@ def write_manifest(store: Store, manifest: Manifest) -> None:
 
 
 def read_manifest(store: Store) -> tuple[Manifest | None, list[str]]:
-    """Return a store's manifest, None where neither copy is sound, and the unsound copies' keys."""
-    found: list[Manifest] = []
+    """Return a store's manifest, or None if neither copy is sound, and the unsound copies' keys."""
+    copies: list[Manifest] = []
     unsound = []
     for key in KEYS:
         buffer = sync(store.get(key, default_buffer_prototype()))
         content = parsed(buffer)
         try:
-            # To the letter: another spelling of the same is damage too.
+            # To the letter: another spelling of the same content is damage, too.
             if buffer is None or content is None or encoded(content) != buffer.to_bytes():
                 raise ValueError(key)
             if content.pop("digest") != digest(encoded(content)):
@@ -79,10 +80,10 @@ def read_manifest(store: Store) -> tuple[Manifest | None, list[str]]:
             files = {key: int(value) for key, value in content["files"].items()}
             if any("\0" in key or ".." in key or key.startswith("/") for key in files):
                 raise ValueError("a key outside the store")
-            found.append(Manifest(dict(content["attributes"]), files))
+            copies.append(Manifest(dict(content["attributes"]), files))
         except (AttributeError, KeyError, TypeError, ValueError):
             unsound.append(key)
-    if len(found) == 2 and found[0] != found[1]:
-        # A kill came between the two: the first is the later.
+    if len(copies) == 2 and copies[0] != copies[1]:
+        # A kill came between the two writes: the first copy is the newer.
         unsound.append(KEYS[1])
-    return (found[0] if found else None), unsound
+    return (copies[0] if copies else None), unsound

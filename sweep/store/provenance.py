@@ -1,4 +1,4 @@
-"""What the numbers depend on beside the pipeline: versions, seed, and files."""
+"""The provenance of numbers beside the pipeline: versions, seed, files, and the environment."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sweep.plan.experiment import Pipeline
 from sweep.version import __version__
 
 NUMBERS_VERSION = 3
-"""Raised whenever the numbers change; a test with golden digests fails when one forgets."""
+"""Raised whenever the numbers change; a test with golden digests fails if it is not."""
 
 
 def versions() -> dict[str, str]:
@@ -23,7 +23,7 @@ def versions() -> dict[str, str]:
 
 
 def fingerprint(pipeline: Pipeline) -> dict[str, Any]:
-    """Return what two stores must share for a cell of one to stand for that of the other."""
+    """Return the values that two stores must share for one to reuse cells of the other."""
     return {
         "numbers": NUMBERS_VERSION,
         **versions(),
@@ -33,7 +33,7 @@ def fingerprint(pipeline: Pipeline) -> dict[str, Any]:
 
 
 def environment() -> dict[str, str]:
-    """Return what is recorded beside the fingerprint: sweep's version, Python, the CPU."""
+    """Return what is recorded beside the fingerprint: versions of sweep and Python, the CPU."""
     return {
         "sweep": __version__,
         "python": platform.python_version(),

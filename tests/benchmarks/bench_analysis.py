@@ -19,7 +19,8 @@ import numpy as np
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.experiment import Pipeline
 from sweep.plan.schema import SCHEMA
-from sweep.store.lifecycle import create_store, region
+from sweep.store.blocks import region
+from sweep.store.lifecycle import create_store
 
 GRID = """
 seed = 1

@@ -23,7 +23,8 @@ from sweep.execution.block_task import compute_block
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
 from sweep.plan.parameters import Stage
-from sweep.store.lifecycle import committed, create_store, open_store, receipts
+from sweep.store.blocks import committed, receipts
+from sweep.store.lifecycle import create_store, open_store
 
 SEED = 20_261
 
@@ -91,7 +92,7 @@ def whole(url, pipeline, reference):
     assert committed(store) == set(range(count))
     told = list(receipts(store, range(count)))
     assert [number for number, _ in told] == list(range(count))
-    assert sum(receipt["scenes"] for _, receipt in told) == pipeline.size(Stage.scene)
+    assert sum(receipt.scenes for _, receipt in told) == pipeline.size(Stage.scene)
     assert same(url, reference)
     with xr.open_zarr(url) as opened:  # a warning where its metadata is not in one place
         assert opened.sizes

@@ -25,7 +25,8 @@ from sweep.evaluation.cells import run_block
 from sweep.execution.cluster import external
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
-from sweep.store.lifecycle import committed, open_store
+from sweep.store.blocks import committed
+from sweep.store.lifecycle import open_store
 
 TIMEOUT_S = 240.0
 

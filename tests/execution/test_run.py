@@ -25,7 +25,8 @@ from sweep.execution.runner import execute
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, Blocks, scene_axes
 from sweep.plan.schema import SCHEMA
-from sweep.store.lifecycle import committed, create_store, open_store, remove_store
+from sweep.store.blocks import committed
+from sweep.store.lifecycle import create_store, open_store, remove_store
 from sweep.store.lock import KEY, locked
 from sweep.store.manifest import get, put
 
@@ -184,7 +185,7 @@ def test_grown_grid_reuses_what_there_is_bit_for_bit(settings, undisturbed, tmp_
     by_hand(fresh, grown, extents)
     store = create_store(reusing, grown, extents)
     computed = [
-        compute_block(reusing, store.run_id, block, (undisturbed,))["computed"]
+        compute_block(reusing, store.run_id, block, (undisturbed,)).computed
         for block in store.blocks
     ]
     assert same(fresh, reusing)
@@ -217,7 +218,7 @@ def test_bound_is_reused_with_its_flag(tmp_path):
     grown = Pipeline.from_text(text % 4)
     by_hand(fresh, grown, (4,))
     store = create_store(new, grown, (2,))
-    computed = [compute_block(new, store.run_id, block, (old,))["computed"]["scenes"]
+    computed = [compute_block(new, store.run_id, block, (old,)).computed["scenes"]
                 for block in store.blocks]
     assert computed == [0, 2]
     assert (sweep.open(fresh).bound == 1).all()
@@ -265,7 +266,7 @@ def test_places_that_hold_something_else_are_left_unharmed(pipeline, tmp_path):
     zarr.open_group(str(foreign), mode="w").create_array("x", shape=(2,), dtype="f8")
     for place in (file, folder, foreign):
         for overwrite in (False, True):
-            with pytest.raises(StoreError, match="holds something else"):
+            with pytest.raises(StoreError, match="not a sweep store"):
                 execute(pipeline, place, overwrite=overwrite)
     assert file.read_text() == (folder / "letter.txt").read_text() == "mine"
     assert "x" in zarr.open_group(str(foreign), mode="r")
@@ -285,15 +286,15 @@ def test_store_in_use_is_refused_and_a_dead_lock_is_not(pipeline, tmp_path):
     url = str(tmp_path / "held.zarr")
     store = create_store(url, pipeline, (2, 4, 2, 3))
     here = {"token": "x", "host": socket.gethostname(), "beat": time.time()}
-    put(store.place, KEY, {**here, "pid": os.getpid()})
+    put(store.storage, KEY, {**here, "pid": os.getpid()})
     with pytest.raises(StoreError, match=f"process {os.getpid()} on .* is writing it"):
         execute(pipeline, url)
-    put(store.place, KEY, {**here, "host": "elsewhere", "pid": 1})
+    put(store.storage, KEY, {**here, "host": "elsewhere", "pid": 1})
     with pytest.raises(StoreError, match="process 1 on elsewhere is writing it"):
         execute(pipeline, url)
     with subprocess.Popen([sys.executable, "-c", ""]) as ended:
         pass
-    put(store.place, KEY, {**here, "pid": ended.pid})
+    put(store.storage, KEY, {**here, "pid": ended.pid})
     assert execute(pipeline, url, workers=1).computed_blocks == 1
     assert not (Path(url) / KEY).exists()
 
@@ -302,8 +303,8 @@ def test_lock_that_was_taken_over_is_left_to_its_holder(pipeline, tmp_path):
     store = create_store(str(tmp_path / "taken.zarr"), pipeline, (2, 4, 2, 3))
     theirs = {"token": "x", "host": socket.gethostname(), "pid": os.getpid(), "beat": time.time()}
     with locked(store):
-        put(store.place, KEY, theirs)
-    assert get(store.place, KEY) == theirs
+        put(store.storage, KEY, theirs)
+    assert get(store.storage, KEY) == theirs
 
 
 def test_silent_scheduler_is_given_up(pipeline, tmp_path, monkeypatch):
@@ -423,7 +424,7 @@ def test_workers_with_other_versions_are_refused(pipeline, tmp_path, monkeypatch
 def test_workers_refuse_a_store_that_was_begun_with_other_versions(pipeline, tmp_path):
     url = str(tmp_path / "begun.zarr")
     store = create_store(url, pipeline, (2, 4, 2, 3))
-    about = store.about
+    about = store.run_metadata
     about["fingerprint"]["numba"] = "0.1"
     store.group.attrs["sweep"] = about
     with pytest.raises(StoreError, match=r"a worker has numba .*, the store was begun with 0\.1"):
@@ -479,7 +480,7 @@ def test_cells_of_a_grid_without_scene_axes_are_reused(tmp_path):
     grown = Pipeline.from_text(REUSED_WITHOUT_SCENE_AXES % '"p3p", "ippe"')
     store = create_store(new, grown, ())
     receipt = compute_block(new, store.run_id, next(iter(store.blocks)), (old,))
-    assert receipt["computed"]["estimates"] == 1
+    assert receipt.computed["estimates"] == 1
 
 
 @pytest.mark.parametrize(

@@ -674,8 +674,8 @@ def test_chunks_that_claim_gigabytes_take_no_memory(sound, tmp_path):
         (url / key).write_bytes(content)
         reseal(url)
         if key.startswith("translation"):
-            edit_receipt(url, 0, lambda receipt: receipt["digests"].__setitem__(
-                10, crc32(content)
+            edit_receipt(url, 0, lambda receipt: receipt["digests"].update(
+                translation_error_m=crc32(content)
             ))
         urls.append(url)
     ran = subprocess.run(

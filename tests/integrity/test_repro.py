@@ -19,8 +19,9 @@ from sweep.evaluation.cells import Failure
 from sweep.execution.block_task import compute_block
 from sweep.execution.finalize import close
 from sweep.plan.experiment import Pipeline
+from sweep.store.blocks import begin_block
 from sweep.store.failures import MAX_CHARACTERS, recorded
-from sweep.store.lifecycle import begin_block, create_store, open_store
+from sweep.store.lifecycle import create_store, open_store
 
 TEXT = """
 title = "Scenes to be seen again"
@@ -280,12 +281,12 @@ def test_receipts_keep_a_bounded_number_of_rows_and_the_end_of_a_long_traceback(
     failures = [Failure(k, "scene", text, crashed=bool(k % 2)) for k in range(1000)]
     rows = list(range(5000, 6000))
     kept = recorded(failures, rows, {"failed": 1000, "crashed": 7})
-    assert len([one for one in kept if one["kind"] == "crashed"]) == 7
-    failed = [one for one in kept if one["kind"] == "failed"]
+    assert len([one for one in kept if one.kind == "crashed"]) == 7
+    failed = [one for one in kept if one.kind == "failed"]
     assert 0 < len(failed) <= 100
-    assert [one["scene"] for one in failed] == list(range(5000, 5000 + 2 * len(failed), 2))
-    assert all(one["text"].endswith("last") and len(one["text"]) <= 4000 for one in kept)
-    assert recorded(failures, rows, {"failed": 0, "crashed": 0}) == []
+    assert [one.scene for one in failed] == list(range(5000, 5000 + 2 * len(failed), 2))
+    assert all(one.text.endswith("last") and len(one.text) <= 4000 for one in kept)
+    assert recorded(failures, rows, {"failed": 0, "crashed": 0}) == ()
 
 
 def test_no_more_than_a_thousand_rows_of_each_kind_are_kept():

@@ -16,7 +16,7 @@ import zarr
 
 from support.lengths import lengths
 from support.poison import Poison, poisoned
-from support.store_files import COPY, MANIFEST, edit_receipt, files, reseal, see_same
+from support.store_files import COPY, MANIFEST, edit_receipt, editable, files, reseal, see_same
 from support.stores import by_hand
 from sweep.cli import main
 from sweep.errors import StoreError
@@ -26,7 +26,8 @@ from sweep.integrity.repair import repair
 from sweep.integrity.verification import verify
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
-from sweep.store.lifecycle import begin_block, create_store, open_store
+from sweep.store.blocks import begin_block
+from sweep.store.lifecycle import create_store, open_store
 
 TEXT = """
 title = "Größen, klein"
@@ -221,20 +222,13 @@ def see_repaired(url, sound, wanted, here):
 
 def edit_values(url, name, change, *, digests_too=False):
     """Change a variable's values through Zarr; with ``digests_too`` the receipts tell of them."""
-    array = zarr.open_array(f"{url}/{name}", mode="r+", zarr_format=3)
+    array = editable(url, name)
     array[...] = change(np.asarray(array[...]))
     if not digests_too:
         return
-    order = [
-        "true_rvec", "true_tvec_m", "marker_area_px", "bound", "bound_std", "bound_kappa",
-        "mirror_distance", "detection", "corner_error_px", "estimate", "translation_error_m",
-        "rotation_error_rad", "rotation_error_deg", "normal_error_deg", "reprojection_error_px",
-        "alternative_rotation_error_deg", "alternative_reprojection_error_px", "predicted_std",
-        "nees", "residual_variance_ratio", "flipped",
-    ]
 
     def told(content):
-        content["digests"][order.index(name)] = crc32((Path(url) / key).read_bytes())
+        content["digests"][name] = crc32((Path(url) / key).read_bytes())
 
     for key in files(url):
         if key.startswith(f"{name}/c/"):

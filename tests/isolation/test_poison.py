@@ -18,7 +18,8 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import SCHEMA
-from sweep.store.lifecycle import committed, create_store, open_store
+from sweep.store.blocks import committed
+from sweep.store.lifecycle import create_store, open_store
 
 TEXT = """
 title = "Scenes of which some are poisoned"

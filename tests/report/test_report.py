@@ -60,7 +60,7 @@ ODD = {
 
 def opened(url, trade=None):
     store = open_store(url)
-    return Subject(url, open_dataset(url), store.pipeline, store.about, trade)
+    return Subject(url, open_dataset(url), store.pipeline, store.run_metadata, trade)
 
 
 @pytest.fixture(scope="module")
@@ -506,8 +506,8 @@ def test_what_cannot_be_reported_is_told_in_one_line(full, tmp_path):
     folder.mkdir()
     file.write_text("mine")
     wanted = {
-        (tmp_path / "none.zarr",): "there is no store",
-        (folder,): "holds something else than a store",
+        (tmp_path / "none.zarr",): "store not found",
+        (folder,): "not a sweep store",
         (unfinished,): f"{unfinished}: unfinished: 1 of 4 blocks; `sweep run` continues it",
         (full, "-o", folder): "it is a folder",
         (full, "-o", tmp_path / "missing" / "report.html"): "there is no folder",
@@ -562,7 +562,7 @@ def test_poses_that_are_missing_are_told(tmp_path):
     url = made(tmp_path, ODD["no draws"], "lost")
     output = tmp_path / "report.html"
     chunks_of(url, "detection")[0].unlink()
-    again = "`sweep verify --repair` mends it\n"
+    again = "`sweep verify --repair` repairs it\n"
     assert command("report", url, "-o", output)[::2] == (
         2, f"{url}: 1 pose is missing; {again}")
     chunks_of(url, "estimate")[-1].unlink()

@@ -7,7 +7,7 @@ from zlib import crc32
 import numpy as np
 import zarr
 
-from sweep.store.lifecycle import place_of
+from sweep.store.locations import open_storage
 from sweep.store.manifest import Manifest, write_manifest
 
 MANIFEST, COPY = "commits/receipt/manifest.json", "commits/receipt/manifest-copy.json"
@@ -48,12 +48,18 @@ def reseal(url):
     recorded = json.loads((url / MANIFEST).read_text())["files"]
     attributes = json.loads((url / "zarr.json").read_text())["attributes"]
     there = {key: crc32((url / key).read_bytes()) for key in recorded if (url / key).exists()}
-    write_manifest(place_of(str(url), "r+"), Manifest(attributes, there))
+    write_manifest(open_storage(str(url), "r+"), Manifest(attributes, there))
+
+
+def editable(url, name):
+    """Return an array of a store that writes every chunk, as sweep does, also of fill values."""
+    array = zarr.open_array(f"{url}/{name}", mode="r+", zarr_format=3)
+    return array.with_config({"write_empty_chunks": True})
 
 
 def edit_receipt(url, number, change):
     """Change a receipt's content; its checksums are right afterwards."""
-    array = zarr.open_array(f"{url}/commits/receipt", mode="r+", zarr_format=3)
+    array = editable(url, "commits/receipt")
     content = json.loads(str(np.asarray(array[number])))
     changed = change(content)
     text = changed if isinstance(changed, str) else json.dumps(changed or content)

@@ -359,10 +359,10 @@ def test_what_is_no_finished_store_is_told_in_one_line(renderer_store, tmp_path)
     (tmp_path / "text.zarr").write_text("hello")
     (tmp_path / "empty").mkdir()
     for place, message in (
-        ("missing.zarr", "there is no store; `sweep run` makes one"),
+        ("missing.zarr", "store not found; create one with `sweep run`"),
         ("missing.toml", "cannot be read: No such file or directory"),
-        ("text.zarr", "holds something else than a store of sweep; name another place"),
-        ("empty", "holds something else than a store of sweep; name another place"),
+        ("text.zarr", "not a sweep store; choose another path"),
+        ("empty", "not a sweep store; choose another path"),
         ("unfinished.zarr", "unfinished; `sweep run` continues it"),
     ):
         assert command(tmp_path / place) == (2, "", f"{tmp_path / place}: {message}\n")

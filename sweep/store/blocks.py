@@ -1,0 +1,186 @@
+"""Blocks of a store: begun, written, committed by their receipts, and dropped.
+
+A block's values are written first and its receipt last, so that a block is either complete or
+absent. The receipts are the checkpoint; that a chunk exists says nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import time
+from collections.abc import AsyncIterator, Iterable, Mapping
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from zarr.buffer import default_buffer_prototype
+from zarr.storage import LocalStore
+
+from sweep.errors import StoreError, StoreReplacedError
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import Block, scene_axes
+from sweep.plan.parameters import Stage
+from sweep.plan.schema import Variable
+from sweep.store.layout import RECEIPTS
+from sweep.store.locations import is_remote, open_group, remote_run_id, translate_errors
+from sweep.store.manifest import put
+from sweep.store.receipt import Receipt
+from sweep.store.run_store import RunStore
+from sweep.store.zarr_sync import sync
+
+BEGUN = f"{RECEIPTS}/begun"
+"""Folder of a mark for each block that was begun and is not committed."""
+
+RECEIPTS_AT_ONCE = 1000
+"""Receipts that are read and held at a time."""
+
+
+def region(variable: Variable, pipeline: Pipeline, block: Block) -> tuple[slice, ...]:
+    """Return a block's part of a variable's array."""
+    slices = {
+        axis.name: slice(start, stop)
+        for axis, start, stop in zip(
+            scene_axes(pipeline), block.starts, block.stops, strict=True
+        )
+    }
+    return tuple(slices.get(name, slice(None)) for name in variable.dimensions(pipeline))
+
+
+def chunk_key(store: RunStore, variable: Variable, block: Block) -> str:
+    """Return the key of a variable's one chunk that holds a block."""
+    array = store.array(variable.name)
+    position = tuple(
+        (part.start or 0) // extent
+        for part, extent in zip(
+            region(variable, store.pipeline, block), array.chunks, strict=True
+        )
+    )
+    return f"{variable.name}/{array.metadata.encode_chunk_key(position)}"
+
+
+def receipt_key(number: int) -> str:
+    """Return the key of a block's receipt."""
+    return f"{RECEIPTS}/c/{number}"
+
+
+def begin_block(store: RunStore, block: Block) -> bool:
+    """Mark a block as begun; return whether it had been begun before."""
+    with translate_errors(store.url, "written"):
+        _check_not_replaced(store)
+        key = f"{BEGUN}/{store.blocks.number(block)}"
+        if sync(store.storage.exists(key)):
+            return True
+        put(store.storage, key, {"pid": os.getpid(), "at": time.time()})
+    return False
+
+
+def write_block(
+    store: RunStore, block: Block, values: Mapping[str, NDArray[Any]], receipt: Receipt
+) -> None:
+    """Write a block's values, then commit them by its receipt, to which the digests are added."""
+    number = store.blocks.number(block)
+    with translate_errors(store.url, "written"):
+        _check_not_replaced(store)
+        if sync(store.storage.exists(receipt_key(number))):
+            return  # another worker was given it too, perhaps of another processor
+        for variable in store.variables:
+            array = store.array(variable.name)
+            array[region(variable, store.pipeline, block)] = values[variable.name]
+        _check_not_replaced(store)
+        digests = {
+            variable.name: _take_digest(store, chunk_key(store, variable, block))
+            for variable in store.variables
+        }
+        text = dataclasses.replace(receipt, digests=digests).to_json(store.format)
+        store.array(RECEIPTS)[number : number + 1] = np.array([text], dtype=object)
+        store.storage.digests.pop(receipt_key(number), None)
+        with contextlib.suppress(FileNotFoundError):
+            sync(store.storage.delete(f"{BEGUN}/{number}"))
+
+
+def _take_digest(store: RunStore, key: str) -> int:
+    """Return the digest of the content that was written under a key, and forget it."""
+    if key not in store.storage.digests:
+        # The same block was written twice at once in this process.
+        sync(store.storage.get(key, default_buffer_prototype()))
+    return store.storage.digests.pop(key)
+
+
+def drop_block(store: RunStore, block: Block) -> None:
+    """Delete a block's receipt and its chunks, so that it is computed again."""
+    keys = [receipt_key(store.blocks.number(block))]
+    keys += [chunk_key(store, variable, block) for variable in store.variables]
+    with translate_errors(store.url, "written"):
+        for key in keys:
+            with contextlib.suppress(FileNotFoundError):
+                sync(store.storage.delete(key))
+
+
+def _check_not_replaced(store: RunStore) -> None:
+    """Raise StoreReplacedError if another run has replaced the store since it was opened."""
+    current: str | None
+    if is_remote(store.url):
+        current = remote_run_id(store.url)
+    else:
+        try:
+            group = open_group(LocalStore(store.url, read_only=True), "r")
+            current = cast("dict[str, Any]", group.attrs["sweep"])["run_id"]
+        except (KeyError, FileNotFoundError):
+            current = None
+    if current != store.run_id:
+        raise StoreReplacedError(
+            f"{store.url}: moved, or replaced by another run, while this run was in progress"
+        )
+
+
+def committed(store: RunStore) -> set[int]:
+    """Return the numbers of the blocks that are committed."""
+    async def gather(keys: AsyncIterator[str]) -> set[int]:
+        return {int(key) async for key in keys if key.isascii() and key.isdecimal()}
+
+    count = len(store.blocks)
+    try:
+        listed = sync(gather(store.storage.list_dir(f"{RECEIPTS}/c")))
+    except FileNotFoundError:
+        return set()
+    return {number for number in listed if number < count}
+
+
+def receipts(store: RunStore, numbers: Iterable[int]) -> Iterable[tuple[int, Receipt]]:
+    """Yield the receipts of committed blocks, in the order of their numbers.
+
+    Raises
+    ------
+    StoreError
+        If one is damaged.
+    """
+    ordered = sorted(numbers)
+    for start in range(0, len(ordered), RECEIPTS_AT_ONCE):
+        some = ordered[start : start + RECEIPTS_AT_ONCE]
+        try:
+            texts = np.asarray(store.array(RECEIPTS).oindex[np.array(some)]).tolist()
+            contents = [
+                parsed_receipt(store, number, text)
+                for number, text in zip(some, texts, strict=True)
+            ]
+        except (ValueError, AttributeError, KeyError, TypeError, OSError) as error:
+            raise StoreError(
+                f"{store.url}: damaged receipts among blocks {some[0]} to {some[-1]} ({error}); "
+                "`sweep verify --repair` repairs it"
+            ) from None
+        yield from zip(some, contents, strict=True)
+
+
+def parsed_receipt(store: RunStore, number: int, text: str) -> Receipt:
+    """Return a block's receipt from its text; ValueError if it is not one of this run's."""
+    receipt = Receipt.from_json(text)
+    if receipt.run_id != store.run_id:
+        raise ValueError("of another run")
+    settings = store.pipeline.size(Stage.detection)
+    estimates = settings * store.pipeline.size(Stage.estimation)
+    receipt.check(len(store.blocks[number]), settings, estimates)
+    if receipt.digests.keys() != {variable.name for variable in store.variables}:
+        raise ValueError("digests of other variables than the store's")
+    return receipt

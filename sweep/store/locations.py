@@ -1,0 +1,185 @@
+"""Where stores lie: their URLs, the folder that a run holds, and a remote store's pointer.
+
+No path is written by two runs. On this machine, a run holds its store by the folder that it
+opened, wherever that is moved; a remote store's data lie under the run's id, to which the store's
+URL points.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import tempfile
+import uuid
+import weakref
+from collections.abc import Iterator
+from pathlib import Path
+
+import zarr
+import zarr.errors
+from zarr.abc.store import Store
+from zarr.storage import FsspecStore, LocalStore
+
+from sweep.errors import StoreError
+from sweep.store.checksums import DigestingStore
+from sweep.store.manifest import put
+from sweep.store.zarr_sync import sync
+
+POINTER = "sweep_run"
+"""Attribute at a remote store's URL: the id of the run whose data are the store's."""
+
+
+def is_remote(url: str) -> bool:
+    """Return whether a store is not a local path."""
+    return "://" in url
+
+
+def not_a_store(url: str) -> str:
+    """Return the message for something that ``sweep run`` did not create."""
+    return f"{url}: not a sweep store; choose another path"
+
+
+@contextlib.contextmanager
+def translate_errors(url: str, action: str) -> Iterator[None]:
+    """Turn errors of a disk or a server into a StoreError: ``url: cannot be <action>: reason``."""
+    try:
+        yield
+    except (StoreError, zarr.errors.BaseZarrError):
+        raise
+    except FileNotFoundError as error:
+        raise StoreError(f"{url}: cannot be {action}: {error.strerror or error}") from None
+    except OSError as error:
+        raise StoreError(f"{url}: cannot be {action}: {reason_of(error)}") from None
+    except Exception as error:
+        # The libraries of remote stores raise errors of many kinds that are no OSError.
+        if not is_remote(url) or not _is_foreign(error):
+            raise
+        raise StoreError(f"{url}: cannot be {action}: {reason_of(error)}") from None
+
+
+def _is_foreign(error: Exception) -> bool:
+    return type(error).__module__.partition(".")[0] not in ("sweep", "zarr", "builtins", "numpy")
+
+
+def reason_of(error: BaseException) -> str:
+    """Return an error's reason in one short line."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def checked_url(url: str) -> str:
+    """Return a store's URL; StoreError if it holds what must not be recorded or printed."""
+    if is_remote(url):
+        scheme, _, rest = url.partition("://")
+        if any(sign in rest for sign in ("@", "?", "#", "://", "::")):
+            raise StoreError(
+                f"{scheme}://...: a store's URL is printed and recorded: expected no credentials "
+                "or options in it; pass them in the environment (AWS_ACCESS_KEY_ID, ...)"
+            )
+        return url.rstrip("/")
+    return url
+
+
+def storage_at(url: str, *, read_only: bool) -> Store:
+    """Return the Zarr storage at a URL, whatever lies there."""
+    if not is_remote(url):
+        return LocalStore(url, read_only=read_only)
+    try:
+        # Without a cache of listings: others write the store at the same time.
+        return FsspecStore.from_url(
+            url, storage_options={"use_listings_cache": False}, read_only=read_only
+        )
+    except ImportError as error:
+        raise StoreError(f"{url}: {error}") from None
+    except ValueError as error:
+        raise StoreError(f"{url}: cannot be reached: {reason_of(error)}") from None
+
+
+def open_group(storage: Store, mode: str) -> zarr.Group:
+    """Open the root group of a storage."""
+    return zarr.open_group(
+        storage, mode=mode, zarr_format=3, use_consolidated=False  # type: ignore[arg-type]
+    )
+
+
+def remote_run_id(url: str) -> str | None:
+    """Return the id of the run that a remote store's URL points to; None if there is no store."""
+    with translate_errors(url, "reached"):
+        try:
+            pointer = open_group(storage_at(url, read_only=True), "r")
+        except (FileNotFoundError, zarr.errors.GroupNotFoundError):
+            return None
+    run_id = pointer.attrs.get(POINTER)
+    if not isinstance(run_id, str) or not is_run_id(run_id):
+        raise StoreError(not_a_store(url))
+    return run_id
+
+
+def is_run_id(text: str) -> bool:
+    """Return whether a text has the form of a run's id."""
+    return re.fullmatch("[0-9a-f]{32}", text) is not None
+
+
+def exists(url: str) -> bool:
+    """Return whether anything lies at a store's URL."""
+    if not is_remote(checked_url(url)):
+        return Path(url).exists() or Path(url).is_symlink()
+    return remote_run_id(url) is not None
+
+
+def open_storage(url: str, mode: str = "r") -> DigestingStore:
+    """Return the storage that holds a store's files.
+
+    With ``mode`` "r+" a local store is held by its folder: writes go to that folder even if
+    another store has since taken its path.
+
+    Raises
+    ------
+    StoreError
+        If there is no store.
+    """
+    url = checked_url(url)
+    if not exists(url):
+        raise StoreError(f"{url}: store not found; create one with `sweep run`")
+    if is_remote(url):
+        return DigestingStore(storage_at(f"{url}/{remote_run_id(url)}", read_only=mode == "r"))
+    if mode == "r" or not Path("/proc/self/fd").is_dir():
+        return DigestingStore(LocalStore(url, read_only=mode == "r"))
+    try:
+        folder = _HeldFolder(url)
+    except NotADirectoryError:
+        raise StoreError(not_a_store(url)) from None
+    except OSError as error:
+        raise StoreError(f"{url}: cannot be read: {error.strerror}") from None
+    return DigestingStore(LocalStore(f"/proc/self/fd/{folder.descriptor}"), folder)
+
+
+class _HeldFolder:
+    """A folder that is held open as long as this object lives."""
+
+    def __init__(self, path: str) -> None:
+        self.descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+        weakref.finalize(self, os.close, self.descriptor)
+
+
+def check_writable(url: str) -> None:
+    """Check that a store can be created at a URL, before any work is done for it.
+
+    Raises
+    ------
+    StoreError
+        If nothing can be written there.
+    """
+    if is_remote(checked_url(url)):
+        trial = f".sweep-{uuid.uuid4().hex}"
+        with translate_errors(url, "written"):
+            storage = storage_at(url, read_only=False)
+            put(storage, trial, {})
+            sync(storage.delete(trial))
+        return
+    with translate_errors(url, "written"):
+        Path(url).parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=Path(url).parent, prefix=".sweep-"):
+            pass

@@ -1,0 +1,57 @@
+"""Whether a store's arrays are those that its pipeline and its format ask for."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import zarr
+
+from sweep.store.layout import RECEIPTS, PlannedArray, planned_arrays
+from sweep.store.locations import reason_of
+from sweep.store.run_store import RunStore, list_folder
+from sweep.store.zarr_sync import sync
+
+GROUPS = ("commits", "cost", "failures")
+"""The groups of a store."""
+
+
+def schema_faults(store: RunStore) -> dict[str, str]:
+    """Return the faults of a store's arrays by name: missing, unknown, or of another schema."""
+    planned = {
+        array.path: array
+        for array in planned_arrays(store.pipeline, store.blocks.extents, store.format)
+    }
+    faults: dict[str, str] = {}
+    present: set[str] = set()
+    with warnings.catch_warnings():
+        # Zarr warns of files that are not its own; they are no fault.
+        warnings.simplefilter("ignore")
+        keys = sync(list_folder(store.storage, ""))
+        for name in sorted({key for key in keys if not key.startswith(".")} | {RECEIPTS}):
+            try:
+                member = store.group[name]
+            except KeyError:
+                continue
+            except Exception as error:
+                # A damaged or forged document may raise anything.
+                present.add(name)
+                faults[name] = f"unreadable: {reason_of(error)}"
+                continue
+            present.add(name)
+            if isinstance(member, zarr.Group):
+                if name not in GROUPS:
+                    faults[name] = "not a group of a sweep store"
+            elif name not in planned:
+                faults[name] = "not an array of a sweep store"
+            elif misfit := _misfit(planned[name], member):
+                faults[name] = misfit
+    faults.update({name: "missing" for name in planned if name not in present})
+    return faults
+
+
+def _misfit(planned: PlannedArray, array: zarr.Array[Any]) -> str:
+    try:
+        return planned.misfit(array)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        return f"unreadable: {reason_of(error)}"

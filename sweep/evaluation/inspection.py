@@ -20,7 +20,7 @@ from sweep.evaluation.cells import (
 from sweep.measure.detector import Detector
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.extent import marker_boxes
-from sweep.model.pose import placed, rotation_of_vector
+from sweep.model.pose import rotation_of_vector, transform_points
 from sweep.model.renderers import render
 from sweep.model.scene import Scenes, build_scenes
 from sweep.plan.experiment import Pipeline
@@ -126,7 +126,7 @@ def look(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInspection:
         rotation = rotation_of_vector(vector) @ scenes.rotation[0]
         position = scenes.translation[0] + columns["translation_error_m"]
         ends = np.concatenate([np.zeros((1, 3)), np.eye(3)]) * size[0] / 2
-        axes_px = cameras.project(placed(ends[None], rotation[None], position[None]))[0]
+        axes_px = cameras.project(transform_points(ends[None], rotation[None], position[None]))[0]
     return SceneInspection(
         image=image,
         window=seen.window,

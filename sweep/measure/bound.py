@@ -1,4 +1,4 @@
-"""How well a pose can be known at all: the Cramér-Rao bound of the exact image's pixels."""
+"""The Cramér-Rao bound of the exact image's pixels: the least error of any unbiased estimate."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from sweep.compilation import compiled
 from sweep.measure.flags import BoundStatus
 from sweep.measure.likelihood import (
     BACKGROUND_MARGIN_PX,
-    FIRST_LEVEL,
+    DEPTH,
+    GREY_LEVELS,
     MIN_NOISE,
     MIN_SPREAD_PX,
     SETTLED,
@@ -20,29 +21,30 @@ from sweep.measure.likelihood import (
     MarkerView,
     curvature,
     fit,
+    marker_view,
     mirrored_state,
     noise_variance,
-    plane_of,
-    pose_covariance,
-    sight_of,
+    projection_of,
+    rotation_of,
     squares,
     state_of,
-    work_space,
 )
+from sweep.measure.positive_definite import pose_covariance
 from sweep.model import coverage
 from sweep.model.declaration import parameter
-from sweep.model.derivatives import POSE
+from sweep.model.derivatives import POSE, work_space
 from sweep.model.effects import NEUTRAL
 from sweep.model.scene import Scenes
 from sweep.typing import Floats
 
 CLIPPING_DEVIATIONS = 2.0
-"""Standard deviations that every grey level must keep from the ends of the scale."""
+"""Standard deviations of the noise by which every grey level must stay off the scale's ends."""
 
 MIRROR_STEPS = 60
+"""Most steps of the search for the mirrored minimum."""
 
-FARTHEST_MIRROR = 100.0
-"""Standard deviations from which on a second minimum is not looked for."""
+MAX_MIRROR_DISTANCE = 100.0
+"""Largest distance of a mirrored minimum that is searched for, in standard deviations."""
 
 MODELLED = ("blur_px", "gain", "noise_grey")
 """The effects that the bound's model of an image has."""
@@ -50,19 +52,20 @@ MODELLED = ("blur_px", "gain", "noise_grey")
 
 @dataclass(frozen=True, slots=True)
 class BoundSetting:
-    """Whether the accuracy bound is computed beside the scenes."""
+    """Whether the accuracy bound is computed for the scenes."""
 
     bound: str = parameter(
         "none",
-        "accuracy bound (Cramér-Rao) of each scene's pixels, black, white and background levels "
-        "unknown: none; known_blur: the point spread is known; unknown_blur: it is estimated too",
+        "accuracy bound (Cramér-Rao) of each scene's pixels with unknown levels of black, white "
+        "and background. none: not computed; known_blur: the point spread is known; unknown_blur: "
+        "it is estimated, too",
         choices=("none", "known_blur", "unknown_blur"),
     )
 
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """The bounds of N scenes; NaN where ``status`` is not given.
+    """The bounds of N scenes; NaN unless ``status`` is ``given``.
 
     Attributes
     ----------
@@ -72,10 +75,10 @@ class Bounds:
         (N, 6) least standard deviations of an unbiased estimate: rotation about the camera's x, y
         and z in radians, position along them in metres.
     kappa
-        (N,) the depth's bias by the bound's own spread of the tilt, in standard deviations.
+        (N,) bias of the depth caused by the spread of the tilt, in standard deviations.
     mirror_distance
-        (N,) standard deviations between the pose and the other minimum of chi-square, near its
-        mirror; NaN where there is none within :data:`FARTHEST_MIRROR`.
+        (N,) distance in standard deviations between the pose and the other minimum of
+        chi-square, near its mirror; NaN if there is none within :data:`MAX_MIRROR_DISTANCE`.
     """
 
     status: NDArray[np.uint8]
@@ -86,53 +89,52 @@ class Bounds:
 
 @compiled
 def curvature_at_truth(
-    state: Floats, sight: MarkerView, height: int, width: int, spread_free: bool
+    state: Floats, view: MarkerView, height: int, width: int, spread_free: bool
 ) -> tuple[Floats, bool]:
-    """Return the Cramér-Rao bound's covariance (6, 6), and whether there is one."""
+    """Return the Cramér-Rao bound's covariance (6, 6), and whether it exists."""
     free = POSE + 1 if spread_free else POSE
     information, gradient = np.empty((free, free)), np.empty(free)
     curvature(
-        np.zeros((height, width)), state.copy(), sight, work_space(height, width), spread_free,
+        np.zeros((height, width)), state.copy(), view, work_space(height, width), spread_free,
         information, gradient,
     )
-    return pose_covariance(information, sight.variance, abs(state[11]))
+    return pose_covariance(information, view.variance, abs(state[DEPTH]))
 
 
 @compiled
 def depth_nonlinearity(covariance: Floats, state: Floats) -> float:
     """Return κ = z (s₁² + s₂²) / (4 s_z), s₁ and s₂ those of the turns that tilt the normal.
 
-    A tilt by a small angle foreshortens by half its square, which looks like depth: an estimate
-    whose tilt scatters has a depth that is off by about κ standard deviations.
+    A tilt by a small angle foreshortens by half its square, which looks like depth: if the
+    estimated tilt scatters, the depth is biased by about κ standard deviations.
     """
+    rotation = rotation_of(state)
     tilting = 0.0
     for i in range(3):
         tilting += covariance[i, i]
         for j in range(3):
-            tilting -= state[3 * i + 2] * covariance[i, j] * state[3 * j + 2]
-    return float(abs(state[11]) * tilting / (4.0 * math.sqrt(covariance[5, 5])))
+            tilting -= rotation[i, 2] * covariance[i, j] * rotation[j, 2]
+    return float(abs(state[DEPTH]) * tilting / (4.0 * math.sqrt(covariance[5, 5])))
 
 
 @compiled
 def mirror_chi_square(
-    state: Floats, sight: MarkerView, height: int, width: int, spread_free: bool
+    state: Floats, view: MarkerView, height: int, width: int, spread_free: bool
 ) -> float:
     """Return the noise-free chi-square of the minimum that is reached from the mirrored pose.
 
-    NaN where that is the pose itself, or none is reached; and where it is so far above that no
-    noise leads there.
+    NaN if that minimum is the pose itself, if none is reached, or if it is so high that no noise
+    leads there.
     """
     cover, image = np.zeros((height, width + 2)), np.empty((height, width))
-    coverage.accumulate(
-        cover, sight.ends, sight.sides, state[FIRST_LEVEL:], plane_of(state, sight),
-        sight.intrinsics, sight.lens, sight.distorted, 0, 0, state[SPREAD],
-    )
-    coverage.sum_levels(cover, state[FIRST_LEVEL], image)
+    levels = state[GREY_LEVELS]
+    coverage.accumulate(cover, view.edges, levels, projection_of(state, view), 0, 0, state[SPREAD])
+    coverage.sum_levels(cover, levels[0], image)
     free = POSE + 1 if spread_free else POSE
     mirror = mirrored_state(state)
     chi_square, reached = fit(
-        image, squares(image), mirror, sight, work_space(height, width), spread_free,
-        MIRROR_STEPS, SETTLED, FARTHEST_MIRROR**2, np.empty((free, free)),
+        image, squares(image), mirror, view, work_space(height, width), spread_free,
+        MIRROR_STEPS, SETTLED, MAX_MIRROR_DISTANCE**2, np.empty((free, free)),
     )
     if not reached or chi_square < 1e-2:
         return math.nan
@@ -142,12 +144,12 @@ def mirror_chi_square(
 def bounds(
     scenes: Scenes, rows: NDArray[np.intp], boxes: NDArray[np.int64], unknown_blur: bool
 ) -> Bounds:
-    """Return the bounds of scenes ``rows`` (n,), visible ones with the marker's ``boxes`` (n, 4).
+    """Return the bounds of visible scenes ``rows`` (n,) with the marker's ``boxes`` (n, 4).
 
-    The bound is that of the exact image, whichever renderer draws it, after its gain, in the
-    frame. Levels of black, white and background are unknown; so is the point spread where
-    ``unknown_blur``. From Kay, "Fundamentals of statistical signal processing: estimation theory"
-    (1993), section 3.9, with analytic derivatives (:mod:`sweep.model.derivatives`).
+    The bound is that of the exact image in the frame, after its gain, whichever renderer draws it.
+    Levels of black, white and background are unknown; with ``unknown_blur`` the point spread is,
+    too. From Kay, "Fundamentals of statistical signal processing: estimation theory" (1993),
+    section 3.9, with analytic derivatives (:mod:`sweep.model.derivatives`).
     """
     count = len(rows)
     status = np.full(count, BoundStatus.given, dtype=np.uint8)
@@ -173,21 +175,20 @@ def bounds(
             status[i] = BoundStatus.clipped
         if status[i] != BoundStatus.given:
             continue
-        cameras = scenes.cameras
-        sight = sight_of(
-            scenes.markers[scenes.marker[row]], scenes.size_m[row], cameras.view[row],
-            cameras.lenses[row], cameras.distorted[row], low[i], noise_variance(noise),
+        view = marker_view(
+            scenes.markers[scenes.marker[row]], scenes.size_m[row], scenes.cameras.optics(row),
+            low[i], noise_variance(noise),
         )
         state = state_of(scenes.rotation[row], scenes.translation[row], blur, levels)
         width, height = (high[i] - low[i]).tolist()
         if unknown_blur:
             state[SPREAD] = max(state[SPREAD], MIN_SPREAD_PX)
-        covariance, found = curvature_at_truth(state, sight, height, width, unknown_blur)
-        # Half a turn is no knowledge: rounding has made a singular problem a regular one.
-        if not found or np.diag(covariance)[:3].max() > math.pi**2:
+        covariance, exists = curvature_at_truth(state, view, height, width, unknown_blur)
+        # Beyond half a turn rounding has made a singular problem a regular one.
+        if not exists or np.diag(covariance)[:3].max() > math.pi**2:
             status[i] = BoundStatus.no_contrast
             continue
         std[i] = np.sqrt(np.diag(covariance))
         kappa[i] = depth_nonlinearity(covariance, state)
-        mirror[i] = math.sqrt(mirror_chi_square(state, sight, height, width, unknown_blur))
+        mirror[i] = math.sqrt(mirror_chi_square(state, view, height, width, unknown_blur))
     return Bounds(status, std, kappa, mirror)

@@ -1,4 +1,4 @@
-"""How sure a pose is, by a model of the corners' noise; and whether errors are as that says."""
+"""The covariance of a pose by a model of the corners' noise, and errors relative to it."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
-from sweep.measure.likelihood import pose_covariance, solve_positive
+from sweep.measure.positive_definite import pose_covariance, solve_positive
 from sweep.model.camera import Cameras
 from sweep.model.derivatives import POSE, velocity
 from sweep.model.marker import marker_corners
-from sweep.model.pose import placed
+from sweep.model.pose import transform_points
+from sweep.model.projection import Optics
 from sweep.typing import Floats
 
 
@@ -22,9 +23,9 @@ def corner_covariance(
     That of least squares, noise_px² (JᵀJ)⁻¹, for corners whose coordinates have independent errors
     of ``noise_px``; J (8, 6) are the corners' velocities in pixels by turn about the camera's
     axes (radians) and shift along them (metres). Hartley and Zisserman, "Multiple view geometry",
-    2nd edition, section 5.2.1. NaN where the pose is, or where J has no full rank.
+    2nd edition, section 5.2.1. NaN if the pose is NaN or J does not have full rank.
     """
-    points = placed(marker_corners(size_m), rotation, translation)
+    points = transform_points(marker_corners(size_m), rotation, translation)
     return _corner_covariance(
         points, np.ascontiguousarray(translation), cameras.view, cameras.lenses,
         cameras.distorted, float(noise_px),
@@ -44,18 +45,16 @@ def _corner_covariance(
         information = np.zeros((POSE, POSE))
         for corner in range(4):
             x, y, z = points[n, corner, 0], points[n, corner, 1], points[n, corner, 2]
-            velocity(
-                x, y, z, translation[n], view[n], lenses[n], distorted[n], rates[0], rates[1]
-            )
+            velocity(x, y, z, translation[n], Optics(view[n], lenses[n], distorted[n]), rates)
+            # Shifts as shares of the distance, so that all numbers are of one size.
             for axis in range(2):
                 for i in range(POSE):
                     for j in range(POSE):
-                        # Shifts as shares of the distance, so that all is of one size.
                         unit = (distance if i >= 3 else 1.0) * (distance if j >= 3 else 1.0)
                         information[i, j] += rates[axis, i] * rates[axis, j] * unit
-        found, known = pose_covariance(information, noise_px**2, distance)
-        if known:
-            covariance[n] = found
+        of_pose, exists = pose_covariance(information, noise_px**2, distance)
+        if exists:
+            covariance[n] = of_pose
     return covariance
 
 
@@ -64,10 +63,10 @@ def squared_deviations(
 ) -> Floats:
     """Return eᵀ C⁻¹ e (N,) of errors (N, 3) rad and (N, 3) m under covariances (N, 6, 6).
 
-    The normalised estimation error squared: where the covariances are true and errors Gaussian it
-    is chi-square distributed with six degrees of freedom (Bar-Shalom, Li and Kirubarajan,
-    "Estimation with applications to tracking and navigation", 2001, section 5.4.2). NaN where an
-    input is, and where a covariance is singular.
+    The normalised estimation error squared: if the covariances are correct and the errors
+    Gaussian, it is chi-square distributed with six degrees of freedom (Bar-Shalom, Li and
+    Kirubarajan, "Estimation with applications to tracking and navigation", 2001, section 5.4.2).
+    NaN if an input is NaN or a covariance is singular.
     """
     deviations = np.full(len(covariance), np.nan)
     known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
@@ -79,6 +78,7 @@ def squared_deviations(
 
 @compiled
 def _squared_deviations(error: Floats, covariance: Floats) -> Floats:
+    """As :func:`squared_deviations`, for errors (N, 6)."""
     deviations = np.full(len(error), np.nan)
     for n in range(len(error)):
         if np.isfinite(error[n]).all() and np.isfinite(covariance[n]).all():

@@ -1,8 +1,8 @@
 """The likelihood of a marker's pixels: fitted to an image, and how sharp it is at the truth.
 
-Pixels are exact levels plus independent Gaussian noise. The pose (and the point spread, where it
-is asked for) is moved by Levenberg-Marquardt; the three grey levels enter linearly and are solved
-for at every step (Golub and Pereyra, "The differentiation of pseudo-inverses and nonlinear least
+Pixels are exact levels plus independent Gaussian noise. The pose (and the point spread, if it is
+free) is moved by Levenberg-Marquardt; the three grey levels enter linearly and are solved for at
+every step (Golub and Pereyra, "The differentiation of pseudo-inverses and nonlinear least
 squares problems whose variables separate", SIAM J. Numer. Anal. 10, 1973).
 """
 
@@ -15,94 +15,92 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
-from sweep.model.derivatives import LEVELS, POSE, differentiate, normal_equations
+from sweep.measure.positive_definite import solve_positive
+from sweep.model.coverage import MarkerEdges
+from sweep.model.derivatives import (
+    LEVELS,
+    POSE,
+    Work,
+    differentiate,
+    normal_equations,
+)
 from sweep.model.marker import MarkerKey, edges, module_count
 from sweep.model.pose import rotations, vectors
+from sweep.model.projection import Optics, Projection
 from sweep.typing import Floats
 
-STATE = 16
-"""Length of a state: rotation (9, row by row), translation (3), point spread, levels (3)."""
-
-SPREAD, FIRST_LEVEL = 12, 13
-"""Where in a state the point spread and the levels are."""
+STATE_LENGTH = 16
+ROTATION, POSITION = slice(0, 9), slice(9, 12)
+DEPTH, SPREAD = 11, 12
+GREY_LEVELS = slice(13, 16)
+"""A state vector: rotation matrix (row by row), position in metres, of which the last is the depth,
+standard deviation of the point spread in pixels, and the levels of outside, black and white."""
 
 MIN_SPREAD_PX = 0.1
-"""The sharpest point spread that is estimated; a sharper one is none, and stays so."""
+"""Smallest point spread that is estimated; a smaller one becomes 0 and stays so."""
 
 MAX_TURN = 0.3
 MAX_SHIFT = 0.1
-"""Largest step: radians, and share of the distance."""
+"""Largest step: in radians, and as a share of the distance."""
 
 SETTLED, NEARLY_SETTLED = 1e-4, 1e-2
-"""Squared standard deviations that an undamped step may still go: then it is the last. Where the
-second minimum has just vanished steps get ever shorter: the larger will do for these."""
+"""Squared standard deviations of the last undamped step. Near a second minimum that has just
+vanished steps get ever shorter: there the larger one suffices."""
 
 MIN_NOISE = 0.5
-"""Grey levels of noise below which quantisation is no noise of its own, uniform and independent."""
+"""Noise in grey levels below which the rounding error is not uniform and independent."""
 
 QUANTISATION_VARIANCE = 1 / 12
-"""Variance in squared grey levels that rounding to whole levels adds."""
+"""Variance in squared grey levels added by rounding to whole levels."""
 
 BACKGROUND_MARGIN_PX = 4
-"""Pixels of background around the marker that tell its level."""
+"""Width of the background around the marker from which its level is estimated."""
 
 PATIENCE = 2
-"""Steps in a row that must foresee an end above what is worth while, to give up."""
+"""Abandon a start after more than this many consecutive steps that predict a chi-square above
+``worth``."""
 
 
 class MarkerView(NamedTuple):
-    """What is known of an image beside its pixels: the marker, its size, and the camera.
+    """An image's known parameters: the marker, its size, the camera and the noise.
 
-    ``ends`` (E, 4) and ``sides`` (E, 2) are the marker's edges, ``corner`` (2,) the least and the
-    greatest column of its outline, all in modules; ``intrinsics`` (4,) are fx, fy and the
-    principal point, relative to the first pixel; ``variance`` is that of a pixel's noise.
+    Attributes
+    ----------
+    edges
+        The marker's edges.
+    extent
+        (2,) least and greatest column of the marker's outline, in modules.
+    modules, size_m
+        Modules along the black square's side, and its length.
+    optics
+        The camera; its principal point is relative to the image's first pixel.
+    variance
+        Variance of a pixel's noise in squared grey levels.
     """
 
-    ends: Floats
-    sides: NDArray[np.int64]
-    corner: Floats
+    edges: MarkerEdges
+    extent: Floats
     modules: float
     size_m: float
-    intrinsics: Floats
-    lens: Floats
-    distorted: bool
+    optics: Optics
     variance: float
 
 
-class Work(NamedTuple):
-    """Scratch of one image size: ``shares`` zero and ``place`` -1 between calls."""
-
-    shares: Floats
-    place: NDArray[np.int32]
-    slopes: Floats
-
-
-@compiled
-def work_space(height: int, width: int) -> Work:
-    """Return the scratch for an image."""
-    return Work(
-        np.zeros((2, height, width + 2)),
-        np.full((height, width), -1, dtype=np.int32),
-        np.empty((height * width, POSE + 1)),
-    )
-
-
-def sight_of(
-    marker: MarkerKey, size_m: float, view: Floats, lens: Floats, distorted: bool,
-    corner: NDArray[np.int64], variance: float,
+def marker_view(
+    marker: MarkerKey, size_m: float, optics: Optics, corner: NDArray[np.int64], variance: float
 ) -> MarkerView:
-    """Return what is known of a marker's image whose first pixel is ``corner`` (2,)."""
-    outlines, modules = edges(*marker), module_count(marker[0])
-    local = view.copy()
+    """Return the view of a marker in an image whose first pixel is ``corner`` (2,) of the frame."""
+    modules = module_count(marker[0])
+    local = optics.intrinsics.copy()
     local[2:] -= corner
     return MarkerView(
-        outlines.ends, outlines.sides, np.array([-marker[2], modules + marker[2]]),
-        float(modules), float(size_m), local, lens, bool(distorted), float(variance),
+        edges(*marker), np.array([-marker[2], modules + marker[2]]), float(modules), float(size_m),
+        Optics(local, optics.lens, optics.distorted), float(variance),
     )
 
 
 def noise_variance(noise_grey: float) -> float:
-    """Return the variance of a pixel in squared grey levels: its noise and its rounding."""
+    """Return the variance of a pixel in squared grey levels, from its noise and its rounding."""
     return noise_grey**2 + QUANTISATION_VARIANCE
 
 
@@ -112,64 +110,33 @@ def state_of(rotation: Floats, translation: Floats, spread_px: float, levels: Fl
 
 
 @compiled
-def solve_positive(matrix: Floats, right: Floats) -> bool:
-    """Solve matrix · x = right in place for a positive definite matrix; False where it is not.
-
-    Scaled to a unit diagonal, then by Cholesky's factors; a pivot below 1e-11 is none.
-    """
-    n = matrix.shape[0]
-    scale, factor = np.empty(n), np.empty((n, n))
-    for i in range(n):
-        if not (matrix[i, i] > 0.0 and matrix[i, i] < math.inf):
-            return False
-        scale[i] = 1.0 / math.sqrt(matrix[i, i])
-    for i in range(n):
-        for j in range(i + 1):
-            total = matrix[i, j] * scale[i] * scale[j]
-            for k in range(j):
-                total -= factor[i, k] * factor[j, k]
-            if i > j:
-                factor[i, j] = total / factor[j, j]
-            elif total > 1e-11:
-                factor[i, i] = math.sqrt(total)
-            else:
-                return False
-    for column in range(right.shape[1]):
-        for i in range(n):
-            total = right[i, column] * scale[i]
-            for k in range(i):
-                total -= factor[i, k] * right[k, column]
-            right[i, column] = total / factor[i, i]
-        for i in range(n - 1, -1, -1):
-            total = right[i, column]
-            for k in range(i + 1, n):
-                total -= factor[k, i] * right[k, column]
-            right[i, column] = total / factor[i, i]
-        for i in range(n):
-            right[i, column] *= scale[i]
-    return True
+def rotation_of(state: Floats) -> Floats:
+    """Return the rotation matrix (3, 3) of a state, a view of it."""
+    return state[ROTATION].reshape(3, 3)
 
 
 @compiled
-def plane_of(state: Floats, sight: MarkerView) -> Floats:
-    """Return what takes module coordinates to the camera frame (3, 3), as ``Scenes.plane``."""
-    module, half = sight.size_m / sight.modules, 0.5 * sight.size_m
+def projection_of(state: Floats, view: MarkerView) -> Projection:
+    """Return the projection at a state; its plane as :class:`sweep.model.scene.Scenes` has it."""
+    module, half = view.size_m / view.modules, 0.5 * view.size_m
+    rotation, position = rotation_of(state), state[POSITION]
     plane = np.empty((3, 3))
     for i in range(3):
-        right, up = state[3 * i], state[3 * i + 1]
+        right, up = rotation[i, 0], rotation[i, 1]
         plane[i, 0], plane[i, 1] = right * module, -up * module
-        plane[i, 2] = state[9 + i] - (right - up) * half
-    return plane
+        plane[i, 2] = position[i] - (right - up) * half
+    return Projection(plane, view.optics)
 
 
 @compiled
-def is_before_camera(state: Floats, sight: MarkerView) -> bool:
-    """Tell whether the marker faces the camera, with all of its outline in front of it."""
-    plane = plane_of(state, sight)
+def is_before_camera(state: Floats, view: MarkerView) -> bool:
+    """Return whether the marker faces the camera with its whole outline in front of it."""
+    plane = projection_of(state, view).plane
+    rotation, position = rotation_of(state), state[POSITION]
     facing = 0.0
     for i in range(3):
-        facing += state[3 * i + 2] * state[9 + i]
-    low, high = sight.corner
+        facing += rotation[i, 2] * position[i]
+    low, high = view.extent
     nearest = min(
         plane[2, 0] * low + plane[2, 1] * low, plane[2, 0] * low + plane[2, 1] * high,
         plane[2, 0] * high + plane[2, 1] * low, plane[2, 0] * high + plane[2, 1] * high,
@@ -179,31 +146,30 @@ def is_before_camera(state: Floats, sight: MarkerView) -> bool:
 
 @compiled
 def curvature(
-    image: Floats, state: Floats, sight: MarkerView, work: Work, spread_free: bool,
+    image: Floats, state: Floats, view: MarkerView, work: Work, spread_free: bool,
     information: Floats, gradient: Floats,
 ) -> float:
-    """Solve for the levels at a state; write the Fisher information of what else is free.
+    """Solve for the levels at a state; write the Fisher information of the other free parameters.
 
     The free parameters are the pose's six, ω in radians and τ as a share of the distance, and
-    with ``spread_free`` the point spread's variance in px². Levels are eliminated: the information
-    (free, free) is what is left for the others, times the noise's variance. ``gradient`` (free,)
-    is that of half the squared residuals, downhill. ``state`` gets its levels; the slopes are for
-    the levels that it came with. Returns vectorᵀ · levels: the sum of squares that is explained.
+    with ``spread_free`` the point spread's variance in px². Levels are eliminated: ``information``
+    (free, free) is that of the others, times the noise's variance. ``gradient`` (free,) is that of
+    half the squared residuals, downhill. ``state`` gets its levels; the slopes are for the levels
+    that it had before. Returns vectorᵀ · levels: the explained part of the image's sum of squares.
     """
     free = information.shape[0]
     matrix, vector = np.empty((free + LEVELS, free + LEVELS)), np.empty(free + LEVELS)
+    grey_levels = state[GREY_LEVELS]
     count = differentiate(
-        work.shares, work.place, work.slopes, sight.ends, sight.sides, state[FIRST_LEVEL:],
-        plane_of(state, sight), state[9:12], sight.intrinsics, sight.lens, sight.distorted,
-        state[SPREAD],
+        work, view.edges, grey_levels, projection_of(state, view), state[POSITION], state[SPREAD]
     )
-    distance = abs(state[11])
+    distance = abs(state[DEPTH])
     for slot in range(count):
         for k in range(3, POSE):
             work.slopes[slot, k] *= distance
         if spread_free and state[SPREAD] > 0.0:
             work.slopes[slot, POSE] /= 2.0 * state[SPREAD]
-    normal_equations(image, work.shares, work.place, work.slopes, free, matrix, vector)
+    normal_equations(image, work, free, matrix, vector)
     levels = np.empty((LEVELS, LEVELS))
     right = np.empty((LEVELS, free + 1))
     for k in range(LEVELS):
@@ -211,7 +177,7 @@ def curvature(
         for m in range(LEVELS):
             levels[k, m] = matrix[free + k, free + m]
         if not levels[k, k] > 0.0:
-            # An area that is not seen has no level: 0.
+            # An area that covers no pixel gets the level 0.
             levels[k, k] = 1.0
         for m in range(free):
             right[k, m] = matrix[free + k, m]
@@ -221,7 +187,7 @@ def curvature(
         return 0.0
     explained = 0.0
     for k in range(LEVELS):
-        state[FIRST_LEVEL + k] = right[k, free]
+        grey_levels[k] = right[k, free]
         explained += right[k, free] * vector[free + k]
     for i in range(free):
         gradient[i] = vector[i]
@@ -232,26 +198,28 @@ def curvature(
             for k in range(LEVELS):
                 information[i, j] -= matrix[i, free + k] * right[k, j]
     if spread_free and not state[SPREAD] > 0.0:
-        # No point spread: it is left alone.
+        # A point spread of 0 stays as it is.
         information[POSE, POSE] = 1.0
     return explained
 
 
 @compiled
 def moved_state(state: Floats, step: Floats, most: float) -> Floats:
-    """Return the state after a step, shortened to the largest turn and shift times ``most``."""
+    """Return the state after a step, shortened to ``most`` times the largest turn and shift."""
     turn = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
     shift = math.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
     shrink = min(1.0, most * MAX_TURN / max(turn, 1e-300))
     shrink = min(shrink, most * MAX_SHIFT / max(shift, 1e-300))
     moved = state.copy()
+    before, position = rotation_of(state), state[POSITION]
+    after, moved_position = rotation_of(moved), moved[POSITION]
     rotation = rotations(shrink * step[:3].copy().reshape(1, 3))[0]
     for i in range(3):
         for j in range(3):
-            moved[3 * i + j] = 0.0
+            after[i, j] = 0.0
             for k in range(3):
-                moved[3 * i + j] += rotation[i, k] * state[3 * k + j]
-        moved[9 + i] = state[9 + i] + shrink * step[3 + i] * abs(state[11])
+                after[i, j] += rotation[i, k] * before[k, j]
+        moved_position[i] = position[i] + shrink * step[3 + i] * abs(state[DEPTH])
     if len(step) > POSE:
         squared = state[SPREAD] ** 2
         # At most to four times the variance, or a quarter of it, and a third of a pixel more.
@@ -263,40 +231,40 @@ def moved_state(state: Floats, step: Floats, most: float) -> Floats:
 
 @compiled
 def fit(
-    image: Floats, square_sum: float, state: Floats, sight: MarkerView, work: Work,
+    image: Floats, square_sum: float, state: Floats, view: MarkerView, work: Work,
     spread_free: bool, most_steps: int, settled: float, worth: float, information: Floats,
 ) -> tuple[float, bool]:
     """Move ``state`` to the nearest maximum of the likelihood.
 
-    Returns chi-square and whether the maximum was reached: an undamped Newton step would go less
-    than ``settled`` squared standard deviations, and is gone; less than ``NEARLY_SETTLED`` after
-    ``most_steps``, or where no step leads down. Given up where that step foresees an end above a
-    chi-square of ``worth``. ``information`` (free, free) is left as :func:`curvature`
-    gives it there; its inverse times the variance is the covariance.
+    Returns chi-square and whether the maximum was reached: the undamped Newton step is shorter
+    than ``settled`` squared standard deviations, and is taken; or shorter than
+    ``NEARLY_SETTLED`` after ``most_steps``, or when no step decreases chi-square. The fit is
+    abandoned if that step predicts a chi-square above ``worth``. ``information`` (free, free) is
+    that of :func:`curvature` at the last state; its inverse times the variance is the covariance.
     """
     free = POSE + 1 if spread_free else POSE
     gradient = np.empty(free)
     trial_information, trial_gradient = np.empty((free, free)), np.empty(free)
-    state[FIRST_LEVEL:] = 0.0
-    curvature(image, state, sight, work, spread_free, information, gradient)
-    explained = curvature(image, state, sight, work, spread_free, information, gradient)
-    chi_square = (square_sum - explained) / sight.variance
+    state[GREY_LEVELS] = 0.0
+    curvature(image, state, view, work, spread_free, information, gradient)
+    explained = curvature(image, state, view, work, spread_free, information, gradient)
+    chi_square = (square_sum - explained) / view.variance
     damping = 1e-3
     above = 0
     decrement = math.inf
     for _ in range(most_steps):
         newton = np.empty((free, 1))
         newton[:, 0] = gradient
-        whole = solve_positive(information, newton)
+        regular = solve_positive(information, newton)
         decrement = math.inf
-        if whole:
+        if regular:
             decrement = 0.0
             for k in range(free):
                 decrement += gradient[k] * newton[k, 0]
-            above = above + 1 if chi_square - decrement / sight.variance > worth else 0
+            above = above + 1 if chi_square - decrement / view.variance > worth else 0
             if above > PATIENCE:
                 return chi_square, False
-            if decrement < settled * sight.variance:
+            if decrement < settled * view.variance:
                 last = moved_state(state, newton[:, 0], 1.0)
                 state[:] = last
                 return chi_square, True
@@ -311,11 +279,11 @@ def fit(
                 damping = max(10.0 * damping, 1e-3)
                 continue
             trial = moved_state(state, step[:, 0], 1.0)
-            if is_before_camera(trial, sight):
+            if is_before_camera(trial, view):
                 explained = curvature(
-                    image, trial, sight, work, spread_free, trial_information, trial_gradient
+                    image, trial, view, work, spread_free, trial_information, trial_gradient
                 )
-                trial_chi_square = (square_sum - explained) / sight.variance
+                trial_chi_square = (square_sum - explained) / view.variance
                 if trial_chi_square < chi_square:
                     accepted = True
                     break
@@ -327,7 +295,7 @@ def fit(
         information[:] = trial_information
         gradient[:] = trial_gradient
         damping *= 0.1
-    return chi_square, decrement < NEARLY_SETTLED * sight.variance
+    return chi_square, decrement < NEARLY_SETTLED * view.variance
 
 
 @compiled
@@ -344,15 +312,15 @@ def binned(image: Floats) -> Floats:
 
 
 @compiled
-def binned_sight(sight: MarkerView) -> MarkerView:
-    """Return the sight of an image of 2 x 2 pixels' means: the exact model holds for it too."""
-    view = np.empty(4)
+def binned_view(view: MarkerView) -> MarkerView:
+    """Return the view for an image of 2 x 2 pixels' means: the exact model holds for it, too."""
+    intrinsics = np.empty(4)
     for k in range(2):
-        view[k] = 0.5 * sight.intrinsics[k]
-        view[2 + k] = 0.5 * (sight.intrinsics[2 + k] + 0.5) - 0.5
+        intrinsics[k] = 0.5 * view.optics.intrinsics[k]
+        intrinsics[2 + k] = 0.5 * (view.optics.intrinsics[2 + k] + 0.5) - 0.5
     return MarkerView(
-        sight.ends, sight.sides, sight.corner, sight.modules, sight.size_m, view, sight.lens,
-        sight.distorted, 0.25 * sight.variance,
+        view.edges, view.extent, view.modules, view.size_m,
+        Optics(intrinsics, view.optics.lens, view.optics.distorted), 0.25 * view.variance,
     )
 
 
@@ -360,14 +328,15 @@ def binned_sight(sight: MarkerView) -> MarkerView:
 def mirrored_state(state: Floats) -> Floats:
     """Return the state with the other planar solution's rotation, as ``pose.mirrored``."""
     mirror = state.copy()
-    length = math.sqrt(state[9] ** 2 + state[10] ** 2 + state[11] ** 2)
+    rotation, position, turned = rotation_of(state), state[POSITION], rotation_of(mirror)
+    length = math.sqrt(position[0] ** 2 + position[1] ** 2 + position[2] ** 2)
     for j in range(3):
         sign = -1.0 if j == 2 else 1.0
         along = 0.0
         for k in range(3):
-            along += state[9 + k] / length * sign * state[3 * k + j]
+            along += position[k] / length * sign * rotation[k, j]
         for i in range(3):
-            mirror[3 * i + j] = sign * state[3 * i + j] - 2.0 * state[9 + i] / length * along
+            turned[i, j] = sign * rotation[i, j] - 2.0 * position[i] / length * along
     return mirror
 
 
@@ -383,24 +352,12 @@ def squares(image: Floats) -> float:
 
 @compiled
 def turn_between(state: Floats, other: Floats) -> float:
-    """Return the angle between two states' rotations in radians, stable where it is small."""
+    """Return the angle between two states' rotations in radians, stable for small angles."""
+    rotation, other_rotation = rotation_of(state), rotation_of(other)
     difference = np.zeros((1, 3, 3))
     for i in range(3):
         for j in range(3):
             for k in range(3):
-                difference[0, i, j] += state[3 * i + k] * other[3 * j + k]
+                difference[0, i, j] += rotation[i, k] * other_rotation[j, k]
     turn = vectors(difference)[0]
     return math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
-
-
-@compiled
-def pose_covariance(information: Floats, variance: float, distance: float) -> tuple[Floats, bool]:
-    """Return the covariance (6, 6) of the pose in radians and metres, and whether there is one."""
-    free = information.shape[0]
-    inverse = np.eye(free)
-    found = solve_positive(information, inverse)
-    for i in range(POSE):
-        for j in range(POSE):
-            unit = (distance if i >= 3 else 1.0) * (distance if j >= 3 else 1.0)
-            inverse[i, j] *= variance * unit
-    return inverse[:POSE, :POSE].copy(), found

@@ -21,28 +21,29 @@ from sweep.measure.estimation import Detections, Estimates
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.likelihood import (
     BACKGROUND_MARGIN_PX,
+    DEPTH,
     MIN_NOISE,
     NEARLY_SETTLED,
+    POSITION,
     SETTLED,
     SPREAD,
-    STATE,
+    STATE_LENGTH,
     MarkerView,
-    Work,
     binned,
-    binned_sight,
+    binned_view,
     fit,
     is_before_camera,
+    marker_view,
     mirrored_state,
     noise_variance,
-    pose_covariance,
-    sight_of,
+    rotation_of,
     squares,
     state_of,
     turn_between,
-    work_space,
 )
+from sweep.measure.positive_definite import pose_covariance
 from sweep.measure.solver import both_planar_solutions, reprojection_errors_px
-from sweep.model.derivatives import LEVELS, POSE
+from sweep.model.derivatives import LEVELS, POSE, Work, work_space
 from sweep.model.marker import module_count
 from sweep.typing import Floats
 
@@ -64,14 +65,14 @@ EXCESS = 5.0
 
 @compiled
 def coarse_fit(
-    coarse: Floats, total: float, state: Floats, sight: MarkerView, work: Work, spread_free: bool,
+    coarse: Floats, total: float, state: Floats, view: MarkerView, work: Work, spread_free: bool,
     worth: float,
 ) -> float:
     """Fit a state to the means of 2 x 2 pixels, whose point spread is half as wide."""
     free = POSE + 1 if spread_free else POSE
     state[SPREAD] *= 0.5
     chi_square, _ = fit(
-        coarse, total, state, sight, work, spread_free, COARSE_STEPS, NEARLY_SETTLED, worth,
+        coarse, total, state, view, work, spread_free, COARSE_STEPS, NEARLY_SETTLED, worth,
         np.empty((free, free)),
     )
     state[SPREAD] *= 2.0
@@ -92,7 +93,7 @@ def is_settled(chi_square: Floats, states: Floats, k: int) -> bool:
 
 @compiled
 def locate(
-    image: Floats, starts: Floats, sight: MarkerView, spread_free: bool, information: Floats
+    image: Floats, starts: Floats, view: MarkerView, spread_free: bool, information: Floats
 ) -> tuple[Floats, float, bool, Floats, float]:
     """Return the most likely pose, and the next minimum.
 
@@ -102,7 +103,7 @@ def locate(
         (height, width) grey levels.
     starts
         (K, 16) states; those that are not before the camera are left out.
-    sight
+    view
         What is known beside the pixels.
     spread_free
         Whether the point spread is estimated.
@@ -116,21 +117,21 @@ def locate(
         but for the last of the next best one; NaN where there is none.
     """
     count = len(starts)
-    coarse, coarse_sight = binned(image), binned_sight(sight)
+    coarse, coarse_view = binned(image), binned_view(view)
     coarse_work = work_space(coarse.shape[0], coarse.shape[1])
     coarse_total = squares(coarse)
     states = starts.copy()
     chi_square = np.full(count, math.inf)
     for k in range(count):
-        if is_before_camera(states[k], sight):
+        if is_before_camera(states[k], view):
             chi_square[k] = coarse_fit(
-                coarse, coarse_total, states[k], coarse_sight, coarse_work, spread_free,
+                coarse, coarse_total, states[k], coarse_view, coarse_work, spread_free,
                 chi_square.min() + HOPELESS,
             )
     work = work_space(image.shape[0], image.shape[1])
     total = squares(image)
     trial_information = np.empty_like(information)
-    found, other = np.full(STATE, math.nan), np.full(STATE, math.nan)
+    found, other = np.full(STATE_LENGTH, math.nan), np.full(STATE_LENGTH, math.nan)
     lowest = next_lowest = math.inf
     reached = False
     freedom = image.size - len(information) - LEVELS
@@ -143,7 +144,7 @@ def locate(
             state = states[k].copy()
         elif k == count:
             state = mirrored_state(found)
-            if not is_before_camera(state, sight):
+            if not is_before_camera(state, view):
                 continue
             # Not worth a fit where it has been found, or where the coarse pixels rule it out.
             away = turn_between(state, found)
@@ -151,7 +152,7 @@ def locate(
                 continue
             tried, best = state.copy(), chi_square.min() + HOPELESS
             level = coarse_fit(
-                coarse, coarse_total, tried, coarse_sight, coarse_work, spread_free, best
+                coarse, coarse_total, tried, coarse_view, coarse_work, spread_free, best
             )
             if not level < best:
                 continue
@@ -162,10 +163,10 @@ def locate(
             if lowest <= likely:
                 break
             state, worth = starts[k - count - 1].copy(), math.inf
-        if not is_before_camera(state, sight):
+        if not is_before_camera(state, view):
             continue
         level, done = fit(
-            image, total, state, sight, work, spread_free, FINE_STEPS, SETTLED,
+            image, total, state, view, work, spread_free, FINE_STEPS, SETTLED,
             worth, trial_information,
         )
         same = turn_between(state, found) < SAME_TURN_RAD
@@ -226,15 +227,14 @@ class Photometric:
             if not len(starts) or right - left < 2 or bottom - top < 2:
                 continue
             noise = float(sightings.noise_grey[i])
-            cameras = sightings.cameras
-            sight = sight_of(
-                sightings.markers[i], sightings.size_m[i], cameras.view[i], cameras.lenses[i],
-                cameras.distorted[i], sightings.origins[i] + (left, top), noise_variance(noise),
+            view = marker_view(
+                sightings.markers[i], sightings.size_m[i], sightings.cameras.optics(i),
+                sightings.origins[i] + (left, top), noise_variance(noise),
             )
             image = sightings.images[i][top:bottom, left:right].astype(np.float64)
             information = np.empty((free, free))
             state, chi_square, reached, other, _ = locate(
-                image, starts, sight, self.spread_free, information
+                image, starts, view, self.spread_free, information
             )
             freedom = image.size - free - LEVELS
             if not math.isfinite(chi_square) or freedom < 1:
@@ -246,11 +246,11 @@ class Photometric:
                 EstimateStatus.solved if explains(chi_square, freedom, noise)
                 else EstimateStatus.not_explained
             )
-            out.rotation[i], out.translation[i] = state[:9].reshape(3, 3), state[9:12]
-            out.alternative_rotation[i] = other[:9].reshape(3, 3)
+            out.rotation[i], out.translation[i] = rotation_of(state), state[POSITION]
+            out.alternative_rotation[i] = rotation_of(other)
             out.alternative_reprojection_px[i] = self._reprojection_px(other, sightings, i)
             out.reprojection_px[i] = self._reprojection_px(state, sightings, i)
-            covariance, found = pose_covariance(information, sight.variance, abs(state[11]))
+            covariance, found = pose_covariance(information, view.variance, abs(state[DEPTH]))
             if found:
                 out.covariance[i] = covariance
             out.residual_ratio[i] = chi_square / freedom
@@ -270,7 +270,7 @@ class Photometric:
         one = np.array([i])
         return float(
             reprojection_errors_px(
-                state[None, :9].reshape(1, 3, 3), state[None, 9:12], sightings.size_m[one],
+                rotation_of(state)[None], state[None, POSITION], sightings.size_m[one],
                 sightings.corners[one], sightings.cameras.take(one),
             )[0]
         )

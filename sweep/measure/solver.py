@@ -16,7 +16,7 @@ from sweep.measure.flags import EstimateStatus
 from sweep.model.camera import Cameras
 from sweep.model.declaration import parameter
 from sweep.model.marker import marker_corners
-from sweep.model.pose import placed, rotation_of_vector
+from sweep.model.pose import rotation_of_vector, transform_points
 from sweep.typing import Floats
 
 SOLVERS = {
@@ -93,7 +93,7 @@ def reprojection_errors_px(
     rotation: Floats, translation: Floats, size_m: Floats, corners: Floats, cameras: Cameras
 ) -> Floats:
     """Return the RMS reprojection error (N,); NaN for poses with a corner behind the camera."""
-    pixels = cameras.project(placed(marker_corners(size_m), rotation, translation))
+    pixels = cameras.project(transform_points(marker_corners(size_m), rotation, translation))
     return np.asarray(np.sqrt(((pixels - corners) ** 2).sum(axis=2).mean(axis=1)))
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sweep.compilation import compiled
 from sweep.model import lens
 from sweep.model.declaration import parameter
+from sweep.model.projection import Optics
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +92,10 @@ class Cameras:
     def take(self, rows: NDArray[np.intp]) -> Cameras:
         """Return the cameras of the given rows."""
         return Cameras(self.view[rows], self.lenses[rows], self.distorted[rows])
+
+    def optics(self, row: int) -> Optics:
+        """Return one camera as compiled functions take it."""
+        return Optics(self.view[row], self.lenses[row], bool(self.distorted[row]))
 
     def matrix(self, row: int) -> NDArray[np.float64]:
         """Return OpenCV's camera matrix (3, 3) of one row."""

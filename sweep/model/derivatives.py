@@ -1,41 +1,41 @@
 """The exact image's derivatives by the marker's pose, by the point spread and by the grey levels.
 
-Where an edge moves, the level of a pixel changes by the edge's jump times the integral of its
-normal velocity over the part of it that lies in the pixel. Under a homography that velocity is
-linear along the edge's image, so that length times the value in the middle of each part is exact:
-twelve numbers an edge, its two ends' velocities under six pose parameters.
+If an edge moves, the level of a pixel changes by the edge's jump times the integral of the edge's
+normal velocity over its part in the pixel. Under a homography that velocity is linear along the
+edge's image, so that length times the value in the middle of each part is exact: twelve numbers an
+edge, the velocities of its two ends under six pose parameters.
 
 A pose moves by δ = (ω, τ): rotation to exp(ω) R, translation to t + τ, in the camera frame, in
 radians and metres: the same six numbers as ``rotation_error_rad`` and ``translation_error_m``.
 
-The box begins at pixel (0, 0) here: a principal point is given relative to the box.
+The box begins at pixel (0, 0): the principal point is given relative to the box.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
-from sweep.model.coverage import (
-    MIN_PANEL_PX,
-    NODES,
-    REACH,
-    WEIGHTS,
-    accumulate,
-    bent,
+from sweep.model.coverage import MarkerEdges, accumulate
+from sweep.model.lens import distort, jacobian
+from sweep.model.point_spread import MIN_PANEL_PX, NODES, REACH, WEIGHTS, spread_below
+from sweep.model.projection import (
+    ModuleEdge,
+    Optics,
+    Projection,
     chord_count,
     clip,
-    imaged,
-    spread_below,
+    distorted_point,
+    homogeneous_pixel,
 )
-from sweep.model.lens import distort, jacobian
 from sweep.typing import Floats
 
 POSE = 6
-"""Parameters of a pose; the point spread, where its slope is asked for, is one more."""
+"""Parameters of a pose; the point spread, if its derivative is requested, is one more."""
 
 LEVELS = 3
 """Unknown grey levels: outside, black, white."""
@@ -44,27 +44,69 @@ JUST_BLACK = np.array([0.0, 1.0, 0.0])
 JUST_WHITE = np.array([0.0, 0.0, 1.0])
 
 
+class Work(NamedTuple):
+    """Scratch space of one image size; ``shares`` is 0 and ``slot`` is -1 between calls.
+
+    Attributes
+    ----------
+    shares
+        (2, height, width + 2): accumulators of the areas that black and white cover.
+    slot
+        (height, width): the row of ``slopes`` of each pixel, -1 for a pixel without slopes.
+    slopes
+        (height · width, 7): d(level)/d(pose) and, for a positive point spread, d(level)/d(sigma).
+    """
+
+    shares: Floats
+    slot: NDArray[np.int32]
+    slopes: Floats
+
+
 @compiled
-def _slot(place: NDArray[np.int32], slopes: Floats, count: int, i: int, j: int) -> int:
-    """Return the row of ``slopes`` of a pixel, the next free one (``count``) where it has none."""
-    slot = place[i, j]
+def work_space(height: int, width: int) -> Work:
+    """Return the scratch space for an image."""
+    return Work(
+        np.zeros((2, height, width + 2)),
+        np.full((height, width), -1, dtype=np.int32),
+        np.empty((height * width, POSE + 1)),
+    )
+
+
+class MovingSegment(NamedTuple):
+    """The image of an edge or of a chord of it, in pixels, from (xa, ya) to (xb, yb).
+
+    ``at_a`` and ``at_b`` (6,) are the normal velocities of its ends under the pose parameters,
+    times the segment's length.
+    """
+
+    xa: float
+    ya: float
+    xb: float
+    yb: float
+    at_a: Floats
+    at_b: Floats
+
+
+@compiled
+def _slot(work: Work, count: int, i: int, j: int) -> int:
+    """Return the row of ``slopes`` of a pixel, the next free one (``count``) if it has none."""
+    slot = work.slot[i, j]
     if slot < 0:
-        place[i, j] = count
-        slopes[count] = 0.0
+        work.slot[i, j] = count
+        work.slopes[count] = 0.0
         return count
     return int(slot)
 
 
 @compiled
-def _add_sharp(
-    place: NDArray[np.int32], slopes: Floats, count: int, jump: float, xa: float, ya: float,
-    xb: float, yb: float, at_a: Floats, at_b: Floats,
-) -> int:
-    """Add the slopes that a segment in pixels stands for, pixel by pixel; return the new count.
+def _add_sharp(work: Work, count: int, jump: float, segment: MovingSegment) -> int:
+    """Add the slopes of a segment to ``work``, pixel by pixel.
 
-    ``at_a`` and ``at_b`` (6,) are the normal velocities times the segment's length at its ends.
+    ``count`` rows of ``slopes`` are in use; returns how many are afterwards.
     """
-    height, width = place.shape
+    xa, ya, xb, yb, at_a, at_b = segment
+    height, width = work.slot.shape
+    slopes = work.slopes
     dx, dy = xb - xa, yb - ya
     line_x = math.floor(xa) + 1.0 if dx > 0.0 else math.ceil(xa) - 1.0
     line_y = math.floor(ya) + 1.0 if dy > 0.0 else math.ceil(ya) - 1.0
@@ -78,7 +120,7 @@ def _add_sharp(
             middle = 0.5 * (t + end)
             j, i = math.floor(xa + middle * dx), math.floor(ya + middle * dy)
             if 0 <= i < height and 0 <= j < width:
-                slot = _slot(place, slopes, count, i, j)
+                slot = _slot(work, count, i, j)
                 count = max(count, slot + 1)
                 share = jump * (end - t)
                 for k in range(POSE):
@@ -95,15 +137,16 @@ def _add_sharp(
 
 @compiled
 def _add_spread(
-    place: NDArray[np.int32], slopes: Floats, count: int, jump: float, sigma: float,
-    xa: float, ya: float, xb: float, yb: float, at_a: Floats, at_b: Floats,
+    work: Work, count: int, jump: float, sigma: float, segment: MovingSegment
 ) -> int:
     """As :func:`_add_sharp` through a Gaussian point spread, with the slope by ``sigma``.
 
     The point spread obeys the heat equation, dK/dsigma = sigma · (Laplacian of K), so that the
     slope by sigma is an integral along the edge, too: that of sigma times K's normal derivative.
     """
-    height, width = place.shape
+    xa, ya, xb, yb, at_a, at_b = segment
+    height, width = work.slot.shape
+    slopes = work.slopes
     reach = REACH * sigma + 0.5
     dx, dy = xb - xa, yb - ya
     panels = math.ceil(math.hypot(dx, dy) / max(1.5 * sigma, MIN_PANEL_PX))
@@ -132,7 +175,7 @@ def _add_spread(
                     below, density = above, higher
             for i in range(last[1] - first[1] + 1):
                 for j in range(last[0] - first[0] + 1):
-                    slot = _slot(place, slopes, count, first[1] + i, first[0] + j)
+                    slot = _slot(work, count, first[1] + i, first[0] + j)
                     count = max(count, slot + 1)
                     share = jump * weight * near[0, j] * near[1, i]
                     for k in range(POSE):
@@ -145,15 +188,18 @@ def _add_spread(
 
 @compiled
 def velocity(
-    x: float, y: float, z: float, translation: Floats, view: Floats, lens: Floats,
-    distorted: bool, u_rate: Floats, v_rate: Floats,
+    x: float, y: float, z: float, translation: Floats, optics: Optics, rates: Floats
 ) -> tuple[float, float]:
-    """Return the pixel of a point in space, and its velocities (6,) under the pose parameters."""
+    """Return the pixel of a point in space; write its velocities to ``rates`` (2, 6).
+
+    The velocities are those of u and of v under the six pose parameters.
+    """
+    intrinsics, lens = optics.intrinsics, optics.lens
     px, py, pz = x - translation[0], y - translation[1], z - translation[2]
     xn, yn = x / z, y / z
     a, b, c, d = 1.0, 0.0, 0.0, 1.0
     u, v = xn, yn
-    if distorted:
+    if optics.distorted:
         a, b, c, d = jacobian(xn, yn, lens)
         u, v = distort(xn, yn, lens)
     for k in range(POSE):
@@ -166,46 +212,39 @@ def velocity(
         else:
             rx, ry, rz = 1.0 * (k == 3), 1.0 * (k == 4), 1.0 * (k == 5)
         x_rate, y_rate = (rx - xn * rz) / z, (ry - yn * rz) / z
-        u_rate[k] = view[0] * (a * x_rate + b * y_rate)
-        v_rate[k] = view[1] * (c * x_rate + d * y_rate)
-    return view[0] * u + view[2] + 0.5, view[1] * v + view[3] + 0.5
+        rates[0, k] = intrinsics[0] * (a * x_rate + b * y_rate)
+        rates[1, k] = intrinsics[1] * (c * x_rate + d * y_rate)
+    return intrinsics[0] * u + intrinsics[2] + 0.5, intrinsics[1] * v + intrinsics[3] + 0.5
 
 
 @compiled
 def differentiate(
-    shares: Floats, place: NDArray[np.int32], slopes: Floats, ends: Floats,
-    sides: NDArray[np.int64], levels: Floats, plane: Floats, translation: Floats, view: Floats,
-    lens: Floats, distorted: bool, sigma: float,
+    work: Work, edges: MarkerEdges, levels: Floats, projection: Projection, translation: Floats,
+    sigma: float,
 ) -> int:
     """Draw a marker's image and its derivatives; return how many pixels have slopes.
 
     Parameters
     ----------
-    shares
-        (2, height, width + 2), zero: gets what :func:`sweep.model.coverage.accumulate` gives for
-        the areas that black and white cover.
-    place
-        (height, width), all -1: gets each pixel's row of ``slopes``.
-    slopes
-        (height · width, 7): gets d(level)/d(pose) and, where ``sigma > 0``, d(level)/d(sigma).
-    ends, sides, plane, view, lens, distorted, sigma
+    work
+        Gets the accumulators of the areas of black and white
+        (:func:`sweep.model.coverage.accumulate`), and the slopes.
+    edges, projection, sigma
         As :func:`sweep.model.coverage.accumulate`.
     levels
-        (3,) grey levels outside, of black and of white, that the slopes are for.
+        (3,) grey levels of outside, black and white that the slopes are for.
     translation
-        (3,) of the marker's centre, which ω turns it about.
+        (3,) position of the marker's centre, about which ω turns it.
     """
-    accumulate(
-        shares[0], ends, sides, JUST_BLACK, plane, view, lens, distorted, 0, 0, sigma
-    )
-    accumulate(
-        shares[1], ends, sides, JUST_WHITE, plane, view, lens, distorted, 0, 0, sigma
-    )
-    height, width = place.shape
+    accumulate(work.shares[0], edges, JUST_BLACK, projection, 0, 0, sigma)
+    accumulate(work.shares[1], edges, JUST_WHITE, projection, 0, 0, sigma)
+    plane, optics = projection.plane, projection.optics
+    ends, sides = edges.ends, edges.sides
+    height, width = work.slot.shape
     margin = REACH * sigma + 0.5 if sigma > 0.0 else 0.0
     rates = np.empty((4, POSE))
     at_a, at_b = np.empty(POSE), np.empty(POSE)
-    shift_x, shift_y = view[2] + 0.5 + margin, view[3] + 0.5 + margin
+    shift_x, shift_y = optics.intrinsics[2] + 0.5 + margin, optics.intrinsics[3] + 0.5 + margin
     far_x, far_y = width + 2.0 * margin, height + 2.0 * margin
     count = 0
     for e in range(ends.shape[0]):
@@ -213,20 +252,21 @@ def differentiate(
         if jump == 0.0:
             continue
         a, b, c, d = ends[e, 0], ends[e, 1], ends[e, 2], ends[e, 3]
-        chords = chord_count(plane, lens, view, a, b, c, d) if distorted else 1
+        edge = ModuleEdge(a, b, c, d)
+        chords = chord_count(projection, edge) if optics.distorted else 1
         for chord in range(chords):
             t0, t1 = chord / chords, (chord + 1.0) / chords
-            if not distorted:
-                # To the box and what spreads into it, before division, as the image is.
-                x0, y0, z0 = imaged(plane, view, shift_x, shift_y, a, b)
-                x1, y1, z1 = imaged(plane, view, shift_x, shift_y, c, d)
+            if not optics.distorted:
+                # Clip to the box and its margin before division, as the image is.
+                x0, y0, z0 = homogeneous_pixel(projection, shift_x, shift_y, a, b)
+                x1, y1, z1 = homogeneous_pixel(projection, shift_x, shift_y, c, d)
                 t0, t1 = clip(x0, x1, t0, t1)
                 t0, t1 = clip(y0, y1, t0, t1)
                 t0, t1 = clip(far_x * z0 - x0, far_x * z1 - x1, t0, t1)
                 t0, t1 = clip(far_y * z0 - y0, far_y * z1 - y1, t0, t1)
             else:
-                u0, v0 = bent(t0, plane, lens, view, a, b, c, d)
-                u1, v1 = bent(t1, plane, lens, view, a, b, c, d)
+                u0, v0 = distorted_point(t0, projection, edge)
+                u1, v1 = distorted_point(t1, projection, edge)
                 if (
                     max(u0, u1) + 0.5 < -margin or min(u0, u1) + 0.5 > width + margin
                     or max(v0, v1) + 0.5 < -margin or min(v0, v1) + 0.5 > height + margin
@@ -239,46 +279,45 @@ def differentiate(
                 plane[0, 0] * ca + plane[0, 1] * da + plane[0, 2],
                 plane[1, 0] * ca + plane[1, 1] * da + plane[1, 2],
                 plane[2, 0] * ca + plane[2, 1] * da + plane[2, 2],
-                translation, view, lens, distorted, rates[0], rates[1],
+                translation, optics, rates[:2],
             )
             xb, yb = velocity(
                 plane[0, 0] * cb + plane[0, 1] * db + plane[0, 2],
                 plane[1, 0] * cb + plane[1, 1] * db + plane[1, 2],
                 plane[2, 0] * cb + plane[2, 1] * db + plane[2, 2],
-                translation, view, lens, distorted, rates[2], rates[3],
+                translation, optics, rates[2:],
             )
             for k in range(POSE):
                 at_a[k] = rates[0, k] * (yb - ya) - rates[1, k] * (xb - xa)
                 at_b[k] = rates[2, k] * (yb - ya) - rates[3, k] * (xb - xa)
+            segment = MovingSegment(xa, ya, xb, yb, at_a, at_b)
             if sigma > 0.0:
-                count = _add_spread(
-                    place, slopes, count, jump, sigma, xa, ya, xb, yb, at_a, at_b
-                )
+                count = _add_spread(work, count, jump, sigma, segment)
             else:
-                count = _add_sharp(place, slopes, count, jump, xa, ya, xb, yb, at_a, at_b)
+                count = _add_sharp(work, count, jump, segment)
     return count
 
 
 @compiled
 def normal_equations(
-    image: Floats, shares: Floats, place: NDArray[np.int32], slopes: Floats, free: int,
-    matrix: Floats, vector: Floats,
+    image: Floats, work: Work, free: int, matrix: Floats, vector: Floats
 ) -> None:
-    """Sum up JᵀJ and Jᵀ·image over the pixels of a box, and clear ``shares`` and ``place``.
+    """Sum up JᵀJ and Jᵀ·image over the pixels of a box, and clear ``work``.
 
-    J's columns are the first ``free`` slopes and the areas outside, of black and of white.
+    J's columns are the first ``free`` slopes and the areas of outside, black and white.
     ``matrix`` (free + 3, free + 3) and ``vector`` (free + 3,) are overwritten.
     """
+    shares, slots, slopes = work
     size = free + LEVELS
     matrix[:] = 0.0
     vector[:] = 0.0
     column = np.empty(size)
-    height, width = place.shape
+    height, width = slots.shape
     for i in range(height):
         black = white = 0.0
         pixels = total = 0.0
         for j in range(width):
-            more_black, more_white, slot = shares[0, i, j], shares[1, i, j], place[i, j]
+            more_black, more_white, slot = shares[0, i, j], shares[1, i, j], slots[i, j]
             level = image[i, j]
             if more_black == 0.0 and more_white == 0.0 and slot < 0:
                 pixels += 1.0
@@ -297,7 +336,7 @@ def normal_equations(
                 pixels, total = 1.0, level
                 continue
             pixels = total = 0.0
-            place[i, j] = -1
+            slots[i, j] = -1
             column[free], column[free + 1], column[free + 2] = 1.0 - black - white, black, white
             for k in range(free):
                 column[k] = slopes[slot, k]

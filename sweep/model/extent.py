@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model import lens as lens_model
-from sweep.model.coverage import REACH
 from sweep.model.marker import marker_corners
-from sweep.model.motion import MEANINGLESS, UNSEEN, row_times, track
-from sweep.model.pose import placed
+from sweep.model.motion import BEHIND, MEANINGLESS, Motion, MovingMarker, row_times, track
+from sweep.model.point_spread import REACH
+from sweep.model.pose import transform_points
 from sweep.model.scene import Box, Scenes
 from sweep.typing import Floats
 
@@ -111,6 +111,14 @@ def outline_modules(scenes: Scenes, row: int) -> Floats:
     return np.asarray(_square(-quiet, scenes.modules[row : row + 1] + quiet, per_side)[0])
 
 
+def moving_marker(scenes: Scenes, row: int, velocity: Floats) -> MovingMarker:
+    """Return the marker of one scene with a velocity (6,) as compiled functions take it."""
+    return MovingMarker(
+        scenes.projection(row), Motion(scenes.translation[row], velocity),
+        outline_modules(scenes, row),
+    )
+
+
 def _exposed_extent(
     scenes: Scenes, row: int, low: Floats, high: Floats
 ) -> tuple[Floats, Floats]:
@@ -131,12 +139,8 @@ def _exposed_extent(
     wanted = max(MIN_INSTANTS, (end - begin) / row_time_s if row_time_s > 0 else 0.0)
     count = int(min(max(wanted, 2 * turn / _COARSE_TURN), MAX_INSTANTS))
     times = np.linspace(begin, end, count)
-    cameras = scenes.cameras
-    extents, states = track(
-        scenes.plane[row], scenes.translation[row], velocity, cameras.view[row],
-        cameras.lenses[row], bool(cameras.distorted[row]), outline_modules(scenes, row), times,
-    )
-    front = states != UNSEEN
+    extents, states = track(moving_marker(scenes, row, velocity), times)
+    front = states != BEHIND
     with np.errstate(invalid="ignore"):
         step = np.abs(np.diff(extents, axis=0))
     margin = np.zeros(count)
@@ -200,19 +204,15 @@ def path_px(scenes: Scenes, row: int, box: Box) -> float:
     if motion is None or motion[0] == 0.0:
         return 0.0
     exposure_s, row_time_s, velocity = motion
-    outline, cameras = outline_modules(scenes, row), scenes.cameras
-    still = velocity * np.array([1.0, 1, 1, 0, 0, 0])
+    marker = moving_marker(scenes, row, velocity * np.array([1.0, 1, 1, 0, 0, 0]))
     longest = 0.0
     for line in (box[1], (box[1] + box[3]) // 2, box[3] - 1):
         times = np.linspace(
             *row_times(line, line + 1, int(scenes.frame[row, 1]), exposure_s, row_time_s),
             MIN_INSTANTS,
         )
-        extents, states = track(
-            scenes.plane[row], scenes.translation[row], still, cameras.view[row],
-            cameras.lenses[row], bool(cameras.distorted[row]), outline, times,
-        )
-        extents = extents[states != UNSEEN]
+        extents, states = track(marker, times)
+        extents = extents[states != BEHIND]
         if not len(extents):
             continue
         along = np.hypot(*np.abs(np.diff(extents, axis=0)).reshape(-1, 2, 2).max(axis=1).T).sum()
@@ -306,7 +306,7 @@ def not_modelled(scenes: Scenes) -> NDArray[np.bool_]:
     if len(rows):
         widened = 1 + 2 * scenes.quiet_zone[rows] / scenes.modules[rows]
         outline = marker_corners(scenes.size_m[rows] * widened)
-        points = placed(outline, scenes.rotation[rows], scenes.translation[rows])
+        points = transform_points(outline, scenes.rotation[rows], scenes.translation[rows])
         folded[rows] |= lens_model.folds(
             np.ascontiguousarray(points[..., :2] / points[..., 2:]),
             scenes.cameras.lenses[rows],

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.model.coverage import MarkerEdges
 from sweep.model.declaration import parameter
 
 OUTSIDE, BLACK, WHITE, OCCLUDER = 0, 1, 2, 3
@@ -71,24 +72,6 @@ def marker_corners(size_m: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.asarray(size_m, dtype=np.float64)[:, None, None] * unit)
 
 
-@dataclass(frozen=True, slots=True)
-class Edges:
-    """A marker's edges in module coordinates (column right, row down, origin at the TL corner).
-
-    Attributes
-    ----------
-    ends
-        (E, 4) column and row of the start and of the end.
-    sides
-        (E, 2) codes of what lies on the two sides. The grey level's jump that an edge stands for
-        is ``level[sides[1]] - level[sides[0]]``, signed for an edge that is traversed downwards
-        in the image with ``sides[1]`` at greater x.
-    """
-
-    ends: NDArray[np.float64]
-    sides: NDArray[np.int64]
-
-
 def _runs(line: NDArray[np.int64]) -> list[tuple[int, int, int, int]]:
     """Return (start, end, before, after) of maximal runs in a line (m, 2) of side codes."""
     runs = []
@@ -103,7 +86,7 @@ def _runs(line: NDArray[np.int64]) -> list[tuple[int, int, int, int]]:
 
 
 @lru_cache(maxsize=8192)
-def edges(dictionary: str, marker_id: int, quiet_zone_modules: float) -> Edges:
+def edges(dictionary: str, marker_id: int, quiet_zone_modules: float) -> MarkerEdges:
     """Return the maximal straight edges between areas of different colour."""
     n = module_count(dictionary)
     surround = OUTSIDE if quiet_zone_modules == 0 else WHITE
@@ -125,7 +108,7 @@ def edges(dictionary: str, marker_id: int, quiet_zone_modules: float) -> Edges:
         a, b = -quiet_zone_modules, n + quiet_zone_modules
         ends += [(a, a, a, b), (b, a, b, b), (a, a, b, a), (a, b, b, b)]
         sides += [(OUTSIDE, WHITE), (WHITE, OUTSIDE), (WHITE, OUTSIDE), (OUTSIDE, WHITE)]
-    return Edges(np.array(ends, dtype=np.float64), np.array(sides, dtype=np.int64))
+    return MarkerEdges(np.array(ends, dtype=np.float64), np.array(sides, dtype=np.int64))
 
 
 MarkerKey = tuple[str, int, float]
@@ -133,12 +116,12 @@ MarkerKey = tuple[str, int, float]
 
 
 @lru_cache(maxsize=64)
-def edge_table(markers: tuple[MarkerKey, ...]) -> tuple[Edges, NDArray[np.int64]]:
+def edge_table(markers: tuple[MarkerKey, ...]) -> tuple[MarkerEdges, NDArray[np.int64]]:
     """Return the edges of K markers in one table, and (K, 2) where each one's begin and end."""
     each = [edges(*marker) for marker in markers]
     stops = np.cumsum([len(outline.ends) for outline in each])
     starts = np.concatenate([[0], stops[:-1]])
-    table = Edges(
+    table = MarkerEdges(
         np.concatenate([outline.ends for outline in each]),
         np.concatenate([outline.sides for outline in each]),
     )
@@ -146,7 +129,7 @@ def edge_table(markers: tuple[MarkerKey, ...]) -> tuple[Edges, NDArray[np.int64]
 
 
 @lru_cache(maxsize=8192)
-def occluded_edges(marker: MarkerKey, occlusion: float, occlusion_deg: float) -> Edges:
+def occluded_edges(marker: MarkerKey, occlusion: float, occlusion_deg: float) -> MarkerEdges:
     """Return the edges of a marker that a sheet lies on, which hides all beyond a straight line.
 
     Parts of edges under the sheet are projected onto its edge, at a right angle: what they then
@@ -192,4 +175,4 @@ def occluded_edges(marker: MarkerKey, occlusion: float, occlusion_deg: float) ->
         parts = split([*start, *stop], hidden=True)
         ends += parts
         sides += [(OUTSIDE, OCCLUDER)] * len(parts)
-    return Edges(np.array(ends, dtype=np.float64), np.array(sides, dtype=np.int64))
+    return MarkerEdges(np.array(ends, dtype=np.float64), np.array(sides, dtype=np.int64))

@@ -3,23 +3,58 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.model.lens import distort, jacobian
+from sweep.model.projection import Projection
 from sweep.typing import Floats
 
 
+class Motion(NamedTuple):
+    """A marker's motion in the camera frame.
+
+    Attributes
+    ----------
+    translation
+        (3,) position of its centre at time 0, in metres.
+    velocity
+        (6,) linear in m/s and angular in rad/s.
+    """
+
+    translation: Floats
+    velocity: Floats
+
+
+class MovingMarker(NamedTuple):
+    """A moving marker seen by a camera.
+
+    Attributes
+    ----------
+    projection
+        The camera, and the marker's plane at time 0.
+    motion
+        How the marker moves.
+    outline
+        (M, 2) points of its outline in module coordinates.
+    """
+
+    projection: Projection
+    motion: Motion
+    outline: Floats
+
+
 @compiled
-def moved(plane: Floats, translation: Floats, velocity: Floats, time_s: float) -> Floats:
+def moved_plane(plane: Floats, motion: Motion, time_s: float) -> Floats:
     """Return the plane (3, 3) of a marker after ``time_s``.
 
-    ``plane`` takes module coordinates to the camera frame, ``translation`` (3,) is the centre's
-    position, ``velocity`` (6,) linear in m/s and angular in rad/s, camera frame; the rotation
-    about the centre is Rodrigues' formula for the vector angular velocity · time.
+    ``plane`` takes module coordinates to the camera frame. The rotation about the centre is
+    Rodrigues' formula for the vector angular velocity · time.
     """
+    translation, velocity = motion
     x, y, z = velocity[3] * time_s, velocity[4] * time_s, velocity[5] * time_s
     angle = math.sqrt(x * x + y * y + z * z)
     sine, versine = 1.0, 0.5
@@ -41,20 +76,22 @@ def moved(plane: Floats, translation: Floats, velocity: Floats, time_s: float) -
     return after
 
 
-SEEN, UNSEEN, MEANINGLESS = 0, 1, 2
-"""States of a moving marker: in front of the camera; behind it as a whole; or across its plane,
-seen from behind, or where the lens folds, so that its image has no meaning."""
+VISIBLE, BEHIND, MEANINGLESS = 0, 1, 2
+"""States of a moving marker: in front of the camera; wholly behind it; or without a meaningful
+image, since it crosses the camera's plane, shows its back, or lies where the lens folds."""
 
 
 @compiled
 def outline_extent(
-    plane: Floats, view: Floats, lens: Floats, distorted: bool, outline: Floats, extent: Floats
+    projection: Projection, outline: Floats, extent: Floats
 ) -> tuple[int, bool]:
     """Write left, top, right, bottom in px of an outline's image to ``extent`` (4,).
 
-    Of the points (M, 2), in module coordinates, before the camera. Returns how many are behind
-    it, and whether the lens folds at one of the others.
+    The extent is that of the points (M, 2), in module coordinates, in front of the camera.
+    Returns how many are behind it, and whether the lens folds at one of the others.
     """
+    plane, optics = projection.plane, projection.optics
+    intrinsics, lens = optics.intrinsics, optics.lens
     behind, folds = 0, False
     extent[0] = extent[1] = math.inf
     extent[2] = extent[3] = -math.inf
@@ -65,30 +102,27 @@ def outline_extent(
             continue
         x = (plane[0, 0] * outline[j, 0] + plane[0, 1] * outline[j, 1] + plane[0, 2]) / z
         y = (plane[1, 0] * outline[j, 0] + plane[1, 1] * outline[j, 1] + plane[1, 2]) / z
-        if distorted:
+        if optics.distorted:
             a, b, c, d = jacobian(x, y, lens)
             folds = folds or not (math.hypot(x, y) < lens[23] and a * d - b * c > 0.0)
             x, y = distort(x, y, lens)
-        u, v = view[0] * x + view[2], view[1] * y + view[3]
+        u, v = intrinsics[0] * x + intrinsics[2], intrinsics[1] * y + intrinsics[3]
         extent[0], extent[2] = min(extent[0], u), max(extent[2], u)
         extent[1], extent[3] = min(extent[1], v), max(extent[3], v)
     return behind, folds
 
 
 @compiled
-def track(
-    plane: Floats, translation: Floats, velocity: Floats, view: Floats, lens: Floats,
-    distorted: bool, outline: Floats, times_s: Floats,
-) -> tuple[Floats, NDArray[np.int64]]:
-    """Return the extents (T, 4) left, top, right, bottom in px of a marker, and states (T,).
-
-    ``outline`` (M, 2) are points of its outline in module coordinates.
-    """
+def track(marker: MovingMarker, times_s: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """Return the extents (T, 4) left, top, right, bottom in px of a marker, and its states (T,)."""
+    projection, motion = marker.projection, marker.motion
     extents = np.empty((len(times_s), 4))
     states = np.zeros(len(times_s), dtype=np.int64)
     for k in range(len(times_s)):
-        p = moved(plane, translation, velocity, times_s[k])
-        behind, folds = outline_extent(p, view, lens, distorted, outline, extents[k])
+        p = moved_plane(projection.plane, motion, times_s[k])
+        behind, folds = outline_extent(
+            Projection(p, projection.optics), marker.outline, extents[k]
+        )
         if folds:
             states[k] = MEANINGLESS
         # The sign of the line of sight along the normal, which is the columns' cross product.
@@ -96,9 +130,9 @@ def track(
         for i in range(3):
             a, b = (i + 1) % 3, (i + 2) % 3
             normal = p[a, 0] * p[b, 1] - p[b, 0] * p[a, 1]
-            facing += normal * (translation[i] + velocity[i] * times_s[k])
-        if behind == len(outline):
-            states[k] = UNSEEN
+            facing += normal * (motion.translation[i] + motion.velocity[i] * times_s[k])
+        if behind == len(marker.outline):
+            states[k] = BEHIND
         elif behind > 0 or not facing > 0.0:
             states[k] = MEANINGLESS
     return extents, states

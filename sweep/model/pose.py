@@ -148,16 +148,16 @@ def vectors(rotation: Floats) -> Floats:
     return rvec
 
 
-def placed(points: Floats, rotation: Floats, translation: Floats) -> Floats:
+def transform_points(points: Floats, rotation: Floats, translation: Floats) -> Floats:
     """Return marker-frame points (N, M, 3) moved to the camera frame by poses (N, 3, 3), (N, 3)."""
-    return _placed(
+    return _transform_points(
         np.ascontiguousarray(points), np.ascontiguousarray(rotation),
         np.ascontiguousarray(translation),
     )
 
 
 @compiled
-def _placed(points: Floats, rotation: Floats, translation: Floats) -> Floats:
+def _transform_points(points: Floats, rotation: Floats, translation: Floats) -> Floats:
     moved = np.empty_like(points)
     for i in range(points.shape[0]):
         for j in range(points.shape[1]):

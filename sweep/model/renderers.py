@@ -12,14 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.model import coverage
+from sweep.model import coverage, drawing
 from sweep.model.exposure import marker_exposure
 from sweep.model.extent import WARP_PX_PER_MODULE
 from sweep.model.image_file import decode_grey
 from sweep.model.marker import edge_table, edges, modules
 from sweep.model.scene import Box, Scenes
-from sweep.model.sensor import illuminate, read_out
-from sweep.model.supersampling import supersample
+from sweep.model.sensor import Light, Readout, illuminate, read_out
+from sweep.model.supersampling import SampledMarker, supersample
 
 Grey = NDArray[np.uint8]
 
@@ -42,7 +42,7 @@ def background_image(path: str) -> Grey:
 
 
 def quantise(levels: NDArray[np.float64]) -> Grey:
-    """Return grey levels rounded to 8 bits (half up, as :func:`coverage.sum_grey`) and clipped."""
+    """Return grey levels rounded to 8 bits (half up, as ``drawing.sum_grey``) and clipped."""
     shifted = levels + (0.5 + coverage.ROUNDING_SNAP)
     return np.clip(shifted, 0.0, 255.0).astype(np.uint8)
 
@@ -126,15 +126,17 @@ def _sensed(scenes: Scenes, row: int, levels: NDArray[np.float64], left: int, to
     slope = effect["illumination_gradient"] / width
     if slope != 0 or effect["vignetting"] > 0:
         turn = math.radians(effect["illumination_deg"])
-        illuminate(
-            levels, left, top, slope * math.cos(turn), slope * math.sin(turn), (width - 1) / 2,
-            (height - 1) / 2, scenes.cameras.view[row], effect["vignetting"],
+        light = Light(
+            slope * math.cos(turn), slope * math.sin(turn), (width - 1) / 2, (height - 1) / 2,
+            effect["vignetting"],
         )
+        illuminate(levels, left, top, light, scenes.cameras.view[row])
     image = np.empty(levels.shape, dtype=np.uint8)
-    read_out(
-        levels, left, top, scenes.noise_key[row], effect["full_well_e"], effect["read_noise_e"],
-        effect["gain"], effect["noise_grey"], int(effect["bit_depth"]), image,
+    readout = Readout(
+        scenes.noise_key[row], effect["full_well_e"], effect["read_noise_e"], effect["gain"],
+        effect["noise_grey"], int(effect["bit_depth"]),
     )
+    read_out(levels, left, top, readout, image)
     return image
 
 
@@ -150,9 +152,13 @@ def _draw(
     scratch = _scratch(int(((box[:, 0] + 2) * box[:, 1]).max()))
     table, spans = edge_table(scenes.markers)
     cameras = scenes.cameras
-    coverage.draw_greys(
-        images, starts, windows, boxes, scratch, table.ends, table.sides, spans, scenes.marker,
-        scenes.levels, scenes.plane, cameras.view, cameras.lenses, cameras.distorted, rows,
+    drawing.draw_greys(
+        drawing.Canvas(images, starts, windows, boxes, scratch),
+        drawing.DrawnScenes(
+            table, spans, scenes.marker, scenes.levels, scenes.plane, cameras.view, cameras.lenses,
+            cameras.distorted,
+        ),
+        rows,
     )
     heights = size[:, 1].tolist()
     return [
@@ -192,11 +198,12 @@ def marker_levels(
         match = SUPERSAMPLE.fullmatch(renderer)
         if match is None:
             raise ValueError(f"renderer = {renderer!r}: expected {renderer_fault(renderer)}")
+        marker = SampledMarker(
+            modules(scenes.dictionary[row], scenes.marker_id[row]), float(scenes.quiet_zone[row]),
+            scenes.levels[row], np.linalg.inv(scenes.plane[row]), scenes.cameras.optics(row),
+        )
         supersample(
-            mean, share, int(match[1]), match[2] is not None,
-            modules(scenes.dictionary[row], scenes.marker_id[row]), scenes.quiet_zone[row],
-            scenes.levels[row], np.linalg.inv(scenes.plane[row]), scenes.cameras.view[row],
-            scenes.cameras.lenses[row], bool(scenes.cameras.distorted[row]), box[0], box[1],
+            mean, share, marker, int(match[1]), match[2] is not None, box[0], box[1]
         )
     return mean, share
 
@@ -208,8 +215,7 @@ def _cover(
     cover = np.zeros((box[3] - box[1], box[2] - box[0] + 2))
     outlines = edges(scenes.dictionary[row], scenes.marker_id[row], float(scenes.quiet_zone[row]))
     coverage.accumulate(
-        cover, outlines.ends, outlines.sides, levels, scenes.plane[row], scenes.cameras.view[row],
-        scenes.cameras.lenses[row], bool(scenes.cameras.distorted[row]), box[0], box[1], 0.0,
+        cover, outlines, levels, scenes.projection(row), box[0], box[1], 0.0
     )
     return cover
 

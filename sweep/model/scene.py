@@ -17,7 +17,8 @@ from sweep.model.columns import Column, map_columns
 from sweep.model.declaration import parameter
 from sweep.model.effects import NEUTRAL, SWITCHES, VELOCITIES, Effects
 from sweep.model.marker import MarkerKey, marker_corners, module_count
-from sweep.model.pose import placed, rotation_of_angles
+from sweep.model.pose import rotation_of_angles, transform_points
+from sweep.model.projection import Projection
 from sweep.typing import Floats
 
 Key = TypeVar("Key")
@@ -123,6 +124,10 @@ class Scenes:
         uneven = (self.effects["illumination_gradient"] != 0) | (self.effects["vignetting"] > 0)
         return np.where(uneven, np.maximum(self.effects["gain"], 1.0), 0.0)
 
+    def projection(self, row: int) -> Projection:
+        """Return the camera and the marker's plane of one scene as compiled functions take them."""
+        return Projection(self.plane[row], self.cameras.optics(row))
+
     def effect(self, row: int) -> dict[str, float]:
         """Return the effects' parameters of one scene."""
         if self.effects is None:
@@ -220,7 +225,7 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
     )
     outline_size = size * (1 + 2 * quiet / modules)
     corners_px, outline_px = (
-        cameras.project(placed(marker_corners(side), rotation, translation))
+        cameras.project(transform_points(marker_corners(side), rotation, translation))
         for side in (size, outline_size)
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,37 +11,80 @@ from numpy.typing import NDArray
 from sweep.compilation import compiled
 from sweep.model.coverage import ROUNDING_SNAP
 from sweep.model.splitmix import mixed
+from sweep.typing import Floats
 
 _PIXEL_STEP = np.uint64(0x9E3779B97F4A7C15)
 _DRAW_STEP = np.uint64(0xD1342543DE82EF95)
 _ONE = np.uint64(1)
 
 
+class Light(NamedTuple):
+    """How the light varies over the frame.
+
+    Attributes
+    ----------
+    slope_x, slope_y
+        Change of the light per pixel, relative to that at the middle.
+    middle_x, middle_y
+        Middle of the frame in pixels.
+    vignetting
+        Power of the cosine of the angle to the optical axis.
+    """
+
+    slope_x: float
+    slope_y: float
+    middle_x: float
+    middle_y: float
+    vignetting: float
+
+
+class Readout(NamedTuple):
+    """The sensor's noise and quantisation.
+
+    Attributes
+    ----------
+    key
+        Key of the scene's noise: all of a pixel's noise is a function of it and of the pixel.
+    full_well_e, read_noise_e
+        Electrons at level 255 and gain 1, and standard deviation of the read noise in electrons;
+        NaN for no electrons.
+    gain, noise_grey, bits
+        As :class:`sweep.model.effects.Effects` has them.
+    """
+
+    key: np.uint64
+    full_well_e: float
+    read_noise_e: float
+    gain: float
+    noise_grey: float
+    bits: int
+
+
 @compiled
 def illuminate(
-    levels: NDArray[np.float64], left: int, top: int, slope_x: float, slope_y: float,
-    middle_x: float, middle_y: float, view: NDArray[np.float64], vignetting: float,
+    levels: Floats, left: int, top: int, light: Light, intrinsics: Floats
 ) -> None:
-    """Multiply levels (h, w), whose top left pixel is given, by the light that falls there.
+    """Multiply levels (h, w), whose top left pixel is (left, top), by the light on each pixel.
 
     1 + slope · (pixel - middle of the frame), never below 0, times the ``vignetting``-th power of
     the cosine of the pixel's angle to the optical axis (the natural cos⁴ law: Born and Wolf,
-    "Principles of optics", section 4.8.1). ``view`` (4,) is fx, fy, cx, cy.
+    "Principles of optics", section 4.8.1). ``intrinsics`` (4,) is fx, fy, cx, cy.
     """
+    slope_x, slope_y, middle_x, middle_y, vignetting = light
     for i in range(levels.shape[0]):
-        y = (top + i - view[3]) / view[1]
+        y = (top + i - intrinsics[3]) / intrinsics[1]
         along_y = 1.0 + slope_y * (top + i - middle_y)
         for j in range(levels.shape[1]):
-            light = max(along_y + slope_x * (left + j - middle_x), 0.0)
+            factor = max(along_y + slope_x * (left + j - middle_x), 0.0)
             if vignetting > 0.0:
-                x = (left + j - view[2]) / view[0]
-                light *= (1.0 + x * x + y * y) ** (-0.5 * vignetting)
-            levels[i, j] *= light
+                x = (left + j - intrinsics[2]) / intrinsics[0]
+                factor *= (1.0 + x * x + y * y) ** (-0.5 * vignetting)
+            levels[i, j] *= factor
 
 
 @compiled
 def _uniform(pixel: np.uint64, draw: int) -> float:
-    """Return the draw of a given number of a pixel's key, in (0, 1)."""
+    """Return draw number ``draw`` of a pixel's key, in (0, 1)."""
     bits = mixed(pixel + _DRAW_STEP * (np.uint64(draw) + _ONE))
     return (float(bits >> np.uint64(11)) + 0.5) * 2.0**-53
 
@@ -89,34 +133,77 @@ def _poisson(mean: float, pixel: np.uint64, draw: int) -> float:
 
 
 @compiled
-def read_out(
-    levels: NDArray[np.float64], left: int, top: int, key: np.uint64, full_well: float,
-    read_noise: float, gain: float, noise: float, bits: int, image: NDArray[np.uint8],
-) -> None:
-    """Turn levels (h, w), whose top left pixel is given, into the image (h, w).
+def _pixel_key(key: np.uint64, column: int, row: int) -> Any:
+    """Return the key of a pixel's draws: a function of the scene's key and of its position."""
+    position = (np.uint64(row) << np.uint64(32)) + np.uint64(column)
+    return mixed(key + _PIXEL_STEP * (position + _ONE))
 
-    In this order: electrons with shot noise, at most ``full_well``, and ``read_noise`` (e-); gain;
-    plain Gaussian ``noise`` (grey levels); quantisation to ``bits``, clipped; 8 bits for OpenCV.
-    ``full_well`` is NaN where there are no electrons. All of a pixel's noise is a function of
-    ``key`` and of where it lies in the frame (EMVA standard 1288, section 2, has the model).
+
+@compiled
+def _signal(level: float, pixel: np.uint64, readout: Readout) -> float:
+    """Return a pixel's signal in grey levels: electrons and their noise, gain, plain noise.
+
+    In this order: electrons with shot noise, at most ``full_well_e``, and read noise; gain; plain
+    Gaussian noise in grey levels (EMVA standard 1288, section 2).
     """
+    if not math.isnan(readout.full_well_e):
+        electrons = _poisson(level * readout.full_well_e / 255.0, pixel, 4)
+        electrons = min(electrons, readout.full_well_e)
+        if readout.read_noise_e > 0.0:
+            electrons += readout.read_noise_e * _normal(pixel, 0)
+        level = electrons * 255.0 / readout.full_well_e
+    level *= readout.gain
+    if readout.noise_grey > 0.0:
+        level += readout.noise_grey * _normal(pixel, 2)
+    return level
+
+
+@compiled
+def _digitised(level: float, bits: int, most: float) -> np.uint8:
+    """Return a level quantised to ``bits`` (``most`` is the largest value), clipped, in 8 bits."""
+    counts = float(math.floor(level * (most / 255.0) + (0.5 + ROUNDING_SNAP)))
+    counts = min(max(counts, 0.0), most)
+    if bits != 8:
+        counts = math.floor(counts * (255.0 / most) + 0.5)
+    return np.uint8(counts)
+
+
+@compiled
+def read_out(
+    levels: Floats, left: int, top: int, readout: Readout, image: NDArray[np.uint8]
+) -> None:
+    """Turn levels (h, w), whose top left pixel is (left, top), into the image (h, w).
+
+    In one pass: :func:`add_noise` and :func:`digitise`.
+    """
+    most = 2.0**readout.bits - 1.0
+    for i in range(levels.shape[0]):
+        for j in range(levels.shape[1]):
+            pixel = _pixel_key(readout.key, left + j, top + i)
+            image[i, j] = _digitised(_signal(levels[i, j], pixel, readout), readout.bits, most)
+
+
+@compiled
+def add_noise(levels: Floats, left: int, top: int, readout: Readout) -> None:
+    """Replace levels (h, w) by the signal with noise and gain, in grey levels, not quantised."""
+    for i in range(levels.shape[0]):
+        for j in range(levels.shape[1]):
+            pixel = _pixel_key(readout.key, left + j, top + i)
+            levels[i, j] = _signal(levels[i, j], pixel, readout)
+
+
+@compiled
+def digitise(levels: Floats, bits: int, image: NDArray[np.uint8]) -> None:
+    """Quantise levels (h, w) to ``bits``, clipped, and write them to ``image`` in 8 bits."""
     most = 2.0**bits - 1.0
     for i in range(levels.shape[0]):
         for j in range(levels.shape[1]):
-            level = levels[i, j]
-            place = (np.uint64(top + i) << np.uint64(32)) + np.uint64(left + j)
-            pixel = mixed(key + _PIXEL_STEP * (place + _ONE))
-            if not math.isnan(full_well):
-                electrons = _poisson(level * full_well / 255.0, pixel, 4)
-                electrons = min(electrons, full_well)
-                if read_noise > 0.0:
-                    electrons += read_noise * _normal(pixel, 0)
-                level = electrons * 255.0 / full_well
-            level *= gain
-            if noise > 0.0:
-                level += noise * _normal(pixel, 2)
-            counts = math.floor(level * (most / 255.0) + (0.5 + ROUNDING_SNAP))
-            counts = min(max(counts, 0.0), most)
-            if bits != 8:
-                counts = math.floor(counts * (255.0 / most) + 0.5)
-            image[i, j] = np.uint8(counts)
+            image[i, j] = _digitised(levels[i, j], bits, most)
+
+
+@compiled
+def standard_normals(key: np.uint64, left: int, top: int, normals: Floats) -> None:
+    """Fill ``normals`` (h, w) with standard normal numbers, a function of key and pixel alone."""
+    for i in range(normals.shape[0]):
+        for j in range(normals.shape[1]):
+            normals[i, j] = _normal(_pixel_key(key, left + j, top + i), 0)

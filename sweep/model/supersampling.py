@@ -2,46 +2,63 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.model.lens import undistort
+from sweep.model.projection import Optics
+from sweep.model.splitmix import mixed
+from sweep.typing import Floats
+
+
+class SampledMarker(NamedTuple):
+    """A marker as its samples see it.
+
+    Attributes
+    ----------
+    modules
+        (n, n) True where white.
+    quiet
+        Width of the quiet zone in modules.
+    levels
+        (3,) grey levels of outside, black and white.
+    inverse
+        (3, 3) takes undistorted normalised image coordinates to module coordinates.
+    optics
+        The camera.
+    """
+
+    modules: NDArray[np.bool_]
+    quiet: float
+    levels: Floats
+    inverse: Floats
+    optics: Optics
 
 
 @compiled
 def _unit(key: int) -> float:
-    """Return a number in [0, 1) that depends on ``key`` alone (splitmix64's finaliser)."""
-    z = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return np.float64((z ^ (z >> np.uint64(31))) >> np.uint64(11)) * 2.0**-53
+    """Return a number in [0, 1) that depends on ``key`` alone."""
+    bits = mixed(np.uint64(key) * np.uint64(0x9E3779B97F4A7C15))
+    return np.float64(bits >> np.uint64(11)) * 2.0**-53
 
 
 @compiled
 def supersample(
-    mean: NDArray[np.float64],
-    share: NDArray[np.float64],
-    per_side: int,
-    jittered: bool,
-    modules: NDArray[np.bool_],
-    quiet: float,
-    levels: NDArray[np.float64],
-    inverse: NDArray[np.float64],
-    view: NDArray[np.float64],
-    lens: NDArray[np.float64],
-    distorted: bool,
-    left: int,
+    mean: Floats, share: Floats, marker: SampledMarker, per_side: int, jittered: bool, left: int,
     top: int,
 ) -> None:
     """Write the mean level of the marker's samples to ``mean`` and their share to ``share``.
 
-    ``mean`` counts samples beside the marker as level 0, so a pixel's level is
-    ``mean + (1 - share) * background``. ``inverse`` (3, 3) takes normalised image coordinates to
-    module coordinates; samples are at the middle of N x N cells of the pixel or, ``jittered``,
-    anywhere within them. The other arguments are those of
-    :func:`sweep.model.coverage.accumulate`.
+    Both are (height, width), of the box whose top left pixel is (``left``, ``top``). ``mean``
+    counts samples beside the marker as level 0, so that a pixel's level is
+    ``mean + (1 - share) * background``. Samples lie in the middle of N x N cells of the pixel or,
+    if ``jittered``, at random within them.
     """
+    modules, quiet, levels, inverse, optics = marker
+    intrinsics, lens = optics.intrinsics, optics.lens
     n = modules.shape[0]
     total = per_side * per_side
     for i in range(mean.shape[0]):
@@ -54,10 +71,10 @@ def supersample(
                     offset_x, offset_y = _unit(key), _unit(key + 1)
                 u = left + j - 0.5 + (k % per_side + offset_x) / per_side
                 v = top + i - 0.5 + (k // per_side + offset_y) / per_side
-                x, y = (u - view[2]) / view[0], (v - view[3]) / view[1]
-                if distorted:
-                    x, y, found = undistort(x, y, lens)
-                    if not found:
+                x, y = (u - intrinsics[2]) / intrinsics[0], (v - intrinsics[3]) / intrinsics[1]
+                if optics.distorted:
+                    x, y, converged = undistort(x, y, lens)
+                    if not converged:
                         continue
                 w = inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
                 if not w > 0.0:

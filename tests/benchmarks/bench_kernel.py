@@ -21,7 +21,7 @@ from sweep.evaluation.cells import (
 )
 from sweep.measure.detector import Detector
 from sweep.measure.flags import DetectionStatus
-from sweep.model import coverage
+from sweep.model import drawing
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render_all
 from sweep.model.scene import build_scenes
@@ -143,7 +143,7 @@ def beside(text):
     spent = []
     with mock.patch.object(cv2, "solvePnPGeneric", played), \
             mock.patch.object(cv2.aruco, "ArucoDetector", Player), \
-            mock.patch.object(coverage, "draw_greys"):
+            mock.patch.object(drawing, "draw_greys"):
         for _ in range(REPEATS):
             answering = clock(answered)
             spent.append(clock(run_cells, pipeline, indices) - answering)

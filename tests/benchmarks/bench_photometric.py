@@ -12,7 +12,7 @@ import numpy as np
 from sweep.evaluation.cells import search, sightings, single_thread, whole_frames
 from sweep.measure.bound import curvature_at_truth
 from sweep.measure.flags import DetectionStatus
-from sweep.measure.likelihood import BACKGROUND_MARGIN_PX, noise_variance, sight_of, state_of
+from sweep.measure.likelihood import BACKGROUND_MARGIN_PX, marker_view, noise_variance, state_of
 from sweep.measure.photometric import Photometric
 from sweep.model.extent import marker_boxes
 from sweep.model.scene import build_scenes
@@ -58,9 +58,8 @@ def measured(side, tilt):
     values = scene_values(pipeline, [np.arange(SCENES)])
     scenes = build_scenes(values, SCENES)
     box = marker_boxes(scenes)[0] + BACKGROUND_MARGIN_PX * np.array([-1, -1, 1, 1])
-    sight = sight_of(
-        scenes.markers[0], scenes.size_m[0], scenes.cameras.view[0], scenes.cameras.lenses[0],
-        False, box[:2], noise_variance(2.0),
+    view = marker_view(
+        scenes.markers[0], scenes.size_m[0], scenes.cameras.optics(0), box[:2], noise_variance(2.0)
     )
     state = state_of(scenes.rotation[0], scenes.translation[0], 0.0, scenes.levels[0])
     width, height = (box[2:] - box[:2]).tolist()
@@ -71,7 +70,7 @@ def measured(side, tilt):
     rows = np.flatnonzero(found[0].flags == DetectionStatus.detected)
     seen = sightings(estimators(pipeline)[0], values, scenes, found[0], rows)
     return (
-        best_ms(lambda: curvature_at_truth(state, sight, height, width, False), 1, 50),
+        best_ms(lambda: curvature_at_truth(state, view, height, width, False), 1, 50),
         *(best_ms(lambda k=k: Photometric(k, spread_free=False)(seen), len(rows))
           for k in (False, True)),
     )

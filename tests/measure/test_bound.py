@@ -24,12 +24,13 @@ from scipy.special import ndtr
 from support.exact_image import DICTIONARIES, LENSES, modules_of, values, visible
 from support.lengths import lengths
 from sweep.evaluation.cells import run_cells, visibility_flags
-from sweep.measure.bound import BACKGROUND_MARGIN_PX, FARTHEST_MIRROR, bounds
+from sweep.measure.bound import BACKGROUND_MARGIN_PX, MAX_MIRROR_DISTANCE, bounds
 from sweep.measure.flags import BoundStatus, DetectionStatus
-from sweep.measure.likelihood import plane_of, state_of
-from sweep.model.coverage import accumulate, sum_levels
+from sweep.measure.likelihood import projection_of, state_of
+from sweep.model.coverage import MarkerEdges, accumulate, sum_levels
 from sweep.model.effects import Effects
 from sweep.model.extent import marker_boxes
+from sweep.model.projection import Optics, Projection
 from sweep.model.scene import build_scenes
 from sweep.plan.experiment import Pipeline
 
@@ -167,10 +168,11 @@ def sharp_area(ends, low, high):
     """Areas (height, width) within closed outlines of segments (E, 4) in pixels."""
     width, height = (high - low).tolist()
     cover, area = np.zeros((height, width + 2)), np.empty((height, width))
+    edges = MarkerEdges(np.ascontiguousarray(ends), np.tile([0, 1], (len(ends), 1)))
+    optics = Optics(np.array([1.0, 1.0, 0.0, 0.0]), np.zeros(24), False)
     accumulate(
-        cover, np.ascontiguousarray(ends), np.tile([0, 1], (len(ends), 1)),
-        np.array([0.0, 1.0, 0.0]), np.eye(3), np.array([1.0, 1.0, 0.0, 0.0]), np.zeros(24),
-        False, int(low[0]), int(low[1]), 0.0,
+        cover, edges, np.array([0.0, 1.0, 0.0]), Projection(np.eye(3), optics), int(low[0]),
+        int(low[1]), 0.0,
     )
     sum_levels(cover, 0.0, area)
     return area
@@ -458,7 +460,7 @@ def test_mirror_distance_is_that_of_an_independent_optimum(given, noise_grey):
     drawing = Drawing(value)
     chi_square, turn = mirror_reference(drawing)
     assert turn > 0.1
-    if math.sqrt(chi_square) > FARTHEST_MIRROR:
+    if math.sqrt(chi_square) > MAX_MIRROR_DISTANCE:
         assert math.isnan(drawing.found().mirror_distance[0])
         return
     # Left where what remains is 1e-2 of chi-square at most, and 1e-4 where steps are whole.
@@ -482,7 +484,7 @@ def test_mirror_distance_of_drawn_poses_is_that_of_independent_optima(count):
         ))
         chi_square, turn = mirror_reference(drawing)
         found = drawing.found().mirror_distance[0]
-        if turn < 1e-3 or math.sqrt(chi_square) > FARTHEST_MIRROR:
+        if turn < 1e-3 or math.sqrt(chi_square) > MAX_MIRROR_DISTANCE:
             assert math.isnan(found)
         else:
             near += 1
@@ -753,9 +755,10 @@ def test_plane_of_a_state_is_what_places_the_marker():
         drawing = Drawing(value)
         state = state_of(drawing.rotation, drawing.translation, 0.0, drawing.levels)
         size, n = value["size_m"], len(modules_of(value)) - 2
-        sight = SimpleNamespace(size_m=size, modules=float(n))
+        view = SimpleNamespace(size_m=size, modules=float(n), optics=None)
         corners = np.array([[0, 0], [n, 0], [n, n], [0, n]], dtype=float)
-        flat = np.column_stack([corners, np.ones(4)]) @ plane_of.py_func(state, sight).T
+        plane = projection_of.py_func(state, view).plane
+        flat = np.column_stack([corners, np.ones(4)]) @ plane.T
         signs = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
         expected = (size / 2 * signs) @ drawing.rotation.T + drawing.translation
         np.testing.assert_allclose(flat, expected, rtol=1e-12, atol=1e-12)

@@ -27,14 +27,13 @@ from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Fl
 from sweep.measure.likelihood import (
     SETTLED,
     fit,
+    marker_view,
     noise_variance,
-    sight_of,
     squares,
     state_of,
-    work_space,
 )
 from sweep.measure.photometric import Photometric, _windows, explains
-from sweep.model.derivatives import LEVELS, POSE
+from sweep.model.derivatives import LEVELS, POSE, work_space
 from sweep.plan.experiment import Pipeline
 
 ALARM = 1e-8
@@ -179,16 +178,14 @@ def chi_square_from(seen, rotation, translation, spread_free=False):
     """Return the chi-square of one sighting's pixels after a fit that starts from a pose."""
     left, top, right, bottom = _windows(seen)[0]
     image = seen.images[0][top:bottom, left:right].astype(np.float64)
-    cameras = seen.cameras
-    sight = sight_of(
-        seen.markers[0], seen.size_m[0], cameras.view[0], cameras.lenses[0],
-        cameras.distorted[0], seen.origins[0] + (left, top),
+    view = marker_view(
+        seen.markers[0], seen.size_m[0], seen.cameras.optics(0), seen.origins[0] + (left, top),
         noise_variance(float(seen.noise_grey[0])),
     )
     free = POSE + 1 if spread_free else POSE
     chi_square, _ = fit(
         image, squares(image), state_of(rotation, translation, seen.blur_px[0], np.zeros(LEVELS)),
-        sight, work_space(*image.shape), spread_free, 100, SETTLED, math.inf,
+        view, work_space(*image.shape), spread_free, 100, SETTLED, math.inf,
         np.empty((free, free)),
     )
     return chi_square, image.size - free - LEVELS

@@ -26,16 +26,17 @@ from support.lengths import lengths
 from sweep.measure.accuracy import pose_error
 from sweep.model import lens
 from sweep.model.camera import Cameras
-from sweep.model.coverage import accumulate, sum_levels
+from sweep.model.coverage import MarkerEdges, accumulate, sum_levels
 from sweep.model.marker import edges, marker_corners
 from sweep.model.pose import (
     angle_between,
     mirrored,
-    placed,
     rotation_of_angles,
     rotation_of_vector,
+    transform_points,
     vector_of_rotation,
 )
+from sweep.model.projection import Optics, Projection
 from sweep.model.scene import build_scenes
 
 ROUNDING = 2.0**-53
@@ -147,7 +148,7 @@ def corner_errors(rng, count, nearness=None):
     """
     view = drawn_views(rng, count)
     rotation, translation, size = drawn_poses(rng, count, view, nearness)
-    points = placed(marker_corners(size), rotation, translation)
+    points = transform_points(marker_corners(size), rotation, translation)
     pixels = undistorted(view).project(points)
     by_bar, by_pose = [], []
     for i in range(count):
@@ -200,7 +201,7 @@ def test_placed_corners_are_projected_to_the_bar(count, table):
     stop = first_failure(depths, lambda depth: corner_errors(rng, count, depth)[0].max() > 1)
     domain = ("1 mm to 1 km, tilts to 89.99°, f 10 to 1e5 px, c ±1e6 px, "
               "z from 1/2 of the distance")
-    table.append(("Cameras.project(placed)", domain, count, f"{by_bar.max():.2f} of the bar",
+    table.append(("Cameras.project", domain, count, f"{by_bar.max():.2f} of the bar",
                   told(stop, "a corner at z = {:.2g} of the distance")))
     assert by_bar.max() <= 1
     # Measured 0.1 to 0.16: there f = 1e5 px magnifies the roundings of z beyond the bar.
@@ -212,7 +213,7 @@ def test_corner_just_before_the_camera_is_off_by_the_last_bits_of_its_pose(count
     # Measured 0.9: the sum of three products is rounded as if their factors were, by 1.1e-16.
     rng = np.random.default_rng(3)
     worst = max(corner_errors(rng, count, 10.0**-power)[1].max() for power in range(1, 10))
-    table.append(("Cameras.project(placed)", "z from 1e-9 to 0.1 of the distance", 9 * count,
+    table.append(("Cameras.project", "z from 1e-9 to 0.1 of the distance", 9 * count,
                   f"{worst:.2f} of what rounding the pose's doubles moves", "z ≤ 0: NaN"))
     assert worst < 3
 
@@ -539,8 +540,9 @@ def covered(plane, view, box, ends=OUTLINE, sides=OUTLINE_SIDES, levels=(0.0, 1.
     left, top, right, bottom = box
     cover = np.zeros((bottom - top, right - left + 2))
     found = np.empty((bottom - top, right - left))
-    accumulate(cover, ends, sides, np.array(levels), np.ascontiguousarray(plane),
-               np.array(view), NO_LENS, False, left, top, 0.0)
+    optics = Optics(np.array(view), NO_LENS, False)
+    accumulate(cover, MarkerEdges(ends, sides), np.array(levels),
+               Projection(np.ascontiguousarray(plane), optics), left, top, 0.0)
     sum_levels(cover, levels[0], found)
     assert (cover == 0).all()
     return found

@@ -1,41 +1,198 @@
-"""How well will I know the pose? Experiments with fiducial markers, against the truth."""
+"""How well will I know the pose? Experiments with fiducial markers, against the truth.
+
+Importing this package is quick: NumPy, Numba, Dask and xarray are imported when a function needs
+them.
+"""
 
 from __future__ import annotations
 
+import functools
+import importlib
 import os
-from typing import TYPE_CHECKING, Any
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
-from sweep.errors import PipelineError, RunError, StoreError, SweepError
-from sweep.plan.experiment import Pipeline
+from sweep.errors import ArgumentError, PipelineError, RunError, StoreError, SweepError
+from sweep.execution.limits import TIME_LIMIT_S
 from sweep.version import __version__
 
 if TYPE_CHECKING:
     import xarray as xr
+    from distributed import Client
+
+    from sweep.execution.cluster import Cluster
+    from sweep.execution.progress import Progress
+    from sweep.plan.experiment import Pipeline
 
 __all__ = [
-    "Pipeline", "PipelineError", "RunError", "StoreError", "SweepError", "__version__", "open",
-    "run",
+    "ArgumentError", "Pipeline", "PipelineError", "Progress", "RunError", "StoreError",
+    "SweepError", "__version__", "open", "run",
 ]
 
+_IMPORTED_ON_USE = {"Pipeline": "sweep.plan.experiment", "Progress": "sweep.execution.progress"}
 
-def run(pipeline: Pipeline, store: str | os.PathLike[str] | None = None, **options: Any) -> Any:
-    """Run a pipeline into a store and return its results, an ``xarray.Dataset``, lazily.
+Arguments = ParamSpec("Arguments")
+Returned = TypeVar("Returned")
 
-    ``options`` are those of :func:`sweep.execution.runner.execute`. Call it under
-    ``if __name__ == "__main__":`` in a script: the workers are processes that import it.
+
+def __getattr__(name: str) -> Any:
+    """Import a public class when it is first used."""
+    if name not in _IMPORTED_ON_USE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_IMPORTED_ON_USE[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def _with_older_arguments(function: Callable[Arguments, Returned]) -> Callable[Arguments, Returned]:
+    """Accept what `run` took in version 0.5, with a warning: deprecated since 0.6."""
+    @functools.wraps(function)
+    def run_as_before(*positional: Any, **options: Any) -> Returned:
+        older = [
+            *(["a second positional argument; use store="] if len(positional) == 2 else []),
+            *(["on_progress=; use progress="] if "on_progress" in options else []),
+            *(["block_s=; blocks are sized by a measurement"] if "block_s" in options else []),
+        ]
+        if not older:
+            return cast("Callable[..., Returned]", function)(*positional, **options)
+        for what in older:
+            warnings.warn(f"sweep.run: {what}", DeprecationWarning, stacklevel=2)
+        if len(positional) == 2:
+            options["store"] = positional[1]
+        if "on_progress" in options:
+            options["progress"] = options.pop("on_progress")
+        return cast("Callable[..., Returned]", _run)(*positional[:1], **options)
+
+    return run_as_before
+
+
+@_with_older_arguments
+def run(
+    pipeline: Pipeline | Mapping[str, Any] | str | os.PathLike[str],
+    *,
+    store: str | os.PathLike[str] | None = None,
+    workers: int | None = None,
+    client: Client | Cluster | None = None,
+    scheduler: str | None = None,
+    reuse: Sequence[str | os.PathLike[str]] = (),
+    overwrite: bool = False,
+    progress: bool | Callable[[Progress], None] | None = None,
+    time_limit_s: float = TIME_LIMIT_S,
+) -> xr.Dataset:
+    """Run a pipeline into a store and return its results.
+
+    A finished store is opened, an unfinished one is continued. In a script, call it under
+    ``if __name__ == "__main__":``, because the workers are processes that import the script.
+
+    Parameters
+    ----------
+    pipeline
+        A `Pipeline`, the path of a TOML file, or a mapping with the content of such a file.
+    store
+        Path or URL of the store (default: ``runs/NAME.zarr`` with the pipeline's name).
+    workers
+        Processes of the cluster that is started for the run (default: the available processors).
+    client
+        A ``distributed.Client``, or a cluster object such as ``LocalCluster`` or ``SLURMCluster``,
+        to run on instead. It stays open. Its workers must be processes that have the same versions
+        as this one and reach the store under the same path.
+    scheduler
+        Address of a Dask scheduler to run on instead, such as ``tcp://host:8786``.
+    reuse
+        Stores whose finished cells are copied where all their parameters agree.
+    overwrite
+        Delete an existing store.
+    progress
+        True for a progress bar on stderr (lines if that is not a terminal), or a function that is
+        called with a `Progress` after each block.
+    time_limit_s
+        Block timeout in seconds: a pose that does not return within it is flagged ``crashed``.
+
+    Returns
+    -------
+    xarray.Dataset
+        The results, lazily loaded; the variables are described in their attributes.
+
+    Raises
+    ------
+    PipelineError
+        If the pipeline is not valid; it names all faults at once.
+    ArgumentError
+        If another argument is not valid, or the cluster cannot be used. It is a ValueError.
+    StoreError
+        If the store cannot be written, continued or reused.
+    RunError
+        If the run fails; finished blocks stay in the store, and the next run continues.
+
+    Examples
+    --------
+    >>> results = sweep.run(
+    ...     {"pose": {"jitter_px": 0.5}, "axes": {"side_px": [20, 40], "trial": 10}},
+    ...     store=folder / "two_sizes.zarr", workers=1,
+    ... )
+    >>> dict(results.detection.sizes)
+    {'side_px': 2, 'trial': 10}
     """
-    from sweep.execution.runner import execute  # noqa: PLC0415  (dask is slow to import)
+    return _run(
+        pipeline, store=store, workers=workers, client=client, scheduler=scheduler, reuse=reuse,
+        overwrite=overwrite, progress=progress, time_limit_s=time_limit_s,
+    )
 
-    return open(execute(pipeline, store, **options).store)
+
+def _run(
+    pipeline: Pipeline | Mapping[str, Any] | str | os.PathLike[str],
+    *,
+    progress: bool | Callable[[Progress], None] | None = None,
+    **options: Any,
+) -> xr.Dataset:
+    from sweep.execution.progress import progress_report  # noqa: PLC0415  (as the docstring says)
+    from sweep.execution.runner import execute  # noqa: PLC0415
+
+    read = _pipeline(pipeline)
+    with progress_report(progress) as report:
+        return open(execute(read, progress=report, **options).store)
+
+
+def _pipeline(given: Pipeline | Mapping[str, Any] | str | os.PathLike[str]) -> Pipeline:
+    from sweep.plan.experiment import Pipeline  # noqa: PLC0415
+
+    if isinstance(given, Pipeline):
+        return given
+    if isinstance(given, Mapping):
+        return Pipeline.from_dict(given)
+    if isinstance(given, (str, os.PathLike)):
+        return Pipeline.from_toml(os.fspath(given))
+    raise ArgumentError(
+        "pipeline", given, "expected a Pipeline, the path of a TOML file, or a mapping"
+    )
 
 
 def open(store: str | os.PathLike[str]) -> xr.Dataset:  # noqa: A001  (as xarray and zarr have it)
     """Open a store's results, lazily; also those of an unfinished run.
 
+    Parameters
+    ----------
+    store
+        Path or URL of the store.
+
+    Returns
+    -------
+    xarray.Dataset
+        The results; cells that were not computed yet are flagged ``not_run``.
+
     Raises
     ------
     StoreError
-        Where there is no store of sweep.
+        If there is no store, or it cannot be read.
+
+    Examples
+    --------
+    >>> results = sweep.open(folder / "two_sizes.zarr")
+    >>> results.side_px.values.tolist()
+    [20.0, 40.0]
     """
     from sweep.store.lifecycle import open_dataset  # noqa: PLC0415  (xarray is slow to import)
 

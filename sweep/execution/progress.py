@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+from sweep.errors import ArgumentError
+
 LINE_INTERVAL_S = 10.0
 """Seconds between two lines of progress where stderr is not a terminal."""
 
@@ -43,10 +45,17 @@ def progress_report(progress: bool | ProgressReport | None) -> Iterator[Progress
     progress
         True for a display on stderr: a bar on a terminal, lines elsewhere; None or False for
         nothing; a function is returned as it is.
+
+    Raises
+    ------
+    ArgumentError
+        If it is none of these.
     """
     if progress is None or progress is False:
         yield None
     elif progress is not True:
+        if not callable(progress):
+            raise ArgumentError("progress", progress, "expected True, False, None or a function")
         yield progress
     elif sys.stderr.isatty():
         with progress_bar() as bar:

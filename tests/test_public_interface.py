@@ -1,0 +1,182 @@
+"""The package as a user's script has it: its types, its arguments, its import."""
+
+import doctest
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+from pathlib import Path
+
+import pytest
+
+import sweep
+from sweep.errors import ArgumentError, PipelineError, SweepError
+
+TOP = Path(__file__).parent.parent
+
+FEW = {"pose": {"side_px": 40}, "axes": {"trial": 3}}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A finished store; running its pipeline again computes nothing and starts no cluster."""
+    store = tmp_path_factory.mktemp("finished") / "few.zarr"
+    sweep.run(FEW, store=store, workers=1)
+    return store
+
+
+def test_importing_the_package_imports_nothing_heavy():
+    heavy = {"numpy", "numba", "cv2", "dask", "distributed", "xarray", "zarr", "tomlkit", "rich"}
+    ran = subprocess.run(
+        [sys.executable, "-c", "import sys, sweep; print(*sys.modules)"],
+        capture_output=True, text=True, check=True,
+    )
+    modules = {name.partition(".")[0] for name in ran.stdout.split()}
+    assert "sweep" in modules
+    assert not modules & heavy
+
+
+def test_every_public_name_exists_and_is_listed():
+    for name in sweep.__all__:
+        assert getattr(sweep, name) is not None
+        assert name in dir(sweep)
+    with pytest.raises(AttributeError, match="no attribute 'runs'"):
+        sweep.runs  # noqa: B018
+
+
+def test_examples_of_the_docstrings_run(tmp_path):
+    runner = doctest.DocTestRunner()
+    finder = doctest.DocTestFinder(recurse=False)
+    for function in (sweep.run, sweep.open):
+        (test,) = finder.find(function, globs={"sweep": sweep, "folder": tmp_path})
+        assert test.examples
+        assert runner.run(test).failed == 0
+
+
+def test_pipeline_is_given_as_a_mapping_a_path_or_a_pipeline(finished, tmp_path):
+    path = tmp_path / "pipeline.toml"
+    path.write_text("pose.side_px = 40\naxes.trial = 3\n")
+    expected = sweep.open(finished)
+    for given in (FEW, path, str(path), sweep.Pipeline.from_toml(path)):
+        with sweep.run(given, store=finished) as results:
+            assert results.identical(expected)
+    with pytest.raises(PipelineError, match="side_pxx"):
+        sweep.run({"pose": {"side_pxx": 40}}, store=finished)
+
+
+def test_progress_is_reported_to_a_function_or_in_lines(tmp_path, capsys):
+    seen = []
+    sweep.run(FEW, store=tmp_path / "seen.zarr", workers=1, progress=seen.append)
+    assert (seen[0].done, seen[-1].done, seen[-1].total) == (0, 3, 3)
+    assert capsys.readouterr().err == ""
+    sweep.run(FEW, store=tmp_path / "lines.zarr", workers=1, progress=True)
+    lines = capsys.readouterr().err.splitlines()
+    assert (lines[0], lines[-1]) == ("0 of 3 poses", "3 of 3 poses")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"workers": 0}, "workers = 0: expected at least 1"),
+        ({"time_limit_s": 0}, "time_limit_s = 0: expected seconds above 0"),
+        ({"time_limit_s": float("nan")}, "time_limit_s = nan: expected seconds above 0"),
+        ({"scheduler": "nowhere"}, "scheduler = nowhere: expected an address such as tcp://"),
+        ({"client": "tcp://a:1"}, "client = tcp://a:1: expected a distributed.Client or a cluster"),
+        ({"client": 3}, "client = 3: expected a distributed.Client or a cluster object"),
+        ({"scheduler": "tcp://a:1", "client": 3}, "scheduler = tcp://a:1: expected no client"),
+        ({"progress": "yes"}, "progress = yes: expected True, False, None or a function"),
+    ],
+)
+def test_arguments_that_cannot_be_are_value_errors_that_name_them(options, message, tmp_path):
+    with pytest.raises(ArgumentError) as raised:
+        sweep.run(FEW, store=tmp_path / "none.zarr", **options)
+    assert str(raised.value).startswith(message)
+    assert isinstance(raised.value, ValueError)
+    assert isinstance(raised.value, SweepError)
+    assert not (tmp_path / "none.zarr").exists()
+
+
+def test_what_is_no_pipeline_is_an_argument_error():
+    with pytest.raises(ArgumentError, match="pipeline = 3: expected a Pipeline, the path of"):
+        sweep.run(3)
+
+
+def test_arguments_of_version_0_5_are_accepted_with_a_warning(finished, tmp_path):
+    pipeline = sweep.Pipeline.from_text("pose.side_px = 40\naxes.trial = 3\n")
+    with pytest.warns(DeprecationWarning, match="second positional argument; use store="):
+        results = sweep.run(pipeline, finished)
+    assert results.identical(sweep.open(finished))
+    seen = []
+    with pytest.warns(DeprecationWarning, match="use progress=|sized by") as warned:
+        sweep.run(
+            pipeline, store=tmp_path / "few.zarr", workers=1, on_progress=seen.append, block_s=0.1
+        )
+    assert {str(each.message) for each in warned} == {
+        "sweep.run: on_progress=; use progress=",
+        "sweep.run: block_s=; blocks are sized by a measurement",
+    }
+    assert seen
+
+
+RIGHT = """
+from pathlib import Path
+
+import sweep
+
+
+def report(progress: sweep.Progress) -> None:
+    print(progress.done, progress.total)
+
+
+results = sweep.run(
+    {"axes": {"trial": 3}}, store=Path("few.zarr"), workers=2, reuse=["old.zarr"], progress=report
+)
+reveal_type(results)
+reveal_type(sweep.open("few.zarr"))
+reveal_type(sweep.Pipeline.from_text("axes.trial = 3"))
+reveal_type(sweep.__version__)
+try:
+    sweep.run("pipeline.toml", overwrite=True, progress=True, time_limit_s=60)
+except sweep.ArgumentError as error:
+    reveal_type(error.argument)
+"""
+
+WRONG = """
+import sweep
+
+sweep.run("pipeline.toml", "few.zarr")
+sweep.run("pipeline.toml", worker=2)
+sweep.run("pipeline.toml", workers="2")
+sweep.run(3)
+"""
+
+
+def test_mypy_sees_the_types_of_the_installed_package_in_a_users_script(tmp_path):
+    pytest.importorskip("mypy")
+    # An environment of its own, in which the package lies as pip would install it.
+    venv.create(tmp_path / "environment", with_pip=False)
+    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    site = tmp_path / "environment" / "lib" / version / "site-packages"
+    shutil.copytree(
+        TOP / "sweep", site / "sweep", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    (site / "others.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    for name, text in (("right.py", RIGHT), ("wrong.py", WRONG)):
+        (tmp_path / name).write_text(text)
+    ran = subprocess.run(
+        [sys.executable, "-m", "mypy", "--strict", "--config-file", "", "--no-color-output",
+         "--python-executable", str(tmp_path / "environment" / "bin" / "python"),
+         "right.py", "wrong.py"],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+        env={"PATH": "", "MYPY_CACHE_DIR": str(TOP / ".mypy_cache" / "user")},
+    )
+    lines = ran.stdout.splitlines()
+    revealed = [line.partition("Revealed type is ")[2] for line in lines if "Revealed" in line]
+    assert revealed == [
+        '"xarray.core.dataset.Dataset"', '"xarray.core.dataset.Dataset"',
+        '"sweep.plan.experiment.Pipeline"', '"str"', '"str"',
+    ], ran.stdout + ran.stderr
+    errors = [line for line in lines if ": error:" in line]
+    assert all(line.startswith("wrong.py:") for line in errors), ran.stdout
+    assert [int(line.split(":")[1]) for line in errors] == [4, 5, 6, 7], ran.stdout

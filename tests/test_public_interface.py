@@ -12,10 +12,12 @@ import pytest
 
 import sweep
 from sweep.errors import ArgumentError, PipelineError, SweepError
+from sweep.execution.progress import progress_report
 
 TOP = Path(__file__).parent.parent
 
-FEW = {"pose": {"side_px": 40}, "axes": {"trial": 3}}
+FEW = {"pose": {"side_px": 40, "jitter_px": 0.5}, "axes": {"trial": 3}}
+TEXT = "pose = { side_px = 40, jitter_px = 0.5 }\naxes.trial = 3\n"
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +58,7 @@ def test_examples_of_the_docstrings_run(tmp_path):
 
 def test_pipeline_is_given_as_a_mapping_a_path_or_a_pipeline(finished, tmp_path):
     path = tmp_path / "pipeline.toml"
-    path.write_text("pose.side_px = 40\naxes.trial = 3\n")
+    path.write_text(TEXT)
     expected = sweep.open(finished)
     for given in (FEW, path, str(path), sweep.Pipeline.from_toml(path)):
         with sweep.run(given, store=finished) as results:
@@ -67,12 +69,18 @@ def test_pipeline_is_given_as_a_mapping_a_path_or_a_pipeline(finished, tmp_path)
 
 def test_progress_is_reported_to_a_function_or_in_lines(tmp_path, capsys):
     seen = []
-    sweep.run(FEW, store=tmp_path / "seen.zarr", workers=1, progress=seen.append)
-    assert (seen[0].done, seen[-1].done, seen[-1].total) == (0, 3, 3)
-    assert capsys.readouterr().err == ""
-    sweep.run(FEW, store=tmp_path / "lines.zarr", workers=1, progress=True)
-    lines = capsys.readouterr().err.splitlines()
-    assert (lines[0], lines[-1]) == ("0 of 3 poses", "3 of 3 poses")
+
+    def report(progress):
+        seen.append(progress)
+        lines(progress)
+
+    with progress_report(progress=True) as lines:
+        sweep.run(FEW, store=tmp_path / "seen.zarr", workers=1, progress=report)
+    assert [progress.done for progress in seen] == [0, 3]
+    assert {progress.total for progress in seen} == {3}
+    assert capsys.readouterr().err == "0 of 3 poses\n3 of 3 poses\n"
+    with progress_report(progress=False) as nothing:
+        assert nothing is None
 
 
 @pytest.mark.parametrize(
@@ -103,7 +111,7 @@ def test_what_is_no_pipeline_is_an_argument_error():
 
 
 def test_arguments_of_version_0_5_are_accepted_with_a_warning(finished, tmp_path):
-    pipeline = sweep.Pipeline.from_text("pose.side_px = 40\naxes.trial = 3\n")
+    pipeline = sweep.Pipeline.from_text(TEXT)
     with pytest.warns(DeprecationWarning, match="second positional argument; use store="):
         results = sweep.run(pipeline, finished)
     assert results.identical(sweep.open(finished))

@@ -54,6 +54,10 @@ class ArgumentError(SweepError, ValueError):
         return ArgumentError, (self.argument, self.value, self.problem)
 
 
+class DatasetError(SweepError):
+    """A dataset that lacks what an analysis needs, or two that do not fit together."""
+
+
 class StoreError(SweepError):
     """A store that cannot be written, read or continued as asked."""
 

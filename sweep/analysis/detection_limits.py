@@ -1,4 +1,4 @@
-"""From how far a marker is still seen: the smallest side with a detection rate."""
+"""From how far a marker is still detected: the smallest side with a detection rate."""
 
 from __future__ import annotations
 
@@ -8,22 +8,25 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from sweep.analysis.blocks import axes_of, fingerprint_of, kept_of, listed
-from sweep.analysis.intervals import wilson
+from sweep.analysis.counts import scaled_to_draws
+from sweep.analysis.dimensions import (
+    DRAWS,
+    as_names,
+    axes_of,
+    fingerprint_of,
+    kept_dimensions,
+    require_dimension,
+)
+from sweep.analysis.intervals import LEVEL, wilson
 from sweep.analysis.rates import detection_rate
-from sweep.analysis.statistics import LEVEL, in_draws
-from sweep.errors import StoreError, SweepError
+from sweep.errors import ArgumentError, DatasetError, SweepError
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.model.marker import module_count
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import PARAMETERS
 from sweep.plan.schema import cf_attributes
-from sweep.typing import Floats
-
-Integers = NDArray[np.int64]
-Masks = NDArray[np.bool_]
+from sweep.typing import Floats, Integers, Masks
 
 SIZE_AXES = ("side_px", "distance_m")
 
@@ -42,46 +45,73 @@ class Limit(IntEnum):
 def detection_limit(
     results: xr.Dataset, rate: float = 0.9, per: Sequence[str] | None = None
 ) -> xr.Dataset:
-    """Return the smallest side of the black square that is seen often enough: dimensions (*per).
+    """Return the smallest side of the black square from which on the marker is detected.
 
-    ``per`` are the dimensions that are kept: the tilt, where there are several, if none are named.
+    Parameters
+    ----------
+    results
+        The dataset of a run with a dimension ``side_px`` or ``distance_m``. Parameters of the
+        camera and the marker's size that are no dimension or coordinate are read from the pipeline
+        in its attributes.
+    rate
+        The detection rate that is asked for, above 0 and at most 1.
+    per
+        Dimensions that are kept; by default the tilt, if it varies. A dimension ``dictionary`` is
+        always kept; the sides and the trials cannot be.
 
-    ``side_px`` is the side in pixels, were the square parallel to the image, from which on, at
-    all larger sides of the grid, the detection rate is at least ``rate``: so a dip at a larger
-    side counts. ``side_px_below`` is the grid's next smaller side, where it is not: the grid tells
-    no more. ``side_px_per_module`` is the same per module, of ``dictionary``; a dimension of that
-    name is always kept. ``distance_m`` stands beside it where that is the grid's axis.
-    ``limit`` tells whether there is one (`Limit`); ``side_px`` is infinite for never.
+    Returns
+    -------
+    xr.Dataset
+        Dimensions (*per); lazy if ``results`` is.
 
+        - ``side_px``: side in pixels, if the square were parallel to the image, from which on, at
+          all larger sides of the grid, the detection rate is at least ``rate``: so a dip at a
+          larger side counts. Infinite for never. Its interval is in ``side_px_low`` and
+          ``side_px_high``; ``side_px_below`` is the grid's next smaller side, at which the rate is
+          not reached.
+        - ``side_px_per_module``: the same per module of the marker, with its interval.
+        - ``distance_m``: the distance of that side, if that is the grid's axis.
+        - ``limit``: whether the rate is reached within the grid (`Limit`).
+
+    Raises
+    ------
+    ArgumentError
+        For a rate outside (0, 1], and for ``per`` that names a dimension that cannot be kept, or
+        misses one over which the sides differ.
+    DatasetError
+        If the dataset has no sides, lacks variables of results, or has no poses.
+
+    Notes
+    -----
     The interval is that of the limit on the grid, at 95 %: from ``side_px_high`` on Wilson's lower
     ends are at least ``rate``, and from ``side_px_low`` on all upper ends are. Only the one side
     below the limit can make the high end too small, any above it the low end too large: the upper
     ends are those of all sides together (Bonferroni). A low end of 0 says that the limit may lie
-    below the grid, an infinite high end that it may lie above; where nothing was drawn both are
-    NaN.
+    below the grid, an infinite high end that it may lie above; both are NaN if no cell has two
+    draws.
 
-    Needs a dimension ``side_px`` or ``distance_m``; of the camera and the marker's size, what is
-    no dimension or coordinate is taken from the pipeline in the attributes. Lazy where ``results``
-    is. Raises ``StoreError`` where that is not there, or where a side is not the same over what is
-    pooled; ``ValueError`` for a rate outside (0, 1].
+    Examples
+    --------
+    >>> limit = detection_limit(results, rate=0.6)
+    >>> limit["side_px"].item(), limit["side_px_below"].item(), Limit(limit["limit"].item()).name
+    (20.0, 10.0, 'found')
     """
     if not 0.0 < rate <= 1.0:
-        raise ValueError(f"rate = {rate}: give a number above 0 and at most 1, for instance 0.9")
-    axis = next((name for name in SIZE_AXES if name in axes_of(results)), None)
-    if axis is None:
-        there = ", ".join(axes_of(results)) or "none"
-        raise StoreError(f"side_px or distance_m: no such dimension; there are {there}")
-    dictionaries = ["dictionary"] if "dictionary" in axes_of(results) else []
+        raise ArgumentError("rate", rate, "expected a number above 0 and at most 1, such as 0.9")
+    axis = require_dimension(results, *SIZE_AXES)
+    axes = axes_of(results)
+    dictionaries = ["dictionary"] if "dictionary" in axes else []
     if per is None:
-        per = [name for name in ("tilt_deg",) if name in axes_of(results)]
-    kept = kept_of(results, (*listed(per), *dictionaries))
-    for name in (axis, "trial"):
+        per = [name for name in ("tilt_deg",) if name in axes]
+    kept = kept_dimensions(results, (*as_names(per), *dictionaries))
+    for name in (axis, DRAWS):
         if name in kept:
-            raise StoreError(f"{name}: the limit is over this dimension; it cannot be kept")
+            raise ArgumentError("per", name, "the limit is over this dimension; it cannot be kept")
     sides = _sides(results, axis)
-    strange = [str(dim) for dim in sides.dims if dim not in (*kept, axis)]
-    if strange:
-        raise StoreError(f"{', '.join(strange)}: sides differ over this dimension; keep it (per)")
+    varied = [str(dim) for dim in sides.dims if dim not in (*kept, axis)]
+    if varied:
+        raise ArgumentError("per", ", ".join(kept) or "()",
+                            f"the sides differ over {', '.join(varied)}; add it")
     table = detection_rate(results, (*kept, axis))
     n, draws, hits = (table[name] for name in ("looked_for", "draws", "detected"))
     drawn = table["detection_rate_low"].notnull()
@@ -129,7 +159,7 @@ def _limit(
     with np.errstate(divide="ignore", invalid="ignore"):
         reached = hits / n >= rate
     # Of draws, rounded outwards, as in `Rate`.
-    fewest, most = in_draws(hits, n, draws)
+    fewest, most = scaled_to_draws(hits, n, draws)
     joint = 1.0 - (1.0 - LEVEL) / sides.shape[-1]
     surely = wilson(fewest, draws)[0] >= rate
     possibly = wilson(most, draws, joint)[1] >= rate
@@ -158,7 +188,7 @@ def _limit(
 def _sides(results: xr.Dataset, axis: str) -> xr.DataArray:
     """Return the sides in pixels, over the axis and whatever else they depend on."""
     if axis not in results.coords:
-        raise StoreError(f"{axis}: has no coordinate, of which the sides are made")
+        raise DatasetError(f"{axis}: has no coordinate, which the sides are computed from")
     if axis == "side_px":
         return _positive(results["side_px"].astype(np.float64))
     values = {name: _value(results, name) for name in (*VIEW_PARAMETERS, "size_m")}
@@ -169,8 +199,8 @@ def _sides(results: xr.Dataset, axis: str) -> xr.DataArray:
 
 def _positive(sides: xr.DataArray) -> xr.DataArray:
     if not (np.isfinite(sides) & (sides > 0)).all():
-        raise StoreError("sides must be finite and above 0 px: see the coordinates of the size, "
-                         "the distance and the camera")
+        raise DatasetError("sides must be finite and above 0 px: see the coordinates of the size, "
+                           "the distance and the camera")
     return sides
 
 
@@ -191,11 +221,11 @@ def _value(results: xr.Dataset, name: str) -> Any:
         files = fingerprint_of(results).get("files", {})
         pipeline = Pipeline.from_text(results.attrs["pipeline"], files=files)
     except (KeyError, SweepError):
-        raise StoreError(f"{name}: neither a coordinate, nor is there a pipeline in the "
-                         "attributes that tells it") from None
+        raise DatasetError(f"{name}: not a coordinate, and the attributes hold no pipeline "
+                           "that has it") from None
     if pipeline.axis(name) is not None:
-        raise StoreError(f"{name}: varies in this store, but the dataset lacks its coordinate")
+        raise DatasetError(f"{name}: varies in this store, but the dataset lacks its coordinate")
     value = pipeline.fixed.get(name, PARAMETERS[name].default)
     if value is not None and not isinstance(value, (int, float, str)):
-        raise StoreError(f"{name}: is drawn, so that a side is no number of the grid")
+        raise DatasetError(f"{name}: is drawn, so that the side is not a number of the grid")
     return value

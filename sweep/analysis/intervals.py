@@ -1,4 +1,4 @@
-"""Confidence intervals for a binomial proportion: how sure is a rate of ``successes`` of ``n``.
+"""Confidence intervals of a binomial proportion, a rate of ``successes`` of ``n``.
 
 Brown, Cai and DasGupta, "Interval Estimation for a Binomial Proportion", Statistical Science
 16(2), 2001, doi:10.1214/ss/1009213286, recommends both for small n.
@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
+from sweep.errors import ArgumentError
 from sweep.typing import Floats
+
+LEVEL = 0.95
+"""Probability with which every interval of a table holds its value."""
+
+TAIL = (1.0 - LEVEL) / 2.0
+"""Probability beyond each end."""
 
 MAX_N = 10**15  # up to here n, n - successes and successes + 1/2 are exact in doubles
 # With as many successes and failures, the Cornish-Fisher expansion is right to 3e-12; scipy's
@@ -18,7 +25,7 @@ MAX_N = 10**15  # up to here n, n - successes and successes + 1/2 are exact in d
 MANY = 3e6
 
 
-def wilson(successes: ArrayLike, n: ArrayLike, level: float = 0.95) -> tuple[Floats, Floats]:
+def wilson(successes: ArrayLike, n: ArrayLike, level: float = LEVEL) -> tuple[Floats, Floats]:
     """Return the ends (low, high) of Wilson's score interval, of the broadcast shape.
 
     Brown, Cai and DasGupta 2001, section 3.1.1, eq. 4. The lower end is taken from the product of
@@ -41,7 +48,7 @@ def wilson(successes: ArrayLike, n: ArrayLike, level: float = 0.95) -> tuple[Flo
                                 upper / (n + kappa**2))
 
 
-def jeffreys(successes: ArrayLike, n: ArrayLike, level: float = 0.95) -> tuple[Floats, Floats]:
+def jeffreys(successes: ArrayLike, n: ArrayLike, level: float = LEVEL) -> tuple[Floats, Floats]:
     """Return the ends (low, high) of Jeffreys' equal-tailed interval, of the broadcast shape.
 
     Quantiles of Beta(successes + 1/2, n - successes + 1/2), and 0 at 0 of n, 1 at n of n: Brown,
@@ -69,17 +76,16 @@ def _checked(
 ) -> tuple[Floats, Floats, float]:
     """Return the counts as float64 of one shape, and the level, if they are good."""
     if not 0.0 < level < 1.0:
-        raise ValueError(f"level = {level}: give a number between 0 and 1, for instance 0.95")
+        raise ArgumentError("level", level, "expected a number between 0 and 1, such as 0.95")
     successes, n = np.broadcast_arrays(
         np.asarray(successes, dtype=np.float64), np.asarray(n, dtype=np.float64)
     )
     good = (successes >= 0) & (successes <= n) & (n <= MAX_N)
     bad = ~(good & (np.floor(successes) == successes) & (np.floor(n) == n))
     if bad.any():
-        raise ValueError(
-            f"successes = {successes[bad][0]:.17g}, n = {n[bad][0]:.17g}: "
-            f"give whole numbers with 0 <= successes <= n <= {MAX_N:.0e}"
-        )
+        raise ArgumentError(
+            "successes", f"{successes[bad][0]:.17g}, n = {n[bad][0]:.17g}",
+            f"expected whole numbers with 0 <= successes <= n <= {MAX_N:.0e}")
     return successes, n, float(level)
 
 

@@ -11,16 +11,16 @@ analysis and recommendations", The American Statistician 37(3), 1983.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
 from numpy.lib.array_utils import normalize_axis_tuple
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from sweep.typing import Floats
-
-Integers = NDArray[np.int64]
+from sweep.analysis.groups import interleaved
+from sweep.typing import Floats, Integers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +39,7 @@ class Moments:
 
     Raises ``ValueError`` if the shapes differ.
 
-    >>> both = merged(Moments.of([1.0, 2.0], axis=0), Moments.of([6.0, np.nan], axis=0))
+    >>> both = Moments.of([1.0, 2.0], axis=0).merge(Moments.of([6.0, np.nan], axis=0))
     >>> int(both.count), float(both.mean), float(both.variance)
     (3, 3.0, 7.0)
     """
@@ -102,35 +102,49 @@ class Moments:
         """Standard deviation of the mean of independent values."""
         return np.asarray(np.sqrt(self.variance / np.maximum(self.count, 1)))
 
+    def merge(self, other: Moments) -> Moments:
+        """Return the moments of the values of both together; both of one shape.
 
-def merged(a: Moments, b: Moments) -> Moments:
-    """Return the moments of the values of ``a`` and ``b`` together; both of one shape.
+        The pairwise formula of Chan, Golub and LeVeque (1979, 1983). Theirs sees the means rounded
+        to doubles, which can cost the whole variance at an offset of 1e9 and a spread of 1e-3; here
+        the mean keeps its tail. Empty moments change nothing. NaN and infinity as in `Moments`.
+        Raises ``ValueError`` if the shapes differ.
+        """
+        a, b = self, other
+        if a.mean.shape != b.mean.shape:
+            raise ValueError(
+                f"merge moments of one shape, not of {a.mean.shape} and {b.mean.shape}")
+        swapped = b.count > a.count
 
-    The pairwise formula of Chan, Golub and LeVeque (1979, 1983). Theirs sees the means rounded to
-    doubles, which can cost the whole variance at an offset of 1e9 and a spread of 1e-3; here the
-    mean keeps its tail. Empty moments change nothing. NaN and infinity as in `Moments`. Raises
-    ``ValueError`` if the shapes differ.
-    """
-    if a.mean.shape != b.mean.shape:
-        raise ValueError(f"merge moments of one shape, not of {a.mean.shape} and {b.mean.shape}")
-    swapped = b.count > a.count
+        def larger_and_smaller(of_a: Any, of_b: Any) -> tuple[Any, Any]:
+            return np.where(swapped, of_b, of_a), np.where(swapped, of_a, of_b)
 
-    def larger_and_smaller(of_a: Any, of_b: Any) -> tuple[Any, Any]:
-        return np.where(swapped, of_b, of_a), np.where(swapped, of_a, of_b)
+        larger, smaller = larger_and_smaller(a.count, b.count)
+        mean, other_mean = larger_and_smaller(a.mean, b.mean)
+        tail, other_tail = larger_and_smaller(a.mean_tail, b.mean_tail)
+        with np.errstate(all="ignore"):
+            share = smaller / np.maximum(larger + smaller, 1)
+            gap = np.where(smaller == 0, 0.0, (other_mean - mean) + (other_tail - tail))
+            total, rest = _two_sum(mean, gap * share)
+            total, rest = _two_sum(total, rest + tail)
+            # A gap that is not finite: of infinite means, or of means above 9e307.
+            weighted = mean * (1.0 - share) + other_mean * share
+            total = np.where(np.isfinite(gap), total, weighted)
+            m2 = a.m2 + b.m2 + gap * (gap * share) * larger
+        return Moments(larger + smaller, total, rest, m2)
 
-    larger, smaller = larger_and_smaller(a.count, b.count)
-    mean, other_mean = larger_and_smaller(a.mean, b.mean)
-    tail, other_tail = larger_and_smaller(a.mean_tail, b.mean_tail)
-    with np.errstate(all="ignore"):
-        share = smaller / np.maximum(larger + smaller, 1)
-        gap = np.where(smaller == 0, 0.0, (other_mean - mean) + (other_tail - tail))
-        total, rest = _two_sum(mean, gap * share)
-        total, rest = _two_sum(total, rest + tail)
-        # A gap that is not finite: of infinite means, or of means above 9e307.
-        weighted = mean * (1.0 - share) + other_mean * share
-        total = np.where(np.isfinite(gap), total, weighted)
-        m2 = a.m2 + b.m2 + gap * (gap * share) * larger
-    return Moments(larger + smaller, total, rest, m2)
+    @staticmethod
+    def interleave(parts: Sequence[Moments]) -> Moments:
+        """Return n moments (groups, ...) as one, (groups * n, ...); the n of a group together."""
+        return Moments(
+            interleaved([part.count for part in parts]), interleaved([part.mean for part in parts]),
+            interleaved([part.mean_tail for part in parts]),
+            interleaved([part.m2 for part in parts]))
+
+    def every_nth(self, n: int, first: int) -> Moments:
+        """Return the moments at ``first``, ``first + n`` and so on along the first axis."""
+        return Moments(self.count[first::n], self.mean[first::n], self.mean_tail[first::n],
+                       self.m2[first::n])
 
 
 def _two_sum(a: Any, b: Any) -> tuple[Any, Any]:

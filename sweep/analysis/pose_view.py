@@ -1,8 +1,8 @@
-"""What is counted of poses, and which errors they have: the words that all statistics share."""
+"""Poses of a block as the statistics see them: which are counted, and what their errors are."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,25 +11,60 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.schema import XYZ
-from sweep.typing import Floats
+from sweep.errors import DatasetError
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, uncounted_values
+from sweep.plan.schema import VARIABLES, XYZ
+from sweep.typing import Floats, Masks
 
-Masks = NDArray[np.bool_]
+NOT_LOOKED_FOR = tuple(uncounted_values(DetectionStatus))
+"""Flags of detection of the poses that are in no denominator."""
 
-NOT_LOOKED_FOR = (
-    DetectionStatus.not_run,
-    DetectionStatus.not_visible,
-    DetectionStatus.not_modelled,
-)
 INSIDE = "inside"
-"""Name of the mask of the poses that count at all, where not all do."""
+"""Name of the mask of the poses that count at all, if not all do."""
+
+DEPTH = "true_depth_m"
+"""Name, beside those of the dataset's variables, of z of the true position."""
+
+DETECTION_INPUTS = ("detection",)
+ESTIMATE_INPUTS = (*DETECTION_INPUTS, "estimate", "flipped")
+ERROR_INPUTS = (*ESTIMATE_INPUTS, "rotation_error_rad", "translation_error_m", DEPTH)
+"""Names of the arrays that a statistic of detections, of estimates, of errors reads."""
+
+REQUIRED_VARIABLES = tuple("true_tvec_m" if name == DEPTH else name for name in ERROR_INPUTS)
+"""Variables that every dataset of results has."""
+
+
+def pose_arrays(results: xr.Dataset, names: Iterable[str]) -> dict[str, xr.DataArray]:
+    """Return arrays by the names that `Poses` gives them: variables' names, or `DEPTH`.
+
+    Raises
+    ------
+    DatasetError
+        If the dataset lacks a variable.
+    """
+    arrays = {}
+    for name in dict.fromkeys(names):
+        variable = "true_tvec_m" if name == DEPTH else name
+        if variable not in results:
+            raise DatasetError(f"no variable {variable}; "
+                               f"there are {', '.join(map(str, results.data_vars)) or 'none'}")
+        array = results[variable]
+        arrays[name] = array.isel(xyz=XYZ.index("z"), drop=True) if name == DEPTH else array
+    return arrays
 
 
 class Poses:
-    """Poses of a block, arrays (groups, cells, draws, settings, ...), by name.
+    """Poses of a block: arrays (groups, cells, draws, settings, ...), by name.
 
-    Those outside the mask `INSIDE` count as not run.
+    Those outside the mask `INSIDE` count as not run. The masks and errors have the shape (groups,
+    cells, draws, settings), but for axes of length 1 that broadcast.
+
+    Parameters
+    ----------
+    arrays
+        The arrays, by the names of `pose_arrays` with ``prefix`` in front, and `INSIDE`.
+    prefix
+        What tells these poses' arrays from others in ``arrays``.
     """
 
     def __init__(self, arrays: dict[str, NDArray[Any]], prefix: str = "") -> None:
@@ -37,15 +72,15 @@ class Poses:
         self._prefix = prefix
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """Return an array, of flags only where the poses count."""
+        """Return an array, of flags 0 (not run) for the poses that do not count."""
         array = self._arrays[self._prefix + name]
-        if name in {"detection", "estimate", "flipped"}:
+        if name in VARIABLES and VARIABLES[name].flags is not None:
             # A dataset that was cut or joined has NaN where nothing was run.
             return np.where(self.inside, np.nan_to_num(array, nan=0.0), 0)
         return array
 
     def __contains__(self, name: object) -> bool:
-        """Tell whether there is such an array."""
+        """Return whether there is such an array."""
         return f"{self._prefix}{name}" in self._arrays
 
     @property
@@ -70,7 +105,7 @@ class Poses:
 
     @cached_property
     def looked_for(self) -> Masks:
-        """Poses that were run, visible and modelled."""
+        """Poses whose detection is counted: run, visible and modelled."""
         return ~np.isin(self.detection, NOT_LOOKED_FOR)
 
     @cached_property
@@ -95,36 +130,52 @@ class Poses:
 
     @cached_property
     def rotation_deg(self) -> Floats:
-        """Rotation error vectors, (..., xyz)."""
-        return np.asarray(np.degrees(self["rotation"], dtype=np.float64))
+        """Rotation error vectors, (..., xyz), in degrees."""
+        return np.asarray(np.degrees(self["rotation_error_rad"], dtype=np.float64))
 
     @cached_property
     def range_percent(self) -> Floats:
-        """Depth error of the true depth, (..., 1)."""
-        return 100.0 * relative(self["position"][..., XYZ.index("z")], self["depth"])[..., None]
+        """Depth error in percent of the true depth, (..., 1)."""
+        error = self["translation_error_m"][..., XYZ.index("z")]
+        return 100.0 * relative(error, self[DEPTH])[..., None]
 
     @cached_property
     def position_m(self) -> Floats:
-        """Position error vectors, (..., xyz)."""
-        return np.asarray(self["position"], dtype=np.float64)
+        """Position error vectors, (..., xyz), in metres."""
+        return np.asarray(self["translation_error_m"], dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """An error of poses, and its words."""
+    """A kind of error of poses.
+
+    Attributes
+    ----------
+    name
+        In the names of variables.
+    unit
+        As in names, such as ``deg``.
+    units
+        As in attributes, such as ``degree``.
+    words
+        As in meanings.
+    vector
+        The error vectors (..., components) of poses.
+    """
 
     name: str
     unit: str
-    """As in names."""
     units: str
-    """As in attributes."""
     words: str
     vector: Callable[[Poses], Floats]
-    """(..., components), of these poses."""
 
     def norm(self, poses: Poses) -> Floats:
-        """Return the absolute error."""
+        """Return the absolute errors (...)."""
         return np.sqrt(norm_squared(self.vector(poses)))
+
+    def squares(self, poses: Poses) -> Floats:
+        """Return the squared absolute errors (..., 1)."""
+        return norm_squared(self.vector(poses))[..., None]
 
     def named(self, statistic: str) -> str:
         """Return a variable's name, such as ``rotation_p95_deg``."""
@@ -137,27 +188,6 @@ QUANTITIES = (
              lambda poses: poses.range_percent),
     Quantity("position", "m", "m", "position error", lambda poses: poses.position_m),
 )
-
-
-def detections(results: xr.Dataset) -> dict[str, xr.DataArray]:
-    """Return what tells what became of the markers."""
-    return {"detection": results["detection"]}
-
-
-def estimates(results: xr.Dataset) -> dict[str, xr.DataArray]:
-    """Return what tells what became of the estimates."""
-    return detections(results) | {
-        "estimate": results["estimate"], "flipped": results["flipped"],
-    }
-
-
-def errors(results: xr.Dataset) -> dict[str, xr.DataArray]:
-    """Return what tells the errors of the estimates."""
-    return estimates(results) | {
-        "rotation": results["rotation_error_rad"],
-        "position": results["translation_error_m"],
-        "depth": results["true_tvec_m"].isel(xyz=XYZ.index("z"), drop=True),
-    }
 
 
 def relative(length: NDArray[Any], depth: NDArray[Any]) -> Floats:

@@ -1,4 +1,4 @@
-"""Which marker IDs are weak: each against the others, corrected for how many there are."""
+"""Which marker IDs are weak: each against the others, corrected for their number."""
 
 from __future__ import annotations
 
@@ -8,46 +8,80 @@ import numpy as np
 import xarray as xr
 from scipy import special, stats
 
-from sweep.analysis.blocks import axes_of, kept_of, listed
+from sweep.analysis.dimensions import (
+    DRAWS,
+    as_names,
+    axes_of,
+    is_grid_axis,
+    kept_dimensions,
+    require_dimension,
+)
 from sweep.analysis.rates import detection_rate
-from sweep.errors import StoreError
-from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
+from sweep.errors import ArgumentError
 from sweep.typing import Floats
 
 SIGNIFICANCE = 0.05
-"""Chance that any ID at all is called weak, or strong, where all are alike."""
+"""Chance that any ID at all is called weak, or strong, if all are alike."""
 
 MIN_SKEWNESS = 1e-6
 """Below it the gamma distribution is normal to 1e-6, and its functions lose digits."""
 
 
 def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
-    """Return how each marker ID compares with the others: dimensions (*per, marker_id).
+    """Return how each marker ID compares with the others.
 
-    Dictionaries hold different markers: a dimension ``dictionary`` is always kept.
+    Parameters
+    ----------
+    results
+        The dataset of a run with a dimension ``marker_id``.
+    per
+        Dimensions that are kept; all others are pooled. Dictionaries hold different markers: a
+        dimension ``dictionary`` is always kept. Trials are the draws and cannot be kept.
 
-    ``detection_rate`` and its interval are as in `sweep.analysis.rates.detection_rate`;
-    ``expected_rate`` is what the ID's cells would give if in each of them all IDs were alike.
-    ``p_value`` is of the test of Cochran, Mantel and Haenszel, each ID against the others,
-    stratified by cell: J. Natl. Cancer Inst. 22 (1959), 719-748. Under the hypothesis the ID's
-    detections in a cell are hypergeometric; the tails of their sum are taken from the gamma
-    distribution (Pearson's type III) with the same mean, variance and skewness, with a continuity
-    correction of 1/2, so that they are right where misses are rare. ``p_adjusted`` is corrected for
-    all comparisons in the table: Holm, Scandinavian Journal of Statistics 6 (1979), 65-70.
-    ``weak``: below its expected rate with ``p_adjusted`` below 0.05. ``rank`` 1 has the lowest
-    share of what is expected of it.
+    Returns
+    -------
+    xr.Dataset
+        Dimensions (*per, marker_id); lazy if ``results`` is.
 
-    Where nothing was drawn there are no intervals and no p-values, and nothing is called weak.
-    Lazy where ``results`` is. Raises ``StoreError`` without a dimension ``marker_id``.
+        - ``looked_for`` and ``detection_rate`` with its interval, as in
+          `sweep.analysis.detection_rate`.
+        - ``expected_rate``: what the ID's cells would give if in each of them all IDs were alike.
+        - ``p_value`` of the ID against the others, stratified by cell; ``p_adjusted`` is corrected
+          for all comparisons in the table.
+        - ``weak``: below its expected rate with ``p_adjusted`` below 0.05.
+        - ``rank``: 1 has the lowest share of its expected rate.
+
+    Raises
+    ------
+    ArgumentError
+        If ``per`` names trials, or a dimension that does not exist.
+    DatasetError
+        If the dataset has no dimension ``marker_id``, lacks variables of results, or has no poses.
+
+    Notes
+    -----
+    The test is that of Cochran, Mantel and Haenszel: J. Natl. Cancer Inst. 22 (1959), 719-748.
+    Under the hypothesis the ID's detections in a cell are hypergeometric; the tails of their sum
+    are taken from the gamma distribution (Pearson's type III) with the same mean, variance and
+    skewness, with a continuity correction of 1/2, so that they are right if misses are rare. The
+    correction is Holm's: Scandinavian Journal of Statistics 6 (1979), 65-70. If no cell has two
+    draws there are no intervals and no p-values, and no ID is weak.
+
+    Examples
+    --------
+    >>> markers = xr.concat([results, results], dim="marker_id").assign_coords(marker_id=[3, 7])
+    >>> table = marker_ranking(markers)
+    >>> table["detection_rate"].round(3).values.tolist(), table["weak"].values.tolist()
+    ([0.542, 0.542], [False, False])
     """
+    require_dimension(results, "marker_id")
     dictionaries = ["dictionary"] if "dictionary" in axes_of(results) else []
-    kept = kept_of(results, (*listed(per), *dictionaries, "marker_id"))
+    kept = kept_dimensions(results, (*as_names(per), *dictionaries, "marker_id"))
     kept = (*(name for name in kept if name != "marker_id"), "marker_id")
-    if "trial" in kept:
-        raise StoreError("trial: trials are draws, of which the ranking speaks; it cannot be kept")
-    cells = [name for name in axes_of(results)
-             if name in results["detection"].dims and name not in (*kept, "trial")
-             and name in PARAMETERS and PARAMETERS[name].section in GEOMETRY_SECTIONS]
+    if DRAWS in kept:
+        raise ArgumentError("per", DRAWS, "the ranking is over the trials; they cannot be kept")
+    cells = [name for name in axes_of(results) if name in results["detection"].dims
+             and name not in (*kept, DRAWS) and is_grid_axis(name)]
     table = detection_rate(results, kept)[
         ["looked_for", "detection_rate", "detection_rate_low", "detection_rate_high"]]
     counts = detection_rate(results, (*kept, *cells))
@@ -58,12 +92,12 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
         hypergeometric_moments, *strata, dask="parallelized", output_core_dims=[[]] * 3,
         output_dtypes=[np.float64] * 3,
     )
-    found = {name: array.sum(cells).transpose(*kept) for name, array in (
+    sums = {name: array.sum(cells).transpose(*kept) for name, array in (
         ("n", n), ("hits", hits), ("expected", expected), ("variance", variance),
         ("third", third))}
     drawn = table["detection_rate_low"].notnull()
     p_value = xr.apply_ufunc(
-        two_sided, found["hits"] - found["expected"], found["variance"], found["third"],
+        two_sided, sums["hits"] - sums["expected"], sums["variance"], sums["third"],
         dask="parallelized", output_dtypes=[np.float64],
     ).where(drawn)
     whole = dict.fromkeys(p_value.dims, -1)
@@ -71,7 +105,7 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
         holm, p_value.chunk(whole) if p_value.chunks else p_value, dask="parallelized",
         output_dtypes=[np.float64],
     )
-    expected_rate = found["expected"] / found["n"]
+    expected_rate = sums["expected"] / sums["n"]
     share = table["detection_rate"] / expected_rate
     rank = xr.apply_ufunc(
         _rank, share.chunk(marker_id=-1) if share.chunks else share, dask="parallelized",
@@ -133,7 +167,7 @@ def two_sided(deviation: Floats, variance: Floats, third: Floats) -> Floats:
 
 
 def holm(p_values: Floats) -> Floats:
-    """Return p-values corrected for their number, that of those that are not NaN."""
+    """Return p-values corrected for the number of those that are not NaN."""
     flat = p_values.ravel()
     order = np.argsort(flat)  # NaN last
     count = int((~np.isnan(flat)).sum())
@@ -145,6 +179,6 @@ def holm(p_values: Floats) -> Floats:
 
 
 def _rank(share: Floats) -> Floats:
-    """Return the ranks along the last axis, from 1, the least of equal ones; NaN of NaN."""
+    """Return the ranks along the last axis, from 1; equal values share the lowest, NaN has NaN."""
     ranks = stats.rankdata(np.nan_to_num(share, nan=np.inf), method="min", axis=-1)
     return np.where(np.isnan(share), np.nan, ranks)

@@ -1,118 +1,202 @@
-"""What is kept of the poses of a block, and how that of several blocks becomes that of all.
+"""States: what a statistic keeps of a block of poses, and how those of several blocks merge.
 
-A state is of groups. That of a block as a whole is merged over all blocks; that of its cells,
-(groups, cells), is merged over the blocks that share the cells, and then folded.
+A state is a frozen dataclass whose first axis runs over the groups. That of a block may also hold
+values of each cell, (groups, cells): it is merged over the blocks that share the cells (other
+draws), then folded to a state of the groups alone, and that is merged over the other blocks.
 """
 
 from __future__ import annotations
 
-import functools
+from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sweep.analysis import radix_histogram as tallies
-from sweep.analysis.moments import Moments, merged
-from sweep.analysis.radix_histogram import Tally
+from sweep.analysis.groups import interleaved, scattered
+from sweep.analysis.moments import Moments
+from sweep.typing import Floats, Integers, Masks
 
-Masks = NDArray[np.bool_]
-State = dict[str, Any]
-"""What is kept of poses, by name: arrays that add up (groups, ...), Moments or a Tally."""
+F_co = TypeVar("F_co", bound="State", covariant=True)
 
 
-def combined(states: Sequence[State]) -> State:
-    """Return the state of what several states are of, each kept name by its own rule."""
-    found = dict(states[0])
-    for state in states[1:]:
-        for name, value in state.items():
-            if isinstance(value, Moments):
-                found[name] = merged(found[name], value)
-            elif isinstance(value, Tally):
-                found[name] = found[name].merged(value)
-            else:
-                found[name] = found[name] + value
-    return found
+class Part(Protocol):
+    """A value of a state that is not an array of sums: `Moments`, a `Tally`, another state."""
+
+    def merge(self, other: Self) -> Self:
+        """Return the value of the poses of both."""
+        ...
+
+    @staticmethod
+    def interleave(parts: Sequence[Any]) -> Any:
+        """Return the value of the groups of all, those of the last index fastest."""
+        ...
 
 
-def interleaved(states: Sequence[State]) -> State:
-    """Return states of as many groups each as one, the groups of the last index fastest."""
-    if len(states) == 1:
-        return states[0]
-    found: State = {}
-    for name, value in states[0].items():
-        values = [state[name] for state in states]
-        if isinstance(value, Moments):
-            found[name] = Moments(*(
-                _interleaved([getattr(each, part) for each in values])
-                for part in ("count", "mean", "mean_tail", "m2")
-            ))
-        elif isinstance(value, Tally):
-            unit = tallies.UPPER * (tallies.LOWER if name == "lower" else 1)
-            moved = [each.moved(len(states), k, unit) for k, each in enumerate(values)]
-            found[name] = functools.reduce(Tally.merged, moved)
-        else:
-            found[name] = _interleaved(values)
-    return found
+@dataclass(frozen=True)
+class State:
+    """Base of all states: fields are arrays (groups, ...) that add up, or a `Part`."""
+
+    def merge(self, other: Self) -> Self:
+        """Return the state of the poses of both, of the same groups."""
+        return type(self)(*map(_merge, self._values(), other._values()))
+
+    @classmethod
+    def interleave(cls, states: Sequence[Self]) -> Self:
+        """Return n states of as many groups each as one; the n of a group stand together."""
+        if len(states) == 1:
+            return states[0]
+        return cls(*map(_interleave, zip(*map(cls._values, states), strict=True)))
+
+    def every_nth(self, n: int, first: int) -> Self:
+        """Return the state of the groups ``first``, ``first + n`` and so on."""
+        if n == 1:
+            return self
+        return type(self)(*(
+            value[first::n] if isinstance(value, np.ndarray) else value.every_nth(n, first)
+            for value in self._values()))
+
+    def scatter(self, where: Masks) -> Self:
+        """Return the state of some cells as that of all; ``where`` (cells,) marks those."""
+        return type(self)(*(
+            value.scatter(where) if isinstance(value, State) else value
+            for value in self._values()))
+
+    def _values(self) -> list[Any]:
+        return [getattr(self, field.name) for field in fields(self)]
 
 
-def every_nth(state: State, n: int, first: int) -> State:
-    """Return the state of the groups ``first``, ``first + n`` and so on; of arrays and Moments."""
-    if n == 1:
-        return state
-    return {
-        name: Moments(value.count[first::n], value.mean[first::n], value.mean_tail[first::n],
-                      value.m2[first::n])
-        if isinstance(value, Moments) else value[first::n]
-        for name, value in state.items()
-    }
+def _merge(a: Any, b: Any) -> Any:
+    return a + b if isinstance(a, np.ndarray) else a.merge(b)
 
 
-def scattered(cells: State, where: Masks) -> State:
-    """Return the state of some cells as that of all; ``where`` (cells,) tells which they are."""
-    def spread(array: NDArray[Any], fill: float = 0.0) -> NDArray[Any]:
-        every = np.full((len(array), len(where)), fill, dtype=array.dtype)
-        every[:, where] = array
-        return every
-
-    return {
-        name: Moments(spread(value.count), spread(value.mean, np.nan), spread(value.mean_tail),
-                      spread(value.m2))
-        if isinstance(value, Moments) else spread(value)
-        for name, value in cells.items()
-    }
+def _interleave(values: Sequence[Any]) -> Any:
+    first = values[0]
+    return interleaved(values) if isinstance(first, np.ndarray) else type(first).interleave(values)
 
 
-def _interleaved(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    stacked = np.stack(arrays, axis=1)
-    return stacked.reshape(-1, *stacked.shape[2:])
+@dataclass(frozen=True)
+class BlockState(State, Generic[F_co]):
+    """State of a block, whose values of cells are still apart."""
+
+    @abstractmethod
+    def fold(self) -> F_co:
+        """Return the state of the groups, the values of their cells put together."""
 
 
-def folded(cells: State) -> State:
-    """Return what cells say together: the state of (groups,), from that of (groups, cells).
+@dataclass(frozen=True)
+class Nothing(BlockState["Nothing"]):
+    """State of a pass that is not needed."""
 
-    ``draws``, the number of draws with a value that counts, gives the draws and the degrees of
-    freedom, those beyond the first of each cell. ``within``, the moments of the draws' deviations
-    from the overall mean, gives the sums that the error of the mean is made of, `error_of`.
+    def fold(self) -> Nothing:
+        """Return itself."""
+        return self
+
+
+# Draws.
+
+@dataclass(frozen=True)
+class CellDraws(State):
+    """How many draws of each cell have a pose that counts."""
+
+    draws: Integers  # (groups, cells)
+
+    @classmethod
+    def of(cls, settings: Integers) -> Self:
+        """Return that of the number of settings that count, (groups, cells, draws)."""
+        return cls((settings > 0).sum(axis=2))
+
+    def scatter(self, where: Masks) -> Self:
+        """Return the state of some cells as that of all."""
+        return type(self)(scattered(self.draws, where))
+
+    def freedom(self) -> Integers:
+        """Return the degrees of freedom (groups,): the draws beyond the first of each cell."""
+        return np.asarray(np.maximum(self.draws - 1, 0).sum(axis=1))
+
+
+@dataclass(frozen=True)
+class Sample(State):
+    """The poses that count, and the draws that they are of; each (groups,)."""
+
+    n: Integers  # poses, times pooled settings
+    squares: Floats  # sum over the draws of the squared number of settings that count
+    freedom: Integers  # draws beyond the first of each cell
+
+    @property
+    def draws(self) -> Integers:
+        """Number of draws that the poses are worth.
+
+        That is the number of draws with a pose that counts if each has equally many of them; else
+        it is less, for those with more of them count more: the effective sample size,
+        (Σ m)² / Σ m² of m poses a draw, rounded down (Kish, "Survey Sampling", 1965, section 11.7).
+        """
+        worth = self.n.astype(np.float64)**2 / np.maximum(self.squares, 1.0)
+        return np.asarray(np.floor(worth * (1.0 + 1e-12)), dtype=np.int64)
+
+    @property
+    def drawn(self) -> Masks:
+        """Whether any cell has two draws, so that intervals exist."""
+        return np.asarray(self.freedom > 0)
+
+
+@dataclass(frozen=True)
+class BlockSample(BlockState[Sample]):
+    """The poses of a block that count, and the draws of each cell that they are of."""
+
+    n: Integers
+    squares: Floats
+    cells: CellDraws
+
+    @classmethod
+    def of(cls, used: Masks) -> Self:
+        """Return that of the poses that count, (groups, cells, draws, settings)."""
+        settings = used.sum(axis=3)
+        squares = np.square(settings, dtype=np.float64).sum(axis=(1, 2))
+        return cls(settings.sum(axis=(1, 2)), squares, CellDraws.of(settings))
+
+    def fold(self) -> Sample:
+        """Return the sample of all cells."""
+        return Sample(self.n, self.squares, self.cells.freedom())
+
+
+# Spread of draws within cells.
+
+@dataclass(frozen=True)
+class Spread(State):
+    """Sums over cells from which the error of a mean follows; each (groups,).
+
+    `sweep.analysis.mean_intervals.estimate_mean` uses them.
     """
-    found: State = {}
-    if "draws" in cells:
-        draws = cells["draws"]
-        found["draws"] = draws.sum(axis=1)
-        found["freedom"] = np.maximum(draws - 1, 0).sum(axis=1)
-    if "within" in cells:
-        within = cells["within"]
-        repeated = within.count > 1
-        freedom = np.where(repeated, within.count - 1.0, 0.0)
-        m2 = np.where(repeated, within.m2, 0.0)
+
+    variance: Floats  # sum over the cells of n_c s_c², s_c² being the variance within the cell
+    squares: Floats  # sum of its terms' squares over their degrees of freedom + 2
+    single: Integers  # cells with a single draw
+    m2: Floats  # sum of squared deviations from the cells' means
+    freedom: Floats  # its degrees of freedom
+
+
+@dataclass(frozen=True)
+class CellDeviations(BlockState[Spread]):
+    """Moments (groups, cells) of the draws' deviations from the mean of all."""
+
+    within: Moments
+
+    def scatter(self, where: Masks) -> Self:
+        """Return the state of some cells as that of all."""
+        w = self.within
+        return type(self)(Moments(
+            scattered(w.count, where), scattered(w.mean, where, np.nan),
+            scattered(w.mean_tail, where), scattered(w.m2, where)))
+
+    def fold(self) -> Spread:
+        """Return the sums over the cells."""
+        repeated = self.within.count > 1
+        freedom = np.where(repeated, self.within.count - 1.0, 0.0)
+        m2 = np.where(repeated, self.within.m2, 0.0)
         with np.errstate(all="ignore"):
             terms = (freedom + 1.0) * m2 / np.maximum(freedom, 1.0)
-            found |= {
-                "spread": terms.sum(axis=1),
-                "spread_squares": (terms**2 / (freedom + 2.0)).sum(axis=1),
-                "alone": (within.count == 1).sum(axis=1),
-                "m2_repeated": m2.sum(axis=1),
-                "freedom_repeated": freedom.sum(axis=1),
-            }
-    return found
+            return Spread(
+                terms.sum(axis=1), (terms**2 / (freedom + 2.0)).sum(axis=1),
+                (self.within.count == 1).sum(axis=1), m2.sum(axis=1), freedom.sum(axis=1))

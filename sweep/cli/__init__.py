@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from sweep.errors import ArgumentError, PipelineError, StoreError, SweepError
+from sweep.errors import ArgumentError, DatasetError, PipelineError, StoreError, SweepError
 
 if TYPE_CHECKING:
     from sweep.execution.progress import Progress
@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         flag = FLAGS.get(error.argument, error.argument.replace("_", "-"))
         _tell(SweepError(f"--{flag} {error.value}: {error.problem}"))
         return 2
-    except (PipelineError, StoreError) as error:
+    except (PipelineError, DatasetError, StoreError) as error:
         _tell(error)
         return 2
     except SweepError as error:

@@ -11,8 +11,8 @@ import xarray as xr
 
 from sweep.analysis import detection_limit, detection_rate, error_statistics
 from sweep.analysis.detection_limits import Limit
-from sweep.analysis.statistics import IntervalOf
-from sweep.errors import StoreError
+from sweep.analysis.quantiles import IntervalOf
+from sweep.errors import ArgumentError, DatasetError
 from sweep.plan.parameters import Stage
 from sweep.report.figure import ends_of, sentences
 from sweep.report.report_data import TILT, Subject, stacked, text_of
@@ -216,7 +216,7 @@ def _seen(subject: Subject) -> Seen:
     per = (TILT,) if subject.tilted else ()
     try:
         limit_of = detection_limit(first, rate=SEEN, per=per)
-    except StoreError:  # the side is not the same over what is pooled, or not known
+    except (ArgumentError, DatasetError):  # the side varies over what is pooled, or is unknown
         return Seen()
     found = subject.once("detection_limit", lambda: limit_of)
     dims = [str(dim) for dim in found["side_px"].dims]

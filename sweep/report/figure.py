@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.statistics import IntervalOf
+from sweep.analysis.quantiles import IntervalOf
 from sweep.report.charts import Series
 from sweep.report.report_data import Subject, labels_of
 from sweep.report.table import Table

@@ -9,9 +9,8 @@ import xarray as xr
 from scipy import stats
 
 from support.lengths import lengths
-from sweep.analysis.comparisons import renderer_bias
-from sweep.analysis.error_summaries import covariance_trust, efficiency, error_statistics
-from sweep.errors import StoreError
+from sweep.analysis import covariance_trust, efficiency, error_statistics, renderer_bias
+from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
 INNER = {"corner": 4, "xy": 2, "xyz": 3, "pose_parameter": 6}
@@ -244,7 +243,7 @@ def test_nothing_seen_says_nothing():
 def test_a_dimension_that_is_not_there_is_told_in_one_line(mixed, function):
     there = "there are distance_m, marker_id, trial, refinement, solver"
     for treatments, per in ((["solverr"], []), ([], ["solverr"]), (["xyz"], [])):
-        with pytest.raises(StoreError, match=there) as refused:
+        with pytest.raises(ArgumentError, match=there) as refused:
             function(mixed, (*per, *treatments))
         assert "\n" not in str(refused.value)
 
@@ -552,9 +551,9 @@ def test_true_covariances_are_trusted_and_others_are_not():
     assert mended["covariance_trusted"].all()
     kept = covariance_trust(results, ["solver"], scale=scale[::-1].sortby("solver"))
     xr.testing.assert_identical(kept, mended)
-    with pytest.raises(ValueError, match="align"):
+    with pytest.raises(ArgumentError, match="scale = array over solver: expected the dataset"):
         covariance_trust(results, ["solver"], scale=scale[:2])
-    with pytest.raises(StoreError, match="lens: no such dimension"):
+    with pytest.raises(ArgumentError, match="scale = array over lens: no such dimension"):
         covariance_trust(results, [], scale=xr.DataArray([1.0], dims="lens"))
 
 
@@ -598,7 +597,7 @@ def test_flips_cost_the_trust_and_too_few_draws_give_none():
 
 @pytest.mark.parametrize("levels", [(), (0.5, 1.0), (50,), (math.nan,)])
 def test_a_level_that_is_no_probability_is_refused(mixed, levels):
-    with pytest.raises(ValueError, match="give numbers between 0 and 1"):
+    with pytest.raises(ValueError, match="expected numbers between 0 and 1"):
         covariance_trust(mixed, [], levels=levels)
 
 
@@ -656,8 +655,8 @@ def test_what_one_renderer_has_not_run_is_no_draw():
 
 
 def test_a_renderer_that_is_not_there_is_told(mixed):
-    with pytest.raises(StoreError, match=r"^renderer: no such dimension; there are distance_m"):
+    with pytest.raises(DatasetError, match=r"^renderer: no such dimension; there are distance_m"):
         renderer_bias(mixed)
     renamed = mixed.isel(marker_id=[0, 1]).assign_coords(marker_id=["warp", "fine"])
-    with pytest.raises(StoreError, match="reference = exact: the renderers are warp, fine"):
+    with pytest.raises(ArgumentError, match="reference = exact: the renderers are warp, fine"):
         renderer_bias(renamed.rename(marker_id="renderer"))

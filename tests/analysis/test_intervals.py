@@ -226,8 +226,8 @@ def test_shapes_broadcast_and_arrays_come_back(interval):
 
 @METHODS
 @pytest.mark.parametrize(("successes", "n", "said"), [
-    (-1, 5, "successes = -1, n = 5: give whole numbers"),
-    ([1, 6], 5, "successes = 6, n = 5: give whole numbers with 0 <= successes <= n <= 1e+15"),
+    (-1, 5, "successes = -1, n = 5: expected whole numbers"),
+    ([1, 6], 5, "successes = 6, n = 5: expected whole numbers with 0 <= successes <= n <= 1e+15"),
     (1.5, 5, "successes = 1.5, n = 5: "),
     (1, 5.5, "successes = 1, n = 5.5: "),
     (np.nan, 5, "successes = nan, n = 5: "),
@@ -237,7 +237,7 @@ def test_shapes_broadcast_and_arrays_come_back(interval):
     (1, 10**15 + 1, "successes = 1, n = 1000000000000001: "),
 ])
 def test_impossible_counts_are_refused_in_one_line(interval, successes, n, said):
-    with pytest.raises(ValueError, match=r"give whole numbers") as refused:
+    with pytest.raises(ValueError, match=r"expected whole numbers") as refused:
         interval(successes, n)
     assert str(refused.value).startswith(said)
     assert "\n" not in str(refused.value)
@@ -246,5 +246,5 @@ def test_impossible_counts_are_refused_in_one_line(interval, successes, n, said)
 @METHODS
 @pytest.mark.parametrize("level", [0.0, 1.0, -0.1, 95, np.nan])
 def test_a_level_that_is_no_probability_is_refused(interval, level):
-    with pytest.raises(ValueError, match=r"level = .*: give a number between 0 and 1"):
+    with pytest.raises(ValueError, match=r"level = .*: expected a number between 0 and 1"):
         interval(1, 2, level)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mpmath import mp, mpf
 
 from support.lengths import lengths
-from sweep.analysis.moments import Moments, merged
+from sweep.analysis.moments import Moments
 
 # offset, spread: what is left of the spread is exact in the doubles, be it only three bits.
 SCALES = [(1e9, 1e-3), (0.0, 1.0), (-3e5, 1e-9), (1e9, 1e9), (1e15, 1.0), (1e-100, 1e-110)]
@@ -66,7 +66,7 @@ def merged_at_random(rng, pieces):
     while len(pieces) > 1:
         a = pieces.pop(rng.integers(len(pieces)))
         b = pieces.pop(rng.integers(len(pieces)))
-        pieces.append(merged(a, b))
+        pieces.append(a.merge(b))
     return pieces[0]
 
 
@@ -103,8 +103,8 @@ def test_tiny_spread_on_a_large_offset_keeps_its_variance(shape, count):
     for moments in (
         Moments.of(values),
         merged_at_random(rng, random_pieces(rng, values, 1e5)),
-        functools.reduce(merged, random_pieces(rng, values, 1e5)),
-        functools.reduce(merged, random_pieces(rng, values, 1e5)[::-1]),
+        functools.reduce(Moments.merge, random_pieces(rng, values, 1e5)),
+        functools.reduce(Moments.merge, random_pieces(rng, values, 1e5)[::-1]),
     ):
         variance, ulp, _ = errors(moments, truth)
         print(f"{count} values: variance {variance:.1e}, mean {ulp:.2f} ulp")
@@ -119,7 +119,7 @@ def test_single_values_merged_one_by_one_keep_the_variance(backwards, count):
     values = 1e9 + 1e-3 * rng.normal(size=count)
     single = [Moments.of(value) for value in values]
     chain = single[::-1] if backwards else single
-    variance, ulp, _ = errors(functools.reduce(merged, chain), exact(values))
+    variance, ulp, _ = errors(functools.reduce(Moments.merge, chain), exact(values))
     print(f"{count} merges: variance {variance:.1e}, mean {ulp:.2f} ulp")
     assert variance <= VARIANCE  # measured 1e-14
     assert ulp <= 0.51
@@ -131,7 +131,7 @@ def test_without_the_tail_of_the_mean_the_variance_is_lost():
     values = 1e9 + 1e-3 * rng.normal(size=500)
 
     def plain(a, b):
-        both = merged(a, b)
+        both = a.merge(b)
         return Moments(both.count, both.mean, np.zeros_like(both.mean), both.m2)
 
     lost = errors(functools.reduce(plain, [Moments.of(value) for value in values]), exact(values))
@@ -157,7 +157,7 @@ def test_few_values_in_any_split_have_the_exact_moments(count):
         cuts = st.lists(st.integers(0, len(values)), max_size=5).map(sorted)
         pieces = [Moments.of(part) for part in np.split(values, data.draw(cuts))]
         order = data.draw(st.permutations(pieces))
-        both = functools.reduce(merged, order)
+        both = functools.reduce(Moments.merge, order)
         assert both.count == len(values)
         assert abs(mpf(float(both.variance)) - variance) <= 1e-14 * variance
         # The mean is the nearest double, up to what cancels among values of both signs.
@@ -173,7 +173,7 @@ def test_few_values_in_any_split_have_the_exact_moments(count):
 def test_equal_values_have_exactly_no_variance(value):
     values = np.full(1001, value)
     parts = [Moments.of(part) for part in np.split(values, [1, 4, 500])]
-    for moments in (Moments.of(values), functools.reduce(merged, parts)):
+    for moments in (Moments.of(values), functools.reduce(Moments.merge, parts)):
         assert moments.m2 == 0.0
         assert moments.variance == 0.0
         assert (moments.mean, moments.mean_tail) == (value, 0.0)
@@ -189,12 +189,12 @@ def test_spread_below_the_spacing_of_doubles_is_that_of_the_stored_doubles():
 
 def test_squares_that_overflow_make_the_variance_infinite_and_leave_the_mean():
     values = np.array([1e300, 2e300, 3e300])
-    for moments in (Moments.of(values), merged(Moments.of(values[:1]), Moments.of(values[1:]))):
+    for moments in (Moments.of(values), Moments.of(values[:1]).merge(Moments.of(values[1:]))):
         assert moments.mean == pytest.approx(2e300, rel=1e-15)
         assert moments.variance == np.inf
         assert moments.standard_deviation == np.inf
     # Their difference overflows too.
-    opposite = merged(Moments.of(1.7e308), Moments.of(-1.7e308))
+    opposite = Moments.of(1.7e308).merge(Moments.of(-1.7e308))
     assert (opposite.mean, opposite.mean_tail, opposite.m2) == (0.0, 0.0, np.inf)
 
 
@@ -235,8 +235,8 @@ def test_one_value_has_a_mean_and_no_variance():
 @pytest.mark.parametrize("values", [[], [4.0], [1e9, 1e9 + 0.3], [np.inf, 1.0], [np.inf, -np.inf]])
 def test_merging_with_nothing_changes_nothing(values):
     moments, nothing = Moments.of(values), Moments.of([np.nan])
-    assert same(merged(moments, nothing), moments)
-    assert same(merged(nothing, moments), moments)
+    assert same(moments.merge(nothing), moments)
+    assert same(nothing.merge(moments), moments)
 
 
 @pytest.mark.parametrize(("values", "mean"), [
@@ -245,8 +245,8 @@ def test_merging_with_nothing_changes_nothing(values):
 ])
 def test_an_infinite_value_is_the_mean_and_leaves_no_variance(values, mean):
     pieces = [Moments.of(value) for value in values]
-    for moments in (Moments.of(values), functools.reduce(merged, pieces),
-                    functools.reduce(merged, pieces[::-1])):
+    for moments in (Moments.of(values), functools.reduce(Moments.merge, pieces),
+                    functools.reduce(Moments.merge, pieces[::-1])):
         assert np.array_equal(moments.mean, mean, equal_nan=True)
         assert np.isnan(moments.m2)
         assert np.isnan(moments.variance)
@@ -282,7 +282,7 @@ def test_every_axis_gives_the_same_bits_as_one_series_at_a_time(axis):
 
 def test_many_series_merge_at_once_with_different_counts():
     first, second = np.array([[1.0, 2.0], [np.nan, 5.0]]), np.array([[6.0], [7.0]])
-    both = merged(Moments.of(first, 1), Moments.of(second, 1))
+    both = Moments.of(first, 1).merge(Moments.of(second, 1))
     assert both.count.tolist() == [3, 2]
     assert both.mean.tolist() == [3.0, 6.0]
     assert both.variance.tolist() == [7.0, 2.0]
@@ -296,7 +296,7 @@ def test_integers_and_single_precision_are_taken_as_they_are():
 
 def test_different_shapes_are_refused():
     with pytest.raises(ValueError, match=r"merge moments of one shape, not of \(2,\) and \(3,\)"):
-        merged(Moments.of(np.zeros((2, 4)), 1), Moments.of(np.zeros((3, 4)), 1))
+        Moments.of(np.zeros((2, 4)), 1).merge(Moments.of(np.zeros((3, 4)), 1))
     with pytest.raises(ValueError, match="must have one shape"):
         Moments(np.array([1, 2]), np.zeros(2), np.zeros(2), np.zeros(3))
     with pytest.raises(ValueError, match="axis 2 is out of bounds"):

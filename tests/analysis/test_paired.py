@@ -35,7 +35,7 @@ from support.small_datasets import (
     wilson,
 )
 from sweep.analysis import compare, detection_limit, detection_rate, marker_ranking
-from sweep.errors import StoreError
+from sweep.errors import DatasetError
 from sweep.measure.flags import DetectionStatus
 
 # Ranking of marker IDs.
@@ -225,7 +225,7 @@ def test_where_all_ids_are_alike_none_is_weak(detected):
 
 def test_a_ranking_without_ids_is_refused():
     results = perfect(np.random.default_rng(9), {"trial": 10})
-    with pytest.raises(StoreError, match="marker_id: no such dimension; there are trial"):
+    with pytest.raises(DatasetError, match="marker_id: no such dimension; there are trial"):
         marker_ranking(results)
 
 
@@ -435,7 +435,7 @@ def test_scenes_of_two_ids_are_no_treatments_of_the_same_scenes():
     # Camera, marker and pose make the key of the draws: these are others, nothing is paired.
     results = mixed({"marker_id": 2, "tilt_deg": 2, "trial": 10, "noise_grey": 2}, 12)
     for name in ("marker_id", "tilt_deg"):
-        with pytest.raises(StoreError, match=name):
+        with pytest.raises(DatasetError, match=name):
             compare(results.isel({name: 0}), results.isel({name: 1}))
     compare(results.isel(noise_grey=0), results.isel(noise_grey=1))
 
@@ -445,17 +445,17 @@ def test_other_scenes_and_other_draws_are_not_compared():
     first = mixed(sizes, 12)
     second = first.copy(deep=True)
     compare(first, second)
-    with pytest.raises(StoreError) as told:
+    with pytest.raises(DatasetError) as told:
         compare(first, second.assign_coords(marker_id=[3, 8]))
     assert "marker_id" in str(told.value)
     assert "\n" not in str(told.value)
-    with pytest.raises(StoreError) as told:
+    with pytest.raises(DatasetError) as told:
         compare(first, second.isel(trial=slice(5)))
     assert "trial" in str(told.value)
     for side, seed in ((first, 1), (second, 2)):
         side.attrs["pipeline"] = pipeline_text(sizes, seed=seed)
         side.attrs["sweep"] = {"fingerprint": {"seed": seed}}
-    with pytest.raises(StoreError) as told:
+    with pytest.raises(DatasetError) as told:
         compare(first, second)
     assert "seed" in str(told.value)
 
@@ -548,6 +548,6 @@ def test_all_that_is_looked_for_may_be_found_with_pooled_settings(settings):
 
 def test_a_limit_needs_sizes():
     results = perfect(np.random.default_rng(15), {"tilt_deg": 2, "trial": 10})
-    with pytest.raises(StoreError, match=r"side_px|distance_m") as told:
+    with pytest.raises(DatasetError, match=r"side_px|distance_m") as told:
         detection_limit(results)
     assert "\n" not in str(told.value)

@@ -44,7 +44,7 @@ from support.small_datasets import (
     wilson,
 )
 from sweep.analysis import detection_rate, error_statistics, failure_composition, flip_rate
-from sweep.errors import StoreError
+from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.experiment import Pipeline
 
@@ -398,11 +398,11 @@ def test_where_nothing_was_looked_for_nothing_is_said(function):
 
 @FUNCTIONS_OF_ONE
 def test_a_dimension_that_is_not_there_is_told_in_one_line(function):
-    with pytest.raises(StoreError, match=r"^speed: no such dimension; there are .*") as told:
+    with pytest.raises(ArgumentError, match=r"^per = speed: no such dimension; there are") as told:
         function(GRIDS["plain"], per=("speed",))
     assert "\n" not in str(told.value)
     assert all(name in str(told.value) for name in ("trial", "distance_m", "marker_id"))
-    with pytest.raises(StoreError, match="speed"):
+    with pytest.raises(ArgumentError, match="bins = speed: no such variable"):
         function(GRIDS["plain"], bins={"speed": [0.0, 1.0]})
 
 
@@ -464,17 +464,23 @@ def test_a_solved_pose_without_a_number_counts_in_no_mean():
     assert told["rotation_p99_deg"] == np.inf
 
 
-@pytest.mark.parametrize(("call", "message"), [
-    (lambda r: detection_rate(r, per=[3]), "expected names of dimensions"),
-    (lambda r: detection_rate(r, per=None), "expected names of dimensions"),
-    (lambda r: detection_rate(r, bins=["marker_area_px"]), "expected names with edges"),
-    (lambda r: detection_rate(r, bins={"marker_area_px": "abc"}), "two increasing edges"),
-    (lambda r: detection_rate(r, bins={"marker_area_px": [1, np.nan]}), "two increasing edges"),
-    (lambda r: detection_rate(r.drop_vars("estimate")), "no variable estimate; there are"),
-    (lambda _: error_statistics(xr.Dataset()), "no variable detection, estimate"),
-    (lambda r: detection_rate(r.isel(trial=slice(0))), "there are no poses: trial has no values"),
+NO_EDGES, NO_NAMES = "expected at least two increasing edges", "expected names of dimensions"
+
+
+@pytest.mark.parametrize(("call", "error", "message"), [
+    (lambda r: detection_rate(r, per=[3]), ArgumentError, NO_NAMES),
+    (lambda r: detection_rate(r, per=None), ArgumentError, NO_NAMES),
+    (lambda r: detection_rate(r, bins=["marker_area_px"]), ArgumentError,
+     "expected names with edges"),
+    (lambda r: detection_rate(r, bins={"marker_area_px": "abc"}), ArgumentError, NO_EDGES),
+    (lambda r: detection_rate(r, bins={"marker_area_px": [1, np.nan]}), ArgumentError, NO_EDGES),
+    (lambda r: detection_rate(r.drop_vars("estimate")), DatasetError,
+     "no variable estimate; there are"),
+    (lambda _: error_statistics(xr.Dataset()), DatasetError, "no variable detection, estimate"),
+    (lambda r: detection_rate(r.isel(trial=slice(0))), DatasetError,
+     "there are no poses: trial has no values"),
 ])
-def test_what_cannot_be_asked_is_told_in_one_line(call, message):
-    with pytest.raises(StoreError, match=message) as refused:
+def test_what_cannot_be_asked_is_told_in_one_line(call, error, message):
+    with pytest.raises(error, match=message) as refused:
         call(GRIDS["draws"])
     assert "\n" not in str(refused.value)

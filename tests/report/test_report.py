@@ -23,7 +23,7 @@ from sweep.analysis import (
     error_statistics,
     failure_composition,
 )
-from sweep.analysis.statistics import IntervalOf
+from sweep.analysis.quantiles import IntervalOf
 from sweep.errors import StoreError
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.renderers import background_image

@@ -1,0 +1,170 @@
+"""Statistics of all poses of a dataset that may be larger than memory: block by block, merged.
+
+The blocks are the chunks of a lazy dataset, and the result is then lazy, too.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic
+
+import dask.array as da
+import xarray as xr
+from dask.typing import Key
+from numpy.typing import NDArray
+
+from sweep.analysis.binning import Binning, Bins, read_bins
+from sweep.analysis.graph import ChunkReader, ReadBlock, TaskLayer, add_pass, array_of_blocks
+from sweep.analysis.layout import Arrays, Layout, Lengths
+from sweep.analysis.states import BlockState, Nothing, State
+from sweep.analysis.statistic import Output, SinglePass, Statistic, Variables, ViewT
+
+
+def aggregate(
+    results: xr.Dataset,
+    inputs: Mapping[str, xr.DataArray],
+    kept: Sequence[str],
+    statistics: Sequence[Statistic[ViewT, Any, Any, Any]],
+    view: Callable[[Arrays], ViewT],
+    bins: Bins | None = None,
+) -> xr.Dataset:
+    """Return the statistics of the poses of each combination of ``kept`` and of bins.
+
+    Parameters
+    ----------
+    results
+        The dataset whose coordinates and variables name what is kept and binned.
+    inputs
+        The arrays, by name, of which ``view`` makes the poses that the statistics see.
+    kept
+        The dimensions of the table; all others are pooled.
+    statistics
+        What to compute.
+    view
+        Makes the view from a block's arrays, (groups, cells, draws, settings, ...).
+    bins
+        Edges (n + 1,) of bins [low, high) of a variable or coordinate of the scene.
+
+    Returns
+    -------
+    xr.Dataset
+        A variable (*kept, *bins) for each output; lazy if any of the inputs is.
+
+    Raises
+    ------
+    ArgumentError
+        For bins that cannot be.
+    """
+    binning, binned = read_bins(results, kept, bins or {})
+    lazy = any(array.chunks is not None for array in inputs.values())
+    dataset = xr.Dataset(
+        {name: array.reset_coords(drop=True) for name, array in inputs.items()} | binned)
+    layout = Layout.of(dataset, kept)
+    chunked = layout.rechunk(dataset, lazy=lazy)
+    lengths = {name: tuple(chunked.chunks[name]) if name in chunked.sizes
+               else (results.sizes[name],) for name in layout.dimensions}
+    passes = Passes(layout, binning, tuple(statistics), view)
+    layer, tables = _add_tasks(chunked, lengths, passes)
+    dims = (*layout.kept, *binning.edges)
+    chunks = (*(lengths[name] for name in layout.kept), *((count,) for count in binning.shape))
+    variables = {
+        output.name: (dims, array_of_blocks(
+            layer, tables, functools.partial(_pick, output), output.name, chunks, output.dtype,
+        ), output.attributes())
+        for statistic in statistics for output in statistic.outputs()
+    }
+    coordinates = {name: value for name, value in results.coords.items()
+                   if set(value.dims) <= set(kept)}
+    table = xr.Dataset(variables, coordinates).assign_coords(binning.coordinates(results))
+    return table if lazy else table.compute(scheduler="synchronous")
+
+
+@dataclass(frozen=True)
+class Passes(Generic[ViewT]):
+    """The passes of several statistics over a block, as functions of tasks.
+
+    States are in lists, one for each statistic. Groups are those of the kept dimensions times the
+    combinations of bins, the bins fastest.
+    """
+
+    layout: Layout
+    binning: Binning
+    statistics: tuple[Statistic[ViewT, Any, Any, Any], ...]
+    view: Callable[[Arrays], ViewT]
+
+    @property
+    def single(self) -> bool:
+        """Whether no statistic needs the second pass."""
+        return all(isinstance(statistic, SinglePass) for statistic in self.statistics)
+
+    def first_pass(self, sizes: Mapping[str, int], read: ReadBlock) -> list[BlockState[Any]]:
+        """Return the states of a block."""
+        return self._by_bin(sizes, read, lambda poses, _: [
+            statistic.first_pass(poses) for statistic in self.statistics])
+
+    def prepare_second(self, first: Sequence[State]) -> list[State]:
+        """Return what the second pass needs, from the states of all blocks."""
+        return [statistic.prepare_second(state)
+                for statistic, state in zip(self.statistics, first, strict=True)]
+
+    def second_pass(
+        self, sizes: Mapping[str, int], read: ReadBlock, known: Sequence[State]
+    ) -> list[BlockState[Any]]:
+        """Return the states of a block."""
+        return self._by_bin(sizes, read, lambda poses, number: [
+            statistic.second_pass(poses, state.every_nth(self.binning.count, number))
+            for statistic, state in zip(self.statistics, known, strict=True)])
+
+    def finish(self, known: Sequence[State], second: Sequence[State] | None = None) -> Variables:
+        """Return the variables of all statistics, each (groups,)."""
+        variables: Variables = {}
+        second = second or [Nothing()] * len(known)
+        for statistic, *states in zip(self.statistics, known, second, strict=True):
+            variables |= statistic.finish(*states)
+        return variables
+
+    def _by_bin(
+        self, sizes: Mapping[str, int], read: ReadBlock,
+        see: Callable[[ViewT, int], list[BlockState[Any]]],
+    ) -> list[BlockState[Any]]:
+        """Return the states of all combinations of bins, those of a group together."""
+        arrays = self.layout.arrange(read(), sizes)
+        by_bin = []
+        for number, (part, cells) in enumerate(self.binning.split(arrays)):
+            states = see(self.view(part), number)
+            by_bin.append(states if cells is None else [each.scatter(cells) for each in states])
+        return [type(states[0]).interleave(states) for states in zip(*by_bin, strict=True)]
+
+
+def fold(*parts: Sequence[BlockState[Any]]) -> list[State]:
+    """Return the folded states of some cells, of all their draws."""
+    return [functools.reduce(type(states[0]).merge, states).fold()
+            for states in zip(*parts, strict=True)]
+
+
+def merge(*parts: Sequence[State]) -> list[State]:
+    """Return the states of all blocks together."""
+    return [functools.reduce(type(states[0]).merge, states)
+            for states in zip(*parts, strict=True)]
+
+
+def _add_tasks(
+    dataset: xr.Dataset, lengths: Lengths, passes: Passes[ViewT]
+) -> tuple[TaskLayer, list[Key]]:
+    """Return the tasks, and the keys of the variables of each block of the kept dimensions."""
+    layer = TaskLayer("statistics")
+    reader = ChunkReader([da.asarray(array.data) for array in dataset.data_vars.values()])
+    add = functools.partial(add_pass, layer, reader, passes.layout, lengths)
+    known = [layer.add(passes.prepare_second, layer.merge(merge, states))
+             for states in add(passes.first_pass, fold)]
+    if passes.single:
+        return layer, [layer.add(passes.finish, state) for state in known]
+    second = [layer.merge(merge, states) for states in add(passes.second_pass, fold, known)]
+    return layer, [layer.add(passes.finish, *states)
+                   for states in zip(known, second, strict=True)]
+
+
+def _pick(output: Output, shape: tuple[int, ...], table: Variables) -> NDArray[Any]:
+    return table[output.name].reshape(shape).astype(output.dtype)

@@ -1,0 +1,99 @@
+"""What the dimensions of a dataset are, and which of them the caller keeps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import xarray as xr
+
+from sweep.analysis.pose_view import REQUIRED_VARIABLES
+from sweep.errors import ArgumentError, DatasetError
+from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS, Stage
+from sweep.plan.schema import LABELS, SCHEMA
+
+DRAWS = "trial"
+"""The dimension of random draws."""
+
+
+def axes_of(results: xr.Dataset, *stages: Stage) -> list[str]:
+    """Return the axes of the schema's variables (of some stages, or of all), in their order."""
+    dims = [str(dim) for variable in SCHEMA if variable.name in results
+            and (not stages or variable.stage in stages)
+            for dim in results[variable.name].dims]
+    return [dim for dim in dict.fromkeys(dims) if dim not in LABELS]
+
+
+def is_grid_axis(name: object) -> bool:
+    """Return whether a dimension is of the camera, the marker or the pose: it makes cells."""
+    return name in PARAMETERS and PARAMETERS[str(name)].section in GEOMETRY_SECTIONS
+
+
+def fingerprint_of(results: xr.Dataset) -> Mapping[str, Any]:
+    """Return the fingerprint in a dataset's attributes; empty if they have none."""
+    metadata = results.attrs.get("sweep")
+    fingerprint = metadata.get("fingerprint") if isinstance(metadata, Mapping) else None
+    return fingerprint if isinstance(fingerprint, Mapping) else {}
+
+
+def as_names(per: Sequence[str]) -> tuple[str, ...]:
+    """Return names of dimensions as a tuple: several, or a single one as a string.
+
+    Raises
+    ------
+    ArgumentError
+        If ``per`` is not a list of names.
+    """
+    if isinstance(per, str):
+        return (per,)
+    if not isinstance(per, Iterable) or not all(isinstance(name, str) for name in per):
+        raise ArgumentError("per", per, "expected names of dimensions")
+    return tuple(per)
+
+
+def kept_dimensions(results: xr.Dataset, per: Sequence[str]) -> tuple[str, ...]:
+    """Return the dimensions to keep, each once.
+
+    Raises
+    ------
+    ArgumentError
+        If the dataset does not have one of them.
+    DatasetError
+        If the dataset lacks variables, or has no poses.
+    """
+    names = as_names(per)
+    require_poses(results)
+    axes = axes_of(results)
+    missing = [name for name in dict.fromkeys(names) if name not in axes]
+    if missing:
+        raise ArgumentError("per", ", ".join(missing),
+                            f"no such dimension; there are {', '.join(axes) or 'none'}")
+    return tuple(dict.fromkeys(names))
+
+
+def require_poses(results: xr.Dataset) -> None:
+    """Raise DatasetError unless a dataset has the variables of results, and poses."""
+    lacking = [name for name in REQUIRED_VARIABLES if name not in results]
+    if lacking:
+        there = ", ".join(map(str, results.data_vars)) or "none"
+        raise DatasetError(f"no variable {', '.join(lacking)}; there are {there}")
+    empty = [name for name in axes_of(results) if results.sizes[name] == 0]
+    if empty:
+        raise DatasetError(f"there are no poses: {', '.join(empty)} has no values")
+
+
+def require_dimension(results: xr.Dataset, *names: str) -> str:
+    """Return the first of the names that is a dimension of the dataset.
+
+    Raises
+    ------
+    DatasetError
+        If none is.
+    """
+    require_poses(results)
+    axes = axes_of(results)
+    for name in names:
+        if name in axes:
+            return name
+    raise DatasetError(f"{' or '.join(names)}: no such dimension; "
+                       f"there are {', '.join(axes) or 'none'}")

@@ -1,0 +1,102 @@
+"""How a dataset's dimensions become the four axes of a block: groups, cells, draws, settings.
+
+Named dimensions are kept, all others are pooled. Of these, ``trial`` counts random draws; the
+other dimensions of camera, marker and pose make cells, a fixed grid; all others that are pooled
+(effects, levels, renderers, settings of detector and estimator, and names that are no parameter's)
+see the same draws (`sweep.plan.draws`), so that their values together count as one draw.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from sweep.analysis.dimensions import DRAWS, is_grid_axis
+from sweep.plan.schema import LABELS
+
+MAX_BLOCK = 1 << 18
+"""Poses in a block of a dataset that is in memory."""
+
+Arrays = dict[str, NDArray[Any]]
+"""Arrays of a block, by name."""
+
+Lengths = Mapping[str, tuple[int, ...]]
+"""The lengths of the chunks of each dimension."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What each dimension is: kept, of cells, of draws, or of settings.
+
+    ``arrays`` gives the dimensions of each array.
+    """
+
+    arrays: Mapping[str, tuple[str, ...]]
+    kept: tuple[str, ...]
+    cells: tuple[str, ...]
+    draws: tuple[str, ...]
+    settings: tuple[str, ...]
+
+    @classmethod
+    def of(cls, dataset: xr.Dataset, kept: Sequence[str]) -> Layout:
+        """Return that of a dataset's arrays."""
+        pooled = [str(dim) for dim in dataset.dims if dim not in LABELS and dim not in kept]
+        cells = tuple(name for name in pooled if name != DRAWS and is_grid_axis(name))
+        draws = tuple(name for name in pooled if name == DRAWS)
+        return cls(
+            {str(name): tuple(map(str, array.dims)) for name, array in dataset.items()},
+            tuple(kept), cells, draws,
+            tuple(name for name in pooled if name not in (*cells, *draws)),
+        )
+
+    @property
+    def dimensions(self) -> tuple[str, ...]:
+        """All dimensions, in the order of a block's axes."""
+        return (*self.kept, *self.cells, *self.draws, *self.settings)
+
+    def arrange(self, blocks: Sequence[NDArray[Any]], sizes: Mapping[str, int]) -> Arrays:
+        """Return a block's arrays as (groups, cells, draws, settings, ...)."""
+        arrays = {}
+        parts = (self.kept, self.cells, self.draws, self.settings)
+        shape = [math.prod(sizes[name] for name in names) for names in parts]
+        for (name, dims), block in zip(self.arrays.items(), blocks, strict=True):
+            inner = [dim for dim in dims if dim not in self.dimensions]
+            present = [dim for dim in self.dimensions if dim in dims]
+            array = block.transpose([dims.index(dim) for dim in (*present, *inner)])
+            rest = array.shape[len(present):]
+            array = array.reshape(
+                (*(sizes[dim] if dim in dims else 1 for dim in self.dimensions), *rest))
+            array = np.broadcast_to(array, (*(sizes[dim] for dim in self.dimensions), *rest))
+            arrays[name] = array.reshape((*shape, *rest))
+        return arrays
+
+    def rechunk(self, dataset: xr.Dataset, *, lazy: bool) -> xr.Dataset:
+        """Return the dataset in chunks; settings and inner dimensions are whole in each.
+
+        Those of a lazy dataset stay; one in memory is cut into blocks of `MAX_BLOCK` poses.
+        """
+        if lazy:
+            whole = {name: -1 for name in dataset.dims
+                     if name in LABELS or name in self.settings}
+            return dataset.chunk().unify_chunks().chunk(whole)
+        lengths: dict[str, int] = {}
+        size = math.prod(dataset.sizes[name] for name in self.dimensions if name in dataset.sizes)
+        for name in (*self.cells, *self.draws, *self.kept):
+            if name in dataset.sizes and size > MAX_BLOCK:
+                length = dataset.sizes[name]
+                lengths[name] = max(1, length * MAX_BLOCK // size)
+                size = size // length * lengths[name]
+        return dataset.chunk({str(name): lengths.get(str(name), -1) for name in dataset.dims})
+
+
+def block_numbers(names: Sequence[str], lengths: Lengths) -> Iterator[dict[str, int]]:
+    """Yield the number of the chunk along each of some dimensions, for every block of them."""
+    for numbers in itertools.product(*(range(len(lengths[name])) for name in names)):
+        yield dict(zip(names, numbers, strict=True))

@@ -1,0 +1,140 @@
+"""The statistics of `sweep.analysis.error_statistics`, a record each.
+
+A new record here is all that a new statistic needs: the table of `error_statistics`, the attributes
+of its variables and the report's table of errors follow from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from sweep.analysis.counts import Count
+from sweep.analysis.means import Mean, MeanLength, RootMeanSquare, StandardDeviation
+from sweep.analysis.pose_view import (
+    DETECTION_INPUTS,
+    ERROR_INPUTS,
+    ESTIMATE_INPUTS,
+    QUANTITIES,
+    Poses,
+    Quantity,
+)
+from sweep.analysis.quantiles import Quantiles
+from sweep.analysis.rates import DETECTION_RATE, FLIP_RATE, LOOKED_FOR, SOLVED, SOLVED_RATE
+from sweep.analysis.statistic import Statistic
+
+AnyPoseStatistic = Statistic[Poses, Any, Any, Any]
+
+
+@dataclass(frozen=True)
+class PoseStatistic:
+    """A statistic of poses.
+
+    Attributes
+    ----------
+    statistic
+        What to compute.
+    inputs
+        Names of the arrays that it reads, as in `sweep.analysis.pose_view.pose_arrays`.
+    """
+
+    statistic: AnyPoseStatistic
+    inputs: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ErrorStatistic:
+    """A statistic of each kind of error.
+
+    Attributes
+    ----------
+    headings
+        The statistic's part of its variables' names (``rmse`` of ``rotation_rmse_deg``), with
+        what a table calls it; one, or more that are computed together.
+    make
+        Returns the statistic of a kind of error; its variables have the names
+        ``quantity.named("rmse")``.
+    inputs
+        Names of the arrays that it reads, as in `sweep.analysis.pose_view.pose_arrays`.
+    """
+
+    headings: Mapping[str, str]
+    make: Callable[[Quantity], AnyPoseStatistic]
+    inputs: tuple[str, ...] = field(default=ERROR_INPUTS)
+
+
+def _bias(quantity: Quantity) -> AnyPoseStatistic:
+    """Return the mean error: signed for the range, the mean vector's length for the others."""
+    mean, of = (Mean, "mean") if quantity.name == "range" else (MeanLength, "length of the mean")
+    return mean(quantity.named("bias"), f"{of} {quantity.words}, solved and not flipped",
+                quantity.units, quantity.vector, lambda poses: poses.unflipped)
+
+
+POSE_STATISTICS: tuple[PoseStatistic, ...] = (
+    PoseStatistic(Count(*LOOKED_FOR, lambda poses: poses.looked_for), DETECTION_INPUTS),
+    PoseStatistic(Count(*SOLVED, lambda poses: poses.solved), ESTIMATE_INPUTS),
+    *(PoseStatistic(record.rate, record.inputs)
+      for record in (DETECTION_RATE, SOLVED_RATE, FLIP_RATE)),
+)
+"""What is known of the poses as such."""
+
+ERROR_STATISTICS: tuple[ErrorStatistic, ...] = (
+    ErrorStatistic(
+        {"median": "median (not solved: infinite)", "p95": "95 % quantile (p95)",
+         "p99": "99 % quantile (p99)"},
+        lambda quantity: Quantiles(
+            quantity.named("{}"), f"absolute {quantity.words}", quantity.units, quantity.norm,
+            lambda poses: poses.solved, lambda poses: poses.looked_for,
+            # Why an end is missing is the same for all kinds of error.
+            with_reason=quantity is QUANTITIES[0])),
+    ErrorStatistic(
+        {"rmse": "RMSE of the solved"},
+        lambda quantity: RootMeanSquare(
+            quantity.named("rmse"), f"RMS {quantity.words}, solved", quantity.units,
+            quantity.squares, lambda poses: poses.solved)),
+    ErrorStatistic(
+        {"rmse_unflipped": "RMSE without flips"},
+        lambda quantity: RootMeanSquare(
+            quantity.named("rmse_unflipped"), f"RMS {quantity.words}, solved and not flipped",
+            quantity.units, quantity.squares, lambda poses: poses.unflipped)),
+    ErrorStatistic({"bias": "bias without flips"}, _bias),
+    ErrorStatistic(
+        {"sd": "standard deviation without flips"},
+        lambda quantity: StandardDeviation(
+            quantity.named("sd"),
+            f"standard deviation of the {quantity.words}, solved and not flipped",
+            quantity.units, quantity.vector, lambda poses: poses.unflipped)),
+)
+"""What is computed of each kind of error, `QUANTITIES`."""
+
+
+def registered() -> list[PoseStatistic]:
+    """Return all statistics, those of each kind of error among them."""
+    return [*POSE_STATISTICS, *(
+        PoseStatistic(record.make(quantity), record.inputs)
+        for quantity in QUANTITIES for record in ERROR_STATISTICS)]
+
+
+def error_headings() -> dict[str, str]:
+    """Return the names of the statistics of errors by what a table calls them.
+
+    Examples
+    --------
+    >>> error_headings()["bias without flips"]
+    'bias'
+    """
+    return {heading: name for record in ERROR_STATISTICS
+            for name, heading in record.headings.items()}
+
+
+def variable_meanings() -> Sequence[tuple[str, str, str]]:
+    """Return name, unit and meaning of every variable of `error_statistics`, for its guide.
+
+    Examples
+    --------
+    >>> variable_meanings()[0]
+    ('looked_for', '1', 'poses that were run, visible and modelled')
+    """
+    return [(output.name, output.units, output.meaning)
+            for record in registered() for output in record.statistic.outputs()]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sweep.cli import main
-from sweep.evaluation.inspection import look
+from sweep.evaluation.inspection import inspect_scene
 from sweep.plan.cell_selection import cell
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
@@ -55,8 +55,8 @@ def test_show_draws_a_scene_or_its_plain_image(tmp_path, capsys):
 
 def test_a_close_look_is_that_of_the_run():
     pipeline = Pipeline.from_toml(TOP / "pipelines" / "smoke.toml")
-    windowed = look(cell(pipeline, "distance_m=0.3,trial=2"))
-    framed = look(cell(pipeline, "distance_m=0.3,trial=2"), whole_frame=True)
+    windowed = inspect_scene(cell(pipeline, "distance_m=0.3,trial=2"))
+    framed = inspect_scene(cell(pipeline, "distance_m=0.3,trial=2"), whole_frame=True)
     assert framed.image.shape == (480, 640)
     left, top, right, bottom = windowed.window
     np.testing.assert_array_equal(framed.image[top:bottom, left:right], windowed.image)

@@ -321,12 +321,12 @@ def _duration(seconds: float) -> str:
 
 def _show(chosen: argparse.Namespace) -> int:
     pipeline = _read(chosen)
-    from sweep.evaluation.inspection import look  # noqa: PLC0415
+    from sweep.evaluation.inspection import inspect_scene  # noqa: PLC0415
     from sweep.plan.cell_selection import cell, coordinates_text  # noqa: PLC0415
     from sweep.report.scene_drawing import draw_scene  # noqa: PLC0415
 
     one = cell(pipeline, chosen.at)
-    seen = look(one, whole_frame=chosen.full)
+    seen = inspect_scene(one, whole_frame=chosen.full)
     picture = seen.image if chosen.plain else draw_scene(seen, coordinates_text(pipeline, one))
     _write_png(chosen.output, picture)
     print(f"{chosen.output}: {seen.detection.name}, {seen.estimate.name}")

@@ -9,14 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import RunError
-from sweep.evaluation.cells import (
-    believed,
-    run_cells,
-    search_windows,
-    single_thread,
-    visibility_flags,
-    whole_frames,
-)
+from sweep.evaluation.cells import run_cells
+from sweep.evaluation.estimation import assumed_cameras
+from sweep.evaluation.opencv_threads import single_threaded
+from sweep.evaluation.search import search_windows, visibility_flags, whole_frames
 from sweep.measure.detector import Detector
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.extent import marker_boxes
@@ -92,15 +88,15 @@ def _rendered(pipeline: Pipeline, *, whole_frame: bool) -> _Rendered:
     return _Rendered(values, scenes, boxes, unseen, window, render(scenes, 0, drawn, window))
 
 
-def picture(pipeline: Pipeline, *, whole_frame: bool = False) -> NDArray[np.uint8]:
+@single_threaded()
+def scene_image(pipeline: Pipeline, *, whole_frame: bool = False) -> NDArray[np.uint8]:
     """Return the image (h, w) of a pipeline's one scene; nothing is searched in it."""
-    single_thread()
     return _rendered(pipeline, whole_frame=whole_frame).image
 
 
-def look(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInspection:
+@single_threaded()
+def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInspection:
     """Return a close look at a pipeline's one scene: every axis but ``trial`` must be fixed."""
-    single_thread()
     indices = [np.zeros(1, dtype=np.intp) for _ in pipeline.axes_of(Stage.scene)]
     result = run_cells(pipeline, indices)
     if result.failures:
@@ -121,7 +117,7 @@ def look(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInspection:
     corners = scenes.corners_px[0] + columns["corner_error_px"]
     axes_px = np.full((4, 2), np.nan)
     if columns["estimate"] == EstimateStatus.solved:
-        cameras, size = believed(estimator, values, scenes)
+        cameras, size = assumed_cameras(estimator, values, scenes)
         vector = columns["rotation_error_rad"]
         rotation = rotation_of_vector(vector) @ scenes.rotation[0]
         position = scenes.translation[0] + columns["translation_error_m"]

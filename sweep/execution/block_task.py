@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from sweep.compilation import processor
 from sweep.errors import StoreError
-from sweep.evaluation.cells import CellsResult, run_cells, shaped
+from sweep.evaluation.cells import run_cells
+from sweep.evaluation.results import CellsResult, to_dataset_layout
 from sweep.execution.limits import TIME_LIMIT_S
 from sweep.execution.reuse import ReusedCells, Source, match, take
 from sweep.isolation.crash_isolation import WHOLE, run_cells_isolated
@@ -116,7 +117,9 @@ def compute_block(
         if cells is None:
             cells = run_cells_isolated(pipeline, indices, need[rows], time_limit_s)
     values = {
-        v.name: shaped(v, pipeline, block, _columns(v, cells, rows, pipeline, len(block)))
+        v.name: to_dataset_layout(
+            v, pipeline, block, _columns(v, cells, rows, pipeline, len(block))
+        )
         for v in SCHEMA
     }
     if taken is not None:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from sweep.compilation import processor
 from sweep.errors import RunError
-from sweep.evaluation.cells import Failure
-from sweep.evaluation.inspection import SceneInspection, look, picture
+from sweep.evaluation.inspection import SceneInspection, inspect_scene, scene_image
+from sweep.evaluation.results import Failure
 from sweep.integrity.tolerances import departure, difference, outside
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.isolation.crash_isolation import run_cells_isolated
@@ -181,7 +181,7 @@ def _looked(
     one: Pipeline, whole_frame: bool, limit_s: float
 ) -> tuple[SceneInspection | None, NDArray[np.uint8] | None]:
     """Return a close look and the image; None for what ends its process or raises."""
-    for function in (look, picture):
+    for function in (inspect_scene, scene_image):
         try:
             with Child() as child:
                 seen = child.call(
@@ -189,5 +189,5 @@ def _looked(
                 )
         except (ChildDiedError, ChildRaisedError, RunError):
             continue
-        return (seen, seen.image) if function is look else (None, seen)
+        return (seen, seen.image) if function is inspect_scene else (None, seen)
     return None, None

@@ -14,7 +14,7 @@ from zarr.buffer import cpu, default_buffer_prototype
 
 from sweep.compilation import processor
 from sweep.errors import StoreError, SweepError
-from sweep.evaluation.cells import shaped
+from sweep.evaluation.results import to_dataset_layout
 from sweep.execution.limits import TIME_LIMIT_S
 from sweep.integrity.consistency import contradiction
 from sweep.integrity.tolerances import MAX_OUTSIDE, departure, difference, outside
@@ -365,7 +365,7 @@ class Check:
         strayed: list[str] = []
         for row, cell in enumerate(cells):
             here = {
-                v.name: shaped(
+                v.name: to_dataset_layout(
                     v, pipeline, one, [part[row : row + 1] for part in again.columns[v.name]]
                 )
                 for v in SCHEMA

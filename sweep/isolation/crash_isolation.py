@@ -21,12 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import RunError
-from sweep.evaluation.cells import CellsResult, Failure, joined, run_cells
+from sweep.evaluation.cells import run_cells
+from sweep.evaluation.results import CellsResult, Failure, concatenate
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.experiment import Pipeline
-from sweep.plan.parameters import Stage
-from sweep.plan.schema import SCHEMA
 
 WHOLE, PIECE, PART = 1 / 4, 1 / 16, 1 / 8
 """Shares of a block's time limit: for the block, for a piece of it, for a part of a scene."""
@@ -142,7 +141,7 @@ def run_cells_isolated(
                     done[int(rows[0])] = scene.compute()
     finally:
         isolated.close()
-    return joined([done[start] for start in sorted(done)])
+    return concatenate([done[start] for start in sorted(done)])
 
 
 def _pieces(rows: NDArray[np.intp]) -> list[NDArray[np.intp]]:
@@ -187,7 +186,7 @@ class _Scene:
                 self._failures.append(Failure(0, "scene", str(error), crashed=died))
                 rendered, searched[:], solved[:] = False, False, False
         if result is None:
-            result = _empty_result(self._pipeline)
+            result = CellsResult.not_run(self._pipeline, 1)
         self._flag(result, searched, solved, rendered=rendered)
         result.failures += self._failures
         return result
@@ -239,21 +238,3 @@ class _Scene:
                     status = EstimateStatus.crashed if crashed[k, j] else EstimateStatus.failed
                 result.columns["estimate"][k * estimators + j][:] = status
                 result.columns["flipped"][k * estimators + j][:] = Flipped.no_estimate
-
-
-def _empty_result(pipeline: Pipeline) -> CellsResult:
-    """Return the result of one scene of which no cell was computed."""
-    columns: dict[str, list[NDArray[Any]]] = {}
-    sizes: dict[Stage, int] = {}
-    for variable in SCHEMA:
-        sizes[variable.stage] = variable.treatments(pipeline)
-        columns[variable.name] = [
-            np.full((1, *variable.inner_shape), variable.fill, dtype=variable.dtype)
-            for _ in range(sizes[variable.stage])
-        ]
-    seconds = {
-        "scene": [0.0],
-        "detection": [0.0] * sizes[Stage.detection],
-        "estimation": [0.0] * sizes[Stage.estimation],
-    }
-    return CellsResult(columns, seconds, np.zeros(1))

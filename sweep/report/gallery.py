@@ -20,7 +20,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.errors import SweepError
-from sweep.evaluation.inspection import SceneInspection, look
+from sweep.evaluation.inspection import SceneInspection, inspect_scene
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.cell_selection import at_text, cell, coordinates_text
 from sweep.plan.experiment import Pipeline
@@ -223,7 +223,7 @@ def _scene(subject: Subject, index: Index, titles: tuple[str, ...]) -> Scene:
             plain, problem="Not drawn: it ended its process; `sweep repro` tries again.")
     try:
         one = cell(subject.pipeline, at)
-        seen = look(one)
+        seen = inspect_scene(one)
         plain = dataclasses.replace(plain, coordinates=coordinates_text(subject.pipeline, one))
         picture = _picture(seen)
     except (SweepError, OSError, ValueError, cv2.error, np.linalg.LinAlgError) as error:

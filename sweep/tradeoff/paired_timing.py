@@ -24,14 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from sweep.evaluation.cells import (
-    SearchResult,
-    search,
-    sightings,
-    single_thread,
-    visibility_flags,
-    whole_frames,
-)
+from sweep.evaluation.estimation import detections_for
+from sweep.evaluation.opencv_threads import single_threaded
+from sweep.evaluation.search import SearchResult, search, visibility_flags, whole_frames
 from sweep.isolation.interrupts import Interrupts
 from sweep.measure.detector import Detector, Found, full_frame_reason
 from sweep.measure.estimation import Detections, PoseEstimator
@@ -96,6 +91,7 @@ class _Regime:
     """What each detector setting finds, with what it searches of each scene."""
 
 
+@single_threaded()
 def measure(
     pipeline: Pipeline, regimes: Sequence[Sequence[NDArray[np.intp]]], limit_s: float,
     interrupts: Interrupts,
@@ -105,7 +101,6 @@ def measure(
     ``regimes`` holds indices (n,) along each scene axis for each. At most ``limit_s`` seconds
     beside preparation, but at least :data:`MIN_ROUNDS` rounds.
     """
-    single_thread()
     settings, estimating = detector_settings(pipeline), estimators(pipeline)
     prepared = []
     for indices in regimes:
@@ -123,7 +118,7 @@ def measure(
             rows = np.flatnonzero(regime.found[d].flags == DetectionStatus.detected)
             found_share[g, d] = len(rows) / len(regime.scenes)
             for estimator, one in zip(estimating, builds, strict=True):
-                seen = sightings(
+                seen = detections_for(
                     estimator, regime.values, regime.scenes, regime.found[d],
                     np.resize(rows, BATCH if len(rows) else 0),
                 )
@@ -205,6 +200,7 @@ def _prepare(pipeline: Pipeline, indices: Sequence[NDArray[np.intp]]) -> _Regime
     return _Regime(scenes, values, found)
 
 
+@single_threaded()
 def measure_renderers(
     pipeline: Pipeline, samples: Sequence[Sequence[NDArray[np.intp]]], reference: int,
     limit_s: float, interrupts: Interrupts,
@@ -215,7 +211,6 @@ def measure_renderers(
     Returns seconds an image (R, K), and the RMS (K,) and the largest (K,) difference in grey levels
     from the images of the ``reference``, over the pixels that the marker touches there.
     """
-    single_thread()
     count = len(samples[0][0])
     scenes = [build_scenes(scene_values(pipeline, indices), count) for indices in samples]
     rows = np.flatnonzero(visibility_flags(scenes[reference]) == DetectionStatus.not_run)

@@ -21,13 +21,13 @@ from pathlib import Path
 
 import numpy as np
 
-from sweep.evaluation.cells import run_block, run_cells
+from sweep.evaluation.cells import run_cells
 from sweep.execution.calibration import calibrate
 from sweep.execution.cluster import default_workers
 from sweep.execution.forecast import forecast
 from sweep.execution.runner import execute
 from sweep.plan.experiment import Pipeline
-from sweep.plan.grid import Block, scene_axes
+from sweep.plan.grid import Block, block_indices, scene_axes
 
 GRID = """
 seed = 1
@@ -68,7 +68,7 @@ def bare(text, start, stop, seconds, at):
     done = 0
     for trial in range(start, stop):
         lengths = tuple(len(axis) for axis in axes)
-        run_block(pipeline, Block((0, 0, 0, trial), (*lengths[:3], trial + 1)))
+        run_cells(pipeline, block_indices(Block((0, 0, 0, trial), (*lengths[:3], trial + 1))))
         done += 800
     seconds.put((done, time.perf_counter() - begun))
 

@@ -12,13 +12,9 @@ from unittest import mock
 import cv2
 import numpy as np
 
-from sweep.evaluation.cells import (
-    run_cells,
-    search_windows,
-    single_thread,
-    visibility_flags,
-    whole_frames,
-)
+from sweep.evaluation.cells import run_cells
+from sweep.evaluation.opencv_threads import single_threaded
+from sweep.evaluation.search import search_windows, visibility_flags, whole_frames
 from sweep.measure.detector import Detector
 from sweep.measure.flags import DetectionStatus
 from sweep.model import drawing
@@ -156,8 +152,8 @@ def clock(function, *arguments):
     return time.perf_counter() - start
 
 
+@single_threaded()
 def main():
-    single_thread()
     print("| frame | naive ms a pose | sweep ms a pose | naive / sweep | sweep / bare calls "
           "| µs a pose beside them |")
     print("| --- | --- | --- | --- | --- | --- |")

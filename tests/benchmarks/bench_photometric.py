@@ -9,7 +9,9 @@ import time
 
 import numpy as np
 
-from sweep.evaluation.cells import search, sightings, single_thread, whole_frames
+from sweep.evaluation.estimation import detections_for
+from sweep.evaluation.opencv_threads import single_threaded
+from sweep.evaluation.search import search, whole_frames
 from sweep.measure.bound import curvature_at_truth
 from sweep.measure.flags import DetectionStatus
 from sweep.measure.likelihood import BACKGROUND_MARGIN_PX, marker_view, noise_variance, state_of
@@ -68,7 +70,7 @@ def measured(side, tilt):
         whole_frames(values, SCENES), [], keep=True,
     )
     rows = np.flatnonzero(found[0].flags == DetectionStatus.detected)
-    seen = sightings(estimators(pipeline)[0], values, scenes, found[0], rows)
+    seen = detections_for(estimators(pipeline)[0], values, scenes, found[0], rows)
     return (
         best_ms(lambda: curvature_at_truth(state, view, height, width, False), 1, 50),
         *(best_ms(lambda k=k: Photometric(k, spread_free=False)(seen), len(rows))
@@ -76,9 +78,9 @@ def measured(side, tilt):
     )
 
 
+@single_threaded()
 def main():
     """Print the table."""
-    single_thread()
     print("| side, px | bound, ms | photometric, two starts, ms | four starts, ms |")
     print("| --- | --- | --- | --- |")
     for side in (20, 50, 100, 150):

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from sweep.evaluation.cells import CellsResult
+from sweep.evaluation.results import CellsResult
 from sweep.execution import block_task as task
 from sweep.execution.finalize import close
 from sweep.integrity.verification import verify

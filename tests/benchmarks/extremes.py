@@ -20,7 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sweep.evaluation.cells import Failure, run_cells
+from sweep.evaluation.cells import run_cells
+from sweep.evaluation.results import Failure
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices, detector_settings, estimators, scene_axes

@@ -38,8 +38,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from support.blocks import run_block
 from support.lengths import lengths
-from sweep.evaluation.cells import believed, run_block
+from sweep.evaluation.estimation import assumed_cameras
 from sweep.measure.accuracy import pose_error
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.measure.solver import SOLVERS, estimate
@@ -90,7 +91,7 @@ class Estimated:
         corners = self.scenes.corners_px + noise * shifts
         self.estimates, self.errors = [], []
         for one in self.estimators:
-            cameras, size_m = believed(one, self.values, self.scenes)
+            cameras, size_m = assumed_cameras(one, self.values, self.scenes)
             found = estimate(
                 corners, cameras, size_m, one.solver, one.guarded, one.reprojection_limit
             )

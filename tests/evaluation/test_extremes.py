@@ -18,7 +18,7 @@ from benchmarks.extremes import (
     measured,
 )
 from support.lengths import lengths
-from sweep.evaluation.cells import Failure
+from sweep.evaluation.results import Failure
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sweep.evaluation.cells import run_block
+from support.blocks import run_block
 from sweep.measure.classify import classify
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.experiment import Pipeline

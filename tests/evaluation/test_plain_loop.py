@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from support.blocks import run_block
 from support.lengths import lengths
-from sweep.evaluation.cells import run_block
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes

@@ -3,16 +3,12 @@
 import numpy as np
 import pytest
 
+from support.blocks import run_block
 from support.lengths import lengths
 from support.windows import outcomes_elsewhere
 from sweep.errors import PipelineError
-from sweep.evaluation.cells import (
-    run_block,
-    search,
-    search_windows,
-    single_thread,
-    visibility_flags,
-)
+from sweep.evaluation.opencv_threads import single_threaded
+from sweep.evaluation.search import search, search_windows, visibility_flags
 from sweep.measure.detector import REFINEMENTS, DetectorSetting, full_frame_reason
 from sweep.measure.flags import DetectionStatus
 from sweep.model.extent import marker_boxes
@@ -57,9 +53,9 @@ def visible_scenes(count, width=640, height=480, settings=()):
     return built(candidates[seen[:count]])
 
 
+@single_threaded()
 def both_searches(scenes, setting):
     """Return what a setting finds in the windows, and in the whole frames."""
-    single_thread()
     everything = np.ones((len(scenes), 1), dtype=bool)
     failures = []
     windowed, framed = (

@@ -19,9 +19,9 @@ import dask
 import pytest
 import trustme
 
+from support.blocks import run_block
 from sweep.cli import main
 from sweep.errors import ArgumentError, StoreError
-from sweep.evaluation.cells import run_block
 from sweep.execution.cluster import external
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes

@@ -17,9 +17,9 @@ import xarray as xr
 import zarr
 
 import sweep
+from support.blocks import run_block
 from support.stores import by_hand, same
 from sweep.errors import ArgumentError, StoreError
-from sweep.evaluation.cells import run_block
 from sweep.execution.block_task import compute_block
 from sweep.execution.runner import execute
 from sweep.plan.experiment import Pipeline

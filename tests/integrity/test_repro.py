@@ -15,7 +15,7 @@ import zarr
 
 from support.poison import Poison, command, poisoned
 from sweep.cli import main
-from sweep.evaluation.cells import Failure
+from sweep.evaluation.results import Failure
 from sweep.execution.block_task import compute_block
 from sweep.execution.finalize import close
 from sweep.plan.experiment import Pipeline

@@ -23,7 +23,8 @@ from scipy.special import ndtr
 
 from support.exact_image import DICTIONARIES, LENSES, modules_of, values, visible
 from support.lengths import lengths
-from sweep.evaluation.cells import run_cells, visibility_flags
+from sweep.evaluation.cells import run_cells
+from sweep.evaluation.search import visibility_flags
 from sweep.measure.bound import BACKGROUND_MARGIN_PX, MAX_MIRROR_DISTANCE, bounds
 from sweep.measure.flags import BoundStatus, DetectionStatus
 from sweep.measure.likelihood import projection_of, state_of

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from support.blocks import run_block
 from support.lengths import lengths
-from sweep.evaluation.cells import run_block
 from sweep.measure.detector import (
     ALIGNMENT_PX,
     MIN_WINDOW_PX,

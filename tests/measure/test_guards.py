@@ -22,9 +22,10 @@ import pytest
 from mpmath import mp, mpf
 
 import sweep
+from support.blocks import run_block
 from support.lengths import lengths
-from sweep.evaluation import cells as kernel
-from sweep.evaluation.cells import run_block, search, visibility_flags
+from sweep.evaluation import search as search_module
+from sweep.evaluation.search import search, visibility_flags
 from sweep.measure import accuracy
 from sweep.measure.accuracy import pose_error
 from sweep.measure.detector import DetectorSetting, margin_px
@@ -617,7 +618,7 @@ trial = {count}
 def check_margin(scenes, framed, margin, monkeypatch):
     """Hold a wide refinement to work in the windows of a margin as it does in the frame."""
     with monkeypatch.context() as patched:
-        patched.setattr(kernel, "margin_px", margin)
+        patched.setattr(search_module, "margin_px", margin)
         failures = []
         found = search(
             scenes, np.ones((len(scenes), 1), dtype=bool), [DetectorSetting(**WIDE_REFINEMENT)],

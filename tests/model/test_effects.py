@@ -29,7 +29,7 @@ from support.exact_image import (
 from support.lengths import lengths
 from sweep.errors import PipelineError
 from sweep.evaluation.cells import run_cells
-from sweep.evaluation.inspection import look
+from sweep.evaluation.inspection import inspect_scene
 from sweep.measure.flags import DetectionStatus
 from sweep.model.effects import SWITCHES, Effects
 from sweep.model.exposure import defocus_px, marker_exposure
@@ -1051,4 +1051,4 @@ velocity_x_m_s = 0.1
 [axes]
 exposure_s = [0, 0.01]
 """)
-    assert look(cell(pipeline, "")).detection is DetectionStatus.detected
+    assert inspect_scene(cell(pipeline, "")).detection is DetectionStatus.detected

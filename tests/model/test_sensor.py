@@ -12,7 +12,8 @@ from scipy import stats
 from support.lengths import lengths
 from support.windows import outcomes_elsewhere
 from sweep.errors import PipelineError
-from sweep.evaluation.cells import search, search_windows, single_thread, visibility_flags
+from sweep.evaluation.opencv_threads import single_threaded
+from sweep.evaluation.search import search, search_windows, visibility_flags
 from sweep.measure.detector import REFINEMENTS, DetectorSetting
 from sweep.measure.flags import DetectionStatus
 from sweep.model import sensor
@@ -340,6 +341,7 @@ trial = 20
 """
 
 
+@single_threaded()
 def both_searches(count, setting):
     """Return the scenes, and what a setting finds in the windows and in the whole frames."""
     pipeline = Pipeline.from_text(NOISY)
@@ -353,7 +355,6 @@ def both_searches(count, setting):
     seen = np.flatnonzero(visibility_flags(built(order)) == DetectionStatus.not_run)[:count]
     assert len(seen) == count
     scenes = built(order[seen])
-    single_thread()
     failures = []
     windowed, framed = (
         search(scenes, np.ones((count, 1), dtype=bool), [setting], np.full(count, full), failures)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from support.blocks import run_block
 from support.lengths import lengths
-from sweep.evaluation.cells import run_block
 from sweep.model.scene import build_scenes
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, Blocks, block_indices, scene_axes, scene_values

@@ -5,7 +5,7 @@ As a preload of Dask workers (``dask_setup``), and in the client by :func:`insta
 
 import numpy as np
 
-from sweep.evaluation.cells import CellsResult
+from sweep.evaluation.results import CellsResult
 from sweep.plan.schema import SCHEMA
 
 

@@ -81,22 +81,23 @@ def _kind():
 
 
 class _Poison:
-    """Wraps the kernel's functions by which the scenes of a call are known."""
+    """Wraps the functions of the evaluation by which the scenes of a call are known."""
 
-    def __init__(self, kernel, poisons, log):
+    def __init__(self, cells, search, poisons, log):
         self._poisons = poisons
         self._log = log
         self._here = threading.local()
         # Scenes made last with their numbers; rendered images by number.
         self._made = collections.deque(maxlen=4)
         self._images = {}
-        self._real = {
-            name: getattr(kernel, name)
-            for name in ("scene_values", "build_scenes", "render_all", "sightings", "build")
+        homes = {
+            "scene_values": cells, "build_scenes": cells, "detections_for": cells, "build": cells,
+            "render_all": search,
         }
-        for name in self._real:
-            setattr(kernel, name, getattr(self, name))
-        kernel.Detector = self._detector(kernel.Detector)
+        self._real = {name: getattr(home, name) for name, home in homes.items()}
+        for name, home in homes.items():
+            setattr(home, name, getattr(self, name))
+        search.Detector = self._detector(search.Detector)
 
     def note(self, event, **what):
         line = {"event": event, "kind": _kind(), "pid": os.getpid(), "time": time.time(), **what}
@@ -170,8 +171,8 @@ class _Poison:
 
         return Detector
 
-    def sightings(self, estimator, values, scenes, found, rows):
-        seen = self._real["sightings"](estimator, values, scenes, found, rows)
+    def detections_for(self, estimator, values, scenes, result, rows):
+        seen = self._real["detections_for"](estimator, values, scenes, result, rows)
         known = self._cells(scenes)
         return _told(seen, [known[row] for row in rows.tolist()]) if known else seen
 
@@ -180,7 +181,7 @@ class _Poison:
 
 
 def _told(seen, cells):
-    """Return sightings that know which scenes they are of."""
+    """Return detections that know which scenes they are of."""
 
     class Told(type(seen)):
         """As its base; found corners alone do not tell one scene from another."""
@@ -202,14 +203,14 @@ class _Estimator:
     def __getattr__(self, name):
         return getattr(self._real, name)
 
-    def __call__(self, sightings):
-        cells = getattr(sightings, "cells", ())
+    def __call__(self, detections):
+        cells = getattr(detections, "cells", ())
         self._poison._act("estimation", cells, solver=self._setting)
-        return self._real(sightings)
+        return self._real(detections)
 
 
 class _Finder(importlib.abc.MetaPathFinder):
-    """Has the kernel wrapped as soon as it has been loaded."""
+    """Has the evaluation wrapped as soon as it has been loaded."""
 
     def __init__(self, poisons, log):
         self._given = poisons, log
@@ -222,7 +223,7 @@ class _Finder(importlib.abc.MetaPathFinder):
 
         def load_and_wrap(module):
             load(module)
-            poison = _Poison(module, *self._given)
+            poison = _Poison(module, sys.modules["sweep.evaluation.search"], *self._given)
             poison.note("start")
 
         spec.loader.exec_module = load_and_wrap

@@ -1,0 +1,91 @@
+"""Detections to poses: what an estimator assumes; a failure in a batch costs one pose only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.evaluation.results import Failure, exception_text
+from sweep.evaluation.search import SearchResult
+from sweep.measure.estimation import Detections, Estimates, PoseEstimator
+from sweep.measure.flags import EstimateStatus
+from sweep.measure.solver import EstimatorSetting
+from sweep.model.camera import Cameras
+from sweep.model.columns import Column
+from sweep.model.lens import pack
+from sweep.model.scene import Scenes
+from sweep.typing import Floats
+
+
+def assumed_cameras(
+    estimator: EstimatorSetting, values: Mapping[str, Column], scenes: Scenes
+) -> tuple[Cameras, Floats]:
+    """Return the N cameras and marker sizes (N,) in m that an estimator assumes.
+
+    Those of the scenes, but for the ``believed_`` parameters: of ``values`` if they are drawn,
+    else of the estimator.
+    """
+    view, size = scenes.cameras.view, scenes.size_m
+    lenses, distorted = scenes.cameras.lenses, scenes.cameras.distorted
+
+    def assumed(name: str) -> Any:
+        drawn = name in values and not values[name].constant
+        return values[name].values if drawn else getattr(estimator, name)
+
+    for k, name in enumerate(("fx_px", "fy_px", "cx_px", "cy_px")):
+        value = assumed(f"believed_{name}")
+        if value is not None:
+            view = view.copy() if view is scenes.cameras.view else view
+            view[:, k] = value
+    if assumed("believed_size_m") is not None:
+        size = np.array(np.broadcast_to(assumed("believed_size_m"), size.shape), dtype=np.float64)
+    if estimator.believed_distortion is not None:
+        packed = pack(estimator.believed_distortion)
+        lenses = np.repeat(packed[None], len(scenes), axis=0)
+        distorted = np.full(len(scenes), bool(packed[:14].any()))
+    return Cameras(view, lenses, distorted), size
+
+
+def detections_for(
+    estimator: EstimatorSetting, values: Mapping[str, Column], scenes: Scenes,
+    result: SearchResult, rows: NDArray[np.intp],
+) -> Detections:
+    """Return the detections of the scenes ``rows`` (n,), with what an estimator assumes of them."""
+    cameras, size = assumed_cameras(estimator, values, scenes)
+    truth = {"noise_grey": 0.0, "blur_px": 0.0} if scenes.effects is None else scenes.effects
+    noise, blur = (
+        np.broadcast_to(truth[name] if assumed is None else assumed, len(scenes))
+        for name, assumed in (
+            ("noise_grey", estimator.believed_noise_grey), ("blur_px", estimator.believed_blur_px)
+        )
+    )
+    return Detections(
+        result.corners[rows], cameras.take(rows), size[rows], noise[rows], blur[rows],
+        [scenes.markers[k] for k in scenes.marker[rows]],
+        [result.images[row] for row in rows.tolist()] if result.images else [],
+        result.origins[rows],
+    )
+
+
+def estimate_poses(
+    detections: Detections, estimator: PoseEstimator, rows: NDArray[np.intp],
+    failures: list[Failure],
+) -> Estimates:
+    """Return estimates (n,) of the scenes ``rows``; one by one if the batch raises.
+
+    The exceptions of single scenes are appended to ``failures``.
+    """
+    try:
+        return estimator(detections)
+    except Exception:
+        parts = []
+        for i in range(len(rows)):
+            try:
+                parts.append(estimator(detections.take(np.array([i]))))
+            except Exception:
+                failures.append(Failure(int(rows[i]), "estimation", exception_text(failures)))
+                parts.append(Estimates.none(1, EstimateStatus.failed))
+        return Estimates.joined(parts)

@@ -1,0 +1,163 @@
+"""How each variable of the dataset is computed from the results of its stage.
+
+To add a variable, add its record to :data:`sweep.plan.schema.SCHEMA` and its function to the
+table of its stage below; a variable with one but not the other is refused on import.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.measure.accuracy import PoseError, rotation_difference
+from sweep.measure.bound import Bounds
+from sweep.measure.covariance import squared_deviations
+from sweep.measure.estimation import Estimates
+from sweep.measure.flags import EstimateStatus, Flipped
+from sweep.model.extent import areas_px
+from sweep.model.pose import vector_of_rotation
+from sweep.model.scene import Scenes
+from sweep.plan.parameters import Stage
+from sweep.plan.schema import SCHEMA, VARIABLES
+from sweep.typing import Floats, Masks
+
+
+@dataclass(frozen=True, slots=True)
+class SceneResults:
+    """N scenes and their accuracy bounds."""
+
+    scenes: Scenes
+    bounds: Bounds
+
+
+@dataclass(frozen=True, slots=True)
+class DetectionResults:
+    """Detections of N scenes with one detector setting: flags (N,), corners (N, 4, 2) px."""
+
+    scenes: Scenes
+    flags: NDArray[np.uint8]
+    corners: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class EstimationResults:
+    """Estimates of one configuration for n scenes, those in which the marker was detected.
+
+    Attributes
+    ----------
+    estimates, error
+        The estimates and their errors, n of each.
+    true_rotation
+        (n, 3, 3) marker to camera.
+    """
+
+    estimates: Estimates
+    error: PoseError
+    true_rotation: Floats
+
+
+def _flipped(results: EstimationResults) -> NDArray[np.uint8]:
+    solved = results.estimates.status == EstimateStatus.solved
+    flipped = np.where(results.error.flipped, Flipped.flipped, Flipped.not_flipped)
+    return np.where(solved, flipped, Flipped.no_estimate).astype(np.uint8)
+
+
+def _alternative_angle_deg(results: EstimationResults) -> Floats:
+    other = rotation_difference(results.estimates.alternative_rotation, results.true_rotation)
+    return np.asarray(np.degrees(np.linalg.norm(other, axis=1)))
+
+
+SCENE: dict[str, Callable[[SceneResults], NDArray[Any]]] = {
+    "true_rvec": lambda results: vector_of_rotation(results.scenes.rotation),
+    "true_tvec_m": lambda results: results.scenes.translation,
+    "marker_area_px": lambda results: areas_px(results.scenes),
+    "bound": lambda results: results.bounds.status,
+    "bound_std": lambda results: results.bounds.std,
+    "bound_kappa": lambda results: results.bounds.kappa,
+    "mirror_distance": lambda results: results.bounds.mirror_distance,
+}
+"""Variable of the scene -> its values (N, ...)."""
+
+DETECTION: dict[str, Callable[[DetectionResults], NDArray[Any]]] = {
+    "detection": lambda results: results.flags,
+    "corner_error_px": lambda results: results.corners - results.scenes.corners_px,
+}
+"""Variable of the detection -> its values (N, ...)."""
+
+ESTIMATION: dict[str, Callable[[EstimationResults], NDArray[Any]]] = {
+    "estimate": lambda results: results.estimates.status,
+    "translation_error_m": lambda results: results.error.translation_m,
+    "rotation_error_rad": lambda results: results.error.rotation_rad,
+    "rotation_error_deg": lambda results: np.degrees(results.error.rotation_angle_rad),
+    "normal_error_deg": lambda results: np.degrees(results.error.normal_angle_rad),
+    "reprojection_error_px": lambda results: results.estimates.reprojection_px,
+    "alternative_rotation_error_deg": _alternative_angle_deg,
+    "alternative_reprojection_error_px": (
+        lambda results: results.estimates.alternative_reprojection_px
+    ),
+    "predicted_std": lambda results: np.sqrt(
+        np.diagonal(results.estimates.covariance, axis1=1, axis2=2)
+    ),
+    "nees": lambda results: squared_deviations(
+        results.error.rotation_rad, results.error.translation_m, results.estimates.covariance
+    ),
+    "residual_variance_ratio": lambda results: results.estimates.residual_ratio,
+    "flipped": _flipped,
+}
+"""Variable of the estimation -> its values (n, ...) for the scenes with a detection."""
+
+WITHOUT_DETECTION: dict[str, int] = {
+    "estimate": EstimateStatus.no_detection, "flipped": Flipped.no_estimate,
+}
+"""Flag variable of the estimation -> its flag for scenes without a detection."""
+
+
+def check_complete(tables: Mapping[Stage, Mapping[str, Any]]) -> None:
+    """Raise TypeError unless each table has exactly the schema's variables of its stage."""
+    for stage, table in tables.items():
+        declared = {variable.name for variable in SCHEMA if variable.stage is stage}
+        for name in sorted(declared ^ table.keys()):
+            missing = "no function computes it" if name in declared else "the schema lacks it"
+            raise TypeError(f"variable {name} of stage {stage.name}: {missing}")
+
+
+check_complete({Stage.scene: SCENE, Stage.detection: DETECTION, Stage.estimation: ESTIMATION})
+
+Results = TypeVar("Results")
+
+
+def compute(
+    table: Mapping[str, Callable[[Results], NDArray[Any]]], results: Results
+) -> dict[str, NDArray[Any]]:
+    """Return every variable of a table."""
+    return {name: function(results) for name, function in table.items()}
+
+
+def compute_estimation(
+    results: EstimationResults, rows: NDArray[np.intp], needed: Masks
+) -> dict[str, NDArray[Any]]:
+    """Return the estimation variables (N, ...) over all scenes.
+
+    Parameters
+    ----------
+    results
+        Those of the n scenes with a detection.
+    rows
+        (n,) their numbers among the N scenes.
+    needed
+        (N,) scenes whose estimate was asked for; the flags of the others are ``not_run``.
+    """
+    columns = {}
+    for name, values in compute(ESTIMATION, results).items():
+        variable = VARIABLES[name]
+        fill = WITHOUT_DETECTION.get(name, variable.fill)
+        column = np.full((len(needed), *values.shape[1:]), fill, dtype=values.dtype)
+        column[rows] = values
+        if variable.flags is not None:
+            column[~needed] = variable.fill
+        columns[name] = column
+    return columns

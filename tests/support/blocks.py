@@ -1,0 +1,28 @@
+"""A block of the grid computed in this process, in the dataset's layout."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from sweep.evaluation.cells import run_cells
+from sweep.evaluation.results import Failure, to_dataset_layout
+from sweep.plan.grid import block_indices
+from sweep.plan.schema import SCHEMA
+
+
+@dataclass
+class BlockResult:
+    """Variable -> array in the dataset's dimensions; seconds and failures as of the cells."""
+
+    values: dict[str, Any]
+    seconds: dict[str, list[float]]
+    failures: list[Failure]
+
+
+def run_block(pipeline, block):
+    """Render, detect and estimate every scene of a block."""
+    cells = run_cells(pipeline, block_indices(block))
+    return BlockResult(
+        {v.name: to_dataset_layout(v, pipeline, block, cells.columns[v.name]) for v in SCHEMA},
+        cells.seconds,
+        cells.failures,
+    )

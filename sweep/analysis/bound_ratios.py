@@ -69,7 +69,7 @@ def efficiency(
     --------
     >>> table = efficiency(results, per=["solver"])
     >>> table["rotation_efficiency"].round(3).values.tolist()
-    [0.586, 0.293]
+    [0.544, 0.27]
     """
     kept = kept_dimensions(results, per)
     labels = [f"rotation_{axis}" for axis in XYZ]

@@ -80,7 +80,7 @@ def compare(
     >>> int(table["compared"]), int(table["both_solved"]), float(table["detection_difference"])
     (24, 13, 0.0)
     >>> table["rotation_rmse_ratio"].round(3).item()
-    2.034
+    2.0
     """
     kept = kept_dimensions(first, per)
     kept_dimensions(second, per)

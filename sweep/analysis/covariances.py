@@ -81,9 +81,9 @@ def covariance_trust(
     --------
     >>> table = covariance_trust(results, levels=[0.5, 0.9])
     >>> int(table["nees_count"]), round(float(table["nees_mean"]), 3)
-    (26, 6.577)
+    (26, 5.97)
     >>> table["covariance_coverage"].round(3).values.tolist()
-    [0.538, 0.923]
+    [0.5, 0.885]
     >>> bool(table["covariance_trusted"])  # fewer than 50 draws
     False
     """

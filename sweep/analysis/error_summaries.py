@@ -65,9 +65,11 @@ def error_statistics(
     --------
     >>> table = error_statistics(results, per=["solver"])
     >>> table["rotation_rmse_unflipped_deg"].round(3).values.tolist()
-    [0.293, 0.586]
-    >>> table["range_bias_percent"].attrs["units"], table["rotation_median_deg"].values.tolist()
-    ('percent', [inf, inf])
+    [0.365, 0.735]
+    >>> table["rotation_median_deg"].round(3).values.tolist()
+    [0.376, 0.752]
+    >>> table["rotation_p95_deg"].values.tolist()  # 11 of 24 poses are not solved
+    [inf, inf]
     """
     kept = kept_dimensions(results, per)
     records = registry.registered()

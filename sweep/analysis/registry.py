@@ -6,7 +6,7 @@ of its variables and the report's table of errors follow from it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -128,13 +128,16 @@ def error_headings() -> dict[str, str]:
             for name, heading in record.headings.items()}
 
 
-def variable_meanings() -> Sequence[tuple[str, str, str]]:
-    """Return name, unit and meaning of every variable of `error_statistics`, for its guide.
+def guide_table() -> str:
+    """Return the guide's table of the variables, in Markdown.
 
     Examples
     --------
-    >>> variable_meanings()[0]
-    ('looked_for', '1', 'poses that were run, visible and modelled')
+    >>> print(guide_table().splitlines()[2])
+    | `looked_for` | poses that were run, visible and modelled |
     """
-    return [(output.name, output.units, output.meaning)
-            for record in registered() for output in record.statistic.outputs()]
+    rows = [(record.statistic.outputs()[0].name, record.statistic.outputs()[0].meaning)
+            for record in POSE_STATISTICS]
+    rows += [(f"*_{name}_*", f"error: {heading}") for heading, name in error_headings().items()]
+    return "\n".join(["| variable | meaning |", "| --- | --- |",
+                      *(f"| `{name}` | {meaning} |" for name, meaning in rows)])

@@ -12,6 +12,7 @@ import xarray as xr
 from sweep.analysis import detection_limit, detection_rate, error_statistics
 from sweep.analysis.detection_limits import Limit
 from sweep.analysis.quantiles import IntervalOf
+from sweep.analysis.registry import error_headings
 from sweep.errors import ArgumentError, DatasetError
 from sweep.plan.parameters import Stage
 from sweep.report.figure import ends_of, sentences
@@ -241,12 +242,6 @@ def _seen(subject: Subject) -> Seen:
 
 QUANTITIES = {"rotation": ("rotation", "deg"), "range": ("range (depth)", "percent"),
               "position": ("position", "m")}
-STATISTICS = {
-    "median (not solved: infinite)": "median", "95 % quantile (p95)": "p95",
-    "99 % quantile (p99)": "p99", "RMSE of the solved": "rmse",
-    "RMSE without flips": "rmse_unflipped", "bias without flips": "bias",
-    "standard deviation without flips": "sd",
-}
 
 
 def _errors_table(errors: xr.Dataset) -> Table:
@@ -258,7 +253,7 @@ def _errors_table(errors: xr.Dataset) -> Table:
         [heading, *(
             cells(errors, name.format(statistic))[0] if name.format(statistic) in errors else ""
             for name in quantities.values())]
-        for heading, statistic in STATISTICS.items()
+        for heading, statistic in error_headings().items()
     ]
     return Table(
         "Errors over the whole store, with 95 % intervals", ["statistic", *quantities], rows)

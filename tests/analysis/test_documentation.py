@@ -1,0 +1,61 @@
+"""The public functions' docstrings: numpydoc's sections, types, and examples that run."""
+
+import doctest
+import importlib
+import inspect
+import pkgutil
+import typing
+from pathlib import Path
+
+import pytest
+import xarray as xr
+
+import sweep.analysis
+from support.example_results import example_results
+from sweep.analysis import registry
+
+FUNCTIONS = [getattr(sweep.analysis, name) for name in sweep.analysis.__all__]
+PUBLIC = pytest.mark.parametrize("function", FUNCTIONS, ids=sweep.analysis.__all__)
+MODULES = [importlib.import_module(f"sweep.analysis.{module.name}")
+           for module in pkgutil.iter_modules(sweep.analysis.__path__)]
+
+
+@PUBLIC
+def test_a_public_function_has_the_sections_of_numpydoc(function):
+    lines = [line.strip() for line in function.__doc__.splitlines()]
+    for section in ("Parameters", "Returns", "Raises", "Notes", "Examples"):
+        assert lines[lines.index(section) + 1] == "-" * len(section), section
+    parameters = lines[lines.index("Parameters"):lines.index("Returns")]
+    for name in inspect.signature(function).parameters:
+        assert any(name in line.split(", ") for line in parameters), name
+
+
+@PUBLIC
+def test_a_public_function_is_typed(function):
+    hints = typing.get_type_hints(function)
+    assert hints["return"] is xr.Dataset
+    assert set(hints) == {*inspect.signature(function).parameters, "return"}
+
+
+@pytest.mark.parametrize("module", MODULES, ids=[module.__name__ for module in MODULES])
+def test_examples_run(module):
+    runner = doctest.DocTestRunner()
+    for example in doctest.DocTestFinder().find(
+            module, extraglobs={"results": example_results(), "xr": xr}):
+        runner.run(example)
+    assert runner.failures == 0
+    examples = [f for f in FUNCTIONS if f.__module__ == module.__name__]
+    assert runner.tries >= 2 * len(examples)
+
+
+@PUBLIC
+def test_the_guide_names_a_public_function(function):
+    assert f"`{function.__name__}`" in guide()
+
+
+def test_the_guide_has_the_statistics_of_the_registry():
+    assert registry.guide_table() in guide()
+
+
+def guide():
+    return (Path(sweep.analysis.__file__).parent / "README.md").read_text(encoding="utf-8")

@@ -1,0 +1,120 @@
+"""Adding a statistic touches one place: a record in the registry, which these tests really add.
+
+The references are plain NumPy on all poses at once.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from support.small_datasets import mixed
+from sweep.analysis import error_statistics, registry
+from sweep.analysis.groups import group_numbers
+from sweep.analysis.means import PositiveMean
+from sweep.analysis.quantiles import Quantiles
+from sweep.analysis.radix_histogram import LowerTally, bits
+from sweep.analysis.registry import ErrorStatistic
+from sweep.analysis.states import BlockState
+from sweep.analysis.statistic import Output
+from sweep.measure.flags import EstimateStatus
+from sweep.report.answer import _errors_table
+
+SIZES = {"marker_id": 2, "tilt_deg": 2, "noise_grey": 2, "trial": 30, "solver": 2}
+RESULTS = mixed(SIZES, 7)
+CHUNKINGS = {
+    "in memory": None, "one chunk": {}, "trials": {"trial": 7}, "cells": {"marker_id": 1},
+    "all": {"marker_id": 1, "tilt_deg": 1, "noise_grey": 1, "trial": 4, "solver": 1},
+}
+
+# A mean with its interval, of a class that exists: three lines.
+MEAN_ABSOLUTE_ERROR = ErrorStatistic(
+    {"mae": "mean absolute error of the solved"},
+    lambda quantity: PositiveMean(
+        quantity.named("mae"), f"mean absolute {quantity.words}, solved", quantity.units,
+        lambda poses: quantity.norm(poses)[..., None], lambda poses: poses.solved))
+
+
+# A statistic with a state of its own: the mean of the errors up to their median.
+@dataclass(frozen=True)
+class LowerHalf(BlockState["LowerHalf"]):
+    below: np.ndarray
+    """Sum of the errors in the bins below the median's, (groups,)."""
+    count: np.ndarray
+    """Their number."""
+    lower: LowerTally
+    """Errors in the median's bin."""
+
+    def fold(self):
+        return self
+
+
+class TrimmedMean(Quantiles):
+    def outputs(self):
+        return [Output(self.name, self.meaning, self.units)]
+
+    def second_pass(self, poses, known):
+        groups, errors = self._grouped_errors(poses, self.used(poses))
+        bins = known.bins[:, 0, :1]
+        inside = bits(errors) >> 16 < bins[groups, 0]
+        below, count = (np.bincount(groups[inside], weights, len(bins))
+                        for weights in (errors[inside], None))
+        return LowerHalf(below, count, LowerTally.of(groups, errors, bins))
+
+    def finish(self, known, second):
+        bins, rank = known.bins[:, 0, 0], known.ranks[:, 0, 0]
+        groups = group_numbers(bins)
+        rest = [sum(second.lower.values_at(groups[g:g + 1], bins[g:g + 1], np.array([k + 1]))[0]
+                    for k in range(rank[g])) for g in groups]
+        return {self.name: (second.below + rest) / (second.count + rank)}
+
+
+TRIMMED_MEAN = ErrorStatistic(
+    {"trimmed": "mean of the smaller half of the errors"},
+    lambda quantity: TrimmedMean(
+        quantity.named("trimmed"), f"mean of the smaller half of the absolute {quantity.words}",
+        quantity.units, quantity.norm, lambda poses: poses.solved, lambda poses: poses.solved))
+
+
+@pytest.fixture(autouse=True)
+def _added(monkeypatch):
+    monkeypatch.setattr(registry, "ERROR_STATISTICS", (
+        *registry.ERROR_STATISTICS, MEAN_ABSOLUTE_ERROR, TRIMMED_MEAN))
+
+
+def errors_of_solved(solver):
+    """Return the absolute rotation errors of the solved poses, in degrees."""
+    part = RESULTS.isel(solver=solver)
+    vectors = part["rotation_error_rad"].transpose(..., "xyz").values.astype(float)
+    solved = part["estimate"].transpose(*part["rotation_error_rad"].dims[:-1]).values
+    return np.degrees(np.linalg.norm(vectors, axis=-1)[solved == EstimateStatus.solved])
+
+
+@pytest.mark.parametrize("chunks", CHUNKINGS.values(), ids=CHUNKINGS)
+def test_an_added_statistic_is_that_of_plain_numpy_in_any_chunks(chunks):
+    results = RESULTS if chunks is None else RESULTS.chunk(chunks)
+    table = error_statistics(results, ["solver"])
+    assert (table["rotation_trimmed_deg"].chunks is None) == (chunks is None)
+    table = table.compute()
+    for solver in range(SIZES["solver"]):
+        errors = np.sort(errors_of_solved(solver))
+        assert len(errors) > 50
+        here = table.isel(solver=solver)
+        assert here["rotation_mae_deg"] == pytest.approx(errors.mean(), rel=1e-12)
+        assert here["rotation_mae_deg_low"] < errors.mean() < here["rotation_mae_deg_high"]
+        # Those in the bin of the last rank are rounded to single precision.
+        half = errors[:-(-len(errors) // 2)].mean()
+        assert here["rotation_trimmed_deg"] == pytest.approx(half, rel=6e-8)
+
+
+def test_an_added_statistic_has_attributes_and_a_row_in_every_table():
+    table = error_statistics(RESULTS)
+    for quantity, unit in (("rotation", "degree"), ("range", "percent"), ("position", "m")):
+        names = [name for name in table if name.startswith(f"{quantity}_mae_")]
+        assert len(names) == 3
+        for name in names:
+            assert table[name].attrs["units"] == unit
+            assert "mean absolute" in table[name].attrs["long_name"]
+    assert "| `*_mae_*` | error: mean absolute error of the solved |" in registry.guide_table()
+    rows = _errors_table(table).rows
+    assert "mean of the smaller half of the errors" in [row[0] for row in rows]

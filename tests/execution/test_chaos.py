@@ -7,7 +7,6 @@ import os
 import random
 import signal
 import subprocess
-import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -16,6 +15,7 @@ import psutil
 import pytest
 import xarray as xr
 
+from support.commands import command, started
 from support.lengths import lengths
 from support.stores import by_hand, same
 from sweep.errors import StoreError
@@ -59,29 +59,6 @@ if __name__ == "__main__":
     execute(Pipeline.from_toml(pipeline), store, workers=2, scheduler=scheduler or None,
             block_s=0.05)
 """
-
-
-@contextlib.contextmanager
-def started(arguments, **options):
-    """Start a command of Python as a group of its own; end the whole group afterwards."""
-    with subprocess.Popen(
-        [sys.executable, *map(str, arguments)], start_new_session=True, **options
-    ) as process:
-        try:
-            yield process
-        finally:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-
-
-def command(*arguments, timeout=300, **options):
-    """Run the command line; end whatever it leaves behind."""
-    with started(
-        ["-m", "sweep", *arguments],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options,
-    ) as running:
-        out, err = running.communicate(timeout=timeout)
-    return subprocess.CompletedProcess(running.args, running.returncode, out, err)
 
 
 def whole(url, pipeline, reference):
@@ -325,6 +302,9 @@ SMALL = (GRID % 10).replace("[0.2, 0.3, 0.4]", "[0.2, 0.3, 0.4, 0.5]")
 
 NEVER = 10**6
 
+ALL = 1000
+"""More than there are instants in a block."""
+
 
 @contextlib.contextmanager
 def pieces(work, url, file, signal_name, instants):
@@ -361,11 +341,13 @@ def small(tmp_path_factory):
     return prepared(tmp_path_factory.mktemp("small"), SMALL, "small")
 
 
-@lengths(3, 1000)
-def test_kill_between_any_two_writes_of_a_block_loses_that_block_alone(count, small, tmp_path):
+@lengths(3, ALL)
+def test_kill_between_any_two_writes_of_a_block_loses_that_block_alone(
+    count, small, cluster, tmp_path
+):
     pipeline, path, reference = small
     url = str(tmp_path / "small.zarr")
-    store = create_store(url, pipeline, (1, 1, 1))
+    store = create_store(url, pipeline, (1, 1, 1) if count == ALL else (1, 1, 5))
     total = instants_of("block", url, path, 0)
     chosen = some(total, count)
     assert len(chosen) < len(store.blocks)
@@ -383,7 +365,8 @@ def test_kill_between_any_two_writes_of_a_block_loses_that_block_alone(count, sm
     assert state.returncode == 0, state.stderr
     assert json.loads(state.stdout)["blocks_done"] == len(committed(store))
     before = len(committed(store))
-    ran = command("run", path, "--store", url, "--workers", 2, "--json")
+    ran = command(
+        "run", path, "--store", url, "--scheduler", cluster.scheduler_address, "--json")
     assert (ran.returncode, ran.stderr) == (0, "")
     told = json.loads(ran.stdout)
     assert told["computed_blocks"] == len(store.blocks) - before
@@ -419,7 +402,7 @@ def test_kill_between_any_two_writes_of_closing_leaves_no_half_finished_store(
         whole(url, pipeline, reference)
 
 
-@lengths(3, 1000)
+@lengths(3, ALL)
 def test_kill_between_any_two_writes_of_a_new_store_leaves_all_or_none(
     count, small, tmp_path
 ):
@@ -438,11 +421,11 @@ def test_kill_between_any_two_writes_of_a_new_store_leaves_all_or_none(
         assert committed(open_store(str(url))) == set()
 
 
-@lengths(4, 1000)
-def test_orphan_that_goes_on_after_an_overwrite_harms_nothing(count, small, tmp_path):
+@lengths(4, ALL)
+def test_orphan_that_goes_on_after_an_overwrite_harms_nothing(count, small, cluster, tmp_path):
     pipeline, path, _ = small
     url = str(tmp_path / "small.zarr")
-    create_store(url, pipeline, (1, 1, 1))
+    create_store(url, pipeline, (1, 1, 1) if count == ALL else (1, 1, 5))
     total = instants_of("block", url, path, 0)
     chosen = some(total, count)[:-1]
     other_text = SMALL.replace("seed = 3", "seed = 4")
@@ -450,7 +433,8 @@ def test_orphan_that_goes_on_after_an_overwrite_harms_nothing(count, small, tmp_
     instants = [[1 + k, at] for k, at in enumerate(chosen)]
     with pieces("block", url, path, "SIGSTOP", instants) as (running, told):
         assert {met for met, _ in told} == {signal.SIGSTOP}
-        ran = command("run", other_path, "--store", url, "--overwrite", "--workers", 2)
+        ran = command("run", other_path, "--store", url, "--overwrite",
+                      "--scheduler", cluster.scheduler_address)
         assert (ran.returncode, ran.stderr) == (0, "")
         whole(url, other, reference)
         running.stdin.write("go on\n")
@@ -525,12 +509,12 @@ FULL = "No space left on device"
 
 
 def test_run_on_a_full_disk_says_so_in_a_line_and_continues_when_there_is_room(
-    small, disk, tmp_path
+    small, disk, cluster, tmp_path
 ):
     pipeline, path, reference = small
     url = str(disk.path / "small.zarr")
     store = create_store(url, pipeline, (1, 1, 2))
-    arguments = ("run", path, "--store", url, "--workers", 2)
+    arguments = ("run", path, "--store", url, "--scheduler", cluster.scheduler_address)
     told_in_a_line(command(*arguments, cwd=tmp_path), FULL)
     done = len(committed(store))
     assert 0 < done < len(store.blocks)

@@ -306,7 +306,6 @@ def test_remote_store_of_a_tls_cluster_holds_what_a_local_one_does(
     told = ""
     with Cluster(tmp_path / "cluster", certificates["ours"]) as cluster:
         cluster.worker()
-        cluster.worker()
         ran = sweep_command(
             "run", small, "--store", url, "--scheduler", cluster.address, "--json",
             env={**os.environ, **client_environment(certificates["ours"])},

@@ -72,14 +72,16 @@ def sweep_command(*arguments, **options):
     )
 
 
-@pytest.mark.parametrize("extents", [(1, 1, 1, 1), (2, 3, 1, 2), (1, 4, 2, 3)])
+@pytest.mark.parametrize("extents", [
+    pytest.param((1, 1, 1, 1), marks=pytest.mark.long), (2, 3, 1, 2), (1, 4, 2, 3),
+])
 def test_block_size_changes_no_bit(extents, pipeline, undisturbed, tmp_path):
     url = str(tmp_path / "cut.zarr")
     by_hand(url, pipeline, extents)
     assert same(url, undisturbed)
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.long), 2])
 def test_number_of_workers_changes_no_bit(workers, pipeline, undisturbed, tmp_path):
     url = str(tmp_path / "run.zarr")
     summary = execute(pipeline, url, workers=workers, block_s=0.02)
@@ -89,17 +91,19 @@ def test_number_of_workers_changes_no_bit(workers, pipeline, undisturbed, tmp_pa
     assert open_store(url).finished
 
 
-def test_stopped_run_continues_and_finished_one_is_left_alone(pipeline, undisturbed, tmp_path):
+def test_stopped_run_continues_and_finished_one_is_left_alone(
+    pipeline, undisturbed, cluster, tmp_path
+):
     url = str(tmp_path / "stopped.zarr")
     store = create_store(url, pipeline, (1, 2, 1, 3))
     for block in list(store.blocks)[:3]:
         compute_block(url, store.run_id, block)
     assert len(committed(store)) == 3
     assert not open_store(url).finished
-    summary = execute(pipeline, url, workers=1)
+    summary = execute(pipeline, url, client=cluster)
     assert summary.computed_blocks == len(store.blocks) - 3
     assert same(url, undisturbed)
-    assert execute(pipeline, url, workers=1).computed_blocks == 0
+    assert execute(pipeline, url, client=cluster).computed_blocks == 0
 
 
 def test_block_computed_twice_is_harmless(pipeline, undisturbed, tmp_path):
@@ -109,8 +113,8 @@ def test_block_computed_twice_is_harmless(pipeline, undisturbed, tmp_path):
     assert same(url, undisturbed)
 
 
-def test_xarray_opens_a_finished_store_with_labels_units_and_flags(pipeline, tmp_path):
-    dataset = sweep.run(pipeline, tmp_path / "labelled.zarr", workers=2)
+def test_xarray_opens_a_finished_store_with_labels_units_and_flags(pipeline, cluster, tmp_path):
+    dataset = sweep.run(pipeline, tmp_path / "labelled.zarr", client=cluster)
     with xr.open_zarr(tmp_path / "labelled.zarr") as opened:
         assert opened.identical(dataset)
     assert list(dataset.detection.dims) == [
@@ -129,15 +133,17 @@ def test_xarray_opens_a_finished_store_with_labels_units_and_flags(pipeline, tmp
 
 def test_side_px_gives_the_distance_as_a_coordinate(tmp_path):
     pipeline = Pipeline.from_text("[axes]\nside_px = [20, 40]\nsize_m = [0.01, 0.02]")
-    dataset = sweep.run(pipeline, tmp_path / "side.zarr", workers=1)
-    assert dataset.distance_m.dims == ("side_px", "size_m")
-    np.testing.assert_allclose(
-        dataset.distance_m.sel(side_px=40, size_m=0.02), 640 * 4 / 4.8 * 0.02 / 40, rtol=1e-15
-    )
-    np.testing.assert_array_equal(dataset.true_tvec_m.sel(xyz="z"), dataset.distance_m)
+    url = str(tmp_path / "side.zarr")
+    by_hand(url, pipeline, (2, 2))
+    with sweep.open(url) as dataset:
+        assert dataset.distance_m.dims == ("side_px", "size_m")
+        np.testing.assert_allclose(
+            dataset.distance_m.sel(side_px=40, size_m=0.02), 640 * 4 / 4.8 * 0.02 / 40, rtol=1e-15
+        )
+        np.testing.assert_array_equal(dataset.true_tvec_m.sel(xyz="z"), dataset.distance_m)
 
 
-def test_store_of_another_experiment_is_not_continued(pipeline, tmp_path):
+def test_store_of_another_experiment_is_not_continued(pipeline, cluster, tmp_path):
     url = str(tmp_path / "one.zarr")
     by_hand(url, pipeline, (2, 4, 2, 3))
     other = Pipeline.from_text(TEXT, ["tilt_deg=[0, 51]", "seed=6", "white=200"], name="small")
@@ -147,7 +153,7 @@ def test_store_of_another_experiment_is_not_continued(pipeline, tmp_path):
     assert "seed: the store has 5, this run 6" in text
     assert "axes.tilt_deg: the store has 0.0, 50.0, this run 0.0, 51.0" in text
     assert "white: the store has 255.0, this run 200.0" in text
-    assert execute(other, url, workers=1, overwrite=True).poses == 48
+    assert execute(other, url, client=cluster, overwrite=True).poses == 48
     assert open_store(url).pipeline.seed == 6
 
 
@@ -174,14 +180,15 @@ GROWN = {
     "new axis": ["background=[128, 60]"],
 }
 
+GROWN_EXTENTS = {"dictionary": 2, "background": 1, "distance_m": 3, "tilt_deg": 2, "trial": 2}
+"""Extents of blocks that cut each axis that grows."""
+
 
 @pytest.mark.parametrize("settings", GROWN.values(), ids=GROWN)
 def test_grown_grid_reuses_what_there_is_bit_for_bit(settings, undisturbed, tmp_path):
     grown = Pipeline.from_text(TEXT, settings, name="grown")
     fresh, reusing = str(tmp_path / "fresh.zarr"), str(tmp_path / "reusing.zarr")
-    extents = (1, 2, 1, 2) if len(scene_axes(grown)) == 4 else tuple(
-        1 for _ in scene_axes(grown)
-    )
+    extents = tuple(GROWN_EXTENTS[axis.name] for axis in scene_axes(grown))
     by_hand(fresh, grown, extents)
     store = create_store(reusing, grown, extents)
     computed = [
@@ -225,24 +232,24 @@ def test_bound_is_reused_with_its_flag(tmp_path):
     assert same(new, fresh)
 
 
-def test_halves_of_a_grid_are_joined(pipeline, undisturbed, tmp_path):
+def test_halves_of_a_grid_are_joined(pipeline, undisturbed, cluster, tmp_path):
     halves = []
     for name, tilts in (("left", "[0]"), ("right", "[50]")):
         half = Pipeline.from_text(TEXT, [f"tilt_deg={tilts}"], name=name)
         halves.append(str(tmp_path / f"{name}.zarr"))
         by_hand(halves[-1], half, (2, 4, 1, 3))
     joined = str(tmp_path / "joined.zarr")
-    summary = execute(pipeline, joined, workers=1, reuse=halves)
+    summary = execute(pipeline, joined, client=cluster, reuse=halves)
     assert summary.computed_estimates == 0
     assert same(joined, undisturbed)
 
 
-def test_nothing_is_reused_from_an_unfinished_block(pipeline, undisturbed, tmp_path):
+def test_nothing_is_reused_from_an_unfinished_block(pipeline, undisturbed, cluster, tmp_path):
     part = str(tmp_path / "part.zarr")
     store = create_store(part, pipeline, (1, 4, 2, 3))
     compute_block(part, store.run_id, next(iter(store.blocks)))
     new = str(tmp_path / "new.zarr")
-    summary = execute(pipeline, new, workers=1, reuse=[part])
+    summary = execute(pipeline, new, client=cluster, reuse=[part])
     assert summary.computed_scenes == 24
     assert same(new, undisturbed)
 
@@ -282,7 +289,7 @@ def test_an_unwritable_path_is_told_in_a_line(tmp_path):
     assert (ran.returncode, ran.stderr.strip()) == (2, "--workers 0: expected at least 1")
 
 
-def test_store_in_use_is_refused_and_a_dead_lock_is_not(pipeline, tmp_path):
+def test_store_in_use_is_refused_and_a_dead_lock_is_not(pipeline, cluster, tmp_path):
     url = str(tmp_path / "held.zarr")
     store = create_store(url, pipeline, (2, 4, 2, 3))
     here = {"token": "x", "host": socket.gethostname(), "beat": time.time()}
@@ -295,7 +302,7 @@ def test_store_in_use_is_refused_and_a_dead_lock_is_not(pipeline, tmp_path):
     with subprocess.Popen([sys.executable, "-c", ""]) as ended:
         pass
     put(store.storage, KEY, {**here, "pid": ended.pid})
-    assert execute(pipeline, url, workers=1).computed_blocks == 1
+    assert execute(pipeline, url, client=cluster).computed_blocks == 1
     assert not (Path(url) / KEY).exists()
 
 
@@ -316,10 +323,11 @@ def test_silent_scheduler_is_given_up(pipeline, tmp_path, monkeypatch):
     assert not (tmp_path / "none.zarr").exists()
 
 
-def test_json_is_one_object_and_progress_goes_elsewhere(tmp_path):
+def test_json_is_one_object_and_progress_goes_elsewhere(cluster, tmp_path):
     path = tmp_path / "small.toml"
     path.write_text(TEXT)
-    ran = sweep_command("run", path, "--json", "--workers", "2", cwd=tmp_path)
+    ran = sweep_command(
+        "run", path, "--json", "--scheduler", cluster.scheduler_address, cwd=tmp_path)
     assert ran.returncode == 0, ran.stderr
     assert ran.stderr == ""
     told = json.loads(ran.stdout)
@@ -339,6 +347,8 @@ LONG = "[axes]\ntrial = 40000\ndistance_m = [0.05, 0.08]\n[pose]\njitter_px = 0.
 def test_interrupted_run_says_how_to_go_on_and_goes_on(tmp_path):
     path = tmp_path / "long.toml"
     path.write_text(LONG)
+    (tmp_path / "runs").mkdir()
+    create_store(str(tmp_path / "runs" / "long.zarr"), Pipeline.from_toml(path), (500, 1))
     command = [sys.executable, "-m", "sweep", "run", str(path), "--workers", "2"]
     with subprocess.Popen(
         command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -364,15 +374,11 @@ def test_interrupted_run_says_how_to_go_on_and_goes_on(tmp_path):
     assert state["blocks_done"] == done
 
 
-def test_running_scheduler_with_two_workers_gives_the_same(pipeline, undisturbed, tmp_path):
-    from distributed import LocalCluster  # noqa: PLC0415
-
+def test_running_scheduler_with_two_workers_gives_the_same(
+    pipeline, undisturbed, cluster, tmp_path
+):
     url = str(tmp_path / "external.zarr")
-    with LocalCluster(
-        n_workers=2, threads_per_worker=2, host="127.0.0.1", dashboard_address="127.0.0.1:0",
-        silence_logs=50,
-    ) as cluster:
-        summary = execute(pipeline, url, scheduler=cluster.scheduler_address, block_s=0.02)
+    summary = execute(pipeline, url, scheduler=cluster.scheduler_address, block_s=0.02)
     assert summary.computed_scenes == 48
     assert same(url, undisturbed)
 
@@ -401,23 +407,17 @@ def test_blocks_cover_the_grid_once_and_are_listed_lazily():
     assert str(next(iter(huge))) == "0-1"
 
 
-def test_workers_with_other_versions_are_refused(pipeline, tmp_path, monkeypatch):
-    from distributed import LocalCluster  # noqa: PLC0415
-
+def test_workers_with_other_versions_are_refused(pipeline, cluster, tmp_path, monkeypatch):
     from sweep.execution import worker_versions  # noqa: PLC0415
     from sweep.store.provenance import fingerprint  # noqa: PLC0415
 
     async def elsewhere(_, given):
         return {"tcp://worker": ({**fingerprint(given), "opencv": "0.0"}, ("elsewhere", 1))}
 
-    with LocalCluster(
-        n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0",
-        silence_logs=50,
-    ) as cluster:
-        monkeypatch.setattr(worker_versions, "_worker_identities", elsewhere)
-        for given in ({"scheduler": cluster.scheduler_address}, {"client": cluster}):
-            with pytest.raises(ArgumentError, match=r"tcp://worker: opencv 0\.0, here"):
-                execute(pipeline, tmp_path / "other.zarr", **given)
+    monkeypatch.setattr(worker_versions, "_worker_identities", elsewhere)
+    for given in ({"scheduler": cluster.scheduler_address}, {"client": cluster}):
+        with pytest.raises(ArgumentError, match=r"tcp://worker: opencv 0\.0, here"):
+            execute(pipeline, tmp_path / "other.zarr", **given)
     assert not (tmp_path / "other.zarr").exists()
 
 
@@ -522,12 +522,13 @@ def test_background_axis_of_levels_and_images(tmp_path):
         compute_block(other.url, other.run_id, next(iter(other.blocks)))
 
 
-def test_progress_is_shown_on_a_terminal(tmp_path):
+def test_progress_is_shown_on_a_terminal(cluster, tmp_path):
     path = tmp_path / "small.toml"
     path.write_text(TEXT)
     ours, theirs = pty.openpty()
     with subprocess.Popen(
-        [sys.executable, "-m", "sweep", "run", str(path), "--workers", "1"],
+        [sys.executable, "-m", "sweep", "run", str(path), "--scheduler",
+         cluster.scheduler_address],
         cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=theirs,
         env={**os.environ, "TERM": "xterm", "COLUMNS": "100"},
     ) as running:

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from support.poison import RAISES, Poison, command, poisoned
+from support.commands import command
+from support.poison import RAISES, Poison, poisoned
 from support.stores import by_hand
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.cell_selection import cell as cell_at

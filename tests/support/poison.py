@@ -1,12 +1,8 @@
-"""Commands under which chosen scenes raise, crash or stall the process that computes them."""
+"""An environment in which chosen scenes raise, crash or stall the process that computes them."""
 
 import dataclasses
 import json
 import os
-import signal
-import subprocess
-import sys
-from contextlib import suppress
 from pathlib import Path
 
 POISONED = Path(__file__).parent / "poisoned"
@@ -38,18 +34,3 @@ def poisoned(poisons, log):
     given = {"log": str(log), "poisons": [poison.written() for poison in poisons]}
     path = os.pathsep.join(filter(None, [str(POISONED), os.environ.get("PYTHONPATH")]))
     return {**os.environ, "PYTHONPATH": path, "SWEEP_POISON": json.dumps(given)}
-
-
-def command(*arguments, timeout=300, **options):
-    """Run the command line; end whatever it leaves behind."""
-    with subprocess.Popen(
-        [sys.executable, "-m", "sweep", *map(str, arguments)],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        **options,
-    ) as running:
-        try:
-            out, err = running.communicate(timeout=timeout)
-        finally:
-            with suppress(ProcessLookupError):
-                os.killpg(running.pid, signal.SIGKILL)
-    return subprocess.CompletedProcess(running.args, running.returncode, out, err)

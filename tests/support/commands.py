@@ -1,0 +1,30 @@
+"""Commands in processes of their own, which leave no process behind."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+
+
+@contextlib.contextmanager
+def started(arguments, **options):
+    """Start a command of Python as a group of its own; end the whole group afterwards."""
+    with subprocess.Popen(
+        [sys.executable, *map(str, arguments)], start_new_session=True, **options
+    ) as process:
+        try:
+            yield process
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+
+
+def command(*arguments, timeout=300, **options):
+    """Run ``sweep`` with arguments; return what ended, with its output."""
+    with started(
+        ["-m", "sweep", *arguments],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options,
+    ) as running:
+        out, err = running.communicate(timeout=timeout)
+    return subprocess.CompletedProcess(running.args, running.returncode, out, err)

@@ -39,7 +39,9 @@ def execute(path: Path, runs: Path) -> None:
         cell.metadata = {}
     notebook.metadata = metadata | {"sweep": {"source_digest": source_digest(notebook)}}
     nbformat.validate(notebook)
-    nbformat.write(notebook, path)
+    # Attributes of a dataset name folders; those of this machine are nobody's business.
+    text = nbformat.writes(notebook).replace(str(runs), "runs").replace(str(FOLDER.parent), "sweep")
+    path.write_text(text.rstrip("\n") + "\n")
     print(f"{path.name}: {path.stat().st_size / 1e3:.0f} kB")
 
 

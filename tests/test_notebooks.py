@@ -1,8 +1,9 @@
-"""The notebooks run, show their figures, and are kept without outputs."""
+"""The notebooks run, show their figures, and are stored with the outputs of their sources."""
 
 import asyncio
 import os
 import re
+import runpy
 from pathlib import Path
 
 import nbformat
@@ -13,6 +14,11 @@ NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 FIGURES = {"choosing_a_marker": 6, "paper_reproduced": 4, "first_analysis": 5}
 FEW_TRIALS = 2  # in place of what a reader gets
 TIMEOUT_S = 300  # a cell, on a busy machine
+MAX_BYTES = 1_000_000
+COSTS = {"choosing_a_marker": "## The recommendation"}
+"""The heading from which on a notebook prints times, which no two runs have alike."""
+
+source_digest = runpy.run_path(str(NOTEBOOKS / "make.py"))["source_digest"]
 
 
 def read(name):
@@ -67,25 +73,31 @@ def test_all_notebooks_are_known():
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_notebook_is_kept_without_outputs(name):
+def test_notebook_is_stored_with_the_outputs_of_its_sources(name):
     notebook = read(name)
     nbformat.validate(notebook)
     assert (notebook.nbformat, notebook.nbformat_minor) == (4, 5)
     assert notebook.metadata.kernelspec.name == "python3"
     assert len({cell.id for cell in notebook.cells}) == len(notebook.cells)
     assert all(cell.metadata == {} for cell in notebook.cells)
-    for cell in code_cells(notebook):
-        assert cell.outputs == []
-        assert cell.execution_count is None
+    assert notebook.metadata.sweep.source_digest == source_digest(notebook), (
+        f"python notebooks/make.py {name}")
+    numbers = [cell.execution_count for cell in code_cells(notebook)]
+    assert numbers == list(range(1, len(numbers) + 1))
+    assert figures_of(notebook) == FIGURES[name]
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_notebook_runs_and_shows_its_figures(name, outcomes):
-    outcome, folder = outcomes[name]
-    if isinstance(outcome, Exception):
-        raise outcome
+def test_stored_notebook_is_small_and_names_no_folder_of_a_machine(name):
+    text = (NOTEBOOKS / f"{name}.ipynb").read_text()
+    assert len(text.encode()) < MAX_BYTES
+    assert not re.search(r"/(?:tmp|home|root|work)/", text)
+
+
+def figures_of(notebook):
+    """Return the number of figures, after checks of a notebook's outputs."""
     shown = 0
-    for cell in code_cells(outcome):
+    for cell in code_cells(notebook):
         kinds = {output.output_type for output in cell.outputs}
         complaints = [output.text for output in cell.outputs
                       if output.output_type == "stream" and output.name == "stderr"]
@@ -95,5 +107,37 @@ def test_notebook_runs_and_shows_its_figures(name, outcomes):
         assert not complaints
         assert len(images) == cell.source.count("plt.show()"), cell.source
         shown += len(images)
-    assert shown == FIGURES[name]
+    return shown
+
+
+def printed(notebook, until):
+    """Return what the cells before the one that starts with ``until`` print."""
+    texts = []
+    for cell in notebook.cells:
+        if until and cell.source.startswith(until):
+            break
+        if cell.cell_type == "code" and 'group="cost"' not in cell.source:
+            texts += [output.text for output in cell.outputs if output.output_type == "stream"]
+            texts += [output.data["text/plain"] for output in cell.outputs
+                      if output.output_type == "execute_result"
+                      and "xarray.Dataset" not in output.data["text/plain"]]
+    return texts
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_notebook_runs_and_shows_its_figures(name, outcomes):
+    outcome, folder = outcomes[name]
+    if isinstance(outcome, Exception):
+        raise outcome
+    assert figures_of(outcome) == FIGURES[name]
     assert list(folder.glob("*.zarr")), "stores go where SWEEP_RUNS says"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("outcomes", ["as it stands"], indirect=True)
+@pytest.mark.parametrize("name", FIGURES)
+def test_notebook_prints_again_what_is_stored(name, outcomes):
+    """With the same versions and processor features; times are left out."""
+    outcome, _ = outcomes[name]
+    until = COSTS.get(name)
+    assert printed(outcome, until) == printed(read(name), until)

@@ -14,11 +14,12 @@ import numba
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def _keep_compiled_code_by_content() -> None:
-    """Cache compiled code under the digest of all source that is compiled.
+def _cache_folder() -> str:
+    """Return a folder for compiled code that is named by the digest of all source it is made of.
 
-    Numba itself looks at a function's own file only, and would go on using what it compiled
-    from an older version of a function in another file.
+    Numba itself checks a function's own file only, and would continue to use code that it compiled
+    from an older version of a function in another file. Empty, so Numba's own choice, if no folder
+    can be written.
     """
     package = Path(__file__).parent
     digest = sha256()
@@ -29,11 +30,11 @@ def _keep_compiled_code_by_content() -> None:
     for folder in (kept.absolute(), Path.home() / ".cache" / "sweep"):
         there = next(above for above in (folder, *folder.parents) if above.exists())
         if os.access(there, os.W_OK):
-            config.CACHE_DIR = str(folder / f"compiled-{digest.hexdigest()[:16]}")
-            return
+            return str(folder / f"compiled-{digest.hexdigest()[:16]}")
+    return str(config.CACHE_DIR)
 
 
-_keep_compiled_code_by_content()
+CACHE_FOLDER = _cache_folder()
 
 
 def compiled(function: Function) -> Function:
@@ -42,7 +43,13 @@ def compiled(function: Function) -> Function:
     IEEE arithmetic is kept in source order (no ``fastmath``), so that results do not depend on
     how loops were vectorised; the global interpreter lock is released while it runs.
     """
-    return cast("Function", numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    config: Any = numba.config
+    before = config.CACHE_DIR
+    config.CACHE_DIR = CACHE_FOLDER  # Numba reads it here; the caller's functions have their own
+    try:
+        return cast("Function", numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    finally:
+        config.CACHE_DIR = before
 
 
 @cache

@@ -244,11 +244,13 @@ def silenced_dask_loggers() -> Iterator[None]:
         if name.partition(".")[0] in ("distributed", "tornado")
         and isinstance(logger, logging.Logger)
     ]
-    before = {logger: logger.level for logger in loggers}
+    before = {logger: (logger.level, logger.handlers[:]) for logger in loggers}
     for logger in loggers:
         logger.setLevel(logging.CRITICAL)
     try:
         yield
     finally:
-        for logger, level in before.items():
+        for logger, (level, handlers) in before.items():
             logger.setLevel(level)
+            for handler in set(logger.handlers).difference(handlers):
+                logger.removeHandler(handler)

@@ -76,7 +76,7 @@ def _worker_identity(pipeline: Pipeline) -> tuple[dict[str, Any], tuple[str, int
 async def _worker_identities(
     client: Client, pipeline: Pipeline
 ) -> dict[str, tuple[dict[str, Any], tuple[str, int]]]:
-    """Return :func:`_worker_identity` of each worker by address; without those that are stalled."""
+    """Return :func:`_worker_identity` of each worker by address; not of those that are stalled."""
     questions = [
         asyncio.ensure_future(client.run(_worker_identity, pipeline, workers=[worker]))
         for worker in await client.nthreads()
@@ -93,6 +93,12 @@ async def _worker_identities(
     done, late = await asyncio.wait(questions, timeout=ANSWER_S)
     for question in late:
         question.cancel()
-    return {
-        worker: identity for question in done for worker, identity in question.result().items()
-    }
+    identities = {}
+    for question in done:
+        try:
+            identities.update(question.result())
+        except OSError:
+            if client.status != "running":
+                raise
+            # The worker left meanwhile, as those of a cluster that adapts to its work do.
+    return identities

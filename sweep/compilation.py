@@ -1,40 +1,145 @@
-"""How the numerical inner loops are compiled: one set of Numba options for all of them."""
+"""How the numerical inner loops are compiled, and where the compiled code is cached.
+
+Only the functions of this package are affected: Numba's own configuration is read, never changed,
+so that functions which a caller compiles are cached where the caller's Numba caches them.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import pickle
+import stat
+import tempfile
+from collections.abc import Callable, Iterator
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def _cache_folder() -> str:
-    """Return a folder for compiled code that is named by the digest of all source it is made of.
-
-    Numba itself checks a function's own file only, and would continue to use code that it compiled
-    from an older version of a function in another file. Empty, so Numba's own choice, if no folder
-    can be written.
-    """
+@cache
+def compiled_sources() -> tuple[Path, ...]:
+    """Return the files with compiled functions, and this one, which has the options."""
     package = Path(__file__).parent
+    files = sorted([*package.glob("model/*.py"), *package.glob("measure/*.py")])
+    return (*(file for file in files if b"\n@compiled\n" in file.read_bytes()), Path(__file__))
+
+
+@cache
+def sources_digest() -> str:
+    """Return a digest of all source that is compiled.
+
+    Numba itself compares a function's own file only, and would go on using what it compiled from
+    an older version of a function in another file. A constant that compiled code uses must be
+    declared in one of these files, too.
+    """
     digest = sha256()
-    for path in sorted([*package.glob("model/*.py"), *package.glob("measure/*.py")]):
+    for path in compiled_sources():
         digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@cache
+def cache_folder() -> Path | None:
+    """Return the folder of the compiled code of these sources; None if no folder is writable.
+
+    In this order: ``NUMBA_CACHE_DIR``, the package's own ``__pycache__``, ``~/.cache/sweep``, a
+    private folder among the temporary files.
+    """
+    name = f"compiled-{sources_digest()}"
+    for folder in _folders():
+        existing = next(above for above in (folder, *folder.parents) if above.exists())
+        if existing.is_dir() and os.access(existing, os.W_OK | os.X_OK):
+            return folder / name
+    private = _private_folder()
+    return private and private / name
+
+
+def _folders() -> Iterator[Path]:
+    """Yield the folders that are tried, in order."""
     config: Any = numba.config
-    kept = Path(config.CACHE_DIR or package / "__pycache__")
-    for folder in (kept.absolute(), Path.home() / ".cache" / "sweep"):
-        there = next(above for above in (folder, *folder.parents) if above.exists())
-        if os.access(there, os.W_OK):
-            return str(folder / f"compiled-{digest.hexdigest()[:16]}")
-    return str(config.CACHE_DIR)
+    if config.CACHE_DIR:
+        yield Path(config.CACHE_DIR).absolute()
+    yield Path(__file__).parent.absolute() / "__pycache__"
+    try:
+        yield Path.home() / ".cache" / "sweep"
+    except (RuntimeError, KeyError):
+        # Without HOME and without an entry for the user there is no home.
+        return
 
 
-CACHE_FOLDER = _cache_folder()
+def _private_folder() -> Path | None:
+    """Return this user's folder among the temporary files; None if nobody else may be kept out.
+
+    Compiled code is executed: a folder that others can write to, or own, is not used.
+    """
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    try:
+        folder = Path(tempfile.gettempdir()) / f"sweep-{user}"
+        folder.mkdir(mode=0o700, exist_ok=True)
+        status = folder.lstat()
+    except OSError:
+        return None
+    private = stat.S_ISDIR(status.st_mode) and not status.st_mode & 0o077
+    return folder if private and status.st_uid == user else None
+
+
+class _Locator(_CacheLocator):
+    """Where Numba finds the compiled code of one function of this package."""
+
+    def __init__(self, line: int) -> None:
+        self._line = line
+
+    def get_cache_path(self) -> str:
+        """Return the folder."""
+        return str(cache_folder())
+
+    def get_source_stamp(self) -> str:
+        """Return the digest of all compiled source."""
+        return sources_digest()
+
+    def get_disambiguator(self) -> str:
+        """Return what distinguishes functions of one name in one file."""
+        return str(self._line)
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> _Locator:  # noqa: ARG003  (Numba's)
+        """Return the locator of a function."""
+        return cls(py_func.__code__.co_firstlineno)
+
+
+class _Implementation(CompileResultCacheImpl):
+    _locator_classes: Any = (_Locator,)
+
+
+class _Cache(FunctionCache):
+    """Numba's cache of one function, in this package's folder.
+
+    A file that cannot be read or written costs a compilation, never the result.
+    """
+
+    _impl_class = _Implementation
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the compiled code for a signature; None if it is not cached."""
+        try:
+            base: Any = super()
+            return base.load_overload(sig, target_context)
+        except (OSError, EOFError, pickle.UnpicklingError):
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Save the compiled code for a signature, if it can be."""
+        try:
+            base: Any = super()
+            base.save_overload(sig, data)
+        except (OSError, EOFError, pickle.UnpicklingError):
+            self._enabled = False
 
 
 def compiled(function: Function) -> Function:
@@ -43,24 +148,23 @@ def compiled(function: Function) -> Function:
     IEEE arithmetic is kept in source order (no ``fastmath``), so that results do not depend on
     how loops were vectorised; the global interpreter lock is released while it runs.
     """
-    config: Any = numba.config
-    before = config.CACHE_DIR
-    config.CACHE_DIR = CACHE_FOLDER  # Numba reads it here; the caller's functions have their own
-    try:
-        return cast("Function", numba.njit(cache=True, nogil=True, error_model="numpy")(function))
-    finally:
-        config.CACHE_DIR = before
+    dispatcher: Any = numba.njit(nogil=True, error_model="numpy")(function)
+    if hasattr(dispatcher, "enable_caching") and cache_folder() is not None:
+        # What `cache=True` does, with a folder of the package's own.
+        make: Any = _Cache
+        dispatcher._cache = make(function)  # noqa: SLF001
+    return cast("Function", dispatcher)
 
 
 @cache
 def processor() -> str:
-    """Return a short name of what last bits of the numbers depend on in this machine.
+    """Return a short name of everything in this machine that the last bits of results depend on.
 
-    The routines that OpenCV and NumPy choose by the processor's features, and what the
-    mathematical and the linear algebra libraries give for fixed numbers: none of them shows in the
-    others, and code that Numba compiles gives the same bits on all.
+    It covers the routines that OpenCV and NumPy choose by the processor's features, and the
+    results of the mathematical and linear algebra libraries for fixed numbers: none of them shows
+    in the others, and code that Numba compiles gives the same bits on all.
     """
-    import platform  # noqa: PLC0415  (what is compiled needs none of these)
+    import platform  # noqa: PLC0415  (slow to import; compiled code needs none of these)
 
     import cv2  # noqa: PLC0415
     import numpy as np  # noqa: PLC0415

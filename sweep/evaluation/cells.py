@@ -34,9 +34,8 @@ from sweep.evaluation.variables import (
 from sweep.measure.accuracy import pose_error
 from sweep.measure.bound import Bounds, bounds
 from sweep.measure.estimation import Estimates
-from sweep.measure.estimators import build
+from sweep.measure.estimators import EstimatorSetting, build
 from sweep.measure.flags import BoundStatus, DetectionStatus
-from sweep.measure.solver import EstimatorSetting
 from sweep.model.columns import Column
 from sweep.model.derivatives import POSE
 from sweep.model.extent import marker_boxes

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from sweep.evaluation.results import Failure, exception_text
 from sweep.evaluation.search import SearchResult
 from sweep.measure.estimation import Detections, Estimates, PoseEstimator
+from sweep.measure.estimators import EstimatorSetting
 from sweep.measure.flags import EstimateStatus
-from sweep.measure.solver import EstimatorSetting
 from sweep.model.camera import Cameras
 from sweep.model.columns import Column
 from sweep.model.lens import pack
@@ -88,4 +88,4 @@ def estimate_poses(
             except Exception:
                 failures.append(Failure(int(rows[i]), "estimation", exception_text(failures)))
                 parts.append(Estimates.none(1, EstimateStatus.failed))
-        return Estimates.joined(parts)
+        return Estimates.concatenate(parts)

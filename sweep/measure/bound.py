@@ -33,7 +33,7 @@ from sweep.measure.positive_definite import pose_covariance
 from sweep.model import coverage
 from sweep.model.declaration import parameter
 from sweep.model.derivatives import POSE, work_space
-from sweep.model.effects import NEUTRAL
+from sweep.model.effects import IN_BOUND, NEUTRAL
 from sweep.model.scene import Scenes
 from sweep.typing import Floats
 
@@ -45,10 +45,6 @@ MIRROR_STEPS = 60
 
 MAX_MIRROR_DISTANCE = 100.0
 """Largest distance of a mirrored minimum that is searched for, in standard deviations."""
-
-MODELLED = ("blur_px", "gain", "noise_grey")
-"""The effects that the bound's model of an image has."""
-
 
 @dataclass(frozen=True, slots=True)
 class BoundSetting:
@@ -165,7 +161,7 @@ def bounds(
         levels = scenes.levels[row] * gain
         margin = CLIPPING_DEVIATIONS * noise
         unmodelled = isinstance(scenes.background[row], str) or any(
-            name not in MODELLED for name in scenes.active(row)
+            name not in IN_BOUND for name in scenes.active(row)
         )
         if unmodelled:
             status[i] = BoundStatus.not_in_model

@@ -1,4 +1,4 @@
-"""What an estimator of poses receives, and what it gives back."""
+"""The interface of pose estimators: detections in, estimates out."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from sweep.typing import Floats
 
 @dataclass(frozen=True, slots=True)
 class Detections:
-    """N detected markers, with all that is believed of them.
+    """N detected markers, with the camera, size and noise that the estimator assumes.
 
     Attributes
     ----------
     corners
-        (N, 4, 2) px in the frame, as found.
+        (N, 4, 2) detected corners in px of the frame.
     cameras, size_m, noise_grey, blur_px
         N cameras and (N,) each: camera, black square's side, noise of a pixel in grey levels, and
-        point spread, as the estimator believes them.
+        point spread, as the estimator assumes them.
     markers
         Dictionary, ID and quiet zone of each.
     images, origins
-        The windows in which they were found, and (N, 2) their first pixels in the frame; no images
-        for estimators that do not ask for them.
+        The windows that were searched, and (N, 2) their first pixels in the frame; no images for
+        estimators that do not need them.
     """
 
     corners: Floats
@@ -44,7 +44,7 @@ class Detections:
     origins: NDArray[np.int64]
 
     def take(self, rows: NDArray[np.intp]) -> Detections:
-        """Return the sightings of the given rows."""
+        """Return the detections of the given rows."""
         return Detections(
             self.corners[rows], self.cameras.take(rows), self.size_m[rows], self.noise_grey[rows],
             self.blur_px[rows], [self.markers[row] for row in rows],
@@ -54,9 +54,14 @@ class Detections:
 
 @dataclass(frozen=True, slots=True)
 class Estimates:
-    """N estimated poses; NaN where there is none, and where there is no alternative."""
+    """N estimated poses.
+
+    Numbers are NaN if there is no pose, and those of the alternative if there is no other planar
+    solution.
+    """
 
     status: NDArray[np.uint8]
+    """(N,) :class:`sweep.measure.flags.EstimateStatus`"""
     rotation: Floats
     """(N, 3, 3)"""
     translation: Floats
@@ -66,16 +71,16 @@ class Estimates:
     alternative_rotation: Floats
     """(N, 3, 3) of the other planar solution"""
     alternative_reprojection_px: Floats
-    """(N,) RMS over the corners"""
+    """(N,) RMS over the corners of the other planar solution"""
     covariance: Floats
-    """(N, 6, 6) of the errors that the estimator expects: turn about the camera's x, y and z in
+    """(N, 6, 6) of the errors, as the estimator predicts it: turn about the camera's x, y and z in
     radians, position along them in metres"""
     residual_ratio: Floats
-    """(N,) variance of the pixels' residuals over what noise and rounding make"""
+    """(N,) variance of the pixels' residuals relative to that of noise and rounding"""
 
     @staticmethod
     def none(count: int, status: EstimateStatus) -> Estimates:
-        """Return ``count`` estimates that do not exist, all with one status."""
+        """Return ``count`` estimates without a pose, all with one status."""
         shapes = ((3, 3), (3,), (), (3, 3), (), (6, 6), ())
         return Estimates(
             np.full(count, status, dtype=np.uint8),
@@ -83,7 +88,7 @@ class Estimates:
         )
 
     @staticmethod
-    def joined(parts: Sequence[Estimates]) -> Estimates:
+    def concatenate(parts: Sequence[Estimates]) -> Estimates:
         """Return the estimates of several parts as one."""
         names = [field.name for field in dataclasses.fields(Estimates)]
         return Estimates(
@@ -92,13 +97,13 @@ class Estimates:
 
 
 class PoseEstimator(Protocol):
-    """Anything that makes poses of sightings: from corners, or from the pixels as well."""
+    """A function from detections to poses, by their corners or by their pixels as well."""
 
     @property
     def needs_images(self) -> bool:
-        """Whether sightings must carry their images."""
+        """Whether detections must carry their images."""
         ...
 
-    def __call__(self, sightings: Detections) -> Estimates:
-        """Return one estimate a sighting; where there is none, its status says why."""
+    def __call__(self, detections: Detections, /) -> Estimates:
+        """Return one estimate for each detection; its status says why a pose is missing."""
         ...

@@ -1,14 +1,129 @@
-"""From an estimator's setting to what runs it."""
+"""The solvers: one record each, the estimator's settings, and from a setting to its estimator."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
 from sweep.measure.estimation import PoseEstimator
 from sweep.measure.photometric import Photometric
-from sweep.measure.solver import CornerSolver, EstimatorSetting
+from sweep.measure.solver import OPENCV_SOLVERS, CornerSolver, OpenCVSolver
+from sweep.model.declaration import parameter
+
+
+@dataclass(frozen=True, slots=True)
+class Solver:
+    """One choice of ``solver`` in pipeline files.
+
+    Attributes
+    ----------
+    meaning
+        One line for the reference.
+    build
+        Makes its estimator from an :class:`EstimatorSetting`; called once for each configuration
+        and process.
+    needs_images
+        Whether it uses the pixels: the detections' images are kept for it.
+    guarded
+        Whether the setting ``guarded`` applies to it.
+    planar_only
+        Whether it works for coplanar points alone.
+    """
+
+    meaning: str
+    build: Callable[[EstimatorSetting], PoseEstimator]
+    needs_images: bool = False
+    guarded: bool = False
+    planar_only: bool = False
+
+
+def _corner_solver(name: str, setting: EstimatorSetting) -> PoseEstimator:
+    return CornerSolver(
+        name, setting.guarded, setting.reprojection_limit, setting.corner_noise_px
+    )
+
+
+def _of_opencv(name: str, each: OpenCVSolver) -> Solver:
+    return Solver(
+        each.meaning, partial(_corner_solver, name), guarded=each.guarded,
+        planar_only=each.planar_only,
+    )
+
+
+SOLVERS: dict[str, Solver] = {
+    **{name: _of_opencv(name, each) for name, each in OPENCV_SOLVERS.items()},
+    "photometric": Solver(
+        "maximum likelihood on the pixels, started from ippe",
+        lambda setting: Photometric(setting.refined_starts, setting.estimate_blur),
+        needs_images=True, planar_only=True,
+    ),
+}
+"""Name in pipeline files -> the solver; choices, messages and reference follow from it."""
+
+_PLAIN = ", ".join(
+    name for name, each in SOLVERS.items() if not (each.guarded or each.needs_images)
+)
+_PIXELS = ", ".join(name for name, each in SOLVERS.items() if each.needs_images)
+
+_ASSUMED = "as assumed by the estimator (default: the true one)"
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorSetting:
+    """How a pose is estimated, and which camera and marker the estimator assumes."""
+
+    solver: str = parameter(
+        "ippe_square", "; ".join(f"{name}: {each.meaning}" for name, each in SOLVERS.items()),
+        choices=tuple(SOLVERS),
+    )
+    guarded: bool = parameter(
+        True, "true: the solver is called in a frame in which it is stable, checked, and replaced "
+        f"by iterative if it fails; false: the plain cv2.solvePnP call ({_PLAIN} always)",
+    )
+    reprojection_limit: float = parameter(
+        0.25, "largest RMS reprojection error of a solution, as a share of the detected side; of a "
+        "pose at infinity it is 0.7", low=0, high=0.5, open_low=True,
+    )
+    corner_noise_px: float | None = parameter(
+        None, "standard deviation of a detected corner's coordinates, for the pose covariance of "
+        f"solvers that use corners alone; {_PIXELS} computes its own from the pixels", unit="px",
+        low=1e-6, high=1e6,
+    )
+    refined_starts: bool = parameter(
+        False, "photometric also starts from the detector's corners after cv2.cornerSubPix: four "
+        "starts instead of two",
+    )
+    estimate_blur: bool = parameter(
+        False, "photometric also estimates the point spread, starting from believed_blur_px"
+    )
+    believed_fx_px: float | None = parameter(
+        None, f"focal length along x {_ASSUMED}; that along y stays as it is", unit="px",
+        low=1e-3, high=1e9, drawable=True,
+    )
+    believed_fy_px: float | None = parameter(
+        None, f"focal length along y {_ASSUMED}", unit="px", low=1e-3, high=1e9, drawable=True
+    )
+    believed_cx_px: float | None = parameter(
+        None, f"principal point, x, {_ASSUMED}", unit="px", low=-1e9, high=1e9, drawable=True
+    )
+    believed_cy_px: float | None = parameter(
+        None, f"principal point, y, {_ASSUMED}", unit="px", low=-1e9, high=1e9, drawable=True
+    )
+    believed_distortion: tuple[float, ...] | None = parameter(
+        None, f"lens coefficients {_ASSUMED}"
+    )
+    believed_size_m: float | None = parameter(
+        None, f"side of the black square {_ASSUMED}", unit="m", low=1e-9, high=1e9, drawable=True
+    )
+    believed_blur_px: float | None = parameter(
+        None, f"Gaussian point spread {_ASSUMED}", unit="px", low=0, high=1000
+    )
+    believed_noise_grey: float | None = parameter(
+        None, f"noise of a pixel {_ASSUMED}", unit="grey level", low=0, high=1e6
+    )
 
 
 def build(setting: EstimatorSetting) -> PoseEstimator:
-    """Return the estimator that a setting describes: the place to add others of either kind."""
-    if setting.solver == "photometric":
-        return Photometric(setting.refined_starts, setting.estimate_blur)
-    return CornerSolver(setting)
+    """Return the estimator that a setting describes."""
+    return SOLVERS[setting.solver].build(setting)

@@ -1,11 +1,10 @@
 """Pose from pixels: maximum likelihood with the exact image, started from the detector's corners.
 
-The chi-square of a small image has several minima: the two planar solutions, and poses where edges
-fall on wrong pixels. So there are several starts; each is fitted to the means of 2 x 2 pixels
-first, for which the exact model holds as well and whose minima are wider; those that end far above
-the best are dropped, the others are fitted to the pixels; and the best is held against the minimum
-that is reached from its mirror. Where none explains the pixels, the starts are fitted to them
-directly.
+The chi-square of a small image has several minima: the two planar solutions, and poses with edges
+on wrong pixels. So there are several starts. Each is first fitted to the means of 2 x 2 pixels,
+for which the exact model holds as well and whose minima are wider. Starts that end far above the
+best are dropped, the others are fitted to the pixels; the best is compared with the minimum that
+is reached from its mirror. If none explains the pixels, the starts are fitted to them directly.
 """
 
 from __future__ import annotations
@@ -51,16 +50,17 @@ COARSE_STEPS = 15
 FINE_STEPS = 30
 
 HOPELESS = 100.0
-"""Chi-square above the best coarse fit's from which a start is given up."""
+"""Excess of chi-square over the best coarse fit's above which a start is abandoned."""
 
 SAME_TURN_RAD = 1e-3
-"""Coarse fits that differ by less than this are one."""
+"""Coarse fits whose rotations differ by less than this are the same."""
 
 LIKELY_SPREAD_PX = 0.5
-"""The least point spread that its estimation starts from: one of 0 is a minimum of its own."""
+"""Smallest start of an estimated point spread: 0 is a minimum of its own."""
 
 EXCESS = 5.0
-"""Standard deviations of the residuals' variance from which the model does not explain them."""
+"""Deviation of the residuals' variance, in its standard deviations, above which the model does not
+explain the pixels."""
 
 
 @compiled
@@ -81,7 +81,7 @@ def coarse_fit(
 
 @compiled
 def is_settled(chi_square: Floats, states: Floats, k: int) -> bool:
-    """Tell whether the k-th coarse fit is hopeless, or the same as one before it."""
+    """Return whether the k-th coarse fit is hopeless, or the same as an earlier one."""
     if not chi_square[k] < chi_square.min() + HOPELESS:
         return True
     for m in range(k):
@@ -102,19 +102,19 @@ def locate(
     image
         (height, width) grey levels.
     starts
-        (K, 16) states; those that are not before the camera are left out.
+        (K, 16) states; those behind the camera are skipped.
     view
-        What is known beside the pixels.
+        The image's known parameters.
     spread_free
         Whether the point spread is estimated.
     information
-        Overwritten: as :func:`sweep.measure.likelihood.fit` leaves it.
+        Overwritten, as by :func:`sweep.measure.likelihood.fit`.
 
     Returns
     -------
     tuple
-        The state (16,), its chi-square, whether it is a maximum of the likelihood, and the same
-        but for the last of the next best one; NaN where there is none.
+        The state (16,), its chi-square, whether it is a maximum of the likelihood, and state and
+        chi-square of the next best minimum; NaN if there is none.
     """
     count = len(starts)
     coarse, coarse_view = binned(image), binned_view(view)
@@ -131,7 +131,7 @@ def locate(
     work = work_space(image.shape[0], image.shape[1])
     total = squares(image)
     trial_information = np.empty_like(information)
-    found, other = np.full(STATE_LENGTH, math.nan), np.full(STATE_LENGTH, math.nan)
+    best, other = np.full(STATE_LENGTH, math.nan), np.full(STATE_LENGTH, math.nan)
     lowest = next_lowest = math.inf
     reached = False
     freedom = image.size - len(information) - LEVELS
@@ -143,59 +143,64 @@ def locate(
                 continue
             state = states[k].copy()
         elif k == count:
-            state = mirrored_state(found)
+            state = mirrored_state(best)
             if not is_before_camera(state, view):
                 continue
-            # Not worth a fit where it has been found, or where the coarse pixels rule it out.
-            away = turn_between(state, found)
+            # Not worth a fit if it was reached before, or if the coarse pixels rule it out.
+            away = turn_between(state, best)
             if turn_between(state, other) < 0.5 * away:
                 continue
-            tried, best = state.copy(), chi_square.min() + HOPELESS
+            tried, most = state.copy(), chi_square.min() + HOPELESS
             level = coarse_fit(
-                coarse, coarse_total, tried, coarse_view, coarse_work, spread_free, best
+                coarse, coarse_total, tried, coarse_view, coarse_work, spread_free, most
             )
-            if not level < best:
+            if not level < most:
                 continue
-            if turn_between(tried, found) > 0.5 * away:
+            if turn_between(tried, best) > 0.5 * away:
                 state = tried
         else:
-            # The coarse fits of all starts have led astray, or the model is wrong.
+            # The coarse fits misled all starts, or the model is wrong.
             if lowest <= likely:
                 break
             state, worth = starts[k - count - 1].copy(), math.inf
         if not is_before_camera(state, view):
             continue
-        level, done = fit(
+        level, converged = fit(
             image, total, state, view, work, spread_free, FINE_STEPS, SETTLED,
             worth, trial_information,
         )
-        same = turn_between(state, found) < SAME_TURN_RAD
+        same = turn_between(state, best) < SAME_TURN_RAD
         if level < lowest:
             if not same:
-                other[:], next_lowest = found, lowest
-            found[:], lowest, reached = state, level, done
+                other[:], next_lowest = best, lowest
+            best[:], lowest, reached = state, level, converged
             information[:] = trial_information
         elif not same and level < next_lowest:
             other[:], next_lowest = state, level
-    return found, lowest, reached, other, next_lowest
+    return best, lowest, reached, other, next_lowest
 
 
 def explains(chi_square: float, freedom: int, noise_grey: float) -> bool:
-    """Tell whether residuals of an expected chi-square ``freedom`` are those of noise.
+    """Return whether residuals of an expected chi-square ``freedom`` are those of the noise.
 
-    Within :data:`EXCESS` standard deviations, sqrt(2 · freedom). Without noise residuals are those
-    of rounding, which are smaller wherever the levels are whole numbers: only an excess counts.
+    Within :data:`EXCESS` standard deviations, sqrt(2 · freedom). Without noise the residuals are
+    those of rounding, which are smaller if the levels are whole numbers: only an excess counts.
     """
-    away = (chi_square / freedom - 1.0) * math.sqrt(freedom / 2.0)
-    return abs(away) <= EXCESS if noise_grey >= MIN_NOISE else away <= EXCESS
+    deviation = (chi_square / freedom - 1.0) * math.sqrt(freedom / 2.0)
+    return abs(deviation) <= EXCESS if noise_grey >= MIN_NOISE else deviation <= EXCESS
 
 
 @dataclass(frozen=True, slots=True)
 class Photometric:
-    """Maximum likelihood on the pixels, as an estimator.
+    """Maximum likelihood on the pixels as a pose estimator.
 
-    It starts from both planar solutions of the corners as found and, where ``refined``, of these
-    after ``cv2.cornerSubPix``, too; ``spread_free`` tells that the point spread is estimated.
+    Attributes
+    ----------
+    refined
+        Whether it also starts from both planar solutions of the corners after
+        ``cv2.cornerSubPix``, beside those of the corners as detected.
+    spread_free
+        Whether the point spread is estimated.
     """
 
     refined: bool
@@ -203,35 +208,35 @@ class Photometric:
 
     @property
     def needs_images(self) -> bool:
-        """Pixels are what it fits."""
+        """Whether detections must carry their images: yes."""
         return True
 
-    def __call__(self, sightings: Detections) -> Estimates:
-        """Return the poses, with the covariances of the likelihood's own curvature."""
-        count = len(sightings.corners)
+    def __call__(self, detections: Detections) -> Estimates:
+        """Return the poses, with covariances from the curvature of the likelihood."""
+        count = len(detections.corners)
         out = Estimates.none(count, EstimateStatus.solver_failed)
-        sets = [sightings.corners]
+        sets = [detections.corners]
         if self.refined:
-            sets.append(_refined(sightings))
+            sets.append(_refined(detections))
         poses = [
-            both_planar_solutions(corners, sightings.cameras, sightings.size_m)
+            both_planar_solutions(corners, detections.cameras, detections.size_m)
             for corners in sets
         ]
         turns = np.concatenate([rotation for rotation, _ in poses], axis=1)
         shifts = np.concatenate([translation for _, translation in poses], axis=1)
-        windows = _windows(sightings)
+        windows = _windows(detections)
         free = POSE + 1 if self.spread_free else POSE
         for i in range(count):
-            starts = self._starts(turns[i], shifts[i], float(sightings.blur_px[i]))
+            starts = self._starts(turns[i], shifts[i], float(detections.blur_px[i]))
             left, top, right, bottom = windows[i]
             if not len(starts) or right - left < 2 or bottom - top < 2:
                 continue
-            noise = float(sightings.noise_grey[i])
+            noise = float(detections.noise_grey[i])
             view = marker_view(
-                sightings.markers[i], sightings.size_m[i], sightings.cameras.optics(i),
-                sightings.origins[i] + (left, top), noise_variance(noise),
+                detections.markers[i], detections.size_m[i], detections.cameras.optics(i),
+                detections.origins[i] + (left, top), noise_variance(noise),
             )
-            image = sightings.images[i][top:bottom, left:right].astype(np.float64)
+            image = detections.images[i][top:bottom, left:right].astype(np.float64)
             information = np.empty((free, free))
             state, chi_square, reached, other, _ = locate(
                 image, starts, view, self.spread_free, information
@@ -248,16 +253,16 @@ class Photometric:
             )
             out.rotation[i], out.translation[i] = rotation_of(state), state[POSITION]
             out.alternative_rotation[i] = rotation_of(other)
-            out.alternative_reprojection_px[i] = self._reprojection_px(other, sightings, i)
-            out.reprojection_px[i] = self._reprojection_px(state, sightings, i)
-            covariance, found = pose_covariance(information, view.variance, abs(state[DEPTH]))
-            if found:
+            out.alternative_reprojection_px[i] = self._reprojection_px(other, detections, i)
+            out.reprojection_px[i] = self._reprojection_px(state, detections, i)
+            covariance, exists = pose_covariance(information, view.variance, abs(state[DEPTH]))
+            if exists:
                 out.covariance[i] = covariance
             out.residual_ratio[i] = chi_square / freedom
         return out
 
     def _starts(self, rotation: Floats, translation: Floats, spread_px: float) -> Floats:
-        """Return the states (K, 16) of those of (M, 3, 3), (M, 3) that are poses."""
+        """Return the states (K, 16) of the finite ones of M poses (M, 3, 3), (M, 3)."""
         spread = max(spread_px, LIKELY_SPREAD_PX) if self.spread_free else spread_px
         none = np.zeros(LEVELS)
         states = np.array(
@@ -266,46 +271,47 @@ class Photometric:
         return np.asarray(states[np.isfinite(states).all(axis=1)])
 
     @staticmethod
-    def _reprojection_px(state: Floats, sightings: Detections, i: int) -> float:
-        one = np.array([i])
+    def _reprojection_px(state: Floats, detections: Detections, i: int) -> float:
+        """Return the RMS reprojection error of a state over the corners of one detection."""
+        row = np.array([i])
         return float(
             reprojection_errors_px(
-                rotation_of(state)[None], state[None, POSITION], sightings.size_m[one],
-                sightings.corners[one], sightings.cameras.take(one),
+                rotation_of(state)[None], state[None, POSITION], detections.size_m[row],
+                detections.corners[row], detections.cameras.take(row),
             )[0]
         )
 
 
-def _windows(sightings: Detections) -> list[list[int]]:
-    """Return what is fitted of each image: left, top, right, bottom around the quiet zone.
+def _windows(detections: Detections) -> list[list[int]]:
+    """Return the part of each image that is fitted: left, top, right, bottom of the quiet zone.
 
     A share of the corners' extent as wide as the quiet zone, and half of that for perspective.
     """
-    low, high = sightings.corners.min(axis=1), sightings.corners.max(axis=1)
+    low, high = detections.corners.min(axis=1), detections.corners.max(axis=1)
     share = np.array(
-        [1.5 * quiet / module_count(dictionary) for dictionary, _, quiet in sightings.markers]
+        [1.5 * quiet / module_count(dictionary) for dictionary, _, quiet in detections.markers]
     )
     margin = BACKGROUND_MARGIN_PX + share[:, None] * (high - low)
-    sizes = np.array([image.shape[::-1] for image in sightings.images]).reshape(-1, 2)
-    low = np.clip(np.floor(low - margin) - sightings.origins, 0, sizes)
-    high = np.clip(np.ceil(high + margin) + 1 - sightings.origins, 0, sizes)
+    sizes = np.array([image.shape[::-1] for image in detections.images]).reshape(-1, 2)
+    low = np.clip(np.floor(low - margin) - detections.origins, 0, sizes)
+    high = np.clip(np.ceil(high + margin) + 1 - detections.origins, 0, sizes)
     windows: list[list[int]] = np.concatenate([low, high], axis=1).astype(np.int64).tolist()
     return windows
 
 
-def _refined(sightings: Detections) -> Floats:
+def _refined(detections: Detections) -> Floats:
     """Return the corners (N, 4, 2) after ``cv2.cornerSubPix``, its window OpenCV's for markers."""
-    refined = sightings.corners.copy()
-    for i, image in enumerate(sightings.images):
-        corners = sightings.corners[i] - sightings.origins[i]
+    refined = detections.corners.copy()
+    for i, image in enumerate(detections.images):
+        corners = detections.corners[i] - detections.origins[i]
         if not ((corners >= 0) & (corners <= np.array(image.shape[::-1]) - 1)).all():
             continue
         side = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
-        module = side / module_count(sightings.markers[i][0])
+        module = side / module_count(detections.markers[i][0])
         half = min(5, max(1, round(0.3 * module)))
         moved = cv2.cornerSubPix(
             image, np.ascontiguousarray(corners[:, None], dtype=np.float32), (half, half),
             (-1, -1), (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 30, 0.1),
         )
-        refined[i] = moved[:, 0] + sightings.origins[i]
+        refined[i] = moved[:, 0] + detections.origins[i]
     return refined

@@ -14,79 +14,62 @@ from sweep.measure.covariance import corner_covariance
 from sweep.measure.estimation import Detections, Estimates
 from sweep.measure.flags import EstimateStatus
 from sweep.model.camera import Cameras
-from sweep.model.declaration import parameter
 from sweep.model.marker import marker_corners
 from sweep.model.pose import rotation_of_vector, transform_points
 from sweep.typing import Floats
 
-SOLVERS = {
-    "ippe": cv2.SOLVEPNP_IPPE,
-    "ippe_square": cv2.SOLVEPNP_IPPE_SQUARE,
-    "iterative": cv2.SOLVEPNP_ITERATIVE,
-    "sqpnp": cv2.SOLVEPNP_SQPNP,
-    "p3p": cv2.SOLVEPNP_P3P,
-    "ap3p": cv2.SOLVEPNP_AP3P,
-    "epnp": cv2.SOLVEPNP_EPNP,
-}
-
-BELIEVED = "as the estimator believes it (default: the truth)"
-
 
 @dataclass(frozen=True, slots=True)
-class EstimatorSetting:
-    """How the pose is computed from the corners, and what is believed of camera and marker."""
+class OpenCVSolver:
+    """One method of ``cv2.solvePnP``.
 
-    solver: str = parameter(
-        "ippe_square",
-        "OpenCV's solver (epnp is unreliable for a single marker: it is not made for four "
-        "coplanar points), or photometric: maximum likelihood on the pixels, started from ippe",
-        choices=(*SOLVERS, "photometric"),
-    )
-    guarded: bool = parameter(
-        True, "true: called where the solver is stable, checked, and replaced by iterative where "
-        "it fails; false: the plain cv2.solvePnP call (epnp is always called plainly)",
-    )
-    reprojection_limit: float = parameter(
-        0.25, "a solution whose RMS reprojection error is above this share of the found side is "
-        "no solution; at infinity it is 0.7", low=0, high=0.5, open_low=True,
-    )
-    corner_noise_px: float | None = parameter(
-        None, "standard deviation of a found corner's coordinates, of which the solvers' pose "
-        "covariance is made; photometric makes its own from the pixels", unit="px", low=1e-6,
-        high=1e6,
-    )
-    refined_starts: bool = parameter(
-        False, "photometric starts from the detector's corners after cv2.cornerSubPix, too: four "
-        "starts instead of two",
-    )
-    estimate_blur: bool = parameter(
-        False, "photometric estimates the point spread, too, from believed_blur_px on"
-    )
-    believed_fx_px: float | None = parameter(
-        None, f"focal length along x {BELIEVED}; that along y stays as it is", unit="px",
-        low=1e-3, high=1e9, drawable=True,
-    )
-    believed_fy_px: float | None = parameter(
-        None, f"focal length along y {BELIEVED}", unit="px", low=1e-3, high=1e9, drawable=True
-    )
-    believed_cx_px: float | None = parameter(
-        None, f"principal point, x, {BELIEVED}", unit="px", low=-1e9, high=1e9, drawable=True
-    )
-    believed_cy_px: float | None = parameter(
-        None, f"principal point, y, {BELIEVED}", unit="px", low=-1e9, high=1e9, drawable=True
-    )
-    believed_distortion: tuple[float, ...] | None = parameter(
-        None, f"lens coefficients {BELIEVED}"
-    )
-    believed_size_m: float | None = parameter(
-        None, f"side of the black square {BELIEVED}", unit="m", low=1e-9, high=1e9, drawable=True
-    )
-    believed_blur_px: float | None = parameter(
-        None, f"Gaussian point spread {BELIEVED}", unit="px", low=0, high=1000
-    )
-    believed_noise_grey: float | None = parameter(
-        None, f"noise of a pixel {BELIEVED}", unit="grey level", low=0, high=1e6
-    )
+    Attributes
+    ----------
+    method
+        OpenCV's constant.
+    meaning
+        One line for the reference.
+    guarded
+        Whether the guard can call it: it is stable for four coplanar points.
+    planar_only
+        Whether it solves for coplanar points alone.
+    two_solutions
+        Whether it returns both planar solutions.
+    """
+
+    method: int
+    meaning: str
+    guarded: bool = True
+    planar_only: bool = False
+    two_solutions: bool = False
+
+
+OPENCV_SOLVERS = {
+    "ippe": OpenCVSolver(
+        cv2.SOLVEPNP_IPPE, "both planar solutions from the homography", planar_only=True,
+        two_solutions=True,
+    ),
+    "ippe_square": OpenCVSolver(
+        cv2.SOLVEPNP_IPPE_SQUARE, "ippe for the corners of a square", planar_only=True,
+        two_solutions=True,
+    ),
+    "iterative": OpenCVSolver(
+        cv2.SOLVEPNP_ITERATIVE, "Levenberg-Marquardt on the reprojection error, started from the "
+        "homography",
+    ),
+    "sqpnp": OpenCVSolver(cv2.SOLVEPNP_SQPNP, "SQPnP, a quadratic program over rotations"),
+    "p3p": OpenCVSolver(cv2.SOLVEPNP_P3P, "three corners; the fourth selects the solution"),
+    "ap3p": OpenCVSolver(
+        cv2.SOLVEPNP_AP3P, "three corners, algebraic; the fourth selects the solution"
+    ),
+    "epnp": OpenCVSolver(
+        cv2.SOLVEPNP_EPNP, "EPnP, unreliable for a single marker: it is not made for four coplanar "
+        "points", guarded=False,
+    ),
+}
+"""The solvers of OpenCV that estimate a pose from four corners."""
+
+_TWO_SOLUTIONS = {each.method for each in OPENCV_SOLVERS.values() if each.two_solutions}
 
 
 def reprojection_errors_px(
@@ -100,15 +83,16 @@ def reprojection_errors_px(
 def estimate(
     corners: Floats, cameras: Cameras, size_m: Floats, solver: str, guarded: bool, limit: float
 ) -> Estimates:
-    """Estimate N poses from corners (N, 4, 2) px with believed cameras and sizes (N,).
+    """Estimate N poses from corners (N, 4, 2) px with assumed cameras and sizes (N,).
 
     ``limit`` is the largest RMS reprojection error of a solution, as a share of the mean side of
-    the found quadrilateral.
+    the detected quadrilateral.
     """
     # OpenCV raises on strided corners, and the guard would take that for no solution.
     corners = np.ascontiguousarray(corners, dtype=np.float64)
-    call = _guarded if guarded and solver != "epnp" else _plain
-    rotation, translation = call(corners, cameras, size_m, SOLVERS[solver])
+    method = OPENCV_SOLVERS[solver]
+    call = _guarded if guarded and method.guarded else _plain
+    rotation, translation = call(corners, cameras, size_m, method.method)
     reprojection = np.stack(
         [
             reprojection_errors_px(rotation[:, k], translation[:, k], size_m, corners, cameras)
@@ -141,35 +125,47 @@ def estimate(
 
 @dataclass(frozen=True, slots=True)
 class CornerSolver:
-    """OpenCV's solvers as estimators: poses from corners alone."""
+    """An OpenCV solver as a pose estimator: poses from corners alone.
 
-    setting: EstimatorSetting
+    Attributes
+    ----------
+    solver
+        A key of :data:`OPENCV_SOLVERS`.
+    guarded, reprojection_limit
+        As :func:`estimate` takes them.
+    corner_noise_px
+        Standard deviation of a corner's coordinates for the poses' covariances; None for none.
+    """
+
+    solver: str
+    guarded: bool
+    reprojection_limit: float
+    corner_noise_px: float | None
 
     @property
     def needs_images(self) -> bool:
-        """Corners are all that it looks at."""
+        """Whether detections must carry their images: no."""
         return False
 
-    def __call__(self, sightings: Detections) -> Estimates:
-        """Return the poses, with covariances where the corners' noise is told."""
-        setting = self.setting
-        found = estimate(
-            sightings.corners, sightings.cameras, sightings.size_m, setting.solver,
-            setting.guarded, setting.reprojection_limit,
+    def __call__(self, detections: Detections) -> Estimates:
+        """Return the poses, with covariances if the corners' noise is given."""
+        estimates = estimate(
+            detections.corners, detections.cameras, detections.size_m, self.solver, self.guarded,
+            self.reprojection_limit,
         )
-        if setting.corner_noise_px is None:
-            return found
+        if self.corner_noise_px is None:
+            return estimates
         covariance = corner_covariance(
-            found.rotation, found.translation, sightings.cameras, sightings.size_m,
-            setting.corner_noise_px,
+            estimates.rotation, estimates.translation, detections.cameras, detections.size_m,
+            self.corner_noise_px,
         )
-        return dataclasses.replace(found, covariance=covariance)
+        return dataclasses.replace(estimates, covariance=covariance)
 
 
 def both_planar_solutions(
     corners: Floats, cameras: Cameras, size_m: Floats
 ) -> tuple[Floats, Floats]:
-    """Return IPPE's rotations (N, 2, 3, 3) and translations (N, 2, 3), guarded; NaN for none."""
+    """Return IPPE's rotations (N, 2, 3, 3) and translations (N, 2, 3), guarded; NaN if missing."""
     corners = np.ascontiguousarray(corners, dtype=np.float64)
     return _guarded(corners, cameras, size_m, cv2.SOLVEPNP_IPPE)
 
@@ -184,12 +180,12 @@ def _plain(
     for i in range(count):
         distortion = cameras.lenses[i, :14] if cameras.distorted[i] else None
         try:
-            found, r, t = cv2.solvePnP(
+            success, r, t = cv2.solvePnP(
                 objects[i], corners[i], cameras.matrix(i), distortion, flags=method
             )
         except cv2.error:
             continue
-        if found:
+        if success:
             rvec[i, 0], translation[i, 0] = r[:, 0], t[:, 0]
     return rotation_of_vector(rvec), translation
 
@@ -203,13 +199,13 @@ def _plain(
 # 0.01° (tests/test_guards.py), so corners are undistorted before.
 
 _UNIT_SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
-"""Corners BL, BR, TR, TL (the order that IPPE_SQUARE wants) in the marker's frame turned z in."""
+"""Corners BL, BR, TR, TL (IPPE_SQUARE's order) in the marker's frame turned z in."""
 
 _Z_OUT = np.array([1.0, -1.0, -1.0])
 
 _CREDIBLE_SHARE = 0.05
-"""Reprojection errors below this share of the side are taken as they are; wrong solutions lie far
-above it. Beyond it a solution must hold its own against ITERATIVE."""
+"""Solutions with a reprojection error below this share of the side are accepted; wrong solutions
+lie far above it. Others are compared with ITERATIVE's."""
 
 _CREDIBLE_RATIO = 2.0
 """The largest ratio of a solution's reprojection error to that of ITERATIVE."""
@@ -220,8 +216,7 @@ def _guarded(
 ) -> tuple[Floats, Floats]:
     """Solve where the solver is stable: undistorted corners, unit side, z in, roll within 45°.
 
-    Returns both solutions' rotations (N, 2, 3, 3) and translations (N, 2, 3), NaN where there is
-    none.
+    Returns both solutions' rotations (N, 2, 3, 3) and translations (N, 2, 3), NaN if missing.
     """
     pixels = corners
     if cameras.distorted.any():
@@ -244,8 +239,7 @@ def _guarded(
     def errors(rows: NDArray[np.intp], r: Floats, t: Floats) -> Floats:
         return reprojection_errors_px(r, t, unit[rows], pixels[rows], pinhole.take(rows))
 
-    everyone = np.arange(len(points))
-    error = errors(everyone, rotation[:, 0], translation[:, 0])
+    error = errors(np.arange(len(points)), rotation[:, 0], translation[:, 0])
     with np.errstate(invalid="ignore"):
         doubtful = ~(error <= _CREDIBLE_SHARE * side)
     doubtful &= np.isfinite(points).all(axis=(1, 2))
@@ -274,34 +268,34 @@ def _guarded(
 def _solve_turned(
     points: Floats, matrices: Floats, turns: NDArray[np.int64], method: int
 ) -> tuple[Floats, Floats]:
-    """Solve with the corners' labels turned by quarter ``turns`` (n,), and turn the result back.
+    """Solve with the corners' labels turned by quarter ``turns`` (n,), and undo the turn.
 
     Points (n, 4, 2) are BL, BR, TR, TL in undistorted pixels. Returns rotations (n, 2, 3, 3) of
     the marker frame and translations (n, 2, 3) in sides.
     """
     count = len(points)
-    nothing = np.full((3, 1), np.nan)
+    missing = np.full((3, 1), np.nan)
     order = (np.arange(4) + turns[:, None]) % 4
     turned = np.take_along_axis(points, order[:, :, None], axis=1)
     vectors: list[Any] = []
-    both = method in (cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_IPPE_SQUARE)
+    both = method in _TWO_SOLUTIONS
     for pixels, matrix in zip(turned, matrices, strict=True):
         try:
             if both:
-                found, rs, ts, _ = cv2.solvePnPGeneric(
+                success, rs, ts, _ = cv2.solvePnPGeneric(
                     _UNIT_SQUARE, pixels, matrix, None, flags=method
                 )
             else:
-                found, r, t = cv2.solvePnP(_UNIT_SQUARE, pixels, matrix, None, flags=method)
+                success, r, t = cv2.solvePnP(_UNIT_SQUARE, pixels, matrix, None, flags=method)
                 rs, ts = (r,), (t,)
         except cv2.error:
-            found = False
-        if not found:
-            vectors += [nothing] * 4
+            success = False
+        if not success:
+            vectors += [missing] * 4
         elif len(rs) > 1:
             vectors += [rs[0], rs[1], ts[0], ts[1]]
         else:
-            vectors += [rs[0], nothing, ts[0], nothing]
+            vectors += [rs[0], missing, ts[0], missing]
     solved = np.concatenate(vectors).reshape(count, 2, 2, 3) if vectors else np.empty((0, 2, 2, 3))
     rotation, translation = rotation_of_vector(solved[:, 0]), solved[:, 1]
     c, s = np.array([1.0, 0.0, -1.0, 0.0])[turns], np.array([0.0, 1.0, 0.0, -1.0])[turns]

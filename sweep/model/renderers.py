@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model import coverage, drawing
+from sweep.model.effects import POINTWISE, Patch, apply_pointwise
 from sweep.model.exposure import marker_exposure
 from sweep.model.extent import WARP_PX_PER_MODULE
 from sweep.model.image_file import decode_grey
 from sweep.model.marker import edge_table, edges, modules
 from sweep.model.scene import Box, Scenes
-from sweep.model.sensor import Light, Readout, illuminate, read_out
+from sweep.model.sensor import Light, Readout, add_noise, digitise, illuminate, read_out
 from sweep.model.supersampling import SampledMarker, supersample
 
 Grey = NDArray[np.uint8]
@@ -120,7 +121,7 @@ def _exposed(
 
 
 def _sensed(scenes: Scenes, row: int, levels: NDArray[np.float64], left: int, top: int) -> Grey:
-    """Return what the sensor makes of levels (h, w), whose top left pixel is given."""
+    """Return the sensor's image of light levels (h, w), whose top left pixel is (left, top)."""
     effect = scenes.effect(row)
     width, height = scenes.frame[row].tolist()
     slope = effect["illumination_gradient"] / width
@@ -131,12 +132,20 @@ def _sensed(scenes: Scenes, row: int, levels: NDArray[np.float64], left: int, to
             effect["vignetting"],
         )
         illuminate(levels, left, top, light, scenes.cameras.view[row])
+    patch = Patch(
+        effect, left, top, (width, height), scenes.cameras.view[row], scenes.noise_key[row]
+    )
+    levels = apply_pointwise("light", levels, patch)
     image = np.empty(levels.shape, dtype=np.uint8)
     readout = Readout(
         scenes.noise_key[row], effect["full_well_e"], effect["read_noise_e"], effect["gain"],
         effect["noise_grey"], int(effect["bit_depth"]),
     )
-    read_out(levels, left, top, readout, image)
+    if any(each.step == "signal" for each in POINTWISE):
+        add_noise(levels, left, top, readout)
+        digitise(apply_pointwise("signal", levels, patch), readout.bits, image)
+    else:
+        read_out(levels, left, top, readout, image)
     return image
 
 

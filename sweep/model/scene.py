@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -15,7 +13,7 @@ from sweep.model import lens as lens_model
 from sweep.model.camera import VIEW_PARAMETERS, Cameras, intrinsics
 from sweep.model.columns import Column, map_columns
 from sweep.model.declaration import parameter
-from sweep.model.effects import NEUTRAL, SWITCHES, VELOCITIES, Effects
+from sweep.model.effects import EFFECTS, NEUTRAL, SWITCHES, VELOCITIES, is_active
 from sweep.model.marker import MarkerKey, marker_corners, module_count
 from sweep.model.pose import rotation_of_angles, transform_points
 from sweep.model.projection import Projection
@@ -78,8 +76,8 @@ class Scenes:
     plain
         (N,) whether the image is an exact one on a background of one level, without effects.
     effects, affected, noise_key
-        (N,) each: every parameter of :class:`Effects`, NaN for none (``effects`` is None where
-        none is active in any of the scenes), whether one is active, and the key of the noise.
+        (N,) each: every parameter of the effects, NaN if not given (``effects`` is None if no
+        effect is active in any of the scenes), whether one is active, and the key of the noise.
     corners_px, outline_px
         (N, 4, 2) images of the black square's and of the quiet zone's corners; NaN at z <= 0.
     """
@@ -112,17 +110,23 @@ class Scenes:
     @property
     def noisy(self) -> NDArray[np.bool_]:
         """Whether a scene's pixels have noise, (N,)."""
-        if self.effects is None:
-            return self.affected
-        return (self.effects["noise_grey"] > 0) | ~np.isnan(self.effects["full_well_e"])
+        return self._any_active("noise")
 
     @property
     def uneven_gain(self) -> Floats:
-        """How much stronger than drawn a scene's uneven light is, (N,): 0 where light is even."""
+        """Amplification of uneven light in each scene, at least 1; 0 if the light is even."""
         if self.effects is None:
             return np.zeros(len(self))
-        uneven = (self.effects["illumination_gradient"] != 0) | (self.effects["vignetting"] > 0)
+        uneven = self._any_active("uneven light")
         return np.where(uneven, np.maximum(self.effects["gain"], 1.0), 0.0)
+
+    def _any_active(self, widens: str) -> NDArray[np.bool_]:
+        """Return whether an effect that widens the windows in this way is active, (N,)."""
+        active = np.zeros(len(self), dtype=bool)
+        for effect in EFFECTS:
+            if effect.widens == widens and self.effects is not None:
+                active |= is_active(effect.switch, self.effects[effect.switch])
+        return active
 
     def projection(self, row: int) -> Projection:
         """Return the camera and the marker's plane of one scene as compiled functions take them."""
@@ -139,10 +143,7 @@ class Scenes:
         if not self.affected[row]:
             return []
         effect = self.effect(row)
-        return [
-            name for name, off in SWITCHES.items()
-            if not (math.isnan(effect[name]) if off is None else effect[name] == off)
-        ]
+        return [name for name in SWITCHES if is_active(name, effect[name])]
 
     def motion(self, row: int) -> tuple[float, float, Floats] | None:
         """Return exposure and row time in s and the velocity (6,), m/s and rad/s; None at rest."""
@@ -239,12 +240,9 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
     )
     effects, affected = None, np.zeros(count, dtype=bool)
     if any(column(name).differs_from(off) for name, off in SWITCHES.items()):
-        effects = {
-            field.name: numbers(field.name) for field in dataclasses.fields(Effects)
-        }
-        for name, off in SWITCHES.items():
-            strength = effects[name]
-            affected |= ~np.isnan(strength) if off is None else strength != off
+        effects = {name: numbers(name) for name in NEUTRAL}
+        for name in SWITCHES:
+            affected |= is_active(name, effects[name])
     plain = np.array(
         mapped(lambda name, level: name == "exact" and not isinstance(level, str),
                "renderer", "background"), dtype=bool,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 from sweep.measure.detector import (
     NOISE_MARGIN_PX,
@@ -10,8 +11,9 @@ from sweep.measure.detector import (
     full_frame_reason,
     margin_px,
 )
+from sweep.measure.estimators import SOLVERS
 from sweep.model.camera import canonical_distortion
-from sweep.model.effects import RANDOM, SWITCHES, is_on
+from sweep.model.effects import EFFECTS, RANDOM, SWITCHES, is_on
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings
 from sweep.plan.parameters import PARAMETERS
@@ -30,19 +32,7 @@ class Part:
     switch: str = ""
 
 
-EFFECTS = {
-    "occlusion": "occlusion",
-    "illumination_gradient": "uneven light",
-    "exposure_s": "motion blur",
-    "row_time_s": "rolling shutter",
-    "blur_px": "optical blur",
-    "aperture_mm": "defocus",
-    "vignetting": "vignetting",
-    "full_well_e": "shot noise",
-    "gain": "gain",
-    "noise_grey": "grey noise",
-    "bit_depth": "bit depth",
-}
+EFFECT_LABELS = {effect.switch: effect.label for effect in EFFECTS}
 """Switch of an effect -> its name, in physical order."""
 
 
@@ -66,7 +56,7 @@ def parts(pipeline: Pipeline) -> list[Part]:
         draws.append("jitter_px")
     draws += [
         name for name in RANDOM
-        if name not in draws and pipeline.any_value(name, lambda value: value > 0)
+        if name not in draws and pipeline.any_value(name, partial(is_on, name))
     ]
     renderers = sorted(set(pipeline.values_of("renderer")))
     image = pipeline.any_value("background", lambda value: isinstance(value, str))
@@ -75,8 +65,9 @@ def parts(pipeline: Pipeline) -> list[Part]:
     whole = sorted({reason for s in settings if (reason := full_frame_reason(s)) is not None})
     gain = max([1.0, *(value for value in pipeline.values_of("gain"))])
     uneven = any(
-        pipeline.any_value(name, lambda value: value != 0) or name in pipeline.distributions
-        for name in ("illumination_gradient", "vignetting")
+        pipeline.any_value(effect.switch, partial(is_on, effect.switch))
+        or effect.switch in pipeline.distributions
+        for effect in EFFECTS if effect.widens == "uneven light"
     )
     if uneven and any(s.adaptiveThreshConstant < UNEVEN_LIGHT_CONSTANT * gain for s in settings):
         whole.append("adaptiveThreshConstant is low for uneven light")
@@ -84,8 +75,8 @@ def parts(pipeline: Pipeline) -> list[Part]:
         whole.append("the background is an image: clutter near the marker may change what is found")
     if asked:
         whole.append('window = "full"')
-    random = any(name in draws for name in RANDOM)
-    noise = f", and {NOISE_MARGIN_PX} more for noise" if random else ""
+    noisy = any(effect.switch in draws for effect in EFFECTS if effect.widens == "noise")
+    noise = f", and {NOISE_MARGIN_PX} more for noise" if noisy else ""
     margins = sorted({margin_px(setting) for setting in settings})
     guarded = pipeline.any_value("guarded", bool)
     beliefs = [
@@ -93,7 +84,7 @@ def parts(pipeline: Pipeline) -> list[Part]:
         if name.startswith("believed_") and pipeline.fixed.get(name, "varies") is not None
     ]
     bounds = sorted(set(pipeline.values_of("bound")) - {"none"})
-    pixels = "photometric" in pipeline.values_of("solver")
+    pixels = [name for name in pipeline.values_of("solver") if SOLVERS[name].needs_images]
     return [
         Part("lens distortion", lens, "distortion is given" if lens else "distortion is empty"),
         Part("random draws", bool(draws), ", ".join(draws) if draws else "nothing is random"),
@@ -105,7 +96,7 @@ def parts(pipeline: Pipeline) -> list[Part]:
         ),
         Part("full frame", bool(whole), "; ".join(whole) if whole else "no setting needs it"),
         Part("renderer", True, ", ".join(renderers)),
-        *(_effect(pipeline, name, switch) for switch, name in EFFECTS.items()),
+        *(_effect(pipeline, name, switch) for switch, name in EFFECT_LABELS.items()),
         Part(
             "solver guard", guarded,
             "guarded = true" if guarded else "guarded = false: plain cv2.solvePnP",
@@ -115,8 +106,8 @@ def parts(pipeline: Pipeline) -> list[Part]:
             f"bound is {', '.join(bounds)}" if bounds else "bound is none",
         ),
         Part(
-            "pixels kept", pixels,
-            "solver photometric fits them" if pixels else "no estimator looks at them",
+            "pixels kept", bool(pixels),
+            f"solver {', '.join(pixels)} needs them" if pixels else "no solver needs them",
         ),
         Part(
             "mistaken beliefs", bool(beliefs),

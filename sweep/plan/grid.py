@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.measure.detector import DetectorSetting
-from sweep.measure.solver import EstimatorSetting
+from sweep.measure.estimators import EstimatorSetting
 from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion, intrinsics
 from sweep.model.columns import Column
 from sweep.model.effects import RANDOM, SWITCHES

@@ -12,7 +12,7 @@ from typing import Any
 
 from sweep.measure.bound import BoundSetting
 from sweep.measure.detector import DetectorSetting
-from sweep.measure.solver import EstimatorSetting
+from sweep.measure.estimators import EstimatorSetting
 from sweep.model.camera import Camera
 from sweep.model.declaration import Declaration
 from sweep.model.effects import Effects

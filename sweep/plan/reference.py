@@ -13,10 +13,10 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+from sweep.measure.estimators import SOLVERS
 from sweep.measure.flags import Flag
 from sweep.messages import label, nearest
-from sweep.model.effects import SWITCHES
-from sweep.plan.active_parts import EFFECTS
+from sweep.model.effects import EFFECTS
 from sweep.plan.parameters import PARAMETERS, SECTIONS, Parameter
 from sweep.plan.schema import SCHEMA, Variable
 
@@ -123,17 +123,30 @@ def flag_tables() -> str:
 
 def solver_table() -> str:
     """Return the choices of the estimator's ``solver``."""
-    choices = PARAMETERS["solver"].declaration.choices
-    return markdown_table(["solver"], [[f"`{name}`"] for name in choices])
+    return markdown_table(
+        ["solver", "meaning", "from", "guarded"],
+        [
+            [f"`{name}`", solver.meaning, "pixels" if solver.needs_images else "corners",
+             "yes" if solver.guarded else "no"]
+            for name, solver in SOLVERS.items()
+        ],
+    )
 
 
 def effect_table() -> str:
     """Return the effects in physical order: name, the parameter that switches it on, meaning."""
     rows = []
-    for switch, name in EFFECTS.items():
-        neutral = "not given" if SWITCHES[switch] is None else f"{SWITCHES[switch]:g}"
-        rows.append([name, f"`{switch}`", neutral, PARAMETERS[switch].declaration.meaning])
-    return markdown_table(["effect", "switched on by", "absent at", "meaning"], rows)
+    for effect in EFFECTS:
+        neutral = "not given" if effect.off is None else f"{effect.off:g}"
+        rows.append([
+            effect.label, f"`{effect.switch}`", neutral, effect.step,
+            "yes" if effect.random else "no", "yes" if effect.in_bound else "no",
+            PARAMETERS[effect.switch].declaration.meaning,
+        ])
+    return markdown_table(
+        ["effect", "switched on by", "absent at", "acts on", "random", "in the bound", "meaning"],
+        rows,
+    )
 
 
 TABLES: dict[str, Callable[[], str]] = {

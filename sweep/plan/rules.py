@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 
 from sweep.measure.detector import DetectorSetting
-from sweep.model.effects import GEOMETRIC, RANDOM, VELOCITIES, is_on
+from sweep.model.effects import GEOMETRIC, NEEDS, RANDOM, is_on
 from sweep.model.image_file import MAX_PIXELS
 from sweep.model.marker import marker_count
 from sweep.plan.axes import TRIAL
@@ -78,36 +78,14 @@ def is_active(reading: Reading, switch: str) -> bool:
     return any(is_on(switch, value) for value in values)
 
 
-def motion_needs_time(reading: Reading) -> None:
-    """Demand a velocity beside an exposure or row time, and the other way round."""
-    moving = [
-        name for name in VELOCITIES
-        if name in reading.distributions
-        or any(reading.values(name) or [name in reading.given])
-    ]
-    for name in ("exposure_s", "row_time_s"):
-        if is_active(reading, name) and not reading.given.intersection(VELOCITIES):
-            reading.fault(
-                f"scene.{name}", reading.written(name),
-                f"a velocity beside it: {', '.join(VELOCITIES)}",
-            )
-    for name in moving:
-        if not reading.given.intersection(("exposure_s", "row_time_s")):
-            reading.fault(
-                f"scene.{name}", reading.written(name), "exposure_s or row_time_s beside it"
-            )
-
-
 def effects_need_partners(reading: Reading) -> None:
     """Demand the parameters without which an effect's parameter has no meaning."""
-    for name, other in (
-        ("aperture_mm", "focus_distance_m"), ("focus_distance_m", "aperture_mm"),
-        ("read_noise_e", "full_well_e"),
-    ):
-        off = PARAMETERS[name].default
-        given = name in reading.distributions or any(v != off for v in reading.values(name))
-        if given and other not in reading.given:
-            reading.fault(f"scene.{name}", reading.written(name), f"{other} beside it")
+    for name, others in NEEDS.items():
+        values, off = reading.values(name), PARAMETERS[name].default
+        wanted = any(value != off for value in values) if values else name in reading.given
+        if wanted and not reading.given.intersection(others):
+            partner = " or ".join(others) if len(others) < 3 else f"one of {', '.join(others)}"
+            reading.fault(f"scene.{name}", reading.written(name), f"{partner} beside it")
 
 
 def effects_need_the_exact_renderer(reading: Reading) -> None:
@@ -194,7 +172,6 @@ RULES: tuple[Callable[[Reading], None], ...] = (
     distance_or_side,
     camera_in_one_unit,
     ids_in_dictionary,
-    motion_needs_time,
     effects_need_partners,
     effects_need_the_exact_renderer,
     threshold_windows_in_order,

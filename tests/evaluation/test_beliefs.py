@@ -43,14 +43,14 @@ from support.lengths import lengths
 from sweep.evaluation.estimation import assumed_cameras
 from sweep.measure.accuracy import pose_error
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.measure.solver import SOLVERS, estimate
+from sweep.measure.solver import OPENCV_SOLVERS, estimate
 from sweep.model.scene import build_scenes
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices, estimators, scene_axes, scene_values
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import SCHEMA
 
-GUARDED = tuple(name for name in SOLVERS if name != "epnp")  # epnp cannot be guarded
+GUARDED = tuple(name for name in OPENCV_SOLVERS if name != "epnp")  # epnp cannot be guarded
 LEAST_SQUARES = ("iterative", "sqpnp")
 IPPE = ("ippe", "ippe_square")
 

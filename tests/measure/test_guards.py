@@ -30,7 +30,7 @@ from sweep.measure import accuracy
 from sweep.measure.accuracy import pose_error
 from sweep.measure.detector import DetectorSetting, margin_px
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.measure.solver import SOLVERS, estimate
+from sweep.measure.solver import OPENCV_SOLVERS, estimate
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.pose import rotation_of_vector, vector_of_rotation
@@ -40,7 +40,7 @@ from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
 
 FOCAL_PX = 1600 / 3
 SQUARE = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5, -0.5, 0]])
-RELIABLE = tuple(name for name in SOLVERS if name != "epnp")
+RELIABLE = tuple(name for name in OPENCV_SOLVERS if name != "epnp")
 
 
 def whole(pipeline):
@@ -312,7 +312,7 @@ def opencv_solve(corners, solver):
     for i, quad in enumerate(corners):
         try:
             solved[i], vector, centre = cv2.solvePnP(
-                0.05 * SQUARE, quad, view, None, flags=SOLVERS[solver]
+                0.05 * SQUARE, quad, view, None, flags=OPENCV_SOLVERS[solver].method
             )
         except cv2.error:
             continue
@@ -362,7 +362,7 @@ def check_solutions(solve, solver, corners_by_kind):
 
 
 @lengths(10, 500)
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", OPENCV_SOLVERS)
 def test_no_worthless_solution_passes_as_solved(count, solver):
     """Of 10 kinds of 500 quadrilaterals that no marker gave, OpenCV calls a success
 
@@ -421,7 +421,7 @@ def test_solver_that_returns_nonsense_has_failed(fault, guarded, monkeypatch):
         assert solve(corners, solver)[0].all(), solver
     monkeypatch.setattr(cv2, "solvePnP", faulty)
     monkeypatch.setattr(cv2, "solvePnPGeneric", faulty_generic)
-    for solver in SOLVERS:
+    for solver in OPENCV_SOLVERS:
         solved, rotation, translation = solve(corners, solver)
         assert not solved.any(), solver
         assert np.isnan(rotation).all(), solver

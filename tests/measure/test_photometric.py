@@ -727,7 +727,7 @@ def test_a_sighting_does_not_depend_on_its_window(monkeypatch):
     seen = sightings_of(monkeypatch, 6)
     estimator = Photometric(refined=True, spread_free=False)
     whole = estimator(seen)
-    one_by_one = Estimates.joined([estimator(seen.take(np.array([i]))) for i in range(6)])
+    one_by_one = Estimates.concatenate([estimator(seen.take(np.array([i]))) for i in range(6)])
     assert all(
         same(getattr(whole, field.name), getattr(one_by_one, field.name))
         for field in dataclasses.fields(Estimates)

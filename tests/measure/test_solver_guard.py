@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 from support.lengths import lengths
 from sweep.measure.accuracy import pose_error
 from sweep.measure.flags import EstimateStatus
-from sweep.measure.solver import SOLVERS, estimate
+from sweep.measure.solver import OPENCV_SOLVERS, estimate
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.plan.parameters import PARAMETERS
 
-RELIABLE = tuple(name for name in SOLVERS if name != "epnp")
+RELIABLE = tuple(name for name in OPENCV_SOLVERS if name != "epnp")
 FOCAL_PX = 1600 / 3
 SQUARE = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5, -0.5, 0]])
 LENS = (-0.3, 0.1, 0.0, 0.0)
@@ -113,7 +113,7 @@ def test_epnp_is_unreliable_and_says_so(count):
     failed = wrong(view, view.estimates("epnp", guarded=True))
     print(f"\nepnp: {failed.sum()} of {len(view)} wrong")
     assert failed.mean() > 0.25
-    assert "epnp is unreliable" in PARAMETERS["solver"].declaration.meaning
+    assert "epnp: EPnP, unreliable" in PARAMETERS["solver"].declaration.meaning
 
 
 @lengths(45, 15)
@@ -144,7 +144,7 @@ def test_relative_errors_are_the_same_at_millimetres_and_kilometres(solver):
         np.testing.assert_allclose(estimates.reprojection_px, middle.reprojection_px, atol=1e-6)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", OPENCV_SOLVERS)
 def test_other_planar_solution_is_there_for_the_solvers_that_give_both(solver):
     view = View(37, (12.0, -9.0))  # no multiple of a right angle: the guard needs no fallback
     estimates = view.estimates(solver, guarded=True)
@@ -219,7 +219,7 @@ def garbage(count):
 @pytest.mark.parametrize("lens", [(), LENS, (-0.5, 0.0, 0.0, 0.0)], ids=["none", "mild", "folds"])
 @pytest.mark.parametrize("guarded", [True, False], ids=["guarded", "plain"])
 def test_garbage_is_solved_in_front_of_the_camera_or_not_at_all(count, guarded, lens):
-    for (kind, corners), solver in itertools.product(garbage(count).items(), SOLVERS):
+    for (kind, corners), solver in itertools.product(garbage(count).items(), OPENCV_SOLVERS):
         estimates = estimate(
             corners, cameras(count, lens), np.full(count, 0.05), solver, guarded, 0.25
         )

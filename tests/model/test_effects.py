@@ -944,10 +944,12 @@ BROKEN = {
     "blur that is no number": ("blur_px = nan", "scene.blur_px = nan: expected a number"),
     "blur of 1001 px": ("blur_px = 1001", "scene.blur_px = 1001: expected a number from 0 to 1000"),
     "exposure without a velocity": (
-        "exposure_s = 0.1", "scene.exposure_s = 0.1: expected a velocity beside it: velocity_x_m_s",
+        "exposure_s = 0.1",
+        "scene.exposure_s = 0.1: expected one of velocity_x_m_s, velocity_y_m_s",
     ),
     "rows without a velocity": (
-        "row_time_s = 1e-3", "scene.row_time_s = 0.001: expected a velocity beside it",
+        "row_time_s = 1e-3",
+        "scene.row_time_s = 0.001: expected one of velocity_x_m_s, velocity_y_m_s",
     ),
     "a velocity without an exposure": (
         "velocity_x_m_s = 1",

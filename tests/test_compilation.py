@@ -1,0 +1,121 @@
+"""Compiled code: cached by content, for this package alone, wherever a folder is writable."""
+
+from __future__ import annotations
+
+import ast
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from sweep import compilation
+
+TOP = Path(compilation.__file__).parent.parent
+UNIT = "from sweep.model.supersampling import _unit; print(_unit(5), _unit.py_func(5))"
+"""Compiles little: a function of one file that calls one of another."""
+
+
+def run(script, top=TOP, **environment):
+    variables = {k: v for k, v in os.environ.items() if not k.startswith("NUMBA_")}
+    variables |= {"PYTHONPATH": str(top), **environment}
+    variables = {name: value for name, value in variables.items() if value is not None}
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=variables, capture_output=True, text=True, check=False,
+        cwd="/",
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+def test_functions_and_settings_of_the_caller_are_untouched(tmp_path):
+    (tmp_path / "mine.py").write_text(
+        "import numba\n@numba.njit(cache=True)\ndef twice(x):\n    return 2 * x\n"
+    )
+    before, after, value, folder = run(
+        "import numba; before = numba.config.CACHE_DIR; import mine, sweep.model.supersampling as s"
+        "; s._unit(1); print(repr(before), repr(numba.config.CACHE_DIR), mine.twice(3),"
+        " mine.twice.stats.cache_path)",
+        top=f"{TOP}{os.pathsep}{tmp_path}",
+    )
+    assert (before, after, value) == ("''", "''", "6")
+    assert Path(folder) == tmp_path / "__pycache__"
+    assert list(Path(folder).glob("mine.twice*.nbc"))
+
+
+def test_folder_of_the_environment_is_used(tmp_path):
+    run(UNIT, NUMBA_CACHE_DIR=str(tmp_path))
+    (folder,) = tmp_path.iterdir()
+    assert folder.name == f"compiled-{compilation.sources_digest()}"
+    assert list(folder.glob("supersampling._unit*.nbc"))
+
+
+def test_code_compiled_from_an_older_version_of_another_file_is_not_used(tmp_path):
+    package, cached = tmp_path / "package", str(tmp_path / "cached")
+    ignored = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(TOP / "sweep", package / "sweep", ignore=ignored)
+    first, _ = run(UNIT, top=package, NUMBA_CACHE_DIR=cached)
+    other = package / "sweep" / "model" / "splitmix.py"
+    text = other.read_text()
+    assert "np.uint64(31)" in text
+    other.write_text(text.replace("np.uint64(31)", "np.uint64(29)"))
+    second, interpreted = run(UNIT, top=package, NUMBA_CACHE_DIR=cached)
+    assert second != first
+    assert float(second) == float(interpreted)
+
+
+def test_read_only_package_without_a_home_uses_a_private_temporary_folder(tmp_path):
+    script = (
+        "import os, pathlib\n"
+        "def home(): raise RuntimeError('Could not determine home directory.')\n"
+        "pathlib.Path.home = home\n"
+        f"os.access = lambda path, mode: str(path).startswith({str(tmp_path)!r})\n"
+    )
+    first, _ = run(script + UNIT, TMPDIR=str(tmp_path), HOME=None)
+    (folder,) = tmp_path.iterdir()
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert list(folder.glob("compiled-*/supersampling._unit*.nbc"))
+    assert run(script + UNIT, TMPDIR=str(tmp_path), HOME=None)[0] == first
+    # Others may have put something into a folder that they can write to: it is not loaded.
+    folder.chmod(0o777)
+    (path,) = run(script + "from sweep import compilation; print(compilation.cache_folder())",
+                  TMPDIR=str(tmp_path), HOME=None)
+    assert path == "None"
+    assert run(script + UNIT, TMPDIR=str(tmp_path), HOME=None)[0] == first
+
+
+def test_damaged_cache_costs_a_compilation_and_nothing_else(tmp_path):
+    first = run(UNIT, NUMBA_CACHE_DIR=str(tmp_path))
+    files = [path for path in tmp_path.rglob("*.nb?") if path.is_file()]
+    assert files
+    for path in files:
+        path.write_bytes(b"")
+    assert run(UNIT, NUMBA_CACHE_DIR=str(tmp_path)) == first
+
+
+def test_what_compiled_code_uses_is_declared_in_the_sources_of_the_digest():
+    sources = compilation.compiled_sources()
+    modules = {
+        ".".join(path.relative_to(TOP).with_suffix("").parts): ast.parse(path.read_text())
+        for path in sources
+    }
+    for name, tree in modules.items():
+        imported = {}
+        for node in tree.body:
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("sweep"):
+                for alias in node.names:
+                    whole = f"{node.module}.{alias.name}"
+                    origin = whole if whole in modules else node.module
+                    imported[alias.asname or alias.name] = origin
+        functions = [
+            node for node in tree.body if isinstance(node, ast.FunctionDef)
+            and any(isinstance(d, ast.Name) and d.id == "compiled" for d in node.decorator_list)
+        ]
+        for function in functions:
+            # Annotations are never evaluated; only what the body uses is compiled.
+            used = {
+                node.id for statement in function.body for node in ast.walk(statement)
+                if isinstance(node, ast.Name)
+            } - {argument.arg for argument in function.args.args}
+            for origin in {imported[each] for each in used & imported.keys()}:
+                assert origin in modules, f"{name}.{function.name} uses {origin}"

@@ -491,7 +491,7 @@ def _verify(chosen: argparse.Namespace) -> int:
 
         found = verify(chosen.store, chosen.sample)
     if chosen.json:
-        _print_json(dataclasses.asdict(found))
+        _print_json(found.to_json())
         return 1 if found.damage else 0
     from sweep.messages import plain  # noqa: PLC0415
 

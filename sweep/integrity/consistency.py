@@ -1,4 +1,8 @@
-"""Whether a block's flags and numbers agree: what a flag says is there is, and nothing else."""
+"""Whether a block's flags and numbers agree: a number exists exactly where its flag says so.
+
+Which flag governs which number is declared with the variables (``Variable.present_when``), and
+beside which flags numbers exist with the flags (``Flag.present``).
+"""
 
 from __future__ import annotations
 
@@ -8,104 +12,118 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
+from sweep.measure.flags import (
+    BoundStatus,
+    DetectionStatus,
+    EstimateStatus,
+    Flipped,
+    present_values,
+)
 from sweep.plan.experiment import Pipeline
-from sweep.plan.schema import SCHEMA
+from sweep.plan.schema import LOST, VARIABLES, Variable
 from sweep.store.receipt import Receipt
 
-POSED = (EstimateStatus.solved, EstimateStatus.not_explained)
-"""Estimates that have a pose."""
-
-LOST = (DetectionStatus.failed, DetectionStatus.crashed)
-"""Detections whose scene may not even have a pose."""
-
-ALWAYS = {
-    "bound": ("bound_std", "bound_kappa"),
-    "detection": ("corner_error_px",),
-    "estimate": (
-        "translation_error_m", "rotation_error_rad", "rotation_error_deg", "normal_error_deg",
-        "reprojection_error_px",
-    ),
-}
-"""Flag -> what is finite wherever the flag says that there is something."""
-
-ONLY = {
-    "bound": ("mirror_distance",),
-    "estimate": (
-        "alternative_rotation_error_deg", "alternative_reprojection_error_px", "predicted_std",
-        "nees", "residual_variance_ratio",
-    ),
-}
-"""Flag -> what may be there only where the flag says so."""
+Values = Mapping[str, NDArray[Any]]
 
 
 def contradiction(
-    pipeline: Pipeline, values: Mapping[str, NDArray[Any]], receipt: Receipt
+    pipeline: Pipeline, variables: Sequence[Variable], values: Values, receipt: Receipt
 ) -> str:
-    """Return the first thing in which a block contradicts itself; empty where there is none.
+    """Return the first contradiction within a block; empty if there is none.
 
-    ``values`` are a block's, by variable; ``receipt`` has the counts of its flags.
+    Parameters
+    ----------
+    pipeline
+        The store's.
+    variables
+        The variables that the store has.
+    values
+        The block's values by variable.
+    receipt
+        The block's, with the counts of its flags.
     """
-    for variable in SCHEMA:
+    for variable in variables:
         if variable.flags is not None:
             unknown = ~np.isin(values[variable.name], [int(flag) for flag in variable.flags])
             if unknown.any():
                 return f"{variable.name}: unknown flag {values[variable.name][unknown][0]}"
     for name, counts in (("detection", receipt.detection), ("estimate", receipt.estimate)):
         if np.bincount(values[name].ravel()).tolist() != list(counts):
-            return f"{name}: flags other than were counted when it was written"
-    present = {
-        "bound": values["bound"] == BoundStatus.given,
-        "detection": values["detection"] == DetectionStatus.detected,
-        "estimate": np.isin(values["estimate"], POSED),
-    }
-    for flag, there in present.items():
-        for name in ALWAYS[flag]:
-            finite = _inner(np.isfinite(values[name]), there, np.all)
-            if not finite[there].all():
-                return f"{name}: no number where {flag} says that there is one"
-        for name in (*ALWAYS[flag], *ONLY.get(flag, ())):
-            number = _inner(~np.isnan(values[name]), there, np.any)
-            if number[~there].any():
-                return f"{name}: a number where {flag} says that there is none"
-    solved = present["estimate"]
-    no_pose = values["flipped"] == Flipped.no_estimate
-    if (no_pose == (values["estimate"] == EstimateStatus.solved)).any():
-        return "flipped: contradicts estimate"
-    names = {v.name: v.dimensions(pipeline) for v in SCHEMA}
-    detection = _spread(values["detection"], names["detection"], names["estimate"])
-    if (solved & (detection != DetectionStatus.detected)).any():
-        return "estimate: a pose where nothing was detected"
-    if (
-        (values["estimate"] == EstimateStatus.no_detection)
-        == (detection == DetectionStatus.detected)
-    ).any():
-        return "estimate: contradicts detection"
-    if (values["detection"] == DetectionStatus.not_run).any():
-        return "detection: not run"
-    scene = names["marker_area_px"]
-    away = tuple(k for k, name in enumerate(names["detection"]) if name not in scene)
-    known = np.asarray(np.any(~np.isin(values["detection"], LOST), axis=away))
-    asked = pipeline.fixed.get("bound", "none") != "none"
-    if asked and ((values["bound"] == BoundStatus.not_run) & known).any():
-        return "bound: not run"
-    for name in ("true_rvec", "true_tvec_m", "marker_area_px"):
-        if not _inner(np.isfinite(values[name]), known, np.all)[known].all():
-            return f"{name}: no number"
+            return f"{name}: flags other than its receipt counts"
+    for variable in variables:
+        if fault := _number_fault(pipeline, variable, values):
+            return f"{variable.name}: {fault}"
+    return _flag_contradiction(pipeline, values)
+
+
+def _number_fault(pipeline: Pipeline, variable: Variable, values: Values) -> str:
+    """Return how a variable's numbers contradict the flag that governs them."""
+    rule = variable.present_when
+    if rule is None:
+        return ""
+    governing = VARIABLES[rule.flag]
+    if governing.flags is None:
+        raise AssertionError(rule)
+    numbers, flags = values[variable.name], values[rule.flag]
+    if rule.number == "unless_lost":
+        computed = _any_configuration(pipeline, governing, variable, ~np.isin(flags, LOST))
+        computed = computed.reshape(computed.shape + (1,) * len(variable.inner))
+        missing = ~np.isfinite(numbers) & computed
+        return "no number" if missing.any() else ""
+    present = _spread(
+        pipeline, governing, np.isin(flags, present_values(governing.flags)), variable
+    )
+    if rule.number == "always" and (~np.isfinite(numbers) & present).any():
+        return f"no number although {rule.flag} says that there is one"
+    if (~np.isnan(numbers) & ~present).any():
+        return f"a number although {rule.flag} says that there is none"
     return ""
 
 
-def _inner(truth: NDArray[np.bool_], like: NDArray[Any], join: Any) -> NDArray[np.bool_]:
-    """Return ``truth`` with its dimensions beyond those of ``like`` joined."""
-    away = tuple(range(like.ndim, truth.ndim))
-    return np.asarray(join(truth, axis=away)) if away else truth
+def _flag_contradiction(pipeline: Pipeline, values: Values) -> str:
+    """Return how the flags of different stages contradict each other."""
+    detection, estimate = VARIABLES["detection"], VARIABLES["estimate"]
+    solved = values["estimate"] == EstimateStatus.solved
+    flipped_exists = np.isin(values["flipped"], present_values(Flipped))
+    no_estimate = values["flipped"] == Flipped.no_estimate
+    if ((flipped_exists != solved) | (no_estimate == solved)).any():
+        return "flipped: contradicts estimate"
+    detected = _spread(
+        pipeline, detection,
+        np.isin(values["detection"], present_values(DetectionStatus)), estimate,
+    )
+    if (np.isin(values["estimate"], present_values(EstimateStatus)) & ~detected).any():
+        return "estimate: a pose although nothing was detected"
+    if ((values["estimate"] == EstimateStatus.no_detection) == detected).any():
+        return "estimate: contradicts detection"
+    if (values["detection"] == DetectionStatus.not_run).any():
+        return "detection: not run"
+    computed = _any_configuration(
+        pipeline, detection, VARIABLES["bound"], ~np.isin(values["detection"], LOST)
+    )
+    demanded = pipeline.fixed.get("bound", "none") != "none"
+    if demanded and ((values["bound"] == BoundStatus.not_run) & computed).any():
+        return "bound: not run"
+    return ""
 
 
 def _spread(
-    values: NDArray[Any], dimensions: Sequence[str], wanted: Sequence[str]
+    pipeline: Pipeline, variable: Variable, values: NDArray[Any], wanted: Variable
 ) -> NDArray[Any]:
-    """Return values over more dimensions, in the same order."""
-    shape = [
-        values.shape[dimensions.index(name)] if name in dimensions else 1 for name in wanted
-    ]
-    return values.reshape(shape)
+    """Return values of one variable's dimensions, shaped to broadcast to those of another."""
+    names = variable.dimensions(pipeline)
+    return values.reshape([
+        values.shape[names.index(name)] if name in names else 1
+        for name in wanted.dimensions(pipeline)
+    ])
+
+
+def _any_configuration(
+    pipeline: Pipeline, variable: Variable, wanted: Variable, truth: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return for each scene whether ``truth`` holds in any configuration."""
+    kept = wanted.dimensions(pipeline)
+    others = tuple(
+        k for k, name in enumerate(variable.dimensions(pipeline)) if name not in kept
+    )
+    return np.asarray(truth.any(axis=others))

@@ -1,62 +1,56 @@
-"""One scene of a store computed again, here, and compared with what the store holds."""
+"""Reproduction of one cell of a store: recomputed, compared with the stored one, and drawn."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.compilation import processor
 from sweep.errors import RunError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene, scene_image
 from sweep.evaluation.results import Failure
-from sweep.integrity.tolerances import departure, difference, outside
+from sweep.integrity.stored_values import Values, current_pipeline, stored_cell
+from sweep.integrity.tolerances import compare
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.messages import nearest, plain, refusal
 from sweep.plan.cell_selection import at_text, cell, places
 from sweep.plan.experiment import Pipeline
-from sweep.plan.grid import Block, scene_axes
+from sweep.plan.grid import scene_axes
 from sweep.plan.parameters import Stage
-from sweep.plan.schema import SCHEMA
-from sweep.store.blocks import committed, receipts
 from sweep.store.lifecycle import open_store
-from sweep.store.provenance import differences
-from sweep.store.run_store import RunStore
-
-Values = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class Reproduction:
-    """What a scene gave when it was computed again.
+    """A cell that was recomputed.
 
     Attributes
     ----------
     at
-        Its coordinates, all of them.
+        Its value of every axis, as text.
     here, stored
-        Variable -> value, of the dimensions of the template that are no axes; ``stored`` is None
-        where the block is not committed.
+        Variable -> value, of the dimensions that are no axes; ``stored`` is None if the block is
+        not committed.
     verdict
-        In what the two differ; empty where in nothing, or there is nothing to compare with.
+        How the two differ; empty if they do not, or nothing is stored.
     exact
-        Whether every bit was compared, as the processor's features are those of then.
+        Whether every bit had to agree: on a processor with the same features, and without
+        ``others``. Else the tolerances apply.
     seconds
-        Stage -> what it took here.
+        Stage -> seconds that it took.
     failures
-        What raised, or ended the process.
+        Exceptions that were raised, and deaths of the process.
     others
-        What is otherwise here than when the store was begun: versions, files.
+        Versions and files that have changed since the store was created.
     pipeline, one
-        The store's, and the same with every axis fixed at the cell.
+        The store's pipeline, and the same with every axis fixed at the cell.
     look
-        A close look at the scene; None where that could not be had.
+        The inspected scene; None if its inspection raises or ends its process.
     image
-        Its image (h, w) where there is one.
+        (h, w) grey levels; None if rendering raises or ends its process.
     """
 
     at: str
@@ -76,24 +70,29 @@ class Reproduction:
 def reproduce(
     url: str, at: str, *, whole_frame: bool = False, time_limit_s: float = 60.0
 ) -> Reproduction:
-    """Compute one cell of a store again in a child process, and compare.
+    """Recompute one cell of a store in a child process, and compare it with the stored one.
 
-    ``at`` names a value of each axis, as "distance_m=0.3,solver=ippe"; axes that are not named
-    take their first.
+    Parameters
+    ----------
+    url
+        The store.
+    at
+        A value of each axis, such as "distance_m=0.3,solver=ippe"; the first one of axes that it
+        does not name.
+    whole_frame
+        Whether the image is that of the whole frame, and not of the marker's surroundings.
+    time_limit_s
+        Timeout in seconds.
 
     Raises
     ------
     PipelineError
-        Where ``at`` is not on the store's grid.
+        If ``at`` is not on the store's grid.
     StoreError
-        Where there is no store.
+        If there is no store.
     """
     store = open_store(url)
-    stored = store.pipeline
-    pipeline = Pipeline.from_text(
-        stored.text, name=stored.name, source=store.url, folder=stored.folder
-    )
-    others = differences(pipeline, stored, store.fingerprint)
+    pipeline, others = current_pipeline(store)
     index = _index(pipeline, at)
     setting, estimator = (
         _number(pipeline, stage, index) for stage in (Stage.detection, Stage.estimation)
@@ -105,48 +104,47 @@ def reproduce(
     need[0, setting, estimator] = True
     scene = [np.array([index[axis.name]], dtype=np.intp) for axis in axes]
     cells = run_cells_isolated(pipeline, scene, need, time_limit_s)
-    treatment = {
+    configuration = {
         Stage.scene: 0, Stage.detection: setting,
         Stage.estimation: setting * need.shape[2] + estimator,
     }
-    here = {
-        v.name: cells.columns[v.name][treatment[v.stage]][0].astype(v.dtype) for v in SCHEMA
+    recomputed = {
+        v.name: cells.columns[v.name][configuration[v.stage]][0].astype(v.dtype)
+        for v in store.variables
     }
-    there, same_processor = _stored(store, index)
-    exact = same_processor and not others
-    verdict = ""
-    if there is not None:
-        verdict = difference(here, there) if exact else (
-            departure(here, there) or outside(here, there)
-        )
+    stored = stored_cell(store, index)
+    exact = stored is not None and stored.same_processor and not others
+    verdict = "" if stored is None else compare(
+        recomputed, stored.values, same_processor=exact
+    ).difference
     full_at = at_text({axis.name: axis.values[index[axis.name]] for axis in pipeline.axes})
     one = cell(pipeline, full_at)
-    seen, image = _looked(one, whole_frame, time_limit_s)
+    inspected, image = _inspected(one, whole_frame, time_limit_s)
     return Reproduction(
-        full_at, here, there, verdict, exact,
+        full_at, recomputed, None if stored is None else stored.values, verdict, exact,
         {"scene": cells.seconds["scene"][0], "detection": cells.seconds["detection"][setting],
-         "estimation": cells.seconds["estimation"][treatment[Stage.estimation]]},
-        cells.failures, others, pipeline, one, seen, image,
+         "estimation": cells.seconds["estimation"][configuration[Stage.estimation]]},
+        cells.failures, others, pipeline, one, inspected, image,
     )
 
 
 def _index(pipeline: Pipeline, at: str) -> dict[str, int]:
-    """Return where a cell lies along each axis."""
+    """Return the index of a cell along each axis."""
     index = {axis.name: 0 for axis in pipeline.axes}
     faults = []
     for name, value in places(at).items():
         axis = pipeline.axis(name)
         if axis is None:
             names = [other.name for other in pipeline.axes]
-            told = nearest(name, names) or f"; there are {', '.join(names) or 'none'}"
-            faults.append(f"--at {name}: no axis of the store{told}")
+            advice = nearest(name, names) or f"; its axes are {', '.join(names) or 'none'}"
+            faults.append(f"--at {name}: not an axis of the store{advice}")
         elif value in axis.values:
             index[name] = axis.values.index(value)
         else:
             known = ", ".join(str(each) for each in axis.values[:6])
             more = f", ... {axis.values[-1]}" if len(axis) > 6 else ""
             faults.append(
-                f"--at {name}={plain(value)}: not on the grid, which has {known}{more}"
+                f"--at {name}={plain(value)}: not on the grid; its values are {known}{more}"
             )
     if faults:
         raise refusal(faults)
@@ -154,40 +152,24 @@ def _index(pipeline: Pipeline, at: str) -> dict[str, int]:
 
 
 def _number(pipeline: Pipeline, stage: Stage, index: dict[str, int]) -> int:
-    """Return which of a stage's treatments an index is of."""
+    """Return the number of a stage's configuration at an index."""
     number = 0
     for axis in pipeline.axes_of(stage):
         number = number * len(axis) + index[axis.name]
     return number
 
 
-def _stored(store: RunStore, index: dict[str, int]) -> tuple[Values | None, bool]:
-    """Return a store's values of a cell, and whether they are of a processor like this one."""
-    at = tuple(index[axis.name] for axis in scene_axes(store.pipeline))
-    number = store.blocks.number(Block(at, at))
-    if number not in committed(store):
-        return None, False
-    _, receipt = next(iter(receipts(store, [number])))
-    values = {}
-    for variable in SCHEMA:
-        where = tuple(
-            index.get(name, slice(None)) for name in variable.dimensions(store.pipeline)
-        )
-        values[variable.name] = np.asarray(store.array(variable.name)[where])
-    return values, receipt.processor == processor()
-
-
-def _looked(
+def _inspected(
     one: Pipeline, whole_frame: bool, limit_s: float
 ) -> tuple[SceneInspection | None, NDArray[np.uint8] | None]:
-    """Return a close look and the image; None for what ends its process or raises."""
+    """Return the inspected scene and its image; None for one that raises or ends its process."""
     for function in (inspect_scene, scene_image):
         try:
             with Child() as child:
-                seen = child.call(
+                result = child.call(
                     partial(function, one, whole_frame=whole_frame), limit_s=limit_s
                 )
         except (ChildDiedError, ChildRaisedError, RunError):
             continue
-        return (seen, seen.image) if function is inspect_scene else (None, seen)
+        return (result, result.image) if function is inspect_scene else (None, result)
     return None, None

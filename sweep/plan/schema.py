@@ -72,8 +72,8 @@ class Tolerance:
     ----------
     kind
         "equal": no difference; "absolute": of each number; "relative": of each number;
-        "length": norm of the difference relative to the stored vector's norm; "distance": norm of
-        the difference relative to the marker's true distance; "rotation": angle in radians
+        "length": of each component, relative to the stored vector's norm; "distance": norm of
+        the difference, relative to the marker's true distance; "rotation": angle in radians
         between the two rotation vectors' rotations.
     limit
         The largest difference, in the variable's unit where ``kind`` is "absolute".

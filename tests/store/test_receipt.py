@@ -1,0 +1,91 @@
+"""Receipts: what is written is read again, of every format, and nothing else is."""
+
+import json
+
+import pytest
+
+from sweep.plan.schema import SCHEMA, variables_of
+from sweep.store.receipt import Receipt, RecordedFailure
+
+NAMES = [variable.name for variable in variables_of(2)]
+
+RECEIPT = Receipt(
+    run_id="a" * 32, processor="avx2", scenes=3,
+    computed={"scenes": 3, "detections": 6, "estimates": 12},
+    detection=[0, 4, 0, 0, 2], estimate=[0, 8, 4],
+    seconds={"scene": [0.5], "detection": [0.1, 0.2], "estimation": [0.1, 0.2, 0.3, 0.4]},
+    failures=(RecordedFailure(2, "failed", "detection", 1, None, "Traceback: x"),),
+    wall_s=1.5, written=1.7e9, digests={name: k for k, name in enumerate(NAMES)},
+)
+"""A block of 3 scenes under 2 detector settings and 2 estimators."""
+
+
+@pytest.mark.parametrize("store_format", [2, 3])
+def test_receipt_that_is_written_is_read_again(store_format):
+    again = Receipt.from_json(RECEIPT.to_json(store_format))
+    assert again == RECEIPT
+    again.check(scenes=3, settings=2, estimates=4)
+
+
+def test_receipts_of_format_2_list_digests_in_the_order_of_sweep_0_5():
+    # As 0.5.0 declared them; its stores can be read as long as this holds.
+    assert NAMES == [
+        "true_rvec", "true_tvec_m", "marker_area_px", "bound", "bound_std", "bound_kappa",
+        "mirror_distance", "detection", "corner_error_px", "estimate", "translation_error_m",
+        "rotation_error_rad", "rotation_error_deg", "normal_error_deg", "reprojection_error_px",
+        "alternative_rotation_error_deg", "alternative_reprojection_error_px", "predicted_std",
+        "nees", "residual_variance_ratio", "flipped",
+    ]
+    assert json.loads(RECEIPT.to_json(2))["digests"] == list(range(21))
+    assert json.loads(RECEIPT.to_json(3))["digests"] == dict(zip(NAMES, range(21), strict=True))
+
+
+def test_every_variable_has_a_format():
+    assert variables_of(1) == ()
+    assert variables_of(99) == SCHEMA
+
+
+@pytest.mark.parametrize(
+    ("scenes", "settings", "estimates"), [(4, 2, 4), (3, 1, 4), (3, 2, 2), (2, 2, 4), (3, 4, 4)]
+)
+def test_receipt_of_another_block_is_refused(scenes, settings, estimates):
+    with pytest.raises(ValueError, match="not a receipt of this block"):
+        RECEIPT.check(scenes, settings, estimates)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"digests": list(range(20))}, {"digests": list(range(22))}, {"digests": {"nees": -1}},
+        {"digests": {"nees": "1"}}, {"digests": None}, {"scenes": True}, {"scenes": 3.0},
+        {"detection": {"1": 4}}, {"estimate": [-1]}, {"seconds": {"scene": [1.0]}},
+        {"seconds": {"scene": ["x"], "detection": [], "estimation": []}}, {"computed": [3]},
+        {"computed": {"scenes": "3"}}, {"wall_s": "1"}, {"written": None}, {"processor": 5},
+        {"run_id": None}, {"failures": [{}]}, {"failures": [None]}, {"failures": {}},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("store_format", [2, 3])
+def test_values_of_wrong_types_are_refused(change, store_format):
+    content = json.loads(RECEIPT.to_json(store_format)) | change
+    with pytest.raises(ValueError, match=r"\w"):
+        Receipt.from_json(json.dumps(content))
+
+
+@pytest.mark.parametrize("key", ["digests", "scenes", "processor", "failures"])
+def test_incomplete_receipts_are_refused(key):
+    content = json.loads(RECEIPT.to_json(3))
+    del content[key]
+    with pytest.raises(ValueError, match="incomplete"):
+        Receipt.from_json(json.dumps(content))
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "7", "null", "[" * 100_000])
+def test_texts_that_are_no_receipt_are_refused(text):
+    with pytest.raises(ValueError, match=r"\w"):
+        Receipt.from_json(text)
+
+
+def test_receipts_may_hold_more_than_this_version_knows():
+    content = json.loads(RECEIPT.to_json(3)) | {"memory_bytes": 5}
+    assert Receipt.from_json(json.dumps(content)) == RECEIPT

@@ -37,7 +37,7 @@ def aggregate(
     results
         The dataset whose coordinates and variables name what is kept and binned.
     inputs
-        The arrays, by name, of which ``view`` makes the poses that the statistics see.
+        The arrays, by name, of which ``view`` makes the poses that the statistics read.
     kept
         The dimensions of the table; all others are pooled.
     statistics
@@ -127,13 +127,13 @@ class Passes(Generic[ViewT]):
 
     def _by_bin(
         self, sizes: Mapping[str, int], read: ReadBlock,
-        see: Callable[[ViewT, int], list[BlockState[Any]]],
+        pass_over: Callable[[ViewT, int], list[BlockState[Any]]],
     ) -> list[BlockState[Any]]:
         """Return the states of all combinations of bins, those of a group together."""
         arrays = self.layout.arrange(read(), sizes)
         by_bin = []
         for number, (part, cells) in enumerate(self.binning.split(arrays)):
-            states = see(self.view(part), number)
+            states = pass_over(self.view(part), number)
             by_bin.append(states if cells is None else [each.scatter(cells) for each in states])
         return [type(states[0]).interleave(states) for states in zip(*by_bin, strict=True)]
 

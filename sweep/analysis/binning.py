@@ -87,9 +87,9 @@ def read_bins(
     edges, arrays = {}, {}
     for name, given in bins.items():
         if name not in results.variables or name in kept:
-            there = [str(n) for n, v in results.variables.items()
-                     if v.dtype.kind == "f" and n not in kept]
-            raise ArgumentError("bins", name, f"no such variable; there are {', '.join(there)}")
+            possible = [str(other) for other, variable in results.variables.items()
+                        if variable.dtype.kind == "f" and other not in kept]
+            raise ArgumentError("bins", name, f"no such variable; there are {', '.join(possible)}")
         array = results[name].reset_coords(drop=True)
         if name in results.dims:  # an index, which has no chunks
             array = xr.DataArray(array.to_numpy(), dims=name)

@@ -53,7 +53,7 @@ class Count(SinglePass[ViewT, CountState], Generic[ViewT]):
     of: Callable[[ViewT], Masks]
 
     def outputs(self) -> Sequence[Output]:
-        """Return the one variable."""
+        """Return the variable."""
         return [Output(self.name, self.meaning, "1", "i8")]
 
     def first_pass(self, poses: ViewT) -> CountState:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from sweep.analysis.dimensions import (
 from sweep.analysis.intervals import LEVEL, wilson
 from sweep.analysis.rates import detection_rate
 from sweep.errors import ArgumentError, DatasetError, SweepError
+from sweep.measure.flags import Flag, flag
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.model.marker import module_count
 from sweep.plan.experiment import Pipeline
@@ -31,15 +31,14 @@ from sweep.typing import Floats, Integers, Masks
 SIZE_AXES = ("side_px", "distance_m")
 
 
-class Limit(IntEnum):
+class Limit(Flag):
     """Whether the rate is reached within the grid."""
 
-    not_run = 0
-    found = 1
-    never = 2
-    """Not even at the largest side."""
-    always = 3
-    """Already at the smallest side: the limit may lie below it."""
+    not_run = flag(0, "No pose was looked for.", counted=False)
+    found = flag(1, "The rate is reached from a side of the grid on.", present=True)
+    never = flag(2, "The rate is not reached at the largest side.")
+    always = flag(
+        3, "The rate is reached at the smallest side: the limit may lie below it.", present=True)
 
 
 def detection_limit(
@@ -117,12 +116,12 @@ def detection_limit(
     drawn = table["detection_rate_low"].notnull()
     counts = [array.chunk({axis: -1}) if array.chunks else array
               for array in (hits, n, draws, drawn)]
-    found = xr.apply_ufunc(
+    *values, limit = xr.apply_ufunc(
         _limit, sides, *counts, kwargs={"rate": rate}, dask="parallelized",
         input_core_dims=[[axis]] * 5, output_core_dims=[[]] * 5, output_dtypes=[np.float64] * 5,
     )
-    named = dict(zip(("side_px", "side_px_low", "side_px_high", "side_px_below"), found[:4],
-                     strict=True))
+    limits = dict(zip(("side_px", "side_px_low", "side_px_high", "side_px_below"), values,
+                      strict=True))
     words = {
         "side_px": f"smallest side from which on the detection rate is at least {rate:g}",
         "side_px_low": "lower end of the 95 % interval: smallest side",
@@ -130,18 +129,18 @@ def detection_limit(
         "side_px_below": "the grid's next smaller side",
     }
     out = {name: array.assign_attrs(long_name=words[name], units="px")
-           for name, array in named.items()}
+           for name, array in limits.items()}
     count = _modules(results)
     out |= {
-        name.replace("px", "px_per_module"): (named[name] / count).assign_attrs(
+        name.replace("px", "px_per_module"): (limits[name] / count).assign_attrs(
             long_name=f"{words[name]}, per module", units="px")
         for name in ("side_px", "side_px_low", "side_px_high")
     }
     if axis == "distance_m":
         scale = (sides * results["distance_m"]).isel(distance_m=0, drop=True)
-        out["distance_m"] = (scale / named["side_px"]).assign_attrs(
+        out["distance_m"] = (scale / limits["side_px"]).assign_attrs(
             long_name="the distance of that side", units="m")
-    out["limit"] = found[4].astype(np.uint8).assign_attrs(
+    out["limit"] = limit.astype(np.uint8).assign_attrs(
         cf_attributes("whether the rate is reached within the grid", flags=Limit))
     return xr.Dataset({name: array.transpose(*kept) for name, array in out.items()})
 
@@ -155,7 +154,7 @@ def _limit(
     sides = np.take_along_axis(sides, order, axis=-1)
     hits, n, draws = (np.take_along_axis(each, order, axis=-1) for each in (hits, n, draws))
     drawn = np.take_along_axis(drawn, order, axis=-1)
-    there = n > 0
+    exists = n > 0
     with np.errstate(divide="ignore", invalid="ignore"):
         reached = hits / n >= rate
     # Of draws, rounded outwards, as in `Rate`.
@@ -166,20 +165,20 @@ def _limit(
 
     def smallest(holds: Masks, none: float) -> tuple[Floats, Masks]:
         """Return the smallest side down to which it holds, and whether it holds for all."""
-        steady = np.logical_and.accumulate(holds | ~there, axis=-1) & there
+        steady = np.logical_and.accumulate(holds | ~exists, axis=-1) & exists
         side = np.where(steady, sides, np.inf).min(axis=-1, initial=np.inf)
-        return np.where(steady.any(axis=-1), side, none), (steady == there).all(axis=-1)
+        return np.where(steady.any(axis=-1), side, none), (steady == exists).all(axis=-1)
 
     side, always = smallest(reached, np.inf)
     high, _ = smallest(surely, np.inf)
     low, everywhere = smallest(possibly, np.inf)
     low = np.where(everywhere, 0.0, low)
-    smaller = np.where(there & (sides < side[..., None]), sides, -np.inf).max(
+    smaller = np.where(exists & (sides < side[..., None]), sides, -np.inf).max(
         axis=-1, initial=-np.inf)
-    empty = ~there.any(axis=-1)
+    empty = ~exists.any(axis=-1)
     flag = np.select([empty, always, np.isinf(side)], [Limit.not_run, Limit.always, Limit.never],
                      Limit.found)
-    unknown = ~(drawn | ~there).all(axis=-1) | empty
+    unknown = ~(drawn | ~exists).all(axis=-1) | empty
     return (np.where(empty, np.nan, side), np.where(unknown, np.nan, low),
             np.where(unknown, np.nan, high), np.where(np.isinf(smaller), np.nan, smaller),
             flag.astype(np.float64))

@@ -75,8 +75,8 @@ def require_poses(results: xr.Dataset) -> None:
     """Raise DatasetError unless a dataset has the variables of results, and poses."""
     lacking = [name for name in REQUIRED_VARIABLES if name not in results]
     if lacking:
-        there = ", ".join(map(str, results.data_vars)) or "none"
-        raise DatasetError(f"no variable {', '.join(lacking)}; there are {there}")
+        present = ", ".join(map(str, results.data_vars)) or "none"
+        raise DatasetError(f"no variable {', '.join(lacking)}; there are {present}")
     empty = [name for name in axes_of(results) if results.sizes[name] == 0]
     if empty:
         raise DatasetError(f"there are no poses: {', '.join(empty)} has no values")

@@ -1,4 +1,4 @@
-"""Tasks of Dask by which statistics see all blocks of a lazy dataset, once or twice.
+"""Tasks of Dask that pass statistics over all blocks of a lazy dataset, once or twice.
 
 No state grows with the dataset. A second pass, if one is needed, reads the chunks again: they are
 computed within its tasks, for as tasks of their own a scheduler would keep those of the first pass
@@ -82,16 +82,16 @@ def _compute_chunks(graph: Mapping[Any, Any], keys: list[Any]) -> list[NDArray[A
 
 def add_pass(
     layer: TaskLayer, reader: ChunkReader, layout: Layout, lengths: Lengths,
-    see_block: Callable[..., Any], fold: Callable[..., Any], known: Sequence[Key] = (),
+    read_state: Callable[..., Any], fold: Callable[..., Any], known: Sequence[Key] = (),
 ) -> list[list[Key]]:
-    """Add tasks that see every block; return the keys of folded states.
+    """Add tasks that read every block; return the keys of folded states.
 
     Parameters
     ----------
-    see_block
+    read_state
         Called with the block's sizes, its `ReadBlock`, and the result of a key of ``known``.
     fold
-        Called with the results of ``see_block`` for all draws of the same cells.
+        Called with the results of ``read_state`` for all draws of the same cells.
     known
         A key for each block of the kept dimensions, or none.
 
@@ -111,7 +111,7 @@ def add_pass(
                     tuple(at.get(dim, 0) for dim in dims) for dims in layout.arrays.values())
                 sizes = {name: chunks[at.get(name, 0)] for name, chunks in lengths.items()}
                 parts.append(layer.add(
-                    functools.partial(see_block, sizes, read), *known[number : number + 1]))
+                    functools.partial(read_state, sizes, read), *known[number : number + 1]))
             states.append(layer.add(fold, *parts))
         folded.append(states)
     return folded

@@ -1,7 +1,7 @@
 """Mean and variance of values that arrive in chunks, accurate to the last digits of a double.
 
-The values themselves are taken as exact: at an offset of 1e9 doubles are 1.2e-7 apart, and what
-is meant is the variance of the doubles that are there.
+The values are taken as exact: at an offset of 1e9 doubles are 1.2e-7 apart, and the variance is
+that of these doubles.
 
 Chan, Golub and LeVeque, "Updating formulae and a pairwise algorithm for computing sample
 variances", Stanford STAN-CS-79-773, 1979, and "Algorithms for computing the sample variance:
@@ -63,8 +63,8 @@ class Moments:
 
         The corrected two-pass algorithm of Chan, Golub and LeVeque (1983), with the correction
         taken from each deviation instead of from their sum of squares: so m2 is never negative,
-        and exactly 0 for equal values. Raises ``AxisError``, a
-        ``ValueError``, for an axis that is not there.
+        and exactly 0 for equal values. Raises ``AxisError``, a ``ValueError``, for an axis that
+        does not exist.
         """
         values = np.asarray(values, dtype=np.float64)
         over = normalize_axis_tuple(range(values.ndim) if axis is None else axis, values.ndim)
@@ -88,7 +88,7 @@ class Moments:
 
     @property
     def variance(self) -> Floats:
-        """Unbiased variance (ddof = 1); NaN where there are fewer than two values."""
+        """Unbiased variance (ddof = 1); NaN of fewer than two values."""
         degrees = np.where(self.count < 2, np.nan, self.count - 1.0)
         return np.asarray(self.m2 / degrees)
 

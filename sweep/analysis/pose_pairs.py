@@ -1,4 +1,4 @@
-"""The same poses with two configurations, of one store or of two, as the statistics see them."""
+"""The same poses with two configurations, of a store or of two stores, as statistics read them."""
 
 from __future__ import annotations
 

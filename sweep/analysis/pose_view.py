@@ -1,4 +1,4 @@
-"""Poses of a block as the statistics see them: which are counted, and what their errors are."""
+"""Poses of a block as statistics read them: which are counted, and their errors."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Poses:
     arrays
         The arrays, by the names of `pose_arrays` with ``prefix`` in front, and `INSIDE`.
     prefix
-        What tells these poses' arrays from others in ``arrays``.
+        What stands before the names of these poses' arrays in ``arrays``, if it has others too.
     """
 
     def __init__(self, arrays: dict[str, NDArray[Any]], prefix: str = "") -> None:
@@ -80,7 +80,7 @@ class Poses:
         return array
 
     def __contains__(self, name: object) -> bool:
-        """Return whether there is such an array."""
+        """Return whether the poses have an array."""
         return f"{self._prefix}{name}" in self._arrays
 
     @property

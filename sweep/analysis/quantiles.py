@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Generic
 
 import numpy as np
@@ -23,21 +22,19 @@ from sweep.analysis.statistic import (
     interval_variables,
     with_interval,
 )
+from sweep.measure.flags import Flag, flag
 from sweep.typing import Floats, Integers, Masks
 
 PERCENTS = {"median": 50, "p95": 95, "p99": 99}
 
 
-class IntervalOf(IntEnum):
+class IntervalOf(Flag):
     """Why an interval has both ends, or not."""
 
-    not_run = 0
-    """No pose counts."""
-    given = 1
-    nothing_drawn = 2
-    """No cell has two draws that count."""
-    too_few_draws = 3
-    """An end lies beyond the smallest or the largest draw."""
+    not_run = flag(0, "No pose counts.", counted=False)
+    given = flag(1, "Both ends exist.", present=True)
+    nothing_drawn = flag(2, "No cell has two draws that count.")
+    too_few_draws = flag(3, "An end lies beyond the smallest or the largest draw.")
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Exact order statistics of values that arrive in chunks, in two passes and little memory.
 
 Non-negative floats are ordered as their bits are, read as whole numbers. The first pass counts the
-upper 16 bits of each value, which tells in which of these bins a rank lies; the second counts the
+upper 16 bits of each value, from which follows the bin in which a rank lies; the second counts the
 lower 16 bits of the values in those bins. This is a radix selection, with the counts in place of
 the values: Knuth, "The Art of Computer Programming", vol. 3, sections 5.2.5 and 5.3.3.
 

@@ -1,8 +1,8 @@
 """A statistic of poses as a record: two passes over every block, and the variables they give.
 
 Poses come in blocks, arrays (groups, cells, draws, settings): the settings of a draw see the same
-images, so that together they count as one draw. A statistic sees every block twice; it keeps
-states of a block, which merge (`sweep.analysis.states`).
+images, so that together they count as one draw. A statistic passes over every block twice; it
+keeps states of a block, which merge (`sweep.analysis.states`).
 
 All intervals are at 95 %, over the random draws, conditional on the grid; NaN if no cell has two
 draws that count.
@@ -91,7 +91,7 @@ class Statistic(ABC, Generic[ViewT, FirstT, KnownT, SecondT]):
 
 
 class SinglePass(Statistic[ViewT, FirstT, FirstT, Nothing]):
-    """A statistic of one pass; if all are so there is no second one."""
+    """A statistic of a single pass; if all are so the second pass is left out."""
 
     @abstractmethod
     def result(self, state: FirstT) -> Variables:

@@ -64,16 +64,16 @@ def of_memory(call):
     return CALLS[call](RESULTS).compute()
 
 
-def assert_same(told, expected):
-    assert set(told.data_vars) == set(expected.data_vars)
-    assert set(told.coords) == set(expected.coords)
+def assert_same(answer, expected):
+    assert set(answer.data_vars) == set(expected.data_vars)
+    assert set(answer.coords) == set(expected.coords)
     for name, array in expected.variables.items():
         if is_exact(name, array):
-            np.testing.assert_array_equal(told[name], array, err_msg=name)
+            np.testing.assert_array_equal(answer[name], array, err_msg=name)
         else:
-            np.testing.assert_allclose(told[name], array, rtol=1e-10, atol=1e-15, err_msg=name)
-        assert told[name].dims == array.dims
-        assert told[name].dtype == array.dtype
+            np.testing.assert_allclose(answer[name], array, rtol=1e-10, atol=1e-15, err_msg=name)
+        assert answer[name].dims == array.dims
+        assert answer[name].dtype == array.dtype
 
 
 @st.composite
@@ -119,8 +119,8 @@ def test_variables_may_be_chunked_differently(call):
 @SOME_CALLS
 def test_slices_of_a_lazy_dataset_are_those_of_memory(call):
     part = {"trial": slice(1, 4), "marker_id": [2, 0], "side_px": slice(None, None, -1)}
-    told = CALLS[call](RESULTS.chunk(trial=2, marker_id=1, solver=1).isel(part)).compute()
-    assert_same(told, CALLS[call](RESULTS.isel(part)).compute())
+    answer = CALLS[call](RESULTS.chunk(trial=2, marker_id=1, solver=1).isel(part)).compute()
+    assert_same(answer, CALLS[call](RESULTS.isel(part)).compute())
 
 
 def unreadable(results):
@@ -150,12 +150,12 @@ class Counter(Callback):
 @EVERY_CALL
 def test_the_call_computes_nothing_and_what_it_gives_is_lazy(call):
     with Counter() as counter:
-        told = CALLS[call](unreadable(RESULTS))
+        answer = CALLS[call](unreadable(RESULTS))
     assert counter.tasks == 0
-    for name, array in told.data_vars.items():
+    for name, array in answer.data_vars.items():
         assert dask.is_dask_collection(array.data), name
     with pytest.raises(AssertionError, match="was computed"):
-        told.compute()
+        answer.compute()
 
 
 @SOME_CALLS
@@ -184,9 +184,9 @@ def test_each_value_is_read_twice_at_most(call):
         data = array.data.map_blocks(
             noted, dtype=array.dtype, meta=np.empty((0,) * array.ndim, array.dtype))
         lazy[name] = (array.dims, data, array.attrs)
-    told = CALLS[call](lazy)
+    answer = CALLS[call](lazy)
     reads.clear()
-    told.compute()
+    answer.compute()
     print(f"{call}: {sum(reads) / total:.2f} reads a value")
     assert sum(reads) <= 2 * total
 
@@ -217,9 +217,9 @@ def test_what_was_looked_at_is_not_kept_in_memory(function, tmp_path):
     results = mixed({"marker_id": 2, "trial": 120}, 21).drop_vars("xyz")
     results.chunk(trial=4).to_zarr(tmp_path / "store.zarr", zarr_format=3, consolidated=False)
     lazy = xr.open_zarr(tmp_path / "store.zarr", consolidated=False)
-    told = function(lazy)
+    answer = function(lazy)
     with Cache() as cache:
-        told.compute(scheduler="synchronous")
+        answer.compute(scheduler="synchronous")
     whole = sum(array.nbytes for array in lazy.data_vars.values())
     print(f"{cache.most / whole:.3f} of the store in memory at a time, in 30 chunks")
     assert cache.most < 0.25 * whole

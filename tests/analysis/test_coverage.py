@@ -2,7 +2,7 @@
 
 In simulations each repetition is a regime, a dimension that is kept: one call gives the intervals
 of all. Statistical assertions fail with a probability below 1e-6 where the coverage is within its
-limits; they print what they found.
+limits; they print their figures.
 """
 
 import math
@@ -53,7 +53,7 @@ def test_the_coverage_is_the_sum_of_the_binomial_chances():
         np.testing.assert_allclose(exact_coverage(low, high, p, n), plain, rtol=1e-12)
 
 
-# n: least coverage of Wilson and Jeffreys, least for p in 0.1 ... 0.9 (found, rounded down).
+# n: least coverage of Wilson and Jeffreys, least for p in 0.1 ... 0.9 (computed, rounded down).
 LEAST = {
     5: (0.831, 0.891, 0.892, 0.900), 10: (0.834, 0.915, 0.868, 0.868),
     20: (0.836, 0.926, 0.893, 0.893), 50: (0.837, 0.930, 0.883, 0.916),
@@ -150,7 +150,7 @@ def test_bias_spread_and_rmse_are_covered(tails, cells, trials, count):
     offsets[:, 0, 2] += np.linspace(-1, 1, cells) if cells > 1 else 0.0
     vectors = draw(rng, (count, cells, trials, 3)) + offsets
     results = simulated(rng, {"regime": count, "marker_id": cells, "trial": trials}, vectors)
-    told = error_statistics(results, ["regime"]).compute()
+    answer = error_statistics(results, ["regime"]).compute()
     mean, between = offsets.mean(axis=(0, 1)), offsets[..., 2].var()
     for name, (unit, scale) in SCALES.items():
         parts = slice(2, 3) if name == "range" else slice(None)
@@ -165,7 +165,7 @@ def test_bias_spread_and_rmse_are_covered(tails, cells, trials, count):
             by_design = statistic == "bias" and name != "range"
             label = f"{name}_{statistic}_{unit}"
             assert_coverage(f"{tails} {cells} x {trials} {label}",
-                            holds(told, label, scale * value), count,
+                            holds(answer, label, scale * value), count,
                             *((0.95, 0.995) if by_design else (0.93, 0.97)))
 
 
@@ -183,17 +183,17 @@ def test_quantiles_are_covered_at_least_as_often_as_they_say(lost, count):
     missed = rng.random(tuple(sizes.values())) < lost
     results["estimate"].values[missed] = EstimateStatus.solver_failed
     results["flipped"].values[missed] = Flipped.no_estimate
-    told = error_statistics(results, ["regime"]).compute()
+    answer = error_statistics(results, ["regime"]).compute()
     for name, share in (("median", 0.5), ("p95", 0.95), ("p99", 0.99)):
         # Half of the values are uniform on [0, 1/2], half on [0, 1]; `lost` are infinite.
         of_solved = share / (1 - lost)
         truth = (math.inf if of_solved > 1 else of_solved / 1.5 if of_solved <= 0.75
                  else 2 * of_solved - 1)
-        assert (told[f"{name}_interval"] == 1).all()
+        assert (answer[f"{name}_interval"] == 1).all()
         for quantity, unit in (("range", "percent"), ("position", "m")):
             label = f"{quantity}_{name}_{unit}"
             scaled = truth * SCALES[quantity][1]
-            assert_coverage(f"lost {lost} {label}", holds(told, label, scaled), count, 0.95, 1.0)
+            assert_coverage(f"lost {lost} {label}", holds(answer, label, scaled), count, 0.95, 1.0)
 
 
 @lengths(300, 10_000)
@@ -208,13 +208,13 @@ def test_differences_of_paired_rates_are_covered(cells, trials, first, second, c
     common = rng.random(shape)
     own = np.where(rng.random(shape) < 0.5, common, rng.random(shape))  # half of them alike
     results = perfect(rng, sizes)
-    told = compare(with_detected(results, common < first), with_detected(results, own < second),
+    answer = compare(with_detected(results, common < first), with_detected(results, own < second),
                    ["regime"]).compute()
     assert_coverage(f"{first} and {second}, {cells} x {trials}",
-                    holds(told, "detection_difference", second - first), count, 0.93,
+                    holds(answer, "detection_difference", second - first), count, 0.93,
                     0.99 if (cells, first) == (1, 0.97) else 0.975)
     if first == second:
-        false_alarms = int((told["detection_p_value"] < 0.05).sum())
+        false_alarms = int((answer["detection_p_value"] < 0.05).sum())
         print(f"McNemar: {false_alarms / count:.4f} below 0.05")
         assert stats.binom.sf(false_alarms - 1, count, 0.05) > 1e-6
 
@@ -233,14 +233,14 @@ def test_differences_and_ratios_of_paired_errors_are_covered(cells, trials, coun
         vectors = np.zeros((*sizes.values(), 3))
         vectors[..., 2] = scale * widths * (0.8 * shared + 0.6 * alone)  # correlated by 0.64
         sides.append(simulated(rng, sizes, vectors))
-    told = compare(*sides, ["regime"]).compute()
+    answer = compare(*sides, ["regime"]).compute()
     mean_size = math.sqrt(2 / math.pi) * widths.mean()
     for name, (unit, scale) in SCALES.items():
         words = f"{cells} x {trials} {name}"
         label = f"{name}_difference_{unit}"
         assert_coverage(f"{words} difference",
-                        holds(told, label, scale * (0.7 - 1.0) * mean_size), count)
-        assert_coverage(f"{words} ratio", holds(told, f"{name}_rmse_ratio", 0.7), count)
+                        holds(answer, label, scale * (0.7 - 1.0) * mean_size), count)
+        assert_coverage(f"{words} ratio", holds(answer, f"{name}_rmse_ratio", 0.7), count)
 
 
 LADDERS = {
@@ -263,11 +263,11 @@ def test_limits_of_detection_are_covered_at_least_as_often_as_they_say(
     results = perfect(rng, sizes)
     sides = results["side_px"].values
     results = with_detected(results, rng.random(tuple(sizes.values())) < rates[:, None])
-    told = detection_limit(results, 0.9, per=["regime"]).compute()
+    answer = detection_limit(results, 0.9, per=["regime"]).compute()
     good = np.minimum.accumulate((rates >= 0.9)[::-1])[::-1]
     truth = sides[good][0] if good.any() else math.inf  # beyond the grid
-    hits = holds(told, "side_px", truth)
-    found = {int(flag): int((told["limit"] == flag).sum()) for flag in (1, 2, 3)}
+    hits = holds(answer, "side_px", truth)
+    found = {int(flag): int((answer["limit"] == flag).sum()) for flag in (1, 2, 3)}
     print(f"{ladder}: found {found[1]}, never {found[2]}, always {found[3]}")
     assert_coverage(f"{ladder}, {cells} x {trials}", hits, count, 0.95, 1.0)
 
@@ -301,9 +301,9 @@ def cell_rates(rate):
 def test_alike_ids_are_called_weak_in_five_per_cent_of_the_tables_at_most(ids, rate, count):
     # Chance of a false alarm below 1e-6: a table has a weak ID with a chance of 5 % at most.
     rng = np.random.default_rng([26, ids, int(1000 * rate)])
-    _, told = ranked(rng, count, ids, np.broadcast_to(cell_rates(rate), (ids, 3)))
-    p_values = told["p_value"].transpose("regime", "marker_id").fillna(1.0).values
-    below = (told["detection_rate"] < told["expected_rate"]).transpose("regime", "marker_id")
+    _, answer = ranked(rng, count, ids, np.broadcast_to(cell_rates(rate), (ids, 3)))
+    p_values = answer["p_value"].transpose("regime", "marker_id").fillna(1.0).values
+    below = (answer["detection_rate"] < answer["expected_rate"]).transpose("regime", "marker_id")
     adjusted = np.array([holm(row.tolist()) for row in p_values])
     any_odd = int((adjusted < 0.05).any(axis=1).sum())
     any_weak = int(((adjusted < 0.05) & below.values).any(axis=1).sum())
@@ -332,23 +332,23 @@ def test_a_planted_weak_id_is_found(ids, fallen, count):
     rng = np.random.default_rng([28, ids, int(100 * fallen)])
     rates = np.full((ids, 3), 0.95)
     rates[4] = fallen
-    results, told = ranked(rng, count, ids, rates)
-    p_values = told["p_value"].transpose("regime", "marker_id").values
+    results, answer = ranked(rng, count, ids, rates)
+    p_values = answer["p_value"].transpose("regime", "marker_id").values
     adjusted = np.array([holm(row.tolist()) for row in p_values])
     power = float((adjusted[:, 4] < 0.05).mean())
-    first = float((told["rank"].isel(marker_id=4) == 1).mean())
+    first = float((answer["rank"].isel(marker_id=4) == 1).mean())
     print(f"{ids} IDs, one found in {fallen}: weak in {power:.3f}, weakest in {first:.3f}")
     least = {(10, 0.7): 0.75, (50, 0.6): 0.75, (50, 0.8): 0.1}[ids, fallen]
     assert power > least
     one = marker_ranking(results.isel(regime=0)).compute()
     assert one["weak"].values.sum() <= 2
-    xr.testing.assert_allclose(one["p_value"], told["p_value"].isel(regime=0))
+    xr.testing.assert_allclose(one["p_value"], answer["p_value"].isel(regime=0))
 
 
 def test_what_is_not_seen_is_never_weak():
     rng = np.random.default_rng(29)
     results, _ = ranked(rng, 1, 5, np.full((5, 3), 0.9))
     results["detection"][{"marker_id": 2}] = DetectionStatus.not_visible
-    told = marker_ranking(results.isel(regime=0)).compute()
-    assert told["looked_for"].values.tolist() == [60, 60, 0, 60, 60]
-    assert not told["weak"].values[2]
+    answer = marker_ranking(results.isel(regime=0)).compute()
+    assert answer["looked_for"].values.tolist() == [60, 60, 0, 60, 60]
+    assert not answer["weak"].values[2]

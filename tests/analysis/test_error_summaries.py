@@ -138,9 +138,9 @@ def approximately(name, value):
     return pytest.approx(value, rel=2e-7 if quantile else 1e-12)
 
 
-def expected_summary(found):
+def expected_summary(chosen):
     """Return the variables without intervals of a list of poses."""
-    aimed = [pose for pose in found if looked_for(pose)]
+    aimed = [pose for pose in chosen if looked_for(pose)]
     solved = [pose for pose in aimed if is_solved(pose)]
     unflipped = [pose for pose in solved if is_unflipped(pose)]
     out = {
@@ -176,12 +176,12 @@ def mixed():
 
 # Values.
 
-@pytest.mark.parametrize(("per", "treatments"), [
+@pytest.mark.parametrize(("per", "configurations"), [
     (("distance_m",), ("refinement", "solver")), ((), ()), (("marker_id", "distance_m"), ()),
     ((), ("solver", "refinement")),
 ])
-def test_every_summary_is_that_of_plain_loops_over_the_poses(mixed, per, treatments):
-    kept = (*per, *treatments)
+def test_every_summary_is_that_of_plain_loops_over_the_poses(mixed, per, configurations):
+    kept = (*per, *configurations)
     summary = error_statistics(mixed, kept)
     assert tuple(summary["looked_for"].dims) == kept
     for index in np.ndindex(*(mixed.sizes[name] for name in kept)):
@@ -240,11 +240,11 @@ def test_nothing_seen_says_nothing():
 
 
 @pytest.mark.parametrize("function", [error_statistics, efficiency, covariance_trust])
-def test_a_dimension_that_is_not_there_is_told_in_one_line(mixed, function):
+def test_a_dimension_that_is_not_there_is_refused_in_one_line(mixed, function):
     there = "there are distance_m, marker_id, trial, refinement, solver"
-    for treatments, per in ((["solverr"], []), ([], ["solverr"]), (["xyz"], [])):
+    for configurations, per in ((["solverr"], []), ([], ["solverr"]), (["xyz"], [])):
         with pytest.raises(ArgumentError, match=there) as refused:
-            function(mixed, (*per, *treatments))
+            function(mixed, (*per, *configurations))
         assert "\n" not in str(refused.value)
 
 
@@ -274,22 +274,22 @@ def test_intervals_of_means_have_the_variance_within_cells():
     results = measured(np.random.default_rng(4))
     summary = error_statistics(results, ["refinement", "solver"])
     for i, j in itertools.product(range(2), range(2)):
-        told = summary.isel(refinement=i, solver=j)
+        answer = summary.isel(refinement=i, solver=j)
         cells = in_cells(results, percent, range(5), refinement=i, solver=j)
         mean, error, freedom = stratified(cells)
         ends = mean + error * stats.t.ppf([0.025, 0.975], freedom)
-        assert told["range_bias_percent_low"].item() == pytest.approx(ends[0], rel=1e-9)
-        assert told["range_bias_percent_high"].item() == pytest.approx(ends[1], rel=1e-9)
+        assert answer["range_bias_percent_low"].item() == pytest.approx(ends[0], rel=1e-9)
+        assert answer["range_bias_percent_high"].item() == pytest.approx(ends[1], rel=1e-9)
         squares = [[value**2 for value in cell] for cell in cells]
         mean, error, freedom = stratified(squares)
         ends = np.sqrt(mean * np.exp(error / mean * stats.t.ppf([0.025, 0.975], freedom)))
-        assert told["range_rmse_percent_low"].item() == pytest.approx(ends[0], rel=1e-9)
-        assert told["range_rmse_percent_high"].item() == pytest.approx(ends[1], rel=1e-9)
+        assert answer["range_rmse_percent_low"].item() == pytest.approx(ends[0], rel=1e-9)
+        assert answer["range_rmse_percent_high"].item() == pytest.approx(ends[1], rel=1e-9)
 
 
 def test_the_rotation_bias_ends_at_students_and_scheffes_distance():
     results = measured(np.random.default_rng(18))
-    told = error_statistics(results, ["refinement", "solver"]).isel(refinement=1, solver=0)
+    answer = error_statistics(results, ["refinement", "solver"]).isel(refinement=1, solver=0)
     cells = in_cells(results, lambda pose: np.degrees(pose["rotation_error_rad"]), range(5),
                      refinement=1, solver=0)
     centre = np.concatenate(cells).mean(axis=0)
@@ -297,8 +297,8 @@ def test_the_rotation_bias_ends_at_students_and_scheffes_distance():
     mean, error, freedom = stratified(along)
     low = mean - error * math.sqrt(3 * freedom / (freedom - 2) * stats.f.ppf(0.95, 3, freedom - 2))
     high = mean + error * stats.t.ppf(0.975, freedom)
-    assert told["rotation_bias_deg_low"].item() == pytest.approx(max(low, 0), rel=1e-9)
-    assert told["rotation_bias_deg_high"].item() == pytest.approx(high, rel=1e-9)
+    assert answer["rotation_bias_deg_low"].item() == pytest.approx(max(low, 0), rel=1e-9)
+    assert answer["rotation_bias_deg_high"].item() == pytest.approx(high, rel=1e-9)
 
 
 def test_a_cell_with_a_single_draw_gets_the_pooled_variance():
@@ -341,28 +341,28 @@ def test_where_nothing_was_drawn_there_is_no_interval(mixed, how):
 
 
 def test_rates_have_wilsons_interval(mixed):
-    told = error_statistics(mixed, ["refinement", "solver"]).isel(refinement=1, solver=1)
-    found = [pose for pose in poses(mixed, refinement=1, solver=1) if looked_for(pose)]
-    solved = [pose for pose in found if is_solved(pose)]
+    answer = error_statistics(mixed, ["refinement", "solver"]).isel(refinement=1, solver=1)
+    chosen = [pose for pose in poses(mixed, refinement=1, solver=1) if looked_for(pose)]
+    solved = [pose for pose in chosen if is_solved(pose)]
     for name, of, hits in (
-        ("detection_rate", found, sum(p["detection"] == DetectionStatus.detected for p in found)),
-        ("solved_rate", found, len(solved)),
+        ("detection_rate", chosen, sum(p["detection"] == DetectionStatus.detected for p in chosen)),
+        ("solved_rate", chosen, len(solved)),
         ("flip_rate", solved, len(solved) - sum(map(is_unflipped, solved))),
     ):
         ends = stats.binomtest(hits, len(of)).proportion_ci(method="wilson")
-        assert told[f"{name}_low"].item() == pytest.approx(ends.low, rel=1e-9)
-        assert told[f"{name}_high"].item() == pytest.approx(ends.high, rel=1e-9)
+        assert answer[f"{name}_low"].item() == pytest.approx(ends.low, rel=1e-9)
+        assert answer[f"{name}_high"].item() == pytest.approx(ends.high, rel=1e-9)
 
 
 @pytest.mark.parametrize("n", [2, 5, 6, 50, 72, 73, 367, 368, 1000])
 def test_quantiles_have_the_binomial_interval_of_order_statistics(n):
     results = measured(np.random.default_rng(6), {"trial": n}, {}, {})
-    told = error_statistics(results, [])
+    answer = error_statistics(results, [])
     values = np.array([degrees(pose) for pose in poses(results)])
     for name, p in (("median", 0.5), ("p95", 0.95), ("p99", 0.99)):
         ends = stats.quantile_test(values, p=p).confidence_interval(0.95)
         for end, value in (("low", ends.low), ("high", ends.high)):
-            assert told[f"rotation_{name}_deg_{end}"].item() == pytest.approx(
+            assert answer[f"rotation_{name}_deg_{end}"].item() == pytest.approx(
                 value, rel=2e-7, nan_ok=True)
 
 
@@ -480,15 +480,15 @@ def test_intervals_of_quantiles_cover_at_least_what_they_say(count):
 # Efficiency.
 
 def test_efficiency_is_that_of_plain_loops(mixed):
-    told = efficiency(mixed, ["distance_m", "solver"])
+    answer = efficiency(mixed, ["distance_m", "solver"])
     for i, j in itertools.product(range(2), range(2)):
-        found = [pose for pose in poses(mixed, distance_m=i, solver=j)
+        chosen = [pose for pose in poses(mixed, distance_m=i, solver=j)
                  if is_unflipped(pose) and not np.isnan(pose["bound_std"]).any()]
-        rotation = rms([rms(p["bound_std"][:3].tolist()) * math.sqrt(3) for p in found]) / rms(
-            [math.radians(degrees(p)) for p in found])
-        depth = rms([p["bound_std"][5] / p["true_tvec_m"][2] for p in found]) / rms(
-            [percent(p) / 100 for p in found])
-        told_here = told.isel(distance_m=i, solver=j)
+        rotation = rms([rms(p["bound_std"][:3].tolist()) * math.sqrt(3) for p in chosen]) / rms(
+            [math.radians(degrees(p)) for p in chosen])
+        depth = rms([p["bound_std"][5] / p["true_tvec_m"][2] for p in chosen]) / rms(
+            [percent(p) / 100 for p in chosen])
+        told_here = answer.isel(distance_m=i, solver=j)
         assert told_here["rotation_efficiency"].item() == pytest.approx(rotation, rel=1e-12)
         assert told_here["range_efficiency"].item() == pytest.approx(depth, rel=1e-12)
 
@@ -506,24 +506,24 @@ def test_on_the_bound_the_interval_holds_one(count):
     results["translation_error_m"].values[..., 2] = rng.normal(size=bound.shape[:3]) * (
         bound[..., 5])
     results["true_tvec_m"].values[...] = 1.0 + np.arange(5)[:, None, None]
-    told = efficiency(results, ["regime"])
-    assert_coverage(covered(told, "rotation_efficiency", 1.0), count)
-    assert_coverage(covered(told, "range_efficiency", 1.0), count)
+    answer = efficiency(results, ["regime"])
+    assert_coverage(covered(answer, "rotation_efficiency", 1.0), count)
+    assert_coverage(covered(answer, "range_efficiency", 1.0), count)
 
 
 def test_without_a_bound_there_is_no_efficiency(mixed):
     nothing = mixed.assign(bound_std=mixed["bound_std"] * np.nan)
     for results in (mixed.drop_vars(["bound_std", "pose_parameter"]), nothing):
-        told = efficiency(results, ["solver"])
-        assert told["rotation_efficiency"].dims == ("solver",)
-        assert all(array.isnull().all() for array in told.values())
+        answer = efficiency(results, ["solver"])
+        assert answer["rotation_efficiency"].dims == ("solver",)
+        assert all(array.isnull().all() for array in answer.values())
 
 
 def test_no_error_at_all_is_infinitely_efficient():
-    told = efficiency(measured(np.random.default_rng(13), relative=0.0, rotation=np.zeros(
+    answer = efficiency(measured(np.random.default_rng(13), relative=0.0, rotation=np.zeros(
         (2, 3, 5, 2, 2, 3))), [])
-    assert told["range_efficiency"] == np.inf
-    assert told["rotation_efficiency_low"] == np.inf
+    assert answer["range_efficiency"] == np.inf
+    assert answer["rotation_efficiency_low"] == np.inf
 
 
 # Covariances.
@@ -533,19 +533,19 @@ def test_true_covariances_are_trusted_and_others_are_not():
     results = measured(rng, {"marker_id": 5, "trial": 400}, {}, {"solver": 3})
     results["nees"].values[..., 1] *= 1.5
     results["nees"].values[..., 2] *= 0.6
-    told = covariance_trust(results, ["solver"])
-    assert told["covariance_trusted"].values.tolist() == [True, False, False]
-    assert told["nees_count"].values.tolist() == [2000] * 3
-    assert told["nees_mean_low"][0] < 6 < told["nees_mean_high"][0]
-    assert told["nees_mean_low"][1] > 6 > told["nees_mean_high"][2]
-    assert told["covariance_coverage"].dims == ("solver", "level")
-    assert told["level"].values.tolist() == [0.5, 0.9, 0.99]
+    answer = covariance_trust(results, ["solver"])
+    assert answer["covariance_trusted"].values.tolist() == [True, False, False]
+    assert answer["nees_count"].values.tolist() == [2000] * 3
+    assert answer["nees_mean_low"][0] < 6 < answer["nees_mean_high"][0]
+    assert answer["nees_mean_low"][1] > 6 > answer["nees_mean_high"][2]
+    assert answer["covariance_coverage"].dims == ("solver", "level")
+    assert answer["level"].values.tolist() == [0.5, 0.9, 0.99]
     for k, level in enumerate((0.5, 0.9, 0.99)):
         hits = int((results["nees"].values[..., 1] <= stats.chi2.ppf(level, 6)).sum())
         ends = stats.binomtest(hits, 2000).proportion_ci(method="wilson")
-        coverage = told["covariance_coverage"].values[1, k]
+        coverage = answer["covariance_coverage"].values[1, k]
         assert coverage == pytest.approx(hits / 2000)
-        assert told["covariance_coverage_low"].values[1, k] == pytest.approx(ends.low)
+        assert answer["covariance_coverage_low"].values[1, k] == pytest.approx(ends.low)
     scale = xr.DataArray([1.0, 1 / 1.5, 1 / 0.6], {"solver": results["solver"]}, "solver")
     mended = covariance_trust(results, ["solver"], scale=scale)
     assert mended["covariance_trusted"].all()
@@ -609,10 +609,10 @@ def test_renderers_are_compared_pose_by_pose():
     results = with_flags_of_every_kind(rng, measured(rng, scene))
     results["true_tvec_m"].values[...] = results["true_tvec_m"].values[:1]
     names = ["warp", "exact", "supersample-4"]
-    told = renderer_bias(results.assign_coords(renderer=names))
-    assert told["corner_shift_rms_px"].dims == ("renderer", "refinement")
-    assert told["range_bias_percent"].dims == ("renderer", "refinement", "solver")
-    exact = told.sel(renderer="exact")
+    answer = renderer_bias(results.assign_coords(renderer=names))
+    assert answer["corner_shift_rms_px"].dims == ("renderer", "refinement")
+    assert answer["range_bias_percent"].dims == ("renderer", "refinement", "solver")
+    exact = answer.sel(renderer="exact")
     assert (exact["differing"] == 0).all()
     assert (exact["rotation_shift_deg_high"] == 0).all()
     for r, d, s in itertools.product(range(3), range(2), range(2)):
@@ -625,7 +625,7 @@ def test_renderers_are_compared_pose_by_pose():
         ranges = [percent(a) - percent(b) for a, b in aimed if is_solved(a) and is_solved(b)]
         turns = [np.degrees(a["rotation_error_rad"] - b["rotation_error_rad"])
                  for a, b in aimed if is_unflipped(a) and is_unflipped(b)]
-        here = told.isel(renderer=r, refinement=d, solver=s)
+        here = answer.isel(renderer=r, refinement=d, solver=s)
         assert here["compared"] == len(aimed)
         assert here["differing"] == sum(a != b for a, b in seen)
         assert here["detection_disagreement"] == sum(a != b for a, b in seen) / len(aimed)
@@ -654,7 +654,7 @@ def test_what_one_renderer_has_not_run_is_no_draw():
             == -renderer_bias(flipped, "b")["range_bias_percent_high"].sel(renderer="a")).all()
 
 
-def test_a_renderer_that_is_not_there_is_told(mixed):
+def test_a_renderer_that_is_not_there_is_refused(mixed):
     with pytest.raises(DatasetError, match=r"^renderer: no such dimension; there are distance_m"):
         renderer_bias(mixed)
     renamed = mixed.isel(marker_id=[0, 1]).assign_coords(marker_id=["warp", "fine"])

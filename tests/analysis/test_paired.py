@@ -40,13 +40,13 @@ from sweep.measure.flags import DetectionStatus
 
 # Ranking of marker IDs.
 
-def strata_of(found):
+def strata_of(chosen):
     """Return {cell: {marker: [hits, looked for]}} of poses of all IDs.
 
-    ``found`` are (marker, cell, pose).
+    ``chosen`` are (marker, cell, pose).
     """
     strata = {}
-    for marker, cell, pose in found:
+    for marker, cell, pose in chosen:
         if looked_for(pose):
             counts = strata.setdefault(cell, {}).setdefault(marker, [0, 0])
             counts[0] += is_detected(pose)
@@ -94,9 +94,9 @@ def of_markers(results, per):
     """Return {kept indices without the marker: (marker, cell, pose)}; cells hold all IDs."""
     names = (*per, "marker_id")
     groups = {}
-    for index, found in poses(results, "detection", names).items():
+    for index, chosen in poses(results, "detection", names).items():
         groups.setdefault(index[:-1], []).extend(
-            (index[-1], pose["cell"], pose) for pose in found)
+            (index[-1], pose["cell"], pose) for pose in chosen)
     return groups
 
 
@@ -112,27 +112,27 @@ RANKED = {
 @pytest.mark.parametrize("case", RANKED)
 def test_rates_of_ids_and_what_their_cells_expect_are_those_of_plain_loops(case):
     results, per = RANKED[case]
-    told = marker_ranking(results, per).compute()
+    answer = marker_ranking(results, per).compute()
     kept = (*per, "dictionary") if "dictionary" in results.dims else per
-    assert set(told["looked_for"].dims) == {*kept, "marker_id"}
-    adjusted = holm(told["p_value"].transpose(*kept, "marker_id").values.ravel().tolist())
+    assert set(answer["looked_for"].dims) == {*kept, "marker_id"}
+    adjusted = holm(answer["p_value"].transpose(*kept, "marker_id").values.ravel().tolist())
     np.testing.assert_allclose(
-        told["p_adjusted"].transpose(*kept, "marker_id").values.ravel(), adjusted, rtol=1e-12)
-    for index, found in of_markers(results, kept).items():
-        strata = strata_of(found)
+        answer["p_adjusted"].transpose(*kept, "marker_id").values.ravel(), adjusted, rtol=1e-12)
+    for index, chosen in of_markers(results, kept).items():
+        strata = strata_of(chosen)
         markers = range(results.sizes["marker_id"])
         for marker in markers:
-            aimed = [pose | {"cell": cell} for who, cell, pose in found
+            aimed = [pose | {"cell": cell} for who, cell, pose in chosen
                      if who == marker and looked_for(pose)]
             hits, parts = hypergeometric_parts(strata, marker)
             expected = {"looked_for": len(aimed), **rate("detection_rate", aimed, hits),
                         "expected_rate": cumulants(parts)[0] / len(aimed)}
             at = dict(zip((*kept, "marker_id"), (*index, marker), strict=True))
-            assert_agrees(told, at, expected)
-            here = told.isel(at)
+            assert_agrees(answer, at, expected)
+            here = answer.isel(at)
             below = here["detection_rate"] < here["expected_rate"]
             assert here["weak"].item() == bool(below and here["p_adjusted"] < 0.05)
-        here = told.isel(dict(zip(kept, index, strict=True)))
+        here = answer.isel(dict(zip(kept, index, strict=True)))
         assert here["weak"].dtype == bool
         if kept == per:
             assert sorted(here["rank"].values.tolist()) == [m + 1 for m in markers]
@@ -142,15 +142,15 @@ def test_rates_of_ids_and_what_their_cells_expect_are_those_of_plain_loops(case)
 def test_p_values_of_ids_are_pearsons_third_curve_near_the_exact_ones(case):
     # Two-sided: twice the smaller tail of the sum of the cells' hypergeometric numbers.
     results, per = RANKED[case]
-    told = marker_ranking(results, per).compute()
+    answer = marker_ranking(results, per).compute()
     kept = (*per, "dictionary") if "dictionary" in results.dims else per
-    for index, found in of_markers(results, kept).items():
-        strata = strata_of(found)
+    for index, chosen in of_markers(results, kept).items():
+        strata = strata_of(chosen)
         for marker in range(results.sizes["marker_id"]):
             hits, parts = hypergeometric_parts(strata, marker)
             mean, variance, third = cumulants(parts)
             at = dict(zip((*kept, "marker_id"), (*index, marker), strict=True))
-            p_value = told["p_value"].isel(at).item()
+            p_value = answer["p_value"].isel(at).item()
             deviation = math.sqrt(variance)
             curve = stats.pearson3(third / deviation**3, mean, deviation)
             tails = curve.cdf(hits + 0.5), curve.sf(hits - 0.5)
@@ -165,23 +165,23 @@ def test_of_two_ids_looked_for_alike_the_p_value_is_that_of_cochran_mantel_and_h
     results = perfect(rng, {"marker_id": 2, "tilt_deg": 3, "trial": 60})
     chances = np.array([[0.9, 0.7, 0.4], [0.8, 0.6, 0.2]])[..., None]
     results = with_detected(results, rng.random((2, 3, 60)) < chances)
-    told = marker_ranking(results).compute()
+    answer = marker_ranking(results).compute()
     tables = []
     for tilt in range(3):
         hits = [(results["detection"].values[m, tilt] == DetectionStatus.detected).sum()
                 for m in range(2)]
         tables.append(np.array([[hits[0], 60 - hits[0]], [hits[1], 60 - hits[1]]]))
-    found = contingency.StratifiedTable(tables).test_null_odds(correction=True)
-    np.testing.assert_allclose(told["p_value"], [found.pvalue] * 2, rtol=1e-9)
-    assert told["rank"].values.tolist() == [2, 1]
+    chosen = contingency.StratifiedTable(tables).test_null_odds(correction=True)
+    np.testing.assert_allclose(answer["p_value"], [chosen.pvalue] * 2, rtol=1e-9)
+    assert answer["rank"].values.tolist() == [2, 1]
 
 
 @pytest.mark.parametrize("case", RANKED)
 def test_the_references_statistic_is_that_of_statsmodels(case):
     results, per = RANKED[case]
     kept = (*per, "dictionary") if "dictionary" in results.dims else per
-    for found in of_markers(results, kept).values():
-        strata = strata_of(found)
+    for chosen in of_markers(results, kept).values():
+        strata = strata_of(chosen)
         hits, parts = hypergeometric_parts(strata, 1)
         tables = []
         for counts in strata.values():
@@ -189,9 +189,9 @@ def test_the_references_statistic_is_that_of_statsmodels(case):
             others = np.sum([counts[m] for m in counts if m != 1], axis=0)
             tables.append(np.array([[own[0], own[1] - own[0]],
                                     [others[0], others[1] - others[0]]], dtype=float))
-        told = contingency.StratifiedTable(tables).test_null_odds(correction=True)
+        answer = contingency.StratifiedTable(tables).test_null_odds(correction=True)
         mean, variance, _ = cumulants(parts)
-        assert (abs(hits - mean) - 0.5) ** 2 / variance == pytest.approx(told.statistic, rel=1e-9)
+        assert (abs(hits - mean) - 0.5) ** 2 / variance == pytest.approx(answer.statistic, rel=1e-9)
 
 
 def test_the_references_holm_is_that_of_statsmodels():
@@ -217,10 +217,10 @@ def test_settings_that_see_the_same_draws_make_no_id_weaker():
 @pytest.mark.parametrize("detected", [False, True])
 def test_where_all_ids_are_alike_none_is_weak(detected):
     results = perfect(np.random.default_rng(8), {"marker_id": 4, "trial": 10})
-    told = marker_ranking(with_detected(results, detected)).compute()
-    assert not told["weak"].any()
-    assert (told["p_value"].fillna(1.0) == 1.0).all()
-    assert (told["expected_rate"] == float(detected)).all()
+    answer = marker_ranking(with_detected(results, detected)).compute()
+    assert not answer["weak"].any()
+    assert (answer["p_value"].fillna(1.0) == 1.0).all()
+    assert (answer["expected_rate"] == float(detected)).all()
 
 
 def test_a_ranking_without_ids_is_refused():
@@ -229,7 +229,7 @@ def test_a_ranking_without_ids_is_refused():
         marker_ranking(results)
 
 
-# Comparison of two treatments.
+# Comparison of two configurations.
 
 def newcombe(both, first, second, neither):
     """Return the difference of two paired rates, second minus first, and its interval.
@@ -269,30 +269,30 @@ def test_the_references_difference_is_the_published_one(table, low, high):
 def test_the_difference_of_two_rates_is_the_published_one(table, low, high):
     results = perfect(np.random.default_rng(16), {"trial": sum(table)})
     seen = np.repeat([[1, 1], [1, 0], [0, 1], [0, 0]], table, axis=0).astype(bool)
-    told = compare(*(with_detected(results, seen[:, k]) for k in range(2))).compute()
-    assert [told[name].item() for name in (
+    answer = compare(*(with_detected(results, seen[:, k]) for k in range(2))).compute()
+    assert [answer[name].item() for name in (
         "both_detected", "only_first_detected", "only_second_detected", "neither_detected",
     )] == list(table)
-    assert round(told["detection_difference_low"].item(), 4) == low
-    assert round(told["detection_difference_high"].item(), 4) == high
+    assert round(answer["detection_difference_low"].item(), 4) == low
+    assert round(answer["detection_difference_high"].item(), 4) == high
 
 
 @pytest.mark.parametrize("table", [(50, 0, 0, 0), (50, 3, 0, 1), (20, 5, 14, 8), (0, 9, 9, 9)])
 def test_the_p_value_of_a_difference_is_mcnemars_exact_one(table):
     results = perfect(np.random.default_rng(17), {"trial": sum(table)})
     seen = np.repeat([[1, 1], [1, 0], [0, 1], [0, 0]], table, axis=0).astype(bool)
-    told = compare(*(with_detected(results, seen[:, k]) for k in range(2))).compute()
+    answer = compare(*(with_detected(results, seen[:, k]) for k in range(2))).compute()
     expected = contingency.mcnemar(np.array(table).reshape(2, 2), exact=True).pvalue
-    assert told["detection_p_value"].item() == pytest.approx(expected, rel=1e-12)
+    assert answer["detection_p_value"].item() == pytest.approx(expected, rel=1e-12)
 
 
 def pairs_of(first, second, per, bins=None):
     """Return {kept indices: pairs of poses of the same scene}."""
     ones, others = (poses(side, "estimate", per, bins) for side in (first, second))
     groups = {}
-    for index, found in ones.items():
+    for index, chosen in ones.items():
         at = {pose["at"]: pose for pose in others[index]}
-        groups[index] = [(pose, at[pose["at"]]) for pose in found]
+        groups[index] = [(pose, at[pose["at"]]) for pose in chosen]
     return groups
 
 
@@ -366,30 +366,30 @@ COMPARED = {
 def test_comparisons_are_those_of_plain_loops(case, per):
     results, name = COMPARED[case]
     first, second = (results.isel({name: k}) for k in range(2))
-    told = compare(first, second, per).compute()
-    assert tuple(told["compared"].dims) == per
+    answer = compare(first, second, per).compute()
+    assert tuple(answer["compared"].dims) == per
     for index, pairs in pairs_of(first, second, per).items():
-        assert_agrees(told, dict(zip(per, index, strict=True)),
+        assert_agrees(answer, dict(zip(per, index, strict=True)),
                       expected_seen(pairs) | expected_solved(pairs))
 
 
 def test_comparisons_in_bins_are_those_of_plain_loops():
     results, bins = COMPARED["solvers"][0], {"marker_area_px": [100.0, 300.0, 600.0, 1001.0]}
     first, second = results.isel(solver=0), results.isel(solver=1)
-    told = compare(first, second, ("tilt_deg",), bins=bins).compute()
+    answer = compare(first, second, ("tilt_deg",), bins=bins).compute()
     for index, pairs in pairs_of(first, second, ("tilt_deg",), bins).items():
         at = dict(zip(("tilt_deg", "marker_area_px"), index, strict=True))
-        assert_agrees(told, at, expected_seen(pairs) | expected_solved(pairs))
+        assert_agrees(answer, at, expected_seen(pairs) | expected_solved(pairs))
 
 
 def test_counts_of_comparisons_with_pooled_settings_are_those_of_plain_loops():
     results = GRIDS["all"]
     first, second = results.isel(noise_grey=0), results.isel(noise_grey=1)
-    told = compare(first, second, ("tilt_deg",)).compute()
+    answer = compare(first, second, ("tilt_deg",)).compute()
     unsure = ("detection_p_value", "detection_difference_low", "detection_difference_high")
     for index, pairs in pairs_of(first, second, ("tilt_deg",)).items():
         wanted = expected_seen(pairs) | expected_solved(pairs)
-        assert_agrees(told, {"tilt_deg": index[0]},
+        assert_agrees(answer, {"tilt_deg": index[0]},
                       {name: value for name, value in wanted.items() if name not in unsure})
 
 
@@ -409,13 +409,13 @@ def test_settings_that_see_the_same_draws_make_no_difference_surer():
 
 def test_a_treatment_compared_with_itself_shows_no_difference():
     results = COMPARED["solvers"][0].isel(solver=0)
-    told = compare(results, results).compute()
-    assert told["detection_difference"] == 0
-    assert told["detection_p_value"] == 1
+    answer = compare(results, results).compute()
+    assert answer["detection_difference"] == 0
+    assert answer["detection_p_value"] == 1
     for name, (unit, _) in QUANTITIES.items():
         for end in ("", "_low", "_high"):
-            assert told[f"{name}_difference_{unit}{end}"] == 0
-            assert told[f"{name}_rmse_ratio{end}"].item() == pytest.approx(1, rel=1e-12)
+            assert answer[f"{name}_difference_{unit}{end}"] == 0
+            assert answer[f"{name}_rmse_ratio{end}"].item() == pytest.approx(1, rel=1e-12)
 
 
 def test_the_other_way_round_the_comparison_turns():
@@ -431,7 +431,7 @@ def test_the_other_way_round_the_comparison_turns():
         1 / other["rotation_rmse_ratio_high"].item(), rel=1e-9)
 
 
-def test_scenes_of_two_ids_are_no_treatments_of_the_same_scenes():
+def test_scenes_of_two_ids_are_no_configurations_of_the_same_scenes():
     # Camera, marker and pose make the key of the draws: these are others, nothing is paired.
     results = mixed({"marker_id": 2, "tilt_deg": 2, "trial": 10, "noise_grey": 2}, 12)
     for name in ("marker_id", "tilt_deg"):
@@ -445,19 +445,19 @@ def test_other_scenes_and_other_draws_are_not_compared():
     first = mixed(sizes, 12)
     second = first.copy(deep=True)
     compare(first, second)
-    with pytest.raises(DatasetError) as told:
+    with pytest.raises(DatasetError) as refused:
         compare(first, second.assign_coords(marker_id=[3, 8]))
-    assert "marker_id" in str(told.value)
-    assert "\n" not in str(told.value)
-    with pytest.raises(DatasetError) as told:
+    assert "marker_id" in str(refused.value)
+    assert "\n" not in str(refused.value)
+    with pytest.raises(DatasetError) as refused:
         compare(first, second.isel(trial=slice(5)))
-    assert "trial" in str(told.value)
+    assert "trial" in str(refused.value)
     for side, seed in ((first, 1), (second, 2)):
         side.attrs["pipeline"] = pipeline_text(sizes, seed=seed)
         side.attrs["sweep"] = {"fingerprint": {"seed": seed}}
-    with pytest.raises(DatasetError) as told:
+    with pytest.raises(DatasetError) as refused:
         compare(first, second)
-    assert "seed" in str(told.value)
+    assert "seed" in str(refused.value)
 
 
 # Limit of detection.
@@ -488,10 +488,10 @@ def expected_limit(sides, rates, wanted):
 def test_the_limit_is_the_smallest_side_from_which_on_all_are_found(axis, rates):
     along = rates[::-1] if axis == "distance_m" else rates  # far is small
     results = stepped([along], {"tilt_deg": 1, axis: 4})
-    told = detection_limit(results, 0.9).compute()
+    answer = detection_limit(results, 0.9).compute()
     sides = results[axis].values if axis == "side_px" else FX * SIZE_M / results[axis].values
     flag, side, below = expected_limit(sides, along, 0.9)
-    here = told.isel(tilt_deg=0)
+    here = answer.isel(tilt_deg=0)
     assert here["limit"].item() == flag
     if flag != 2:
         assert here["side_px"].item() == pytest.approx(side, rel=1e-12)
@@ -518,13 +518,13 @@ def test_limits_are_those_of_the_pooled_rates(per):
     )
     rates = detection_rate(results, (*per, "side_px")).compute()
     for rate_ in (0.5, 0.75, 0.9):
-        told = detection_limit(results, rate_, per=per).compute()
-        assert tuple(told["side_px"].dims) == per
+        answer = detection_limit(results, rate_, per=per).compute()
+        assert tuple(answer["side_px"].dims) == per
         for index in np.ndindex(*(sizes[name] for name in per)):
             at = dict(zip(per, index, strict=True))
             flag, side, below = expected_limit(
                 results["side_px"].values, rates["detection_rate"].isel(at).values, rate_)
-            here = told.isel(at)
+            here = answer.isel(at)
             assert here["limit"] == flag
             np.testing.assert_allclose(here["side_px"], side, rtol=1e-12)
             if flag == 1:
@@ -548,6 +548,6 @@ def test_all_that_is_looked_for_may_be_found_with_pooled_settings(settings):
 
 def test_a_limit_needs_sizes():
     results = perfect(np.random.default_rng(15), {"tilt_deg": 2, "trial": 10})
-    with pytest.raises(DatasetError, match=r"side_px|distance_m") as told:
+    with pytest.raises(DatasetError, match=r"side_px|distance_m") as refused:
         detection_limit(results)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(refused.value)

@@ -134,11 +134,11 @@ def expected_composition(found):
     return out
 
 
-def by_outcome(told):
+def by_outcome(answer):
     """Return the table with a variable for each outcome."""
-    assert tuple(told["outcome"].values) == OUTCOMES
+    assert tuple(answer["outcome"].values) == OUTCOMES
     return xr.Dataset({f"{key} {name}": array.isel(outcome=k, drop=True)
-                       for key, array in told.data_vars.items()
+                       for key, array in answer.data_vars.items()
                        for k, name in enumerate(OUTCOMES)})
 
 
@@ -167,10 +167,10 @@ def expected_errors(found):
 # Comparison.
 
 
-def assert_all_agree(told, groups, names, expected):
+def assert_all_agree(answer, groups, names, expected):
     """Compare every kept combination; ``names`` are the kept dimensions."""
-    arrays = {name: array.transpose(*names).values for name, array in told.data_vars.items()}
-    assert not set(next(iter(arrays.values())).shape) - {told.sizes[name] for name in names}
+    arrays = {name: array.transpose(*names).values for name, array in answer.data_vars.items()}
+    assert not set(next(iter(arrays.values())).shape) - {answer.sizes[name] for name in names}
     for index, found in groups.items():
         here = {name: array[index] for name, array in arrays.items()}
         assert_values(here, expected(found), dict(zip(names, index, strict=True)))
@@ -184,11 +184,11 @@ CASES = pytest.mark.parametrize(("grid", "per"), [
     ("plain", ("trial",)), ("draws", ()), ("draws", ("marker_id",)),
     ("no trial", ()), ("no trial", ("cornerRefinementMethod",)),
     ("one trial", ()), ("one trial", ("tilt_deg",)), ("only trial", ()), ("only trial", ("trial",)),
-    ("treatments first", ()), ("treatments first", ("distance_m",)),
+    ("settings first", ()), ("settings first", ("distance_m",)),
 ])
 ESTIMATION_CASES = pytest.mark.parametrize(("grid", "per"), [
     ("all", ("solver",)), ("all", ("tilt_deg", "solver", "noise_grey")), ("small", tuple(ALL)),
-    ("treatments first", ("solver",)), ("treatments first", ("cornerRefinementMethod", "solver")),
+    ("settings first", ("solver",)), ("settings first", ("cornerRefinementMethod", "solver")),
 ])
 
 
@@ -217,13 +217,13 @@ def test_flip_rates_of_solvers_are_those_of_plain_loops(grid, per):
 @CASES
 def test_failures_are_those_of_plain_loops(grid, per):
     results = GRIDS[grid]
-    told = failure_composition(results, per).compute()
-    assert set(told["count"].dims) == {*per, "outcome"}
-    assert_all_agree(by_outcome(told), poses_of(grid, "estimate", per), per, expected_composition)
-    total = told["share"].sum("outcome").values
-    anything = told["share"].notnull().any("outcome").values
+    answer = failure_composition(results, per).compute()
+    assert set(answer["count"].dims) == {*per, "outcome"}
+    assert_all_agree(by_outcome(answer), poses_of(grid, "estimate", per), per, expected_composition)
+    total = answer["share"].sum("outcome").values
+    anything = answer["share"].notnull().any("outcome").values
     np.testing.assert_allclose(total[anything], 1.0, rtol=1e-12)
-    assert (told["count"].sum("outcome") == results["estimate"].size
+    assert (answer["count"].sum("outcome") == results["estimate"].size
             // math.prod(results.sizes[name] for name in per)).all()
 
 
@@ -250,7 +250,7 @@ FUNCTIONS = pytest.mark.parametrize(("function", "of", "expected"), [
 
 
 @FUNCTIONS
-@pytest.mark.parametrize("grid", ["all", "treatments first"])
+@pytest.mark.parametrize("grid", ["all", "settings first"])
 def test_the_order_of_dimensions_does_not_matter(function, of, expected, grid):
     results = GRIDS[grid]
     names = [name for name in results.dims if name not in INNER]
@@ -275,22 +275,22 @@ EDGES = [100.0, 200.0, 450.0, 451.0, 2000.0]
 ])
 def test_bins_are_those_of_plain_loops(function, of, expected, grid, per, bins):
     results = GRIDS[grid]
-    told = function(results, per, bins=bins)
+    answer = function(results, per, bins=bins)
     names = (*per, *bins)
-    assert tuple(next(iter(told.values())).dims) == names
-    assert_all_agree(told, poses(results, of, per, bins), names, expected)
+    assert tuple(next(iter(answer.values())).dims) == names
+    assert_all_agree(answer, poses(results, of, per, bins), names, expected)
     for name, edges in bins.items():
-        np.testing.assert_allclose(told[name], (np.array(edges[1:]) + edges[:-1]) / 2)
-        np.testing.assert_array_equal(told[f"{name}_low"], edges[:-1])
-        np.testing.assert_array_equal(told[f"{name}_high"], edges[1:])
+        np.testing.assert_allclose(answer[name], (np.array(edges[1:]) + edges[:-1]) / 2)
+        np.testing.assert_array_equal(answer[f"{name}_low"], edges[:-1])
+        np.testing.assert_array_equal(answer[f"{name}_high"], edges[1:])
 
 
 def test_a_value_on_an_edge_is_in_the_bin_above_and_on_the_last_in_none():
     results = mixed({"trial": 6}, 8).isel(trial=slice(6))
     results["detection"].values[...] = DetectionStatus.detected
     results["marker_area_px"].values[...] = [0.0, 1.0, 2.0, 3.0, np.nan, 2.5]
-    told = detection_rate(results, bins={"marker_area_px": [1.0, 2.0, 3.0]})
-    assert told["looked_for"].values.tolist() == [1, 2]
+    answer = detection_rate(results, bins={"marker_area_px": [1.0, 2.0, 3.0]})
+    assert answer["looked_for"].values.tolist() == [1, 2]
 
 
 def test_a_coordinate_that_is_no_dimension_can_be_binned():
@@ -305,18 +305,18 @@ def test_a_coordinate_that_is_no_dimension_can_be_binned():
 
 def test_failures_in_bins_are_those_of_plain_loops():
     results, bins = GRIDS["all"], {"marker_area_px": EDGES}
-    told = failure_composition(results, ("solver",), bins=bins)
+    answer = failure_composition(results, ("solver",), bins=bins)
     groups = poses(results, "estimate", ("solver",), bins)
-    assert_all_agree(by_outcome(told), groups, ("solver", *bins), expected_composition)
+    assert_all_agree(by_outcome(answer), groups, ("solver", *bins), expected_composition)
 
 
 def test_the_detection_rate_is_the_same_for_every_solver():
     results = GRIDS["all"]
-    told = detection_rate(results, ("solver", "tilt_deg"))
+    answer = detection_rate(results, ("solver", "tilt_deg"))
     alone = detection_rate(results, ("tilt_deg",))
     for k in range(2):
         for name in ("detected", "looked_for", "detection_rate", "detection_rate_low"):
-            np.testing.assert_array_equal(told[name].isel(solver=k), alone[name])
+            np.testing.assert_array_equal(answer[name].isel(solver=k), alone[name])
 
 
 FUNCTIONS_OF_ONE = pytest.mark.parametrize(
@@ -334,12 +334,12 @@ def test_what_was_not_run_changes_nothing_but_its_own_count(function):
     for name in longer.data_vars:
         if longer[name].dtype.kind == "f":
             longer[name][{"trial": slice(50, None)}] = np.nan
-    told, expected = (function(results, ("tilt_deg",)).compute() for results in (longer, short))
+    answer, expected = (function(results, ("tilt_deg",)).compute() for results in (longer, short))
     if function is failure_composition:
-        more = (told["count"] - expected["count"]).sel(outcome="not_run")
+        more = (answer["count"] - expected["count"]).sel(outcome="not_run")
         assert more.values.tolist() == [60, 60]
-        told, expected = (table.drop_sel(outcome="not_run") for table in (told, expected))
-    xr.testing.assert_allclose(told, expected, rtol=1e-12)
+        answer, expected = (table.drop_sel(outcome="not_run") for table in (answer, expected))
+    xr.testing.assert_allclose(answer, expected, rtol=1e-12)
 
 
 @FUNCTIONS_OF_ONE
@@ -356,14 +356,14 @@ def test_settings_that_see_the_same_draws_add_no_certainty(function):
 
 @FUNCTIONS_OF_ONE
 def test_variables_are_described_and_lie_in_their_intervals(function):
-    told = function(GRIDS["draws"], ("tilt_deg",)).compute()
-    for name, array in told.data_vars.items():
+    answer = function(GRIDS["draws"], ("tilt_deg",)).compute()
+    for name, array in answer.data_vars.items():
         assert array.attrs["long_name"], name
         assert "units" in array.attrs or "flag_meanings" in array.attrs, name
-        if f"{name}_low" in told:
-            assert not (told[f"{name}_low"] > array).any(), name
-            assert not (told[f"{name}_high"] < array).any(), name
-    assert told["tilt_deg"].values.tolist() == VALUES["tilt_deg"][:2]
+        if f"{name}_low" in answer:
+            assert not (answer[f"{name}_low"] > array).any(), name
+            assert not (answer[f"{name}_high"] < array).any(), name
+    assert answer["tilt_deg"].values.tolist() == VALUES["tilt_deg"][:2]
 
 
 def test_a_small_spread_about_a_large_bias_keeps_its_digits():
@@ -397,11 +397,11 @@ def test_where_nothing_was_looked_for_nothing_is_said(function):
 
 
 @FUNCTIONS_OF_ONE
-def test_a_dimension_that_is_not_there_is_told_in_one_line(function):
-    with pytest.raises(ArgumentError, match=r"^per = speed: no such dimension; there are") as told:
+def test_a_dimension_that_is_not_there_is_refused_in_one_line(function):
+    with pytest.raises(ArgumentError, match=r"^per = speed: no such dimension; there") as refused:
         function(GRIDS["plain"], per=("speed",))
-    assert "\n" not in str(told.value)
-    assert all(name in str(told.value) for name in ("trial", "distance_m", "marker_id"))
+    assert "\n" not in str(refused.value)
+    assert all(name in str(refused.value) for name in ("trial", "distance_m", "marker_id"))
     with pytest.raises(ArgumentError, match="bins = speed: no such variable"):
         function(GRIDS["plain"], bins={"speed": [0.0, 1.0]})
 
@@ -450,18 +450,19 @@ def test_a_draw_with_more_solved_settings_counts_more():
     # Kish 1965: 10 draws with 30 settings each and 90 with one are worth 19 draws, not 100.
     results = perfect(np.random.default_rng(1), {"trial": 100, "solver": 30})
     results["estimate"].values[10:, 1:] = EstimateStatus.solver_failed
-    told = flip_rate(results)
-    assert told["solved"] == 10 * 30 + 90
-    assert told["draws"] == (10 * 30 + 90) ** 2 // (10 * 30**2 + 90) == 16
+    answer = flip_rate(results)
+    assert answer["solved"] == 10 * 30 + 90
+    assert answer["draws"] == (10 * 30 + 90) ** 2 // (10 * 30**2 + 90) == 16
 
 
 def test_a_solved_pose_without_a_number_counts_in_no_mean():
     results = perfect(np.random.default_rng(2), {"trial": 60})
     results["rotation_error_rad"].values[:3] = np.nan
-    told, without = error_statistics(results), error_statistics(results.isel(trial=slice(3, None)))
+    answer = error_statistics(results)
+    without = error_statistics(results.isel(trial=slice(3, None)))
     for name in ("rotation_rmse_deg", "rotation_sd_deg", "rotation_bias_deg"):
-        assert told[name].item() == pytest.approx(without[name].item(), rel=1e-12), name
-    assert told["rotation_p99_deg"] == np.inf
+        assert answer[name].item() == pytest.approx(without[name].item(), rel=1e-12), name
+    assert answer["rotation_p99_deg"] == np.inf
 
 
 NO_EDGES, NO_NAMES = "expected at least two increasing edges", "expected names of dimensions"
@@ -480,7 +481,7 @@ NO_EDGES, NO_NAMES = "expected at least two increasing edges", "expected names o
     (lambda r: detection_rate(r.isel(trial=slice(0))), DatasetError,
      "there are no poses: trial has no values"),
 ])
-def test_what_cannot_be_asked_is_told_in_one_line(call, error, message):
+def test_arguments_that_cannot_be_is_refused_in_one_line(call, error, message):
     with pytest.raises(error, match=message) as refused:
         call(GRIDS["draws"])
     assert "\n" not in str(refused.value)

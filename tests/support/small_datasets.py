@@ -388,6 +388,6 @@ GRIDS = {
     "one trial": mixed({"trial": 1, "tilt_deg": 3}, 5),
     "only trial": mixed({"trial": 60}, 6),
     "small": mixed({name: 1 if name in ("dictionary", "marker_id") else 2 for name in ALL}, 10),
-    "treatments first": mixed(
+    "settings first": mixed(
         {"solver": 2, "trial": 5, "cornerRefinementMethod": 2, "distance_m": 3}, 7),
 }

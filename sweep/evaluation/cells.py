@@ -33,7 +33,7 @@ from sweep.evaluation.variables import (
 )
 from sweep.measure.accuracy import pose_error
 from sweep.measure.bound import Bounds, bounds
-from sweep.measure.estimation import Estimates
+from sweep.measure.estimation import Detections, Estimates
 from sweep.measure.estimators import EstimatorSetting, build
 from sweep.measure.flags import BoundStatus, DetectionStatus
 from sweep.model.columns import Column
@@ -148,19 +148,19 @@ def _run_batch(
                 dataclasses.replace(failure, setting=k, estimator=j)
                 for failure in failures[known:]
             ]
-            compared = _compared(estimates, scenes, rows)
+            compared = _compare(detections, estimates, scenes, rows)
             add(compute_estimation(compared, rows, need[:, k, j]))
             seconds["estimation"].append(time.perf_counter() - start)
     return CellsResult(columns, seconds, row_s, failures)
 
 
-def _compared(
-    estimates: Estimates, scenes: Scenes, rows: NDArray[np.intp]
+def _compare(
+    detections: Detections, estimates: Estimates, scenes: Scenes, rows: NDArray[np.intp]
 ) -> EstimationResults:
-    """Return the estimates (n,) of the scenes ``rows`` beside their errors."""
-    truth = scenes.rotation[rows]
-    error = pose_error(estimates.rotation, estimates.translation, truth, scenes.translation[rows])
-    return EstimationResults(estimates, error, truth)
+    """Return the estimates (n,) of the scenes ``rows`` beside the truth and their errors."""
+    rotation, translation = scenes.rotation[rows], scenes.translation[rows]
+    error = pose_error(estimates.rotation, estimates.translation, rotation, translation)
+    return EstimationResults(detections, estimates, error, rotation, translation)
 
 
 def _bounds(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sweep.measure.accuracy import PoseError, rotation_difference
 from sweep.measure.bound import Bounds
 from sweep.measure.covariance import squared_deviations
-from sweep.measure.estimation import Estimates
+from sweep.measure.estimation import Detections, Estimates
 from sweep.measure.flags import EstimateStatus, Flipped
 from sweep.model.extent import areas_px
 from sweep.model.pose import vector_of_rotation
@@ -49,15 +49,17 @@ class EstimationResults:
 
     Attributes
     ----------
-    estimates, error
-        The estimates and their errors, n of each.
-    true_rotation
-        (n, 3, 3) marker to camera.
+    detections, estimates, error
+        What the estimator got, what it returned, and its errors: n of each.
+    true_rotation, true_translation
+        (n, 3, 3) and (n, 3) in metres, marker to camera.
     """
 
+    detections: Detections
     estimates: Estimates
     error: PoseError
     true_rotation: Floats
+    true_translation: Floats
 
 
 def _flipped(results: EstimationResults) -> NDArray[np.uint8]:

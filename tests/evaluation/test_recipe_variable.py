@@ -1,0 +1,129 @@
+"""Adding a variable: a record in the schema, a function in the evaluation, and the rest follows.
+
+The two are really added, to copies of their modules that every process of a run loads in place of
+the originals.
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sweep.evaluation import variables
+from sweep.evaluation.variables import check_complete
+from sweep.plan.parameters import Stage
+from sweep.store.layout import FORMAT
+
+TOP = Path(__file__).parents[2]
+
+PIPELINE = """
+seed = 5
+[marker]
+size_m = 0.05
+[scene]
+background = 255
+[pose]
+jitter_px = 0.5
+[axes]
+distance_m = [0.4, 40]
+trial = 3
+solver = ["ippe", "iterative"]
+"""
+
+RECORD = f"""
+    Variable("range_error", _E, "f4", "estimated over true distance of the camera, minus 1",
+             present_when=_POSE, since_format={FORMAT + 1}),
+"""
+FUNCTION = """
+    "range_error": lambda results: (
+        np.linalg.norm(results.estimates.translation, axis=1)
+        / np.linalg.norm(results.true_translation, axis=1) - 1
+    ),
+"""
+
+ADDITIONS = {
+    # Module -> where its text is changed, and what is put there.
+    "sweep.plan.schema": (')\n"""Every variable, in the order', RECORD),
+    "sweep.evaluation.variables": ('}\n"""Variable of the estimation', FUNCTION),
+    "sweep.store.layout": (f"FORMAT = {FORMAT}", f"FORMAT = {FORMAT + 1}  # "),
+}
+
+# Python imports this in every process that has its folder on PYTHONPATH.
+FINDER = """
+import importlib.abc, importlib.util, os, sys
+from pathlib import Path
+
+class Finder(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        file = Path(__file__).parent / f"{name}.txt"
+        if name.startswith("sweep.") and file.exists():
+            loader = importlib.machinery.SourceFileLoader(name, str(file))
+            return importlib.util.spec_from_file_location(name, file, loader=loader)
+
+sys.meta_path.insert(0, Finder())
+"""
+
+SCRIPT = """
+import sys
+import numpy as np
+import sweep
+from sweep.cli import main
+from sweep.plan.reference import TABLES
+
+if __name__ == "__main__":
+    pipeline, old, new = sys.argv[1:]
+    results = sweep.run(pipeline, store=new, workers=1)
+    solved = results["estimate"].values == 1
+    error = results["range_error"]
+    assert error.dims == results["nees"].dims and error.dtype == "f4"
+    assert (np.isfinite(error.values) == solved).all() and solved.any() and not solved.all()
+    assert error.attrs["long_name"].startswith("estimated over true")
+    truth = results["true_tvec_m"]
+    estimated = truth + results["translation_error_m"]
+    expected = (estimated**2).sum("xyz") ** 0.5 / (truth**2).sum("xyz") ** 0.5 - 1
+    expected = expected.transpose(*error.dims).values[solved]
+    np.testing.assert_allclose(error.values[solved], expected, atol=1e-6)
+    for store in (new, old):
+        assert main(["verify", store]) == 0, store
+        assert main(["status", store]) == 0, store
+    older = sweep.open(old)
+    assert "range_error" not in older
+    np.testing.assert_array_equal(older["nees"], results["nees"])
+    assert "`range_error` | estimation" in TABLES["variables"]()
+"""
+
+
+def test_a_record_and_a_function_make_a_variable(tmp_path):
+    overlay = tmp_path / "overlay"
+    overlay.mkdir()
+    (overlay / "sitecustomize.py").write_text(FINDER)
+    for module, (mark, addition) in ADDITIONS.items():
+        text = TOP.joinpath(*module.split(".")).with_suffix(".py").read_text()
+        assert text.count(mark) == 1, module
+        changed = text.replace(mark, addition + (mark if mark not in addition else ""))
+        (overlay / f"{module}.txt").write_text(changed)
+    pipeline = tmp_path / "range.toml"
+    pipeline.write_text(PIPELINE)
+    (tmp_path / "script.py").write_text(SCRIPT)
+    old, new = tmp_path / "old.zarr", tmp_path / "new.zarr"
+    run = [sys.executable, "-m", "sweep", "run", str(pipeline), "--store", str(old),
+           "--workers", "1"]
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(overlay), str(TOP)])}
+    script = [sys.executable, str(tmp_path / "script.py"), str(pipeline), str(old), str(new)]
+    for command, environment in ((run, None), (script, env)):
+        done = subprocess.run(
+            command, cwd=TOP, env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_a_variable_without_a_function_and_a_function_without_a_variable_are_refused():
+    tables = {Stage.scene: variables.SCENE, Stage.detection: variables.DETECTION}
+    check_complete(tables)
+    lacking = {name: f for name, f in variables.SCENE.items() if name != "bound"}
+    with pytest.raises(TypeError, match="variable bound of stage scene: no function computes it"):
+        check_complete({Stage.scene: lacking})
+    with pytest.raises(TypeError, match="variable glare of stage detection: the schema lacks it"):
+        check_complete({Stage.detection: variables.DETECTION | {"glare": None}})

@@ -9,9 +9,16 @@ from __future__ import annotations
 import functools
 import importlib
 import os
+import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
+
+if sys.version_info < (3, 11):  # noqa: UP036  (a copy of the sources, which pip did not check)
+    _PROBLEM = "sweep needs Python 3.11 or newer; this is Python {}.{}".format(*sys.version_info)
+    if os.path.basename(sys.argv[0]) in ("sweep", "-m"):  # noqa: PTH119
+        raise SystemExit(_PROBLEM)  # the command: one line, no traceback
+    raise ImportError(_PROBLEM)
 
 from sweep.errors import ArgumentError, PipelineError, RunError, StoreError, SweepError
 from sweep.execution.limits import TIME_LIMIT_S

@@ -16,7 +16,7 @@ from matplotlib.ticker import MaxNLocator
 from sweep.measure.bit_reading import reading_of
 from sweep.measure.detector import DetectorSetting
 from sweep.model.marker import modules
-from sweep.report.trade_figure import COLOURS, FAINT, INK, RULE, STRIP_COLOUR
+from sweep.report.theme import COLOURS, FAINT, INK, RULE, STRIP
 
 BLUE, VERMILION, GREEN, _, SKY, ORANGE, _ = COLOURS
 STYLE = {
@@ -45,8 +45,8 @@ def draw_second_dip(
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 4.5))
         axes = figure.subplots()
-        axes.axvspan(350, 450, color=STRIP_COLOUR, zorder=0)
-        axes.axvspan(298, 302, color=STRIP_COLOUR, zorder=0)
+        axes.axvspan(350, 450, color=STRIP, zorder=0)
+        axes.axvspan(298, 302, color=STRIP, zorder=0)
         for area, words in ((300, "the paper's first, 300"), (400, "the paper's second, 350-450")):
             axes.text(area, 101.6, words, ha="center", va="bottom", color=FAINT)
         axes.plot([361, 441], [100.9, 100.9], color=INK, lw=2.5, solid_capstyle="butt")

@@ -47,6 +47,8 @@ class SceneInspection:
         estimated pose; NaN where there is none.
     errors
         Name -> value of the template's scalar error variables.
+    values
+        Name -> value of every variable, as a store holds it.
     """
 
     image: NDArray[np.uint8]
@@ -60,6 +62,7 @@ class SceneInspection:
     corners: Floats
     axes_px: Floats
     errors: dict[str, float]
+    values: dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,4 +145,5 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
             for v in SCHEMA
             if v.flags is None and v.inner in ((), ("xyz",)) and v.stage is Stage.estimation
         },
+        values={v.name: np.asarray(columns[v.name], dtype=v.dtype) for v in SCHEMA},
     )

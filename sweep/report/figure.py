@@ -1,4 +1,4 @@
-"""What a figure of a report is: when it applies, the table behind it, and how it is drawn."""
+"""Figures of a report: for which stores they are made, their tables, panels and captions."""
 
 from __future__ import annotations
 
@@ -7,21 +7,35 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from markupsafe import Markup
 
 from sweep.analysis.quantiles import IntervalOf
-from sweep.report.charts import Series
-from sweep.report.report_data import Subject, labels_of
+from sweep.report.grouping import group_labels
+from sweep.report.report_data import ReportData
+from sweep.report.scales import Series
+from sweep.report.svg import Panel
 from sweep.report.table import Table
-from sweep.report.theme import Panel
 from sweep.typing import Floats
 
 
 @dataclass(frozen=True, slots=True)
 class RenderedFigure:
-    """A figure of one store, ready to be put on a page.
+    """A figure of one store.
 
-    ``svg``, where there is one, is a whole drawing that stands in place of panels; its files are
-    written by ``write``, which takes a path whose suffix is the format.
+    Attributes
+    ----------
+    name
+        Its anchor on the page, and the name of its files.
+    title, caption
+        Text above and below it.
+    table
+        The numbers that it shows.
+    panels
+        Its drawings.
+    svg
+        Returns one drawing in place of panels as inline SVG; takes a prefix for its identifiers.
+    write
+        Writes that drawing into a file; the suffix of the path is the format.
     """
 
     name: str
@@ -29,25 +43,37 @@ class RenderedFigure:
     caption: str
     table: Table
     panels: Sequence[Panel] = ()
-    svg: Callable[[str], str] | None = None
+    svg: Callable[[str], Markup] | None = None
     write: Callable[[str], None] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class FigureKind:
-    """A kind of figure: ``applies`` tells of which stores, ``show`` makes it of one of these.
+    """A kind of figure.
 
-    ``covers`` are the axes that need no other figure where it applies.
+    Attributes
+    ----------
+    name
+        Name of its figures.
+    applies
+        Whether a store has such a figure.
+    render
+        Makes the figure of a store to which the kind applies.
+    covers
+        The axes that need no figure of their own if the kind applies.
     """
 
     name: str
-    applies: Callable[[Subject], bool]
-    show: Callable[[Subject], RenderedFigure]
-    covers: Callable[[Subject], Sequence[str]] = lambda _: ()
+    applies: Callable[[ReportData], bool]
+    render: Callable[[ReportData], RenderedFigure]
+    covers: Callable[[ReportData], Sequence[str]] = lambda _: ()
 
 
-def middles(found: xr.Dataset, name: str) -> Floats:
-    """Return where the groups of a numeric axis stand: its values, or the middles of bins."""
+def group_positions(found: xr.Dataset, name: str) -> Floats:
+    """Return the positions (n,) of groups on a numeric axis: values, or the middles of bins.
+
+    The middle of a bin is the geometric mean of its ends if both are positive.
+    """
     if f"{name}_low" in found.coords:
         low, high = (
             np.asarray(found[f"{name}_{end}"], dtype=np.float64) for end in ("low", "high")
@@ -56,8 +82,10 @@ def middles(found: xr.Dataset, name: str) -> Floats:
     return np.asarray(found[name].values, dtype=np.float64)
 
 
-def ends_of(found: xr.Dataset, name: str, scale: float = 1.0) -> tuple[Floats, Floats, Floats]:
-    """Return a variable's values and the ends of its intervals, NaN where there are none."""
+def values_with_ends(
+    found: xr.Dataset, name: str, scale: float = 1.0
+) -> tuple[Floats, Floats, Floats]:
+    """Return a variable's values and the ends of its intervals, NaN without an interval."""
     value = np.asarray(found[name].values, dtype=np.float64)
     low, high = (
         np.asarray(found[f"{name}_{end}"].values, dtype=np.float64)
@@ -67,52 +95,60 @@ def ends_of(found: xr.Dataset, name: str, scale: float = 1.0) -> tuple[Floats, F
     return scale * value, scale * low, scale * high
 
 
-def series_of(
+def dots_of(found: xr.Dataset, name: str, scale: float = 1.0) -> Series:
+    """Return a variable (n,) and its intervals as the dots of n rows."""
+    value, low, high = values_with_ends(found, name, scale)
+    return Series("", value, value, low, high)
+
+
+def lines_of(
     found: xr.Dataset, along: str, name: str, by: str | None, scale: float = 1.0
 ) -> list[Series]:
-    """Return a line of ``name`` along an axis for each value of ``by``; what is NaN is left out."""
-    x = middles(found, along)
+    """Return a line of ``name`` along an axis for each value of ``by``, without NaN."""
+    x = group_positions(found, along)
     order = np.argsort(x)
     parts = (
         [(f"{by.removesuffix('_deg')} {label}\u00b0" if by.endswith("_deg") else f"{label}",
-          found.isel({by: k})) for k, label in enumerate(labels_of(found, by))]
+          found.isel({by: k})) for k, label in enumerate(group_labels(found, by))]
         if by is not None else [("", found)]
     )
     lines = []
     for label, part in parts:
-        value, low, high = ends_of(part, name, scale)
-        there = order[~np.isnan(value[order])]
-        lines.append(Series(label, x[there], value[there], low[there], high[there]))
+        value, low, high = values_with_ends(part, name, scale)
+        known = order[~np.isnan(value[order])]
+        lines.append(Series(label, x[known], value[known], low[known], high[known]))
     return lines
 
 
-def on_intervals(found: xr.Dataset, *names: str, marks: str = "Bars") -> str:
-    """Return what the drawn intervals are, or why there are none."""
+def interval_sentence(found: xr.Dataset, *names: str, marks: str = "Bars") -> str:
+    """Return a sentence that says what the drawn intervals are, or why there are none."""
     ends = [found[f"{name}_{end}"] for name in names for end in ("low", "high")
             if f"{name}_{end}" in found]
     if any(bool(np.isfinite(end).any()) for end in ends):
-        return f"{marks} are 95 % intervals, of the random draws on this fixed grid."
+        return f"{marks} are 95 % intervals over the random draws, conditional on the grid."
     few = "median_interval" in found and bool(
         (found["median_interval"] == IntervalOf.too_few_draws).any())
     return "No intervals: too few draws." if few else (
         "No intervals: nothing was drawn at random.")
 
 
-def of_how_many(found: xr.Dataset, name: str = "looked_for", what: str = "poses looked for") -> str:
-    """Return the denominators in words: ``each of 40 to 200 poses looked for``."""
+def denominators(
+    found: xr.Dataset, name: str = "looked_for", what: str = "poses looked for"
+) -> str:
+    """Return a sentence with the denominators: ``Each value is of 40 to 200 poses ...``."""
     counts = found[name].values[found[name].values > 0]
     if not counts.size:
         return f"No {what}."
     low, high = int(counts.min()), int(counts.max())
-    which = f"{low:,}" if low == high else f"{low:,} to {high:,}"
-    return f"Each value is of {which} {what}."
+    span = f"{low:,}" if low == high else f"{low:,} to {high:,}"
+    return f"Each value is of {span} {what}."
 
 
-def lower(title: str) -> str:
+def uncapitalised(title: str) -> str:
     """Return a title as it stands within a sentence or on an axis."""
     return title[0].lower() + title[1:]
 
 
 def sentences(*parts: str) -> str:
-    """Join what is not empty."""
+    """Return the parts that are not empty, joined by spaces."""
     return " ".join(part for part in parts if part)

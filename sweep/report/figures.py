@@ -1,35 +1,33 @@
-"""The figures that a report can have, in the order in which they stand."""
+"""The kinds of figures of a report, in the order in which they stand."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
+from sweep.report.axis_effect import effect_of
+from sweep.report.bound_figure import BOUND
+from sweep.report.configuration_figures import COMPARED, CONFIGURATIONS
+from sweep.report.failure_figure import FAILURES
 from sweep.report.figure import FigureKind
-from sweep.report.report_data import Subject
-from sweep.report.scene_figures import (
-    DETECTION,
-    ERRORS_BY_SIZE,
-    FAILURES,
-    FLIPS,
-    MAPS,
-    RANKING,
-    effect_of,
-)
-from sweep.report.treatment_figures import BOUND, COMPARED, TRADE, TREATMENTS
+from sweep.report.ranking_figure import RANKING
+from sweep.report.report_data import ReportData
+from sweep.report.scene_figures import DETECTION, ERRORS_BY_SIZE, FLIPS, MAPS
+from sweep.report.tradeoff_figure import TRADE
 
 KINDS: tuple[FigureKind, ...] = (
-    DETECTION, ERRORS_BY_SIZE, MAPS, FAILURES, FLIPS, RANKING, TREATMENTS, COMPARED, BOUND, TRADE,
+    DETECTION, ERRORS_BY_SIZE, MAPS, FAILURES, FLIPS, RANKING, CONFIGURATIONS, COMPARED, BOUND,
+    TRADE,
 )
-"""Add a kind of figure here; an axis that none of them covers gets a figure of its effect."""
+"""Add a kind of figure here; an axis that no kind covers gets a figure of its effect."""
 
 
-def figures_of(subject: Subject) -> Iterator[FigureKind]:
-    """Yield the kinds of figures that apply to a store; no axis of it is only pooled."""
+def figure_kinds(data: ReportData) -> Iterator[FigureKind]:
+    """Yield the kinds of figures of a store, such that every axis is shown in one of them."""
     covered: set[str] = set()
     for kind in KINDS:
-        if kind.applies(subject):
-            covered.update(kind.covers(subject))
+        if kind.applies(data):
+            covered.update(kind.covers(data))
             yield kind
-    for name in (*subject.scene_axes, *subject.treatments):
+    for name in (*data.scene_axes, *data.setting_axes):
         if name not in covered:
             yield effect_of(name)

@@ -10,52 +10,53 @@ from sweep.report.answer import Answer
 from sweep.report.figure import RenderedFigure
 from sweep.report.gallery import Scene
 from sweep.report.provenance_facts import Provenance
+from sweep.report.svg import write_panels
 from sweep.report.table import markdown_text
-from sweep.report.theme import write_panels
 
 
-def write_figure(shown: RenderedFigure, folder: Path) -> None:
-    """Write a figure as NAME.svg and NAME.png in a folder."""
-    if shown.write is not None:
+def write_figure(figure: RenderedFigure, folder: Path) -> None:
+    """Write a figure as NAME.svg and NAME.png into a folder."""
+    if figure.write is not None:
         for suffix in ("svg", "png"):
-            shown.write(str(folder / f"{shown.name}.{suffix}"))
+            figure.write(str(folder / f"{figure.name}.{suffix}"))
     else:
-        write_panels(shown.panels, folder / shown.name)
+        write_panels(figure.panels, folder / figure.name)
 
 
 def markdown(
-    title: str, found: Answer, made: Provenance, figures: Sequence[RenderedFigure],
-    scenes: Iterable[Scene], folder: Path, shown_folder: str,
+    title: str, answer: Answer, provenance: Provenance, figures: Sequence[RenderedFigure],
+    scenes: Iterable[Scene], folder: Path, link_folder: str,
 ) -> str:
     """Return the report as Markdown; pictures of scenes are written into ``folder``.
 
-    ``shown_folder`` is the folder's name as the text refers to it; the figures are there.
+    ``link_folder`` is the name of the folder with figures and pictures in the links of the text.
     """
-    place = quote(shown_folder)
+    base = quote(link_folder)
     parts = [
-        f"# {markdown_text(title)}", markdown_text(found.paragraph),
+        f"# {markdown_text(title)}", markdown_text(answer.paragraph),
         "\n".join(
             f"- {markdown_text(tile.heading)}: **{markdown_text(tile.value)}**"
             + (f" ({markdown_text(tile.detail)})" if tile.detail else "")
-            for tile in found.tiles
+            for tile in answer.tiles
         ),
-        "## Where the numbers come from",
-        "\n".join(f"- {name}: {markdown_text(text)}" for name, text in made.facts.items()),
-        "Store and report are made again by", _code("\n".join(made.commands), "sh"),
-        _folded(f"The pipeline, {made.file}", _code(made.pipeline, "toml")),
+        "## Origin of the numbers",
+        "\n".join(f"- {name}: {markdown_text(text)}" for name, text in provenance.facts.items()),
+        "Commands that reproduce the store and this report:",
+        _code("\n".join(provenance.commands), "sh"),
+        _folded(f"The pipeline, {provenance.file}", _code(provenance.pipeline, "toml")),
     ]
-    if made.axes is not None:
-        parts.append(made.axes.markdown())
-    if made.drawn:
-        parts.append(f"Drawn per trial: {markdown_text(made.drawn)}.")
-    parts += [table.markdown() for table in found.tables]
+    if provenance.axes is not None:
+        parts.append(provenance.axes.markdown())
+    if provenance.drawn:
+        parts.append(f"Drawn in each trial: {markdown_text(provenance.drawn)}.")
+    parts += [table.markdown() for table in answer.tables]
     parts.append("## Figures")
-    for shown in figures:
+    for figure in figures:
         parts += [
-            f"### {markdown_text(shown.title)}",
-            f"![{markdown_text(shown.title)}]({place}/{quote(shown.name)}.png)",
-            markdown_text(shown.caption),
-            _folded("The numbers behind it", shown.table.markdown()),
+            f"### {markdown_text(figure.title)}",
+            f"![{markdown_text(figure.title)}]({base}/{quote(figure.name)}.png)",
+            markdown_text(figure.caption),
+            _folded("The numbers", figure.table.markdown()),
         ]
     for number, scene in enumerate(scenes):
         if number == 0:
@@ -64,9 +65,9 @@ def markdown(
         if scene.picture is not None:
             name = f"scene-{number + 1}.png"
             (folder / name).write_bytes(scene.picture)
-            parts.append(f"![{markdown_text(scene.alt)}]({place}/{name})")
+            parts.append(f"![{markdown_text(scene.alt)}]({base}/{name})")
         parts += [
-            markdown_text(text) for text in (scene.told, scene.coordinates, scene.problem) if text
+            markdown_text(text) for text in (scene.result, scene.coordinates, scene.problem) if text
         ]
         parts.append(_code(scene.command, "sh"))
     return "\n\n".join(parts) + "\n"

@@ -1,4 +1,4 @@
-"""Where a report's numbers come from: versions, dates, axes, and the commands that make it."""
+"""Origin of a report's numbers: versions, dates, axes, and the commands that reproduce it."""
 
 from __future__ import annotations
 
@@ -13,14 +13,29 @@ from typing import Any
 from sweep.messages import label
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.parameters import PARAMETERS
+from sweep.report.formatting import coordinates
 from sweep.report.gallery import pipeline_file
-from sweep.report.report_data import Subject, texts_of
+from sweep.report.report_data import ReportData
 from sweep.report.table import Table
 
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Facts by name, the commands that make store and report again, and tables of the axes."""
+    """Origin of a report's numbers.
+
+    Attributes
+    ----------
+    facts
+        Name -> fact, as text.
+    commands
+        Command lines that reproduce the store and the report.
+    axes
+        Table of the grid's axes; None for a single pose.
+    drawn
+        The distributions of drawn parameters, as text.
+    pipeline, file
+        Text of the pipeline, and the name of its file.
+    """
 
     facts: Mapping[str, str]
     commands: tuple[str, ...]
@@ -30,11 +45,10 @@ class Provenance:
     file: str
 
 
-def provenance(subject: Subject, output: str) -> Provenance:
-    """Return where a store's numbers come from; ``output`` is the report's own file."""
-    about = subject.about
-    fingerprint: dict[str, Any] = dict(about.get("fingerprint", {}))
-    environment: dict[str, Any] = dict(about.get("environment", {}))
+def provenance(data: ReportData, output: str) -> Provenance:
+    """Return the origin of a store's numbers; ``output`` is the report's own file."""
+    fingerprint: dict[str, Any] = dict(data.run_metadata.get("fingerprint", {}))
+    environment: dict[str, Any] = dict(data.run_metadata.get("environment", {}))
     versions = ", ".join(
         f"{name} {value}" for name, value in (
             ("sweep", environment.get("sweep")), ("OpenCV", fingerprint.get("opencv")),
@@ -45,59 +59,61 @@ def provenance(subject: Subject, output: str) -> Provenance:
     files = dict(fingerprint.get("files", {}))
     digest = hashlib.sha256(json.dumps(fingerprint, sort_keys=True).encode()).hexdigest()
     facts = {
-        "Store": subject.store,
-        "Run": _dates(about),
+        "Store": data.store,
+        "Run": _dates(data.run_metadata),
         "Versions": versions,
         "Processor": str(environment.get("cpu", "unknown")),
-        "Seed": str(fingerprint.get("seed", subject.pipeline.seed)),
+        "Seed": str(fingerprint.get("seed", data.pipeline.seed)),
         "Fingerprint": f"{digest[:16]} (numbers {fingerprint.get('numbers', '?')})",
-        **({"Files": ", ".join(f"{name} (SHA-256 {some[:12]}\u2026)"
-                               for name, some in files.items())} if files else {}),
+        **({"Files": ", ".join(f"{name} (SHA-256 {sha256[:12]}\u2026)"
+                               for name, sha256 in files.items())} if files else {}),
         "Report": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
     }
-    store = shlex.quote(subject.store)
-    trade = [f"sweep tradeoff {store}{_per(subject)}"] if subject.trade is not None else []
+    store = shlex.quote(data.store)
+    trade = [f"sweep tradeoff {store}{_per(data)}"] if data.trade is not None else []
     return Provenance(
         facts,
-        (f"sweep run {pipeline_file(subject.pipeline)} --store {store}", *trade,
+        (f"sweep run {pipeline_file(data.pipeline)} --store {store}", *trade,
          f"sweep report {store} -o {shlex.quote(output)}"),
-        _axes(subject),
+        _axes(data),
         "; ".join(f"{name} {distribution}"
-                  for name, distribution in subject.pipeline.distributions.items()),
-        subject.pipeline.text,
-        f"{subject.pipeline.name}.toml",
+                  for name, distribution in data.pipeline.distributions.items()),
+        data.pipeline.text,
+        f"{data.pipeline.name}.toml",
     )
 
 
-def _dates(about: Mapping[str, Any]) -> str:
-    made = str(about.get("created", "unknown")).replace("T", " ").replace("Z", " UTC")
-    finished = str(about.get("finished_at", "")).replace("T", " ").replace("Z", " UTC")
-    return f"begun {made}" + (f", finished {finished}" if finished else "")
+def _dates(run_metadata: Mapping[str, Any]) -> str:
+    created, finished = (
+        str(run_metadata.get(name, default)).replace("T", " ").replace("Z", " UTC")
+        for name, default in (("created", "unknown"), ("finished_at", ""))
+    )
+    return f"begun {created}" + (f", finished {finished}" if finished else "")
 
 
-def _per(subject: Subject) -> str:
-    """Return the options that tell the regimes of the trade apart."""
-    if subject.trade is None:
+def _per(data: ReportData) -> str:
+    """Return the options of `sweep tradeoff` that give the trade its conditions."""
+    if data.trade is None:
         return ""
     return "".join(
-        f" --per {name}" for name in map(str, subject.trade["cost_ms"].dims) if name != "treatment"
+        f" --per {name}" for name in map(str, data.trade["cost_ms"].dims) if name != "treatment"
     )
 
 
-def _axes(subject: Subject) -> Table | None:
-    if not subject.pipeline.axes:
+def _axes(data: ReportData) -> Table | None:
+    if not data.pipeline.axes:
         return None
     rows = [
         [axis.name, f"{len(axis):,}", _values(axis), axis.unit,
          "draws" if axis.name == TRIAL else PARAMETERS[axis.name].section, axis.meaning]
-        for axis in subject.pipeline.axes
+        for axis in data.pipeline.axes
     ]
     return Table("Axes of the grid", ["axis", "values", "which", "unit", "of", "meaning"], rows,
                  words=True)
 
 
 def _values(axis: Axis) -> str:
-    """Return an axis' values as text, the middle ones left out where they are many."""
+    """Return an axis' values as text; of many the first three and the last."""
     if len(axis) <= 7:
         return ", ".join(_texts(axis.values))
     texts = _texts([*axis.values[:3], axis.values[-1]])
@@ -105,4 +121,4 @@ def _values(axis: Axis) -> str:
 
 
 def _texts(values: Sequence[Any]) -> list[str]:
-    return texts_of([label(v) if isinstance(v, (tuple, str)) else v for v in values])
+    return coordinates([label(v) if isinstance(v, (tuple, str)) else v for v in values])

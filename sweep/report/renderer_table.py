@@ -1,4 +1,4 @@
-"""What other renderers cost, and what they change, as a table."""
+"""A table of other renderers: their cost, and the differences that they make."""
 
 from __future__ import annotations
 
@@ -7,25 +7,27 @@ from collections.abc import Iterator
 import numpy as np
 import xarray as xr
 
+from sweep.tradeoff.labels import configuration_label
 from sweep.tradeoff.pareto import digits
 
 IMAGES = {"ms an image": "render_ms", "x exact": "render_ratio", "grey RMS": "grey_rms",
           "grey max": "grey_max"}
 CHANGES = {
-    "found or not, %": ("detection_disagreement", 100), "corner RMS px": ("corner_shift_rms_px", 1),
+    "detection differs, %": ("detection_disagreement", 100),
+    "corner RMS px": ("corner_shift_rms_px", 1),
     "range bias %": ("range_bias_percent", 1), "rotation RMS deg": ("rotation_shift_deg", 1),
 }
-"""Headings, the variables below them, and what these are multiplied by."""
+"""Heading -> variable of the images; heading -> variable of a configuration, and its factor."""
 
 
 def renderer_lines(renderers: xr.Dataset, *, markdown: bool) -> list[str]:
-    """Return the lines of a table of renderers (rows) as ``cost/renderers`` holds them.
+    """Return the lines of a table of the renderers in ``cost/renderers``.
 
-    The images' own cost and difference from exact ones, then for each treatment how often it
-    finds what it does not find in the exact image or the other way round, and by how much corners,
-    range and rotation change, paired on the scenes that both solve.
+    First the images: cost, and difference from the exact image. Then for each configuration the
+    share of scenes in which the marker is detected in only one of the two images, and the change
+    of corners, range and rotation, paired on the scenes that both solve.
     """
-    rows = [["renderer", *IMAGES, "treatment", *CHANGES], *_rows(renderers)]
+    rows = [["renderer", *IMAGES, "configuration", *CHANGES], *_rows(renderers)]
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     if markdown:
         lines = ["| " + " | ".join(row) + " |" for row in rows]
@@ -46,11 +48,11 @@ def _rows(renderers: xr.Dataset) -> Iterator[list[str]]:
             yield [name, *images, "", *[""] * len(CHANGES)]
             continue
         for index in np.ndindex(*(one.sizes[dim] for dim in settings)):
-            chosen = dict(zip(settings, index, strict=True))
-            treated = one.isel(chosen)
-            label = " · ".join(str(treated[dim].item()) for dim in settings)
+            configuration = one.isel(dict(zip(settings, index, strict=True)))
+            label = configuration_label({dim: configuration[dim].item() for dim in settings})
             changes = [
-                digits(float(treated[variable]) * factor) for variable, factor in CHANGES.values()
+                digits(float(configuration[variable]) * factor)
+                for variable, factor in CHANGES.values()
             ]
             first = not any(index)
             yield [name if first else "", *(images if first else [""] * len(images)), label,

@@ -1,6 +1,8 @@
-"""One scene as a picture, with what was found drawn on it."""
+"""One scene as a picture, with the truth and the detections drawn on it."""
 
 from __future__ import annotations
+
+import math
 
 import cv2
 import numpy as np
@@ -10,9 +12,9 @@ from sweep.evaluation.inspection import SceneInspection
 
 Colour = tuple[int, int, int]
 
-# Blue, green, red. Okabe and Ito's palette, told apart by the colour-blind.
+# Blue, green, red; of the palette of Okabe and Ito, distinguishable by the colour-blind.
 TRUTH: Colour = (115, 158, 0)
-FOUND: Colour = (0, 94, 213)
+DETECTED: Colour = (0, 94, 213)
 OTHER: Colour = (167, 121, 204)
 REJECTED: Colour = (66, 228, 240)
 AXES: tuple[Colour, Colour, Colour] = ((0, 0, 230), (0, 170, 0), (230, 80, 0))
@@ -20,27 +22,42 @@ PAPER: Colour = (255, 255, 255)
 INK: Colour = (40, 40, 40)
 FAINT: Colour = (110, 110, 110)
 
+LEGEND: tuple[tuple[str, Colour], ...] = (
+    ("truth", TRUTH), ("detected (dot: first corner)", DETECTED), ("other detection", OTHER),
+    ("rejected candidate", REJECTED), ("x", AXES[0]), ("y", AXES[1]), ("z", AXES[2]),
+)
+"""The meaning of the colours."""
+
 MAX_SIDE = 900
 MIN_SIDE = 560
 LINE_HEIGHT = 26
+CAPTION_HEIGHT = 3 * LINE_HEIGHT + 20
 SHIFT = 4
 """Fractional bits of the drawn coordinates."""
 
 
-def draw_scene(look: SceneInspection, title: str) -> NDArray[np.uint8]:
-    """Return a scene's picture (H, W, 3), blue-green-red, enlarged, with a caption below it."""
-    height, width = look.image.shape
+def draw_scene(scene: SceneInspection, title: str) -> NDArray[np.uint8]:
+    """Return a scene enlarged, (H, W, 3), blue-green-red, with a caption below it.
+
+    Parameters
+    ----------
+    scene
+        Image, truth and detections.
+    title
+        First line of the caption; the second holds flags and errors, the third the legend.
+    """
+    height, width = scene.image.shape
     scale = max(1, min(MAX_SIDE // max(height, width), 24))
     enlarged = cv2.resize(
-        look.image, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST
+        scene.image, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST
     )
     canvas = np.asarray(cv2.cvtColor(enlarged, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
-    origin = np.array(look.window[:2], dtype=np.float64)
+    origin = np.array(scene.window[:2], dtype=np.float64)
     weight = 2 if max(canvas.shape[:2]) < 1400 else 3
 
     def at(points: NDArray[np.float64]) -> NDArray[np.int32]:
-        """Return pixels of the frame as fixed-point coordinates of the picture."""
-        # The middle of pixel 0 lies half an enlarged pixel inside the picture.
+        """Return points (n, 2) px of the frame as fixed-point coordinates of the picture."""
+        # The centre of pixel 0 lies half an enlarged pixel inside the picture.
         moved = (points - origin + 0.5) * scale - 0.5
         clipped = np.clip(moved, -1e6, 1e6)
         return np.asarray(np.round(clipped * 2**SHIFT), dtype=np.int32)
@@ -52,41 +69,41 @@ def draw_scene(look: SceneInspection, title: str) -> NDArray[np.uint8]:
                 thickness=thickness, lineType=cv2.LINE_AA, shift=SHIFT,
             )
 
-    for quad in look.rejected:
+    for quad in scene.rejected:
         outline(quad, REJECTED, 1)
-    for _, quad in look.decoded:
-        if not np.allclose(quad, look.corners, atol=0.01):
+    for _, quad in scene.decoded:
+        if not np.allclose(quad, scene.corners, atol=0.01):
             outline(quad, OTHER, weight)
-    outline(look.true_corners, TRUTH, weight + 3)
-    outline(look.corners, FOUND, weight)
-    if np.isfinite(look.corners).all():
-        for k, corner in enumerate(at(look.corners).tolist()):
+    outline(scene.true_corners, TRUTH, weight + 3)
+    outline(scene.corners, DETECTED, weight)
+    if np.isfinite(scene.corners).all():
+        for k, corner in enumerate(at(scene.corners).tolist()):
             filled = cv2.FILLED if k == 0 else weight
             cv2.circle(
-                canvas, corner, 6 << SHIFT, FOUND, filled, cv2.LINE_AA, SHIFT
+                canvas, corner, 6 << SHIFT, DETECTED, filled, cv2.LINE_AA, SHIFT
             )
-    if np.isfinite(look.axes_px).all():
-        ends = at(look.axes_px).tolist()
+    if np.isfinite(scene.axes_px).all():
+        ends = at(scene.axes_px).tolist()
         for colour, end in zip(AXES, ends[1:], strict=True):
             cv2.line(canvas, ends[0], end, colour, weight + 1, cv2.LINE_AA, SHIFT)
-    return _captioned(canvas, look, title)
+    return _captioned(canvas, scene, title)
 
 
-def _captioned(canvas: NDArray[np.uint8], look: SceneInspection, title: str) -> NDArray[np.uint8]:
-    """Return the picture with its legend and figures below it."""
-    lines = [(title, INK), (_figures(look), INK)]
-    legend = [("truth", TRUTH)]
-    if np.isfinite(look.corners).all():
-        legend.append(("found (dot: first corner)", FOUND))
-    if len(look.decoded) > int(np.isfinite(look.corners).all()):
-        legend.append(("other ID or place", OTHER))
-    if look.rejected:
-        legend.append((f"rejected: {len(look.rejected)}", REJECTED))
-    if np.isfinite(look.axes_px).all():
-        legend += [("x", AXES[0]), ("y", AXES[1]), ("z", AXES[2])]
+def _captioned(canvas: NDArray[np.uint8], scene: SceneInspection, title: str) -> NDArray[np.uint8]:
+    """Return the picture with title, result and legend below it."""
+    lines = [(title, INK), (_result_text(scene), INK)]
+    legend = [LEGEND[0]]
+    if np.isfinite(scene.corners).all():
+        legend.append(LEGEND[1])
+    if len(scene.decoded) > int(np.isfinite(scene.corners).all()):
+        legend.append(LEGEND[2])
+    if scene.rejected:
+        legend.append((f"rejected: {len(scene.rejected)}", REJECTED))
+    if np.isfinite(scene.axes_px).all():
+        legend += LEGEND[-3:]
     widest = max(_text_width(text) for text, _ in lines) + 32
     width = max(canvas.shape[1], MIN_SIDE, widest)
-    height = canvas.shape[0] + LINE_HEIGHT * 3 + 20
+    height = canvas.shape[0] + CAPTION_HEIGHT
     page = np.full((height, width, 3), PAPER, dtype=np.uint8)
     left = (width - canvas.shape[1]) // 2
     page[: canvas.shape[0], left : left + canvas.shape[1]] = canvas
@@ -114,15 +131,25 @@ def _text_width(text: str) -> int:
     return int(cv2.getTextSize(text, FONT, FONT_SCALE, 1)[0][0])
 
 
-def _figures(look: SceneInspection) -> str:
-    """Return what was found, and how far off it is, in one line."""
-    parts = [look.detection.name.replace("_", " "), f"area {look.area_px:.4g} px2"]
-    if look.errors["rotation_error_deg"] == look.errors["rotation_error_deg"]:
+def _result_text(scene: SceneInspection) -> str:
+    """Return flags and errors in one line of ASCII, which is all that OpenCV's font has."""
+    parts = [scene.detection.name.replace("_", " "), f"area {scene.area_px:.4g} px2"]
+    if not math.isnan(scene.errors["rotation_error_deg"]):
         parts += [
-            f"rotation off by {look.errors['rotation_error_deg']:.3g} deg",
-            f"position by {1000 * look.errors['translation_error_m']:.3g} mm",
-            f"reprojection {look.errors['reprojection_error_px']:.2g} px",
+            f"rotation error {scene.errors['rotation_error_deg']:.3g} deg",
+            f"position error {1000 * scene.errors['translation_error_m']:.3g} mm",
+            f"reprojection error {scene.errors['reprojection_error_px']:.2g} px",
         ]
-    if look.detection.name == "detected" and look.estimate.name != "solved":
-        parts.append(look.estimate.name.replace("_", " "))
+    if scene.detection.name == "detected" and scene.estimate.name != "solved":
+        parts.append(scene.estimate.name.replace("_", " "))
     return ", ".join(parts)
+
+
+def css_colour(colour: Colour) -> str:
+    """Return a colour as CSS has it.
+
+    >>> css_colour((255, 128, 0))
+    '#0080ff'
+    """
+    blue, green, red = colour
+    return f"#{red:02x}{green:02x}{blue:02x}"

@@ -1,4 +1,4 @@
-"""One scene's values in lines of text, beside those of a store."""
+"""Values of one cell as lines of text, with the stored values beside them."""
 
 from __future__ import annotations
 

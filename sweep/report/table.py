@@ -1,4 +1,4 @@
-"""Tables of a report, as HTML and as Markdown."""
+"""Tables of a report: their cells as text, and as Markdown."""
 
 from __future__ import annotations
 
@@ -9,19 +9,32 @@ from html import escape
 import numpy as np
 import xarray as xr
 
-from sweep.report.report_data import label_of, labels_of
-from sweep.tradeoff.pareto import digits, interval
+from sweep.report.formatting import interval_text, number
+from sweep.report.grouping import axis_label, group_labels
+from sweep.tradeoff.pareto import interval
 
 MAX_ROWS = 300
-"""Rows that a page shows of a table."""
+"""Rows of a table that a page shows."""
 
-ONE_LINE = 28
-"""Characters of words that stand in one line."""
+MAX_LINE_CHARS = 28
+"""Characters of a cell that stand in one line."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table: the first ``stub`` columns name a row, the others hold its numbers, or words."""
+    """A table of text.
+
+    Attributes
+    ----------
+    caption
+        What the table holds.
+    headings, rows
+        Text of the columns' headings and of the cells.
+    stub
+        Number of leading columns that name a row.
+    words
+        Whether the other columns hold words instead of numbers.
+    """
 
     caption: str
     headings: Sequence[str]
@@ -29,58 +42,53 @@ class Table:
     stub: int = 1
     words: bool = False
 
-    def html(self) -> str:
-        """Return it as HTML in a box that scrolls by itself."""
-        head = "".join(
-            f'<th scope="col"{self._side(k)}>{escape(text)}</th>'
-            for k, text in enumerate(self.headings)
-        )
-        body = "\n".join(
-            "<tr>" + "".join(
-                f'<th scope="row">{escape(text)}</th>' if k < self.stub
-                else f"<td{self._side(k)}>{escape(text)}</td>"
-                for k, text in enumerate(row)
-            ) + "</tr>"
-            for row in self.rows[:MAX_ROWS]
-        )
-        return (
-            f'<div class="scroll" role="region" tabindex="0" aria-label="{escape(self.caption)}">'
-            f"<table><caption>{escape(self._caption())}</caption>\n"
-            f"<thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>"
-        )
+    @property
+    def shown_rows(self) -> Sequence[Sequence[str]]:
+        """The rows that a page shows."""
+        return self.rows[:MAX_ROWS]
 
-    def markdown(self) -> str:
-        """Return it as a Markdown table, its caption before it."""
-        lines = [
-            [_cell(text) for text in self.headings],
-            ["---:" if self._side(k).endswith('"n"') else "---" for k in range(len(self.headings))],
-            *([_cell(text) for text in row] for row in self.rows[:MAX_ROWS]),
-        ]
-        table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-        return f"{markdown_text(self._caption())}\n\n{table}"
-
-    def _side(self, column: int) -> str:
-        """Return the class of a column's cells: numbers, or words that take several lines."""
-        if column < self.stub:
-            return ""
-        if not self.words:
-            return ' class="n"'
-        long = any(len(row[column]) > ONE_LINE for row in self.rows)
-        return ' class="text"' if long else ""
-
-    def _caption(self) -> str:
+    @property
+    def full_caption(self) -> str:
+        """The caption, with the number of rows if not all are shown."""
         if len(self.rows) <= MAX_ROWS:
             return self.caption
         return f"{self.caption} (the first {MAX_ROWS} of {len(self.rows):,} rows)"
 
+    @property
+    def column_classes(self) -> list[str]:
+        """CSS class of each column: ``n`` numbers, ``text`` long words, empty for others."""
+        return [self._column_class(k) for k in range(len(self.headings))]
+
+    def _column_class(self, column: int) -> str:
+        if column < self.stub:
+            return ""
+        if not self.words:
+            return "n"
+        long = any(len(row[column]) > MAX_LINE_CHARS for row in self.rows)
+        return "text" if long else ""
+
+    def markdown(self) -> str:
+        """Return it as a Markdown table behind its caption."""
+        lines = [
+            [_markdown_cell(text) for text in self.headings],
+            ["---:" if name == "n" else "---" for name in self.column_classes],
+            *([_markdown_cell(text) for text in row] for row in self.shown_rows),
+        ]
+        table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+        return f"{markdown_text(self.full_caption)}\n\n{table}"
+
 
 def markdown_text(text: str) -> str:
-    """Return text of any kind so that Markdown shows it as it is."""
-    shown = escape(" ".join(text.split()), quote=False)
-    return "".join(f"\\{c}" if c in "\\`*_[]#|$~" else c for c in shown)
+    """Return arbitrary text escaped for Markdown, on one line.
+
+    >>> markdown_text("a < b")
+    'a &lt; b'
+    """
+    escaped = escape(" ".join(text.split()), quote=False)
+    return "".join(f"\\{c}" if c in "\\`*_[]#|$~" else c for c in escaped)
 
 
-def _cell(text: str) -> str:
+def _markdown_cell(text: str) -> str:
     return markdown_text(text) or " "
 
 
@@ -90,48 +98,46 @@ def table_of(
 ) -> Table:
     """Return a table with a row for each combination of ``dims``.
 
-    ``columns`` are headings, each with a variable and what it is multiplied by. A variable that
-    ``found`` lacks is left out. Where a variable has an interval its ends stand behind it.
-    ``sources`` has the units of the dimensions, if ``found`` has not.
+    Parameters
+    ----------
+    found
+        Results of an analysis, with the ends of intervals as ``NAME_low`` and ``NAME_high``.
+    caption
+        What the table holds.
+    dims
+        Dimensions of ``found``, all of them.
+    columns
+        Heading -> variable and the factor that it is multiplied by; a variable that ``found``
+        lacks is left out.
+    sources
+        A dataset with the units of ``dims``, if ``found`` has none.
     """
-    there = {
-        heading: column for heading, column in columns.items() if column[0] in found
-    }
-    labels = [labels_of(found, dim) for dim in dims]
-    texts = {
-        heading: cells(found.transpose(*dims, ...), name, scale)
-        for heading, (name, scale) in there.items()
-    }
-    rows = [
-        [*(some[k] for some, k in zip(labels, index, strict=True)),
-         *(column[position] for column in texts.values())]
-        for position, index in enumerate(np.ndindex(*(len(some) for some in labels)))
+    present = {heading: column for heading, column in columns.items() if column[0] in found}
+    labels = [group_labels(found, dim) for dim in dims]
+    texts = [
+        cells(found.transpose(*dims, ...), name, scale) for name, scale in present.values()
     ]
-    headings = [label_of(sources if sources is not None else found, dim) for dim in dims]
-    return Table(caption, [*headings, *there], rows, stub=len(dims))
+    rows = [
+        [*(names[k] for names, k in zip(labels, index, strict=True)),
+         *(column[position] for column in texts)]
+        for position, index in enumerate(np.ndindex(*(len(names) for names in labels)))
+    ]
+    headings = [axis_label(sources if sources is not None else found, dim) for dim in dims]
+    return Table(caption, [*headings, *present], rows, stub=len(dims))
 
 
 def cells(found: xr.Dataset, name: str, scale: float = 1.0) -> list[str]:
-    """Return a variable's values as text, each with its interval where it has one."""
+    """Return a variable's values as text, each with the ends of its interval if it has one."""
     values = found[name]
-    if values.dtype.kind in "biu":
-        if values.dtype.kind == "b":
-            return ["yes" if value else "no" for value in np.ravel(values)]
+    if values.dtype.kind == "b":
+        return ["yes" if value else "no" for value in np.ravel(values)]
+    if values.dtype.kind in "iu":
         return [f"{value:,}" for value in np.ravel(values).tolist()]
     low, high = interval(found, name)
     texts = []
     for value, a, b in zip(np.ravel(values), np.ravel(low), np.ravel(high), strict=True):
         text = number(scale * value)
         if not (np.isnan(a) and np.isnan(b)):
-            text += f" ({number(scale * a)} to {number(scale * b)})"
+            text += f" ({interval_text(scale * a, scale * b)})"
         texts.append(text)
     return texts
-
-
-def number(value: float) -> str:
-    """Return a number with three significant digits; a dash for NaN, a lying eight for infinity."""
-    if np.isnan(value):
-        return "\u2013"
-    if np.isinf(value):
-        return "\u221e" if value > 0 else "\u2212\u221e"
-    return digits(value).replace("-", "\u2212") if value < 0 else digits(value)

@@ -1,4 +1,4 @@
-"""A report written: whole or not at all."""
+"""Writing a report: completely, or not at all."""
 
 from __future__ import annotations
 
@@ -12,45 +12,54 @@ from pathlib import Path
 
 import xarray as xr
 
-from sweep.errors import StoreError
+from sweep.errors import ArgumentError, StoreError
 from sweep.measure.flags import DetectionStatus
 from sweep.report.answer import answer
-from sweep.report.figures import figures_of
+from sweep.report.figures import figure_kinds
 from sweep.report.gallery import scenes_of
+from sweep.report.grouping import AREA
 from sweep.report.markdown import markdown, write_figure
 from sweep.report.page import page
 from sweep.report.provenance_facts import provenance
-from sweep.report.report_data import AREA, Subject, reading
+from sweep.report.report_data import ReportData, store_errors
 
 FORMATS = ("html", "md")
 PICTURES = (".svg", ".png")
-MENDED = "`sweep verify --repair` repairs it"
+COMPUTED_FLAGS = ("detection", "estimate", "flipped")
+"""Flags that are not ``not_run`` in any cell of a finished store."""
+
+REPAIR = "`sweep verify --repair` repairs it"
 
 
 def check_output(
     output: Path, figures: Path | None = None, form: str = "html", store: str = ""
 ) -> None:
-    """See that a report can be written, before any work is done for it.
+    """Check that a report can be written, before it is computed.
 
-    ``store`` is where the report's store is.
+    Parameters
+    ----------
+    output, figures, form
+        As in :func:`write_report`.
+    store
+        Path or URL of the report's own store.
 
     Raises
     ------
     StoreError
-        Where the output is a folder, or its folder is missing or cannot be written; where the
-        figures' folder is a file; where anything would be written into a store; or where the
-        Markdown's folder, which is replaced as a whole, holds something else than pictures.
+        If the output is a folder, or its folder is missing or not writable; if the figures' folder
+        is a file; if anything would be written into a store; or if the Markdown's folder, which is
+        replaced as a whole, holds anything but pictures.
     """
     folder = figures_folder(output) if form == "md" else None
     for wanted in (output, figures, folder):
         if wanted is not None:
             _check_outside(wanted, store)
     if output.is_dir():
-        raise StoreError(f"{output}: cannot be written: it is a folder; name a file in it")
+        raise StoreError(f"{output}: cannot be written: it is a folder; choose a file in it")
     _check_folder(output, output.absolute().parent)
     for wanted in (figures, folder):
         if wanted is not None and os.path.lexists(wanted) and not wanted.is_dir():
-            raise StoreError(f"{wanted}: cannot hold figures: it is a file; name a folder")
+            raise StoreError(f"{wanted}: cannot hold figures: it is a file; choose a folder")
     if figures is not None:
         _check_folder(figures, figures if figures.is_dir() else figures.absolute().parent)
     if figures is not None and folder is not None and (
@@ -61,28 +70,28 @@ def check_output(
         others = sorted(path.name for path in folder.iterdir()
                         if path.suffix not in PICTURES or path.is_dir())
         if others:
-            raise StoreError(f"{folder}: cannot be replaced: it holds {others[0]}, which is no "
-                             "figure; name another output")
+            raise StoreError(f"{folder}: cannot be replaced: it holds {others[0]}, which is not a "
+                             "figure; choose another output")
 
 
 def figures_folder(output: Path) -> Path:
-    """Return the folder with the figures and scenes of a report in Markdown."""
+    """Return the folder of the figures and scenes of a report in Markdown."""
     return output.with_name(f"{output.stem}_figures")
 
 
 def _check_outside(wanted: Path, store: str) -> None:
-    """See that a path is not in a local store, its own or any other."""
+    """Check that a path is not inside a local store, the report's own or any other."""
     local = store.removeprefix("file://")
     own = None if not local or "://" in local else Path(os.path.realpath(local))
-    place = Path(os.path.realpath(wanted))
-    for path in (*reversed(place.parents), place):
+    resolved = Path(os.path.realpath(wanted))
+    for path in (*reversed(resolved.parents), resolved):
         if path == own or (path / "zarr.json").is_file():
-            raise StoreError(f"{wanted}: cannot be written: it lies in the store {path}")
+            raise StoreError(f"{wanted}: cannot be written: it is inside the store {path}")
 
 
 def _check_folder(wanted: Path, folder: Path) -> None:
     if not folder.is_dir():
-        raise StoreError(f"{wanted}: cannot be written: there is no folder {folder}")
+        raise StoreError(f"{wanted}: cannot be written: folder {folder} not found")
     try:
         with tempfile.TemporaryFile(dir=folder):
             pass
@@ -91,88 +100,86 @@ def _check_folder(wanted: Path, folder: Path) -> None:
 
 
 def write_report(
-    subject: Subject, output: Path, form: str = "html", figures: Path | None = None
+    data: ReportData, output: Path, form: str = "html", figures: Path | None = None
 ) -> int:
-    """Write a store's report; return how many figures it has.
+    """Write the report of a store; return its number of figures.
 
     Parameters
     ----------
+    data
+        The store.
     output
-        The page, or the Markdown text; what stands there is replaced.
+        The file to write; an existing one is replaced.
     form
-        ``html``, one page that needs nothing else, or ``md``, Markdown with its figures and
-        scenes in a folder beside it, ``output`` without its suffix and ``_figures`` behind; an
-        older one is replaced as a whole.
+        ``html``: one self-contained page. ``md``: Markdown with its figures and scenes in a folder
+        beside it, named as ``output`` with ``_figures`` in place of the suffix; an existing folder
+        is replaced as a whole.
     figures
-        Where each figure goes as an SVG and a PNG file too.
+        Folder into which each figure is written as an SVG and a PNG file, too.
 
     Raises
     ------
+    ArgumentError
+        If ``form`` is neither of these.
     StoreError
-        Where there are no results, some are missing or cannot be read, or something cannot be
-        written.
+        If there are no results, some are missing or cannot be read, or a file cannot be written.
     """
     if form not in FORMATS:
-        raise StoreError(f"--format {form}: expected one of {', '.join(FORMATS)}")
-    check_output(output, figures, form, subject.store)
-    _check_results(subject)
-    subject = subject.in_memory()
-    _check_poses(subject)
-    title = subject.pipeline.title.strip() or subject.pipeline.name
-    found, made = answer(subject), provenance(subject, str(output))
-    shown = [kind.show(subject) for kind in figures_of(subject)]
+        raise ArgumentError("form", form, f"expected one of {', '.join(FORMATS)}")
+    check_output(output, figures, form, data.store)
+    if data.results["estimate"].size == 0:
+        raise StoreError(f"{data.store}: there are no results")
+    data = data.in_memory()
+    _check_complete(data)
+    title = data.pipeline.title.strip() or data.pipeline.name
+    found, origin = answer(data), provenance(data, str(output))
+    rendered = [kind.render(data) for kind in figure_kinds(data)]
     try:
-        with _beside(output) as place:
-            pictures = place / "figures"
+        with _temporary_folder(output) as temporary:
+            pictures = temporary / "figures"
             pictures.mkdir(parents=True)
             if form == "md" or figures is not None:
-                for figure in shown:
+                for figure in rendered:
                     write_figure(figure, pictures)
             drawn = sorted(pictures.iterdir())
-            scenes = scenes_of(subject)
+            scenes = scenes_of(data)
             folder = figures_folder(output)
             if form == "md":
-                text = markdown(title, found, made, shown, scenes, pictures, folder.name)
+                text = markdown(title, found, origin, rendered, scenes, pictures, folder.name)
             else:
-                text = page(title, found, made, shown, scenes)
-            written = place / "report"
-            # What is not valid Unicode on its own, from a file's name for instance, is shown as ?.
+                text = page(title, found, origin, rendered, scenes)
+            written = temporary / "report"
+            # Invalid Unicode, which a file's name may hold, is written as a question mark.
             written.write_text(text, encoding="utf-8", errors="replace")
-            # Nothing is where it was asked for before all is done.
+            # Files are moved to their final paths only after all were written.
             if figures is not None:
                 figures.mkdir(exist_ok=True)
                 for path in drawn:
                     shutil.copyfile(path, figures / path.name)
             if form == "md":
-                _replace_folder(folder, pictures, place / "old")
+                _replace_folder(folder, pictures, temporary / "old")
             written.replace(output)
     except OSError as error:
         raise StoreError(f"{output}: cannot be written: {error.strerror or error}") from None
-    return len(shown)
+    return len(rendered)
 
 
-def _check_results(subject: Subject) -> None:
-    """See that there is something to report."""
-    if subject.results["estimate"].size == 0:
-        raise StoreError(f"{subject.store}: there are no results")
-
-
-def _check_poses(subject: Subject) -> None:
-    """See that every pose of a finished store was run: a chunk that is lost reads as not run."""
-    lost = xr.zeros_like(subject.results[AREA], dtype=bool)
-    for name in ("detection", "estimate", "flipped"):
-        flag = subject.results[name]
+def _check_complete(data: ReportData) -> None:
+    """Check that every pose of the finished store was computed: a lost chunk reads as not run."""
+    lost = xr.zeros_like(data.results[AREA], dtype=bool)
+    for name in COMPUTED_FLAGS:
+        flag = data.results[name]
         missing = flag == DetectionStatus.not_run
         lost |= missing.any([dim for dim in flag.dims if dim not in lost.dims])
-    with reading(subject.store):
+    with store_errors(data.store):
         count = int(lost.sum())
     if count:
         poses = "1 pose is" if count == 1 else f"{count:,} poses are"
-        raise StoreError(f"{subject.store}: {poses} missing; {MENDED}")
+        raise StoreError(f"{data.store}: {poses} missing; {REPAIR}")
 
 
 def _replace_folder(folder: Path, new: Path, old: Path) -> None:
-    """Move a new folder to a place; what is there goes to ``old``, and back if that fails."""
+    """Move ``new`` to ``folder``; an existing folder goes to ``old``, and back on failure."""
     if folder.exists():
         folder.rename(old)
     try:
@@ -184,8 +191,8 @@ def _replace_folder(folder: Path, new: Path, old: Path) -> None:
 
 
 @contextlib.contextmanager
-def _beside(output: Path) -> Iterator[Path]:
-    """Give the path of a folder beside the output, which is removed in the end."""
+def _temporary_folder(output: Path) -> Iterator[Path]:
+    """Yield the path of a folder beside the output, which is removed in the end."""
     path = output.absolute().with_name(f".{output.name}.{uuid.uuid4().hex[:8]}.{os.getpid()}")
     try:
         yield path

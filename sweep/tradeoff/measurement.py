@@ -23,6 +23,7 @@ from sweep.plan.parameters import Stage
 from sweep.store.lifecycle import open_dataset, open_store, write_group
 from sweep.store.lock import locked
 from sweep.store.provenance import differences
+from sweep.tradeoff.labels import configuration_label
 from sweep.tradeoff.paired_timing import (
     PROCESS_SHARE,
     measure,
@@ -207,16 +208,9 @@ def _of_any_process(ratio: NDArray[np.float64]) -> Interval:
     return value, low - spare, high + spare
 
 
-def _label(name: str, value: Any) -> str:
-    return value if isinstance(value, str) else f"{name} {value}"
-
-
 def _flattened(found: xr.Dataset, axes: Sequence[Axis]) -> xr.Dataset:
     """Return a dataset whose dimensions of settings are one, ``treatment``, with labels."""
-    labels = [
-        " · ".join(_label(name, value) for name, value in chosen.items()) or "as set"
-        for chosen in combinations(axes)
-    ]
+    labels = [configuration_label(chosen) for chosen in combinations(axes)]
     if not axes:
         return found.expand_dims(treatment=labels)
     flat = found.stack(treatment=[axis.name for axis in axes], create_index=False)

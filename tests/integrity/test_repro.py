@@ -106,7 +106,7 @@ def test_scene_gives_what_the_store_holds_and_its_image(finished, tmp_path, caps
     pipeline.write_text(TEXT)
     assert main(["repro", str(finished), "--at", NEAR, "-o", str(out), "--plain"]) == 0
     told = capsys.readouterr().out
-    assert "gives what the store holds, to the bit" in told
+    assert "agrees with the store bit for bit" in told
     assert str(out) in told
     with xr.open_zarr(finished) as store:
         cell = store.isel(distance_m=0, distortion=0, trial=1).sel(
@@ -175,8 +175,8 @@ def test_block_that_is_not_there_yet_is_said(pipeline, tmp_path, capsys):
     out = tmp_path / "scene.png"
     assert main(["repro", url, "--at", "distance_m=0.4", "-o", str(out)]) == 0
     told = capsys.readouterr().out
-    assert "does not have it yet" in told
-    assert "gives what" not in told
+    assert "does not hold this cell yet" in told
+    assert "agrees with" not in told
     assert out.exists()
 
 
@@ -200,7 +200,7 @@ def test_every_failure_that_status_lists_is_seen_again_as_printed(finished, tmp_
         words = shlex.split(f"repro {finished} --at {at} -o {out}")
         ran = command(*words, env=env, timeout=60)
         assert (ran.returncode, ran.stderr) == (0, "")
-        assert "gives what the store holds, to the bit" in ran.stdout
+        assert "agrees with the store bit for bit" in ran.stdout
         assert reason.split(": ", 1)[1] in ran.stdout
         assert re.search(rf"^ +(detection|estimate) +{kind}$", ran.stdout, re.MULTILINE)
 
@@ -212,7 +212,7 @@ def test_all_failures_that_status_lists_are_seen_again(finished, tmp_path, capsy
         words = shlex.split(f"repro {finished} --at {at} -o {tmp_path / 's.png'}")
         ran = command(*words, env=env, timeout=60)
         assert (ran.returncode, ran.stderr) == (0, "")
-        assert "gives what the store holds, to the bit" in ran.stdout
+        assert "agrees with the store bit for bit" in ran.stdout
         assert reason.split(": ", 1)[1] in ran.stdout
         assert re.search(rf"^ +(detection|estimate) +{kind}$", ran.stdout, re.MULTILINE)
 

@@ -2,6 +2,8 @@
 
 import base64
 import contextlib
+import dataclasses
+import html
 import math
 import os
 import re
@@ -28,13 +30,14 @@ from sweep.errors import StoreError
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.renderers import background_image
 from sweep.plan.experiment import Pipeline
-from sweep.report import gallery
-from sweep.report import report_data as subjects
-from sweep.report.answer import _best, answer
-from sweep.report.figures import figures_of
+from sweep.report import report_data, scene_selection
+from sweep.report.answer import _best_sentence as best_sentence
+from sweep.report.answer import answer
+from sweep.report.figures import figure_kinds
+from sweep.report.formatting import coordinates, number
 from sweep.report.gallery import scenes_of
-from sweep.report.report_data import Grouping, Subject, texts_of
-from sweep.report.table import number
+from sweep.report.grouping import Grouping
+from sweep.report.report_data import ReportData, read_report_data
 from sweep.report.write_report import write_report
 from sweep.store.lifecycle import open_dataset, open_store, write_group
 
@@ -59,8 +62,8 @@ ODD = {
 
 
 def opened(url, trade=None):
-    store = open_store(url)
-    return Subject(url, open_dataset(url), store.pipeline, store.run_metadata, trade)
+    data = read_report_data(url)
+    return data if trade is None else dataclasses.replace(data, trade=trade)
 
 
 @pytest.fixture(scope="module")
@@ -141,14 +144,14 @@ def test_the_page_needs_nothing_else(page):
     assert len(read.ids) == len(set(read.ids))
     assert not re.search(r"url\((?!#|data:|['\"]data:)", page)
     assert not re.search(r"<script|@import|javascript:|\son\w+=", page)
-    assert "default-src 'none'" in page
+    assert "default-src 'none'" in html.unescape(page)
     assert "http" not in re.sub(r"http-equiv|<pre.*?</pre>", "", page, flags=re.DOTALL)
 
 
 def test_the_page_can_be_read_by_those_who_cannot_see_it(page):
     read = Page(page)
     assert '<html lang="en">' in page
-    assert "<title>All &lt;axes&gt; &amp; &quot;kinds&quot; of $figures$</title>" in page
+    assert "<title>All &lt;axes&gt; &amp; &#34;kinds&#34; of $figures$</title>" in page
     assert read.images
     for tag, attributes in read.images:
         assert attributes.get("alt" if tag == "img" else "aria-label")
@@ -168,12 +171,12 @@ def test_drawings_take_the_colours_of_the_page(page):
 
 
 def kinds(url):
-    return [kind.name for kind in figures_of(opened(url))]
+    return [kind.name for kind in figure_kinds(opened(url))]
 
 
 def test_each_figure_applies_where_it_should(full, tmp_path):
     assert kinds(full) == [
-        "detection", "errors", "maps", "failures", "flips", "ranking", "treatments", "paired",
+        "detection", "errors", "maps", "failures", "flips", "ranking", "configurations", "paired",
         "bound",
     ]
     found = {name: kinds(made(tmp_path, text, name.replace(" ", "_")))
@@ -184,19 +187,21 @@ def test_each_figure_applies_where_it_should(full, tmp_path):
         "only trial": ["failures"],
         "nothing detected": ["detection", "errors", "maps", "failures"],
         "nothing visible": ["detection", "errors", "failures"],
-        "no draws": ["detection", "errors", "maps", "failures", "flips", "treatments", "paired"],
-        "lists and words": ["failures", "treatments", "paired", "effect-distortion",
+        "no draws": ["detection", "errors", "maps", "failures", "flips", "configurations",
+                     "paired"],
+        "lists and words": ["failures", "configurations", "paired", "effect-distortion",
                             "effect-renderer"],
         "distances drawn": ["detection", "errors", "failures", "ranking", "effect-dictionary"],
     }
 
 
-def test_an_axis_of_too_many_treatments_has_a_figure_of_its_own(tmp_path):
+def test_an_axis_of_too_many_configurations_has_a_figure_of_its_own(tmp_path):
     text = (f"{CAMERA}[pose]\nside_px = 40\n[axes]\nminMarkerDistanceRate = [0.1, 0.12]\n"
             "errorCorrectionRate = [0.2, 0.4, 0.6, 0.8]\n"
             "polygonalApproxAccuracyRate = [0.01, 0.02, 0.03, 0.04, 0.05]\n")
     url = made(tmp_path, text, "many")
-    assert kinds(url) == ["failures", "treatments", "paired", "effect-polygonalApproxAccuracyRate"]
+    assert kinds(url) == [
+        "failures", "configurations", "paired", "effect-polygonalApproxAccuracyRate"]
     assert command("report", url, "-o", tmp_path / "report.html")[::2] == (0, "")
 
 
@@ -240,7 +245,7 @@ def test_numbers_of_the_tables_are_those_of_the_analysis(full, page):
         assert row[column].split(" (")[0] == number(share)
 
 
-def test_each_treatment_is_paired_with_the_first(full, page):
+def test_each_configuration_is_paired_with_the_first(full, page):
     results = open_dataset(full)
     first, second = (
         results.sel(cornerRefinementMethod=refinement, solver=solver, drop=True)
@@ -250,7 +255,7 @@ def test_each_treatment_is_paired_with_the_first(full, page):
     rows = Page(page).tables["Against none \u00b7 ippe_square, with 95 % intervals"]
     (row,) = (row for row in rows if row[0] == "subpix \u00b7 photometric")
     for heading, name in {"compared": "compared", "both solved": "both_solved",
-                          "found by it only": "only_second_detected"}.items():
+                          "detected by it only": "only_second_detected"}.items():
         assert row[rows[0].index(heading)] == f"{int(expected[name]):,}"
     low, ratio, high = (
         number(float(expected[f"rotation_rmse_ratio{end}"])) for end in ("_low", "", "_high"))
@@ -264,7 +269,7 @@ def test_the_answer_is_that_of_plain_arithmetic(full, page):
     ordered = np.sort(results["rotation_error_deg"].where(solved, np.inf).values.ravel())
     median = ordered[math.ceil(len(ordered) / 2) - 1]
     paragraph = re.search(r'<p class="answer">(.*?)</p>', page)[1]
-    assert f"found in {number(detected)} %" in paragraph
+    assert f"detected in {number(detected)} %" in paragraph
     assert f"median is {number(median)}\u00b0" in paragraph
     poses = np.prod([results.sizes[axis] for axis in ("marker_id", "side_px", "tilt_deg", "trial")])
     assert f'<span class="value">{poses}</span>' in page
@@ -273,15 +278,15 @@ def test_the_answer_is_that_of_plain_arithmetic(full, page):
 def test_the_answer_s_numbers_have_their_own_denominators(full, page, tmp_path):
     results = open_dataset(full).load()
     paragraph = re.search(r'<p class="answer">(.*?)</p>', page)[1]
-    assert (f"looked for {results.detection.size} times, with 2 settings of the detector together,"
+    assert (f"looked for {results.detection.size} times, pooled over 2 detector settings,"
             in paragraph)
     solved = 100 * float((results["estimate"] == EstimateStatus.solved).mean())
-    assert (f"solved in {number(solved)} % of {results.estimate.size} results, with 4 treatments "
-            "together." in paragraph)
+    assert (f"solved in {number(solved)} % of {results.estimate.size} results, pooled over 4 "
+            "configurations." in paragraph)
     assert f"to {number(100 * float(error_statistics(results)['solved_rate_high']))} %, of " + str(
         results.estimate.size) in page
     single = answer(opened(made(tmp_path, ODD["single pose"], "single"))).paragraph
-    assert single.startswith("The marker was looked for once and found in 100 %; a pose was ")
+    assert single.startswith("The marker was looked for once and detected in 100 %; a pose was ")
 
 
 def test_the_limit_is_that_of_the_detector_s_first_setting(full, page):
@@ -289,15 +294,16 @@ def test_the_limit_is_that_of_the_detector_s_first_setting(full, page):
     first = detection_limit(
         results.isel(cornerRefinementMethod=0), rate=0.9, per=("tilt_deg",)).compute()
     shown = answer(opened(full))
-    assert "With cornerRefinementMethod none, at least 90 % are found from" in shown.paragraph
+    assert ("With cornerRefinementMethod none, detected in at least 90 % of poses down to this "
+            "size: " in shown.paragraph)
     tile = shown.tiles[-1]
     assert tile.detail.endswith("with cornerRefinementMethod none")
     assert tile.value.endswith(f"{number(float(first['side_px'][0]))} px")
     assert tile.detail in page
 
 
-def treated(medians, intervals, flag):
-    """Return a subject whose estimators have these medians; nothing of it is read."""
+def configured(medians, intervals, flag):
+    """Return data whose estimators have these medians; nothing else is read of them."""
     low, high = np.transpose(intervals)
     names = np.array(list("abcdef"[:len(medians)]), dtype=object)
     found = xr.Dataset(
@@ -307,59 +313,60 @@ def treated(medians, intervals, flag):
          "solved_rate": ("solver", np.ones(len(medians)))}, {"solver": names})
     solvers = ["ippe", "iterative", "sqpnp", "epnp", "ippe_square", "ap3p"][:len(medians)]
     text = f"{CAMERA}[pose]\nside_px = 40\n[axes]\nsolver = {solvers}\n"
-    pipeline = Pipeline.from_text(text, name="treated")
-    subject = Subject("treated", xr.Dataset(), pipeline, {})
-    subject._found["error_statistics", ("solver",), (), ()] = found
-    return subject
+    pipeline = Pipeline.from_text(text, name="configured")
+    data = ReportData("configured", xr.Dataset(), pipeline, {})
+    data._analyses["error_statistics", ("solver",), (), ()] = found
+    return data
 
 
-def test_the_best_treatment_is_told_with_those_that_it_cannot_be_told_from():
+def test_the_best_configuration_is_named_with_those_that_are_indistinguishable_from_it():
     nan, given, none, few = np.nan, *map(IntervalOf, (1, 2, 3))
-    subject = treated([2, 1, 9], [(1.4, 3), (0.5, 1.5), (8, 10)], given)
-    assert _best(subject) == (
-        "Of the treatments b has the smallest median rotation error, 1.00\u00b0 (0.500 to 1.50), "
-        "and solves 100 %; it is not told apart from a.")
-    assert _best(treated([2, 1], [(1.6, 3), (0.5, 1.5)], given)).endswith("solves 100 %.")
-    many = treated([1, 2, 3, 4, 5], [(0, 9)] * 5, given)
-    assert _best(many).endswith("not told apart from b, c, d and 1 more.")
-    # Nothing was drawn: what is larger is larger. Too few draws: an end may lie anywhere.
-    assert _best(treated([2, 1, 1], [(nan, nan)] * 3, none)).endswith("1.00\u00b0, and solves "
-                                                                    "100 %; it is not told apart "
-                                                                    "from c.")
-    assert _best(treated([2, 1], [(nan, nan)] * 2, few)).endswith("not told apart from a.")
+    assert best_sentence(configured([2, 1, 9], [(1.4, 3), (0.5, 1.5), (8, 10)], given)) == (
+        "Of the configurations, b has the smallest median rotation error, 1.00\u00b0 (0.500 to "
+        "1.50), and solves 100 %; it is indistinguishable from a.")
+    apart = best_sentence(configured([2, 1], [(1.6, 3), (0.5, 1.5)], given))
+    assert apart.endswith("solves 100 %.")
+    many = best_sentence(configured([1, 2, 3, 4, 5], [(0, 9)] * 5, given))
+    assert many.endswith("indistinguishable from b, c, d and 1 more.")
+    # Without draws a larger median is larger; with too few draws an end may lie anywhere.
+    exact = best_sentence(configured([2, 1, 1], [(nan, nan)] * 3, none))
+    assert exact.endswith("1.00\u00b0, and solves 100 %; it is indistinguishable from c.")
+    unknown = best_sentence(configured([2, 1], [(nan, nan)] * 2, few))
+    assert unknown.endswith("indistinguishable from a.")
 
 
 def test_long_axes_are_put_in_bins_that_hold_every_pose(tmp_path):
-    subject = opened(made(tmp_path, ODD["long axes"], "long"))
-    grouping = subject.along("side_px", 10)
-    found = subject.of(detection_rate, grouping)
+    data = opened(made(tmp_path, ODD["long axes"], "long"))
+    grouping = data.along("side_px", 10)
+    found = data.analysed(detection_rate, grouping)
     assert found.sizes["side_px"] == 10
     assert int(found["looked_for"].sum()) == int(
-        subject.of(detection_rate, Grouping())["looked_for"])
-    assert grouping.notes == ("The 42 values of side_px are in 10 bins.",)
-    thinned = subject.along("marker_id", 5, binned=False)
-    assert subject.of(detection_rate, thinned)["marker_id"].values.tolist() == [0, 6, 12, 19, 25]
+        data.analysed(detection_rate, Grouping())["looked_for"])
+    assert grouping.notes == ("The 42 values of side_px are grouped into 10 bins.",)
+    thinned = data.along("marker_id", 5, binned=False)
+    assert data.analysed(detection_rate, thinned)["marker_id"].values.tolist() == [0, 6, 12, 19, 25]
 
 
 def test_bins_are_the_same_whether_a_store_is_loaded_or_read_in_pieces(full, monkeypatch):
-    subject, loaded = opened(full), opened(full).in_memory()
+    data, loaded = opened(full), opened(full).in_memory()
     assert loaded.results["estimate"].chunks is None
-    monkeypatch.setattr(subjects, "LOADED_BYTES", 0)
-    assert subject.in_memory().results["estimate"].chunks is not None
-    for grouping in (subject.by_tilt() + subject.along("side_px", 2), subject.along("solver")):
+    monkeypatch.setattr(report_data, "MAX_LOADED_BYTES", 0)
+    assert data.in_memory().results["estimate"].chunks is not None
+    for grouping in (data.by_tilt() + data.along("side_px", 2), data.along("solver")):
         xr.testing.assert_allclose(
-            subject.of(error_statistics, grouping), loaded.of(error_statistics, grouping))
+            data.analysed(error_statistics, grouping), loaded.analysed(error_statistics, grouping))
 
 
 # Scenes.
 
 def test_scenes_are_those_with_the_smallest_and_largest_errors(full, monkeypatch):
-    subject = opened(full)
-    results = subject.results.load()
+    data = opened(full)
+    results = data.results.load()
     solved = results["rotation_error_deg"].where(results["estimate"] == EstimateStatus.solved)
     for piece in (10**9, 50):
-        monkeypatch.setattr(gallery, "PIECE", piece)
-        chosen = dict(gallery._chosen(results if piece > 50 else opened(full).results))
+        monkeypatch.setattr(scene_selection, "MAX_PIECE", piece)
+        chosen = dict(scene_selection.select_scenes(
+            results if piece > 50 else opened(full).results))
         found = {
             title.split(":")[0]: float(results["rotation_error_deg"].isel(index))
             for title, index in chosen.items()
@@ -394,18 +401,18 @@ def test_a_scene_s_command_shows_it(full, tmp_path):
 
 
 def test_a_scene_that_is_not_what_the_store_holds_is_told(full):
-    subject = opened(full)
-    results = subject.results.load()
-    subject.results["rotation_error_deg"] = results["rotation_error_deg"] * 1.5
-    told = [scene.problem for scene in scenes_of(subject)]
-    assert any("Not what the store holds: rotation_error_deg is" in problem for problem in told)
+    data = opened(full)
+    results = data.results.load()
+    data.results["rotation_error_deg"] = results["rotation_error_deg"] * 1.5
+    told = [scene.problem for scene in scenes_of(data)]
+    assert any("Differs from the store: rotation_error_deg " in problem for problem in told)
 
 
 def test_a_crashed_scene_is_not_rendered_and_a_lost_background_is_told(full, tmp_path):
-    subject = opened(full)
-    results = subject.results.load()
+    data = opened(full)
+    results = data.results.load()
     results["detection"][0, 0, 0] = DetectionStatus.crashed
-    problems = {title: scene.problem for scene in scenes_of(subject) for title in scene.titles}
+    problems = {title: scene.problem for scene in scenes_of(data) for title in scene.titles}
     assert problems["crashed: the process died"].startswith("Not drawn")
     background = tmp_path / "wall.png"
     cv2.imwrite(str(background), np.full((120, 160), 130, np.uint8))
@@ -415,7 +422,7 @@ def test_a_crashed_scene_is_not_rendered_and_a_lost_background_is_told(full, tmp
     background.unlink()
     background_image.cache_clear()
     (scene,) = scenes_of(opened(url))
-    assert scene.problem.startswith("Cannot be drawn here: ")
+    assert scene.problem.startswith("Cannot be drawn on this machine: ")
     assert scene.picture is None
 
 
@@ -478,8 +485,8 @@ def test_the_figures_of_an_earlier_markdown_go_but_nothing_else_does(tmp_path):
     assert output.read_text(encoding="utf-8").startswith("# one\n")
     (folder / "notes.txt").write_text("mine")
     code, _, err = command("report", url, "-o", output)
-    held = f"{folder}: cannot be replaced: it holds notes.txt, which is no figure"
-    assert (code, err) == (2, f"{held}; name another output\n")
+    held = f"{folder}: cannot be replaced: it holds notes.txt, which is not a figure"
+    assert (code, err) == (2, f"{held}; choose another output\n")
     (folder / "notes.txt").unlink()
     inside = folder / "inside"
     assert "is replaced as a whole" in command(
@@ -491,11 +498,11 @@ def test_the_pipeline_can_be_taken_from_the_page(full, page):
     assert base64.b64decode(encoded).decode() == open_store(full).pipeline.text
 
 
-def test_numbers_of_axes_are_short_and_told_apart():
-    assert texts_of([0.15, 0.208424, 0.2891]) == ["0.15", "0.208", "0.289"]
-    assert texts_of([1.00001, 1.00002]) == ["1.00001", "1.00002"]
-    assert texts_of([True, False]) == ["True", "False"]
-    assert texts_of([]) == []
+def test_numbers_of_axes_are_short_and_distinct():
+    assert coordinates([0.15, 0.208424, 0.2891]) == ["0.15", "0.208", "0.289"]
+    assert coordinates([1.00001, 1.00002]) == ["1.00001", "1.00002"]
+    assert coordinates([True, False]) == ["True", "False"]
+    assert coordinates([]) == []
 
 
 # What cannot be.
@@ -510,10 +517,10 @@ def test_what_cannot_be_reported_is_told_in_one_line(full, tmp_path):
         (folder,): "not a sweep store",
         (unfinished,): f"{unfinished}: unfinished: 1 of 4 blocks; `sweep run` continues it",
         (full, "-o", folder): "it is a folder",
-        (full, "-o", tmp_path / "missing" / "report.html"): "there is no folder",
-        (full, "-o", file / "report.html"): "there is no folder",
+        (full, "-o", tmp_path / "missing" / "report.html"): " not found",
+        (full, "-o", file / "report.html"): " not found",
         (full, "--figures", file): "it is a file",
-        (full, "--figures", tmp_path / "missing" / "pictures"): "there is no folder",
+        (full, "--figures", tmp_path / "missing" / "pictures"): " not found",
         (full, "--format", "pdf"): "invalid choice",
     }
     with contextlib.chdir(tmp_path):
@@ -548,8 +555,8 @@ def test_a_report_is_never_written_into_a_store(tmp_path):
         ):
             code, out, err = command("report", url, *arguments)
             assert (code, out, len(err.splitlines())) == (2, "", 1)
-            assert "cannot be written: it lies in the store" in err
-        for option in ("-o", "--figures"):
+            assert "cannot be written: it is inside the store" in err
+        for option in ("--output", "--figures"):
             assert command("report", url, option, "")[::2] == (2, f"{option} '': expected a name\n")
     assert held() == before
 
@@ -573,7 +580,7 @@ def test_poses_that_are_missing_are_told(tmp_path):
 
 @pytest.mark.parametrize("loaded", [200_000_000, 0])
 def test_a_damaged_store_is_told_in_one_line(loaded, tmp_path, monkeypatch):
-    monkeypatch.setattr(subjects, "LOADED_BYTES", loaded)
+    monkeypatch.setattr(report_data, "MAX_LOADED_BYTES", loaded)
     output = tmp_path / "report.html"
 
     def flip(url):
@@ -620,15 +627,16 @@ def test_a_report_is_whole_or_not_there(full, tmp_path, monkeypatch):
 
 
 def test_results_without_poses_are_refused(full, tmp_path):
-    subject = opened(full)
-    empty = Subject(subject.store, subject.results.isel(trial=slice(0, 0)), subject.pipeline,
-                    subject.about)
+    data = opened(full)
+    empty = ReportData(data.store, data.results.isel(trial=slice(0, 0)), data.pipeline,
+                       data.run_metadata)
     with pytest.raises(StoreError, match="there are no results"):
         write_report(empty, tmp_path / "report.html")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_report_needs_neither_dask_nor_the_engine():
-    for path in Path(subjects.__file__).parent.glob("*.py"):
+def test_a_report_needs_neither_dask_nor_workers():
+    for path in Path(report_data.__file__).parent.glob("*.py"):
         text = path.read_text(encoding="utf-8")
-        assert not re.search(r"^\s*(from|import) (dask|sweep\.engine)", text, re.MULTILINE)
+        above = r"^\s*(from|import) (dask|sweep\.(execution|isolation))"
+        assert not re.search(above, text, re.MULTILINE)

@@ -10,8 +10,8 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sweep.report.trade_figure import draw_trade
-from sweep.report.trade_table import WIDEST, as_json, table_markdown, table_text
+from sweep.report.tradeoff_chart import draw_trade
+from sweep.report.tradeoff_table import MAX_WIDTH, as_json, table_markdown, table_text
 from sweep.tradeoff.pareto import CRITERIA, UNITS, advice, digits, mark_front, pareto_front
 
 P95 = "rotation_p95_deg"
@@ -247,9 +247,9 @@ TRADES = pytest.mark.parametrize(
 @TRADES
 def test_tables_have_a_row_for_every_treatment(trade):
     text, markdown = table_text(trade, P95), table_markdown(trade, P95)
-    assert max(map(len, text.splitlines())) <= WIDEST
+    assert max(map(len, text.splitlines())) <= MAX_WIDTH
     regimes = trade.sizes.get("side_px", 1)
-    tables = text.count("  treatment")
+    tables = text.count("  configuration")
     assert tables % regimes == 0
     front = mark_front(trade, P95).on_front
     assert text.count("\n* ") == int(front.sum()) * tables // regimes + 1  # and the legend

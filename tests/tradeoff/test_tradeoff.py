@@ -25,7 +25,7 @@ from sweep.execution.status import status
 from sweep.isolation.interrupts import Interrupts
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
-from sweep.report.trade_table import as_json
+from sweep.report.tradeoff_table import as_json
 from sweep.store.lifecycle import create_store
 from sweep.tradeoff import measurement as tradeoff
 from sweep.tradeoff import paired_timing as paired_costs

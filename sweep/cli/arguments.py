@@ -1,0 +1,71 @@
+"""Arguments that several commands share."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sweep.plan.experiment import Pipeline
+
+
+def add_pipeline(parser: argparse.ArgumentParser) -> None:
+    """Add the pipeline file and the settings that replace its values."""
+    parser.add_argument("pipeline", metavar="PIPELINE", help="TOML file of the experiment")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
+        help="replace a value of the file by this TOML value; a list makes an axis; "
+        "may be repeated",
+    )
+
+
+def read_pipeline(options: argparse.Namespace) -> Pipeline:
+    """Return the pipeline of a command that takes one.
+
+    Raises
+    ------
+    PipelineError
+        If the file or a setting is invalid.
+    """
+    from sweep.plan.experiment import Pipeline  # noqa: PLC0415
+
+    return Pipeline.from_toml(options.pipeline, options.settings)
+
+
+def add_store(parser: argparse.ArgumentParser) -> None:
+    """Add the store that is read."""
+    parser.add_argument("store", metavar="STORE", help="path or URL of the store")
+
+
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """Add the number of worker processes."""
+    parser.add_argument(
+        "--workers", type=int, metavar="N",
+        help="number of worker processes (default: one for each processor)",
+    )
+
+
+def add_cell(parser: argparse.ArgumentParser, meaning: str) -> None:
+    """Add the selection of one cell."""
+    parser.add_argument(
+        "--at", default="", metavar="NAME=VALUE,...",
+        help=f"{meaning}; an axis that is not named takes its first value",
+    )
+
+
+def add_picture(parser: argparse.ArgumentParser) -> None:
+    """Add where and how one scene is drawn."""
+    parser.add_argument(
+        "-o", "--output", default="scene.png", metavar="PNG",
+        help="file to write (default: scene.png)",
+    )
+    parser.add_argument("--plain", action="store_true", help="draw the image without annotations")
+    parser.add_argument(
+        "--full", action="store_true",
+        help="draw the whole frame instead of the marker's surroundings",
+    )
+
+
+def add_json(parser: argparse._ActionsContainer) -> None:
+    """Add the choice of JSON on standard output."""
+    parser.add_argument("--json", action="store_true", help="print one JSON object")

@@ -1,0 +1,50 @@
+"""Errors as the user of a command reads them: lines that name flags, and an exit status."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from sweep.errors import ArgumentError, DatasetError, PipelineError, StoreError, SweepError
+from sweep.messages import plain
+
+MAX_LINE_LENGTH = 2000
+
+REFUSALS = (ArgumentError, DatasetError, PipelineError, StoreError)
+"""Errors of what was asked for (exit status 2); others occur while a command runs (1)."""
+
+
+def print_error(error: SweepError, options: argparse.Namespace) -> int:
+    """Print an error's lines, without terminal control characters; return the exit status.
+
+    An :class:`ArgumentError` names an argument of a Python function, such as ``time_limit_s``; the
+    line names the flag that sets it, ``--time-limit``.
+    """
+    text = str(error)
+    if isinstance(error, ArgumentError):
+        text = f"{flag_of(error.argument, options)} {error.value}: {error.problem}"
+    for line in text.splitlines():
+        print(plain(line, MAX_LINE_LENGTH), file=sys.stderr)
+    return 2 if isinstance(error, REFUSALS) else 1
+
+
+def print_import_error(error: ImportError) -> int:
+    """Print one line if OpenCV cannot be imported; raise any other error, which is a defect."""
+    if error.name is None or error.name.partition(".")[0] != "cv2":
+        raise error
+    print(
+        f"OpenCV cannot be imported: {error}; reinstall it with "
+        "`pip install --force-reinstall opencv-contrib-python-headless`",
+        file=sys.stderr,
+    )
+    return 2
+
+
+def flag_of(argument: str, options: argparse.Namespace) -> str:
+    """Return the flag that sets an argument of a Python function, in the command being run.
+
+    A command declares flags under the names of these arguments (``dest``); an argument without a
+    declared flag is named as a flag usually is, with ``-`` for ``_``.
+    """
+    flags: dict[str, str] = getattr(options, "flags", {})
+    return flags.get(argument, f"--{argument.replace('_', '-')}")

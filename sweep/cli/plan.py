@@ -1,0 +1,78 @@
+"""``sweep plan``."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+
+from sweep.cli.arguments import add_json, add_pipeline, add_workers, read_pipeline
+from sweep.cli.command import Command, Example
+from sweep.cli.output import print_json
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_pipeline(parser)
+    add_workers(parser)
+    add_json(parser)
+
+
+def _execute(options: argparse.Namespace) -> int:
+    pipeline = read_pipeline(options)
+    from sweep.execution.forecast import forecast_isolated  # noqa: PLC0415
+    from sweep.plan.active_parts import parts  # noqa: PLC0415
+    from sweep.report.formatting import byte_count, duration  # noqa: PLC0415
+
+    listed = parts(pipeline)
+    switches = [part.switch for part in listed if part.switch and part.active]
+    expected, costs = forecast_isolated(pipeline, options.workers, switches)
+    if options.json:
+        print_json(
+            {
+                "title": pipeline.title,
+                "dimensions": {axis.name: len(axis) for axis in pipeline.axes},
+                **dataclasses.asdict(expected),
+                "parts": [
+                    {**dataclasses.asdict(part), "pose_s": costs.get(part.switch)}
+                    for part in listed
+                ],
+            }
+        )
+        return 0
+    print(pipeline.title or pipeline.name)
+    print("\nDimensions")
+    width = max((len(axis.name) for axis in pipeline.axes), default=0)
+    for axis in pipeline.axes:
+        stage = axis.stage.name
+        values = f"{axis.values[0]} ... {axis.values[-1]}" if len(axis) > 1 else axis.values[0]
+        print(f"  {axis.name:{width}}  {len(axis):>11,}  {stage:10}  {values} {axis.unit}".rstrip())
+    print("\nParts")
+    for part in listed:
+        cost = f"; {costs[part.switch] * 1e3:.3g} ms a pose" if part.switch in costs else ""
+        print(f"  {part.name:17} {'on ' if part.active else 'off'}  {part.reason}{cost}")
+    print("\nExpected")
+    rows = {
+        "poses": f"{expected.poses:,}",
+        "results": f"{expected.results:,}",
+        "blocks": f"{expected.blocks:,} of {' x '.join(map(str, expected.block)) or '1'} poses",
+        "store": f"{byte_count(expected.bytes)} before compression",
+        "memory": f"{byte_count(expected.worker_bytes)} a worker",
+        "cost": f"{1e3 * expected.pose_s:.3g} ms a pose ({expected.sampled} sampled)",
+        "time": f"{duration(expected.seconds)} with {expected.workers} workers",
+    }
+    for name, text in rows.items():
+        print(f"  {name:8} {text}")
+    return 0
+
+
+PLAN = Command(
+    "plan", "show a pipeline's grid, active parts and expected cost",
+    "pipelines/README.md",
+    (
+        Example("sweep plan pipelines/smoke.toml", "shows the grid, memory and time"),
+        Example(
+            "sweep plan pipelines/smoke.toml --set trial=1000 --workers 16 --json",
+            "shows the same of a larger run, as JSON",
+        ),
+    ),
+    _add_arguments, _execute,
+)

@@ -1,0 +1,56 @@
+"""``sweep report``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sweep.cli.arguments import add_store
+from sweep.cli.command import Command, Example
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_store(parser)
+    parser.add_argument(
+        "-o", "--output", metavar="FILE",
+        help="file to write (default: report.html, or report.md with --format md)",
+    )
+    parser.add_argument(
+        "--format", choices=("html", "md"), dest="form",
+        help="one HTML page, or Markdown with a folder of figures (default: by FILE's suffix)",
+    )
+    parser.add_argument(
+        "--figures", metavar="DIR", help="also write each figure into DIR, as SVG and PNG"
+    )
+
+
+def _execute(options: argparse.Namespace) -> int:
+    from sweep.errors import ArgumentError  # noqa: PLC0415
+    from sweep.report.formatting import byte_count  # noqa: PLC0415
+    from sweep.report.report_data import read_report_data  # noqa: PLC0415
+    from sweep.report.write_report import write_report  # noqa: PLC0415
+
+    for name in ("output", "figures"):
+        value = getattr(options, name)
+        if value is not None and not value.strip():
+            raise ArgumentError(name, repr(value), "expected a name")
+    form = options.form or ("md" if str(options.output).lower().endswith(".md") else "html")
+    output = Path(options.output or f"report.{form}")
+    figures = Path(options.figures) if options.figures else None
+    count = write_report(read_report_data(options.store), output, form, figures)
+    print(f"{output}: {count} figures, {byte_count(output.stat().st_size)}")
+    return 0
+
+
+REPORT = Command(
+    "report", "write a report of a store: the answer, figures, example scenes",
+    "sweep/analysis/README.md",
+    (
+        Example("sweep report runs/smoke.zarr", "writes report.html, one self-contained page"),
+        Example(
+            "sweep report runs/smoke.zarr -o answer.md --figures figures",
+            "writes Markdown, and each figure as SVG and PNG",
+        ),
+    ),
+    _add_arguments, _execute,
+)

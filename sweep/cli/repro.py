@@ -1,0 +1,103 @@
+"""``sweep repro``."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from sweep.cli.arguments import add_cell, add_picture, add_store
+from sweep.cli.command import Command, Example
+from sweep.cli.output import write_png
+
+if TYPE_CHECKING:
+    from sweep.integrity.reproduction import Reproduction
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_store(parser)
+    add_cell(parser, "the cell")
+    add_picture(parser)
+    parser.add_argument(
+        "--time-limit", type=float, default=60.0, metavar="S", dest="time_limit_s",
+        help="timeout in seconds (default: 60)",
+    )
+
+
+def _execute(options: argparse.Namespace) -> int:
+    import math  # noqa: PLC0415
+
+    from sweep.errors import ArgumentError  # noqa: PLC0415
+
+    if not 0 < options.time_limit_s < math.inf:
+        raise ArgumentError("time_limit_s", options.time_limit_s, "expected seconds above 0")
+    from sweep.integrity.reproduction import reproduce  # noqa: PLC0415
+    from sweep.messages import plain  # noqa: PLC0415
+    from sweep.report.scene_values import value_lines  # noqa: PLC0415
+
+    again = reproduce(
+        options.store, options.at, whole_frame=options.full, time_limit_s=options.time_limit_s
+    )
+    print(f"--at {again.at}")
+    for line in again.others:
+        print(f"changed since the store was created: {line}")
+    print("\n".join(value_lines(again.here, again.stored)))
+    if again.look is not None:
+        left, top, right, bottom = again.look.window
+        ids = ", ".join(str(marker_id) for marker_id, _ in again.look.decoded) or "none"
+        print(
+            f"columns {left} to {right - 1}, rows {top} to {bottom - 1} of the frame; "
+            f"IDs decoded: {ids}; candidates rejected: {len(again.look.rejected)}"
+        )
+    times = ", ".join(f"{stage} {1e3 * seconds:.3g} ms" for stage, seconds in again.seconds.items())
+    print(f"time: {times}")
+    for failure in again.failures:
+        kind = "the process died" if failure.crashed else "an exception was raised"
+        print(f"{failure.stage}: {kind}:")
+        print("\n".join(plain(line, 1000) for line in failure.text.strip().splitlines()))
+    _write_image(again, options)
+    return _print_verdict(again)
+
+
+def _write_image(again: Reproduction, options: argparse.Namespace) -> None:
+    if again.image is None:
+        print("no image: rendering failed")
+        return
+    from sweep.plan.cell_selection import coordinates_text  # noqa: PLC0415
+    from sweep.report.scene_drawing import draw_scene  # noqa: PLC0415
+
+    image = again.image
+    if again.look is not None and not options.plain:
+        image = draw_scene(again.look, coordinates_text(again.pipeline, again.one))
+    write_png(options.output, image)
+    print(f"{options.output}: image of the cell")
+
+
+def _print_verdict(again: Reproduction) -> int:
+    """Print whether the values are the stored ones; return the exit status."""
+    if again.stored is None:
+        print("the store does not hold this cell yet")
+        return 0
+    if again.verdict:
+        print(f"differs from the store: {again.verdict}")
+        return 1
+    how = "bit for bit" if again.exact else (
+        "within the tolerances for another processor or version")
+    print(f"agrees with the store {how}")
+    return 0
+
+
+REPRO = Command(
+    "repro", "recompute one cell of a store and compare it with the stored one",
+    "sweep/integrity/README.md",
+    (
+        Example(
+            "sweep repro runs/smoke.zarr --at distance_m=0.3,tilt_deg=45",
+            "prints both values of each variable and draws the image",
+        ),
+        Example(
+            "sweep repro runs/faults.zarr --time-limit 10",
+            "recomputes the first cell, for 10 seconds at most",
+        ),
+    ),
+    _add_arguments, _execute,
+)

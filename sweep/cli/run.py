@@ -1,0 +1,71 @@
+"""``sweep run``."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+
+from sweep.cli.arguments import add_json, add_pipeline, add_workers, read_pipeline
+from sweep.cli.command import Command, Example
+from sweep.cli.output import print_json
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_pipeline(parser)
+    parser.add_argument(
+        "--store", metavar="STORE", help="path or URL of the store (default: runs/NAME.zarr)"
+    )
+    add_workers(parser)
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="address of a Dask scheduler")
+    parser.add_argument(
+        "--reuse", action="append", default=[], metavar="STORE",
+        help="copy the finished cells that this store shares with the experiment; may be repeated",
+    )
+    parser.add_argument(
+        "--time-limit", type=float, metavar="S", default=600.0, dest="time_limit_s",
+        help="block timeout in seconds (default: 600)",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing store")
+    add_json(parser)
+
+
+def _execute(options: argparse.Namespace) -> int:
+    pipeline = read_pipeline(options)
+    from sweep.execution.progress import progress_bar  # noqa: PLC0415
+    from sweep.execution.runner import execute  # noqa: PLC0415
+
+    with progress_bar() as bar:
+        summary = execute(
+            pipeline, options.store, workers=options.workers, scheduler=options.scheduler,
+            reuse=options.reuse, overwrite=options.overwrite, time_limit_s=options.time_limit_s,
+            progress=bar,
+        )
+    if options.json:
+        print_json(dataclasses.asdict(summary))
+        return 0
+    if summary.computed_blocks == 0:
+        print(f"{summary.store} is already finished; --overwrite recomputes it")
+    rate = summary.poses / summary.seconds if summary.computed_blocks else 0
+    print(
+        f"{summary.poses:,} poses, {summary.results:,} results, {summary.detected:,} detected"
+        + (f", {summary.seconds:.1f} s ({rate:,.0f} poses/s)" if rate else "")
+    )
+    for flag, count in (("crashed", summary.crashed), ("failed", summary.failed)):
+        if count:
+            print(f"{count:,} flagged {flag}; `sweep status {summary.store}` lists them")
+    print(f'xarray.open_zarr("{summary.data}")')
+    return 0
+
+
+RUN = Command(
+    "run", "run a pipeline into a store, or continue an interrupted run",
+    "sweep/execution/README.md",
+    (
+        Example("sweep run pipelines/smoke.toml", "writes runs/smoke.zarr"),
+        Example(
+            "sweep run pipelines/smoke.toml --set 'tilt_deg=[0, 30, 60]' --store runs/tilts.zarr",
+            "runs the same experiment at other tilts",
+        ),
+    ),
+    _add_arguments, _execute,
+)

@@ -1,0 +1,46 @@
+"""``sweep show``."""
+
+from __future__ import annotations
+
+import argparse
+
+from sweep.cli.arguments import add_cell, add_picture, add_pipeline, read_pipeline
+from sweep.cli.command import Command, Example
+from sweep.cli.output import write_png
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_pipeline(parser)
+    add_cell(parser, "the pose and its configuration")
+    add_picture(parser)
+
+
+def _execute(options: argparse.Namespace) -> int:
+    pipeline = read_pipeline(options)
+    from sweep.evaluation.inspection import inspect_scene  # noqa: PLC0415
+    from sweep.plan.cell_selection import cell, coordinates_text  # noqa: PLC0415
+    from sweep.report.scene_drawing import draw_scene  # noqa: PLC0415
+
+    one = cell(pipeline, options.at)
+    scene = inspect_scene(one, whole_frame=options.full)
+    image = scene.image if options.plain else draw_scene(scene, coordinates_text(pipeline, one))
+    write_png(options.output, image)
+    print(f"{options.output}: {scene.detection.name}, {scene.estimate.name}")
+    return 0
+
+
+SHOW = Command(
+    "show", "draw the image of one pose with the detections in it",
+    "pipelines/README.md",
+    (
+        Example(
+            "sweep show pipelines/smoke.toml --at distance_m=0.3,tilt_deg=45",
+            "draws this pose into scene.png",
+        ),
+        Example(
+            "sweep show pipelines/faults.toml --full --plain -o frame.png",
+            "writes the whole frame of the first pose, without annotations",
+        ),
+    ),
+    _add_arguments, _execute,
+)

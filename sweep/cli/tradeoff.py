@@ -1,0 +1,132 @@
+"""``sweep tradeoff``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sweep.cli.arguments import add_json
+from sweep.cli.command import Command, Example
+from sweep.cli.output import print_json
+
+FIGURE_SUFFIXES = (".png", ".svg")
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "source", metavar="STORE|PIPELINE",
+        help="a finished store, or a TOML file, which is run into its default store first",
+    )
+    parser.add_argument(
+        "--per", action="append", default=[], metavar="AXIS",
+        help="scene axis whose values are separate conditions, such as side_px; may be repeated",
+    )
+    parser.add_argument(
+        "--criterion", default="rotation_p95_deg", metavar="NAME",
+        help="error that ranks the configurations (default: rotation_p95_deg)",
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=60.0, metavar="S", dest="limit_s",
+        help="time limit of the cost measurement, in seconds (default: 60)",
+    )
+    parser.add_argument(
+        "-o", "--output", metavar="FIGURE", help="draw a figure into this PNG or SVG file"
+    )
+    form = parser.add_mutually_exclusive_group()
+    add_json(form)
+    form.add_argument("--markdown", action="store_true", help="print Markdown tables")
+
+
+def _execute(options: argparse.Namespace) -> int:
+    from sweep.tradeoff.measurement import measure_trade  # noqa: PLC0415
+    from sweep.tradeoff.pareto import advice  # noqa: PLC0415
+
+    _check(options)
+    output = _checked_output(options.output)
+    store = options.source
+    if store.endswith(".toml"):
+        from sweep.execution.progress import progress_bar  # noqa: PLC0415
+        from sweep.execution.runner import execute  # noqa: PLC0415
+        from sweep.plan.experiment import Pipeline  # noqa: PLC0415
+
+        with progress_bar() as bar:
+            store = execute(Pipeline.from_toml(store), None, progress=bar).store
+    trade, renderers = measure_trade(store, options.per, options.limit_s)
+    if output is not None:
+        from sweep.errors import StoreError  # noqa: PLC0415
+        from sweep.report.tradeoff_chart import draw_trade  # noqa: PLC0415
+
+        try:
+            draw_trade(trade, options.criterion, output)
+        except OSError as error:
+            raise StoreError(f"{output}: cannot be written: {error.strerror}") from None
+    from sweep.report.renderer_table import renderer_lines  # noqa: PLC0415
+    from sweep.report.tradeoff_table import as_json, table_markdown, table_text  # noqa: PLC0415
+
+    if options.json:
+        content = as_json(trade)
+        if renderers is not None:
+            content["renderers"] = as_json(renderers)
+        content["advice"] = advice(trade, options.criterion)
+        print_json(content)
+        return 0
+    form = table_markdown if options.markdown else table_text
+    print(form(trade, options.criterion))
+    if renderers is not None:
+        print()
+        print("\n".join(renderer_lines(renderers, markdown=options.markdown)))
+    print()
+    print("\n".join(advice(trade, options.criterion)))
+    return 0
+
+
+def _check(options: argparse.Namespace) -> None:
+    import math  # noqa: PLC0415
+
+    from sweep.errors import ArgumentError  # noqa: PLC0415
+    from sweep.tradeoff.pareto import CRITERIA  # noqa: PLC0415
+
+    if options.criterion not in CRITERIA:
+        raise ArgumentError(
+            "criterion", options.criterion, f"expected one of {', '.join(CRITERIA)}")
+    if not 0 < options.limit_s < math.inf:
+        raise ArgumentError("limit_s", options.limit_s, "expected a finite number above 0")
+
+
+def _checked_output(name: str | None) -> Path | None:
+    """Return the path of the figure, checked before the long measurement.
+
+    Raises
+    ------
+    StoreError
+        If the suffix names no format, or the file cannot be written.
+    """
+    if not name:
+        return None
+    from sweep.errors import StoreError  # noqa: PLC0415
+
+    output = Path(name)
+    if output.suffix.lower() not in FIGURE_SUFFIXES:
+        raise StoreError(f"{output}: expected a file that ends in .png or .svg")
+    if output.is_dir():
+        raise StoreError(f"{output}: cannot be written: Is a directory")
+    if not output.absolute().parent.is_dir():
+        raise StoreError(f"{output}: cannot be written: No such file or directory")
+    return output
+
+
+TRADEOFF = Command(
+    "tradeoff", "compare configurations: cost and accuracy on the same images",
+    "sweep/tradeoff/README.md",
+    (
+        Example(
+            "sweep tradeoff runs/tradeoff.zarr --per side_px -o trade.svg",
+            "compares the configurations at each size of the marker, with a figure",
+        ),
+        Example(
+            "sweep tradeoff pipelines/tradeoff.toml --criterion range_p95_percent --markdown",
+            "runs the pipeline first; ranks by the range error; prints Markdown",
+        ),
+    ),
+    _add_arguments, _execute,
+)

@@ -1,0 +1,74 @@
+"""``sweep verify``."""
+
+from __future__ import annotations
+
+import argparse
+
+from sweep.cli.arguments import add_json, add_store, add_workers
+from sweep.cli.command import Command, Example
+from sweep.cli.output import MAX_LINES, print_json
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_store(parser)
+    parser.add_argument(
+        "--repair", action="store_true",
+        help="recompute damaged blocks, and rewrite or delete other damaged files",
+    )
+    parser.add_argument(
+        "--sample", type=int, default=20, metavar="N",
+        help="number of scenes to recompute and compare (default: 20)",
+    )
+    add_workers(parser)
+    add_json(parser)
+
+
+def _execute(options: argparse.Namespace) -> int:
+    if options.repair:
+        from sweep.integrity.repair import repair  # noqa: PLC0415
+
+        found = repair(options.store, options.sample, workers=options.workers)
+    else:
+        from sweep.integrity.verification import verify  # noqa: PLC0415
+
+        found = verify(options.store, options.sample)
+    if options.json:
+        print_json(found.to_json())
+        return 1 if found.damage else 0
+    from sweep.messages import plain  # noqa: PLC0415
+
+    for what, listed in (("repaired", found.repaired), ("damaged", found.damage)):
+        for damage in listed[:MAX_LINES]:
+            print(f"{what:9} {plain(damage.where, 300)}: {plain(damage.what, 300)}")
+        if len(listed) > MAX_LINES:
+            print(f"{what:9} and {len(listed) - MAX_LINES:,} more; --json lists all")
+    if found.left_over:
+        example = plain(found.left_over[0])
+        print(f"{len(found.left_over):,} files do not belong to the store, such as {example}; "
+              "--repair deletes them")
+    again = f"{found.sampled} scenes recomputed" if found.sampled else (
+        f"no scene recomputed ({found.not_sampled})"
+    )
+    state = "" if found.finished else ", unfinished"
+    print(
+        f"{found.store}: {'damaged' if found.damage else 'sound'}{state}: "
+        f"{found.blocks_done:,} of {found.blocks:,} blocks, {found.files:,} files, "
+        f"{again}"
+        + (f"; damaged: {len(found.damage):,}, `sweep verify --repair` repairs them"
+           if found.damage and not options.repair else "")
+    )
+    return 1 if found.damage else 0
+
+
+VERIFY = Command(
+    "verify", "check a store's integrity; optionally repair it",
+    "sweep/integrity/README.md",
+    (
+        Example("sweep verify runs/smoke.zarr", "checks every file, and recomputes 20 scenes"),
+        Example(
+            "sweep verify runs/smoke.zarr --repair --sample 100",
+            "repairs what is damaged, and recomputes 100 scenes",
+        ),
+    ),
+    _add_arguments, _execute,
+)

@@ -1,0 +1,68 @@
+"""The figure of an axis that no other figure shows: rates and errors along it."""
+
+from __future__ import annotations
+
+from sweep.analysis import error_statistics
+from sweep.report.charts import draw_dots, draw_lines, rows_height
+from sweep.report.error_columns import ERRORS, INFINITE_ERRORS, RATES
+from sweep.report.figure import (
+    FigureKind,
+    RenderedFigure,
+    denominators,
+    dots_of,
+    interval_sentence,
+    lines_of,
+    sentences,
+    uncapitalised,
+)
+from sweep.report.grouping import group_labels, is_numeric
+from sweep.report.report_data import ReportData
+from sweep.report.svg import Panel
+from sweep.report.table import table_of
+
+MAX_BINS, MAX_ROWS = 40, 24
+"""Groups of a numeric axis, and of any other."""
+
+
+def effect_of(name: str) -> FigureKind:
+    """Return the kind of figure that shows the effect of one axis."""
+    return FigureKind(f"effect-{name}", lambda data: data.length(name) > 1,
+                      lambda data: _render(data, name), lambda _: (name,))
+
+
+def _render(data: ReportData, name: str) -> RenderedFigure:
+    axis = data.pipeline.axis(name)
+    numeric = axis is not None and is_numeric(axis)
+    grouping = data.along(name, MAX_BINS if numeric else MAX_ROWS)
+    found = data.analysed(error_statistics, grouping)
+    label = data.label(name)
+
+    def panel(variable: str, title: str, unit: str, scale: float = 1.0) -> Panel:
+        share = scale != 1
+        quantity = f"{uncapitalised(title)}, {unit}"
+        if numeric:
+            lines = lines_of(found, name, variable, None, scale)
+            return Panel(title, f"Line of {uncapitalised(title)} in {unit} against {label}.",
+                         lambda axes: draw_lines(axes, lines, (label, quantity), share=share))
+        names = group_labels(found, name)
+        dots = dots_of(found, variable, scale)
+        return Panel(title, f"Rows of {uncapitalised(title)} in {unit} for each {name}.",
+                     lambda axes: draw_dots(axes, names, dots, quantity, share=share),
+                     height=rows_height(len(names)))
+
+    return RenderedFigure(
+        f"effect-{name}", f"The effect of {name}",
+        sentences(
+            f"Detection rate, and median and 95 % quantile of the rotation error, by {name}"
+            + (f" ({axis.meaning})." if axis is not None else "."),
+            interval_sentence(found, "detection_rate", marks="Bars and bands"), INFINITE_ERRORS,
+            denominators(found),
+            *grouping.notes, data.pooled(*grouping.dims),
+        ),
+        table_of(found, f"By {name}, with 95 % intervals", grouping.dims, RATES | ERRORS,
+                 data.results),
+        [panel("detection_rate", "Detected", "%", 100),
+         panel("rotation_median_deg", "Rotation error, median", "deg"),
+         panel("rotation_p95_deg", "Rotation error, p95", "deg"),
+         panel("range_median_percent", "Range error, median", "%")],
+    )

@@ -1,0 +1,184 @@
+"""Figures that compare configurations: combinations of detector and estimator settings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import xarray as xr
+
+from sweep.analysis import compare, error_statistics
+from sweep.report.charts import draw_dots, draw_map, rows_height
+from sweep.report.error_columns import ERRORS, LOOKED_FOR
+from sweep.report.figure import (
+    FigureKind,
+    RenderedFigure,
+    denominators,
+    dots_of,
+    interval_sentence,
+    sentences,
+    uncapitalised,
+)
+from sweep.report.grouping import CONFIGURATION, Grouping, by_configuration, group_labels
+from sweep.report.report_data import ReportData
+from sweep.report.svg import Panel
+from sweep.report.table import Table, cells
+
+MAX_CONFIGURATIONS = 30
+SIZE_COLUMNS = 12
+
+
+def configuration_grouping(data: ReportData) -> Grouping:
+    """Return the grouping by configuration, of at most :data:`MAX_CONFIGURATIONS` groups.
+
+    If there are more, the settings with the most values are pooled.
+    """
+    kept: list[str] = []
+    count = 1
+    for name in sorted(data.setting_axes, key=data.length):
+        if count * data.length(name) > MAX_CONFIGURATIONS and kept:
+            break
+        kept.append(name)
+        count *= data.length(name)
+    grouping = Grouping()
+    pooled = [name for name in data.setting_axes if name not in kept]
+    if pooled:
+        note = f"There are too many configurations to show each: pooled over {', '.join(pooled)}."
+        grouping = Grouping(notes=(note,))
+    for name in data.setting_axes:
+        if name in kept:
+            grouping += data.along(name, MAX_CONFIGURATIONS, binned=False)
+    return grouping
+
+
+def _dot_panel(
+    found: xr.Dataset, names: list[str], name: str, title: str, unit: str, *,
+    scale: float = 1.0, share: bool = False, level: float | None = None,
+) -> Panel:
+    dots = dots_of(found, name, scale)
+    label = f"{uncapitalised(title)}, {unit}" if unit else uncapitalised(title)
+    return Panel(
+        title, f"Rows of {label}, for each configuration.",
+        lambda axes: draw_dots(axes, names, dots, label, share=share, level=level),
+        height=rows_height(len(names)),
+    )
+
+
+def _configurations(data: ReportData) -> RenderedFigure:
+    grouping = configuration_grouping(data)
+    names, found = by_configuration(data.analysed(error_statistics, grouping), grouping.dims)
+    panels = [
+        _dot_panel(found, names, "solved_rate", "Solved", "%", scale=100, share=True),
+        _dot_panel(found, names, "rotation_median_deg", "Rotation error, median", "deg"),
+        _dot_panel(found, names, "range_median_percent", "Range error, median", "%"),
+    ]
+    if found["solved"].sum() > 0:
+        panels.append(
+            _dot_panel(found, names, "flip_rate", "Flipped", "%", scale=100, share=True))
+    notes = list(grouping.notes)
+    if data.size_axis is not None:
+        panel, note = _map_by_size(data, grouping)
+        panels.append(panel)
+        notes += note
+    return RenderedFigure(
+        "configurations", f"Configurations compared: {', '.join(grouping.dims)}",
+        sentences(
+            "Share of the poses looked for that are solved, and the median errors, of each "
+            "configuration on the same images; a pose that is not solved counts as an infinite "
+            "error (right edge, \u221e).",
+            interval_sentence(found, "solved_rate"), denominators(found), *notes,
+            data.pooled(*grouping.dims),
+        ),
+        _table("Configurations, with 95 % intervals", names, found,
+               LOOKED_FOR | ERRORS | {"flipped, %": ("flip_rate", 100.0)}),
+        panels,
+    )
+
+
+def _map_by_size(data: ReportData, grouping: Grouping) -> tuple[Panel, tuple[str, ...]]:
+    """Return a map of the median rotation error over size and configuration, with notes."""
+    axis = str(data.size_axis)
+    sizes = data.along(axis, SIZE_COLUMNS)
+    names, found = by_configuration(
+        data.analysed(error_statistics, grouping + sizes), grouping.dims)
+    values = found["rotation_median_deg"].transpose(CONFIGURATION, axis).values
+    columns = group_labels(found, axis)
+    return Panel(
+        "Rotation error, median, deg",
+        f"Map of the median rotation error over {axis} and configuration.",
+        lambda axes: draw_map(axes, names[::-1], columns, values[::-1], (data.label(axis), "")),
+        wide=len(columns) > 6, height=rows_height(len(names)) + 0.3,
+    ), sizes.notes
+
+
+def _table(
+    caption: str, names: list[str], found: xr.Dataset,
+    columns: Mapping[str, tuple[str, float]],
+) -> Table:
+    present = {heading: of for heading, of in columns.items() if of[0] in found}
+    texts = [cells(found, name, scale) for name, scale in present.values()]
+    rows = [[name, *(column[k] for column in texts)] for k, name in enumerate(names)]
+    return Table(caption, [CONFIGURATION, *present], rows)
+
+
+# Paired with the first configuration.
+
+PAIRED = {
+    "compared": ("compared", 1.0),
+    "detected by it only": ("only_second_detected", 1.0),
+    "detected by the first only": ("only_first_detected", 1.0),
+    "detection difference, points": ("detection_difference", 100.0),
+    "p (McNemar)": ("detection_p_value", 1.0),
+    "both solved": ("both_solved", 1.0),
+    "rotation difference, deg": ("rotation_difference_deg", 1.0),
+    "rotation RMSE ratio": ("rotation_rmse_ratio", 1.0),
+    "range difference, %": ("range_difference_percent", 1.0),
+    "range RMSE ratio": ("range_rmse_ratio", 1.0),
+}
+"""Heading -> variable of `sweep.analysis.compare`, and the factor that it is multiplied by."""
+
+
+def _paired(data: ReportData) -> RenderedFigure:
+    grouping = configuration_grouping(data)
+    results = data.results.isel({name: list(some) for name, some in grouping.chosen})
+    found = data.once("paired", lambda: compare(
+        _with_first_configuration(results, grouping.dims), results, grouping.dims))
+    names, differences = by_configuration(found, grouping.dims)
+    others = differences.isel({CONFIGURATION: slice(1, None)})
+    return RenderedFigure(
+        "paired", f"Each configuration against the first: {names[0]}",
+        sentences(
+            f"Differences from {names[0]}, on the same scenes: detection rate in percentage "
+            "points (to the right: detected more often), and the ratio of the RMSE of rotation "
+            "and range over the scenes that both solve (below 1: smaller errors).",
+            interval_sentence(others, "detection_difference"),
+            denominators(others, "compared", "pairs"), *grouping.notes,
+            data.pooled(*grouping.dims),
+        ),
+        _table(f"Against {names[0]}, with 95 % intervals", names[1:], others, PAIRED),
+        [_dot_panel(others, names[1:], "detection_difference", "Detection, difference",
+                    "points", scale=100, level=0.0),
+         _dot_panel(others, names[1:], "rotation_rmse_ratio", "Rotation RMSE, ratio", "",
+                    level=1.0),
+         _dot_panel(others, names[1:], "range_rmse_ratio", "Range RMSE, ratio", "", level=1.0)],
+    )
+
+
+def _with_first_configuration(results: xr.Dataset, settings: Sequence[str]) -> xr.Dataset:
+    """Return results in which every configuration has the values of the first."""
+    replaced = {}
+    for name, variable in results.data_vars.items():
+        dims = [dim for dim in settings if dim in variable.dims]
+        if dims:
+            first = variable.isel(dict.fromkeys(dims, 0), drop=True)
+            replaced[name] = first.expand_dims({dim: results[dim] for dim in dims}).transpose(
+                *variable.dims)
+    return results.assign(replaced)
+
+
+def _covered(data: ReportData) -> tuple[str, ...]:
+    return configuration_grouping(data).dims
+
+
+CONFIGURATIONS = FigureKind(
+    "configurations", lambda data: bool(data.setting_axes), _configurations, _covered)
+COMPARED = FigureKind("paired", lambda data: bool(data.setting_axes), _paired)

@@ -1,0 +1,122 @@
+"""Groups of poses that a figure compares, and the labels of groups."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from sweep.plan.axes import Axis
+from sweep.report.formatting import bin_text, coordinates
+from sweep.tradeoff.labels import configuration_label
+from sweep.typing import Floats
+
+AREA = "marker_area_px"
+TILT = "tilt_deg"
+IDS = "marker_id"
+CONFIGURATION = "configuration"
+"""Dimension of tables that have a row for each configuration."""
+
+AREA_BINS = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Grouping:
+    """How the poses are grouped.
+
+    Attributes
+    ----------
+    per
+        Axes whose values are groups.
+    bins
+        Axes, or the area, with the edges of bins that are groups.
+    chosen
+        Axes of which only the values at these indices are kept.
+    notes
+        Sentences for the reader about bins and chosen values.
+    """
+
+    per: tuple[str, ...] = ()
+    bins: tuple[tuple[str, tuple[float, ...]], ...] = ()
+    chosen: tuple[tuple[str, tuple[int, ...]], ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        """Dimensions of an analysis of these groups."""
+        return self.per + tuple(name for name, _ in self.bins)
+
+    def __add__(self, other: Grouping) -> Grouping:
+        return Grouping(
+            self.per + other.per, self.bins + other.bins, self.chosen + other.chosen,
+            self.notes + other.notes,
+        )
+
+
+def area_bins(low: float, high: float) -> Grouping:
+    """Return the grouping by bins of the area, of equal ratio, between two areas in px²."""
+    areas = np.geomspace(low, high, AREA_BINS + 1)
+    areas[[0, -1]] = low, np.nextafter(high, np.inf)
+    return Grouping(
+        bins=((AREA, tuple(areas.tolist())),),
+        notes=(f"Areas are grouped into {AREA_BINS} bins of equal ratio.",),
+    )
+
+
+def bins_of(name: str, values: Floats, most: int) -> Grouping:
+    """Return the grouping of an axis' values (n,) into ``most`` bins of about as many each."""
+    groups = np.array_split(np.sort(values), most)
+    between = [float(a[-1] + b[0]) / 2 for a, b in itertools.pairwise(groups)]
+    edges = (float(groups[0][0]), *between, float(np.nextafter(groups[-1][-1], np.inf)))
+    note = f"The {len(values):,} values of {name} are grouped into {len(edges) - 1} bins."
+    return Grouping(bins=((name, edges),), notes=(note,))
+
+
+def chosen_of(name: str, length: int, most: int) -> Grouping:
+    """Return the grouping by ``most`` of the ``length`` values of an axis, evenly spaced."""
+    chosen = tuple(np.linspace(0, length - 1, most).round().astype(int).tolist())
+    note = f"{most} of the {length:,} values of {name} are shown."
+    return Grouping((name,), chosen=((name, chosen),), notes=(note,))
+
+
+def is_numeric(axis: Axis) -> bool:
+    """Return whether an axis' values are numbers, and not labels or switches."""
+    return not axis.labelled and not isinstance(axis.values[0], bool)
+
+
+def axis_label(results: xr.Dataset, name: str) -> str:
+    """Return the name of a coordinate or variable in words, with its unit: ``distance, m``."""
+    names = {AREA: "area of the marker", "side_px": "side of the marker"}
+    units = str(results[name].attrs.get("units", "")) if name in results.variables else ""
+    words = names.get(name, name)
+    for ending in ("_deg", "_m", "_px", "_s", "_mm", "_e", "_m_s"):
+        if units and words == name and name.endswith(ending):
+            words = name.removesuffix(ending)
+    unit = {"px2": "px²", "degree": "deg"}.get(units, units)
+    words = words.replace("_", " ")
+    return f"{words}, {unit}" if unit else words
+
+
+def group_labels(table: xr.Dataset, name: str) -> list[str]:
+    """Return the values of a dimension as text; of bins their ends."""
+    if f"{name}_low" in table.coords:
+        ends = zip(table[f"{name}_low"].values, table[f"{name}_high"].values, strict=True)
+        return [bin_text(low, high) for low, high in ends]
+    return coordinates(table[name].values.tolist())
+
+
+def by_configuration(table: xr.Dataset, dims: Sequence[str]) -> tuple[list[str], xr.Dataset]:
+    """Return the labels of all combinations of the settings ``dims``, and the table by them.
+
+    In the table the dimension ``configuration`` stands in place of ``dims``.
+    """
+    values = [table[dim].values.tolist() for dim in dims]
+    labels = [
+        configuration_label(dict(zip(dims, chosen, strict=True)))
+        for chosen in itertools.product(*values)
+    ]
+    stacked = table.stack({CONFIGURATION: list(dims)}, create_index=False)
+    return labels, stacked.drop_vars([*dims], errors="ignore")

@@ -1,0 +1,271 @@
+"""The command line: help, version, flags in messages, and installations that cannot work."""
+
+import argparse
+import ast
+import dataclasses
+import importlib
+import re
+import shlex
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+
+import pytest
+
+import sweep
+from sweep import cli
+from sweep.cli import installation
+from sweep.cli.errors import flag_of, print_error
+from sweep.cli.parser import COMMANDS, GUIDES, build_parser
+from sweep.errors import ArgumentError, PipelineError, RunError, StoreError
+
+TOP = Path(__file__).parents[2]
+HEAVY = ("numpy", "dask", "xarray", "numba", "cv2", "zarr", "matplotlib", "jinja2", "rich")
+
+
+def python(code):
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=TOP, capture_output=True, text=True, check=False)
+
+
+def told(capsys, *arguments):
+    """Run a command in this process; return its exit status, output and error output."""
+    try:
+        code = cli.main(list(arguments))
+    except SystemExit as stopped:
+        code = stopped.code
+    return code, *capsys.readouterr()
+
+
+# Help and version.
+
+def test_bare_sweep_prints_the_help(capsys):
+    code, out, err = told(capsys)
+    assert (code, err) == (0, "")
+    assert out == told(capsys, "--help")[1]
+    for command in COMMANDS:
+        assert re.search(
+            rf"^    {command.name} +{re.escape(command.summary[:20])}", out, re.MULTILINE)
+
+
+def test_every_summary_fits_into_a_line_of_a_terminal(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    _, out, _ = told(capsys)
+    for command in COMMANDS:
+        assert command.summary in out
+
+
+def test_version_is_that_of_the_package(capsys):
+    assert told(capsys, "--version") == (0, f"sweep {sweep.__version__}\n", "")
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
+def test_each_help_ends_with_two_examples_and_the_guide(command, capsys):
+    code, out, _ = told(capsys, command.name, "--help")
+    assert code == 0
+    examples = out.split("examples:\n")[1]
+    assert re.findall(r"^  (sweep .*)$", examples, re.MULTILINE) == [
+        example.line for example in command.examples]
+    assert len(command.examples) == 2
+    assert out.endswith(f"\nguide: {command.guide}\n")
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
+def test_every_example_is_a_command_that_the_parser_takes(command):
+    for example in command.examples:
+        program, *arguments = shlex.split(example.line)
+        assert program == "sweep"
+        options = build_parser().parse_args(arguments)
+        assert options.command is command
+        for value in arguments:
+            if value.startswith("pipelines/"):
+                assert (TOP / value).is_file()
+
+
+def test_every_argument_has_a_help_text():
+    for command in COMMANDS:
+        parser = argparse.ArgumentParser()
+        command.add_arguments(parser)
+        for action in parser._actions:
+            assert action.help, (command.name, action.dest)
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], [], ["run", "--help"]])
+def test_help_and_version_import_nothing_heavy(arguments):
+    done = python(
+        f"import sys\nfrom sweep.cli import main\n"
+        f"try:\n    main({arguments!r})\nexcept SystemExit:\n    pass\n"
+        f"print('imported:', *(name for name in {HEAVY!r} if name in sys.modules))"
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith("imported:\n")
+
+
+def test_the_package_runs_as_a_module():
+    done = subprocess.run([sys.executable, "-m", "sweep", "--version"], cwd=TOP,
+                          capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, f"sweep {sweep.__version__}\n")
+
+
+@pytest.mark.parametrize("guide", sorted({*GUIDES, *(command.guide for command in COMMANDS)}))
+def test_every_guide_that_a_help_names_exists(guide):
+    assert (TOP / guide).is_file()
+
+
+# Messages.
+
+def test_an_argument_is_named_by_its_flag(capsys):
+    options = build_parser().parse_args(["run", "file.toml"])
+    error = ArgumentError("time_limit_s", 0, "expected seconds above 0")
+    assert print_error(error, options) == 2
+    assert capsys.readouterr().err == "--time-limit 0: expected seconds above 0\n"
+    flags = {
+        ("run", "workers"): "--workers", ("run", "scheduler"): "--scheduler",
+        ("run", "settings"): "--set", ("tradeoff", "limit_s"): "--seconds",
+        ("report", "form"): "--format", ("report", "output"): "--output",
+        ("report", "store"): "STORE", ("verify", "sample"): "--sample",
+        ("verify", "some_other"): "--some-other",
+    }
+    for (command, argument), flag in flags.items():
+        chosen = build_parser().parse_args([command, "x"])
+        assert flag_of(argument, chosen) == flag
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [(ArgumentError("workers", 0, "expected at least 1"), 2), (PipelineError(["a", "b"]), 2),
+     (StoreError("s"), 2), (RunError("r"), 1)],
+)
+def test_exit_status_says_whether_a_command_was_refused(error, status, capsys):
+    assert print_error(error, build_parser().parse_args(["status", "x"])) == status
+    assert capsys.readouterr().err.count("\n") == len(getattr(error, "faults", ["one"]))
+
+
+def test_control_characters_do_not_reach_the_terminal(capsys):
+    print_error(StoreError("x\x1b[2J"), build_parser().parse_args(["status", "x"]))
+    assert capsys.readouterr().err == "x\\u001b[2J\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["repro", "x", "--time-limit", "0"], "--time-limit 0.0: expected seconds above 0\n"),
+        (["repro", "x", "--time-limit", "inf"], "--time-limit inf: expected seconds above 0\n"),
+        (["tradeoff", "x", "--seconds", "nan"],
+         "--seconds nan: expected a finite number above 0\n"),
+        (["tradeoff", "x", "--criterion", "speed"],
+         "--criterion speed: expected one of rotation_rmse_deg, "),
+    ],
+)
+def test_a_value_that_cannot_be_is_refused_before_any_work(arguments, line, capsys):
+    code, out, err = told(capsys, *arguments)
+    assert (code, out) == (2, "")
+    assert err.startswith(line)
+    assert len(err.splitlines()) == 1
+
+
+# Installations.
+
+class Installed:
+    """A distribution as `importlib.metadata` describes it."""
+
+    def __init__(self, version, commands=()):
+        self.version = version
+        self.entry_points = [type("Entry", (), {"value": value}) for value in commands]
+
+
+def installed(monkeypatch, **distributions):
+    def distribution(name):
+        if name.replace("-", "_") not in distributions:
+            raise PackageNotFoundError(name)
+        return distributions[name.replace("-", "_")]
+
+    monkeypatch.setattr(installation, "distribution", distribution)
+
+
+def refused(capsys):
+    code, out, err = told(capsys, "status", "none.zarr")
+    assert (code, out) == (2, "")
+    assert len(err.splitlines()) == 1
+    return err
+
+
+def test_two_distributions_of_opencv_are_refused_with_the_command_that_removes_them(
+    capsys, monkeypatch
+):
+    installed(monkeypatch, opencv_contrib_python_headless=Installed("5.0.0"),
+              opencv_python_headless=Installed("4.11.0"))
+    assert refused(capsys) == (
+        "several distributions of OpenCV are installed and overwrite each other: "
+        "opencv-contrib-python-headless 5.0.0 and opencv-python-headless 4.11.0; "
+        "`pip uninstall opencv-contrib-python-headless opencv-python-headless`, then "
+        "`pip install opencv-contrib-python-headless`\n"
+    )
+
+
+def test_another_distribution_of_opencv_is_refused(capsys, monkeypatch):
+    installed(monkeypatch, opencv_python=Installed("5.0.0"))
+    assert refused(capsys) == (
+        "opencv-python 5.0.0 is installed in place of opencv-contrib-python-headless: "
+        "`pip uninstall opencv-python`, then `pip install opencv-contrib-python-headless`\n"
+    )
+
+
+def test_the_required_opencv_is_accepted(capsys, monkeypatch):
+    installed(monkeypatch, opencv_contrib_python_headless=Installed("5.0.0"))
+    assert "OpenCV" not in refused(capsys)
+
+
+@pytest.mark.parametrize("distributions", [
+    {}, {"opencv_contrib_python_headless": Installed("5.0.0")}])
+def test_a_missing_opencv_is_refused_in_one_line(distributions, capsys, monkeypatch):
+    installed(monkeypatch, **distributions)
+    monkeypatch.setattr(installation.importlib.util, "find_spec", lambda _: None)
+    assert refused(capsys) == (
+        "OpenCV is missing: `pip install --force-reinstall opencv-contrib-python-headless`\n")
+
+
+def test_an_opencv_that_cannot_be_imported_is_told_in_one_line(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+
+    def execute(_):
+        importlib.import_module("cv2")
+
+    monkeypatch.setattr("sweep.cli.parser.COMMANDS", tuple(
+        dataclasses.replace(command, execute=execute) for command in COMMANDS))
+    monkeypatch.setattr(installation, "_problems", lambda: iter(()))
+    code, _, err = told(capsys, "status", "none.zarr")
+    assert code == 2
+    assert err.startswith("OpenCV cannot be imported: ")
+    assert "`pip install --force-reinstall opencv-contrib-python-headless`" in err
+
+
+def test_the_other_project_s_package_is_refused_and_an_older_one_of_ours_is_not(
+    capsys, monkeypatch
+):
+    installed(monkeypatch, sweep=Installed("0.1.0", ["sweep.main:run"]))
+    assert refused(capsys) == (
+        "another project's package `sweep` (0.1.0) is installed, and its files overwrite those of "
+        "fiducial-sweep: `pip uninstall sweep`, then "
+        "`pip install --force-reinstall fiducial-sweep`\n"
+    )
+    installed(monkeypatch, sweep=Installed("0.5.0", ["sweep.cli:main"]))
+    assert "another project" not in refused(capsys)
+
+
+def test_help_is_printed_whatever_is_installed(capsys, monkeypatch):
+    installed(monkeypatch, sweep=Installed("0.1.0"))
+    assert told(capsys, "--help")[0] == 0
+
+
+def test_python_3_10_is_refused_in_one_line():
+    source = (TOP / "sweep" / "__init__.py").read_text(encoding="utf-8")
+    ast.parse(source, feature_version=(3, 10))
+    problem = "sweep needs Python 3.11 or newer; this is Python 3.10"
+    old = "import sys; sys.version_info = (3, 10, 4); "
+    done = python(f"{old}import sweep")
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1] == f"ImportError: {problem}"
+    done = python(f"{old}sys.argv[0] = '/usr/bin/sweep'; import sweep")
+    assert (done.returncode, done.stderr) == (1, f"{problem}\n")

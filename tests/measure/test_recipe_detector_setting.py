@@ -1,0 +1,75 @@
+"""The recipe "add a detector setting": one is taken away and added again, as the recipe says."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import re
+
+from sweep.measure.detector import DetectorSetting
+from tests.support.recipes import added, printed_by
+
+NAME = "minOtsuStdDev"
+
+SCRIPT = '''
+import json
+import numpy as np
+from sweep.errors import PipelineError
+from sweep.evaluation.cells import run_cells
+from sweep.plan.experiment import Pipeline
+from sweep.plan.reference import TABLES
+
+TEXT = """
+[marker]
+size_m = 0.05
+[pose]
+distance_m = 0.5
+[scene]
+black = 100
+white = 130
+background = 130
+[axes]
+minOtsuStdDev = {values}
+"""
+
+def read(values):
+    try:
+        return Pipeline.from_text(TEXT.format(values=values)), ""
+    except PipelineError as error:
+        return None, str(error)
+
+pipeline, message = read([40.0, 5.0])
+detection = [] if pipeline is None else [
+    column.tolist() for column in run_cells(pipeline, []).columns["detection"]
+]
+print(json.dumps({
+    "message": message, "out_of_range": read([-1.0])[1], "detection": detection,
+    "table": TABLES["parameters.detector"](),
+}))
+'''
+
+
+def test_setting_is_one_field(tmp_path):
+    source = inspect.getsource(DetectorSetting)
+    field = re.search(rf"    {NAME}: float = parameter\(.*?\n    \)\n", source, re.DOTALL)[0]
+    without = added(tmp_path / "without")
+    file = without / "sweep" / "measure" / "detector.py"
+    file.write_text(file.read_text().replace(field, ""))
+    before = printed_by(without, SCRIPT)
+    assert f"axes.{NAME}" in before["message"]
+    assert f"`{NAME}`" not in before["table"]
+
+    # Put back as a contributor would: as the last of the fields.
+    last = [each.name for each in dataclasses.fields(DetectorSetting)][-1]
+    line = re.search(rf"    {last}: .*?\n    \)\n", source, re.DOTALL)[0]
+    text = file.read_text()
+    assert text.count(line) == 1
+    file.write_text(text.replace(line, line + field))
+    after = printed_by(without, SCRIPT)
+    assert after["message"] == ""
+    assert f"{NAME} = -1" in after["out_of_range"].replace("[", "").replace("axes.", "")
+    assert f"| `{NAME}` | 5 | grey level | a number at least 0 |" in after["table"]
+    # Levels 30 apart have a standard deviation of at most 15: below 40 they count as one colour.
+    (strict,), (lax,) = after["detection"]
+    assert strict != 1
+    assert lax == 1

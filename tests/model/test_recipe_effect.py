@@ -1,0 +1,149 @@
+"""The recipe "add an effect": two are added, one a step, in the one place that the recipe names."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.support.recipes import added, printed_by
+
+RECORDS = """
+    Effect(
+        "haze", "light",
+        {"haze": parameter(0.0, "share of the light that haze adds", low=0, high=1, drawable=True)},
+        apply=lambda light, patch: light * (1 - patch.values["haze"]) + 200 * patch.values["haze"],
+    ),
+    Effect(
+        "column noise", "signal",
+        {
+            "column_noise_grey": parameter(0.0, "noise of columns", low=0, high=100),
+            "column_period_px": parameter(2.0, "their period", low=1, high=100),
+        },
+        needs={"column_period_px": ("column_noise_grey",)}, random=True, widens="noise",
+        apply=lambda signal, patch: signal + patch.values["column_noise_grey"] * (
+            (patch.left + np.arange(signal.shape[1])) % patch.values["column_period_px"] == 0
+        ) * patch.normals("column_noise_grey", signal.shape),
+    ),
+"""
+
+SCRIPT = '''
+import json
+import numpy as np
+from sweep.errors import PipelineError
+from sweep.evaluation.cells import run_cells
+from sweep.evaluation.search import search, search_windows, whole_frames
+from sweep.execution.forecast import effect_costs
+from sweep.measure.flags import BoundStatus
+from sweep.model.extent import marker_boxes
+from sweep.model.renderers import marker_levels
+from sweep.model.scene import build_scenes
+from sweep.plan.active_parts import parts
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import detector_settings, scene_values
+from sweep.plan.reference import TABLES
+
+TEXT = """
+[camera]
+width_px = 160
+height_px = 120
+[marker]
+size_m = 0.05
+[pose]
+distance_m = 0.3
+tilt_deg = 20
+[scene]
+background = 90
+black = 20
+white = 230
+bound = "known_blur"
+{scene}
+[axes]
+haze = [0, 0.25]
+column_noise_grey = [0, 6]
+window = ["auto", "full"]
+"""
+
+def broken(scene):
+    try:
+        Pipeline.from_text(TEXT.format(scene=scene))
+    except PipelineError as error:
+        return str(error)
+
+pipeline = Pipeline.from_text(TEXT.format(scene="column_period_px = 3"))
+indices = [index.ravel() for index in np.indices((2, 2, 2))]
+values = scene_values(pipeline, indices)
+scenes = build_scenes(values, 8)
+settings = detector_settings(pipeline)
+(result,), _, _ = search(
+    scenes, np.ones((8, 1), dtype=bool), settings, whole_frames(values, 8), [], keep=True
+)
+boxes = marker_boxes(scenes)
+box = tuple(boxes[0].tolist())
+mean, share = marker_levels(scenes, 0, box)
+cells = run_cells(pipeline, indices)
+margins = search_windows(scenes, boxes, settings[0], np.zeros(8, dtype=bool))
+print(json.dumps({
+    "box": box, "levels": (mean + (1 - share) * 90).tolist(),
+    "images": [result.images[row].tolist() for row in range(8)],
+    "origins": result.origins.tolist(), "windows": margins.tolist(),
+    "parts": {part.name: [part.active, part.switch] for part in parts(pipeline)},
+    "draws": next(part.reason for part in parts(pipeline) if part.name == "random draws"),
+    "bound": [BoundStatus(int(flag)).name for flag in cells.columns["bound"][0]],
+    "costs": sorted(effect_costs(pipeline, ["haze", "column_noise_grey"], 1.0)),
+    "broken": [broken("haze_x = 1"), broken("read_noise_e = 3")],
+    "table": TABLES["effects"](),
+    "parameters": TABLES["parameters.scene"](),
+}))
+'''
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    change = "model/effects.py", "EFFECTS: tuple[Effect, ...] = (", RECORDS
+    return printed_by(added(tmp_path_factory.mktemp("recipe"), change), SCRIPT)
+
+
+def test_pixels_are_those_of_plain_numpy(result):
+    x0, y0, x1, y1 = result["box"]
+    frame = np.full((120, 160), 90.0)
+    frame[y0:y1, x0:x1] = result["levels"]
+    hazy = frame * (1 - 0.25) + 200 * 0.25
+    for row, expected in ((0, frame), (1, frame), (4, hazy), (5, hazy)):
+        image, (left, top) = np.array(result["images"][row]), result["origins"][row]
+        height, width = image.shape
+        whole = np.clip(np.floor(expected + 0.5 + 1e-9), 0, 255)
+        np.testing.assert_array_equal(image, whole[top : top + height, left : left + width])
+
+
+def test_noise_of_a_pixel_does_not_depend_on_the_window(result):
+    plain, noisy = np.array(result["images"][1]), np.array(result["images"][3])
+    assert plain.shape == noisy.shape == (120, 160)
+    difference = noisy.astype(float) - plain
+    assert (difference[:, np.arange(160) % 3 != 0] == 0).all()
+    # 54 columns of 120 pixels: the standard deviation is known to 1 %, levels are off the ends.
+    assert difference[:, ::3].std() == pytest.approx(6, rel=0.05)
+    assert abs(difference[:, ::3].mean()) < 0.4
+    for row in (2, 6):
+        window, whole = np.array(result["images"][row]), np.array(result["images"][row + 1])
+        left, top = result["origins"][row]
+        height, width = window.shape
+        assert (height, width) < whole.shape
+        np.testing.assert_array_equal(window, whole[top : top + height, left : left + width])
+
+
+def test_all_else_follows_from_the_record(result):
+    assert result["parts"]["haze"] == [True, "haze"]
+    assert result["parts"]["column noise"] == [True, "column_noise_grey"]
+    assert result["draws"] == "column_noise_grey"
+    assert result["costs"] == ["column_noise_grey", "haze"]
+    # Neither is part of the bound's model; without them there is no noise.
+    assert result["bound"] == ["no_noise"] * 2 + ["not_in_model"] * 6
+    quiet, noisy = np.array(result["windows"][0]), np.array(result["windows"][2])
+    assert (noisy[:2] <= quiet[:2]).all()
+    assert (noisy[2:] >= quiet[2:]).all()
+    assert (noisy != quiet).any()
+    assert "did you mean haze?" in result["broken"][0]
+    assert "expected full_well_e beside it" in result["broken"][1]
+    assert "| haze | `haze` | 0 | light | no | no |" in result["table"]
+    assert "| column noise | `column_noise_grey` | 0 | signal | yes | no |" in result["table"]
+    assert "`column_period_px`" in result["parameters"]

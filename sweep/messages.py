@@ -1,7 +1,7 @@
-"""What is wrong with a pipeline, in lines that are few, short and printable.
+"""Text of messages: few, short, printable lines.
 
-A file's names and values are quoted in them, and the file may be anyone's: what is quoted is cut,
-and its control characters are escaped, so that it neither forges a line nor reaches a terminal.
+Messages quote names and values of files that may be anyone's. Quotes are cut and their control
+characters escaped, so that they neither forge a line nor control a terminal.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from typing import Any
 from sweep.errors import PipelineError
 
 MAX_FAULTS = 20
-"""Faults that are told; the others are counted."""
+"""Faults that are listed; the others are counted."""
 
 MAX_QUOTE_LENGTH = 120
 MAX_LINE_LENGTH = 1000
 
 
 def refusal(faults: Sequence[str]) -> PipelineError:
-    """Return the error that tells of ``faults``, a line each."""
+    """Return the error that lists ``faults``, a line each."""
     lines = [plain(fault, MAX_LINE_LENGTH) for fault in faults[:MAX_FAULTS]]
     if len(faults) > MAX_FAULTS:
         lines.append(f"... and {len(faults) - MAX_FAULTS:,} faults more")
@@ -29,7 +29,11 @@ def refusal(faults: Sequence[str]) -> PipelineError:
 
 
 def plain(text: object, most: int = MAX_QUOTE_LENGTH) -> str:
-    """Return text on one line, without control characters, cut where it is long."""
+    r"""Return text on one line without control characters, cut to ``most`` characters.
+
+    >>> plain("two\nlines"), plain("long" * 99, 9)
+    ('two\\nlines', 'longlo...')
+    """
     text = str(text)
     cut = text if len(text) <= most else text[: most - 3] + "..."
     if cut.isprintable():
@@ -44,7 +48,11 @@ def _escape(character: str) -> str:
 
 
 def shown(value: Any) -> str:
-    """Return a value as TOML would have it, cut where it is long; only that much is written out."""
+    """Return a value as TOML, cut if it is long; the rest is not even formatted.
+
+    >>> shown({"uniform": [0, 4.5]})
+    '{uniform = [0, 4.5]}'
+    """
     text = ""
     for piece in _pieces(value):
         text += piece
@@ -89,18 +97,26 @@ def _key(key: str) -> str:
 
 
 def label(value: Any) -> str:
-    """Return a value that is no plain number as a coordinate shows it: "[-0.3, 0.1, 0, 0]"."""
+    """Return a value as a coordinate of strings shows it.
+
+    >>> label((-0.3, 0.1)), label("ippe"), label(True)
+    ('[-0.3, 0.1]', 'ippe', 'True')
+    """
     if isinstance(value, tuple):
         return "[" + ", ".join(f"{item!r}" for item in value) + "]"
     return value if isinstance(value, str) else repr(value)
 
 
 MAX_WORD_LENGTH = 60
-"""Words beyond this length are like no known one."""
+"""Longer words are not compared with known ones."""
 
 
 def nearest(word: str, known: Sequence[str]) -> str:
-    """Return "; did you mean ...?" for the nearest known word, or nothing."""
+    """Return "; did you mean ...?" with the most similar known word, or "" if none is similar.
+
+    >>> nearest("tilt", ["roll_deg", "tilt_deg"])
+    '; did you mean tilt_deg?'
+    """
     if len(word) > MAX_WORD_LENGTH:
         return ""
     close = [name for name in known if word and name.startswith(word)]

@@ -1,4 +1,4 @@
-"""One scene looked at closely, as ``sweep show`` draws it."""
+"""A single scene in detail: its image, detections and estimate, as ``sweep show`` draws it."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search_windows, visibility_flags, whole_frames
 from sweep.measure.detector import Detector
 from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.model.columns import Column
 from sweep.model.extent import marker_boxes
 from sweep.model.pose import rotation_of_vector, transform_points
 from sweep.model.renderers import render
@@ -23,12 +24,12 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings, estimators, scene_values
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import SCHEMA
-from sweep.typing import Floats
+from sweep.typing import Floats, Grey, Integers, Masks
 
 
 @dataclass(frozen=True, slots=True)
 class SceneInspection:
-    """One scene looked at closely, as ``sweep show`` draws it.
+    """A single scene in detail, as ``sweep show`` draws it.
 
     Attributes
     ----------
@@ -37,21 +38,21 @@ class SceneInspection:
     true_corners
         (4, 2) px.
     decoded, rejected
-        What the detector found: (ID, corners (4, 2)) and corners (4, 2), px.
+        The detector's quadrilaterals: (ID, corners (4, 2)) and corners (4, 2), px.
     detection, estimate
-        What became of it.
+        The flags.
     corners
-        (4, 2) px of the marker where it was detected, else NaN.
+        (4, 2) px of the detected marker; NaN if it was not detected.
     axes_px
         (4, 2) images of the origin and of the ends of x, y and z (half a side long) of the
-        estimated pose; NaN where there is none.
+        estimated pose; NaN if there is none.
     errors
-        Name -> value of the template's scalar error variables.
+        Name -> value (or norm) of the estimation's error variables.
     values
         Name -> value of every variable, as a store holds it.
     """
 
-    image: NDArray[np.uint8]
+    image: Grey
     window: tuple[int, int, int, int]
     true_corners: Floats
     area_px: float
@@ -67,14 +68,14 @@ class SceneInspection:
 
 @dataclass(frozen=True, slots=True)
 class _Rendered:
-    """A pipeline's one scene: its parameters, itself, its image and the image's window."""
+    """A pipeline's single scene: parameters, geometry, image and the image's window."""
 
-    values: dict[str, Any]
+    values: dict[str, Column]
     scenes: Scenes
-    boxes: NDArray[np.int64]
-    unseen: NDArray[np.bool_]
+    boxes: Integers
+    invisible: Masks
     window: tuple[int, int, int, int]
-    image: NDArray[np.uint8]
+    image: Grey
 
 
 def _rendered(pipeline: Pipeline, *, whole_frame: bool) -> _Rendered:
@@ -83,34 +84,49 @@ def _rendered(pipeline: Pipeline, *, whole_frame: bool) -> _Rendered:
     scenes = build_scenes(values, 1)
     boxes = marker_boxes(scenes)
     full = whole_frames(values, 1) | whole_frame
-    unseen = visibility_flags(scenes) != DetectionStatus.not_run
+    invisible = visibility_flags(scenes) != DetectionStatus.not_run
     setting = detector_settings(pipeline)[0]
-    left, top, right, bottom = search_windows(scenes, boxes, setting, full | unseen)[0].tolist()
-    drawn = np.zeros_like(boxes[0]) if unseen[0] else boxes[0]
+    left, top, right, bottom = search_windows(scenes, boxes, setting, full | invisible)[0].tolist()
+    drawn = np.zeros_like(boxes[0]) if invisible[0] else boxes[0]
     window = (left, top, right, bottom)
-    return _Rendered(values, scenes, boxes, unseen, window, render(scenes, 0, drawn, window))
+    return _Rendered(values, scenes, boxes, invisible, window, render(scenes, 0, drawn, window))
 
 
 @single_threaded()
-def scene_image(pipeline: Pipeline, *, whole_frame: bool = False) -> NDArray[np.uint8]:
-    """Return the image (h, w) of a pipeline's one scene; nothing is searched in it."""
+def scene_image(pipeline: Pipeline, *, whole_frame: bool = False) -> Grey:
+    """Return the image (h, w) of a pipeline's single scene; it is not searched."""
     return _rendered(pipeline, whole_frame=whole_frame).image
 
 
 @single_threaded()
 def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInspection:
-    """Return a close look at a pipeline's one scene: every axis but ``trial`` must be fixed."""
+    """Return a pipeline's single scene in detail.
+
+    Parameters
+    ----------
+    pipeline
+        Every axis but ``trial`` must be fixed, as :func:`sweep.plan.cell_selection.cell` does.
+    whole_frame
+        Whether the image is the whole frame; the searched window is that of a run all the same.
+
+    Raises
+    ------
+    RunError
+        If the scene's computation raises.
+    """
     indices = [np.zeros(1, dtype=np.intp) for _ in pipeline.axes_of(Stage.scene)]
     result = run_cells(pipeline, indices)
     if result.failures:
         raise RunError(result.failures[0].text.strip().splitlines()[-1])
-    seen = _rendered(pipeline, whole_frame=whole_frame)
-    values, scenes, image, (left, top, _, _) = seen.values, seen.scenes, seen.image, seen.window
+    rendered = _rendered(pipeline, whole_frame=whole_frame)
+    values, scenes, image = rendered.values, rendered.scenes, rendered.image
+    left, top, _, _ = rendered.window
     setting, estimator = detector_settings(pipeline)[0], estimators(pipeline)[0]
-    # Searched in its own window, as in a run, even where the whole frame is shown.
-    searched = search_windows(scenes, seen.boxes, setting, whole_frames(values, 1) | seen.unseen)
+    # Searched in its own window, as in a run, even if the whole frame is shown.
+    full = whole_frames(values, 1) | rendered.invisible
+    searched = search_windows(scenes, rendered.boxes, setting, full)
     x0, y0, x1, y1 = searched[0].tolist()
-    found, ids, rejected = Detector(setting).find(
+    quads, ids, rejected = Detector(setting).find(
         image[y0 - top : y1 - top, x0 - left : x1 - left],
         scenes.dictionary[0],
         int(scenes.frame[0].max()),
@@ -128,12 +144,12 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
         axes_px = cameras.project(transform_points(ends[None], rotation[None], position[None]))[0]
     return SceneInspection(
         image=image,
-        window=seen.window,
+        window=rendered.window,
         true_corners=scenes.corners_px[0],
         area_px=float(columns["marker_area_px"]),
         decoded=[
             (int(marker_id), quad[0] + origin)
-            for marker_id, quad in zip(() if ids is None else ids.ravel(), found, strict=True)
+            for marker_id, quad in zip(() if ids is None else ids.ravel(), quads, strict=True)
         ],
         rejected=[quad[0] + origin for quad in rejected],
         detection=DetectionStatus(int(columns["detection"])),

@@ -83,7 +83,7 @@ class CellsResult:
             {
                 variable.name: [
                     np.full((count, *variable.inner_shape), variable.fill, dtype=variable.dtype)
-                    for _ in range(variable.treatments(pipeline))
+                    for _ in range(variable.configurations(pipeline))
                 ]
                 for variable in SCHEMA
             },
@@ -130,12 +130,12 @@ def to_dataset_layout(
         One array (N, ...) per configuration of the variable's stage; N scenes, the last scene
         axis fastest.
     """
-    configuration_axes = variable.treatment_axes(pipeline)
+    inner_axes = variable.configuration_axes(pipeline)
     stacked = np.stack(columns, axis=1).astype(variable.dtype)
     spread = stacked.reshape(
-        (*block.shape, *(len(axis) for axis in configuration_axes), *variable.inner_shape)
+        (*block.shape, *(len(axis) for axis in inner_axes), *variable.inner_shape)
     )
-    axes = itertools.chain(pipeline.axes_of(Stage.scene), configuration_axes)
+    axes = itertools.chain(pipeline.axes_of(Stage.scene), inner_axes)
     names = [*(axis.name for axis in axes), *variable.inner]
     order = [names.index(name) for name in variable.dimensions(pipeline)]
     return spread.transpose(order).copy(order="C")

@@ -156,7 +156,7 @@ def _columns(
     if cells is not None and len(rows) == count:
         return cells.columns[variable.name]
     columns = []
-    for k in range(variable.treatments(pipeline)):
+    for k in range(variable.configurations(pipeline)):
         whole = np.full((count, *variable.inner_shape), variable.fill, dtype=variable.dtype)
         if cells is not None:
             whole[rows] = cells.columns[variable.name][k]

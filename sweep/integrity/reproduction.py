@@ -16,7 +16,7 @@ from sweep.integrity.tolerances import compare
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.messages import nearest, plain, refusal
-from sweep.plan.cell_selection import at_text, cell, places
+from sweep.plan.cell_selection import cell, parse_selection, selection_text
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
 from sweep.plan.parameters import Stage
@@ -117,7 +117,7 @@ def reproduce(
     verdict = "" if stored is None else compare(
         recomputed, stored.values, same_processor=exact
     ).difference
-    full_at = at_text({axis.name: axis.values[index[axis.name]] for axis in pipeline.axes})
+    full_at = selection_text({axis.name: axis.values[index[axis.name]] for axis in pipeline.axes})
     one = cell(pipeline, full_at)
     inspected, image = _inspected(one, whole_frame, time_limit_s)
     return Reproduction(
@@ -132,7 +132,7 @@ def _index(pipeline: Pipeline, at: str) -> dict[str, int]:
     """Return the index of a cell along each axis."""
     index = {axis.name: 0 for axis in pipeline.axes}
     faults = []
-    for name, value in places(at).items():
+    for name, value in parse_selection(at).items():
         axis = pipeline.axis(name)
         if axis is None:
             names = [other.name for other in pipeline.axes]

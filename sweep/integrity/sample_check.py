@@ -16,7 +16,7 @@ from sweep.integrity.stored_values import Values, computable, stored_scene
 from sweep.integrity.tolerances import MAX_OUTSIDE, MIN_OUTSIDE, compare
 from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.plan.cell_selection import at_text
+from sweep.plan.cell_selection import selection_text
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
 from sweep.plan.parameters import Stage
@@ -146,7 +146,7 @@ class SampleCheck:
 
     def _at(self, scene: _Scene) -> str:
         index = self._store.blocks[scene.block].cell(scene.number)
-        return at_text({
+        return selection_text({
             axis.name: axis.values[k]
             for axis, k in zip(scene_axes(self._store.pipeline), index, strict=True)
         })

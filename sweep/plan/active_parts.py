@@ -1,4 +1,4 @@
-"""Which parts of the model and the measurement a pipeline needs, and why."""
+"""The optional parts of model and measurement that a pipeline needs, and why."""
 
 from __future__ import annotations
 
@@ -21,9 +21,16 @@ from sweep.plan.parameters import PARAMETERS
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A part of the work: what it is, whether it runs, and the reason.
+    """An optional part of the work.
 
-    ``switch`` is the parameter that switches an effect on.
+    Attributes
+    ----------
+    name
+        Its name.
+    active, reason
+        Whether it runs, and why.
+    switch
+        Of an effect: the parameter that switches it on.
     """
 
     name: str
@@ -72,14 +79,14 @@ def parts(pipeline: Pipeline) -> list[Part]:
     if uneven and any(s.adaptiveThreshConstant < UNEVEN_LIGHT_CONSTANT * gain for s in settings):
         whole.append("adaptiveThreshConstant is low for uneven light")
     if image:
-        whole.append("the background is an image: clutter near the marker may change what is found")
+        whole.append("the background is an image: clutter near the marker may change the detection")
     if asked:
         whole.append('window = "full"')
     noisy = any(effect.switch in draws for effect in EFFECTS if effect.widens == "noise")
     noise = f", and {NOISE_MARGIN_PX} more for noise" if noisy else ""
     margins = sorted({margin_px(setting) for setting in settings})
     guarded = pipeline.any_value("guarded", bool)
-    beliefs = [
+    assumptions = [
         name for name in PARAMETERS
         if name.startswith("believed_") and pipeline.fixed.get(name, "varies") is not None
     ]
@@ -91,7 +98,7 @@ def parts(pipeline: Pipeline) -> list[Part]:
         Part("background image", image, "background names a file" if image else "a level"),
         Part(
             "window", not (asked or image),
-            f"{', '.join(str(m) for m in margins)} px around what the marker can influence{noise}"
+            f"{', '.join(str(m) for m in margins)} px around the marker's pixels{noise}"
             if not (asked or image) else "the full frame",
         ),
         Part("full frame", bool(whole), "; ".join(whole) if whole else "no setting needs it"),
@@ -110,7 +117,7 @@ def parts(pipeline: Pipeline) -> list[Part]:
             f"solver {', '.join(pixels)} needs them" if pixels else "no solver needs them",
         ),
         Part(
-            "mistaken beliefs", bool(beliefs),
-            ", ".join(beliefs) if beliefs else "the estimator knows the truth of camera and size",
+            "wrong assumptions", bool(assumptions),
+            ", ".join(assumptions) or "the estimator knows the true camera and size",
         ),
     ]

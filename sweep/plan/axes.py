@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sweep.messages import label, nearest, shown
 from sweep.plan.parameters import PARAMETERS, Parameter, Stage
+from sweep.typing import Floats
 
 TRIAL = "trial"
 """The axis of repeated draws; a scene dimension with coordinates 0, 1, 2, ..."""
@@ -40,25 +41,25 @@ class Axis:
 
     @property
     def unit(self) -> str:
-        """The unit of its values; empty where there is none."""
+        """The unit of its values; empty if they have none."""
         return "" if self.name == TRIAL else PARAMETERS[self.name].unit
 
     @property
     def meaning(self) -> str:
-        """What the values mean, in words."""
+        """Meaning of the values, in words."""
         return "number of the draw" if self.name == TRIAL else (
             PARAMETERS[self.name].declaration.meaning
         )
 
     @property
     def labelled(self) -> bool:
-        """Whether its values are shown as strings: not all are numbers, or all booleans."""
+        """Whether its coordinates are strings: its values are not all numbers, or all booleans."""
         if isinstance(self.values, range):
             return False
         return {type(value) for value in self.values} not in ({bool}, {int}, {float})
 
     def coordinates(self, start: int = 0, stop: int | None = None) -> NDArray[Any]:
-        """Return the values [start, stop) as they label the dataset: numbers, booleans, strings."""
+        """Return the values [start, stop) as coordinates: numbers, booleans or strings."""
         part = self.values[start:stop]
         if isinstance(part, range):
             return np.arange(part.start, part.stop, part.step, dtype=np.int64)
@@ -75,8 +76,8 @@ class Distribution:
     a: float
     b: float
 
-    def at(self, uniform: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the draws that uniform numbers in (0, 1) stand for (inverse CDF)."""
+    def at(self, uniform: Floats) -> Floats:
+        """Return the inverse CDF at uniform numbers in (0, 1), of any shape."""
         if self.kind == "uniform":
             return self.a + (self.b - self.a) * uniform
         from scipy.special import ndtri  # noqa: PLC0415  (slow to import, and seldom needed)
@@ -87,8 +88,8 @@ class Distribution:
         return f"{self.kind}({self.a:.12g},{self.b:.12g})"
 
 
-WIDEST_SD = 8.3
-"""How far from its mean, in standard deviations, a normal draw of 53 bits can lie."""
+MAX_DEVIATIONS = 8.3
+"""The largest distance of a normal draw of 53 bits from its mean, in standard deviations."""
 
 AXIS_FORMS = {
     "range": "[start, stop] or [start, stop, step], whole numbers, half-open",
@@ -101,9 +102,12 @@ DISTRIBUTION_FORMS = {"uniform": "[a, b] with a < b", "normal": "[mean, sd] with
 
 
 def parse_distribution(parameter: Parameter, table: dict[str, Any]) -> Distribution:
-    """Return the distribution that ``{ uniform = [a, b] }`` or the like stands for.
+    """Return the distribution of a table such as ``{ uniform = [a, b] }``.
 
-    ValueError with what was expected where it is none.
+    Raises
+    ------
+    ValueError
+        The expectation, if the table is not a distribution of the parameter.
     """
     forms = " or ".join(f"{{ {kind} = {form} }}" for kind, form in DISTRIBUTION_FORMS.items())
     if len(table) != 1 or next(iter(table)) not in DISTRIBUTION_FORMS:
@@ -126,23 +130,40 @@ def parse_distribution(parameter: Parameter, table: dict[str, Any]) -> Distribut
     if kind == "uniform":
         parameter.check(a)
         parameter.check(b)
-    elif not all(parameter.declaration.admits(a + side * WIDEST_SD * b) for side in (-1, 1)):
+    elif not all(parameter.declaration.admits(a + side * MAX_DEVIATIONS * b) for side in (-1, 1)):
         extent = parameter.declaration.range_text()
-        raise ValueError(f"mean - {WIDEST_SD} sd and mean + {WIDEST_SD} sd {extent}")
+        raise ValueError(f"mean - {MAX_DEVIATIONS} sd and mean + {MAX_DEVIATIONS} sd {extent}")
     return Distribution(kind, a, b)
 
 
 def parse_trial(value: Any) -> Axis:
-    """Return the axis that ``trial = N`` stands for; ValueError where N is no count."""
+    """Return the axis of ``trial = N``; ValueError with the expectation if N is not a count."""
     if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= MAX_VALUES:
         raise ValueError(f"a whole number from 1 to {MAX_VALUES:,}: how many draws")
     return Axis(TRIAL, range(value))
 
 
-def parse_axis(parameter: Parameter, given: Any, room: int = MAX_LISTED) -> Axis:
-    """Return the axis that a list or a table such as ``{ geom = [0.05, 1, 40] }`` stands for.
+def parse_axis(parameter: Parameter, given: Any, quota: int = MAX_LISTED) -> Axis:
+    """Return the axis of a list or of a table such as ``{ geom = [0.05, 1, 40] }``.
 
-    It lists ``room`` values at most. ValueError with what was expected where it cannot be one.
+    Parameters
+    ----------
+    parameter
+        The parameter that varies along the axis.
+    given
+        The list or table of the document.
+    quota
+        The most values that are listed; a ``range`` is not.
+
+    Raises
+    ------
+    ValueError
+        The expectation, if it is not an axis of the parameter.
+
+    Examples
+    --------
+    >>> parse_axis(PARAMETERS["tilt_deg"], {"linspace": [0, 60, 3]}).values
+    (0.0, 30.0, 60.0)
     """
     forms = ", ".join(AXIS_FORMS)
     if isinstance(given, list):
@@ -157,7 +178,7 @@ def parse_axis(parameter: Parameter, given: Any, room: int = MAX_LISTED) -> Axis
         raise ValueError(f"a list, or a table with one of {forms}{nearest(form, [*AXIS_FORMS])}")
     if not isinstance(ends, list):
         raise ValueError(f"{form} = {AXIS_FORMS[form]}")  # noqa: TRY004  (a fault of the file)
-    values = _bounded(ends, room) if form == "values" else _expand(form, ends, room)
+    values = _bounded(ends, quota) if form == "values" else _expand(form, ends, quota)
     if len(values) == 0:
         raise ValueError("at least one value")
     if isinstance(values, range):
@@ -165,9 +186,9 @@ def parse_axis(parameter: Parameter, given: Any, room: int = MAX_LISTED) -> Axis
             for end in (values[0], values[-1]):
                 parameter.check(end)
             return Axis(parameter.name, values)
-        values = [float(value) for value in _bounded(values, room)]
+        values = [float(value) for value in _bounded(values, quota)]
     if form != "values" and float in parameter.types:
-        # All are numbers: where the least and the largest are admitted, so is what is between.
+        # All are numbers: if the least and the largest are admitted, all are.
         for end in (min(values), max(values)):
             _checked(parameter, end)
         checked = values
@@ -189,8 +210,8 @@ def _checked(parameter: Parameter, value: Any) -> Any:
         raise ValueError(f"{error} (not {shown(value)})") from None
 
 
-def _bounded(values: Sequence[Any], room: int) -> Sequence[Any]:
-    if len(values) > room:
+def _bounded(values: Sequence[Any], quota: int) -> Sequence[Any]:
+    if len(values) > quota:
         raise _too_many()
     return values
 
@@ -199,44 +220,44 @@ def _too_many() -> ValueError:
     return ValueError(f"at most {MAX_LISTED:,} values, all axes together")
 
 
-def _expand(form: str, ends: list[Any], room: int) -> Sequence[Any]:
-    """Return the values of a generating form."""
-    wanted = ValueError(f"{form} = {AXIS_FORMS[form]}")
+def _expand(form: str, ends: list[Any], quota: int) -> Sequence[Any]:
+    """Return the values of a form that generates them."""
+    misuse = ValueError(f"{form} = {AXIS_FORMS[form]}")
     if not all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends):
-        raise wanted
+        raise misuse
     if not all(abs(end) < 1e300 for end in ends):
-        raise wanted
+        raise misuse
     if form == "range":
         if not all(isinstance(end, int) for end in ends) or len(ends) not in (2, 3):
-            raise wanted
+            raise misuse
         if len(ends) == 3 and ends[2] == 0:
-            raise wanted
+            raise misuse
         if any(abs(end) > 2**62 for end in ends):
-            raise wanted
+            raise misuse
         values = range(*ends)
         if len(values) > MAX_VALUES:
             raise ValueError(f"at most {MAX_VALUES:,} values")
         return values
     if len(ends) != 3:
-        raise wanted
+        raise misuse
     if form == "arange":
         start, stop, step = (float(end) for end in ends)
         if step == 0:
-            raise wanted
+            raise misuse
         steps = (stop - start) / step
-        if steps > room:
+        if steps > quota:
             raise _too_many()
-        # Half-open also where the last step falls short of the stop by rounding alone.
+        # Half-open also if the last step misses the stop only by rounding.
         count = math.ceil(steps - 1e-9) if steps > 0 else 0
         if all(isinstance(end, int) for end in ends):
             return range(*ends)
         return [start + step * i for i in range(count)]
     if not isinstance(ends[2], int) or ends[2] < 1:
-        raise wanted
-    if ends[2] > room:
+        raise misuse
+    if ends[2] > quota:
         raise _too_many()
     if form == "linspace":
         return list(map(float, np.linspace(ends[0], ends[1], ends[2])))
     if not (ends[0] > 0 and ends[1] > 0):
-        raise wanted
+        raise misuse
     return list(map(float, np.geomspace(ends[0], ends[1], ends[2])))

@@ -1,4 +1,4 @@
-"""One cell of a grid, chosen by its coordinates: ``distance_m=0.3,tilt_deg=45``."""
+"""A cell of a grid, selected by its coordinates: ``distance_m=0.3,tilt_deg=45``."""
 
 from __future__ import annotations
 
@@ -14,20 +14,26 @@ from sweep.plan.parameters import PARAMETERS
 from sweep.plan.toml_text import read_value
 
 _PART = re.compile(r"(?:\[[^\]]*\]?|[^,\[])+")
-"""What stands between commas; those of a list do not count."""
+"""A part between commas; commas within a list do not separate."""
 
 
 def cell(pipeline: Pipeline, at: str) -> Pipeline:
-    """Return the pipeline with every axis fixed: as ``at`` says, the others at their first value.
+    """Return the pipeline with every axis but ``trial`` fixed, and a single trial.
 
-    Any value that a parameter admits may be asked for, on the grid or not.
+    Parameters
+    ----------
+    pipeline
+        The grid.
+    at
+        Coordinates as ``--at`` takes them; axes without one take their first value. Any value
+        that a parameter admits is accepted, on the grid or not.
 
     Raises
     ------
     PipelineError
-        One line for each part of ``at`` that cannot be.
+        One line for each invalid part of ``at``.
     """
-    named = places(at)
+    named = parse_selection(at)
     chosen = {axis.name: axis.values[0] for axis in pipeline.axes} | named
     trial = chosen.pop(TRIAL, 0)
     axes = (Axis(TRIAL, range(trial, trial + 1)),)
@@ -37,13 +43,18 @@ def cell(pipeline: Pipeline, at: str) -> Pipeline:
     return dataclasses.replace(pipeline.fixed_at(chosen), axes=axes)
 
 
-def places(at: str) -> dict[str, Any]:
-    """Return the parameters that ``--at`` names, with their values.
+def parse_selection(at: str) -> dict[str, Any]:
+    """Return the values of the parameters that ``--at`` names.
 
     Raises
     ------
     PipelineError
-        One line for each part of ``at`` that cannot be.
+        One line for each invalid part of ``at``.
+
+    Examples
+    --------
+    >>> parse_selection("distance_m=0.3,solver=ippe")
+    {'distance_m': 0.3, 'solver': 'ippe'}
     """
     faults: list[str] = []
     named: dict[str, Any] = {}
@@ -79,9 +90,13 @@ def _value(name: str, written: str) -> Any:
     raise ValueError("a whole number, at least 0")
 
 
-def at_text(place: Mapping[str, Any]) -> str:
-    """Return a cell's coordinates as ``--at`` takes them: "distance_m=0.3,tilt_deg=45.0"."""
-    return ",".join(f"{name}={_written(value)}" for name, value in place.items())
+def selection_text(coordinates: Mapping[str, Any]) -> str:
+    """Return a cell's coordinates as ``--at`` takes them.
+
+    >>> selection_text({"distance_m": 0.3, "guarded": True, "distortion": (0.1, 0.0)})
+    'distance_m=0.3,guarded=true,distortion=[0.1,0.0]'
+    """
+    return ",".join(f"{name}={_written(value)}" for name, value in coordinates.items())
 
 
 def _written(value: Any) -> str:
@@ -91,7 +106,7 @@ def _written(value: Any) -> str:
 
 
 def coordinates_text(pipeline: Pipeline, chosen: Pipeline) -> str:
-    """Return where a cell lies on its grid, in words: "distance_m 0.3, tilt_deg 45"."""
+    """Return the coordinates of a cell on its grid, in words: "distance_m 0.3, tilt_deg 45"."""
     parts = []
     for axis in pipeline.axes:
         value = chosen.axes[0].values[0] if axis.name == TRIAL else chosen.fixed[axis.name]

@@ -21,6 +21,7 @@ from sweep.model.columns import Column, map_columns
 from sweep.model.splitmix import mixed
 from sweep.plan.axes import Distribution
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
+from sweep.typing import Floats, Integers
 
 _DEFAULT_VIEW = dict(
     zip(
@@ -38,7 +39,7 @@ _PLAIN = (
 
 
 def _text(value: Any) -> str:
-    """Return a value's canonical text."""
+    """Return the canonical text of a value."""
     if isinstance(value, str):
         return value.upper()
     if isinstance(value, tuple):
@@ -99,19 +100,19 @@ _STEP = np.uint64(0x9E3779B97F4A7C15)
 
 
 def uniform(
-    seed: int, quantity: str, keys: NDArray[np.uint64], trials: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Return one uniform number in (0, 1) for each scene's geometry key and trial (N,).
+    seed: int, quantity: str, keys: NDArray[np.uint64], trials: Integers
+) -> Floats:
+    """Return uniform numbers in (0, 1) of scenes, by geometry key and trial, (N,) each.
 
     (seed, quantity) is hashed by BLAKE2b, as the keys are; trials are steps of SplitMix64 from
-    there. 53 bits, the middle of their cell, so that neither end occurs.
+    there. 53 bits, in the middle of their interval, so that neither 0 nor 1 occurs.
     """
     return np.asarray(((bits(seed, quantity, keys, trials) >> np.uint64(11)) + 0.5) * 2.0**-53)
 
 
 def bits(
-    seed: int, quantity: str, keys: NDArray[np.uint64], trials: NDArray[np.int64]
+    seed: int, quantity: str, keys: NDArray[np.uint64], trials: Integers
 ) -> NDArray[np.uint64]:
-    """Return 64 random bits for each scene, as :func:`uniform`."""
+    """Return 64 random bits for each scene (arguments as :func:`uniform`)."""
     start = mixed(keys ^ _hash(f"{seed}\n{quantity}"))
     return np.asarray(mixed(start + _STEP * (np.asarray(trials).astype(np.uint64) + np.uint64(1))))

@@ -126,8 +126,8 @@ class Pipeline:
         folder
             Where relative paths start.
         files
-            Path as written -> SHA-256: used instead of looking at the files that the text refers
-            to, as for a store whose files may have moved.
+            Path as written -> SHA-256: used instead of reading the files that the text refers to,
+            as for a store whose files may have moved.
 
         Raises
         ------

@@ -28,7 +28,7 @@ from sweep.plan.parameters import PARAMETERS, Stage
 class Block:
     """A box of scene cells: half-open index ranges along the scene axes, in their order.
 
-    It names a piece of the grid everywhere: in a task, a commit, a log line, an error.
+    It identifies a piece of the grid in tasks, receipts, logs and errors.
 
     >>> str(Block((0, 10), (5, 20)))
     '0-5,10-20'
@@ -46,7 +46,7 @@ class Block:
         return math.prod(self.shape)
 
     def cell(self, scene: int) -> tuple[int, ...]:
-        """Return where one of its scenes lies along each scene axis, the last axis fastest."""
+        """Return the indices of its scene number ``scene`` along each scene axis."""
         if not self.shape:
             return ()
         within = np.unravel_index(scene, self.shape)
@@ -59,7 +59,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Blocks:
-    """The grid of scene cells cut into equal boxes; nothing is listed until it is asked for."""
+    """The grid of scene cells cut into equal boxes, which are made on demand."""
 
     lengths: tuple[int, ...]
     extents: tuple[int, ...]
@@ -195,7 +195,7 @@ def block_indices(block: Block) -> list[NDArray[np.intp]]:
 
 
 def combinations(axes: Sequence[Axis]) -> list[dict[str, Any]]:
-    """Return every combination of the axes' values, the last axis fastest."""
+    """Return all combinations of the axes' values, the last axis fastest."""
     return [
         dict(zip((axis.name for axis in axes), chosen, strict=True))
         for chosen in itertools.product(*(axis.values for axis in axes))

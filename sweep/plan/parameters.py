@@ -24,7 +24,7 @@ from sweep.model.scene import Scene
 
 
 class Stage(IntEnum):
-    """The stages of the core loop; a parameter binds to the first stage that it touches."""
+    """The stages of the core loop; a parameter belongs to the first stage that it affects."""
 
     scene = 0
     detection = 1
@@ -39,15 +39,15 @@ SECTIONS: dict[str, tuple[tuple[type, ...], Stage]] = {
     "detector": ((DetectorSetting,), Stage.detection),
     "estimator": ((EstimatorSetting,), Stage.estimation),
 }
-"""Section of a pipeline file -> the dataclasses that declare its parameters, and their stage."""
+"""Section of a pipeline file -> the dataclasses that declare its parameters, and its stage."""
 
 GEOMETRY_SECTIONS = ("camera", "marker", "pose")
-"""Sections whose values make the geometry key of the random draws."""
+"""Sections whose values make up the geometry key of the random draws."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A parameter: where it is declared, of which type, and what was declared of it."""
+    """A parameter: its section, stage, types, default and declaration."""
 
     name: str
     section: str
@@ -58,11 +58,11 @@ class Parameter:
 
     @property
     def unit(self) -> str:
-        """The unit; empty where there is none."""
+        """The unit; empty if it has none."""
         return self.declaration.unit
 
     def expected(self) -> str:
-        """Return in words what a value must be."""
+        """Return the allowed values in words."""
         if tuple in self.types:
             counts = ", ".join(str(count) for count in COUNTS[:-1])
             return f"a list of {counts} or {COUNTS[-1]} finite numbers"
@@ -74,7 +74,7 @@ class Parameter:
         return f"{kind} {extent}".strip()
 
     def check(self, value: Any) -> Any:
-        """Return ``value`` in the parameter's own type; ValueError(expectation) where it is not."""
+        """Return ``value`` in the parameter's type; ValueError(expectation) if not allowed."""
         if tuple in self.types and isinstance(value, (list, tuple)):
             numbers = all(_is_number(item) and abs(item) < 1e300 for item in value)
             if numbers and len(value) in COUNTS:

@@ -38,7 +38,7 @@ class Reading:
     folder
         Where relative paths start.
     known_files
-        Path as written -> SHA-256 of files that are not looked at; None to look at them.
+        Path as written -> SHA-256, used instead of reading the files; None to read them.
     title, seed, fixed, distributions, axes, files
         As :class:`sweep.plan.experiment.Pipeline` has them; ``axes`` by name.
     given

@@ -20,7 +20,7 @@ from sweep.plan.reader import Reading
 MAX_POSES = 10**12
 """The largest grid."""
 
-MAX_TREATMENTS = 10_000
+MAX_CONFIGURATIONS = 10_000
 """The most configurations: they are listed, and each has its share of every block."""
 
 
@@ -136,13 +136,13 @@ def size_of_the_grid(reading: Reading) -> None:
             f"{reading.source}: axes: {min(poses, 10**300):.3g} poses: expected at most "
             f"{MAX_POSES:.0e}"
         )
-    treatments = math.prod(
+    configurations = math.prod(
         length for axis, length in lengths.items() if axis.stage is not Stage.scene
     )
-    if treatments > MAX_TREATMENTS:
+    if configurations > MAX_CONFIGURATIONS:
         reading.faults.append(
-            f"{reading.source}: axes: {min(treatments, 10**300):.3g} detector settings times "
-            f"estimators: expected at most {MAX_TREATMENTS:,}"
+            f"{reading.source}: axes: {min(configurations, 10**300):.3g} detector settings times "
+            f"estimators: expected at most {MAX_CONFIGURATIONS:,}"
         )
 
 

@@ -155,7 +155,7 @@ class Variable:
         """Lengths of the inner dimensions."""
         return tuple(len(LABELS[name]) for name in self.inner)
 
-    def treatment_axes(self, pipeline: Pipeline) -> tuple[Axis, ...]:
+    def configuration_axes(self, pipeline: Pipeline) -> tuple[Axis, ...]:
         """Return the axes of detection and estimation that it has, stage by stage.
 
         They span its configurations, the last axis fastest; a scene's variable has none.
@@ -163,9 +163,9 @@ class Variable:
         stages = [stage for stage in Stage if Stage.scene < stage <= self.stage]
         return tuple(axis for stage in stages for axis in pipeline.axes_of(stage))
 
-    def treatments(self, pipeline: Pipeline) -> int:
+    def configurations(self, pipeline: Pipeline) -> int:
         """Return the number of its configurations: one for a scene's variable."""
-        return math.prod(len(axis) for axis in self.treatment_axes(pipeline))
+        return math.prod(len(axis) for axis in self.configuration_axes(pipeline))
 
     def axes(self, pipeline: Pipeline) -> tuple[Axis, ...]:
         """Return its axes in the pipeline's order: those of its stage and of the stages before."""
@@ -266,7 +266,7 @@ def variables_of(store_format: int) -> tuple[Variable, ...]:
 def bytes_per_block(pipeline: Pipeline, scenes: int) -> int:
     """Return the uncompressed bytes that ``scenes`` scene cells take in the store."""
     return scenes * sum(
-        variable.treatments(pipeline)
+        variable.configurations(pipeline)
         * math.prod(variable.inner_shape)
         * np.dtype(variable.dtype).itemsize
         for variable in SCHEMA

@@ -18,7 +18,7 @@ MAX_BYTES = 250_000
 """The largest text that is read."""
 
 MAX_PARTS = 8
-"""The most parts of a dotted key: reading them takes time that grows with their square."""
+"""The most parts of a dotted key: reading it takes time that grows with their square."""
 
 _PART = r"""(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sweep.errors import SweepError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.plan.cell_selection import at_text, cell, coordinates_text
+from sweep.plan.cell_selection import cell, coordinates_text, selection_text
 from sweep.plan.experiment import Pipeline
 from sweep.report.formatting import degrees, number
 from sweep.report.report_data import ReportData, store_errors
@@ -76,7 +76,7 @@ def scenes_of(data: ReportData) -> Iterator[Scene]:
 
 def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
     stored = stored_cell(data, index)
-    at = at_text({axis.name: axis.values[index[axis.name]] for axis in data.pipeline.axes})
+    at = selection_text({axis.name: axis.values[index[axis.name]] for axis in data.pipeline.axes})
     command = f"sweep show {pipeline_file(data.pipeline)}"
     command += f" --at {shlex.quote(at)}" if at else ""
     detection = DetectionStatus(int(stored["detection"]))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.plan.axes import Axis
-from sweep.plan.cell_selection import at_text
+from sweep.plan.cell_selection import selection_text
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
 from sweep.plan.parameters import Stage
@@ -82,7 +82,7 @@ def failed_cells(store: RunStore, number: int, receipt: Receipt) -> Iterator[Fai
     block = store.blocks[number]
     for failure in receipt.failures:
         coordinates = _coordinates(store.pipeline, block, failure)
-        yield FailedCell(at_text(coordinates), failure.kind, failure.stage, failure.text)
+        yield FailedCell(selection_text(coordinates), failure.kind, failure.stage, failure.text)
 
 
 def _coordinates(

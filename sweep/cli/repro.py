@@ -38,15 +38,15 @@ def _execute(options: argparse.Namespace) -> int:
         options.store, options.at, whole_frame=options.full, time_limit_s=options.time_limit_s
     )
     print(f"--at {again.at}")
-    for line in again.others:
+    for line in again.changes:
         print(f"changed since the store was created: {line}")
-    print("\n".join(value_lines(again.here, again.stored)))
-    if again.look is not None:
-        left, top, right, bottom = again.look.window
-        ids = ", ".join(str(marker_id) for marker_id, _ in again.look.decoded) or "none"
+    print("\n".join(value_lines(again.recomputed, again.stored)))
+    if again.inspection is not None:
+        left, top, right, bottom = again.inspection.window
+        ids = ", ".join(str(marker_id) for marker_id, _ in again.inspection.decoded) or "none"
         print(
             f"columns {left} to {right - 1}, rows {top} to {bottom - 1} of the frame; "
-            f"IDs decoded: {ids}; candidates rejected: {len(again.look.rejected)}"
+            f"IDs decoded: {ids}; candidates rejected: {len(again.inspection.rejected)}"
         )
     times = ", ".join(f"{stage} {1e3 * seconds:.3g} ms" for stage, seconds in again.seconds.items())
     print(f"time: {times}")
@@ -66,8 +66,8 @@ def _write_image(again: Reproduction, options: argparse.Namespace) -> None:
     from sweep.report.scene_drawing import draw_scene  # noqa: PLC0415
 
     image = again.image
-    if again.look is not None and not options.plain:
-        image = draw_scene(again.look, coordinates_text(again.pipeline, again.one))
+    if again.inspection is not None and not options.plain:
+        image = draw_scene(again.inspection, coordinates_text(again.pipeline, again.cell_pipeline))
     write_png(options.output, image)
     print(f"{options.output}: image of the cell")
 
@@ -77,8 +77,8 @@ def _print_verdict(again: Reproduction) -> int:
     if again.stored is None:
         print("the store does not hold this cell yet")
         return 0
-    if again.verdict:
-        print(f"differs from the store: {again.verdict}")
+    if again.difference:
+        print(f"differs from the store: {again.difference}")
         return 1
     how = "bit for bit" if again.exact else (
         "within the tolerances for another processor or version")

@@ -31,39 +31,39 @@ class Reproduction:
     ----------
     at
         Its value of every axis, as text.
-    here, stored
+    recomputed, stored
         Variable -> value, of the dimensions that are no axes; ``stored`` is None if the block is
         not committed.
-    verdict
+    difference
         How the two differ; empty if they do not, or nothing is stored.
     exact
         Whether every bit had to agree: on a processor with the same features, and without
-        ``others``. Else the tolerances apply.
+        ``changes``. Else the tolerances apply.
     seconds
         Stage -> seconds that it took.
     failures
         Exceptions that were raised, and deaths of the process.
-    others
+    changes
         Versions and files that have changed since the store was created.
-    pipeline, one
+    pipeline, cell_pipeline
         The store's pipeline, and the same with every axis fixed at the cell.
-    look
+    inspection
         The inspected scene; None if its inspection raises or ends its process.
     image
         (h, w) grey levels; None if rendering raises or ends its process.
     """
 
     at: str
-    here: Values
+    recomputed: Values
     stored: Values | None
-    verdict: str
+    difference: str
     exact: bool
     seconds: dict[str, float]
     failures: list[Failure]
-    others: list[str]
+    changes: list[str]
     pipeline: Pipeline
-    one: Pipeline
-    look: SceneInspection | None
+    cell_pipeline: Pipeline
+    inspection: SceneInspection | None
     image: NDArray[np.uint8] | None
 
 
@@ -92,7 +92,7 @@ def reproduce(
         If there is no store.
     """
     store = open_store(url)
-    pipeline, others = current_pipeline(store)
+    pipeline, changes = current_pipeline(store)
     index = _index(pipeline, at)
     setting, estimator = (
         _number(pipeline, stage, index) for stage in (Stage.detection, Stage.estimation)
@@ -113,18 +113,18 @@ def reproduce(
         for v in store.variables
     }
     stored = stored_cell(store, index)
-    exact = stored is not None and stored.same_processor and not others
-    verdict = "" if stored is None else compare(
+    exact = stored is not None and stored.same_processor and not changes
+    difference = "" if stored is None else compare(
         recomputed, stored.values, same_processor=exact
     ).difference
     full_at = selection_text({axis.name: axis.values[index[axis.name]] for axis in pipeline.axes})
-    one = cell(pipeline, full_at)
-    inspected, image = _inspected(one, whole_frame, time_limit_s)
+    cell_pipeline = cell(pipeline, full_at)
+    inspected, image = _inspected(cell_pipeline, whole_frame, time_limit_s)
     return Reproduction(
-        full_at, recomputed, None if stored is None else stored.values, verdict, exact,
+        full_at, recomputed, None if stored is None else stored.values, difference, exact,
         {"scene": cells.seconds["scene"][0], "detection": cells.seconds["detection"][setting],
          "estimation": cells.seconds["estimation"][configuration[Stage.estimation]]},
-        cells.failures, others, pipeline, one, inspected, image,
+        cells.failures, changes, pipeline, cell_pipeline, inspected, image,
     )
 
 
@@ -160,14 +160,14 @@ def _number(pipeline: Pipeline, stage: Stage, index: dict[str, int]) -> int:
 
 
 def _inspected(
-    one: Pipeline, whole_frame: bool, limit_s: float
+    cell_pipeline: Pipeline, whole_frame: bool, limit_s: float
 ) -> tuple[SceneInspection | None, NDArray[np.uint8] | None]:
     """Return the inspected scene and its image; None for one that raises or ends its process."""
     for function in (inspect_scene, scene_image):
         try:
             with Child() as child:
                 result = child.call(
-                    partial(function, one, whole_frame=whole_frame), limit_s=limit_s
+                    partial(function, cell_pipeline, whole_frame=whole_frame), limit_s=limit_s
                 )
         except (ChildDiedError, ChildRaisedError, RunError):
             continue

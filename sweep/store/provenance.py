@@ -52,7 +52,15 @@ def _cpu() -> str:
 
 
 def differences(ours: Pipeline, theirs: Pipeline, stored: dict[str, Any]) -> list[str]:
-    """Return a line for each thing in which a store (``theirs``, ``stored``) does not fit."""
+    """Return a line for each difference between a pipeline and a store's.
+
+    Parameters
+    ----------
+    ours, theirs
+        The pipeline, and the store's.
+    stored
+        The store's fingerprint.
+    """
     lines = []
     mine = fingerprint(ours)
     lines += [
@@ -69,20 +77,20 @@ def differences(ours: Pipeline, theirs: Pipeline, stored: dict[str, Any]) -> lis
         if (other := theirs.axis(axis.name)) is not None
         and not same_values(axis.values, other.values)
     ]
-    for here, there in (
+    for our_values, their_values in (
         (ours.fixed, theirs.fixed), (ours.distributions, theirs.distributions),
     ):
         lines += [
-            f"{name}: the store has {there.get(name)}, this run {here.get(name)}"
-            for name in sorted({*here, *there})
+            f"{name}: the store has {their_values.get(name)}, this run {our_values.get(name)}"
+            for name in sorted({*our_values, *their_values})
             if ours.axis(name) is None and theirs.axis(name) is None
-            and there.get(name) != here.get(name)
+            and their_values.get(name) != our_values.get(name)
         ]
     return lines
 
 
 def same_values(a: Any, b: Any) -> bool:
-    """Tell whether two axes have the same values in the same order."""
+    """Return whether two axes have the same values in the same order."""
     if isinstance(a, range) and isinstance(b, range):
         return a == b
     return len(a) == len(b) and all(x == y for x, y in zip(a, b, strict=True))

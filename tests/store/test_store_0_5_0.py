@@ -163,7 +163,7 @@ def see_similar(url, other):
 @same_versions
 def test_cell_of_an_old_store_is_reproduced(unpacked):
     again = reproduce(str(unpacked / "finished.zarr"), AT)
-    assert (again.verdict, again.others) == ("", [])
+    assert (again.difference, again.changes) == ("", [])
     assert again.stored is not None
     assert again.stored["detection"] == DetectionStatus.detected
 

@@ -1,0 +1,118 @@
+"""A recomputed scene against the stored one: to the bit here, within tolerances elsewhere."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sweep.integrity.tolerances import Comparison, compare
+
+TURN = Rotation.from_rotvec([0.3, -0.2, 0.1])
+
+
+def scene():
+    """Return the values of one scene under two estimators."""
+    return {
+        "true_rvec": np.array([3.0, 0.1, 0.2]),
+        "true_tvec_m": np.array([0.0, 0.3, 0.4]),
+        "marker_area_px": np.array(900.0),
+        "bound": np.array(1, dtype="u1"),
+        "bound_std": np.full(6, 1e-3, dtype="f4"),
+        "mirror_distance": np.array(np.nan, dtype="f4"),
+        "detection": np.array(1, dtype="u1"),
+        "corner_error_px": np.full((4, 2), 0.1, dtype="f4"),
+        "estimate": np.array([1, 3], dtype="u1"),
+        "translation_error_m": np.array([[1e-3, 0, 2e-3], [np.nan] * 3], dtype="f4"),
+        "rotation_error_rad": np.array([TURN.as_rotvec(), [np.nan] * 3], dtype="f4"),
+        "rotation_error_deg": np.array([21.4, np.nan], dtype="f4"),
+        "reprojection_error_px": np.array([0.2, np.nan], dtype="f4"),
+    }
+
+
+def moved(name, amount):
+    """Return a scene and the same with ``amount`` added to a variable."""
+    values = scene()
+    values[name] = (values[name] + amount).astype(values[name].dtype)
+    return values, scene()
+
+
+def turned(angle_rad):
+    """Return a scene and the same whose estimate is turned further by an angle."""
+    values = scene()
+    further = TURN * Rotation.from_rotvec([0, angle_rad, 0])
+    values["rotation_error_rad"][0] = further.as_rotvec()
+    return values, scene()
+
+
+@pytest.mark.parametrize("same_processor", [True, False])
+def test_equal_scenes_agree_also_in_what_is_missing(same_processor):
+    assert compare(scene(), scene(), same_processor=same_processor) == Comparison()
+
+
+@pytest.mark.parametrize("name", scene())
+def test_every_bit_counts_on_the_same_processor(name):
+    values, stored = scene(), scene()
+    flat = values[name].reshape(-1)
+    flat[0] = np.nextafter(flat[0], 9, dtype=flat.dtype) if flat.dtype.kind == "f" else 7
+    if np.isnan(flat[0]):
+        flat[0] = 0
+    found = compare(values, stored, same_processor=True)
+    assert found.departure.startswith(f"{name} ")
+    assert found.outside == ""
+    assert found.difference == found.departure
+
+
+@pytest.mark.parametrize(
+    ("name", "within", "beyond"),
+    [
+        ("corner_error_px", 0.009, 0.011), ("reprojection_error_px", -0.009, 0.011),
+        # 1e-4 of 0.5 m, as the length of the difference.
+        ("translation_error_m", [2.5e-5, 3e-5, 2.5e-5], [3.5e-5, 3.5e-5, 3.5e-5]),
+        ("detection", 0, 1), ("estimate", 0, [0, 1]),
+    ],
+)
+def test_results_of_another_processor_lie_within_their_tolerance(name, within, beyond):
+    assert compare(*moved(name, within), same_processor=False) == Comparison()
+    found = compare(*moved(name, beyond), same_processor=False)
+    assert found.outside.startswith(f"{name} ")
+    assert found.departure == ""
+    assert found.difference == found.outside
+
+
+def test_rotations_are_compared_by_the_angle_between_them():
+    assert compare(*turned(0.9e-4), same_processor=False) == Comparison()
+    assert compare(*turned(1.1e-4), same_processor=False).outside.startswith("rotation_error_rad")
+
+
+@pytest.mark.parametrize(
+    ("name", "within", "beyond"),
+    [
+        # Each component, relative to the vector's length.
+        ("true_rvec", 2.9e-12, 3.3e-12), ("true_tvec_m", 0.4e-12, 0.6e-12),
+        ("marker_area_px", 8e-10, 10e-10), ("bound_std", 0.9e-9, 1.5e-9), ("bound", 0, 1),
+    ],
+)
+def test_no_scene_may_depart_in_its_truth_or_bound(name, within, beyond):
+    assert compare(*moved(name, within), same_processor=False) == Comparison()
+    found = compare(*moved(name, beyond), same_processor=False)
+    assert found.departure.startswith(f"{name} ")
+    assert found.outside == ""
+
+
+def test_number_that_only_one_of_the_two_has_is_a_difference():
+    for name in ("mirror_distance", "reprojection_error_px"):
+        values, stored = scene(), scene()
+        values[name] = np.where(np.isnan(values[name]), 1.0, values[name]).astype("f4")
+        for ours, theirs in ((values, stored), (stored, values)):
+            assert compare(ours, theirs, same_processor=False).difference.startswith(name)
+
+
+def test_variables_without_a_tolerance_are_compared_on_the_same_processor_alone():
+    values, stored = moved("rotation_error_deg", 1.0)
+    assert compare(values, stored, same_processor=False) == Comparison()
+    assert compare(values, stored, same_processor=True).departure.startswith("rotation_error_deg")
+
+
+def test_variables_that_only_one_of_the_two_has_are_not_compared():
+    values, stored = scene(), scene()
+    del values["detection"], stored["estimate"], stored["true_tvec_m"]
+    assert compare(values, stored, same_processor=True) == Comparison()

@@ -116,7 +116,7 @@ def swept(
     """Return a pipeline's results from its store in runs/, which is completed if need be."""
     store = f"runs/{name}.zarr" if trials is None else f"runs/{name}_trials_{trials}.zarr"
     begun = time.perf_counter()
-    results = sweep.run(pipeline, store, workers=workers)
+    results = sweep.run(pipeline, store=store, workers=workers)
     print(f"{store}: {time.perf_counter() - begun:.0f} s", file=sys.stderr, flush=True)
     return results.assign(detection=results["detection"].compute())
 

@@ -1,1 +1,1 @@
-"""Runs on a Dask cluster: what is computed where, in blocks, and how far it is."""
+"""Runs on a Dask cluster: blocks, calibration, reuse, progress, status and forecasts."""

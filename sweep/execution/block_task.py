@@ -1,4 +1,4 @@
-"""What a worker does: compute one block, write it, and return a receipt."""
+"""The task of a worker: compute one block, write it, and return its receipt."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sweep.errors import StoreError
 from sweep.evaluation.cells import run_cells
 from sweep.evaluation.results import CellsResult, to_dataset_layout
 from sweep.execution.limits import TIME_LIMIT_S
-from sweep.execution.reuse import ReusedCells, Source, match, take
+from sweep.execution.reuse import ReusedCells, Source, match, read_cells
 from sweep.isolation.crash_isolation import WHOLE, run_cells_isolated
 from sweep.isolation.watchdog import ending_after
 from sweep.plan.background_files import file_digest
@@ -38,18 +38,24 @@ FAILURE_QUOTA: Mapping[str, int] = {"failed": MAX_ROWS, "crashed": MAX_ROWS}
 
 @lru_cache(maxsize=4)
 def _opened(url: str, run_id: str) -> RunStore:
-    """Open a store once in each process, and see that its numbers can be made here."""
+    """Open a store once in each process; check that this process computes the same numbers.
+
+    Raises
+    ------
+    StoreError
+        If the store was replaced, or this machine has other versions or files.
+    """
     store = open_store(url, "r+")
     if store.run_id != run_id:
         raise StoreError(f"{url}: replaced by another run while this one was going on")
-    here, there = fingerprint(store.pipeline), store.fingerprint
-    for key, value in there.items():
-        if here.get(key) != value:
+    worker, recorded_versions = fingerprint(store.pipeline), store.fingerprint
+    for key, value in recorded_versions.items():
+        if worker.get(key) != value:
             raise StoreError(
-                f"a worker has {key} {here.get(key)}, the store was begun with {value}; "
+                f"a worker has {key} {worker.get(key)}, the store was begun with {value}; "
                 "install the same version on every machine"
             )
-    for path, digest in there["files"].items():
+    for path, digest in recorded_versions["files"].items():
         if file_digest(Path(store.pipeline.folder) / path) != digest:
             raise StoreError(
                 f"{path}: not in {store.pipeline.folder} on a worker as it was when the run began; "
@@ -100,30 +106,25 @@ def compute_block(
     begun_before = begin_block(store, block)
     pipeline = store.pipeline
     shape = (len(block), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
-    taken: ReusedCells | None = None
+    reused: ReusedCells | None = None
     need = np.ones(shape, dtype=bool)
     if reuse:
-        taken = take(pipeline, block, [_source(url, run_id, old) for old in reuse])
-        need = ~taken.have.reshape(shape)
-    # Scenes of which nothing is missing are not even rendered.
+        reused = read_cells(pipeline, block, [_source(url, run_id, old) for old in reuse])
+        need = ~reused.available.reshape(shape)
+    # Scenes of which every cell is reused are not rendered.
     rows = np.flatnonzero(need.any(axis=(1, 2)))
     cells = None
     if len(rows):
         indices = [index[rows] for index in block_indices(block)]
-        if not begun_before:
-            # What raises for a block as a whole is found as what ends its process is.
-            with ending_after(WHOLE * time_limit_s), contextlib.suppress(Exception):
-                cells = run_cells(pipeline, indices, need[rows])
-        if cells is None:
-            cells = run_cells_isolated(pipeline, indices, need[rows], time_limit_s)
+        cells = _compute(pipeline, indices, need[rows], time_limit_s, isolated=begun_before)
     values = {
         v.name: to_dataset_layout(
             v, pipeline, block, _columns(v, cells, rows, pipeline, len(block))
         )
         for v in SCHEMA
     }
-    if taken is not None:
-        values = {v.name: _merged(v, values, taken) for v in SCHEMA}
+    if reused is not None:
+        values = {v.name: _merged(v, values, reused) for v in SCHEMA}
     receipt = Receipt(
         run_id=store.run_id,
         processor=processor(),
@@ -144,15 +145,27 @@ def compute_block(
     return receipt
 
 
+def _compute(
+    pipeline: Pipeline, indices: Sequence[NDArray[np.intp]], need: NDArray[np.bool_],
+    time_limit_s: float, *, isolated: bool,
+) -> CellsResult:
+    """Compute cells in this process, or in a child if that was tried or the block raises."""
+    if not isolated:
+        # If the block raises as a whole, the scenes that do so are isolated as crashes are.
+        with ending_after(WHOLE * time_limit_s), contextlib.suppress(Exception):
+            return run_cells(pipeline, indices, need)
+    return run_cells_isolated(pipeline, indices, need, time_limit_s)
+
+
 _NO_SECONDS: dict[str, list[float]] = {"scene": [], "detection": [], "estimation": []}
-"""What a block cost of which nothing was computed."""
+"""The cost of a block of which nothing was computed."""
 
 
 def _columns(
     variable: Variable, cells: CellsResult | None, rows: NDArray[np.intp], pipeline: Pipeline,
     count: int,
 ) -> list[NDArray[Any]]:
-    """Return a variable's columns (N, ...) per treatment: what ``rows`` gave, fill elsewhere."""
+    """Return a variable's columns (N, ...) by configuration: computed in ``rows``, else fill."""
     if cells is not None and len(rows) == count:
         return cells.columns[variable.name]
     columns = []
@@ -165,13 +178,13 @@ def _columns(
 
 
 def _merged(
-    variable: Variable, computed: dict[str, NDArray[Any]], taken: ReusedCells
+    variable: Variable, computed: dict[str, NDArray[Any]], reused: ReusedCells
 ) -> NDArray[Any]:
-    """Return a variable with what was taken in place of what was not computed.
+    """Return a variable with the reused values in the cells that were not computed.
 
-    Only whole cells are either: the flags of the variable's stage tell which.
+    A cell is computed or reused as a whole, as the flag of the variable's stage says.
     """
-    new, old = computed[variable.name], taken.values[variable.name]
+    new, old = computed[variable.name], reused.values[variable.name]
     flag = {Stage.detection: "detection", Stage.estimation: "estimate"}.get(variable.stage)
     if flag is None:
         missing = new == variable.fill if variable.flags is not None else np.isnan(new)

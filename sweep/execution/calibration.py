@@ -1,4 +1,4 @@
-"""A short look at what scenes cost: for the size of blocks, and for predictions of time."""
+"""What scenes cost, measured on a sample: for the size of blocks and for forecasts."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ from sweep.plan.parameters import Stage
 from sweep.plan.schema import bytes_per_block
 
 MIN_BATCH, MAX_BATCH = 24, 1536
-"""Scenes measured at a time; more where they are cheap, for a call has a cost of its own."""
+"""Scenes measured at a time: more if they are cheap, because a call has a cost of its own."""
 
 LONG_BATCH_S = 0.06
-"""Time from which a batch is large enough."""
+"""Batches that take longer are large enough."""
 
 MAX_BATCHES = 40
 
 UNEVEN = 0.25
-"""Axes whose two halves differ in cost by more than this share are kept whole where possible."""
+"""Axes whose two halves differ in cost by more than this share are not cut if possible."""
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What a sample of the grid cost.
+    """The cost of scenes, from a sample of the grid.
 
     Attributes
     ----------
     scene_s
-        Mean seconds a scene, all its treatments included.
+        Mean seconds a scene, all configurations included.
     error_s
         Standard error of that mean.
     sampled
         Scenes in the sample.
     unevenness
-        Along each scene axis: how much the mean costs of its two halves differ, as a share.
+        For each scene axis, the difference of the mean costs of its two halves, as a share.
     """
 
     scene_s: float
@@ -61,7 +61,7 @@ class Calibration:
 def calibrate(pipeline: Pipeline, budget_s: float) -> Calibration:
     """Measure a seeded random sample of scenes for about ``budget_s`` seconds.
 
-    The first batch, in which code is compiled and caches fill, is measured again.
+    A few scenes are computed first, so that code is compiled and caches are filled.
     """
     axes = scene_axes(pipeline)
     generator = np.random.Generator(np.random.PCG64(0))
@@ -73,12 +73,12 @@ def calibrate(pipeline: Pipeline, budget_s: float) -> Calibration:
     started = time.perf_counter()
     while True:
         indices = sample(axes, generator, batch)
-        begun, working = time.perf_counter(), time.thread_time()
+        wall, working = time.perf_counter(), time.thread_time()
         result = run_cells(pipeline, indices)
-        # This thread's own time: the workers' processes come up meanwhile, and use the processors.
+        # This thread's own time: the workers' processes start meanwhile and use the processors.
         spent = time.thread_time() - working
-        own = result.row_seconds * (spent / (time.perf_counter() - begun))
-        # What is not counted by scene (solving, projecting) is spread evenly over the batch.
+        own = result.row_seconds * (spent / (time.perf_counter() - wall))
+        # Time that is not measured by scene (solving, projecting) is spread over the batch.
         count = len(own)
         rows.append(own + (spent - own.sum()) / count)
         picks.append(indices)
@@ -103,13 +103,16 @@ def calibrate(pipeline: Pipeline, budget_s: float) -> Calibration:
 
 
 UNMEASURED_S = 0.01
-"""What a scene is taken to cost where measuring it ended the process."""
+"""Assumed cost of a scene if the measurement crashed."""
 
 
 def calibrate_isolated(
     child: Child, pipeline: Pipeline, budget_s: float, limit_s: float
 ) -> Calibration:
-    """Measure as :func:`calibrate` does, in a child process: a scene may end it."""
+    """Call :func:`calibrate` in a child process, which a scene may crash.
+
+    If it crashes, raises or takes longer than ``limit_s`` seconds, :data:`UNMEASURED_S` is assumed.
+    """
     try:
         measured: Calibration = child.call(calibrate, pipeline, budget_s, limit_s=limit_s)
     except (ChildDiedError, ChildRaisedError):
@@ -127,10 +130,19 @@ def sample(
 def block_extents(
     pipeline: Pipeline, calibration: Calibration, workers: int, block_s: float | None = None
 ) -> tuple[int, ...]:
-    """Return the cells of a block along each scene axis.
+    """Return the scenes of a block along each scene axis.
 
-    Axes along which the cost changes are kept whole first, so that blocks are even; the others
-    are cut, the first axis of the file first.
+    Axes along which the cost changes are not cut if possible, so that blocks are even; of the
+    others, the first axis of the file is cut first.
+
+    Parameters
+    ----------
+    pipeline, calibration
+        The grid, and what its scenes cost.
+    workers
+        Threads that share the work.
+    block_s
+        Seconds of work in a block (default: about 2, less if there is little to do).
     """
     axes = scene_axes(pipeline)
     total = pipeline.size(Stage.scene)
@@ -147,12 +159,12 @@ def block_extents(
     )
     extents = [1] * len(axes)
     for k in order:
-        room = max(target // math.prod(extents), 1)
+        most = max(target // math.prod(extents), 1)
         length = len(axes[k])
-        if room >= length:
+        if most >= length:
             extents[k] = length
             continue
         # Equal parts rather than a short last one.
-        extents[k] = -(-length // -(-length // room))
+        extents[k] = -(-length // -(-length // most))
         break
     return tuple(extents)

@@ -1,4 +1,4 @@
-"""What a run leaves when its last block is there: costs, failures, and counts of flags."""
+"""Closing a complete store: tables of costs and failures, and counts of flags."""
 
 from __future__ import annotations
 
@@ -21,7 +21,15 @@ if TYPE_CHECKING:
 
 
 def close(store: RunStore) -> None:
-    """Close a complete store: what its receipts tell is gathered, and it is marked finished."""
+    """Close a store of which every block is committed.
+
+    Its receipts are summed up in the groups ``cost`` and ``failures``; then it is marked finished.
+
+    Raises
+    ------
+    StoreError
+        If a receipt is damaged or the store cannot be written.
+    """
     blocks: list[tuple[int, Mapping[str, Sequence[float]]]] = []
     cells: list[FailedCell] = []
     kept: Counter[str] = Counter()
@@ -43,7 +51,13 @@ def close(store: RunStore) -> None:
 
 
 def lost(detection: list[int], estimate: list[int]) -> dict[str, int]:
-    """Return how many cells failed and crashed, from counts of their flags."""
+    """Return how many cells failed and crashed, from counts by flag.
+
+    Parameters
+    ----------
+    detection, estimate
+        Counts of cells; the flag is the index.
+    """
     def count(flags: list[int], flag: int) -> int:
         return flags[flag] if len(flags) > flag else 0
 
@@ -56,7 +70,7 @@ def lost(detection: list[int], estimate: list[int]) -> dict[str, int]:
 def _cost(
     store: RunStore, blocks: Sequence[tuple[int, Mapping[str, Sequence[float]]]]
 ) -> xr.Dataset:
-    """Return the cost group: seconds per stage and treatment for each block."""
+    """Return the cost group: seconds of each block per stage and configuration."""
     import xarray as xr  # noqa: PLC0415  (slow to import, and often not needed)
 
     pipeline = store.pipeline

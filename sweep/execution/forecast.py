@@ -1,4 +1,4 @@
-"""What a run would take: blocks, bytes, memory and time, from a short calibration."""
+"""The forecast of a run: blocks, bytes, memory and time, from a short calibration."""
 
 from __future__ import annotations
 
@@ -25,15 +25,32 @@ from sweep.plan.parameters import Stage
 from sweep.plan.schema import bytes_per_block
 
 EFFECT_SCENES = 24
-"""Scenes at most that an effect is measured on."""
+"""Most scenes on which an effect is measured."""
+
+EFFECT_S = 0.6
+"""Least seconds of measurement for each effect."""
 
 START_S = 3.0
-"""Seconds that a run takes beside its blocks: processes start and end, packages are imported."""
+"""Seconds of a run apart from its blocks: processes start and end, packages are imported."""
 
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """What is to be expected of a run."""
+    """What a run would take.
+
+    Attributes
+    ----------
+    poses, results
+        Cells of the scene axes; estimates, which are poses times configurations.
+    block, blocks
+        Scenes of a block along each scene axis; number of blocks.
+    bytes, worker_bytes
+        Size of the store before compression; memory of a worker.
+    pose_s, sampled
+        Mean seconds a pose, all configurations included; scenes that were measured.
+    workers, seconds
+        Number of workers, and how long they would take.
+    """
 
     poses: int
     results: int
@@ -47,18 +64,22 @@ class Forecast:
     seconds: float
 
 
-EFFECT_S = 0.6
-"""Seconds of measuring for each effect, at least."""
-
-
 def effect_costs(
     pipeline: Pipeline, switches: Sequence[str], pose_s: float
 ) -> dict[str, float]:
-    """Return what each effect adds to a pose, in seconds: with it against without it, paired.
+    """Return the seconds that each effect adds to a pose: medians of pairs with and without it.
 
-    On a seeded sample of scenes, all other parameters as they are, so that effects which
-    multiply one another's work are each charged with all of it; medians of repeated pairs.
-    ``pose_s`` is what a pose takes, all in all.
+    All other parameters stay as they are, so that effects that multiply one another's work are each
+    charged with all of it.
+
+    Parameters
+    ----------
+    pipeline
+        Measured on a seeded sample of its scenes.
+    switches
+        Parameters that switch an effect on.
+    pose_s
+        Seconds that a pose takes with all effects, from :func:`forecast`.
     """
     axes = scene_axes(pipeline)
     generator = np.random.Generator(np.random.PCG64(1))
@@ -68,21 +89,21 @@ def effect_costs(
     for switch in switches:
         pair = pipeline, _without(pipeline, switch)
         differences: list[float] = []
-        begun = time.perf_counter()
-        while len(differences) < 3 or time.perf_counter() - begun < EFFECT_S:
+        started = time.perf_counter()
+        while len(differences) < 3 or time.perf_counter() - started < EFFECT_S:
             spent = []
             for variant in pair:
                 start = time.thread_time()
                 run_cells(variant, indices)
                 spent.append(time.thread_time() - start)
             differences.append((spent[0] - spent[1]) / count)
-        # What is lost in the noise of measuring costs nothing that can be told.
+        # A difference below 0 is measurement noise.
         costs[switch] = max(statistics.median(differences), 0.0)
     return costs
 
 
 def _without(pipeline: Pipeline, switch: str) -> Pipeline:
-    """Return a pipeline on the same grid in which an effect is absent everywhere."""
+    """Return the pipeline with an effect switched off everywhere, on the same grid."""
     off = SWITCHES[switch]
     return dataclasses.replace(
         pipeline,
@@ -103,7 +124,7 @@ def forecast_isolated(
     Raises
     ------
     RunError
-        Where a scene that is measured ends its process, never returns, or raises.
+        If a measured scene crashes its process, never returns, or raises.
     """
     try:
         with Child() as child:
@@ -112,16 +133,29 @@ def forecast_isolated(
                 effect_costs, pipeline, switches, expected.pose_s, limit_s=PLAN_LIMIT_S
             )
     except (ChildDiedError, ChildRaisedError) as error:
-        why = str(error).strip().splitlines()[-1]
+        reason = str(error).strip().splitlines()[-1]
         raise RunError(
-            f"a scene that was measured ended its process ({why}); `sweep run` finds it, and "
+            f"a measured scene crashed its process ({reason}); `sweep run` isolates it and "
             "computes the others"
         ) from None
     return expected, costs
 
 
 def forecast(pipeline: Pipeline, workers: int | None = None) -> Forecast:
-    """Return what a run with ``workers`` processes would take; nothing is written."""
+    """Return what a run would take; nothing is written.
+
+    Parameters
+    ----------
+    pipeline
+        Measured on a seeded sample of its scenes, for less than a second.
+    workers
+        Number of workers (default: the available processors).
+
+    Raises
+    ------
+    ArgumentError
+        If there are no workers.
+    """
     if workers is None:
         workers = default_workers()
     if workers < 1:

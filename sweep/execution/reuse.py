@@ -1,7 +1,7 @@
-"""Finished cells of other stores, taken into a new one: grids grow, halves are joined.
+"""Finished cells of other stores, copied into a new one: grids grow, halves are joined.
 
-A cell is reusable where the fingerprint and all its parameter values agree. What is asked of an
-old store is decided cell by cell from its receipts and flags; the old store is only read.
+A cell is reusable if the fingerprint and all its parameter values agree. Which cells an old store
+has finished follows from its receipts and flags; the old store is only read.
 """
 
 from __future__ import annotations
@@ -26,20 +26,22 @@ from sweep.store.provenance import fingerprint
 from sweep.store.run_store import RunStore
 
 MISSING = -1
-"""Stands for the index of a value that the old grid does not have."""
+"""In place of the index of a value that the old grid does not have."""
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """An old store, and where each new axis' values lie in it.
+    """An old store, and where the values of each new axis lie in it.
 
     Attributes
     ----------
+    store
+        The old store.
     old_index
-        New axis -> (length,) index along the old axis of that name, or ``MISSING``; 0 where the
-        old store had the value fixed.
+        New axis -> (length,) index along the old axis of that name, or ``MISSING``; 0 if the
+        parameter is fixed in the old store.
     pinned
-        Old axes that the new grid does not have -> the index of the value that it has fixed.
+        Old axis that is fixed in the new grid -> the index of the fixed value.
     done
         Numbers of the old store's committed blocks.
     """
@@ -51,23 +53,29 @@ class Source:
 
 
 def match(pipeline: Pipeline, store: RunStore) -> Source:
-    """Find a new grid's cells in an old store.
+    """Match a new grid to an old store's.
 
     Raises
     ------
     StoreError
-        Where no cell can be taken: another fingerprint, or parameters that never agree.
+        If no cell is reusable: another fingerprint, parameters that never agree, or variables that
+        the old store's format does not have.
     """
     old = store.pipeline
     mine, theirs = fingerprint(pipeline), store.fingerprint
     # A file that only one of them refers to is a value that only one of them has.
     shared = mine["files"].keys() & theirs["files"].keys()
-    for one in (mine, theirs):
-        one["files"] = {path: one["files"][path] for path in sorted(shared)}
+    for stamp in (mine, theirs):
+        stamp["files"] = {path: stamp["files"][path] for path in sorted(shared)}
     faults = [
         f"{key}: the store has {json.dumps(theirs.get(key))}, this run {json.dumps(mine.get(key))}"
         for key in sorted({*mine, *theirs})
         if mine.get(key) != theirs.get(key)
+    ]
+    known = {variable.name for variable in store.variables}
+    faults += [
+        f"{variable.name}: not in a store of format {store.format}"
+        for variable in SCHEMA if variable.name not in known
     ]
     present = {variable.name for variable in store.variables}
     faults += [
@@ -82,25 +90,25 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
         old_values = _values(old, name, old_axis)
         if new_values is None or old_values is None:
             if pipeline.distributions.get(name) != old.distributions.get(name):
-                faults.append(f"{name}: drawn in one and not, or otherwise, in the other")
+                faults.append(f"{name}: not drawn from the same distribution in both")
             continue
-        where = _indices(new_values, old_values)
-        if not (where != MISSING).any():
+        index = _indices(new_values, old_values)
+        if not (index != MISSING).any():
             faults.append(
-                f"{name}: the store has {_some(old_values)}, this run {_some(new_values)}"
+                f"{name}: the store has {_excerpt(old_values)}, this run {_excerpt(new_values)}"
             )
         if new_axis is not None:
-            old_index[name] = where
+            old_index[name] = index
         if old_axis is not None and new_axis is None:
-            pinned[name] = int(where[0])
+            pinned[name] = int(index[0])
     if faults:
         listed = "\n".join(f"  {fault}" for fault in faults)
-        raise StoreError(f"{store.url}: nothing of it can be reused\n{listed}")
+        raise StoreError(f"{store.url}: no cell of it can be reused\n{listed}")
     return Source(store, old_index, pinned, frozenset(committed(store)))
 
 
 def _values(pipeline: Pipeline, name: str, axis: Axis | None) -> Sequence[Any] | None:
-    """Return a parameter's values; None where it is drawn."""
+    """Return a parameter's values, None if it is drawn from a distribution."""
     if axis is not None:
         return axis.values
     if name == TRIAL:
@@ -108,37 +116,44 @@ def _values(pipeline: Pipeline, name: str, axis: Axis | None) -> Sequence[Any] |
     return None if name in pipeline.distributions else (pipeline.fixed[name],)
 
 
-def _indices(wanted: Sequence[Any], there: Sequence[Any]) -> NDArray[np.int64]:
-    if isinstance(wanted, range) and isinstance(there, range):
-        low, step = there.start, there.step
-        values = np.arange(wanted.start, wanted.stop, wanted.step, dtype=np.int64)
-        index, off = np.divmod(values - low, step)
-        return np.where((off == 0) & (index >= 0) & (index < len(there)), index, MISSING)
-    if isinstance(there, range):
-        found = [there.index(value) if value in there else MISSING for value in wanted]
-        return np.array(found, dtype=np.int64)
-    known = {value: i for i, value in enumerate(there)}
-    return np.array([known.get(value, MISSING) for value in wanted], dtype=np.int64)
+def _indices(new: Sequence[Any], old: Sequence[Any]) -> NDArray[np.int64]:
+    """Return the index in ``old`` of each value of ``new``, or ``MISSING``."""
+    if isinstance(new, range) and isinstance(old, range):
+        low, step = old.start, old.step
+        values = np.arange(new.start, new.stop, new.step, dtype=np.int64)
+        index, remainder = np.divmod(values - low, step)
+        exists = (remainder == 0) & (index >= 0) & (index < len(old))
+        return np.where(exists, index, MISSING)
+    if isinstance(old, range):
+        indices = [old.index(value) if value in old else MISSING for value in new]
+        return np.array(indices, dtype=np.int64)
+    index_of = {value: i for i, value in enumerate(old)}
+    return np.array([index_of.get(value, MISSING) for value in new], dtype=np.int64)
 
 
-def _some(values: Sequence[Any]) -> str:
+def _excerpt(values: Sequence[Any]) -> str:
     shown = ", ".join(str(value) for value in values[:4])
     return shown if len(values) <= 4 else f"{shown}, ... ({len(values):,} values)"
 
 
 @dataclass(slots=True)
 class ReusedCells:
-    """What old stores gave of a block: values in the template's dimensions, fill where nothing.
+    """The cells of a block that old stores have.
 
-    ``have`` (N, detector settings, estimators) tells what need not be computed.
+    Attributes
+    ----------
+    values
+        Variable -> values in the dataset's dimensions; fill values in cells that are missing.
+    available
+        (N, detector settings, estimators): the cells that need not be computed.
     """
 
     values: dict[str, NDArray[Any]]
-    have: NDArray[np.bool_]
+    available: NDArray[np.bool_]
 
 
-def take(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> ReusedCells:
-    """Read a block's reusable cells from old stores; the first that has a cell gives it."""
+def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> ReusedCells:
+    """Read a block's reusable cells from old stores; of several, the first that has a cell."""
     axes = scene_axes(pipeline)
     cuts = {
         axis.name: slice(start, stop)
@@ -157,53 +172,53 @@ def take(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> ReusedC
         )
         for v in SCHEMA
     }
-    have = np.zeros([shape[name] for name in order], dtype=bool)
+    available = np.zeros([shape[name] for name in order], dtype=bool)
     for source in sources:
-        _take_from(source, pipeline, cuts, order, values, have)
+        _read_from(source, pipeline, cuts, order, values, available)
     settings = pipeline.size(Stage.detection)
-    return ReusedCells(values, have.reshape(len(block), settings, -1))
+    return ReusedCells(values, available.reshape(len(block), settings, -1))
 
 
-def _take_from(
+def _read_from(
     source: Source,
     pipeline: Pipeline,
     cuts: dict[str, slice],
     order: list[str],
     values: dict[str, NDArray[Any]],
-    have: NDArray[np.bool_],
+    available: NDArray[np.bool_],
 ) -> None:
-    """Add one old store's cells to ``values``, and note them in ``have`` (dimensions ``order``)."""
-    places: dict[str, NDArray[np.int64]] = {}
+    """Add an old store's cells to ``values`` and ``available``, of which ``order`` is the axes."""
+    positions: dict[str, NDArray[np.int64]] = {}
     indices: dict[str, NDArray[np.int64]] = {}
     for name in order:
-        where = source.old_index[name][cuts.get(name, slice(None))]
-        places[name] = np.flatnonzero(where != MISSING)
-        indices[name] = where[places[name]]
-        if len(places[name]) == 0:
+        index = source.old_index[name][cuts.get(name, slice(None))]
+        positions[name] = np.flatnonzero(index != MISSING)
+        indices[name] = index[positions[name]]
+        if len(positions[name]) == 0:
             return
-    ready = _committed_cells(source, order, places, indices)
+    ready = _committed_cells(source, order, positions, indices)
     if not ready.any():
         return
     old = {
         v.name: _read(source, pipeline, v, indices) for v in SCHEMA
     }
-    # A cell is there where it was committed and its flags say that it was run.
+    # A cell is finished if its block is committed and its flag says that it was run.
     estimate = next(v for v in SCHEMA if v.name == "estimate")
-    names = [name for name in estimate.dimensions(pipeline) if name in places]
+    names = [name for name in estimate.dimensions(pipeline) if name in positions]
     flags = np.transpose(old["estimate"], [names.index(name) for name in order])
-    fresh = ready & (flags != 0) & ~have[np.ix_(*(places[name] for name in order))]
+    fresh = ready & (flags != 0) & ~available[np.ix_(*(positions[name] for name in order))]
     if not fresh.any():
         return
-    have[np.ix_(*(places[name] for name in order))] |= fresh
+    available[np.ix_(*(positions[name] for name in order))] |= fresh
     for variable in SCHEMA:
-        names = [name for name in variable.dimensions(pipeline) if name in places]
-        # Where any treatment of a scene (or of a detection) is taken, so is what it shares.
+        names = [name for name in variable.dimensions(pipeline) if name in positions]
+        # With a configuration of a scene (or of a detection), what it shares is reused.
         away = tuple(k for k, name in enumerate(order) if name not in names)
         chosen = fresh.any(axis=away)
         kept = [name for name in order if name in names]
         chosen = np.transpose(chosen, [kept.index(name) for name in names])
         target = values[variable.name]
-        grid = np.ix_(*(places[name] for name in names)) if names else ...
+        grid = np.ix_(*(positions[name] for name in names)) if names else ...
         part = target[grid]
         part[chosen] = old[variable.name][chosen]
         target[grid] = part
@@ -212,10 +227,10 @@ def _take_from(
 def _committed_cells(
     source: Source,
     order: list[str],
-    places: dict[str, NDArray[np.int64]],
+    positions: dict[str, NDArray[np.int64]],
     indices: dict[str, NDArray[np.int64]],
 ) -> NDArray[np.bool_]:
-    """Tell for each candidate cell (dimensions ``order``) whether its old block is committed."""
+    """Return for each candidate cell (axes ``order``) whether its old block is committed."""
     store = source.store
     blocks = store.blocks
     along: list[NDArray[np.int64]] = []
@@ -234,7 +249,7 @@ def _committed_cells(
         starts = tuple(int(c) * e for c, e in zip(chosen, blocks.extents, strict=True))
         if blocks.number(Block(starts, starts)) in source.done:
             ready[np.ix_(*(n == c for n, c in zip(numbers, chosen, strict=True)))] = True
-    # Old dimensions that are pinned go; new ones that the old store had fixed come, length 1.
+    # Pinned dimensions are dropped; new ones that are fixed in the old store get length 1.
     for k in reversed(range(len(names))):
         if names[k] in source.pinned:
             ready = ready.take(0, axis=k)
@@ -243,7 +258,7 @@ def _committed_cells(
     for k, name in enumerate(order):
         if name not in names:
             full = np.expand_dims(full, k)
-    return np.array(np.broadcast_to(full, [len(places[name]) for name in order]))
+    return np.array(np.broadcast_to(full, [len(positions[name]) for name in order]))
 
 
 def _read(
@@ -265,10 +280,10 @@ def _read(
         if names[k] in source.pinned:
             part = part.take(0, axis=k)
             del names[k]
-    wanted = list(variable.dimensions(pipeline))
-    part = part.transpose([names.index(name) for name in wanted if name in names])
-    for k, name in enumerate(wanted):
+    new_names = list(variable.dimensions(pipeline))
+    part = part.transpose([names.index(name) for name in new_names if name in names])
+    for k, name in enumerate(new_names):
         if name not in names:
             part = np.expand_dims(part, k)
-    shape = [len(indices[n]) if n in indices else part.shape[k] for k, n in enumerate(wanted)]
+    shape = [len(indices[n]) if n in indices else part.shape[k] for k, n in enumerate(new_names)]
     return np.array(np.broadcast_to(part, shape))

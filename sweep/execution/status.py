@@ -1,4 +1,4 @@
-"""How far a store is: what is done, flags counted, rate, time left; also while it is written."""
+"""The status of a store: progress, counts of flags, rate, time left; also while it is written."""
 
 from __future__ import annotations
 
@@ -13,12 +13,30 @@ from sweep.store.lifecycle import open_store
 from sweep.store.lock import holder
 
 RATE_BLOCKS = 50
-"""The rate is that of this many blocks, the last to be written."""
+"""The rate is measured over this many blocks, those written last."""
 
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """A store's state; flags are counted from the receipts of its committed blocks."""
+    """A store's status, from the receipts of its committed blocks.
+
+    Attributes
+    ----------
+    store, title
+        The store's URL; the pipeline's title or name.
+    finished
+        Whether every block is committed and the store is closed.
+    writer
+        The process that holds the store's lock, None if nobody does.
+    blocks, blocks_done, poses, poses_done
+        Sizes of the grid, and how much of it is committed.
+    detection, estimate
+        Cells by flag; flags without cells are left out.
+    poses_per_s, seconds_left
+        Rate over the last blocks; time to the end if somebody writes. None if unknown.
+    crashed, failed
+        Cells whose process died and cells that raised, at most 1,000 of each.
+    """
 
     store: str
     title: str
@@ -37,12 +55,12 @@ class Status:
 
 
 def status(url: str) -> Status:
-    """Return the state of a store.
+    """Return the status of a store.
 
     Raises
     ------
     StoreError
-        Where there is none.
+        If there is no store, or it cannot be read.
     """
     store = open_store(url)
     detection: Counter[str] = Counter()
@@ -64,13 +82,13 @@ def status(url: str) -> Status:
             if len(cells[cell.kind]) < MAX_ROWS:
                 cells[cell.kind].append(cell)
     total = store.pipeline.size(Stage.scene)
-    held = holder(store.storage)
+    writer = holder(store.storage)
     rate = _rate(written)
     return Status(
         store=url,
         title=store.pipeline.title or store.pipeline.name,
         finished=store.finished,
-        writer=f"process {held.get('pid')} on {held.get('host')}" if held else None,
+        writer=f"process {writer.get('pid')} on {writer.get('host')}" if writer else None,
         blocks=len(store.blocks),
         blocks_done=done,
         poses=total,
@@ -78,13 +96,16 @@ def status(url: str) -> Status:
         detection={name: count for name, count in detection.items() if count},
         estimate={name: count for name, count in estimate.items() if count},
         poses_per_s=rate,
-        seconds_left=(total - poses) / rate if rate and held else None,
+        seconds_left=(total - poses) / rate if rate and writer else None,
         **cells,
     )
 
 
 def _rate(written: list[tuple[float, int]]) -> float | None:
-    """Return poses per second over the last blocks; None where too few are there."""
+    """Return poses per second over the last blocks, None if there are too few.
+
+    ``written`` has the time at which each block was written, in seconds, and its scenes.
+    """
     last = sorted(written)[-RATE_BLOCKS:]
     if len(last) < 2 or last[-1][0] <= last[0][0]:
         return None

@@ -1,8 +1,9 @@
-"""What accuracy costs: a finished store's treatments, with what they cost and how good they are."""
+"""The tradeoff of a finished store: what each configuration costs, and how accurate it is."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,7 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.analysis import covariance_trust, efficiency, error_statistics, renderer_bias
-from sweep.errors import StoreError
+from sweep.errors import ArgumentError, StoreError
 from sweep.isolation.interrupts import Interrupts
 from sweep.measure.estimators import build
 from sweep.measure.flags import DetectionStatus, EstimateStatus
@@ -23,81 +24,97 @@ from sweep.plan.parameters import Stage
 from sweep.store.lifecycle import open_dataset, open_store, write_group
 from sweep.store.lock import locked
 from sweep.store.provenance import differences
+from sweep.tradeoff.configuration_costs import measure
 from sweep.tradeoff.labels import configuration_label
-from sweep.tradeoff.paired_timing import (
-    PROCESS_SHARE,
-    measure,
-    measure_renderers,
-    median_interval,
-    sample_cells,
-    whole_frames_of,
-)
+from sweep.tradeoff.paired_timing import any_process_interval, median_interval
+from sweep.tradeoff.renderer_costs import measure_renderers
+from sweep.tradeoff.scene_sample import Indices, sample_scenes, whole_frames_of
+from sweep.typing import Floats
 
-Interval = tuple[Any, Any, Any]
-"""Values and the ends of their intervals, arrays of one shape."""
+Interval = tuple[Floats, Floats, Floats]
+"""Values and the low and high ends of their intervals, arrays of one shape."""
 
 REFERENCE = "exact"
-"""The renderer that others are compared with, where several are in a grid."""
+"""The renderer with which others are compared if the grid has several."""
 
 
 def measure_trade(
     url: str, per: Sequence[str] = (), limit_s: float = 60.0
 ) -> tuple[xr.Dataset, xr.Dataset | None]:
-    """Measure the trade of a finished store, and write it to its group ``cost/tradeoff``.
+    """Measure the tradeoff of a finished store, and write it to its group ``cost/tradeoff``.
 
-    A treatment is a combination of detector and estimator settings. Each has its costs, measured
-    for at most ``limit_s`` seconds (`sweep.tradeoff.paired_timing.measure`), and its accuracy in
-    the store (:func:`sweep.analysis.error_statistics`), for each combination of the
-    values of the scene axes ``per``; the first one is the baseline. Where renderers are an axis,
-    the treatments are those on ``exact`` images, and a second dataset tells what other renderers
-    change (``cost/renderers``); else that is None.
+    Each configuration, a combination of detector and estimator settings, has its costs, measured
+    here (`sweep.tradeoff.configuration_costs.measure`), and its accuracy in the store
+    (:func:`sweep.analysis.error_statistics`). The first configuration is the baseline.
+
+    Parameters
+    ----------
+    url
+        A finished store.
+    per
+        Scene axes; each combination of their values is a condition of its own.
+    limit_s
+        Time limit of the measurement in seconds.
+
+    Returns
+    -------
+    trade
+        Dimensions ``per`` and ``treatment``, the configurations by label. If renderers are an axis,
+        of ``exact`` images alone.
+    renderers
+        If renderers are an axis, what each costs, and what it changes against ``exact`` images
+        (also written, to ``cost/renderers``); else None.
 
     Raises
     ------
     StoreError
-        Where there is no finished store, or ``per`` names no axis of its scenes.
+        If there is no finished store, it has no results, or it was made with other versions.
+    ArgumentError
+        If ``per`` names no axis of the scenes, or there is no time.
     """
+    if not 0 < limit_s < math.inf:
+        raise ArgumentError("limit_s", limit_s, "expected a finite number above 0")
     store = open_store(url, "r+")
     if not store.finished:
         raise StoreError(f"{url}: unfinished; `sweep run` continues it")
     stored, results = store.pipeline, open_dataset(url)
     per = list(dict.fromkeys(per))
     _check(url, stored, results, per)
-    # What is measured here must be what was run: the same versions, the same files.
+    # The same versions and files must be measured as were run.
     pipeline = Pipeline.from_text(stored.text, name=stored.name, source=url, folder=stored.folder)
     lines = differences(pipeline, stored, store.fingerprint)
     if lines:
         raise StoreError("\n".join([f"{url}: its costs cannot be measured here:", *lines]))
-    fidelity = None
+    renderers = None
     with locked(store), Interrupts() as interrupts:
         if "renderer" in results.dims:
             names = [str(name) for name in results["renderer"].values.tolist()]
-            fidelity = _fidelity(pipeline, results, names, limit_s / 4, interrupts)
+            renderers = _renderers(pipeline, results, names, limit_s / 4, interrupts)
             pipeline = dataclasses.replace(
                 pipeline, fixed={**pipeline.fixed, "renderer": REFERENCE},
                 axes=tuple(axis for axis in pipeline.axes if axis.name != "renderer"),
             )
             results = results.sel(renderer=REFERENCE, drop=True)
         trade = _trade(pipeline, results, per, limit_s, interrupts)
-        if fidelity is not None:
-            write_group(store, "cost/renderers", fidelity)
+        if renderers is not None:
+            write_group(store, "cost/renderers", renderers)
         write_group(store, "cost/tradeoff", trade)
-    return trade, fidelity
+    return trade, renderers
 
 
 def _check(url: str, pipeline: Pipeline, results: xr.Dataset, per: Sequence[str]) -> None:
-    """Raise StoreError where a trade cannot be told apart by the axes ``per``."""
+    """Raise an error if the tradeoff cannot be measured by the axes ``per``."""
     axes = [axis.name for axis in pipeline.axes_of(Stage.scene) if axis.name != TRIAL]
     for name in per:
         if name == TRIAL:
-            raise StoreError("--per trial: trials are draws, of which the intervals speak")
+            raise ArgumentError("per", TRIAL, "trials are draws, over which the intervals are")
         if name not in axes:
             known = nearest(name, axes) or f"; there are {', '.join(axes) or 'none'}"
-            raise StoreError(f"--per {name}: no axis of the scene{known}")
+            raise ArgumentError("per", name, f"no axis of the scene{known}")
     if results["estimate"].size == 0:
         raise StoreError(f"{url}: there are no results")
     if "renderer" in per:
-        raise StoreError("--per renderer: renderers are compared with exact in any case")
+        raise ArgumentError("per", "renderer", "renderers are compared with exact in any case")
     if "renderer" in axes and REFERENCE not in results["renderer"].values.tolist():
         raise StoreError(
             f"{url}: renderers are compared with {REFERENCE}, which is not among them: "
@@ -112,7 +129,7 @@ def _trade(
     axes = [*pipeline.axes_of(Stage.detection), *pipeline.axes_of(Stage.estimation)]
     settings = [axis.name for axis in axes]
     kept = [*per, *settings]
-    found = xr.merge(
+    accuracy = xr.merge(
         [
             error_statistics(results, kept),
             efficiency(results, kept),
@@ -121,28 +138,28 @@ def _trade(
         ],
         compat="no_conflicts", join="exact",
     ).compute()
-    trade = _flattened(found, axes)
+    trade = _flattened(accuracy, axes)
     lengths = [results.sizes[name] for name in per]
-    regimes = list(np.ndindex(*lengths))
+    conditions = list(np.ndindex(*lengths))
     costs = measure(
         pipeline,
         [
-            _harmless(pipeline, results, [
-                sample_cells(pipeline, dict(zip(per, regime, strict=True)), len(regimes))
+            _without_crashed(pipeline, results, [
+                sample_scenes(pipeline, dict(zip(per, condition, strict=True)), len(conditions))
             ])[0]
-            for regime in regimes
+            for condition in conditions
         ],
         limit_s, interrupts,
     )
-    treatments = trade.sizes["treatment"]
+    configurations = trade.sizes["treatment"]
 
     def add(name: str, meaning: str, unit: str, interval: Interval) -> None:
-        shaped = [np.asarray(end).reshape(*lengths, treatments) for end in interval]
+        shaped = [np.asarray(end).reshape(*lengths, configurations) for end in interval]
         _add(trade, (*per, "treatment"), name, meaning, unit, shaped)
 
     total = costs.total
     add("cost_ms", "detection and estimation of a frame", "ms", median_interval(1e3 * total))
-    add("cost_ratio", "cost over the baseline's", "1", _of_any_process(costs.ratio))
+    add("cost_ratio", "cost over the baseline's", "1", any_process_interval(costs.ratio))
     each = np.broadcast_to(costs.detection[..., None], total.shape)
     add("detection_ms", "detection of a frame", "ms", median_interval(1e3 * each))
     add("estimation_ms", "estimation of a frame", "ms", median_interval(1e3 * costs.estimation))
@@ -160,12 +177,17 @@ def _trade(
     return trade
 
 
-def _harmless(
-    pipeline: Pipeline, results: xr.Dataset, samples: list[list[NDArray[np.intp]]]
-) -> list[list[NDArray[np.intp]]]:
-    """Return samples of cells with others in place of those that ended their process in the run.
+def _without_crashed(
+    pipeline: Pipeline, results: xr.Dataset, samples: Sequence[Sequence[Indices]]
+) -> list[list[Indices]]:
+    """Return samples with other scenes in place of those that crashed their process in the run.
 
-    Samples are paired: what goes in one goes in all.
+    Samples are paired: a scene that is replaced in one is replaced in all.
+
+    Raises
+    ------
+    StoreError
+        If all scenes crashed.
     """
     names = [axis.name for axis in pipeline.axes_of(Stage.scene)]
     dead = np.zeros(len(samples[0][0]) if names else 1, dtype=bool)
@@ -179,7 +201,7 @@ def _harmless(
             crashed = results[name].isel(at) == flag
             dead |= crashed.any([dim for dim in crashed.dims if dim != "cell"]).to_numpy()
     if dead.all():
-        raise StoreError("each scene that would be timed ended its process in the run")
+        raise StoreError("each scene that would be timed crashed its process in the run")
     alive = np.resize(np.flatnonzero(~dead), len(dead))
     rows = np.where(dead, alive, np.arange(len(dead)))
     return [[index[rows] for index in indices] for indices in samples]
@@ -198,27 +220,17 @@ def _add(
         table[name + ending] = (dims, values, {"long_name": meaning + words, "units": unit})
 
 
-def _of_any_process(ratio: NDArray[np.float64]) -> Interval:
-    """Return the median ratio of rounds (R, ...) with the interval of what any process measures.
-
-    That of the baseline is 1, whatever the process.
-    """
-    value, low, high = median_interval(ratio)
-    spare = np.where(high > low, PROCESS_SHARE * value, 0.0)
-    return value, low - spare, high + spare
-
-
-def _flattened(found: xr.Dataset, axes: Sequence[Axis]) -> xr.Dataset:
-    """Return a dataset whose dimensions of settings are one, ``treatment``, with labels."""
+def _flattened(accuracy: xr.Dataset, axes: Sequence[Axis]) -> xr.Dataset:
+    """Return a dataset with one dimension ``treatment``, by label, for the settings' axes."""
     labels = [configuration_label(chosen) for chosen in combinations(axes)]
     if not axes:
-        return found.expand_dims(treatment=labels)
-    flat = found.stack(treatment=[axis.name for axis in axes], create_index=False)
+        return accuracy.expand_dims(treatment=labels)
+    flat = accuracy.stack(treatment=[axis.name for axis in axes], create_index=False)
     return flat.assign_coords(treatment=("treatment", labels))
 
 
 def _bound(results: xr.Dataset, per: Sequence[str]) -> xr.Dataset:
-    """Return the RMS bound of rotation and range over the poses that have one."""
+    """Return the RMS bound of rotation and range over the poses with a bound."""
     bound = results["bound_std"].astype(np.float64).load()
     over = [dim for dim in bound.dims if dim not in (*per, "pose_parameter")]
     turns = bound.sel(pose_parameter=[f"rotation_{axis}" for axis in "xyz"])
@@ -240,9 +252,9 @@ def _bound(results: xr.Dataset, per: Sequence[str]) -> xr.Dataset:
 def _corner_noise_scale(
     pipeline: Pipeline, results: xr.Dataset, per: Sequence[str]
 ) -> xr.DataArray:
-    """Return what turns squared deviations under the assumed corner noise into the measured one's.
+    """Return the factor from squared deviations under the assumed to the measured corner noise.
 
-    1 for estimators that make their covariance of something else.
+    1 for estimators whose covariance does not come from the corners' noise.
     """
     error = results["corner_error_px"].astype(np.float64)
     searched = [axis.name for axis in pipeline.axes_of(Stage.detection)]
@@ -251,11 +263,11 @@ def _corner_noise_scale(
     axes = pipeline.axes_of(Stage.estimation)
     assumed = np.array(
         [
-            np.nan if one.corner_noise_px is None else one.corner_noise_px
-            for one in estimators(pipeline)
+            np.nan if setting.corner_noise_px is None else setting.corner_noise_px
+            for setting in estimators(pipeline)
         ]
     )
-    other = np.array([build(one).needs_images for one in estimators(pipeline)])
+    from_images = np.array([build(setting).needs_images for setting in estimators(pipeline)])
     shape = [len(axis) for axis in axes]
     names = [axis.name for axis in axes]
 
@@ -264,27 +276,28 @@ def _corner_noise_scale(
                             coords={name: results[name] for name in names})
 
     scale = over_estimators(assumed) ** 2 / measured
-    return scale.where(~over_estimators(other), 1.0)
+    return scale.where(~over_estimators(from_images), 1.0)
 
 
-def _fidelity(
+def _renderers(
     pipeline: Pipeline, results: xr.Dataset, names: Sequence[str], limit_s: float,
     interrupts: Interrupts,
 ) -> xr.Dataset:
-    """Return what each renderer costs, and what it changes against exact images."""
-    samples = _harmless(pipeline, results, [
-        sample_cells(pipeline, {"renderer": number}, len(names)) for number in range(len(names))
+    """Return the cost of each renderer, and what it changes against exact images."""
+    samples = _without_crashed(pipeline, results, [
+        sample_scenes(pipeline, {"renderer": number}, len(names)) for number in range(len(names))
     ])
-    at = names.index(REFERENCE)
-    seconds, errors = measure_renderers(pipeline, samples, at, limit_s, interrupts)
+    reference = names.index(REFERENCE)
+    costs = measure_renderers(pipeline, samples, reference, limit_s, interrupts)
     changed = renderer_bias(results, REFERENCE).compute()
     _add(changed, ("renderer",), "render_ms", "rendering of an image", "ms",
-         median_interval(1e3 * seconds))
+         median_interval(1e3 * costs.seconds))
     _add(changed, ("renderer",), "render_ratio", "cost over that of exact", "1",
-         _of_any_process(seconds / seconds[:, at : at + 1]))
+         any_process_interval(costs.seconds / costs.seconds[:, [reference]]))
     for name, meaning, values in (
-        ("grey_rms", "RMS difference of the marker's pixels from the exact image's", errors[0]),
-        ("grey_max", "largest difference from the exact image", errors[1]),
+        ("grey_rms", "RMS difference of the marker's pixels from the exact image's",
+         costs.grey_rms),
+        ("grey_max", "largest difference from the exact image", costs.grey_max),
     ):
         changed[name] = ("renderer", values, {"long_name": meaning, "units": "grey level"})
     changed.attrs = {"title": pipeline.title or pipeline.name, "reference": REFERENCE}

@@ -114,7 +114,7 @@ def test_block_computed_twice_is_harmless(pipeline, undisturbed, tmp_path):
 
 
 def test_xarray_opens_a_finished_store_with_labels_units_and_flags(pipeline, cluster, tmp_path):
-    dataset = sweep.run(pipeline, tmp_path / "labelled.zarr", client=cluster)
+    dataset = sweep.run(pipeline, store=tmp_path / "labelled.zarr", client=cluster)
     with xr.open_zarr(tmp_path / "labelled.zarr") as opened:
         assert opened.identical(dataset)
     assert list(dataset.detection.dims) == [

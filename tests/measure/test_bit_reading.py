@@ -155,7 +155,7 @@ def test_dips_of_dictionaries_held_back_are_where_and_whose_the_model_says(
     make = importlib.import_module("make")
     pipeline = make.HELD_BACK[number].pipeline()
     [dictionary] = pipeline.values_of("dictionary")
-    measured = make.measured(sweep.run(pipeline, tmp_path / "held_back.zarr"), dictionary)
+    measured = make.measured(sweep.run(pipeline, store=tmp_path / "held_back.zarr"), dictionary)
     pairs = list(make.pairs(make.predicted(pipeline), measured))
     make.table(["sides, px", "area, px²", "off", "IDs", "IDs that differ", "lowest rate"],
                [pair.cells(len(measured.ids)) for pair in pairs])

@@ -27,9 +27,9 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
 from sweep.report.tradeoff_table import as_json
 from sweep.store.lifecycle import create_store
+from sweep.tradeoff import configuration_costs, paired_timing, scene_sample
 from sweep.tradeoff import measurement as tradeoff
-from sweep.tradeoff import paired_timing as paired_costs
-from sweep.tradeoff.paired_timing import MIN_ROUNDS, NARROW, in_turns, median_interval
+from sweep.tradeoff.paired_timing import MIN_ROUNDS, NARROW, median_interval, time_in_turns
 
 CAMERA = """
 seed = 3
@@ -93,7 +93,7 @@ TREATMENTS = [
 def _few_scenes():
     """Measure costs on few scenes: what is told is the same, and sooner."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(paired_costs, "MAX_SCENES", 4)
+        patch.setattr(scene_sample, "MAX_SCENES", 4)
         yield
 
 
@@ -422,13 +422,13 @@ def test_ctrl_c_while_costs_are_measured_leaves_the_store_as_it_was(
     assert trade
     with xr.open_zarr(store, group="cost/tradeoff") as written:
         before = written.load()
-    monkeypatch.setattr(paired_costs, "NARROW", 0.0)
+    monkeypatch.setattr(paired_timing, "NARROW", 0.0)
 
     def interrupted(*arguments):
         threading.Timer(0.3, _thread.interrupt_main).start()
-        return in_turns(*arguments)
+        return time_in_turns(*arguments)
 
-    monkeypatch.setattr(paired_costs, "in_turns", interrupted)
+    monkeypatch.setattr(configuration_costs, "time_in_turns", interrupted)
     code, out, err = command(store, "--seconds", "20")
     assert (code, out) == (130, "")
     assert err.startswith("stopped")
@@ -462,7 +462,7 @@ class Clock:
 def clock(monkeypatch):
     one = Clock()
     fake = SimpleNamespace(thread_time=lambda: one.now, perf_counter=lambda: one.now)
-    monkeypatch.setattr(paired_costs, "time", fake)
+    monkeypatch.setattr(paired_timing, "time", fake)
     return one
 
 
@@ -472,14 +472,14 @@ def to_first(seconds):
 
 def test_rounds_end_when_every_ratio_is_known(clock):
     parts = [clock.part(k, lambda _, k=k: 1.0 + k) for k in range(3)]
-    seconds = in_turns(parts, to_first, math.inf, Interrupts())
+    seconds = time_in_turns(parts, to_first, math.inf, Interrupts())
     assert seconds.tolist() == [[1.0, 2.0, 3.0]] * MIN_ROUNDS
 
 
 def test_rounds_go_on_until_the_widest_ratio_is_narrow(clock):
     noise = np.random.default_rng(1).lognormal(0, 0.05, 2000)
     parts = [clock.part(0, lambda _: 1.0), clock.part(1, lambda call: 2.0 * noise[call])]
-    seconds = in_turns(parts, to_first, math.inf, Interrupts())
+    seconds = time_in_turns(parts, to_first, math.inf, Interrupts())
     assert MIN_ROUNDS < len(seconds) < 2000 - 1
 
     def width(count):
@@ -494,29 +494,32 @@ def test_rounds_go_on_until_the_widest_ratio_is_narrow(clock):
 def test_rounds_end_at_the_limit_but_not_before_there_are_enough(clock, limit, rounds):
     parts = [clock.part(0, lambda _: 1.0), clock.part(1, lambda call: 1.0 + 2.0 * (call % 2))]
     # Rounds of 2 and 4 s by turns, the first of which warms up: 34 rounds take 102 s.
-    assert len(in_turns(parts, to_first, limit, Interrupts())) == rounds
+    assert len(time_in_turns(parts, to_first, limit, Interrupts())) == rounds
 
 
 def test_rounds_end_at_the_most_rounds(clock, monkeypatch):
-    monkeypatch.setattr(paired_costs, "MAX_ROUNDS", 50)
+    monkeypatch.setattr(paired_timing, "MAX_ROUNDS", 50)
     parts = [clock.part(0, lambda _: 1.0), clock.part(1, lambda call: 1.0 + call % 2)]
-    assert len(in_turns(parts, to_first, math.inf, Interrupts())) == 49
+    assert len(time_in_turns(parts, to_first, math.inf, Interrupts())) == 49
 
 
 def test_a_ratio_that_does_not_exist_does_not_hold_up_the_rounds(clock):
     parts = [clock.part(k, lambda _: 1.0) for k in range(2)]
-    seconds = in_turns(parts, lambda spent: to_first(spent) * [1.0, np.nan], math.inf, Interrupts())
+    seconds = time_in_turns(
+        parts, lambda spent: to_first(spent) * [1.0, np.nan], math.inf, Interrupts()
+    )
     assert len(seconds) == MIN_ROUNDS
 
 
 def test_the_first_round_warms_up(clock):
     parts = [clock.part(k, lambda call: 100.0 if call == 0 else 1.0) for k in range(2)]
-    assert (in_turns(parts, to_first, math.inf, Interrupts()) == 1.0).all()
+    assert (time_in_turns(parts, to_first, math.inf, Interrupts()) == 1.0).all()
 
 
 def test_each_round_has_every_part_once_in_an_order_of_its_own(clock):
     count = 6
-    in_turns([clock.part(k, lambda _: 1.0) for k in range(count)], to_first, math.inf, Interrupts())
+    parts = [clock.part(k, lambda _: 1.0) for k in range(count)]
+    time_in_turns(parts, to_first, math.inf, Interrupts())
     rounds = np.reshape(clock.order, (MIN_ROUNDS + 1, count))
     assert (np.sort(rounds) == np.arange(count)).all()
     # 13 of 720 orders: that two of them are the same is no fault, that half are would be.

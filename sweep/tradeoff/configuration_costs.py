@@ -1,0 +1,169 @@
+"""The cost of each configuration: of its detection, and of its estimation, a frame.
+
+All are measured on the same images, by paired timing in one process. Frames are searched one at a
+time, as a user does. Estimators solve :data:`BATCH` detections in one call, so that the overhead of
+a call is that of a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.evaluation.estimation import detections_for
+from sweep.evaluation.opencv_threads import single_threaded
+from sweep.evaluation.search import SearchResult, search, visibility_flags, whole_frames
+from sweep.isolation.interrupts import Interrupts
+from sweep.measure.detector import Detector, Found
+from sweep.measure.estimation import Detections, PoseEstimator
+from sweep.measure.estimators import build
+from sweep.measure.flags import DetectionStatus
+from sweep.model.renderers import Grey
+from sweep.model.scene import Scenes, build_scenes
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import detector_settings, estimators, scene_values
+from sweep.tradeoff.paired_timing import time_in_turns
+from sweep.tradeoff.scene_sample import Indices
+from sweep.typing import Floats
+
+BATCH = 16
+"""Detections that an estimator gets in one call."""
+
+
+@dataclass(frozen=True, slots=True)
+class Costs:
+    """The costs of C conditions, D detector settings and E estimators in R rounds.
+
+    Attributes
+    ----------
+    detection
+        (R, C, D) seconds a frame.
+    estimation
+        (R, C, D, E) seconds a frame, those without a detection included.
+    frames
+        (C,) images that were measured.
+    """
+
+    detection: Floats
+    estimation: Floats
+    frames: NDArray[np.int64]
+
+    @property
+    def total(self) -> Floats:
+        """(R, C, D, E) seconds a frame of detection and estimation."""
+        return self.detection[..., None] + self.estimation
+
+    @property
+    def ratio(self) -> Floats:
+        """(R, C, D, E) cost over the first configuration's; NaN if no scene is visible."""
+        total = self.total
+        with np.errstate(invalid="ignore"):
+            return np.asarray(total / total[:, :, :1, :1])
+
+
+@dataclass(frozen=True, slots=True)
+class _Condition:
+    """The scenes of a condition, ready to be measured."""
+
+    scenes: Scenes
+    values: dict[str, Any]
+    searches: list[SearchResult]
+    """The result of each detector setting, with the image that it searches of each scene."""
+
+
+@single_threaded()
+def measure(
+    pipeline: Pipeline, conditions: Sequence[Sequence[Indices]], limit_s: float,
+    interrupts: Interrupts,
+) -> Costs:
+    """Measure detection and estimation of every configuration on the scenes of each condition.
+
+    Parameters
+    ----------
+    pipeline
+        The pipeline whose configurations are measured.
+    conditions
+        For each condition, the (n,) indices of its scenes along each scene axis.
+    limit_s
+        Time limit in seconds, without the preparation; at least
+        `sweep.tradeoff.paired_timing.MIN_ROUNDS` rounds are measured.
+    interrupts
+        Checked between two measurements.
+    """
+    settings, estimating = detector_settings(pipeline), estimators(pipeline)
+    prepared = []
+    for indices in conditions:
+        interrupts.check()
+        prepared.append(_prepare(pipeline, indices))
+    finders = [Detector(setting).find for setting in settings]
+    builds = [build(estimator) for estimator in estimating]
+    shape = (len(prepared), len(settings), len(builds))
+    parts: list[Callable[[], Any]] = []
+    detected_share = np.zeros(shape[:2])
+    for c, condition in enumerate(prepared):
+        sides = condition.scenes.frame.max(axis=1).tolist()
+        for d, find in enumerate(finders):
+            images = condition.searches[d].images
+            parts.append(partial(_search_all, find, images, condition.scenes, sides))
+            rows = np.flatnonzero(condition.searches[d].flags == DetectionStatus.detected)
+            detected_share[c, d] = len(rows) / len(condition.scenes)
+            for estimator, estimate in zip(estimating, builds, strict=True):
+                detections = detections_for(
+                    estimator, condition.values, condition.scenes, condition.searches[d],
+                    np.resize(rows, BATCH if len(rows) else 0),
+                )
+                parts.append(partial(_estimate_all, estimate, detections))
+    frames = np.array([len(condition.scenes) for condition in prepared])
+    visible = np.array([len(condition.searches[0].images) > 0 for condition in prepared])
+
+    def costs(seconds: Floats) -> Costs:
+        each = seconds.reshape(-1, *shape[:2], 1 + shape[2])
+        # A condition without a visible scene has no costs.
+        count = np.where(visible, frames, np.nan)[:, None]
+        estimation = each[..., 1:] / BATCH * detected_share[..., None]
+        return Costs(
+            each[..., 0] / count, np.where(visible[:, None, None], estimation, np.nan),
+            np.where(visible, frames, 0),
+        )
+
+    def ratios(seconds: Floats) -> Floats:
+        return costs(seconds).ratio
+
+    return costs(time_in_turns(parts, ratios, limit_s, interrupts))
+
+
+def _search_all(
+    find: Callable[[Grey, str, int], Found], images: Mapping[int, Grey], scenes: Scenes,
+    sides: Sequence[int],
+) -> None:
+    for row, image in images.items():
+        # If it raises, the run has flagged the pose; the attempt has a cost as well.
+        with suppress(Exception):
+            find(image, scenes.dictionary[row], sides[row])
+
+
+def _estimate_all(estimator: PoseEstimator, detections: Detections) -> None:
+    with suppress(Exception):
+        if len(detections.corners):
+            estimator(detections)
+
+
+def _prepare(pipeline: Pipeline, indices: Sequence[Indices]) -> _Condition:
+    """Render a condition's visible scenes, and search each once with each setting."""
+    count = len(indices[0]) if indices else 1
+    values = scene_values(pipeline, indices)
+    scenes = build_scenes(values, count)
+    rows = np.flatnonzero(visibility_flags(scenes) == DetectionStatus.not_run)
+    if 0 < len(rows) < count:
+        return _prepare(pipeline, [index[rows] for index in indices])
+    settings = detector_settings(pipeline)
+    wanted = np.full((count, len(settings)), len(rows) > 0)
+    full = whole_frames(values, count)
+    searches, _, _ = search(scenes, wanted, settings, full, [], keep=True)
+    return _Condition(scenes, values, searches)

@@ -1,13 +1,53 @@
-"""Which tests run, and the cluster that they share."""
+"""Which tests run and in which order, what they take, and the cluster that they share."""
+
+import resource
+from collections import defaultdict
+from pathlib import Path
 
 import pytest
 from distributed import LocalCluster
 
 pytest.register_assert_rewrite("support")
 
+SLOW = Path(__file__).parent / "slow.txt"
+"""Names the test functions that ``-m quick`` leaves out; ``--record-slow`` writes it."""
 
+QUICK_LIMIT_S = 0.5
+"""Processor time of all default cases of a test function, in seconds, from which on it is slow."""
+
+COMPILES_MOST = "measure/test_photometric.py"
+COMPILES_NOTHING = "analysis/"
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--record-slow", action="store_true",
+        help=f"write tests/{SLOW.name} from this run; run once before, so that code is compiled")
+
+
+def function_of(nodeid):
+    """Return the name of a test without its case, below tests/."""
+    return nodeid.partition("[")[0].removeprefix("tests/")
+
+
+def turn(item):
+    """Return an item's place in the order of files.
+
+    In a fresh clone one process compiles while the other runs what needs no compiled code; in
+    alphabetical order both would compile the same functions.
+    """
+    name = function_of(item.nodeid)
+    return 0 if name.startswith(COMPILES_MOST) else 1 if name.startswith(COMPILES_NOTHING) else 2
+
+
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config, items):
-    """Deselect the long tests unless the command line asks for them by marker or by name."""
+    """Mark the quick tests; deselect the long ones unless the command line asks for them."""
+    items.sort(key=turn)
+    slow = set(SLOW.read_text().splitlines())
+    for item in items:
+        if not item.get_closest_marker("long") and function_of(item.nodeid) not in slow:
+            item.add_marker("quick")
     asked = config.getoption("-m") or any("::" in argument for argument in config.args)
     if not asked:
         skipped = [item for item in items if item.get_closest_marker("long")]
@@ -15,9 +55,48 @@ def pytest_collection_modifyitems(config, items):
         config.hook.pytest_deselected(items=skipped)
 
 
+def processor_s():
+    """Return the processor time of this process and of children that it waited for, in seconds."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(part.ru_utime + part.ru_stime for part in used)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup(item):
+    item.stash["begun_s"] = processor_s()
+    return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item):
+    result = yield
+    item.user_properties.append(("processor_s", processor_s() - item.stash["begun_s"]))
+    return result
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    """Write or name the test functions that take too long to be quick."""
+    recorded, quick = config.getoption("--record-slow"), config.getoption("-m") == "quick"
+    if not (recorded or quick):
+        return
+    taken = defaultdict(float)
+    for reports in terminalreporter.stats.values():
+        for report in reports:
+            properties = dict(getattr(report, "user_properties", ()))
+            if getattr(report, "when", None) == "teardown" and "processor_s" in properties:
+                taken[function_of(report.nodeid)] += properties["processor_s"]
+    if recorded:
+        slow = sorted(name for name, seconds in taken.items() if seconds >= QUICK_LIMIT_S)
+        SLOW.write_text("".join(f"{name}\n" for name in slow))
+        terminalreporter.write_line(f"{SLOW}: {len(slow)} of {len(taken)} test functions")
+    for name, seconds in sorted(taken.items(), key=lambda entry: -entry[1]) if quick else ():
+        if seconds > 4 * QUICK_LIMIT_S:
+            terminalreporter.write_line(f"{seconds:.1f} s of processor time: {name}")
+
+
 @pytest.fixture(scope="session")
 def cluster():
-    """A cluster of two worker processes: what needs workers, but no certain ones, shares it."""
+    """A cluster of two worker processes, for tests to which it does not matter whose it is."""
     with LocalCluster(
         n_workers=2, threads_per_worker=2, host="127.0.0.1", dashboard_address="127.0.0.1:0",
         silence_logs=50,

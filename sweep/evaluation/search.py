@@ -15,8 +15,8 @@ from sweep.measure.detector import (
     NOISE_MARGIN_PX,
     UNEVEN_LIGHT_CONSTANT,
     Detector,
+    DetectorOutput,
     DetectorSetting,
-    Found,
     full_frame_reason,
     margin_px,
     windows,
@@ -212,8 +212,8 @@ def search(
 class _Pass:
     """The search with one setting: its candidates by row, and the rows for which it raised."""
 
-    find: Callable[[Grey, str, int], Found]
-    candidates: list[tuple[int, *Found]] = field(default_factory=list)
+    find: Callable[[Grey, str, int], DetectorOutput]
+    candidates: list[tuple[int, *DetectorOutput]] = field(default_factory=list)
     images: dict[int, Grey] = field(default_factory=dict)
     failed: list[int] = field(default_factory=list)
     seconds: float = 0.0

@@ -1,1 +1,1 @@
-"""What is under test: detectors, solvers, error metrics. Nothing here knows of the grid."""
+"""Under test: detectors, solvers, errors, bound, flags; without the grid of the experiment."""

@@ -1,4 +1,4 @@
-"""How far an estimated pose is from the truth."""
+"""Errors of estimated poses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sweep.typing import Floats
 
 @dataclass(frozen=True, slots=True)
 class PoseError:
-    """Errors of N poses, estimated against true, in the camera frame; NaN where not solved."""
+    """Errors of N poses, estimated against true, in the camera frame; NaN if not solved."""
 
     translation_m: Floats
     """(N, 3)"""

@@ -1,7 +1,7 @@
-"""How the detector reads the bits of an upright frontal marker: three roundings and a majority.
+"""The detector's reading of the bits of an upright frontal marker: three roundings, a majority.
 
-Where modules are a few pixels wide, whether a marker is found depends on how the grids of modules,
-pixels and samples fall on each other. No image is needed to tell:
+If modules are a few pixels wide, detection depends on how the grids of modules, pixels and samples
+fall on each other. It can be computed without an image (a cell is a module as OpenCV samples it):
 
 1. *Pixels.* A pixel has the colour of the module that its centre lies in.
 2. *Corners.* Bits are read in a quadrilateral with whole-pixel corners: the first and the last
@@ -9,11 +9,11 @@ pixels and samples fall on each other. No image is needed to tell:
 3. *Samples.* The quadrilateral is mapped to p samples a cell by nearest neighbour: sample k of
    n·p reads pixel round(k·W / (n·p - 1)) after the first, where W is the number of pixels from
    the first to the last. That depends on the whole number W alone; the modules' edges do not.
-4. *Majority.* A bit is wrong where more than 49 % of its samples have the other colour, so half
-   is wrong for black and for white. More wrong bits than are corrected lose the marker.
+4. *Majority.* A bit is wrong if more than 49 % of its samples have the other colour, so half is
+   wrong for black and for white. More wrong bits than are corrected lose the marker.
 
 Left out: grey pixels on edges, corners that a threshold cuts off, and the further quadrilaterals
-of the square that the detector tries where the first cannot be read (see :data:`STAYS_LOST`).
+of the square that the detector tries if the first cannot be read (see :data:`STAYS_LOST`).
 
 Sources: OpenCV 5, modules/objdetect/src/aruco/aruco_detector.cpp (_extractCellPixelRatio,
 _getBorderErrors, _findMarkerContours) and aruco_dictionary.cpp (Dictionary::identify).
@@ -32,28 +32,28 @@ from sweep.model.marker import opencv_dictionary
 from sweep.typing import Floats
 
 STAYS_LOST = 0.4
-"""Share of what the first quadrilateral loses that further ones do not find: the one fitted number,
-to DICT_5X5_50 with the renderer ``warp``, a black surround and the default settings."""
+"""Share of the first quadrilateral's losses that further ones do not recover: the only fitted
+number, to DICT_5X5_50 with the renderer ``warp``, a black surround and the default settings."""
 
 Bits = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """How bits are read and judged."""
+    """The detector's settings for reading bits."""
 
     cell_px: int
     """Samples along a cell, p."""
     margin_px: int
-    """Samples at each side of a cell that are not looked at."""
+    """Samples at each side of a cell that are ignored."""
     valid_share: float
-    """A cell is wrong where more than this share of it is of the other colour."""
+    """A cell is wrong if more than this share of it has the other colour."""
     corrected_bits: int
-    """Most wrong bits of a marker that is found."""
+    """Largest number of wrong bits of a detected marker."""
     border_errors: int
-    """Most wrong cells of its border."""
+    """Largest number of wrong cells of its border."""
     outline_px: int
-    """Fewest pixels on the outline of a candidate."""
+    """Smallest number of pixels on the outline of a candidate."""
 
 
 def reading_of(
@@ -75,7 +75,7 @@ def reading_of(
 def cell_mixing(
     side_px: float, modules: int, edges_px: Floats, reading: Reading
 ) -> tuple[Floats, Floats]:
-    """Return what the cells along one axis read of the modules along it, and the span.
+    """Return the shares of the modules that the cells along one axis read, and the span.
 
     Parameters
     ----------
@@ -84,13 +84,13 @@ def cell_mixing(
     modules
         n, along that side, border included.
     edges_px
-        (K,): where the square begins, from the centre of the first pixel inside: in (-1, 0].
+        (K,): the square's edge relative to the centre of the first pixel inside, in (-1, 0].
 
     Returns
     -------
     mixing
-        (K, n, n): of each cell (row) the share of its samples on each module. What the cells of
-        an image read is separable: C_y · bits · C_xᵀ.
+        (K, n, n): of each cell (row) the share of its samples on each module. The reading of an
+        image is separable: C_y · bits · C_xᵀ.
     span_px
         (K,): pixels from the first to the last of the square, W.
     """
@@ -104,12 +104,12 @@ def cell_mixing(
 
 
 def wrong_cells(bits: Bits, along_y: Floats, along_x: Floats, reading: Reading) -> Bits:
-    """Tell which cells are misread: (Y, X, n, n).
+    """Return which cells are misread: (Y, X, n, n).
 
     Parameters
     ----------
     bits
-        (n, n): the black square's modules with their border, True where white.
+        (n, n): the black square's modules with their border, True for white.
     along_y, along_x
         (Y, n, n) and (X, n, n): the mixing along each axis (see :func:`cell_mixing`).
     """
@@ -122,7 +122,7 @@ def predicted_rate(
     bits: Bits, side_px: float, reading: Reading, offsets: int = 200,
     stays_lost: float = STAYS_LOST,
 ) -> float:
-    """Return the share of sub-pixel positions at which an upright frontal marker is found.
+    """Return the share of sub-pixel positions at which an upright frontal marker is detected.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def predicted_rate(
     offsets
         Sub-pixel offsets along each axis, spread evenly over a pixel.
     stays_lost
-        Share of the first quadrilateral's losses that stay lost; 1 where it is the only one.
+        Share of the first quadrilateral's losses that stay lost; 1 if it is the only one.
     """
     mixing, span, share = _along(side_px, len(bits), reading, offsets)
     wrong = wrong_cells(bits, mixing, mixing, reading)
@@ -155,11 +155,11 @@ def _along(
 
 
 def lone_cells(bits: Bits) -> int:
-    """Return the most lone cells in the middle column or in the middle row.
+    """Return the larger number of lone cells in the middle column and in the middle row.
 
-    A cell is lone where both of its neighbours across the column (row) have the other colour. At
+    A cell is lone if both of its neighbours across the column (row) have the other colour. At
     4 samples a cell, W odd above 2(4n - 1)/3 and a side below 3n px, the middle cell reads half
-    of its samples from these two. 0 where n is even: there is no middle.
+    of its samples from these two. 0 if n is even: there is no middle.
     """
     if len(bits) % 2 == 0:
         return 0

@@ -1,4 +1,4 @@
-"""OpenCV's ArUco detector, on a window of the frame as on the whole of it."""
+"""OpenCV's ArUco detector, with equal results on a window and on the whole frame."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class DetectorSetting:
         1, "width of the border that the detector expects", unit="module", low=1, high=10
     )
     perspectiveRemovePixelPerCell: int = parameter(
-        4, "pixels that a module is sampled with", unit="px", low=1, high=1000
+        4, "samples along a side of a module", unit="px", low=1, high=1000
     )
     perspectiveRemoveIgnoredMarginPerCell: float = parameter(
         0.13, "margin of a module that is not sampled, relative to the module", low=0, high=0.499
@@ -110,7 +110,7 @@ class DetectorSetting:
         5, "apriltag: smallest cluster of edge pixels", unit="px", low=0, high=10**6
     )
     aprilTagMaxNmaxima: int = parameter(
-        10, "apriltag: corner candidates looked at in a cluster", low=1, high=1000
+        10, "apriltag: most corner candidates of a cluster", low=1, high=1000
     )
     aprilTagCriticalRad: float = parameter(
         0.1745329201221466, "apriltag: edges closer than this to straight or to reversal make no "
@@ -123,10 +123,10 @@ class DetectorSetting:
         5, "apriltag: smallest contrast of a tile", unit="grey level", low=0, high=255
     )
     aprilTagDeglitch: int = parameter(
-        0, "apriltag: clean up the threshold; only 0, for with 1 OpenCV's result depends on what "
-        "was searched before (5-7 of 150 images, in 4.14 and 5.0)", low=0, high=0,
+        0, "apriltag: clean up the threshold; only 0: with 1 OpenCV's result depends on the "
+        "images searched before (5-7 of 150 images, in 4.14 and 5.0)", low=0, high=0,
     )
-    detectInvertedMarker: bool = parameter(False, "also look for white-on-black markers")
+    detectInvertedMarker: bool = parameter(False, "also search for white-on-black markers")
     useAruco3Detection: bool = parameter(
         False, "the faster search of ArUco 3 (always on the full frame)"
     )
@@ -155,7 +155,7 @@ MIN_WINDOW_PX = 8
 
 
 def full_frame_reason(setting: DetectorSetting) -> str | None:
-    """Return why a setting cannot search a window in place of the frame; None where it can."""
+    """Return why a setting must search the whole frame; None if it can search a window."""
     if setting.useAruco3Detection:
         return "useAruco3Detection scales the image by the frame's size"
     if setting.cornerRefinementMethod == "apriltag" and setting.aprilTagQuadDecimate > 1:
@@ -166,12 +166,12 @@ def full_frame_reason(setting: DetectorSetting) -> str | None:
 
 
 def margin_px(setting: DetectorSetting) -> int:
-    """Return how many pixels around the marker can change what the setting finds.
+    """Return the width of the border around the marker whose pixels can change the detection.
 
     Half the largest threshold window and the border in which no corner may lie, plus the
-    contour's own pixel and one to spare; the reach of the sub-pixel refinement and of the
-    apriltag search's tiles and blur where they are in use (measured: 2 of 1,500 searches differed
-    at 24 px, none from 32). With OpenCV's defaults: 16.
+    contour's own pixel and one to spare; at least the reach of the sub-pixel refinement and of the
+    apriltag search's tiles and blur, if they are used (measured: 2 of 1,500 searches differed at
+    24 px, none from 32). With OpenCV's defaults: 16.
     """
     margin = setting.adaptiveThreshWinSizeMax // 2 + setting.minDistanceToBorder + 2
     if setting.cornerRefinementMethod == "subpix":
@@ -182,7 +182,7 @@ def margin_px(setting: DetectorSetting) -> int:
 
 
 NOISE_MARGIN_PX = 32
-"""Added where there is noise, whose candidates around the marker reach into one another.
+"""Added to the margin if there is noise: its candidates around the marker affect one another.
 
 Of 3,600 searches with noise of 1 to 32 grey levels 102 flags differed from the full frame's
 without it, 3 with 16 px, none from 32.
@@ -191,7 +191,7 @@ without it, 3 with 16 px, none from 32.
 
 UNEVEN_LIGHT_CONSTANT = 7.0
 """The adaptive threshold's constant below which uneven light (at gain 1) is searched on whole
-frames: on a slope the window's border, replicated, makes candidates of the background. With
+frames: on a slope the replicated border of a window makes candidates of the background. With
 gradients to 2 of frames from 96 px wide no flag differed at 7, of 400 up to 17 at 1.5."""
 
 
@@ -202,8 +202,8 @@ def windows(
 
     ``margin`` (N, 1) in pixels.
 
-    Never below 8 px a side where the frame allows it; a window reaches the frame's edge where
-    the margin does, exactly, since what lies beyond must not be seen.
+    A side is at least 8 px if the frame allows it. A window reaches the frame's edge exactly if
+    the margin does, since nothing lies beyond.
     """
     start = (boxes[:, :2] - margin) // ALIGNMENT_PX * ALIGNMENT_PX
     stop = -((-boxes[:, 2:] - margin) // ALIGNMENT_PX) * ALIGNMENT_PX
@@ -218,18 +218,18 @@ def windows(
     return np.concatenate([start, stop - over], axis=1)
 
 
-Found = tuple[
+DetectorOutput = tuple[
     Sequence[NDArray[np.float32]], NDArray[np.int32] | None, Sequence[NDArray[np.float32]]
 ]
-"""Corners (1, 4, 2) each of n markers that were decoded; their IDs, (n,) in OpenCV 5 and (n, 1)
-in 4, None where n is 0; and corners of what was rejected."""
+"""Corners (1, 4, 2) each of n decoded markers; their IDs, (n,) in OpenCV 5 and (n, 1) in 4, None if
+n is 0; and corners of the rejected candidates."""
 
 
-SearchFunction = Callable[[NDArray[np.uint8]], Found]
+SearchFunction = Callable[[NDArray[np.uint8]], DetectorOutput]
 
 
 class Detector:
-    """One detector setting in this process; OpenCV's objects do not travel between processes."""
+    """One detector setting in this process; OpenCV's objects cannot be pickled."""
 
     def __init__(self, setting: DetectorSetting) -> None:
         self._setting = setting
@@ -244,16 +244,16 @@ class Detector:
             setattr(self._parameters, field.name, value)
         self._searches: dict[tuple[str, int, int], SearchFunction] = {}
 
-    def find(self, image: NDArray[np.uint8], dictionary: str, frame_side: int) -> Found:
+    def find(self, image: NDArray[np.uint8], dictionary: str, frame_side: int) -> DetectorOutput:
         """Search an image (h, w): a window of a frame whose larger side is ``frame_side``."""
         key = dictionary, max(image.shape), frame_side
         return (self._searches.get(key) or self._search(*key))(image)
 
     def _search(self, dictionary: str, side: int, frame_side: int) -> SearchFunction:
-        """Return OpenCV's search for images whose larger side is ``side``; one a size is kept.
+        """Return OpenCV's search for images of larger side ``side``; one for each size is kept.
 
         The perimeter limits, which OpenCV takes relative to the image that it is given and turns
-        into whole pixels, are passed so that they come to the same number as on the frame.
+        into whole pixels, are passed so that they give the same numbers as on the frame.
         """
         low, high = self._setting.minMarkerPerimeterRate, self._setting.maxMarkerPerimeterRate
         if side != frame_side:
@@ -262,7 +262,7 @@ class Detector:
         parameters = self._parameters
         parameters.minMarkerPerimeterRate, parameters.maxMarkerPerimeterRate = low, high
         detector = cv2.aruco.ArucoDetector(opencv_dictionary(dictionary), parameters)
-        # OpenCV's stubs know neither the element types nor that there may be no ids.
+        # OpenCV's stubs have neither the element types nor that the IDs may be None.
         search = cast("SearchFunction", detector.detectMarkers)
         self._searches[dictionary, side, frame_side] = search
         return search

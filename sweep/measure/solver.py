@@ -1,4 +1,4 @@
-"""Pose from four corners: OpenCV's solvers, guarded or as users call them."""
+"""Pose from four corners: OpenCV's solvers, guarded or as plain calls."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def both_planar_solutions(
 def _plain(
     corners: Floats, cameras: Cameras, size_m: Floats, method: int
 ) -> tuple[Floats, Floats]:
-    """Call ``cv2.solvePnP`` as users do: marker frame, metres, OpenCV's own lens inverse."""
+    """Call ``cv2.solvePnP`` plainly: marker frame, metres, OpenCV's own lens inverse."""
     count = len(corners)
     rvec, translation = np.full((count, 2, 3), np.nan), np.full((count, 2, 3), np.nan)
     objects = marker_corners(size_m)
@@ -190,13 +190,13 @@ def _plain(
     return rotation_of_vector(rvec), translation
 
 
-# The guard. IPPE divides by sin(pi) where the rotation vector's norm is pi, which in the marker
+# The guard. IPPE divides by sin(pi) if the rotation vector's norm is pi, which in the marker
 # frame (z out) is every upright marker tilted about one image axis; and it is not finite for a
 # few poses on the optical axis in any frame. SQPNP's tolerances are absolute lengths. On 14,832
 # noise-free poses the plain calls of ippe, ippe_square and sqpnp were wrong for 2,441, 2,431 and
 # 572 of them (`pytest -m long -k guard -s` counts again). OpenCV inverts a lens in about five
 # steps, converged or not: of 990 poses to 40° off the axis 36 to 45 % came out wrong by more than
-# 0.01° (tests/test_guards.py), so corners are undistorted before.
+# 0.01° (tests/measure/test_guards.py), so corners are undistorted before.
 
 _UNIT_SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 """Corners BL, BR, TR, TL (IPPE_SQUARE's order) in the marker's frame turned z in."""
@@ -214,7 +214,7 @@ _CREDIBLE_RATIO = 2.0
 def _guarded(
     corners: Floats, cameras: Cameras, size_m: Floats, method: int
 ) -> tuple[Floats, Floats]:
-    """Solve where the solver is stable: undistorted corners, unit side, z in, roll within 45°.
+    """Solve in a stable frame: undistorted corners, unit side, z in, roll within 45°.
 
     Returns both solutions' rotations (N, 2, 3, 3) and translations (N, 2, 3), NaN if missing.
     """

@@ -1,1 +1,1 @@
-"""What is simulated: camera, marker, pose, renderers. Nothing here knows of detectors."""
+"""The simulation: camera, lens, marker, pose, renderers, effects, sensor; without detectors."""

@@ -1,4 +1,4 @@
-"""The camera: pinhole intrinsics and a lens, and where points in space fall in the image."""
+"""The camera: pinhole intrinsics, a lens, and the projection of points in space."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Camera:
         4.0, "focal length of the lens", unit="mm", low=1e-6, high=1e6
     )
     fx_px: float | None = parameter(
-        None, "focal length along x; stands in place of the three in mm", unit="px", low=1e-3,
+        None, "focal length along x; replaces the three parameters in mm", unit="px", low=1e-3,
         high=1e9,
     )
     fy_px: float | None = parameter(
@@ -82,7 +82,7 @@ def intrinsics(
 class Cameras:
     """N cameras as arrays: ``view`` (N, 4) fx, fy, cx, cy in px; packed ``lenses`` (N, 24).
 
-    ``distorted`` (N,) tells which of them have a lens at all; no lens code runs for the others.
+    ``distorted`` (N,) says which have a lens model; no lens code runs for the others.
     """
 
     view: NDArray[np.float64]
@@ -105,14 +105,14 @@ class Cameras:
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the pixels (N, M, 2) of points (N, M, 3) in metres in the camera frame.
 
-        Points with z <= 0 have no image: NaN.
+        NaN for points with z <= 0.
         """
         return _project(np.ascontiguousarray(points), self.view, self.lenses, self.distorted)
 
     def normalise(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return undistorted normalised coordinates (N, M, 2) of pixels (N, M, 2).
 
-        NaN where the lens has no inverse.
+        NaN if the lens has no inverse at a pixel.
         """
         flat = np.asarray((pixels - self.view[:, None, 2:]) / self.view[:, None, :2])
         if self.distorted.any():

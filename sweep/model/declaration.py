@@ -10,7 +10,7 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Declaration:
-    """What is said of a parameter where it is declared.
+    """The declaration of a parameter: meaning, unit, allowed values.
 
     ``low`` and ``high`` are inclusive unless ``open_low`` excludes the lower end. ``drawable``
     parameters may be drawn from a distribution per trial.
@@ -38,12 +38,12 @@ class Declaration:
         return ""
 
     def admits(self, number: float) -> bool:
-        """Tell whether a finite number lies in the declared range."""
+        """Return whether a finite number lies in the declared range."""
         above = number > self.low if self.open_low else number >= self.low
         return above and number <= self.high and abs(number) < 1e300
 
 
 def parameter(default: Any, meaning: str, **declared: Any) -> Any:
-    """Return a dataclass field that carries its :class:`Declaration` (keywords as there)."""
+    """Return a dataclass field that carries its :class:`Declaration` (keywords as its fields)."""
     declaration = Declaration(meaning, **declared)
     return dataclasses.field(default=default, metadata={"declaration": declaration})

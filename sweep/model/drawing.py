@@ -37,7 +37,7 @@ class Canvas(NamedTuple):
     images
         The pixels of all windows in one vector.
     starts
-        (n,) where each window's pixels begin in ``images``.
+        (n,) index of each window's first pixel in ``images``.
     windows, boxes
         (n, 4) left, top, right, bottom of the windows and of the pixels that the markers may
         touch.
@@ -58,9 +58,9 @@ class DrawnScenes(NamedTuple):
     Attributes
     ----------
     edges, spans
-        The edges of all markers, and (K, 2) where each marker's begin and end.
+        The edges of all markers, and (K, 2) the first and past-the-end row of each marker's.
     marker
-        (N,) which marker a scene has.
+        (N,) index of each scene's marker.
     levels, plane, intrinsics, lenses, distorted
         (N, 3), (N, 3, 3), (N, 4), (N, 24), (N,), of each scene as
         :func:`sweep.model.coverage.accumulate` takes them.

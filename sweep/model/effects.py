@@ -1,7 +1,7 @@
-"""What a camera and its surroundings do to the ideal image: one record an effect.
+"""The effects of camera and surroundings on the ideal image: one record for each.
 
-An effect is absent, at no cost, unless its switch has another value than its neutral one. All that
-is known of an effect stands in its record in :data:`EFFECTS`; parameters of pipeline files, their
+An effect is absent, at no cost, unless its switch has another value than its neutral one. Its
+record in :data:`EFFECTS` is the only place that declares it; parameters of pipeline files, their
 checks, the list of active parts, random draws, the bound and the windows follow from it.
 """
 
@@ -71,10 +71,10 @@ class Effect:
     label
         Its name in ``sweep plan`` and in tables.
     step
-        Where it acts in the image chain. "edges": on the marker's edges, before pixels (only the
-        renderer ``exact`` has these effects); "light": on the levels of light that falls on the
-        pixels; "signal": on the pixels' signal, with its noise and gain, before quantisation;
-        "readout": on quantisation.
+        The step of the image chain on which it acts. "edges": on the marker's edges, before
+        pixels (only the renderer ``exact`` has these effects); "light": on the levels of light
+        that falls on the pixels; "signal": on the pixels' signal, with its noise and gain, before
+        quantisation; "readout": on quantisation.
     parameters
         Its parameters by name, as :func:`sweep.model.declaration.parameter` declares them. The
         first is its switch: the effect is active if that has another value than its default.

@@ -1,4 +1,4 @@
-"""Where in the image the markers of scenes are, and whether they can be seen at all."""
+"""The extent of the markers in the image, their areas, and whether they are visible."""
 
 from __future__ import annotations
 
@@ -43,23 +43,23 @@ def _outline(scenes: Scenes, rows: NDArray[np.intp], quiet: bool, per_side: int)
 
 
 CHORDS_PER_SIDE = 32
-"""Points at which a bent outline is looked at for its extent: its bulge between them is less
-than 1/1000 of the side's, well inside the 2 px that :func:`marker_boxes` adds under a lens."""
+"""Points of a side at which a curved outline is sampled for its extent: between them it bulges by
+less than 1/1000 of the side's bulge, well inside the 2 px that :func:`marker_boxes` adds."""
 
 
 def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
     """Return the boxes (N, 4) left, top, right, bottom (half-open) of pixels a marker may touch.
 
-    Clipped at the frame; empty (all zero) where nothing of the marker is in it.
+    Clipped at the frame; empty (all zero) if no part of the marker is in it.
     """
     low, high = scenes.outline_px.min(axis=1), scenes.outline_px.max(axis=1)
-    bent = np.flatnonzero(scenes.cameras.distorted & np.isfinite(low).all(axis=1))
-    if len(bent):
-        points = _outline(scenes, bent, quiet=True, per_side=CHORDS_PER_SIDE)
-        low[bent], high[bent] = points.min(axis=1) - 2, points.max(axis=1) + 2
-    warped = np.flatnonzero([name == "warp" for name in scenes.renderer])
-    if len(warped):
-        low[warped], high[warped] = _warp_extent(scenes, warped)
+    curved = np.flatnonzero(scenes.cameras.distorted & np.isfinite(low).all(axis=1))
+    if len(curved):
+        points = _outline(scenes, curved, quiet=True, per_side=CHORDS_PER_SIDE)
+        low[curved], high[curved] = points.min(axis=1) - 2, points.max(axis=1) + 2
+    warp_rows = np.flatnonzero([name == "warp" for name in scenes.renderer])
+    if len(warp_rows):
+        low[warp_rows], high[warp_rows] = _warp_extent(scenes, warp_rows)
     for row in np.flatnonzero(scenes.affected & np.isfinite(low).all(axis=1)).tolist():
         low[row], high[row] = _exposed_extent(scenes, row, low[row], high[row])
     limit = scenes.frame.astype(np.float64)
@@ -74,9 +74,9 @@ def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
 def _warp_extent(scenes: Scenes, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
     """Return the least and greatest pixels (n, 2) that the ``warp`` renderer may touch.
 
-    It maps bitmap to image by the homography of the black square's corners, bent ones under a
-    lens, so its quiet zone ends elsewhere than the marker's. Interpolation spreads it by half a
-    pixel of the bitmap. Where the homography's horizon crosses it, it reaches everywhere.
+    It maps bitmap to image by the homography of the black square's corners, distorted by the lens,
+    so that its quiet zone ends elsewhere than the marker's. Interpolation spreads it by half a
+    pixel of the bitmap. If the homography's horizon crosses it, it may touch every pixel.
     """
     low, high = np.full((len(rows), 2), np.nan), np.full((len(rows), 2), np.nan)
     for i, row in enumerate(rows.tolist()):
@@ -98,14 +98,14 @@ def _warp_extent(scenes: Scenes, rows: NDArray[np.intp]) -> tuple[Floats, Floats
 
 
 MIN_INSTANTS, MAX_INSTANTS = 65, 8193
-"""Instants at which a moving marker is looked at for its extent; a step is added all around."""
+"""Instants at which a moving marker's extent is computed; a step is added on all sides."""
 
 _COARSE_TURN = math.pi / 8
-"""Turn between two instants from which a marker may be anywhere around its centre between them."""
+"""Turn between two instants above which the marker may point anywhere between them."""
 
 
 def outline_modules(scenes: Scenes, row: int) -> Floats:
-    """Return points (M, 2) of a marker's outline in modules: its corners, or more where bent."""
+    """Return points (M, 2) of a marker's outline in modules: its corners, or more under a lens."""
     quiet = scenes.quiet_zone[row : row + 1]
     per_side = CHORDS_PER_SIDE if scenes.cameras.distorted[row] else 1
     return np.asarray(_square(-quiet, scenes.modules[row : row + 1] + quiet, per_side)[0])
@@ -124,8 +124,8 @@ def _exposed_extent(
 ) -> tuple[Floats, Floats]:
     """Return the extent, from ``low`` to ``high`` (2,) at rest, under motion and blur.
 
-    NaN where the image has no meaning while rows that see it are exposed. A marker is seen at an
-    instant by those rows that it is on and that are exposed then.
+    NaN if the image has no meaning while rows that see the marker are exposed. At an instant a
+    marker is seen by those rows that it covers and that are exposed then.
     """
     motion = scenes.motion(row)
     reach = _largest_spread_px(scenes, row) * REACH
@@ -199,7 +199,7 @@ def corner_depths(scenes: Scenes, row: int) -> Floats:
 
 
 def path_px(scenes: Scenes, row: int, box: Box) -> float:
-    """Return at most how far a corner of a moving marker travels while a row is exposed."""
+    """Return the longest path of a moving marker's corner, in px, while a row is exposed."""
     motion = scenes.motion(row)
     if motion is None or motion[0] == 0.0:
         return 0.0
@@ -222,12 +222,12 @@ def path_px(scenes: Scenes, row: int, box: Box) -> float:
 
 
 def areas_px(scenes: Scenes) -> Floats:
-    """Return the projected black square's area (N,) in px², bent edges followed."""
+    """Return the projected black square's area (N,) in px², along its curved edges."""
     points = scenes.corners_px
     area = _shoelace(points)
-    bent = np.flatnonzero(scenes.cameras.distorted & np.isfinite(area))
-    if len(bent):
-        area[bent] = _shoelace(_outline(scenes, bent, quiet=False, per_side=256))
+    curved = np.flatnonzero(scenes.cameras.distorted & np.isfinite(area))
+    if len(curved):
+        area[curved] = _shoelace(_outline(scenes, curved, quiet=False, per_side=256))
     return np.abs(area)
 
 
@@ -241,13 +241,13 @@ def _shoelace(points: Floats) -> Floats:
 
 
 EDGE_ON = 1e-12
-"""Sine of the angle to the line of sight at which a marker is seen edge on."""
+"""Sine of the angle to the line of sight below which a marker is seen edge on."""
 
 
 def hidden(scenes: Scenes) -> NDArray[np.bool_]:
-    """Tell (N,) where a marker is seen from behind or edge on, or has a corner at z <= 0.
+    """Return (N,) whether a marker is seen from behind or edge on, or has a corner at z <= 0.
 
-    The quiet zone's corners count, for the marker is drawn with it.
+    The quiet zone's corners count, since the marker is drawn with it.
     """
     towards = np.sum(scenes.rotation[:, :, 2] * scenes.translation, axis=1)
     # A tilt of 90° is not quite one in double precision.
@@ -256,7 +256,7 @@ def hidden(scenes: Scenes) -> NDArray[np.bool_]:
 
 
 def outside_frame(scenes: Scenes, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Tell (n,) for scenes ``rows`` (n,) where the black square lies wholly outside the frame."""
+    """Return (n,) whether the black square of scenes ``rows`` lies wholly outside the frame."""
     corners, limit = scenes.corners_px[rows], scenes.frame[rows] - 0.5
     outside = np.zeros(len(rows), dtype=bool)
     cut = ((corners < -0.5) | (corners > limit[:, None])).any(axis=(1, 2))
@@ -269,7 +269,7 @@ def outside_frame(scenes: Scenes, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
 
 
 def _meets_frame(polygon: Floats, limit: Floats) -> bool:
-    """Tell whether a polygon (M, 2) has a part of positive area in [-0.5, limit]."""
+    """Return whether a polygon (M, 2) has a part of positive area in [-0.5, limit]."""
     for axis in (0, 1):
         for sign, bound in ((1.0, -0.5), (-1.0, -limit[axis])):
             polygon = _half_plane(polygon, sign * polygon[:, axis] - bound)
@@ -279,7 +279,10 @@ def _meets_frame(polygon: Floats, limit: Floats) -> bool:
 
 
 def _half_plane(polygon: Floats, inside: Floats) -> Floats:
-    """Clip a polygon (M, 2) to where the linear function ``inside`` (M,) is not negative."""
+    """Clip a polygon (M, 2) to the half plane in which a linear function is not negative.
+
+    ``inside`` (M,) are the function's values at the polygon's points.
+    """
     kept = []
     for i in range(len(polygon)):
         j = (i + 1) % len(polygon)
@@ -292,10 +295,10 @@ def _half_plane(polygon: Floats, inside: Floats) -> Floats:
 
 
 def not_modelled(scenes: Scenes) -> NDArray[np.bool_]:
-    """Tell (N,) where the image has no meaning.
+    """Return (N,) whether the image has no meaning.
 
-    The lens model folds on the marker, or does so while it moves in the exposure, or the marker
-    comes behind the camera in it or shows its back.
+    That is so if the lens model folds on the marker, or if during the exposure it does so, or the
+    marker comes behind the camera or shows its back.
     """
     folded = np.zeros(len(scenes), dtype=bool)
     for row in np.flatnonzero(scenes.affected).tolist():

@@ -1,4 +1,4 @@
-"""Image files that a pipeline names: their size is read and judged before they are decoded."""
+"""Image files named by a pipeline: their size is read and checked before they are decoded."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_PIXELS = 500_000_000
-"""The largest image that is read; also the largest frame that is rendered whole."""
+"""Size of the largest image that is read, and of the largest frame that is rendered whole."""
 
 HEADER_BYTES = 1_000_000
-"""How much of a file is looked through for the image's size."""
+"""Length of the part of a file that is searched for the image's size."""
 
 BYTES_PER_PIXEL = 8
-"""The most that a pixel takes in a file, beside the header: four channels of 16 bits."""
+"""Largest size of a pixel in a file, beside the header: four channels of 16 bits."""
 
 MAX_PATH_LENGTH = 4096
 
 JPEG = b"\xff\xd8\xff"
-"""How such a file begins."""
+"""First bytes of a JPEG file."""
 
 _BLANK = rb"(?:[ \t\r\n]|#[^\r\n]*+[\r\n])++"
 _PORTABLE = re.compile(rb"P[1-6]" + _BLANK + rb"([0-9]{1,9})" + _BLANK + rb"([0-9]{1,9})[\s#]")
@@ -36,7 +36,7 @@ def read_regular(path: str | Path, most: int) -> bytes:
     Raises
     ------
     OSError, ValueError
-        Where there is no such file, it cannot be read, or is no regular file.
+        If the file does not exist, cannot be read, or is not a regular file.
     """
     if len(str(path)) > MAX_PATH_LENGTH:
         raise ValueError("File name too long")
@@ -49,7 +49,7 @@ def read_regular(path: str | Path, most: int) -> bytes:
 def image_size(path: str) -> tuple[int, int]:
     """Return width and height of an image file, from its header.
 
-    ValueError where it is no PNG, JPEG, BMP or PGM (PPM, PBM) image, or too large to be read.
+    Raises ValueError if it is not a PNG, JPEG, BMP or PGM (PPM, PBM) image, or too large.
     """
     try:
         size = _size(read_regular(path, HEADER_BYTES - 1))
@@ -67,7 +67,7 @@ def image_size(path: str) -> tuple[int, int]:
 
 
 def read_image(path: str) -> bytes:
-    """Return an image file as it is, encoded; ValueError as :func:`image_size`."""
+    """Return an encoded image file; raises ValueError as :func:`image_size`."""
     width, height = image_size(path)
     try:
         return read_regular(path, BYTES_PER_PIXEL * width * height + HEADER_BYTES)
@@ -76,13 +76,13 @@ def read_image(path: str) -> bytes:
 
 
 def decode_grey(path: str) -> NDArray[np.uint8]:
-    """Return an image file as grey levels (height, width); ValueError as :func:`image_size`."""
+    """Return an image file as grey levels (height, width); raises as :func:`image_size`."""
     size = image_size(path)
     encoded = read_image(path)
-    with tempfile.TemporaryFile() as said:
-        # What the decoders write to standard error by themselves would stand beside our one line.
+    with tempfile.TemporaryFile() as printed:
+        # The decoders print to standard error; the caller prints one line of its own.
         kept = os.dup(2)
-        os.dup2(said.fileno(), 2)
+        os.dup2(printed.fileno(), 2)
         try:
             image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
         except cv2.error:
@@ -90,16 +90,16 @@ def decode_grey(path: str) -> NDArray[np.uint8]:
         finally:
             os.dup2(kept, 2)
             os.close(kept)
-        # A JPEG that ends early is filled up with grey, and only this tells.
-        damaged = encoded.startswith(JPEG) and said.seek(0, os.SEEK_END) > 0
-    # OpenCV turns an image as its EXIF tag says.
+        # A JPEG that ends early is filled with grey; only what the decoder prints shows it.
+        damaged = encoded.startswith(JPEG) and printed.seek(0, os.SEEK_END) > 0
+    # OpenCV rotates an image according to its EXIF tag.
     if image is None or damaged or sorted(image.shape) != sorted(size):
         raise ValueError("not an image that OpenCV can read")
     return np.asarray(image, dtype=np.uint8)
 
 
 def _size(header: bytes) -> tuple[int, int] | None:
-    """Return the width and height that a file's beginning declares; None where it does not."""
+    """Return the width and height that a file's header declares; None if it declares none."""
     if header.startswith(b"\x89PNG\r\n\x1a\n") and header[12:16] == b"IHDR":
         return _big(header[16:20]), _big(header[20:24])
     if header.startswith(b"BM") and len(header) >= 26:
@@ -122,7 +122,7 @@ def _little(digits: bytes) -> int:
 
 
 def _jpeg_size(header: bytes) -> tuple[int, int] | None:
-    """Return what the frame header says; the segments before it are passed over."""
+    """Return the width and height in the frame header, after the segments before it."""
     at = 2
     while at + 9 <= len(header) and header[at] == 0xFF:
         kind, length = header[at + 1], _big(header[at + 2 : at + 4])

@@ -1,8 +1,8 @@
-"""OpenCV's lens distortion, its Jacobian, its inverse, and where it folds.
+"""OpenCV's lens distortion, its Jacobian, its inverse, and its folds.
 
 The model is the one documented under "Detailed Description" of OpenCV's calib3d module: rational
 radial (k1-k6), tangential (p1, p2), thin prism (s1-s4) and tilted sensor (tau_x, tau_y) terms.
-All coordinates here are normalised image coordinates (metres at one metre's depth, no unit).
+All coordinates are normalised image coordinates (metres at one metre's depth, no unit).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def _tilt_matrix(tau_x: float, tau_y: float) -> NDArray[np.float64]:
 
 
 def fold_radius(coefficients: Sequence[float]) -> float:
-    """Return the radius at which the radial terms stop growing; infinity where they never do.
+    """Return the radius at which the radial terms stop growing; infinity if they never do.
 
     The distorted radius is r·N(s)/D(s) with s = r²; its derivative has the sign of
     N·D + 2s(N'·D - N·D') as long as D > 0. The fold is at the first positive root of either.
@@ -50,7 +50,7 @@ def fold_radius(coefficients: Sequence[float]) -> float:
     )
     first = math.inf
     for polynomial in (growth, denominator):
-        # A leading coefficient this small moves no root that matters, but spoils all of them.
+        # A leading coefficient this small moves no relevant root, but makes all of them inaccurate.
         trimmed = polynomial.trim(1e-13 * float(np.abs(polynomial.coef).max()))
         if trimmed.degree() == 0:
             continue
@@ -125,9 +125,9 @@ def jacobian(
 
 @compiled
 def undistort(xd: float, yd: float, lens: NDArray[np.float64]) -> tuple[float, float, bool]:
-    """Return (x, y, found) with distort(x, y) = (xd, yd) inside the fold, by Newton's method.
+    """Return (x, y, converged) with distort(x, y) = (xd, yd) inside the fold, by Newton's method.
 
-    ``found`` is False where no such point was reached: the point lies outside the lens' image.
+    ``converged`` is False if no such point was reached: the pixel lies outside the lens' image.
     """
     if lens[12] != 0.0 or lens[13] != 0.0:
         # Start from the point before the sensor's tilt: solve the 2x2 system of its homography.
@@ -142,7 +142,7 @@ def undistort(xd: float, yd: float, lens: NDArray[np.float64]) -> tuple[float, f
     if radius >= lens[23]:
         shrink = 0.5 * lens[23] / radius
         x, y = x * shrink, y * shrink
-    # Tangential terms fold inside that radius, too: start where they do not, nearer to the centre.
+    # Tangential terms may fold inside that radius: start nearer to the centre, before they do.
     a, b, c, d = jacobian(x, y, lens)
     for _ in range(60):
         if a * d - b * c > 0.0:
@@ -194,22 +194,22 @@ def distort_points(
 def undistort_points(
     points: NDArray[np.float64], lenses: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Undistort points (N, M, 2) through packed lenses (N, 24); NaN where there is no inverse."""
+    """Undistort points (N, M, 2) through packed lenses (N, 24); NaN if there is no inverse."""
     undistorted = np.empty_like(points)
     for i in range(points.shape[0]):
         for j in range(points.shape[1]):
-            x, y, found = undistort(points[i, j, 0], points[i, j, 1], lenses[i])
-            undistorted[i, j, 0] = x if found else np.nan
-            undistorted[i, j, 1] = y if found else np.nan
+            x, y, converged = undistort(points[i, j, 0], points[i, j, 1], lenses[i])
+            undistorted[i, j, 0] = x if converged else np.nan
+            undistorted[i, j, 1] = y if converged else np.nan
     return undistorted
 
 
 @compiled
 def folds(corners: NDArray[np.float64], lenses: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell for each convex quadrilateral (N, 4, 2) whether the lens folds somewhere on it.
+    """Return for each convex quadrilateral (N, 4, 2) whether the lens folds somewhere on it.
 
-    A lens folds where its radial part stops growing or the Jacobian's determinant is not
-    positive; the latter is looked at on a 9x9 grid over the quadrilateral.
+    A lens folds if its radial part stops growing or the Jacobian's determinant is not positive;
+    the latter is evaluated on a 9x9 grid over the quadrilateral.
     """
     folded = np.zeros(corners.shape[0], dtype=np.bool_)
     for i in range(corners.shape[0]):

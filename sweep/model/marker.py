@@ -16,7 +16,7 @@ from sweep.model.coverage import MarkerEdges
 from sweep.model.declaration import parameter
 
 OUTSIDE, BLACK, WHITE, OCCLUDER = 0, 1, 2, 3
-"""Codes of what lies on a side of an edge."""
+"""Codes of the areas beside an edge."""
 
 
 def dictionary_names() -> tuple[str, ...]:
@@ -42,7 +42,7 @@ class Marker:
 
 @lru_cache(maxsize=64)
 def opencv_dictionary(name: str) -> cv2.aruco.Dictionary:
-    """Return a predefined dictionary; built once in each process, for it does not pickle."""
+    """Return a predefined dictionary; built once in each process, since it cannot be pickled."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
@@ -58,7 +58,7 @@ def module_count(dictionary: str) -> int:
 
 @lru_cache(maxsize=4096)
 def modules(dictionary: str, marker_id: int) -> NDArray[np.bool_]:
-    """Return the black square's modules (n, n), True where white, top row first."""
+    """Return the black square's modules (n, n), True for white, top row first."""
     n = module_count(dictionary)
     bitmap = cv2.aruco.generateImageMarker(opencv_dictionary(dictionary), marker_id, n)
     white = np.asarray(bitmap) > 127
@@ -112,12 +112,12 @@ def edges(dictionary: str, marker_id: int, quiet_zone_modules: float) -> MarkerE
 
 
 MarkerKey = tuple[str, int, float]
-"""Dictionary, ID and quiet zone in modules: what decides a marker's edges."""
+"""Dictionary, ID and quiet zone in modules: they determine a marker's edges."""
 
 
 @lru_cache(maxsize=64)
 def edge_table(markers: tuple[MarkerKey, ...]) -> tuple[MarkerEdges, NDArray[np.int64]]:
-    """Return the edges of K markers in one table, and (K, 2) where each one's begin and end."""
+    """Return the edges of K markers in one table, and (K, 2) first and last + 1 row of each."""
     each = [edges(*marker) for marker in markers]
     stops = np.cumsum([len(outline.ends) for outline in each])
     starts = np.concatenate([[0], stops[:-1]])
@@ -130,11 +130,11 @@ def edge_table(markers: tuple[MarkerKey, ...]) -> tuple[MarkerEdges, NDArray[np.
 
 @lru_cache(maxsize=8192)
 def occluded_edges(marker: MarkerKey, occlusion: float, occlusion_deg: float) -> MarkerEdges:
-    """Return the edges of a marker that a sheet lies on, which hides all beyond a straight line.
+    """Return the edges of a marker under a sheet that hides everything beyond a straight line.
 
-    Parts of edges under the sheet are projected onto its edge, at a right angle: what they then
-    enclose is what of their area is not hidden, for the projection moves nothing else. The
-    sheet ends where the quiet zone ends.
+    Parts of edges under the sheet are projected onto its edge at a right angle: they then enclose
+    the visible part of their area, since the projection moves nothing else. The sheet ends with
+    the quiet zone.
     """
     n, margin = module_count(marker[0]), marker[2]
     angle = math.radians(occlusion_deg)

@@ -26,7 +26,7 @@ class Pose:
     )
     side_px: float | None = parameter(
         None,
-        "side of the black square in the image were it parallel to it; in place of distance_m",
+        "side of the black square in the image if it were parallel to it; replaces distance_m",
         unit="px", low=0, open_low=True, drawable=True,
     )
     tilt_deg: float = parameter(
@@ -34,11 +34,11 @@ class Pose:
         high=360, drawable=True,
     )
     azimuth_deg: float = parameter(
-        0.0, "direction of the axis of the tilt, in the image plane", unit="degree", low=-360,
+        0.0, "direction of the tilt axis in the image plane", unit="degree", low=-360,
         high=360, drawable=True,
     )
     roll_deg: float = parameter(
-        0.0, "turn of the marker in its own plane, before the tilt", unit="degree", low=-360,
+        0.0, "rotation of the marker in its own plane, before the tilt", unit="degree", low=-360,
         high=360, drawable=True,
     )
     bearing_x_deg: float = parameter(
@@ -172,7 +172,7 @@ def _transform_points(points: Floats, rotation: Floats, translation: Floats) -> 
 def angle_between(a: Floats, b: Floats) -> Floats:
     """Return the angle (...,) in radians between vectors (..., 3), by atan2, never acos."""
     cosine = np.sum(a * b, axis=-1)
-    # a x b = a x (b - a), whose digits do not cancel where the vectors are alike.
+    # a x b = a x (b - a), whose digits do not cancel for similar vectors.
     other = np.where(cosine[..., None] > 0, b - a, b)
     return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, other), axis=-1), cosine))
 

@@ -28,7 +28,7 @@ SUPERSAMPLE = re.compile(r"supersample-([1-9][0-9]{0,2})(-jittered)?")
 
 
 def renderer_fault(name: str) -> str | None:
-    """Return what was expected where ``name`` is no renderer, else None."""
+    """Return an error message if ``name`` is not a valid renderer, else None."""
     if name in ("exact", "warp") or SUPERSAMPLE.fullmatch(name):
         return None
     return "exact, warp, supersample-N or supersample-N-jittered with N from 1 to 999"
@@ -36,7 +36,7 @@ def renderer_fault(name: str) -> str | None:
 
 @lru_cache(maxsize=16)
 def background_image(path: str) -> Grey:
-    """Return an image file as grey levels (height, width); ValueError where it is none."""
+    """Return an image file as grey levels (height, width); raises ValueError if it is not one."""
     grey = decode_grey(path)
     grey.setflags(write=False)
     return grey
@@ -59,7 +59,7 @@ def render_all(
     """Return the images of scenes ``rows`` (n,) in their ``windows`` (n, 4), quantised once.
 
     ``boxes`` (n, 4) hold all pixels that the markers may touch; the renderer sees only them, so
-    that no image depends on its window. ValueError where a window does not hold its box.
+    that no image depends on its window. Raises ValueError if a window does not hold its box.
     """
     lost = ((boxes[:, :2] < windows[:, :2]) | (boxes[:, 2:] > windows[:, 2:])).any(axis=1)
     lost &= boxes[:, 2] > boxes[:, 0]
@@ -77,7 +77,7 @@ def render_all(
 
 
 def _compose(scenes: Scenes, row: int, box: Sequence[int], window: Sequence[int]) -> Grey:
-    """Return the image of a scene that is not drawn by :func:`_draw`: any renderer, any ground."""
+    """Return the image of a scene with any renderer and any background."""
     left, top, right, bottom = window
     x0, y0, x1, y1 = box
     inner = np.s_[y0 - top : y1 - top, x0 - left : x1 - left]
@@ -106,7 +106,7 @@ def _compose(scenes: Scenes, row: int, box: Sequence[int], window: Sequence[int]
 def _exposed(
     scenes: Scenes, row: int, box: Box, behind: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the levels of ``box`` in front of those ``behind`` (both (h, w)), with the effects."""
+    """Return the levels (h, w) of ``box`` over those ``behind`` it, with the effects on edges."""
     if scenes.renderer[row] != "exact":
         mean, share = marker_levels(scenes, row, box)
     else:
@@ -192,7 +192,7 @@ def marker_levels(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the marker's levels before quantisation, and its share of each pixel of ``box``.
 
-    Both (height, width); where the marker covers a pixel in part, the rest counts as level 0.
+    Both (height, width); the part of a pixel that the marker does not cover counts as level 0.
     """
     renderer = scenes.renderer[row]
     height, width = box[3] - box[1], box[2] - box[0]

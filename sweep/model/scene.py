@@ -25,7 +25,7 @@ Box = tuple[int, int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What surrounds the marker, and how its image is made."""
+    """The marker's surroundings, and the renderer."""
 
     renderer: str = parameter(
         "exact",
@@ -34,7 +34,7 @@ class Scene:
     )
     window: str = parameter(
         "auto",
-        "auto: render and search what the marker can influence; full: the whole frame",
+        "auto: render and search the pixels that the marker can influence; full: the whole frame",
         choices=("auto", "full"),
     )
     black: float = parameter(
@@ -60,9 +60,9 @@ class Scenes:
     frame
         (N, 2) width and height in pixels.
     dictionary, marker_id, quiet_zone, renderer, background
-        One value for each scene; the quiet zone is 0 where the background has its level.
+        One value for each scene; the quiet zone is 0 if the background has its level.
     markers, marker
-        The distinct markers (dictionary, ID, quiet zone), and (N,) which one a scene has.
+        The distinct markers (dictionary, ID, quiet zone), and (N,) the index of each scene's.
     modules
         (N,) modules along the black square's side.
     size_m
@@ -72,9 +72,9 @@ class Scenes:
     plane
         (N, 3, 3) takes module coordinates (column, row, 1) to the camera frame.
     levels
-        (N, 3) grey levels of the background (0 where it is an image), black and white.
+        (N, 3) grey levels of the background (0 if it is an image), black and white.
     plain
-        (N,) whether the image is an exact one on a background of one level, without effects.
+        (N,) whether the image is exact, on a background of one level, without effects.
     effects, affected, noise_key
         (N,) each: every parameter of the effects, NaN if not given (``effects`` is None if no
         effect is active in any of the scenes), whether one is active, and the key of the noise.
@@ -163,7 +163,7 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
 
     ``values`` has every parameter of camera, marker, pose and scene (``distance_m`` resolved,
     ``distortion`` canonical) and ``shift_u_px``, ``shift_v_px``: the drawn jitter. Each is a
-    :class:`Column`, or what :meth:`Column.of` makes one of.
+    :class:`Column`, or a value that :meth:`Column.of` takes.
     """
     values = {**_NEUTRAL_COLUMNS, "noise_key": 0, **values}
 
@@ -205,8 +205,8 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
 
     # Steps 2, 3, 5, 6: the corners, moved by the pose and projected.
     size = numbers("size_m")
-    # A quiet zone on a background of its own level cannot be seen, unless a sheet hides it: it is
-    # not modelled.
+    # A quiet zone on a background of its own level is invisible, unless a sheet hides a part of
+    # it: it is not modelled.
     keys = mapped(
         lambda dictionary, marker_id, width, white, background, occlusion: (
             dictionary, int(marker_id),
@@ -273,7 +273,7 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
 
 
 def distinct(keys: Sequence[Key]) -> tuple[tuple[Key, ...], NDArray[np.int64]]:
-    """Return the distinct ones of N keys in order of appearance, and (N,) which one each is."""
+    """Return the distinct keys of N in order of appearance, and the index (N,) of each key."""
     number: dict[Key, int] = {}
     index = [number.setdefault(key, len(number)) for key in keys]
     return tuple(number), np.array(index, dtype=np.int64)

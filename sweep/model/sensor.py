@@ -1,4 +1,4 @@
-"""Light on the sensor, its noise, and what is read out: pixel by pixel, after the optics."""
+"""The sensor, pixel by pixel after the optics: light, noise, gain, quantisation."""
 
 from __future__ import annotations
 

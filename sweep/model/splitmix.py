@@ -1,4 +1,4 @@
-"""The mixing of bits that all random numbers are made by."""
+"""SplitMix64's mixing of bits, from which all random numbers are made."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sweep.compilation import compiled
 
 @compiled
 def mixed(bits: Any) -> Any:
-    """Return 64-bit numbers, one or an array, mixed so that each bit depends on all.
+    """Return 64-bit numbers, a scalar or an array, mixed so that each bit depends on all.
 
     SplitMix64's finaliser (Steele, Lea and Flood, "Fast splittable pseudorandom number
     generators", 2014).

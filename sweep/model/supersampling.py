@@ -20,7 +20,7 @@ class SampledMarker(NamedTuple):
     Attributes
     ----------
     modules
-        (n, n) True where white.
+        (n, n) True for white.
     quiet
         Width of the quiet zone in modules.
     levels

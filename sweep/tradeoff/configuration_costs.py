@@ -20,7 +20,7 @@ from sweep.evaluation.estimation import detections_for
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import SearchResult, search, visibility_flags, whole_frames
 from sweep.isolation.interrupts import Interrupts
-from sweep.measure.detector import Detector, Found
+from sweep.measure.detector import Detector, DetectorOutput
 from sweep.measure.estimation import Detections, PoseEstimator
 from sweep.measure.estimators import build
 from sweep.measure.flags import DetectionStatus
@@ -139,7 +139,7 @@ def measure(
 
 
 def _search_all(
-    find: Callable[[Grey, str, int], Found], images: Mapping[int, Grey], scenes: Scenes,
+    find: Callable[[Grey, str, int], DetectorOutput], images: Mapping[int, Grey], scenes: Scenes,
     sides: Sequence[int],
 ) -> None:
     for row, image in images.items():

@@ -105,11 +105,20 @@ def _axes(data: ReportData) -> Table | None:
         return None
     rows = [
         [axis.name, f"{len(axis):,}", _values(axis), axis.unit,
-         "draws" if axis.name == TRIAL else PARAMETERS[axis.name].section, axis.meaning]
+         "draws" if axis.name == TRIAL else PARAMETERS[axis.name].section, _meaning(axis)]
         for axis in data.pipeline.axes
     ]
     return Table("Axes of the grid", ["axis", "values", "which", "unit", "of", "meaning"], rows,
                  words=True)
+
+
+def _meaning(axis: Axis) -> str:
+    """Return an axis' meaning; of one that explains each choice, only the axis' own choices."""
+    choices = [
+        text for text in axis.meaning.split("; ")
+        if text.partition(": ")[0] in map(str, axis.values)
+    ]
+    return "; ".join(choices) or axis.meaning
 
 
 def _values(axis: Axis) -> str:

@@ -1,4 +1,4 @@
-"""The few errors that reach a user: each prints as lines that say what to change."""
+"""The errors that reach a user: their messages say in lines what to change."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 
 class SweepError(Exception):
-    """Something the user can mend; the message is one line a fault, and no traceback is shown."""
+    """An error that the user can correct: one line a fault, shown without a traceback."""
 
 
 class PipelineError(SweepError):
-    """A pipeline that cannot be run; it carries all its faults at once.
+    """A pipeline that is not valid; the error has all faults at once.
 
     Parameters
     ----------
@@ -23,12 +23,12 @@ class PipelineError(SweepError):
         self.faults = tuple(faults)
 
     def __reduce__(self) -> tuple[type[PipelineError], tuple[tuple[str, ...]]]:
-        """Return how it is made anew in another process."""
+        """Return how to make it again in another process."""
         return PipelineError, (self.faults,)
 
 
 class ArgumentError(SweepError, ValueError):
-    """An argument of a function that cannot be; the commands name their flag in its place.
+    """An argument that is not valid; it is a ValueError, too. The commands name their flag instead.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class ArgumentError(SweepError, ValueError):
         self.argument, self.value, self.problem = argument, value, problem
 
     def __reduce__(self) -> tuple[type[ArgumentError], tuple[str, object, str]]:
-        """Return how it is made anew in another process."""
+        """Return how to make it again in another process."""
         return ArgumentError, (self.argument, self.value, self.problem)
 
 
@@ -63,8 +63,8 @@ class StoreError(SweepError):
 
 
 class StoreReplacedError(StoreError):
-    """A store that is no longer where a run had it: another run's is there, or nothing."""
+    """A store that was moved, deleted or replaced by another run's while a run wrote it."""
 
 
 class RunError(SweepError):
-    """A run that could not go on; what is finished stays in the store."""
+    """A run that failed; finished blocks stay in the store, and another run continues."""

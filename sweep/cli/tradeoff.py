@@ -38,8 +38,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _execute(options: argparse.Namespace) -> int:
+    from sweep.tradeoff.advice import advice  # noqa: PLC0415
     from sweep.tradeoff.measurement import measure_trade  # noqa: PLC0415
-    from sweep.tradeoff.pareto import advice  # noqa: PLC0415
 
     _check(options)
     output = _checked_output(options.output)

@@ -159,11 +159,11 @@ def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> R
         axis.name: slice(start, stop)
         for axis, start, stop in zip(axes, block.starts, block.stops, strict=True)
     }
-    treatments = [*pipeline.axes_of(Stage.detection), *pipeline.axes_of(Stage.estimation)]
-    order = [axis.name for axis in (*axes, *treatments)]
+    settings = [*pipeline.axes_of(Stage.detection), *pipeline.axes_of(Stage.estimation)]
+    order = [axis.name for axis in (*axes, *settings)]
     shape = {
         **dict(zip((axis.name for axis in axes), block.shape, strict=True)),
-        **{axis.name: len(axis) for axis in treatments},
+        **{axis.name: len(axis) for axis in settings},
     }
     values = {
         v.name: np.full(
@@ -175,8 +175,8 @@ def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> R
     available = np.zeros([shape[name] for name in order], dtype=bool)
     for source in sources:
         _read_from(source, pipeline, cuts, order, values, available)
-    settings = pipeline.size(Stage.detection)
-    return ReusedCells(values, available.reshape(len(block), settings, -1))
+    searches = pipeline.size(Stage.detection)
+    return ReusedCells(values, available.reshape(len(block), searches, -1))
 
 
 def _read_from(

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import xarray as xr
 
-from sweep.tradeoff.labels import configuration_label
-from sweep.tradeoff.pareto import digits
+from sweep.tradeoff.labels import configuration_label, digits
 
 IMAGES = {"ms an image": "render_ms", "x exact": "render_ratio", "grey RMS": "grey_rms",
           "grey max": "grey_max"}

@@ -20,14 +20,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from matplotlib.transforms import Bbox
 
 from sweep.report.theme import COLOURS, FAINT, INK, REFERENCE_DASHES, RULE, SHAPES, STRIP
-from sweep.tradeoff.pareto import (
-    UNITS,
-    Booleans,
-    by_regime,
-    heading_of,
-    interval,
-    mark_front,
-)
+from sweep.tradeoff.labels import heading_of
+from sweep.tradeoff.pareto import UNITS, Booleans, by_condition, interval, mark_front
 from sweep.typing import Floats
 
 WIDTH = 12.0
@@ -82,7 +76,7 @@ def draw_trade(trade: xr.Dataset, criterion: str, path: str | os.PathLike[str]) 
     OSError
         If the file cannot be written.
     """
-    conditions = list(by_regime(mark_front(trade, criterion), criterion))
+    conditions = list(by_condition(mark_front(trade, criterion), criterion))
     colours, shapes = _encodings(trade)
     columns = min(len(conditions), COLUMNS)
     rows = math.ceil(len(conditions) / columns)

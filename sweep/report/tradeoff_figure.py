@@ -18,7 +18,8 @@ from sweep.report.svg import inline_svg
 from sweep.report.table import Table, cells
 from sweep.report.theme import MATPLOTLIB_STYLE
 from sweep.report.tradeoff_chart import draw_trade
-from sweep.tradeoff.pareto import advice, by_regime, mark_front
+from sweep.tradeoff.advice import advice
+from sweep.tradeoff.pareto import by_condition, mark_front
 
 CRITERION = "rotation_p95_deg"
 OTHER_CRITERION = "rotation_median_deg"
@@ -85,7 +86,7 @@ def _table(trade: xr.Dataset, criterion: str) -> Table:
 def _rows(
     trade: xr.Dataset, criterion: str, columns: list[tuple[str, float]]
 ) -> Iterator[list[str]]:
-    for label, condition in by_regime(mark_front(trade, criterion), criterion):
+    for label, condition in by_condition(mark_front(trade, criterion), criterion):
         cheapest_first = np.argsort(condition["cost_ms"].values, kind="stable")
         ordered = condition.isel(treatment=cheapest_first)
         texts = [cells(ordered, name, scale) for name, scale in columns]

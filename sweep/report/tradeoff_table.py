@@ -9,15 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from sweep.tradeoff.pareto import (
-    UNITS,
-    by_regime,
-    digits,
-    heading_of,
-    interval,
-    mark_front,
-    unit_of,
-)
+from sweep.tradeoff.labels import digits, heading_of, unit_of
+from sweep.tradeoff.pareto import UNITS, by_condition, interval, mark_front
 
 MAX_WIDTH = 140
 """Characters of a line; groups of columns that do not fit side by side are put below each other."""
@@ -173,7 +166,7 @@ def _legend(criterion: str) -> str:
 
 def _sorted_conditions(trade: xr.Dataset, criterion: str) -> Iterator[tuple[str, xr.Dataset]]:
     """Yield the conditions with ``on_front``, each with its cheapest configuration first."""
-    for label, condition in by_regime(mark_front(trade, criterion), criterion):
+    for label, condition in by_condition(mark_front(trade, criterion), criterion):
         order = np.argsort(condition["cost_ms"].to_numpy(), kind="stable")
         yield label, condition.isel(treatment=order)
 

@@ -10,9 +10,12 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sweep.errors import ArgumentError
 from sweep.report.tradeoff_chart import draw_trade
 from sweep.report.tradeoff_table import MAX_WIDTH, as_json, table_markdown, table_text
-from sweep.tradeoff.pareto import CRITERIA, UNITS, advice, digits, mark_front, pareto_front
+from sweep.tradeoff.advice import advice
+from sweep.tradeoff.labels import digits
+from sweep.tradeoff.pareto import CRITERIA, UNITS, mark_front, pareto_front
 
 P95 = "rotation_p95_deg"
 SOLVERS = ("ippe_square", "ippe", "iterative", "sqpnp", "ap3p")
@@ -120,7 +123,7 @@ def test_equal_points_are_both_on_the_front():
 
 
 def test_costs_and_errors_must_be_of_one_shape():
-    with pytest.raises(ValueError, match="one shape"):
+    with pytest.raises(ArgumentError, match="expected the shape"):
         pareto_front([1, 2], [1])
 
 
@@ -144,7 +147,7 @@ def test_advice_is_true(points, spread):
     steps = named(sentence)
     if not (np.isfinite(costs) & np.isfinite(errors)).any():
         assert not steps
-        assert sentence.startswith(f"no treatment has a finite {P95}: ")
+        assert sentence.startswith(f"no configuration has a finite {P95}: ")
         return
     assert 1 <= len(steps) <= 3
     front = pareto_front(costs, errors)
@@ -176,7 +179,7 @@ def test_overlapping_intervals_are_no_step():
     (sentence,) = advice(trade, P95)
     assert sentence == (
         "within 1.0 ms a frame take 0 (rotation_p95 1.00 deg); "
-        "no dearer one on the front is clearly better"
+        "no more expensive one is clearly better"
     )
     # An upper end that is missing is beyond all draws; without any interval the value counts.
     trade[f"{P95}_high"][2] = np.nan
@@ -189,8 +192,8 @@ def test_advice_says_why_there_is_none():
     trade = one_regime([1, 2], [np.inf, np.inf]).expand_dims(side_px=[20])
     (sentence,) = advice(trade, P95)
     assert sentence == (
-        f"side_px = 20: no treatment has a finite {P95}: each misses at least 5 % of the poses; "
-        "another --criterion may tell them apart"
+        f"side_px = 20: no configuration has a finite {P95}: "
+        "each misses at least 5 % of the poses; another criterion may rank them"
     )
     assert "none solved enough" in advice(one_regime([1, 2], [np.inf, np.nan]), P95)[0]
     nothing = trade.assign(solved_rate=0 * trade.solved_rate)

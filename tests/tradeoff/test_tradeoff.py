@@ -392,7 +392,7 @@ def test_where_nothing_is_to_be_seen_nothing_has_a_cost(unseen_store):
 
 def test_what_is_not_to_be_seen_has_no_error_and_no_advice(unseen_store):
     out = told(unseen_store, "--per", "tilt_deg", "--seconds", "0.1")
-    assert "tilt_deg = 180: no treatment has a finite rotation_p95_deg" in out
+    assert "tilt_deg = 180: no configuration has a finite rotation_p95_deg" in out
 
 
 # A pose that failed in the run.

@@ -45,8 +45,8 @@ def _problems() -> Iterator[str]:
             "`pip install --force-reinstall fiducial-sweep`"
         )
     versions = {
-        name: found.version for name in OPENCV_DISTRIBUTIONS
-        if (found := _installed(name)) is not None
+        name: package.version for name in OPENCV_DISTRIBUTIONS
+        if (package := _installed(name)) is not None
     }
     listed = " and ".join(f"{name} {version}" for name, version in versions.items())
     replace = f"`pip uninstall {' '.join(versions)}`, then `pip install {OPENCV}`"

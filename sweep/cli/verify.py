@@ -27,37 +27,37 @@ def _execute(options: argparse.Namespace) -> int:
     if options.repair:
         from sweep.integrity.repair import repair  # noqa: PLC0415
 
-        found = repair(options.store, options.sample, workers=options.workers)
+        report = repair(options.store, options.sample, workers=options.workers)
     else:
         from sweep.integrity.verification import verify  # noqa: PLC0415
 
-        found = verify(options.store, options.sample)
+        report = verify(options.store, options.sample)
     if options.json:
-        print_json(found.to_json())
-        return 1 if found.damage else 0
+        print_json(report.to_json())
+        return 1 if report.damage else 0
     from sweep.messages import plain  # noqa: PLC0415
 
-    for what, listed in (("repaired", found.repaired), ("damaged", found.damage)):
+    for what, listed in (("repaired", report.repaired), ("damaged", report.damage)):
         for damage in listed[:MAX_LINES]:
             print(f"{what:9} {plain(damage.where, 300)}: {plain(damage.what, 300)}")
         if len(listed) > MAX_LINES:
             print(f"{what:9} and {len(listed) - MAX_LINES:,} more; --json lists all")
-    if found.left_over:
-        example = plain(found.left_over[0])
-        print(f"{len(found.left_over):,} files do not belong to the store, such as {example}; "
+    if report.left_over:
+        example = plain(report.left_over[0])
+        print(f"{len(report.left_over):,} files do not belong to the store, such as {example}; "
               "--repair deletes them")
-    again = f"{found.sampled} scenes recomputed" if found.sampled else (
-        f"no scene recomputed ({found.not_sampled})"
+    again = f"{report.sampled} scenes recomputed" if report.sampled else (
+        f"no scene recomputed ({report.not_sampled})"
     )
-    state = "" if found.finished else ", unfinished"
+    state = "" if report.finished else ", unfinished"
     print(
-        f"{found.store}: {'damaged' if found.damage else 'sound'}{state}: "
-        f"{found.blocks_done:,} of {found.blocks:,} blocks, {found.files:,} files, "
+        f"{report.store}: {'damaged' if report.damage else 'sound'}{state}: "
+        f"{report.blocks_done:,} of {report.blocks:,} blocks, {report.files:,} files, "
         f"{again}"
-        + (f"; damaged: {len(found.damage):,}, `sweep verify --repair` repairs them"
-           if found.damage and not options.repair else "")
+        + (f"; damaged: {len(report.damage):,}, `sweep verify --repair` repairs them"
+           if report.damage and not options.repair else "")
     )
-    return 1 if found.damage else 0
+    return 1 if report.damage else 0
 
 
 VERIFY = Command(

@@ -1,1 +1,1 @@
-"""Figures and drawn scenes. Nothing here knows how results are made."""
+"""The report of a store: figures, tables, page and example scenes; and tables of tradeoffs."""

@@ -57,15 +57,15 @@ def _results(data: ReportData, poses: int) -> str:
     return f"{results:,} results, {results // poses:,} configurations each"
 
 
-def _share_tile(heading: str, found: xr.Dataset, name: str) -> Tile:
-    value, low, high = (float(end) for end in values_with_ends(found, name, 100))
+def _share_tile(heading: str, summary: xr.Dataset, name: str) -> Tile:
+    value, low, high = (float(end) for end in values_with_ends(summary, name, 100))
     interval = f"{interval_text(low, high, ' %')}, " if math.isfinite(low) else ""
     return Tile(heading, "\u2013" if math.isnan(value) else f"{number(value)} %",
-                f"{interval}of {int(found['looked_for']):,}")
+                f"{interval}of {int(summary['looked_for']):,}")
 
 
-def _error_tile(heading: str, found: xr.Dataset, name: str) -> Tile:
-    value, low, high = (float(end) for end in values_with_ends(found, name))
+def _error_tile(heading: str, summary: xr.Dataset, name: str) -> Tile:
+    value, low, high = (float(end) for end in values_with_ends(summary, name))
     if math.isinf(value):
         missed = "half" if "median" in name else "5 %"
         return Tile(heading, "\u221e", f"more than {missed} not solved")
@@ -117,12 +117,12 @@ def _best_sentence(data: ReportData) -> str:
     grouping = configuration_grouping(data)
     if not grouping.dims:
         return ""
-    names, found = by_configuration(data.analysed(error_statistics, grouping), grouping.dims)
-    median, low, high = values_with_ends(found, "rotation_median_deg")
+    names, summary = by_configuration(data.analysed(error_statistics, grouping), grouping.dims)
+    median, low, high = values_with_ends(summary, "rotation_median_deg")
     if not np.isfinite(median).any():
         return ""
     best = int(np.nanargmin(median))
-    exact = found["median_interval"].values == IntervalOf.nothing_drawn
+    exact = summary["median_interval"].values == IntervalOf.nothing_drawn
     interval = "" if math.isnan(low[best]) and math.isnan(high[best]) else (
         f" ({interval_text(low[best], high[best])})")
     # Without draws a median is exact; an unknown end otherwise lies beyond all draws.
@@ -138,7 +138,7 @@ def _best_sentence(data: ReportData) -> str:
     return sentences(
         f"Of the configurations, {names[best]} has the smallest median rotation error, "
         f"{degrees(float(median[best]))}{interval}, and solves "
-        f"{number(100 * float(found['solved_rate'].values[best]))} %"
+        f"{number(100 * float(summary['solved_rate'].values[best]))} %"
         + (f"; it is indistinguishable from {listed}." if rivals else "."),
         *grouping.notes,
     )

@@ -34,18 +34,18 @@ def _render(data: ReportData, name: str) -> RenderedFigure:
     axis = data.pipeline.axis(name)
     numeric = axis is not None and is_numeric(axis)
     grouping = data.along(name, MAX_BINS if numeric else MAX_ROWS)
-    found = data.analysed(error_statistics, grouping)
+    summary = data.analysed(error_statistics, grouping)
     label = data.label(name)
 
     def panel(variable: str, title: str, unit: str, scale: float = 1.0) -> Panel:
         share = scale != 1
         quantity = f"{uncapitalised(title)}, {unit}"
         if numeric:
-            lines = lines_of(found, name, variable, None, scale)
+            lines = lines_of(summary, name, variable, None, scale)
             return Panel(title, f"Line of {uncapitalised(title)} in {unit} against {label}.",
                          lambda axes: draw_lines(axes, lines, (label, quantity), share=share))
-        names = group_labels(found, name)
-        dots = dots_of(found, variable, scale)
+        names = group_labels(summary, name)
+        dots = dots_of(summary, variable, scale)
         return Panel(title, f"Rows of {uncapitalised(title)} in {unit} for each {name}.",
                      lambda axes: draw_dots(axes, names, dots, quantity, share=share),
                      height=rows_height(len(names)))
@@ -55,11 +55,11 @@ def _render(data: ReportData, name: str) -> RenderedFigure:
         sentences(
             f"Detection rate, and median and 95 % quantile of the rotation error, by {name}"
             + (f" ({axis.meaning})." if axis is not None else "."),
-            interval_sentence(found, "detection_rate", marks="Bars and bands"), INFINITE_ERRORS,
-            denominators(found),
+            interval_sentence(summary, "detection_rate", marks="Bars and bands"), INFINITE_ERRORS,
+            denominators(summary),
             *grouping.notes, data.pooled(*grouping.dims),
         ),
-        table_of(found, f"By {name}, with 95 % intervals", grouping.dims, RATES | ERRORS,
+        table_of(summary, f"By {name}, with 95 % intervals", grouping.dims, RATES | ERRORS,
                  data.results),
         [panel("detection_rate", "Detected", "%", 100),
          panel("rotation_median_deg", "Rotation error, median", "deg"),

@@ -32,9 +32,9 @@ from sweep.report.table import Table, cells
 def _has_bound(data: ReportData) -> bool:
     if "bound" not in data.results:
         return False
-    found = data.once("has bound", lambda: xr.Dataset(
+    summary = data.once("has bound", lambda: xr.Dataset(
         {"any": data.results["bound"].isin(present_values(BoundStatus)).any()}))
-    return bool(found["any"])
+    return bool(summary["any"])
 
 
 def _render(data: ReportData) -> RenderedFigure:
@@ -44,14 +44,14 @@ def _render(data: ReportData) -> RenderedFigure:
     settings, per = list(grouping.dims), list(sizes.dims)
     ratio = _over_bound(data.analysed(efficiency, grouping + sizes))
     if settings:
-        names, found = by_configuration(ratio, settings)
+        names, summary = by_configuration(ratio, settings)
     else:
-        names, found = ["all"], ratio.expand_dims(CONFIGURATION)
-    columns = group_labels(found, along) if along else ["all"]
+        names, summary = ["all"], ratio.expand_dims(CONFIGURATION)
+    columns = group_labels(summary, along) if along else ["all"]
     label = data.label(along) if along else ""
 
     def panel(name: str, title: str) -> Panel:
-        values = found[name].transpose(CONFIGURATION, *per).values.reshape(len(names), -1)[::-1]
+        values = summary[name].transpose(CONFIGURATION, *per).values.reshape(len(names), -1)[::-1]
         return Panel(
             title,
             f"Map of {uncapitalised(title)} over {label or 'all poses'} and configuration.",
@@ -61,7 +61,7 @@ def _render(data: ReportData) -> RenderedFigure:
 
     rows = [
         [name, *(column,) * bool(along), *(
-            cells(found.isel({CONFIGURATION: k} | ({along: j} if along else {})), key)[0]
+            cells(summary.isel({CONFIGURATION: k} | ({along: j} if along else {})), key)[0]
             for key in ("rotation_over_bound", "range_over_bound"))]
         for k, name in enumerate(names) for j, column in enumerate(columns)
     ]
@@ -70,7 +70,7 @@ def _render(data: ReportData) -> RenderedFigure:
         sentences(
             "RMSE divided by the Cram\u00e9r-Rao bound, over the solved poses that are not "
             "flipped and have a bound: 1 is the best that an unbiased estimator can reach.",
-            interval_sentence(found, "rotation_over_bound", marks="In the table there"),
+            interval_sentence(summary, "rotation_over_bound", marks="In the table there"),
             *grouping.notes, *sizes.notes, data.pooled(*settings, *per),
         ),
         Table("RMSE over the bound, with 95 % intervals",
@@ -81,13 +81,13 @@ def _render(data: ReportData) -> RenderedFigure:
     )
 
 
-def _over_bound(found: xr.Dataset) -> xr.Dataset:
+def _over_bound(summary: xr.Dataset) -> xr.Dataset:
     """Return RMSE over bound, the inverse of efficiency, with the ends of its intervals."""
     ratios: dict[str, Any] = {}
     for quantity in ("rotation", "range"):
         for end, other in (("", ""), ("_low", "_high"), ("_high", "_low")):
-            ratios[f"{quantity}_over_bound{end}"] = 1 / found[f"{quantity}_efficiency{other}"]
-    return xr.Dataset(ratios, found.coords)
+            ratios[f"{quantity}_over_bound{end}"] = 1 / summary[f"{quantity}_efficiency{other}"]
+    return xr.Dataset(ratios, summary.coords)
 
 
 BOUND = FigureKind("bound", _has_bound, _render)

@@ -51,10 +51,10 @@ def configuration_grouping(data: ReportData) -> Grouping:
 
 
 def _dot_panel(
-    found: xr.Dataset, names: list[str], name: str, title: str, unit: str, *,
+    summary: xr.Dataset, names: list[str], name: str, title: str, unit: str, *,
     scale: float = 1.0, share: bool = False, level: float | None = None,
 ) -> Panel:
-    dots = dots_of(found, name, scale)
+    dots = dots_of(summary, name, scale)
     label = f"{uncapitalised(title)}, {unit}" if unit else uncapitalised(title)
     return Panel(
         title, f"Rows of {label}, for each configuration.",
@@ -65,15 +65,15 @@ def _dot_panel(
 
 def _configurations(data: ReportData) -> RenderedFigure:
     grouping = configuration_grouping(data)
-    names, found = by_configuration(data.analysed(error_statistics, grouping), grouping.dims)
+    names, summary = by_configuration(data.analysed(error_statistics, grouping), grouping.dims)
     panels = [
-        _dot_panel(found, names, "solved_rate", "Solved", "%", scale=100, share=True),
-        _dot_panel(found, names, "rotation_median_deg", "Rotation error, median", "deg"),
-        _dot_panel(found, names, "range_median_percent", "Range error, median", "%"),
+        _dot_panel(summary, names, "solved_rate", "Solved", "%", scale=100, share=True),
+        _dot_panel(summary, names, "rotation_median_deg", "Rotation error, median", "deg"),
+        _dot_panel(summary, names, "range_median_percent", "Range error, median", "%"),
     ]
-    if found["solved"].sum() > 0:
+    if summary["solved"].sum() > 0:
         panels.append(
-            _dot_panel(found, names, "flip_rate", "Flipped", "%", scale=100, share=True))
+            _dot_panel(summary, names, "flip_rate", "Flipped", "%", scale=100, share=True))
     notes = list(grouping.notes)
     if data.size_axis is not None:
         panel, note = _map_by_size(data, grouping)
@@ -85,10 +85,10 @@ def _configurations(data: ReportData) -> RenderedFigure:
             "Share of the poses looked for that are solved, and the median errors, of each "
             "configuration on the same images; a pose that is not solved counts as an infinite "
             "error (right edge, \u221e).",
-            interval_sentence(found, "solved_rate"), denominators(found), *notes,
+            interval_sentence(summary, "solved_rate"), denominators(summary), *notes,
             data.pooled(*grouping.dims),
         ),
-        _table("Configurations, with 95 % intervals", names, found,
+        _table("Configurations, with 95 % intervals", names, summary,
                LOOKED_FOR | ERRORS | {"flipped, %": ("flip_rate", 100.0)}),
         panels,
     )
@@ -98,10 +98,10 @@ def _map_by_size(data: ReportData, grouping: Grouping) -> tuple[Panel, tuple[str
     """Return a map of the median rotation error over size and configuration, with notes."""
     axis = str(data.size_axis)
     sizes = data.along(axis, SIZE_COLUMNS)
-    names, found = by_configuration(
+    names, summary = by_configuration(
         data.analysed(error_statistics, grouping + sizes), grouping.dims)
-    values = found["rotation_median_deg"].transpose(CONFIGURATION, axis).values
-    columns = group_labels(found, axis)
+    values = summary["rotation_median_deg"].transpose(CONFIGURATION, axis).values
+    columns = group_labels(summary, axis)
     return Panel(
         "Rotation error, median, deg",
         f"Map of the median rotation error over {axis} and configuration.",
@@ -111,11 +111,11 @@ def _map_by_size(data: ReportData, grouping: Grouping) -> tuple[Panel, tuple[str
 
 
 def _table(
-    caption: str, names: list[str], found: xr.Dataset,
+    caption: str, names: list[str], summary: xr.Dataset,
     columns: Mapping[str, tuple[str, float]],
 ) -> Table:
-    present = {heading: of for heading, of in columns.items() if of[0] in found}
-    texts = [cells(found, name, scale) for name, scale in present.values()]
+    present = {heading: of for heading, of in columns.items() if of[0] in summary}
+    texts = [cells(summary, name, scale) for name, scale in present.values()]
     rows = [[name, *(column[k] for column in texts)] for k, name in enumerate(names)]
     return Table(caption, [CONFIGURATION, *present], rows)
 
@@ -140,9 +140,9 @@ PAIRED = {
 def _paired(data: ReportData) -> RenderedFigure:
     grouping = configuration_grouping(data)
     results = data.results.isel({name: list(some) for name, some in grouping.chosen})
-    found = data.once("paired", lambda: compare(
+    summary = data.once("paired", lambda: compare(
         _with_first_configuration(results, grouping.dims), results, grouping.dims))
-    names, differences = by_configuration(found, grouping.dims)
+    names, differences = by_configuration(summary, grouping.dims)
     others = differences.isel({CONFIGURATION: slice(1, None)})
     return RenderedFigure(
         "paired", f"Each configuration against the first: {names[0]}",

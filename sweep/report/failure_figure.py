@@ -29,8 +29,8 @@ def _axis(data: ReportData) -> str | None:
         return None
 
     def influence(name: str) -> float:
-        found = data.analysed(failure_composition, data.along(name, MAX_BARS))
-        share = found["share"].fillna(0).transpose(name, "outcome").values
+        summary = data.analysed(failure_composition, data.along(name, MAX_BARS))
+        share = summary["share"].fillna(0).transpose(name, "outcome").values
         return float(np.abs(share - share.mean(axis=0)).sum(axis=1).mean())
 
     return max(names, key=influence)
@@ -39,21 +39,21 @@ def _axis(data: ReportData) -> str | None:
 def _render(data: ReportData) -> RenderedFigure:
     axis = _axis(data)
     grouping = data.along(axis, MAX_BARS) if axis else Grouping()
-    found = data.analysed(failure_composition, grouping)
-    if axis and axis in found.indexes and np.issubdtype(found[axis].dtype, np.number):
-        found = found.isel({axis: np.argsort(found[axis].values, kind="stable")})
-    names = group_labels(found, axis) if axis else ["all"]
-    counts = found["count"].sum([axis] if axis else [])
+    summary = data.analysed(failure_composition, grouping)
+    if axis and axis in summary.indexes and np.issubdtype(summary[axis].dtype, np.number):
+        summary = summary.isel({axis: np.argsort(summary[axis].values, kind="stable")})
+    names = group_labels(summary, axis) if axis else ["all"]
+    counts = summary["count"].sum([axis] if axis else [])
     parts = {
         str(outcome): np.atleast_1d(
-            found["share"].sel(outcome=outcome).values.astype(np.float64))
-        for outcome in found["outcome"].values.tolist()
+            summary["share"].sel(outcome=outcome).values.astype(np.float64))
+        for outcome in summary["outcome"].values.tolist()
         if counts.sel(outcome=outcome) > 0
-        and np.isfinite(found["share"].sel(outcome=outcome)).any()
+        and np.isfinite(summary["share"].sel(outcome=outcome)).any()
     }
     excluded = ", ".join(
         f"{int(counts.sel(outcome=outcome)):,} {outcome}" for outcome in outcomes(counted=False)
-        if outcome in found["outcome"].values and counts.sel(outcome=outcome) > 0
+        if outcome in summary["outcome"].values and counts.sel(outcome=outcome) > 0
     )
     label = data.label(axis) if axis else "all poses"
     return RenderedFigure(
@@ -62,19 +62,19 @@ def _render(data: ReportData) -> RenderedFigure:
             "Shares of the poses looked for" + (f", by {long_name(axis)}" if axis else "")
             + ": solved, or the flag that says why not.",
             f"Not counted in the shares: {excluded}." if excluded else "",
-            interval_sentence(found, "share", marks="In the table there"),
+            interval_sentence(summary, "share", marks="In the table there"),
             *grouping.notes, data.pooled(*grouping.dims),
         ),
-        _table(found, label, names, list(parts)),
+        _table(summary, label, names, list(parts)),
         [Panel("Outcome", f"Stacked bars of the shares of {', '.join(parts) or 'nothing'}.",
                lambda axes: draw_stack(axes, names, parts, label),
                wide=len(names) > WIDE_FROM)],
     )
 
 
-def _table(found: xr.Dataset, label: str, names: list[str], shown: list[str]) -> Table:
-    columns = [cells(found.sel(outcome=outcome), "share", 100) for outcome in shown]
-    total = found["count"].where(found["share"].notnull(), 0).sum("outcome")
+def _table(summary: xr.Dataset, label: str, names: list[str], shown: list[str]) -> Table:
+    columns = [cells(summary.sel(outcome=outcome), "share", 100) for outcome in shown]
+    total = summary["count"].where(summary["share"].notnull(), 0).sum("outcome")
     looked_for = [f"{int(value):,}" for value in np.atleast_1d(total.values)]
     rows = [
         [name, looked_for[k], *(column[k] for column in columns)] for k, name in enumerate(names)

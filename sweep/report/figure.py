@@ -69,48 +69,48 @@ class FigureKind:
     covers: Callable[[ReportData], Sequence[str]] = lambda _: ()
 
 
-def group_positions(found: xr.Dataset, name: str) -> Floats:
+def group_positions(summary: xr.Dataset, name: str) -> Floats:
     """Return the positions (n,) of groups on a numeric axis: values, or the middles of bins.
 
     The middle of a bin is the geometric mean of its ends if both are positive.
     """
-    if f"{name}_low" in found.coords:
+    if f"{name}_low" in summary.coords:
         low, high = (
-            np.asarray(found[f"{name}_{end}"], dtype=np.float64) for end in ("low", "high")
+            np.asarray(summary[f"{name}_{end}"], dtype=np.float64) for end in ("low", "high")
         )
         return np.asarray(np.where(low > 0, np.sqrt(np.abs(low * high)), (low + high) / 2))
-    return np.asarray(found[name].values, dtype=np.float64)
+    return np.asarray(summary[name].values, dtype=np.float64)
 
 
 def values_with_ends(
-    found: xr.Dataset, name: str, scale: float = 1.0
+    summary: xr.Dataset, name: str, scale: float = 1.0
 ) -> tuple[Floats, Floats, Floats]:
     """Return a variable's values and the ends of its intervals, NaN without an interval."""
-    value = np.asarray(found[name].values, dtype=np.float64)
+    value = np.asarray(summary[name].values, dtype=np.float64)
     low, high = (
-        np.asarray(found[f"{name}_{end}"].values, dtype=np.float64)
-        if f"{name}_{end}" in found else np.full(value.shape, np.nan)
+        np.asarray(summary[f"{name}_{end}"].values, dtype=np.float64)
+        if f"{name}_{end}" in summary else np.full(value.shape, np.nan)
         for end in ("low", "high")
     )
     return scale * value, scale * low, scale * high
 
 
-def dots_of(found: xr.Dataset, name: str, scale: float = 1.0) -> Series:
+def dots_of(summary: xr.Dataset, name: str, scale: float = 1.0) -> Series:
     """Return a variable (n,) and its intervals as the dots of n rows."""
-    value, low, high = values_with_ends(found, name, scale)
+    value, low, high = values_with_ends(summary, name, scale)
     return Series("", value, value, low, high)
 
 
 def lines_of(
-    found: xr.Dataset, along: str, name: str, by: str | None, scale: float = 1.0
+    summary: xr.Dataset, along: str, name: str, by: str | None, scale: float = 1.0
 ) -> list[Series]:
     """Return a line of ``name`` along an axis for each value of ``by``, without NaN."""
-    x = group_positions(found, along)
+    x = group_positions(summary, along)
     order = np.argsort(x)
     parts = (
         [(f"{by.removesuffix('_deg')} {label}\u00b0" if by.endswith("_deg") else f"{label}",
-          found.isel({by: k})) for k, label in enumerate(group_labels(found, by))]
-        if by is not None else [("", found)]
+          summary.isel({by: k})) for k, label in enumerate(group_labels(summary, by))]
+        if by is not None else [("", summary)]
     )
     lines = []
     for label, part in parts:
@@ -120,23 +120,23 @@ def lines_of(
     return lines
 
 
-def interval_sentence(found: xr.Dataset, *names: str, marks: str = "Bars") -> str:
+def interval_sentence(summary: xr.Dataset, *names: str, marks: str = "Bars") -> str:
     """Return a sentence that says what the drawn intervals are, or why there are none."""
-    ends = [found[f"{name}_{end}"] for name in names for end in ("low", "high")
-            if f"{name}_{end}" in found]
+    ends = [summary[f"{name}_{end}"] for name in names for end in ("low", "high")
+            if f"{name}_{end}" in summary]
     if any(bool(np.isfinite(end).any()) for end in ends):
         return f"{marks} are 95 % intervals over the random draws, conditional on the grid."
-    few = "median_interval" in found and bool(
-        (found["median_interval"] == IntervalOf.too_few_draws).any())
+    few = "median_interval" in summary and bool(
+        (summary["median_interval"] == IntervalOf.too_few_draws).any())
     return "No intervals: too few draws." if few else (
         "No intervals: nothing was drawn at random.")
 
 
 def denominators(
-    found: xr.Dataset, name: str = "looked_for", what: str = "poses looked for"
+    summary: xr.Dataset, name: str = "looked_for", what: str = "poses looked for"
 ) -> str:
     """Return a sentence with the denominators: ``Each value is of 40 to 200 poses ...``."""
-    counts = found[name].values[found[name].values > 0]
+    counts = summary[name].values[summary[name].values > 0]
     if not counts.size:
         return f"No {what}."
     low, high = int(counts.min()), int(counts.max())

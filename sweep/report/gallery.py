@@ -88,9 +88,9 @@ def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
             scene, problem="Not drawn: its process died; `sweep repro` computes it in a process "
             "of its own.")
     try:
-        one = cell(data.pipeline, at)
-        inspected = inspect_scene(one)
-        scene = dataclasses.replace(scene, coordinates=coordinates_text(data.pipeline, one))
+        single = cell(data.pipeline, at)
+        inspected = inspect_scene(single)
+        scene = dataclasses.replace(scene, coordinates=coordinates_text(data.pipeline, single))
         picture = _picture(inspected)
         difference = difference_from_store(data, inspected.values, stored, index)
     except (SweepError, OSError, ValueError, cv2.error, np.linalg.LinAlgError) as error:

@@ -63,34 +63,35 @@ def limits_of(data: ReportData) -> Limits:
         lazy = detection_limit(first, rate=RELIABLE_RATE, per=per)
     except SweepError:  # the side differs within what is pooled, or is not known
         return Limits()
-    found = data.once("detection_limit", lambda: lazy)
-    dims = [str(dim) for dim in found["side_px"].dims]
+    computed = data.once("detection_limit", lambda: lazy)
+    dims = [str(dim) for dim in computed["side_px"].dims]
     limits = []
-    for index in np.ndindex(*(found.sizes[name] for name in dims)):
-        one = found.isel(dict(zip(dims, index, strict=True)))
+    for index in np.ndindex(*(computed.sizes[name] for name in dims)):
+        cell = computed.isel(dict(zip(dims, index, strict=True)))
+        values = {name: cell[name].item() for name in dims}
         condition = ", ".join(
-            f"tilt {coordinate(one[name].item())}\u00b0" if name == TILT else str(one[name].item())
-            for name in dims
+            f"tilt {coordinate(value)}\u00b0" if name == TILT else str(value)
+            for name, value in values.items()
         )
-        limit = int(one["limit"])
+        limit = int(cell["limit"])
         if limit == Limit.never:
             limits.append(SizeLimit(condition, NEVER, ""))
             continue
         at_most = "\u2264 " if limit == Limit.always else ""
         distance = ""
-        if "distance_m" in one.variables and math.isfinite(float(one["distance_m"])):
-            distance = f"{number(float(one['distance_m']))} m"
-        side = f"{at_most}{number(float(one['side_px']))} px"
+        if "distance_m" in cell.variables and math.isfinite(float(cell["distance_m"])):
+            distance = f"{number(float(cell['distance_m']))} m"
+        side = f"{at_most}{number(float(cell['side_px']))} px"
         limits.append(SizeLimit(condition, side, distance))
     return Limits(tuple(limits), f"with {settings}" if settings else "")
 
 
-def limits_sentence(found: Limits) -> str:
+def limits_sentence(detected: Limits) -> str:
     """Return the limits as a sentence: each, or the first and the last of many."""
-    limits = found.limits
+    limits = detected.limits
     if not limits:
         return ""
-    start = f"{found.settings}, " if found.settings else ""
+    start = f"{detected.settings}, " if detected.settings else ""
     share = f"at least {100 * RELIABLE_RATE:.0f} %"
     if all(limit.side == NEVER for limit in limits):
         return _capitalised(f"{start}the detection rate reaches {share} at no size.")
@@ -103,22 +104,22 @@ def limits_sentence(found: Limits) -> str:
     return _capitalised(f"{start}{CRITERION}: {text}.")
 
 
-def limits_tile(found: Limits) -> Sequence[Tile]:
+def limits_tile(detected: Limits) -> Sequence[Tile]:
     """Return a tile with the first limit, if there are limits."""
     return [
         Tile(f"{100 * RELIABLE_RATE:.0f} % detected down to a side of", limit.side,
-             ", ".join(filter(None, (limit.distance, limit.condition, found.settings))))
-        for limit in found.limits[:1]
+             ", ".join(filter(None, (limit.distance, limit.condition, detected.settings))))
+        for limit in detected.limits[:1]
     ]
 
 
-def limits_table(found: Limits) -> Sequence[Table]:
+def limits_table(detected: Limits) -> Sequence[Table]:
     """Return a table of the limits, if there are more than the sentence lists."""
-    limits = found.limits
+    limits = detected.limits
     if len(limits) <= MAX_LISTED:
         return []
     columns = 3 if any(limit.distance for limit in limits) else 2
-    settings = f", {found.settings}" if found.settings else ""
+    settings = f", {detected.settings}" if detected.settings else ""
     return [Table(
         f"{_capitalised(CRITERION)}{settings}",
         ["condition", "side", "distance"][:columns], [list(limit)[:columns] for limit in limits],

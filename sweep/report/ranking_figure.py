@@ -26,9 +26,9 @@ WEAKEST = 24
 
 
 def _render(data: ReportData) -> RenderedFigure:
-    found = data.once("marker_ranking", lambda: marker_ranking(data.results))
-    dims = [name for name in ("dictionary", IDS) if name in found["detection_rate"].dims]
-    ranked = _weakest_first(found, dims)
+    summary = data.once("marker_ranking", lambda: marker_ranking(data.results))
+    dims = [name for name in ("dictionary", IDS) if name in summary["detection_rate"].dims]
+    ranked = _weakest_first(summary, dims)
     names = [
         " ".join(str(ranked[dim].values[k]) for dim in dims) for k in range(ranked.sizes["marker"])
     ]
@@ -41,12 +41,12 @@ def _render(data: ReportData) -> RenderedFigure:
             f"{count:,} of {len(names):,} IDs are weak (diamonds): below the expected rate, "
             "with an adjusted p-value under 0.05." if count else
             f"None of {len(names):,} IDs is weak (adjusted p-value under 0.05).",
-            interval_sentence(found, "detection_rate"), denominators(found),
+            interval_sentence(summary, "detection_rate"), denominators(summary),
             data.pooled(*dims),
         ),
         Table(
             "IDs by detection rate, with 95 % intervals",
-            [*(axis_label(found, dim) for dim in dims), "looked for", "detected, %",
+            [*(axis_label(summary, dim) for dim in dims), "looked for", "detected, %",
              "expected, %", "p, adjusted", "weak"],
             [list(row) for row in zip(
                 *([str(value) for value in ranked[dim].values.tolist()] for dim in dims),
@@ -59,9 +59,9 @@ def _render(data: ReportData) -> RenderedFigure:
     )
 
 
-def _weakest_first(found: xr.Dataset, dims: list[str]) -> xr.Dataset:
+def _weakest_first(summary: xr.Dataset, dims: list[str]) -> xr.Dataset:
     """Return the IDs that were looked for, along ``marker``: weak ones first, then by rate."""
-    ranked = found.stack(marker=dims, create_index=False)
+    ranked = summary.stack(marker=dims, create_index=False)
     ranked = ranked.isel(marker=np.flatnonzero(ranked["looked_for"].values > 0))
     order = np.lexsort(
         (ranked[IDS].values, ranked["detection_rate"].values, ~ranked["weak"].values))

@@ -58,19 +58,19 @@ def _detection(data: ReportData) -> RenderedFigure:
     areas = axis is None or data.length(axis) >= MIN_BINNED_SIZES
     along = AREA if areas else str(axis)
     grouping = data.by_tilt() + data.along(along)
-    found = data.analysed(detection_rate, grouping)
-    lines = lines_of(found, along, "detection_rate", TILT if data.tilted else None, 100)
+    summary = data.analysed(detection_rate, grouping)
+    lines = lines_of(summary, along, "detection_rate", TILT if data.tilted else None, 100)
     label = data.label(along)
     return RenderedFigure(
         "detection", f"Detection rate by {_short_name(along)}",
         sentences(
             f"Share of the poses looked for in which the marker is detected, against its "
             f"{long_name(along)}{_by_tilt(data)}.",
-            interval_sentence(found, "detection_rate", marks="Bands and bars").replace(
+            interval_sentence(summary, "detection_rate", marks="Bands and bars").replace(
                 "intervals over", "intervals (Wilson's) over"),
-            denominators(found), *grouping.notes, data.pooled(along, *grouping.dims),
+            denominators(summary), *grouping.notes, data.pooled(along, *grouping.dims),
         ),
-        table_of(found, "Detection rate, with 95 % intervals", grouping.dims,
+        table_of(summary, "Detection rate, with 95 % intervals", grouping.dims,
                  RATES | {"draws": ("draws", 1)}, data.results),
         [Panel("Detected", f"Lines of the detection rate in percent against {label}.",
                lambda axes: draw_lines(axes, lines, (label, "detected, %"), share=True),
@@ -83,12 +83,12 @@ def _detection(data: ReportData) -> RenderedFigure:
 def _errors(data: ReportData) -> RenderedFigure:
     along = str(data.size)
     grouping = data.by_tilt() + data.along(along)
-    found = data.analysed(error_statistics, grouping)
+    summary = data.analysed(error_statistics, grouping)
     by = TILT if data.tilted else None
     label = data.label(along)
 
     def panel(name: str, title: str, unit: str) -> Panel:
-        lines = lines_of(found, along, name, by)
+        lines = lines_of(summary, along, name, by)
         return Panel(
             title, f"Lines of {uncapitalised(title)} in {unit} against {label}.",
             lambda axes: draw_lines(axes, lines, (label, f"{uncapitalised(title)}, {unit}")),
@@ -101,12 +101,12 @@ def _errors(data: ReportData) -> RenderedFigure:
             f"{_by_tilt(data)}: median and 95 % quantile (p95) of the rotation error, median of "
             "the range error (depth, relative to the true depth), RMSE of range without flips.",
             "An error of 0 is drawn at the lower edge."
-            if (found["rotation_median_deg"] == 0).any() else "",
-            interval_sentence(found, "rotation_median_deg", "range_rmse_unflipped_percent",
+            if (summary["rotation_median_deg"] == 0).any() else "",
+            interval_sentence(summary, "rotation_median_deg", "range_rmse_unflipped_percent",
                               marks="Bars and bands"), INFINITE_ERRORS,
-            denominators(found), *grouping.notes, data.pooled(along, *grouping.dims),
+            denominators(summary), *grouping.notes, data.pooled(along, *grouping.dims),
         ),
-        table_of(found, "Errors, with 95 % intervals", grouping.dims, LOOKED_FOR | ERRORS,
+        table_of(summary, "Errors, with 95 % intervals", grouping.dims, LOOKED_FOR | ERRORS,
                  data.results),
         [panel("rotation_median_deg", "Rotation error, median", "deg"),
          panel("rotation_p95_deg", "Rotation error, p95", "deg"),
@@ -126,11 +126,11 @@ def _map_grouping(data: ReportData) -> Grouping:
 
 
 def _map_panel(
-    data: ReportData, found: xr.Dataset, name: str, title: str, *, share: bool = False
+    data: ReportData, summary: xr.Dataset, name: str, title: str, *, share: bool = False
 ) -> Panel:
     along = str(data.size_axis)
-    rows, columns = group_labels(found, TILT), group_labels(found, along)
-    values = found[name].transpose(TILT, along).values.astype(np.float64)
+    rows, columns = group_labels(summary, TILT), group_labels(summary, along)
+    values = summary[name].transpose(TILT, along).values.astype(np.float64)
     labels = (data.label(along), data.label(TILT))
     return Panel(
         title, f"Map of {uncapitalised(title)} over {labels[0]} and {labels[1]}.",
@@ -141,18 +141,18 @@ def _map_panel(
 
 def _maps(data: ReportData) -> RenderedFigure:
     grouping = _map_grouping(data)
-    found = data.analysed(error_statistics, grouping)
+    summary = data.analysed(error_statistics, grouping)
     return RenderedFigure(
         "maps", f"Detection and rotation error over {_short_name(str(data.size_axis))} and tilt",
         sentences(
             "Detection rate in percent, and 95 % quantile of the rotation error in degrees; "
             "a pose that is not solved counts as an infinite error (\u221e).",
-            denominators(found), *grouping.notes, data.pooled(*grouping.dims),
+            denominators(summary), *grouping.notes, data.pooled(*grouping.dims),
         ),
-        table_of(found, "Detection rate and rotation error, with 95 % intervals", grouping.dims,
+        table_of(summary, "Detection rate and rotation error, with 95 % intervals", grouping.dims,
                  RATES | {"rotation p95, deg": ("rotation_p95_deg", 1.0)}, data.results),
-        [_map_panel(data, found, "detection_rate", "Detected, %", share=True),
-         _map_panel(data, found, "rotation_p95_deg", "Rotation error, p95, deg")],
+        [_map_panel(data, summary, "detection_rate", "Detected, %", share=True),
+         _map_panel(data, summary, "rotation_p95_deg", "Rotation error, p95, deg")],
     )
 
 
@@ -162,18 +162,18 @@ def _has_flips(data: ReportData) -> bool:
 
 def _flips(data: ReportData) -> RenderedFigure:
     grouping = _map_grouping(data)
-    found = data.analysed(flip_rate, grouping)
+    summary = data.analysed(flip_rate, grouping)
     return RenderedFigure(
         "flips", f"Flips to the mirrored pose over {_short_name(str(data.size_axis))} and tilt",
         sentences(
             "Share of the solved poses that are nearer to the mirror of the truth than to the "
             "truth, in percent. At a tilt near 0 the mirror hardly differs from the truth.",
-            denominators(found, "solved", "solved poses"), *grouping.notes,
+            denominators(summary, "solved", "solved poses"), *grouping.notes,
             data.pooled(*grouping.dims),
         ),
-        table_of(found, "Flip rate, with 95 % intervals", grouping.dims,
+        table_of(summary, "Flip rate, with 95 % intervals", grouping.dims,
                  {"solved": ("solved", 1.0), "flipped, %": ("flip_rate", 100.0)}, data.results),
-        [_map_panel(data, found, "flip_rate", "Flipped, % of the solved", share=True)],
+        [_map_panel(data, summary, "flip_rate", "Flipped, % of the solved", share=True)],
     )
 
 

@@ -80,23 +80,23 @@ class _Candidates:
 
 def select_scenes(results: xr.Dataset) -> Iterator[tuple[str, Index]]:
     """Yield a title and the index along each axis, for each kind of scene that occurs."""
-    found = _scan(results)
+    candidates = _scan(results)
     titles = {
         "best": "best: the smallest rotation error", "worst": "worst: the largest rotation error",
         "worst_unflipped": "worst without a flip", "flipped": "flipped to the mirrored pose",
     }
-    if "best" in found.best:
-        yield titles.pop("best"), found.best["best"][1]
-    median = found.median()
+    if "best" in candidates.best:
+        yield titles.pop("best"), candidates.best["best"][1]
+    median = candidates.median()
     if median is not None:
         yield "median rotation error of the solved", median
     for kind, title in titles.items():
-        if kind in found.best:
-            yield title, found.best[kind][1]
+        if kind in candidates.best:
+            yield title, candidates.best[kind][1]
     for flag in FAILURES:
-        if _kind(flag) in found.best:
+        if _kind(flag) in candidates.best:
             meaning = uncapitalised(flag.meaning).removesuffix(".")
-            yield f"{flag.name.replace('_', ' ')}: {meaning}", found.best[_kind(flag)][1]
+            yield f"{flag.name.replace('_', ' ')}: {meaning}", candidates.best[_kind(flag)][1]
 
 
 def _kind(flag: Flag) -> str:
@@ -104,7 +104,7 @@ def _kind(flag: Flag) -> str:
 
 
 def _scan(results: xr.Dataset) -> _Candidates:
-    found = _Candidates()
+    candidates = _Candidates()
     names = ("estimate", "rotation_error_deg", "flipped", "detection", AREA)
     for offsets, piece in _pieces(results[list(names)].reset_coords(drop=True)):
         dims = tuple(str(dim) for dim in piece["estimate"].dims)
@@ -123,25 +123,25 @@ def _scan(results: xr.Dataset) -> _Candidates:
         solved = (estimate == EstimateStatus.solved) & np.isfinite(error)
         index = indices(solved)
         errors = error[solved].astype(np.float64)
-        found.offer("best", -errors, index)
-        found.offer("worst", errors, index)
+        candidates.offer("best", -errors, index)
+        candidates.offer("worst", errors, index)
         mirrored = flipped == Flipped.flipped
         unflipped = solved & ~mirrored
-        found.offer("worst_unflipped", error[unflipped].astype(np.float64), indices(unflipped))
+        candidates.offer("worst_unflipped", error[unflipped].astype(np.float64), indices(unflipped))
         mirrored &= solved & (error > MIN_FLIP_DEG)
-        found.offer("flipped", area[mirrored], indices(mirrored))
-        found.count(errors, index)
+        candidates.offer("flipped", area[mirrored], indices(mirrored))
+        candidates.count(errors, index)
         detection = piece["detection"].broadcast_like(piece["estimate"]).transpose(*dims).values
         for flag in FAILURES:
             flagged = (detection if isinstance(flag, DetectionStatus) else estimate) == flag
             # The larger the marker, the more surprising the failure.
-            found.offer(_kind(flag), area[flagged], indices(flagged))
+            candidates.offer(_kind(flag), area[flagged], indices(flagged))
     for flag in EstimateStatus:
         # A failure of the detection is flagged in the estimate, too: it is shown once.
         name = flag.name
-        if name in DetectionStatus.__members__ and _kind(DetectionStatus[name]) in found.best:
-            found.best.pop(_kind(flag), None)
-    return found
+        if name in DetectionStatus.__members__ and _kind(DetectionStatus[name]) in candidates.best:
+            candidates.best.pop(_kind(flag), None)
+    return candidates
 
 
 def _pieces(results: xr.Dataset) -> Iterator[tuple[Index, xr.Dataset]]:

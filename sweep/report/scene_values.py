@@ -5,33 +5,47 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from sweep.plan.schema import SCHEMA, Variable
+from sweep.report.formatting import coordinate
 
 NAME_WIDTH, VALUE_WIDTH = 34, 44
 
 
 def value_lines(
-    here: Mapping[str, NDArray[Any]], stored: Mapping[str, NDArray[Any]] | None
+    recomputed: Mapping[str, NDArray[Any]], stored: Mapping[str, NDArray[Any]] | None
 ) -> list[str]:
-    """Return a line for each variable: its value here, its unit, and the store's if it differs."""
+    """Return a line for each variable that ``recomputed`` has.
+
+    Each has the recomputed value with its unit, and the stored value if that differs.
+    """
     lines = []
     for variable in SCHEMA:
-        value = here[variable.name]
-        line = f"  {variable.name:{NAME_WIDTH}} {_text(variable, value):{VALUE_WIDTH}}"
-        line += f" {variable.units}"
-        if stored is not None and value.tobytes() != stored[variable.name].tobytes():
-            there = _text(variable, stored[variable.name])
-            if there != _text(variable, value):
-                line = f"{line.rstrip()}  (stored: {there})"
-            elif not ((value != value) & (stored[variable.name] != stored[variable.name])).all():  # noqa: PLR0124
-                line = f"{line.rstrip()}  (stored: other last digits)"
-        lines.append(line.rstrip())
+        if variable.name not in recomputed:
+            continue
+        value = recomputed[variable.name]
+        text = _text(variable, value)
+        line = f"  {variable.name:{NAME_WIDTH}} {text:{VALUE_WIDTH}} {variable.units}".rstrip()
+        if stored is not None and variable.name in stored:
+            line += _difference(variable, text, value, stored[variable.name])
+        lines.append(line)
     return lines
+
+
+def _difference(
+    variable: Variable, text: str, value: NDArray[Any], stored: NDArray[Any]
+) -> str:
+    """Return a remark on the stored value; empty if it is the same."""
+    stored_text = _text(variable, stored)
+    if stored_text != text:
+        return f"  (stored: {stored_text})"
+    same = np.array_equal(value, stored, equal_nan=variable.flags is None)
+    return "" if same else "  (stored: other last digits)"
 
 
 def _text(variable: Variable, value: NDArray[Any]) -> str:
     if variable.flags is not None:
         return str(variable.flags(int(value)).name)
-    return " ".join(f"{number:.6g}" for number in value.ravel().tolist())
+    return " ".join(coordinate(float(number)) for number in value.ravel())

@@ -93,47 +93,47 @@ def _markdown_cell(text: str) -> str:
 
 
 def table_of(
-    found: xr.Dataset, caption: str, dims: Sequence[str],
+    summary: xr.Dataset, caption: str, dims: Sequence[str],
     columns: Mapping[str, tuple[str, float]], sources: xr.Dataset | None = None,
 ) -> Table:
     """Return a table with a row for each combination of ``dims``.
 
     Parameters
     ----------
-    found
+    summary
         Results of an analysis, with the ends of intervals as ``NAME_low`` and ``NAME_high``.
     caption
         What the table holds.
     dims
-        Dimensions of ``found``, all of them.
+        Dimensions of ``summary``, all of them.
     columns
-        Heading -> variable and the factor that it is multiplied by; a variable that ``found``
+        Heading -> variable and the factor that it is multiplied by; a variable that ``summary``
         lacks is left out.
     sources
-        A dataset with the units of ``dims``, if ``found`` has none.
+        A dataset with the units of ``dims``, if ``summary`` has none.
     """
-    present = {heading: column for heading, column in columns.items() if column[0] in found}
-    labels = [group_labels(found, dim) for dim in dims]
+    present = {heading: column for heading, column in columns.items() if column[0] in summary}
+    labels = [group_labels(summary, dim) for dim in dims]
     texts = [
-        cells(found.transpose(*dims, ...), name, scale) for name, scale in present.values()
+        cells(summary.transpose(*dims, ...), name, scale) for name, scale in present.values()
     ]
     rows = [
         [*(names[k] for names, k in zip(labels, index, strict=True)),
          *(column[position] for column in texts)]
         for position, index in enumerate(np.ndindex(*(len(names) for names in labels)))
     ]
-    headings = [axis_label(sources if sources is not None else found, dim) for dim in dims]
+    headings = [axis_label(sources if sources is not None else summary, dim) for dim in dims]
     return Table(caption, [*headings, *present], rows, stub=len(dims))
 
 
-def cells(found: xr.Dataset, name: str, scale: float = 1.0) -> list[str]:
+def cells(summary: xr.Dataset, name: str, scale: float = 1.0) -> list[str]:
     """Return a variable's values as text, each with the ends of its interval if it has one."""
-    values = found[name]
+    values = summary[name]
     if values.dtype.kind == "b":
         return ["yes" if value else "no" for value in np.ravel(values)]
     if values.dtype.kind in "iu":
         return [f"{value:,}" for value in np.ravel(values).tolist()]
-    low, high = interval(found, name)
+    low, high = interval(summary, name)
     texts = []
     for value, a, b in zip(np.ravel(values), np.ravel(low), np.ravel(high), strict=True):
         text = number(scale * value)

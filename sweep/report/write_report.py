@@ -132,7 +132,7 @@ def write_report(
     data = data.in_memory()
     _check_complete(data)
     title = data.pipeline.title.strip() or data.pipeline.name
-    found, origin = answer(data), provenance(data, str(output))
+    numbers, origin = answer(data), provenance(data, str(output))
     rendered = [kind.render(data) for kind in figure_kinds(data)]
     try:
         with _temporary_folder(output) as temporary:
@@ -145,9 +145,9 @@ def write_report(
             scenes = scenes_of(data)
             folder = figures_folder(output)
             if form == "md":
-                text = markdown(title, found, origin, rendered, scenes, pictures, folder.name)
+                text = markdown(title, numbers, origin, rendered, scenes, pictures, folder.name)
             else:
-                text = page(title, found, origin, rendered, scenes)
+                text = page(title, numbers, origin, rendered, scenes)
             written = temporary / "report"
             # Invalid Unicode, which a file's name may hold, is written as a question mark.
             written.write_text(text, encoding="utf-8", errors="replace")

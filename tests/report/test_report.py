@@ -400,12 +400,30 @@ def test_a_scene_s_command_shows_it(full, tmp_path):
     assert out.endswith(": detected, solved\n")
 
 
-def test_a_scene_that_is_not_what_the_store_holds_is_told(full):
+def test_a_scene_that_differs_from_the_store_is_reported(full):
     data = opened(full)
     results = data.results.load()
     data.results["rotation_error_deg"] = results["rotation_error_deg"] * 1.5
-    told = [scene.problem for scene in scenes_of(data)]
-    assert any("Differs from the store: rotation_error_deg " in problem for problem in told)
+    problems = [scene.problem for scene in scenes_of(data)]
+    assert any("Differs from the store: rotation_error_deg " in problem for problem in problems)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [(1e-6, ""), (1e-2, ", outside the tolerance for another processor or version.")])
+def test_a_scene_of_another_processor_may_differ_within_the_tolerance(
+    change, message, full, monkeypatch
+):
+    monkeypatch.setattr("sweep.report.stored_cell.processor", lambda: "another")
+    data = opened(full)
+    data.results["rotation_error_rad"] = data.results.load()["rotation_error_rad"] + change
+    problems = [scene.problem for scene in scenes_of(data)
+                if "detected" in scene.result and "not" not in scene.result]
+    assert problems
+    for problem in problems:
+        assert problem.startswith("Differs from the store: rotation_error_rad " if message else "")
+        assert problem.endswith(message)
+        assert bool(problem) == bool(message)
 
 
 def test_a_crashed_scene_is_not_rendered_and_a_lost_background_is_told(full, tmp_path):

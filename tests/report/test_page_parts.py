@@ -1,0 +1,102 @@
+"""Parts of the page: escaped text, colours of outcomes, tables, and what is packaged with it."""
+
+import html
+import re
+from importlib.resources import files
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.report.answer import Answer
+from sweep.report.charts import OUTCOME_COLOURS, draw_stack
+from sweep.report.figure import RenderedFigure
+from sweep.report.gallery import Scene
+from sweep.report.page import page
+from sweep.report.provenance_facts import Provenance
+from sweep.report.scene_selection import FAILURES
+from sweep.report.svg import Panel
+from sweep.report.table import MAX_ROWS, Table
+from sweep.report.theme import COLOURS, THEME, css_variables
+from sweep.report.tile import Tile
+
+HOSTILE = "<script>alert('x')</script>\"&{{ 7 * 7 }}"
+
+
+def hostile_table():
+    return Table(HOSTILE, [HOSTILE] * 2, [[HOSTILE] * 2], words=True)
+
+
+def hostile_page():
+    figure = RenderedFigure(
+        "name", HOSTILE, HOSTILE, hostile_table(),
+        [Panel(HOSTILE, HOSTILE, lambda axes: axes.set_xlabel(HOSTILE), wide=True)])
+    scenes = [Scene((HOSTILE,), HOSTILE, HOSTILE, HOSTILE, HOSTILE, picture, problem=HOSTILE)
+              for picture in (b"png", None)]
+    origin = Provenance({"Store": HOSTILE, "Report": HOSTILE}, (HOSTILE,), hostile_table(),
+                        HOSTILE, HOSTILE, HOSTILE)
+    numbers = Answer(HOSTILE, (Tile(HOSTILE, HOSTILE, HOSTILE),), (hostile_table(),))
+    return page(HOSTILE, numbers, origin, [figure], scenes)
+
+
+def test_all_text_of_a_store_is_escaped():
+    text = hostile_page()
+    assert "<script" not in text
+    assert "49" not in re.sub(r"<svg.*?</svg>|base64,[^\"]*", "", text, flags=re.DOTALL)
+    # Title twice; kicker, tiles, captions, cells, facts, commands, scenes: every one is shown.
+    assert html.unescape(text).count(HOSTILE) > 30
+
+
+def test_templates_and_style_are_files_of_the_package():
+    folder = files("sweep.report") / "templates"
+    assert {path.name for path in folder.iterdir()} == {"page.html", "parts.html", "style.css"}
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_the_page_has_every_colour_of_the_figures(dark):
+    declared = dict(re.findall(r"--(\w+): (#\w{6});", css_variables(dark=dark)))
+    assert declared == {name: colours[dark] for name, colours in THEME.items()}
+    assert set(COLOURS) <= {light for light, _ in THEME.values()}
+    assert f"--c1: {declared['c1']};" in hostile_page()
+
+
+# Flags.
+
+def test_every_flag_of_a_counted_pose_that_is_not_solved_is_a_kind_of_scene():
+    assert [(type(flag), flag.name) for flag in FAILURES] == [
+        *((DetectionStatus, name)
+          for name in ("wrong_id", "rejected", "no_candidate", "failed", "crashed")),
+        *((EstimateStatus, name) for name in (
+            "solver_failed", "not_converged", "not_explained", "failed", "crashed")),
+    ]
+
+
+def test_an_outcome_without_a_colour_of_its_own_is_hatched():
+    axes = Figure().add_subplot()
+    share = np.array([0.25])
+    draw_stack(axes, ["all"], {"solved": share, "blinded": share, "tired": share}, "all poses")
+    solved, blinded, tired = (bars.patches[0] for bars in axes.containers)
+    assert solved.get_hatch() is None
+    assert blinded.get_hatch()
+    assert blinded.get_facecolor() != tired.get_facecolor()
+
+
+def test_every_counted_outcome_of_today_has_a_colour_of_its_own():
+    assert {flag.name for flag in FAILURES} | {"solved"} == set(OUTCOME_COLOURS)
+    assert len(set(OUTCOME_COLOURS.values())) == len(OUTCOME_COLOURS)
+
+
+# Tables.
+
+def test_a_long_table_is_cut_and_says_so():
+    table = Table("Many", ["name", "value"], [[str(k), "1"] for k in range(MAX_ROWS + 5)])
+    assert len(table.shown_rows) == MAX_ROWS
+    assert table.full_caption == f"Many (the first {MAX_ROWS} of {MAX_ROWS + 5} rows)"
+    assert table.markdown().count("\n") == MAX_ROWS + 3
+
+
+def test_columns_of_numbers_are_aligned_and_long_words_wrap():
+    assert Table("", ["a", "b"], [["x", "1"]]).column_classes == ["", "n"]
+    words = Table("", ["a", "b", "c"], [["x", "short", "long " * 9]], words=True)
+    assert words.column_classes == ["", "", "text"]

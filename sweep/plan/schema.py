@@ -96,6 +96,7 @@ CORNER_ATOL_PX = 1e-2
 """Of corners and of the reprojection error."""
 
 ROTATION_ATOL_RAD = 1e-4
+"""Also, in degrees, of the angles that follow from the rotation: they change by no more."""
 
 TRANSLATION_RTOL = 1e-4
 """Relative to the marker's distance."""
@@ -190,6 +191,7 @@ _BOUND, _MAYBE_BOUND = FlagRule("bound", "always"), FlagRule("bound", "only")
 _DETECTED = FlagRule("detection", "always")
 _POSE, _MAYBE_POSE = FlagRule("estimate", "always"), FlagRule("estimate", "only")
 _EQUAL = Tolerance("equal")
+_ANGLE = Tolerance("absolute", math.degrees(ROTATION_ATOL_RAD))
 
 SCHEMA: tuple[Variable, ...] = (
     Variable("true_rvec", _S, "f8", "true rotation vector, marker to camera", "radian", ("xyz",),
@@ -225,9 +227,9 @@ SCHEMA: tuple[Variable, ...] = (
              ("xyz",),
              present_when=_POSE, tolerance=Tolerance("rotation", ROTATION_ATOL_RAD)),
     Variable("rotation_error_deg", _E, "f4", "angle of the rotation error", "degree",
-             present_when=_POSE),
+             present_when=_POSE, tolerance=_ANGLE),
     Variable("normal_error_deg", _E, "f4", "angle between true and estimated normal", "degree",
-             present_when=_POSE),
+             present_when=_POSE, tolerance=_ANGLE),
     Variable("reprojection_error_px", _E, "f4", "RMS over the corners", "px",
              present_when=_POSE, tolerance=Tolerance("absolute", CORNER_ATOL_PX)),
     Variable("alternative_rotation_error_deg", _E, "f4",

@@ -264,7 +264,7 @@ def _label_front(panel: Axes, condition: xr.Dataset, criterion: str, scale: floa
     )
     # The stepped line goes along each point's error to the next point's cost, then down to it.
     line = panel.transData.transform(np.column_stack([np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]]))
-    placed: list[Bbox] = []
+    occupied: list[Bbox] = []
     for k, label in enumerate(labels):
         size = scale * np.array(text_to_path.get_text_width_height_descent(label, FONT, False)[:2])
         # The corner of the label, or the middle of its side, that is nearest to the point.
@@ -275,14 +275,14 @@ def _label_front(panel: Axes, condition: xr.Dataset, criterion: str, scale: floa
             # In increasing weight: order of preference, on the line, connector across another
             # label, on points, outside the panel, on another label.
             rank + 12 * Path(line).intersects_bbox(box, filled=False)
-            + 20 * sum(Path([line[2 * k], near]).intersects_bbox(other) for other in placed)
+            + 20 * sum(Path([line[2 * k], near]).intersects_bbox(other) for other in occupied)
             + 40 * box.padded(4 * scale).count_contains(points)
             + 1e3 * (panel.bbox.count_contains(box.get_points()) < 2)
-            + 1e4 * box.padded(2 * scale).count_overlaps(placed)
+            + 1e4 * box.padded(2 * scale).count_overlaps(occupied)
             for rank, (box, near) in enumerate(zip(boxes, nearest, strict=True))
         ]
         best = int(np.argmin(penalties))
-        placed.append(boxes[best])
+        occupied.append(boxes[best])
         panel.annotate(
             label, (x[k], y[k]), (lowest[best] - line[2 * k]) / scale,
             textcoords="offset points", va="bottom", fontsize=LABEL_SIZE, color=INK, zorder=6,

@@ -109,7 +109,10 @@ def test_what_compiled_code_uses_is_declared_in_the_sources_of_the_digest():
                     imported[alias.asname or alias.name] = origin
         functions = [
             node for node in tree.body if isinstance(node, ast.FunctionDef)
-            and any(isinstance(d, ast.Name) and d.id == "compiled" for d in node.decorator_list)
+            and any(
+                isinstance(d, ast.Name) and d.id in ("compiled", "compiled_inline")
+                for d in node.decorator_list
+            )
         ]
         for function in functions:
             # Annotations are never evaluated; only what the body uses is compiled.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from sweep.compilation import compiled
+from sweep.compilation import compiled, compiled_inline
 from sweep.model.lens import distort
 from sweep.typing import Floats
 
@@ -59,7 +59,7 @@ class ModuleEdge(NamedTuple):
     to_row: float
 
 
-@compiled
+@compiled_inline
 def homogeneous_pixel(
     projection: Projection, shift_x: float, shift_y: float, column: float, row: float
 ) -> tuple[float, float, float]:
@@ -74,7 +74,7 @@ def homogeneous_pixel(
     return x, y, z
 
 
-@compiled
+@compiled_inline
 def distorted_point(t: float, projection: Projection, edge: ModuleEdge) -> tuple[float, float]:
     """Return the pixel of the point at parameter t of an edge, seen through the lens."""
     plane, optics = projection.plane, projection.optics

@@ -132,10 +132,11 @@ def _sensed(scenes: Scenes, row: int, levels: NDArray[np.float64], left: int, to
             effect["vignetting"],
         )
         illuminate(levels, left, top, light, scenes.cameras.view[row])
-    patch = Patch(
-        effect, left, top, (width, height), scenes.cameras.view[row], scenes.noise_key[row]
-    )
-    levels = apply_pointwise("light", levels, patch)
+    if POINTWISE:
+        patch = Patch(
+            effect, left, top, (width, height), scenes.cameras.view[row], scenes.noise_key[row]
+        )
+        levels = apply_pointwise("light", levels, patch)
     image = np.empty(levels.shape, dtype=np.uint8)
     readout = Readout(
         scenes.noise_key[row], effect["full_well_e"], effect["read_noise_e"], effect["gain"],

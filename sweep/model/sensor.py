@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.compilation import compiled
+from sweep.compilation import compiled, compiled_inline
 from sweep.model.coverage import ROUNDING_SNAP
 from sweep.model.splitmix import mixed
 from sweep.typing import Floats
@@ -132,14 +132,14 @@ def _poisson(mean: float, pixel: np.uint64, draw: int) -> float:
             return k
 
 
-@compiled
+@compiled_inline
 def _pixel_key(key: np.uint64, column: int, row: int) -> Any:
     """Return the key of a pixel's draws: a function of the scene's key and of its position."""
     position = (np.uint64(row) << np.uint64(32)) + np.uint64(column)
     return mixed(key + _PIXEL_STEP * (position + _ONE))
 
 
-@compiled
+@compiled_inline
 def _signal(level: float, pixel: np.uint64, readout: Readout) -> float:
     """Return a pixel's signal in grey levels: electrons and their noise, gain, plain noise.
 
@@ -158,7 +158,7 @@ def _signal(level: float, pixel: np.uint64, readout: Readout) -> float:
     return level
 
 
-@compiled
+@compiled_inline
 def _digitised(level: float, bits: int, most: float) -> np.uint8:
     """Return a level quantised to ``bits`` (``most`` is the largest value), clipped, in 8 bits."""
     counts = float(math.floor(level * (most / 255.0) + (0.5 + ROUNDING_SNAP)))

@@ -20,7 +20,14 @@ if sys.version_info < (3, 11):  # noqa: UP036  (a copy of the sources, which pip
         raise SystemExit(_PROBLEM)  # the command: one line, no traceback
     raise ImportError(_PROBLEM)
 
-from sweep.errors import ArgumentError, PipelineError, RunError, StoreError, SweepError
+from sweep.errors import (
+    ArgumentError,
+    DatasetError,
+    PipelineError,
+    RunError,
+    StoreError,
+    SweepError,
+)
 from sweep.execution.limits import TIME_LIMIT_S
 from sweep.version import __version__
 
@@ -33,8 +40,8 @@ if TYPE_CHECKING:
     from sweep.plan.experiment import Pipeline
 
 __all__ = [
-    "ArgumentError", "Pipeline", "PipelineError", "Progress", "RunError", "StoreError",
-    "SweepError", "__version__", "open", "run",
+    "ArgumentError", "DatasetError", "Pipeline", "PipelineError", "Progress", "RunError",
+    "StoreError", "SweepError", "__version__", "open", "run",
 ]
 
 _IMPORTED_ON_USE = {"Pipeline": "sweep.plan.experiment", "Progress": "sweep.execution.progress"}

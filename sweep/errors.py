@@ -54,12 +54,15 @@ class ArgumentError(SweepError, ValueError):
         return ArgumentError, (self.argument, self.value, self.problem)
 
 
-class DatasetError(SweepError):
-    """A dataset that lacks what an analysis needs, or two that do not fit together."""
-
-
 class StoreError(SweepError):
     """A store that cannot be written, read or continued as asked."""
+
+
+class DatasetError(StoreError):
+    """A dataset that lacks what an analysis needs, or two that do not fit together.
+
+    It is a StoreError because analyses raised that in 0.5: deprecated since 0.6.
+    """
 
 
 class StoreReplacedError(StoreError):

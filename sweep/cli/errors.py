@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 
-from sweep.errors import ArgumentError, DatasetError, PipelineError, StoreError, SweepError
+from sweep.errors import ArgumentError, PipelineError, StoreError, SweepError
 from sweep.messages import plain
 
 MAX_LINE_LENGTH = 2000
 
-REFUSALS = (ArgumentError, DatasetError, PipelineError, StoreError)
+REFUSALS = (ArgumentError, PipelineError, StoreError)
 """Errors of what was asked for (exit status 2); others occur while a command runs (1)."""
 
 

@@ -72,11 +72,6 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
         for key in sorted({*mine, *theirs})
         if mine.get(key) != theirs.get(key)
     ]
-    known = {variable.name for variable in store.variables}
-    faults += [
-        f"{variable.name}: not in a store of format {store.format}"
-        for variable in SCHEMA if variable.name not in known
-    ]
     present = {variable.name for variable in store.variables}
     faults += [
         f"{variable.name}: not a variable of the store's format {store.format}"

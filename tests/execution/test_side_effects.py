@@ -30,7 +30,8 @@ def settings():
             for name, logger in loggers.items()
         },
         "signals": {n: signal.getsignal(n) for n in signal.valid_signals()},
-        "environment": dict(os.environ),
+        # Dask notes the process that started workers in a variable of its own.
+        "environment": {k: v for k, v in os.environ.items() if k != "__DASK_PARENT_PID"},
         "warnings": list(warnings.filters),
         "path": list(sys.path),
     }

@@ -316,7 +316,7 @@ def test_scenes_that_end_their_process_are_found_and_no_other_is_touched(
     see_status(url, pipeline, poisons)
     again, _, _ = run_poisoned(tmp_path, TEXT, poisons, "--workers", 2)
     assert again.returncode == 0
-    assert "is finished" in again.stdout
+    assert "is already finished" in again.stdout
 
 
 @pytest.mark.long

@@ -152,7 +152,10 @@ def printed(notebook, until):
     return texts
 
 
-@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize("name", [
+    name if name == "first_analysis" else pytest.param(name, marks=pytest.mark.long)
+    for name in FIGURES
+])
 def test_notebook_runs_with_few_trials(name, kernel, tmp_path, capsys):
     sources = [cell.source for cell in code_cells(read(name))]
     few = [re.sub(r"^trials = \d+", f"trials = {FEW_TRIALS}", source, flags=re.MULTILINE)

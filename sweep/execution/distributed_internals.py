@@ -1,6 +1,6 @@
 """What this package uses of Dask's ``distributed`` beyond its documented interface.
 
-Checked with versions 2025.1 to 2026.8. Everything else of this package uses public names only, so
+Tried with version 2026.8. Everything else of this package uses public names only, so
 that a new version of ``distributed`` can break a run in this module alone.
 """
 

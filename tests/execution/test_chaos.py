@@ -421,7 +421,7 @@ def test_kill_between_any_two_writes_of_a_new_store_leaves_all_or_none(
         assert committed(open_store(str(url))) == set()
 
 
-@lengths(4, ALL)
+@lengths(2, ALL)
 def test_orphan_that_goes_on_after_an_overwrite_harms_nothing(count, small, cluster, tmp_path):
     pipeline, path, _ = small
     url = str(tmp_path / "small.zarr")
@@ -508,6 +508,7 @@ def told_in_a_line(ran, what, codes=(1,)):
 FULL = "No space left on device"
 
 
+@pytest.mark.long
 def test_run_on_a_full_disk_says_so_in_a_line_and_continues_when_there_is_room(
     small, disk, cluster, tmp_path
 ):

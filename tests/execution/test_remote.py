@@ -299,6 +299,7 @@ class Cluster:
 # --- stores on the server ---
 
 
+@pytest.mark.long
 def test_remote_store_of_a_tls_cluster_holds_what_a_local_one_does(
     bucket, certificates, small, tmp_path
 ):

@@ -115,7 +115,8 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("how", ["embedded", "cluster of the caller"])
+@pytest.mark.parametrize("how", [
+    pytest.param("embedded", marks=pytest.mark.long), "cluster of the caller"])
 def test_settings_of_the_caller_are_as_before_and_the_callers_client_still_computes(how, tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)

@@ -195,6 +195,7 @@ def test_each_figure_applies_where_it_should(full, tmp_path):
     }
 
 
+@pytest.mark.long
 def test_an_axis_of_too_many_configurations_has_a_figure_of_its_own(tmp_path):
     text = (f"{CAMERA}[pose]\nside_px = 40\n[axes]\nminMarkerDistanceRate = [0.1, 0.12]\n"
             "errorCorrectionRate = [0.2, 0.4, 0.6, 0.8]\n"

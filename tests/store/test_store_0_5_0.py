@@ -168,7 +168,7 @@ def test_cell_of_an_old_store_is_reproduced(unpacked):
     assert again.stored["detection"] == DetectionStatus.detected
 
 
-@pytest.mark.parametrize("form", ["html", "md"])
+@pytest.mark.parametrize("form", ["html", pytest.param("md", marks=pytest.mark.long)])
 def test_old_store_is_reported(form, finished, tmp_path, capsys):
     output = tmp_path / f"report.{form}"
     assert main(["report", str(finished), "-o", str(output)]) == 0, capsys.readouterr().err

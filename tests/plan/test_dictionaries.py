@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tomlkit
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from sweep.errors import PipelineError
@@ -49,9 +49,11 @@ def documents(draw):
         elif kind == "uniform":
             document["pose"][name] = {"uniform": [a, b]}
         else:
+            count = draw(st.integers(2, 5))
+            assume(len({*np.linspace(a, b, count).tolist()}) == count)  # doubles lie between
             document["axes"][name] = {
                 "list": [a, b], "range": {"range": [1, draw(st.integers(2, 9))]},
-                "linspace": {"linspace": [a, b, draw(st.integers(2, 5))]},
+                "linspace": {"linspace": [a, b, count]},
             }[kind]
     if draw(st.booleans()):
         document["axes"]["solver"] = ["ippe", "sqpnp"]

@@ -191,8 +191,20 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
                 _lay_out(LocalStore(building), pipeline, extents, run_id)
                 building.rename(Path(url).resolve())
             finally:
-                shutil.rmtree(building, ignore_errors=True)
+                _remove_unfinished(building)
     return open_store(url, "r+")
+
+
+def _remove_unfinished(folder: Path) -> None:
+    """Delete a store that could not be created.
+
+    After the first write that fails, Zarr's others go on for a moment and may add files again.
+    """
+    for _ in range(50):
+        shutil.rmtree(folder, ignore_errors=True)
+        if not folder.exists():
+            return
+        time.sleep(0.02)
 
 
 def _beside(url: str, ending: str) -> Path:

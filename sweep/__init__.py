@@ -162,12 +162,16 @@ def _run(
     progress: bool | Callable[[Progress], None] | None = None,
     **options: Any,
 ) -> xr.Dataset:
-    from sweep.execution.progress import progress_report  # noqa: PLC0415  (as the docstring says)
-    from sweep.execution.runner import execute  # noqa: PLC0415
+    from sweep.execution import BLOCK_TASK  # noqa: PLC0415  (as the docstring says)
+    from sweep.execution.progress import progress_report  # noqa: PLC0415
+    from sweep.isolation.child_process import Child  # noqa: PLC0415
 
-    read = _pipeline(pipeline)
-    with progress_report(progress) as report:
-        return open(execute(read, progress=report, **options).store)
+    # The child imports its packages while this process does.
+    with Child(BLOCK_TASK) as child, progress_report(progress) as report:
+        from sweep.execution.runner import execute  # noqa: PLC0415
+
+        read = _pipeline(pipeline)
+        return open(execute(read, progress=report, child=child, **options).store)
 
 
 def _pipeline(given: Pipeline | Mapping[str, Any] | str | os.PathLike[str]) -> Pipeline:

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+from typing import TYPE_CHECKING
 
 from sweep.cli.arguments import add_json, add_pipeline, add_workers, read_pipeline
 from sweep.cli.command import Command, Example
 from sweep.cli.output import print_json
+
+if TYPE_CHECKING:
+    from sweep.isolation.child_process import Child
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,6 +34,15 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _execute(options: argparse.Namespace) -> int:
+    from sweep.execution import BLOCK_TASK  # noqa: PLC0415
+    from sweep.isolation.child_process import Child  # noqa: PLC0415
+
+    # It imports its packages while this process does.
+    with Child(BLOCK_TASK) as child:
+        return _execute_beside(child, options)
+
+
+def _execute_beside(child: Child, options: argparse.Namespace) -> int:
     pipeline = read_pipeline(options)
     from sweep.execution.progress import progress_bar  # noqa: PLC0415
     from sweep.execution.runner import execute  # noqa: PLC0415
@@ -38,7 +51,7 @@ def _execute(options: argparse.Namespace) -> int:
         summary = execute(
             pipeline, options.store, workers=options.workers, scheduler=options.scheduler,
             reuse=options.reuse, overwrite=options.overwrite, time_limit_s=options.time_limit_s,
-            progress=bar,
+            progress=bar, child=child,
         )
     if options.json:
         print_json(dataclasses.asdict(summary))

@@ -11,8 +11,7 @@ import itertools
 import time
 import uuid
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from collections.abc import Set as AbstractSet
+from collections.abc import Iterable, Iterator, Sequence
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -24,19 +23,13 @@ from sweep.execution.cluster import thread_count
 from sweep.execution.limits import (
     BLOCKS_PER_THREAD,
     MAX_DEATHS,
-    MAX_FAILED_BLOCKS,
     NO_WORKERS_TIMEOUT_S,
     POLL_S,
     THREAD_COUNT_INTERVAL_S,
     TIME_LIMIT_S,
 )
-from sweep.execution.progress import Progress, ProgressReport
+from sweep.execution.tally import Tally
 from sweep.isolation.interrupts import Interrupts
-from sweep.measure.flags import DetectionStatus
-from sweep.plan.parameters import Stage
-from sweep.store.blocks import receipts
-from sweep.store.failures import MAX_ROWS
-from sweep.store.receipt import Receipt
 from sweep.store.run_store import RunStore
 
 
@@ -100,16 +93,10 @@ class BlocksInFlight:
         self._interrupts = interrupts
         self._finished: SimpleQueue[Future[Any]] = SimpleQueue()
         self._numbers: dict[Future[Any], int] = {}
-        self._failures = Counter({"failed": 0, "crashed": 0})
         self._deaths: Counter[int] = Counter()
 
-    def compute(
-        self, numbers: Iterable[int], done: AbstractSet[int] = frozenset(),
-        report: ProgressReport | None = None,
-    ) -> Mapping[str, int]:
-        """Compute blocks by their numbers; ``done`` are those that are committed already.
-
-        Returns how many blocks, scenes, detections and estimates were computed.
+    def compute(self, numbers: Iterable[int], tally: Tally) -> None:
+        """Compute blocks by their numbers, and count them.
 
         Raises
         ------
@@ -119,24 +106,15 @@ class BlocksInFlight:
             If a worker cannot write the store.
         """
         try:
-            return self._compute(iter(numbers), done, report)
+            self._compute(iter(numbers), tally)
         finally:
             self._cancel()
+        tally.check()
 
-    def _compute(
-        self, waiting: Iterator[int], done: AbstractSet[int],
-        report: ProgressReport | None,
-    ) -> Mapping[str, int]:
-        progress = Progress(0, self._store.pipeline.size(Stage.scene), 0)
-        for _, receipt in receipts(self._store, done):
-            progress = self._counted(progress, receipt)
-        if report is not None:
-            report(progress)
-        computed: Counter[str] = Counter()
-        failed: list[str] = []
+    def _compute(self, waiting: Iterator[int], tally: Tally) -> None:
         limit = InFlightLimit(self._client)
         for number in itertools.islice(waiting, limit.blocks()):
-            self._submit(number)
+            self._submit(number, tally)
         while self._numbers:
             self._interrupts.check()
             most = limit.blocks()
@@ -146,35 +124,25 @@ class BlocksInFlight:
                 continue
             number = self._numbers.pop(future)
             if future.status == "finished":
-                receipt = future.result()
-                computed.update({"blocks": 1, **receipt.computed})
-                progress = self._counted(progress, receipt)
-                if report is not None:
-                    report(progress)
-            elif (reason := self._failure(number, future)) is not None:
-                failed.append(reason)
+                tally.add(future.result())
+            elif (reason := self._failure(number, future, tally)) is not None:
+                tally.add_failed(reason)
             future.release()
-            if len(failed) < MAX_FAILED_BLOCKS:
+            if not tally.hopeless:
                 for following in itertools.islice(waiting, max(most - len(self._numbers), 0)):
-                    self._submit(following)
-        if failed:
-            raise RunError(
-                f"{self._store.url}: {len(failed)} blocks failed\n"
-                + "\n".join(f"  {reason}" for reason in failed)
-            )
-        return computed
+                    self._submit(following, tally)
 
-    def _submit(self, number: int) -> None:
+    def _submit(self, number: int, tally: Tally) -> None:
         block = self._store.blocks[number]
-        quota = {kind: max(MAX_ROWS - count, 0) for kind, count in self._failures.items()}
         future = self._client.submit(
             compute_block, self._url, self._store.run_id, block, self._sources,
-            self._time_limit_s, quota, pure=False, key=f"block-{block}-{uuid.uuid4().hex[:8]}",
+            self._time_limit_s, tally.quota(), pure=False,
+            key=f"block-{block}-{uuid.uuid4().hex[:8]}",
         )
         self._numbers[future] = number
         future.add_done_callback(self._finished.put)
 
-    def _failure(self, number: int, future: Future[Any]) -> str | None:
+    def _failure(self, number: int, future: Future[Any], tally: Tally) -> str | None:
         """Return why a block failed; None if it was submitted again."""
         if future.status in ("cancelled", "lost"):
             raise RunError("the scheduler went away")
@@ -185,7 +153,7 @@ class BlocksInFlight:
             # A block that ends its process is computed in isolation when it is begun again, but
             # it may have been queued behind one, or its workers were killed from outside.
             self._deaths[number] += 1
-            self._submit(number)
+            self._submit(number, tally)
             return None
         return f"block {self._store.blocks[number]}: {type(error).__name__}: {error}"
 
@@ -195,13 +163,3 @@ class BlocksInFlight:
             with contextlib.suppress(OSError, TimeoutError):
                 self._client.cancel(list(self._numbers))
         self._numbers.clear()
-
-    def _counted(self, progress: Progress, receipt: Receipt) -> Progress:
-        """Return the progress after one more block; count its failures."""
-        self._failures.update(failure.kind for failure in receipt.failures)
-        counts = receipt.detection
-        detected = DetectionStatus.detected
-        return Progress(
-            progress.done + receipt.scenes, progress.total,
-            progress.detected + (counts[detected] if len(counts) > detected else 0),
-        )

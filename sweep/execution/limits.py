@@ -21,6 +21,14 @@ MAX_FAILED_BLOCKS = 10
 POLL_S = 0.2
 """How often a run that waits for blocks checks for Ctrl-C."""
 
+# Small runs (`sweep.execution.small_run`)
+
+SMALL_RUN_S = 3.0
+"""Work up to which a run needs no cluster, which takes about as long to start and to end."""
+
+SMALL_RUN_LIMIT_S = 10.0
+"""Seconds after which the rest of a run that was taken for a small one goes to a cluster."""
+
 # Time limits
 
 TIME_LIMIT_S = 600.0
@@ -28,6 +36,9 @@ TIME_LIMIT_S = 600.0
 
 CALIBRATION_S = 0.6
 """Seconds spent on measuring what scenes cost before blocks are cut."""
+
+QUICK_CALIBRATION_S = 0.1
+"""Seconds spent on finding out whether a run is small."""
 
 CALIBRATION_SHARE = 1 / 8
 """Share of a block's time limit after which the measurement is abandoned."""

@@ -4,27 +4,37 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import itertools
 import math
 import os
+import statistics
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sweep.errors import ArgumentError, RunError, StoreError, StoreReplacedError
+from sweep.execution import BLOCK_TASK
 from sweep.execution.calibration import Calibration, block_extents, calibrate_isolated
-from sweep.execution.finalize import close, lost
-from sweep.execution.limits import CALIBRATION_S, CALIBRATION_SHARE, POLL_S, TIME_LIMIT_S
+from sweep.execution.finalize import close
+from sweep.execution.limits import (
+    CALIBRATION_S,
+    CALIBRATION_SHARE,
+    QUICK_CALIBRATION_S,
+    SMALL_RUN_S,
+    TIME_LIMIT_S,
+)
 from sweep.execution.progress import ProgressReport
 from sweep.execution.reuse import match
+from sweep.execution.small_run import BlocksInChild
+from sweep.execution.summary import Summary, summary_of, summary_of_complete
+from sweep.execution.tally import Tally
 from sweep.isolation.child_process import Child
 from sweep.isolation.interrupts import Interrupts
-from sweep.measure.flags import DetectionStatus
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
-from sweep.store.blocks import committed
+from sweep.store.blocks import committed, receipts
 from sweep.store.lifecycle import create_store, open_store, read_run_metadata, remove_store
 from sweep.store.locations import check_writable, exists, is_remote, open_storage
 from sweep.store.lock import locked, refuse_if_held
@@ -37,47 +47,10 @@ if TYPE_CHECKING:
     from sweep.execution.cluster import Cluster
 
 # `sweep.execution.cluster` and `in_flight` are imported where they are used: Dask is slow to
-# import, and a finished store needs none of it.
+# import, and finished stores and small runs need none of it.
 
-
-@dataclass(frozen=True, slots=True)
-class Summary:
-    """What a run did; ``sweep run --json`` prints it.
-
-    Attributes
-    ----------
-    store
-        The store as it was given, or the default.
-    data
-        What ``xarray.open_zarr`` opens.
-    poses
-        Cells of the grid's scene axes.
-    results
-        Estimates: poses times detector settings times estimators.
-    detected
-        Detections, over all detector settings.
-    blocks
-        Blocks of the store.
-    computed_blocks, computed_scenes, computed_estimates
-        What this run computed; the rest was committed before, or reused from other stores.
-    seconds
-        Duration of this run.
-    crashed, failed
-        Cells that are flagged so.
-    """
-
-    store: str
-    data: str
-    poses: int
-    results: int
-    detected: int
-    blocks: int
-    computed_blocks: int
-    computed_scenes: int
-    computed_estimates: int
-    seconds: float
-    crashed: int = 0
-    failed: int = 0
+SAMPLED_RECEIPTS = 100
+"""Committed blocks from which the work that is left is estimated."""
 
 
 def absolute_url(url: str) -> str:
@@ -97,6 +70,7 @@ def execute(
     block_s: float | None = None,
     time_limit_s: float = TIME_LIMIT_S,
     progress: ProgressReport | None = None,
+    child: Child | None = None,
 ) -> Summary:
     """Run a pipeline into a store; what is committed there already is not computed again.
 
@@ -107,7 +81,8 @@ def execute(
     store
         Path or URL of the store (default: ``runs/NAME.zarr``).
     workers
-        Processes of the embedded cluster (default: the available processors).
+        Processes of the embedded cluster (default: the available processors, or a single child
+        process and no cluster where :data:`SMALL_RUN_S` seconds of work are left).
     scheduler
         Address of a running Dask scheduler, in place of the embedded cluster. Its workers must
         reach the store under the same path.
@@ -124,6 +99,9 @@ def execute(
         Block timeout in seconds; the search for a scene that never returns keeps within it.
     progress
         Called before the first block and after each one.
+    child
+        The process that measures scenes and computes small runs, if the caller started it earlier
+        (`Child(BLOCK_TASK)`), so that it has imported its packages by now.
 
     Raises
     ------
@@ -139,32 +117,45 @@ def execute(
     url = os.fspath(store) if store is not None else f"runs/{pipeline.name}.zarr"
     unfinished = _store_to_continue(url, pipeline, overwrite)
     if unfinished is not None and unfinished.finished:
-        return _summary_of_complete(unfinished, started)
+        return summary_of_complete(unfinished, started)
     sources = _matching_sources(url, pipeline, reuse)
     if unfinished is None:
         check_writable(url)
 
-    from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
-
     with contextlib.ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts())
-        # Compiling and measuring in a child process while the workers' processes start.
-        measuring = None if unfinished is not None else stack.enter_context(
-            _calibrating(pipeline, CALIBRATION_SHARE * time_limit_s)
-        )
-        connection = stack.enter_context(
-            connected(pipeline, workers=workers, scheduler=scheduler, client=client)
-        )
-        if unfinished is None and measuring is not None:
-            calibration = _result(measuring, interrupts)
-            unfinished = _new_store(url, pipeline, calibration, connection, block_s, overwrite)
+        thread = stack.enter_context(ThreadPoolExecutor(1))
+        child = child or Child(BLOCK_TASK)
+        stack.callback(child.close)  # the thread waits for it
+
+        def measuring(budget_s: float) -> Future[Calibration]:
+            limit_s = CALIBRATION_SHARE * time_limit_s
+            return thread.submit(calibrate_isolated, child, pipeline, budget_s, limit_s)
+
+        calibration: Calibration | None = None
+        connection: Client | None = None
+        embedded = workers is None and scheduler is None and client is None
+        if embedded and unfinished is None:
+            calibration = interrupts.await_result(measuring(QUICK_CALIBRATION_S))
+        if not (embedded and _work_s(pipeline, unfinished, calibration) < SMALL_RUN_S):
+            from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
+
+            # Measured while the workers' processes start.
+            future = measuring(CALIBRATION_S) if unfinished is None else None
+            connection = stack.enter_context(
+                connected(pipeline, workers=workers, scheduler=scheduler, client=client)
+            )
+            if future is not None:
+                calibration = interrupts.await_result(future)
         if unfinished is None:
-            raise AssertionError(url)
+            if calibration is None:
+                raise AssertionError(url)
+            unfinished = _new_store(url, pipeline, calibration, connection, block_s, overwrite)
         with _continuable_errors(without=" without overwrite" if overwrite else ""):
             computed = _compute_and_close(
-                unfinished, connection, sources, time_limit_s, interrupts, progress
+                unfinished, child, connection, sources, time_limit_s, interrupts, progress
             )
-    return _summary(open_store(url), computed, time.perf_counter() - started)
+    return summary_of(open_store(url), computed, time.perf_counter() - started)
 
 
 def recompute(
@@ -174,25 +165,27 @@ def recompute(
     workers: int | None = None,
     time_limit_s: float = TIME_LIMIT_S,
 ) -> None:
-    """Compute blocks of a store whose lock this process holds, on an embedded cluster.
+    """Compute blocks of a store whose lock this process holds, as :func:`execute` does.
 
     Raises
     ------
     RunError
         If blocks failed.
     """
-    from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
-    from sweep.execution.in_flight import BlocksInFlight  # noqa: PLC0415  (slow to import)
-
     _check_arguments(workers, None, None, None, time_limit_s)
-    with (
-        Interrupts() as interrupts,
-        connected(store.pipeline, workers=workers) as client,
-        _continuable_errors(),
-    ):
-        BlocksInFlight(
-            store, client, absolute_url(store.url), (), time_limit_s, interrupts=interrupts
-        ).compute(numbers)
+    chosen = list(numbers)
+    with contextlib.ExitStack() as stack:
+        interrupts = stack.enter_context(Interrupts())
+        child = stack.enter_context(Child(BLOCK_TASK))
+        connection: Client | None = None
+        if workers is not None or _block_s(store) * len(chosen) >= SMALL_RUN_S:
+            from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
+
+            connection = stack.enter_context(connected(store.pipeline, workers=workers))
+        with _continuable_errors():
+            _compute(
+                store, iter(chosen), Tally(store), child, connection, (), time_limit_s, interrupts
+            )
 
 
 def _check_arguments(
@@ -232,16 +225,6 @@ def _store_to_continue(url: str, pipeline: Pipeline, overwrite: bool) -> RunStor
     return store
 
 
-def _summary_of_complete(store: RunStore, started: float) -> Summary:
-    done = len(committed(store))
-    if done != len(store.blocks):
-        raise StoreError(
-            f"{store.url}: damaged: finished, but {done} of {len(store.blocks)} blocks exist; "
-            "repair it with `sweep verify --repair`"
-        )
-    return _summary(store, {}, time.perf_counter() - started)
-
-
 def _matching_sources(
     url: str, pipeline: Pipeline, reuse: Sequence[str | os.PathLike[str]]
 ) -> list[str]:
@@ -254,58 +237,86 @@ def _matching_sources(
     return sources
 
 
-# While the cluster starts
+# What the run takes
 
 
-@contextlib.contextmanager
-def _calibrating(pipeline: Pipeline, limit_s: float) -> Iterator[Future[Calibration]]:
-    """Measure what scenes cost, in a child process, while the body runs."""
-    with ThreadPoolExecutor(1) as thread, Child() as child:
-        yield thread.submit(calibrate_isolated, child, pipeline, CALIBRATION_S, limit_s)
+def _work_s(
+    pipeline: Pipeline, unfinished: RunStore | None, calibration: Calibration | None
+) -> float:
+    """Return the estimated seconds of work that are left."""
+    if unfinished is not None:
+        left = len(unfinished.blocks) - len(committed(unfinished))
+        return left * _block_s(unfinished)
+    if calibration is None:
+        return math.inf
+    return pipeline.size(Stage.scene) * calibration.scene_s
 
 
-def _result(measuring: Future[Calibration], interrupts: Interrupts) -> Calibration:
-    while not measuring.done():
-        interrupts.check()
-        wait([measuring], timeout=POLL_S)
-    interrupts.check()
-    return measuring.result()
+def _block_s(store: RunStore) -> float:
+    """Return the mean seconds of some committed blocks; infinity if there are none."""
+    some = sorted(committed(store))[:SAMPLED_RECEIPTS]
+    spent = [receipt.wall_s for _, receipt in receipts(store, some)]
+    return statistics.fmean(spent) if spent else math.inf
 
 
 def _new_store(
-    url: str, pipeline: Pipeline, calibration: Calibration, client: Client,
+    url: str, pipeline: Pipeline, calibration: Calibration, client: Client | None,
     block_s: float | None, overwrite: bool,
 ) -> RunStore:
-    """Create an empty store whose blocks suit the calibration and the cluster."""
-    from sweep.execution.cluster import thread_count  # noqa: PLC0415  (slow to import)
+    """Create an empty store whose blocks suit the calibration and the cluster, if there is one."""
+    threads = 1
+    if client is not None:
+        from sweep.execution.cluster import thread_count  # noqa: PLC0415  (slow to import)
 
-    threads = max(thread_count(client), 1)
+        threads = max(thread_count(client), 1)
     extents = block_extents(pipeline, calibration, threads, block_s)
     if overwrite and exists(url):
         remove_store(url)
     return create_store(url, pipeline, extents)
 
 
-# On the cluster
+# In the child, or on the cluster
 
 
 def _compute_and_close(
-    store: RunStore, client: Client, sources: Sequence[str], time_limit_s: float,
-    interrupts: Interrupts, progress: ProgressReport | None,
+    store: RunStore, child: Child, client: Client | None, sources: Sequence[str],
+    time_limit_s: float, interrupts: Interrupts, progress: ProgressReport | None,
 ) -> Mapping[str, int]:
     """Compute the blocks that are not committed; return counts of what was computed."""
-    from sweep.execution.in_flight import BlocksInFlight  # noqa: PLC0415  (slow to import)
-
     with ThreadPoolExecutor(1) as thread, locked(store):
         thread.submit(importlib.import_module, "xarray")  # to close the store
         done = committed(store)
+        tally = Tally(store, progress)
+        tally.begin(done)
         waiting = (number for number in range(len(store.blocks)) if number not in done)
-        blocks = BlocksInFlight(
-            store, client, absolute_url(store.url), sources, time_limit_s, interrupts=interrupts
-        )
-        computed = blocks.compute(waiting, done, progress)
+        _compute(store, waiting, tally, child, client, sources, time_limit_s, interrupts)
         close(store)
-    return computed
+    return tally.computed
+
+
+def _compute(
+    store: RunStore, waiting: Iterator[int], tally: Tally, child: Child, client: Client | None,
+    sources: Sequence[str], time_limit_s: float, interrupts: Interrupts,
+) -> None:
+    """Compute blocks on a cluster; without one in the child, as long as that is quick."""
+    url = absolute_url(store.url)
+    with contextlib.ExitStack() as stack:
+        if client is None:
+            BlocksInChild(
+                store, child, url, sources, time_limit_s, interrupts=interrupts
+            ).compute(waiting, tally)
+            following = next(waiting, None)
+            if following is None:
+                return
+            from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
+
+            waiting = itertools.chain([following], waiting)
+            client = stack.enter_context(connected(store.pipeline))
+        from sweep.execution.in_flight import BlocksInFlight  # noqa: PLC0415  (slow to import)
+
+        BlocksInFlight(
+            store, client, url, sources, time_limit_s, interrupts=interrupts
+        ).compute(waiting, tally)
 
 
 @contextlib.contextmanager
@@ -319,22 +330,3 @@ def _continuable_errors(without: str = "") -> Iterator[None]:
         first, *others = str(error).splitlines()
         advice = f"{first}; run it again{without} to continue"
         raise RunError("\n".join([advice, *others])) from None
-
-
-def _summary(store: RunStore, computed: Mapping[str, int], seconds: float) -> Summary:
-    """Return the summary of a finished store from the counts that it recorded."""
-    counts = store.run_metadata["counts"]
-    missing = lost(counts["detection"], counts["estimate"])
-    return Summary(
-        store=store.url,
-        data=store.data_url,
-        poses=store.pipeline.size(Stage.scene),
-        results=math.prod(len(axis) for axis in store.pipeline.axes),
-        detected=counts["detection"][DetectionStatus.detected],
-        blocks=len(store.blocks),
-        computed_blocks=computed.get("blocks", 0),
-        computed_scenes=computed.get("scenes", 0),
-        computed_estimates=computed.get("estimates", 0),
-        seconds=round(seconds, 3),
-        **missing,
-    )

@@ -7,6 +7,7 @@ these two processes of one program send each other is unpickled.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import os
 import pickle
@@ -22,7 +23,6 @@ from pathlib import Path
 from typing import IO, Any, Self
 
 from sweep.errors import SweepError
-from sweep.isolation.watchdog import ending_after
 
 SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
@@ -61,6 +61,11 @@ class ChildRaisedError(Exception):
 class Child:
     """A child process that calls functions, one at a time.
 
+    Parameters
+    ----------
+    module
+        Imported by the child while it waits for the first call.
+
     Examples
     --------
     >>> with Child() as child:
@@ -68,14 +73,23 @@ class Child:
     1024
     """
 
-    def __init__(self) -> None:
+    def __init__(self, module: str = "sweep.isolation.watchdog") -> None:
+        self._module = module
+        self._start()
+
+    def _start(self) -> None:
         self._killed_late = False
         self._process = subprocess.Popen(  # noqa: S603  (this program)
-            [sys.executable, "-P", "-c", _START, json.dumps(sys.path)],
+            [sys.executable, "-P", "-c", _START, json.dumps(sys.path), self._module],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             env={**os.environ, **SINGLE_THREADED},
             start_new_session=True,  # a terminal's Ctrl-C is the caller's to act on
         )
+
+    def restart(self) -> None:
+        """Start another process in place of one that ended."""
+        self.close()
+        self._start()
 
     def __enter__(self) -> Self:
         return self
@@ -143,18 +157,23 @@ class Child:
 
 _START = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
-    "from sweep.isolation.child_process import serve; serve()"
+    "from sweep.isolation.child_process import serve; serve(sys.argv[2])"
 )
 
 
-def serve() -> None:
-    """Answer calls until the caller closes the pipe; what the child process runs."""
+def serve(module: str) -> None:
+    """Import a module, then answer calls until the caller closes the pipe; what the child runs."""
     # What libraries print must not mix with the answers.
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     # If memory runs out, the system kills this process first.
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000")
+    with contextlib.suppress(Exception):
+        importlib.import_module(module)  # an error is raised by the call that needs it
+    # Numba is slow to import, and the caller needs none of it.
+    from sweep.isolation.watchdog import ending_after  # noqa: PLC0415
+
     while True:
         try:
             function, arguments, limit_s = _receive(sys.stdin.buffer)

@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import signal
 import threading
+from concurrent.futures import Future, wait
 from types import FrameType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
+
+Result = TypeVar("Result")
+
+POLL_S = 0.2
+"""How often Ctrl-C is checked while a result is awaited."""
 
 
 def in_main_thread() -> bool:
@@ -46,3 +52,11 @@ class Interrupts:
         """Raise KeyboardInterrupt if Ctrl-C has been noted."""
         if self._noted:
             raise KeyboardInterrupt
+
+    def await_result(self, future: Future[Result]) -> Result:
+        """Return a future's result, checking meanwhile."""
+        while not future.done():
+            self.check()
+            wait([future], timeout=POLL_S)
+        self.check()
+        return future.result()

@@ -1,0 +1,104 @@
+"""Small runs: blocks are computed one after another in the child process that measured scenes.
+
+A cluster takes seconds to start and to end, and as many processors as it has workers to import the
+packages. The guarantees are those of a cluster: a block that ends its process is computed in
+isolation when it is begun again, and a block is committed by its receipt.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+from sweep.errors import StoreError, SweepError
+from sweep.execution.block_task import compute_block
+from sweep.execution.limits import MAX_DEATHS, SMALL_RUN_LIMIT_S, TIME_LIMIT_S
+from sweep.execution.tally import Tally
+from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
+from sweep.isolation.interrupts import Interrupts
+from sweep.store.receipt import Receipt
+from sweep.store.run_store import RunStore
+
+
+class BlocksInChild:
+    """Computes blocks of a store in a child process.
+
+    Parameters
+    ----------
+    store
+        A store of which this process holds the lock.
+    child
+        The child process; another is started in its place if it ends.
+    url
+        The store's absolute address.
+    sources
+        Addresses of the stores whose finished cells are reused.
+    time_limit_s
+        Block timeout in seconds.
+    interrupts
+        Entered; checked while a block is computed.
+    """
+
+    def __init__(
+        self, store: RunStore, child: Child, url: str, sources: Sequence[str] = (),
+        time_limit_s: float = TIME_LIMIT_S, *, interrupts: Interrupts,
+    ) -> None:
+        self._store = store
+        self._child = child
+        self._url = url
+        self._sources = sources
+        self._time_limit_s = time_limit_s
+        self._interrupts = interrupts
+
+    def compute(self, waiting: Iterator[int], tally: Tally) -> None:
+        """Compute blocks by their numbers for at most :data:`SMALL_RUN_LIMIT_S` seconds.
+
+        ``waiting`` keeps the numbers of those that were not begun.
+
+        Raises
+        ------
+        RunError
+            If blocks failed.
+        StoreError
+            If the store cannot be written.
+        """
+        deadline = time.monotonic() + SMALL_RUN_LIMIT_S
+        with ThreadPoolExecutor(1) as thread:
+            try:
+                while time.monotonic() < deadline and not tally.hopeless:
+                    number = next(waiting, None)
+                    if number is None:
+                        break
+                    self._compute_block(thread, number, tally)
+            except BaseException:
+                self._child.close()  # the thread waits for its answer
+                raise
+        tally.check()
+
+    def _compute_block(self, thread: ThreadPoolExecutor, number: int, tally: Tally) -> None:
+        block = self._store.blocks[number]
+        for _ in range(1 + MAX_DEATHS):
+            call = thread.submit(
+                self._child.call, compute_block, self._url, self._store.run_id, block,
+                self._sources, self._time_limit_s, tally.quota(),
+                # The block keeps its own time limit; this one is for what surrounds it.
+                limit_s=2 * self._time_limit_s,
+            )
+            try:
+                receipt: Receipt = self._interrupts.await_result(call)
+            except StoreError:
+                raise
+            except ChildDiedError as error:
+                reason = f"its process ended: {error}"
+                self._child.restart()
+                continue
+            except ChildRaisedError as error:
+                reason = str(error).strip().splitlines()[-1]
+            except SweepError as error:
+                reason = f"{type(error).__name__}: {error}"
+            else:
+                tally.add(receipt)
+                return
+            break
+        tally.add_failed(f"block {block}: {reason}")

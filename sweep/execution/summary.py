@@ -1,0 +1,91 @@
+"""What a run did, in one record."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from sweep.errors import StoreError
+from sweep.execution.finalize import lost
+from sweep.measure.flags import DetectionStatus
+from sweep.plan.parameters import Stage
+from sweep.store.blocks import committed
+from sweep.store.run_store import RunStore
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What a run did; ``sweep run --json`` prints it.
+
+    Attributes
+    ----------
+    store
+        The store as it was given, or the default.
+    data
+        What ``xarray.open_zarr`` opens.
+    poses
+        Cells of the grid's scene axes.
+    results
+        Estimates: poses times detector settings times estimators.
+    detected
+        Detections, over all detector settings.
+    blocks
+        Blocks of the store.
+    computed_blocks, computed_scenes, computed_estimates
+        What this run computed; the rest was committed before, or reused from other stores.
+    seconds
+        Duration of this run.
+    crashed, failed
+        Cells that are flagged so.
+    """
+
+    store: str
+    data: str
+    poses: int
+    results: int
+    detected: int
+    blocks: int
+    computed_blocks: int
+    computed_scenes: int
+    computed_estimates: int
+    seconds: float
+    crashed: int = 0
+    failed: int = 0
+
+
+def summary_of_complete(store: RunStore, started: float) -> Summary:
+    """Return the summary of a run into a store that was finished before it began.
+
+    Raises
+    ------
+    StoreError
+        If blocks are missing.
+    """
+    done = len(committed(store))
+    if done != len(store.blocks):
+        raise StoreError(
+            f"{store.url}: damaged: finished, but {done} of {len(store.blocks)} blocks exist; "
+            "repair it with `sweep verify --repair`"
+        )
+    return summary_of(store, {}, time.perf_counter() - started)
+
+
+def summary_of(store: RunStore, computed: Mapping[str, int], seconds: float) -> Summary:
+    """Return the summary of a finished store from the counts that it recorded."""
+    counts = store.run_metadata["counts"]
+    missing = lost(counts["detection"], counts["estimate"])
+    return Summary(
+        store=store.url,
+        data=store.data_url,
+        poses=store.pipeline.size(Stage.scene),
+        results=math.prod(len(axis) for axis in store.pipeline.axes),
+        detected=counts["detection"][DetectionStatus.detected],
+        blocks=len(store.blocks),
+        computed_blocks=computed.get("blocks", 0),
+        computed_scenes=computed.get("scenes", 0),
+        computed_estimates=computed.get("estimates", 0),
+        seconds=round(seconds, 3),
+        **missing,
+    )

@@ -1,0 +1,89 @@
+"""What a run has done so far: its progress, counts of what was computed, failures by kind."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
+
+from sweep.errors import RunError
+from sweep.execution.limits import MAX_FAILED_BLOCKS
+from sweep.execution.progress import Progress, ProgressReport
+from sweep.measure.flags import DetectionStatus
+from sweep.plan.parameters import Stage
+from sweep.store.blocks import receipts
+from sweep.store.failures import MAX_ROWS
+from sweep.store.receipt import Receipt
+from sweep.store.run_store import RunStore
+
+
+class Tally:
+    """Counts the receipts of a run and the blocks that failed; reports progress.
+
+    Parameters
+    ----------
+    store
+        The store that is written.
+    report
+        Called with the progress after each block.
+    """
+
+    def __init__(self, store: RunStore, report: ProgressReport | None = None) -> None:
+        self._store = store
+        self._report = report
+        self._progress = Progress(0, store.pipeline.size(Stage.scene), 0)
+        self._failures = Counter({"failed": 0, "crashed": 0})
+        self._failed_blocks: list[str] = []
+        self.computed: Counter[str] = Counter()
+        """Blocks, scenes, detections and estimates that were computed and not reused."""
+
+    def begin(self, done: AbstractSet[int]) -> None:
+        """Count the blocks that are committed already.
+
+        Raises
+        ------
+        StoreError
+            If a receipt is damaged.
+        """
+        for _, receipt in receipts(self._store, done):
+            self._count(receipt)
+        self._notify()
+
+    def add(self, receipt: Receipt) -> None:
+        """Count a block that was committed now."""
+        self.computed.update({"blocks": 1, **receipt.computed})
+        self._count(receipt)
+        self._notify()
+
+    def add_failed(self, reason: str) -> None:
+        """Note why a block failed."""
+        self._failed_blocks.append(reason)
+
+    @property
+    def hopeless(self) -> bool:
+        """Whether so many blocks failed that no more are tried."""
+        return len(self._failed_blocks) >= MAX_FAILED_BLOCKS
+
+    def quota(self) -> Mapping[str, int]:
+        """Return how many failures of each kind another receipt may list."""
+        return {kind: max(MAX_ROWS - count, 0) for kind, count in self._failures.items()}
+
+    def check(self) -> None:
+        """Raise RunError if blocks failed."""
+        if self._failed_blocks:
+            raise RunError(
+                f"{self._store.url}: {len(self._failed_blocks)} blocks failed\n"
+                + "\n".join(f"  {reason}" for reason in self._failed_blocks)
+            )
+
+    def _count(self, receipt: Receipt) -> None:
+        self._failures.update(failure.kind for failure in receipt.failures)
+        counts, detected = receipt.detection, DetectionStatus.detected
+        self._progress = Progress(
+            self._progress.done + receipt.scenes, self._progress.total,
+            self._progress.detected + (counts[detected] if len(counts) > detected else 0),
+        )
+
+    def _notify(self) -> None:
+        if self._report is not None:
+            self._report(self._progress)

@@ -14,13 +14,13 @@ from sweep.integrity.block_check import BlockCheck
 from sweep.integrity.damage import Damage, FileDamage, as_json
 from sweep.integrity.file_check import FileCheck
 from sweep.integrity.sample_check import SampleCheck
-from sweep.plan.grid import Block, scene_axes
 from sweep.store.blocks import BEGUN, committed
 from sweep.store.layout import planned_arrays
 from sweep.store.lifecycle import store_of
 from sweep.store.locations import open_storage
 from sweep.store.lock import holder
 from sweep.store.manifest import KEYS, Manifest, parsed, read_manifest
+from sweep.store.snapshot import axis_positions, block_of_chunk
 from sweep.store.zarr_sync import sync
 
 SAMPLE = 20
@@ -126,6 +126,7 @@ class Verification:
             FileDamage(key, "unreadable or out of date") for key in unsound
         ]
         self.store = store_of(url, self.storage, self._root_attributes(url), mode)
+        self._positions = axis_positions(self.store)
         self.planned = planned_arrays(
             self.store.pipeline, self.store.blocks.extents, self.store.format
         )
@@ -187,21 +188,8 @@ class Verification:
         if key.startswith(f"{BEGUN}/"):
             number = key.removeprefix(f"{BEGUN}/")
             return number.isdecimal() and int(number) not in done
-        name, _, position = key.partition("/c/")
-        variable = next((v for v in store.variables if v.name == name), None)
-        if variable is None or store.finished:
-            return False
-        along = dict(
-            zip(variable.dimensions(store.pipeline), position.split("/"), strict=False)
-        )
-        try:
-            starts = tuple(
-                int(along[axis.name]) * extent for axis, extent in
-                zip(scene_axes(store.pipeline), store.blocks.extents, strict=True)
-            )
-        except (KeyError, ValueError):
-            return False
-        return store.blocks.number(Block(starts, starts)) not in done
+        written = block_of_chunk(key, store.blocks, self._positions)
+        return written is not None and not store.finished and written not in done
 
 
 def root_document(manifest: Manifest) -> bytes:

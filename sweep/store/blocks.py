@@ -22,16 +22,19 @@ from sweep.errors import StoreError, StoreReplacedError
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
 from sweep.plan.parameters import Stage
-from sweep.plan.schema import Variable
+from sweep.plan.schema import SCHEMA, Variable
 from sweep.store.layout import RECEIPTS
 from sweep.store.locations import is_remote, open_group, remote_run_id, translate_errors
 from sweep.store.manifest import put
-from sweep.store.receipt import Receipt
+from sweep.store.receipt import NAMING_FORMAT, Receipt
 from sweep.store.run_store import RunStore
 from sweep.store.zarr_sync import sync
 
 BEGUN = f"{RECEIPTS}/begun"
 """Folder of a mark for each block that was begun and is not committed."""
+
+GOVERNING = {variable.present_when.flag for variable in SCHEMA if variable.present_when}
+"""The flag variables that say where numbers exist."""
 
 RECEIPTS_AT_ONCE = 1000
 """Receipts that are read and held at a time."""
@@ -85,7 +88,7 @@ def write_block(
         _check_not_replaced(store)
         if sync(store.storage.exists(receipt_key(number))):
             return  # another worker was given it too, perhaps of another processor
-        for variable in store.variables:
+        for variable in in_writing_order(store.variables):
             array = store.array(variable.name)
             array[region(variable, store.pipeline, block)] = values[variable.name]
         _check_not_replaced(store)
@@ -93,11 +96,21 @@ def write_block(
             variable.name: _take_digest(store, chunk_key(store, variable, block))
             for variable in store.variables
         }
-        text = dataclasses.replace(receipt, digests=digests).to_json(store.format)
+        text = dataclasses.replace(
+            receipt, digests=digests, block=number
+        ).to_json(store.format)
         store.array(RECEIPTS)[number : number + 1] = np.array([text], dtype=object)
         store.storage.digests.pop(receipt_key(number), None)
         with contextlib.suppress(FileNotFoundError):
             sync(store.storage.delete(f"{BEGUN}/{number}"))
+
+
+def in_writing_order(variables: Iterable[Variable]) -> list[Variable]:
+    """Return variables in the order in which a block's are written: numbers before their flags.
+
+    So whoever reads the store meanwhile finds no flag that speaks of a number that is not there.
+    """
+    return sorted(variables, key=lambda v: (v.flags is not None, v.name in GOVERNING))
 
 
 def _take_digest(store: RunStore, key: str) -> int:
@@ -110,8 +123,9 @@ def _take_digest(store: RunStore, key: str) -> int:
 
 def drop_block(store: RunStore, block: Block) -> None:
     """Delete a block's receipt and its chunks, so that it is computed again."""
+    last_first = reversed(in_writing_order(store.variables))
     keys = [receipt_key(store.blocks.number(block))]
-    keys += [chunk_key(store, variable, block) for variable in store.variables]
+    keys += [chunk_key(store, variable, block) for variable in last_first]
     with translate_errors(store.url, "written"):
         for key in keys:
             with contextlib.suppress(FileNotFoundError):
@@ -178,6 +192,8 @@ def parsed_receipt(store: RunStore, number: int, text: str) -> Receipt:
     receipt = Receipt.from_json(text)
     if receipt.run_id != store.run_id:
         raise ValueError("of another run")
+    if receipt.block != (number if store.format >= NAMING_FORMAT else None):
+        raise ValueError(f"block {number} has the receipt of block {receipt.block}")
     settings = store.pipeline.size(Stage.detection)
     estimates = settings * store.pipeline.size(Stage.estimation)
     receipt.check(len(store.blocks[number]), settings, estimates)

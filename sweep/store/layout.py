@@ -22,11 +22,11 @@ from sweep.plan.grid import DISTANCE_PARAMETERS, Blocks, distance_of_side, scene
 from sweep.plan.schema import LABELS, Variable, variables_of
 from sweep.store.zarr_sync import sync
 
-FORMAT = 3
+FORMAT = 4
 """Version of the layout of the stores that are created."""
 
 FORMATS = range(2, FORMAT + 1)
-"""Versions that can be read and continued; 2 is that of sweep 0.5.
+"""Versions that can be read and continued; 2 is that of sweep 0.5, 3 of 0.6.
 
 A store keeps its format; it lacks the variables that a later format introduced.
 """

@@ -48,6 +48,7 @@ from sweep.store.provenance import environment, fingerprint
 from sweep.store.receipt import are_counts
 from sweep.store.run_store import RunStore, list_folder
 from sweep.store.schema_check import GROUPS, schema_faults
+from sweep.store.snapshot import snapshot
 from sweep.store.zarr_sync import sync
 
 if TYPE_CHECKING:
@@ -376,7 +377,8 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
                 if is_special(Path(store.url, key)):
                     raise StoreError(f"{store.url}: {key} is not a file")
     try:
-        dataset: xr.Dataset = xr.open_zarr(store.source, consolidated=False, zarr_format=3)
+        source = store.source if store.finished else snapshot(store)
+        dataset: xr.Dataset = xr.open_zarr(source, consolidated=False, zarr_format=3)
         # Much of xarray and pandas does not support NumPy's strings of variable length.
         texts = {name: (value.dims, value.to_numpy().astype(object), value.attrs)
                  for name, value in dataset.coords.items() if value.dtype.kind == "T"}

@@ -1,7 +1,8 @@
 """The receipt of a block: what commits it, counts its flags, and holds its chunks' digests.
 
 A receipt is the last thing that is written of a block, as JSON. Stores of format 2 (sweep 0.5)
-list the digests by position, in the order of that format's variables; later ones name them.
+list the digests by position, in the order of that format's variables; later ones name them. From
+format 4 on, a receipt names its block, so that it commits no other one.
 """
 
 from __future__ import annotations
@@ -15,6 +16,9 @@ from sweep.plan.schema import variables_of
 
 POSITIONAL_FORMAT = 2
 """The store format whose receipts list digests by position."""
+
+NAMING_FORMAT = 4
+"""The store format from which on receipts name their block."""
 
 REQUIRED = {
     "run_id", "processor", "scenes", "detection", "estimate", "seconds", "failures", "written",
@@ -98,6 +102,8 @@ class Receipt:
         Time at which it was computed, seconds since 1970.
     digests
         Variable -> CRC-32 of its chunk.
+    block
+        The block's number; None in stores of formats before 4.
     """
 
     run_id: str
@@ -111,6 +117,7 @@ class Receipt:
     wall_s: float
     written: float
     digests: Mapping[str, int] = field(default_factory=dict)
+    block: int | None = None
 
     def to_json(self, store_format: int) -> str:
         """Return the text that a store of a format holds."""
@@ -119,6 +126,8 @@ class Receipt:
             content["digests"] = [
                 self.digests[variable.name] for variable in variables_of(store_format)
             ]
+        if store_format < NAMING_FORMAT:
+            del content["block"]
         return json.dumps(content, separators=(",", ":"))
 
     @classmethod
@@ -146,6 +155,7 @@ class Receipt:
             and isinstance(content["failures"], list)
             and _is_number(content["written"])
             and _is_number(content.get("wall_s", 0.0))
+            and (content.get("block") is None or _is_count(content["block"]))
         )
         if not valid:
             raise ValueError("a value of a wrong type")
@@ -161,6 +171,7 @@ class Receipt:
             wall_s=content.get("wall_s", 0.0),
             written=content["written"],
             digests=_digests(content["digests"]),
+            block=content.get("block"),
         )
 
     def check(self, scenes: int, settings: int, estimates: int) -> None:

@@ -1,5 +1,6 @@
 """Receipts: what is written is read again, of every format, and nothing else is."""
 
+import dataclasses
 import json
 
 import pytest
@@ -20,10 +21,13 @@ RECEIPT = Receipt(
 """A block of 3 scenes under 2 detector settings and 2 estimators."""
 
 
-@pytest.mark.parametrize("store_format", [2, 3])
+@pytest.mark.parametrize("store_format", [2, 3, 4])
 def test_receipt_that_is_written_is_read_again(store_format):
-    again = Receipt.from_json(RECEIPT.to_json(store_format))
-    assert again == RECEIPT
+    block = 7 if store_format == 4 else None
+    receipt = dataclasses.replace(RECEIPT, block=block)
+    again = Receipt.from_json(receipt.to_json(store_format))
+    assert again == receipt
+    assert ("block" in json.loads(receipt.to_json(store_format))) == (block is not None)
     again.check(scenes=3, settings=2, estimates=4)
 
 
@@ -61,11 +65,12 @@ def test_receipt_of_another_block_is_refused(scenes, settings, estimates):
         {"detection": {"1": 4}}, {"estimate": [-1]}, {"seconds": {"scene": [1.0]}},
         {"seconds": {"scene": ["x"], "detection": [], "estimation": []}}, {"computed": [3]},
         {"computed": {"scenes": "3"}}, {"wall_s": "1"}, {"written": None}, {"processor": 5},
-        {"run_id": None}, {"failures": [{}]}, {"failures": [None]}, {"failures": {}},
+        {"run_id": None}, {"block": -1}, {"block": "1"},
+        {"failures": [{}]}, {"failures": [None]}, {"failures": {}},
     ],
     ids=str,
 )
-@pytest.mark.parametrize("store_format", [2, 3])
+@pytest.mark.parametrize("store_format", [2, 3, 4])
 def test_values_of_wrong_types_are_refused(change, store_format):
     content = json.loads(RECEIPT.to_json(store_format)) | change
     with pytest.raises(ValueError, match=r"\w"):

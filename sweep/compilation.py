@@ -53,7 +53,8 @@ def cache_folder() -> Path | None:
     """
     name = f"compiled-{sources_digest()}"
     for folder in _folders():
-        existing = next(above for above in (folder, *folder.parents) if above.exists())
+        # `os.path.exists`: what cannot be looked at is not there.
+        existing = next(above for above in (folder, *folder.parents) if os.path.exists(above))  # noqa: PTH110
         if existing.is_dir() and os.access(existing, os.W_OK | os.X_OK):
             return folder / name
     private = _private_folder()

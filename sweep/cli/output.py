@@ -6,8 +6,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from sweep.errors import StoreError
-
 MAX_LINES = 50
 """Lines of each kind that `sweep status` and `sweep verify` print."""
 
@@ -15,6 +13,19 @@ MAX_LINES = 50
 def print_json(content: dict[str, Any]) -> None:
     """Print one JSON object."""
     print(json.dumps(content, indent=2))
+
+
+def check_png(output: str) -> None:
+    """Check that a picture can be written, before it is computed.
+
+    Raises
+    ------
+    StoreError
+        If it cannot be.
+    """
+    from sweep.report.output_file import check_output_file  # noqa: PLC0415
+
+    check_output_file(Path(output))
 
 
 def write_png(output: str, image: Any) -> None:
@@ -27,8 +38,7 @@ def write_png(output: str, image: Any) -> None:
     """
     import cv2  # noqa: PLC0415
 
+    from sweep.report.output_file import write_output_file  # noqa: PLC0415
+
     _, encoded = cv2.imencode(".png", image)
-    try:
-        Path(output).write_bytes(encoded.tobytes())
-    except OSError as error:
-        raise StoreError(f"{output}: cannot be written: {error.strerror}") from None
+    write_output_file(Path(output), encoded.tobytes())

@@ -27,6 +27,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _execute(options: argparse.Namespace) -> int:
     from sweep.errors import ArgumentError  # noqa: PLC0415
     from sweep.report.formatting import byte_count  # noqa: PLC0415
+    from sweep.report.output_file import is_standard_stream  # noqa: PLC0415
     from sweep.report.report_data import read_report_data  # noqa: PLC0415
     from sweep.report.write_report import write_report  # noqa: PLC0415
 
@@ -38,7 +39,10 @@ def _execute(options: argparse.Namespace) -> int:
     output = Path(options.output or f"report.{form}")
     figures = Path(options.figures) if options.figures else None
     count = write_report(read_report_data(options.store), output, form, figures)
-    print(f"{output}: {count} figures, {byte_count(output.stat().st_size)}")
+    if is_standard_stream(output):
+        return 0  # a line more would not be HTML
+    size = f", {byte_count(output.stat().st_size)}" if output.is_file() else ""
+    print(f"{output}: {count} figures{size}")
     return 0
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from sweep.cli.arguments import add_cell, add_picture, add_store
 from sweep.cli.command import Command, Example
-from sweep.cli.output import write_png
+from sweep.cli.output import check_png, write_png
 
 if TYPE_CHECKING:
     from sweep.integrity.reproduction import Reproduction
@@ -30,6 +30,7 @@ def _execute(options: argparse.Namespace) -> int:
 
     if not 0 < options.time_limit_s < math.inf:
         raise ArgumentError("time_limit_s", options.time_limit_s, "expected seconds above 0")
+    check_png(options.output)
     from sweep.integrity.reproduction import reproduce  # noqa: PLC0415
     from sweep.messages import plain  # noqa: PLC0415
     from sweep.report.scene_values import value_lines  # noqa: PLC0415

@@ -6,7 +6,7 @@ import argparse
 
 from sweep.cli.arguments import add_cell, add_picture, add_pipeline, read_pipeline
 from sweep.cli.command import Command, Example
-from sweep.cli.output import write_png
+from sweep.cli.output import check_png, write_png
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -17,6 +17,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _execute(options: argparse.Namespace) -> int:
     pipeline = read_pipeline(options)
+    check_png(options.output)
     from sweep.evaluation.inspection import inspect_scene  # noqa: PLC0415
     from sweep.plan.cell_selection import cell, coordinates_text  # noqa: PLC0415
     from sweep.report.scene_drawing import draw_scene  # noqa: PLC0415

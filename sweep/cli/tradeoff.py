@@ -53,13 +53,14 @@ def _execute(options: argparse.Namespace) -> int:
             store = execute(Pipeline.from_toml(store), None, progress=bar).store
     trade, renderers = measure_trade(store, options.per, options.limit_s)
     if output is not None:
-        from sweep.errors import StoreError  # noqa: PLC0415
+        import io  # noqa: PLC0415
+
+        from sweep.report.output_file import write_output_file  # noqa: PLC0415
         from sweep.report.tradeoff_chart import draw_trade  # noqa: PLC0415
 
-        try:
-            draw_trade(trade, options.criterion, output)
-        except OSError as error:
-            raise StoreError(f"{output}: cannot be written: {error.strerror}") from None
+        figure = io.BytesIO()
+        draw_trade(trade, options.criterion, figure, output.suffix[1:].lower())
+        write_output_file(output, figure.getvalue())
     from sweep.report.renderer_table import renderer_lines  # noqa: PLC0415
     from sweep.report.tradeoff_table import as_json, table_markdown, table_text  # noqa: PLC0415
 
@@ -101,17 +102,15 @@ def _checked_output(name: str | None) -> Path | None:
     StoreError
         If the suffix names no format, or the file cannot be written.
     """
-    if not name:
+    if name is None:
         return None
     from sweep.errors import StoreError  # noqa: PLC0415
+    from sweep.report.output_file import check_output_file  # noqa: PLC0415
 
     output = Path(name)
     if output.suffix.lower() not in FIGURE_SUFFIXES:
         raise StoreError(f"{output}: expected a file that ends in .png or .svg")
-    if output.is_dir():
-        raise StoreError(f"{output}: cannot be written: Is a directory")
-    if not output.absolute().parent.is_dir():
-        raise StoreError(f"{output}: cannot be written: No such file or directory")
+    check_output_file(output)
     return output
 
 

@@ -36,7 +36,7 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
 from sweep.store.blocks import committed, receipts
 from sweep.store.lifecycle import create_store, open_store, read_run_metadata, remove_store
-from sweep.store.locations import check_writable, exists, is_remote, open_storage
+from sweep.store.locations import check_writable, checked_url, exists, is_remote, open_storage
 from sweep.store.lock import locked, refuse_if_held
 from sweep.store.provenance import differences
 from sweep.store.run_store import RunStore
@@ -55,7 +55,7 @@ SAMPLED_RECEIPTS = 100
 
 def absolute_url(url: str) -> str:
     """Return a store's address as every process of this machine understands it."""
-    return url if is_remote(url) else str(Path(url).absolute())
+    return url if is_remote(checked_url(url)) else str(Path(url).absolute())
 
 
 def execute(

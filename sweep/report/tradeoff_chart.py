@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from itertools import cycle
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -48,7 +48,10 @@ class Encoding(NamedTuple):
     styles: dict[str, str]
 
 
-def draw_trade(trade: xr.Dataset, criterion: str, path: str | os.PathLike[str]) -> None:
+def draw_trade(
+    trade: xr.Dataset, criterion: str, path: str | os.PathLike[str] | IO[bytes],
+    form: str | None = None,
+) -> None:
     """Write a chart of cost, ms a frame, against the criterion, both logarithmic.
 
     There is a panel for each condition. Of the settings that ``trade`` has as coordinates of
@@ -65,14 +68,16 @@ def draw_trade(trade: xr.Dataset, criterion: str, path: str | os.PathLike[str]) 
     criterion
         An error of ``trade``.
     path
-        File to write; its suffix is the format: ``.png``, ``.svg`` or another of matplotlib's.
+        File to write, or an open one.
+    form
+        ``png``, ``svg`` or another of matplotlib's formats (default: by the file's suffix).
 
     Raises
     ------
     KeyError
         If ``trade`` lacks ``cost_ms`` or the criterion.
     ValueError
-        If the suffix is unknown.
+        If the format is unknown.
     OSError
         If the file cannot be written.
     """
@@ -100,7 +105,7 @@ def draw_trade(trade: xr.Dataset, criterion: str, path: str | os.PathLike[str]) 
     figure.set_layout_engine("none")
     for panel, (_, condition) in zip(panels, conditions, strict=True):
         _label_front(panel, condition, criterion, figure.dpi / 72)
-    figure.savefig(path, dpi=DOTS_PER_INCH)
+    figure.savefig(path, dpi=DOTS_PER_INCH, format=form)
 
 
 def _encodings(trade: xr.Dataset) -> tuple[Encoding, Encoding]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-import tempfile
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,9 +18,11 @@ from sweep.report.figures import figure_kinds
 from sweep.report.gallery import scenes_of
 from sweep.report.grouping import AREA
 from sweep.report.markdown import markdown, write_figure
+from sweep.report.output_file import check_output_file, write_output_file
 from sweep.report.page import page
 from sweep.report.provenance_facts import provenance
 from sweep.report.report_data import ReportData, store_errors
+from sweep.store.locations import enclosing_store, is_remote, reason_of
 
 FORMATS = ("html", "md")
 PICTURES = (".svg", ".png")
@@ -53,20 +54,22 @@ def check_output(
     folder = figures_folder(output) if form == "md" else None
     for wanted in (output, figures, folder):
         if wanted is not None:
-            _check_outside(wanted, store)
-    if output.is_dir():
-        raise StoreError(f"{output}: cannot be written: it is a folder; choose a file in it")
-    _check_folder(output, output.absolute().parent)
+            with _explained(wanted):
+                _check_outside(wanted, store)
+    check_output_file(output)
+    if folder is not None and output.exists() and not output.is_file():
+        raise StoreError(
+            f"{output}: cannot be written: Markdown needs a folder for its figures beside it; "
+            "choose a file, or --format html"
+        )
     for wanted in (figures, folder):
-        if wanted is not None and os.path.lexists(wanted) and not wanted.is_dir():
-            raise StoreError(f"{wanted}: cannot hold figures: it is a file; choose a folder")
-    if figures is not None:
-        _check_folder(figures, figures if figures.is_dir() else figures.absolute().parent)
+        if wanted is not None:
+            with _explained(wanted):
+                _check_folder(wanted)
     if figures is not None and folder is not None and (
         Path(os.path.realpath(folder)) in Path(os.path.realpath(figures)).parents):
         raise StoreError(f"{figures}: cannot hold figures: {folder} is replaced as a whole")
     if folder is not None and folder.is_dir():
-        _check_folder(folder, folder)
         others = sorted(path.name for path in folder.iterdir()
                         if path.suffix not in PICTURES or path.is_dir())
         if others:
@@ -81,22 +84,33 @@ def figures_folder(output: Path) -> Path:
 
 def _check_outside(wanted: Path, store: str) -> None:
     """Check that a path is not inside a local store, the report's own or any other."""
-    local = store.removeprefix("file://")
-    own = None if not local or "://" in local else Path(os.path.realpath(local))
+    own = None if not store or is_remote(store) else Path(os.path.realpath(store))
     resolved = Path(os.path.realpath(wanted))
-    for path in (*reversed(resolved.parents), resolved):
-        if path == own or (path / "zarr.json").is_file():
-            raise StoreError(f"{wanted}: cannot be written: it is inside the store {path}")
+    store_around = own if own in (resolved, *resolved.parents) else enclosing_store(resolved)
+    if store_around is not None:
+        raise StoreError(f"{wanted}: cannot be written: it is inside the store {store_around}")
 
 
-def _check_folder(wanted: Path, folder: Path) -> None:
+def _check_folder(wanted: Path) -> None:
+    """Check that files can be written into a folder, which may have to be made."""
+    if os.path.lexists(wanted) and not wanted.is_dir():
+        wanted.stat()  # a link that leads nowhere, or in a circle
+        raise StoreError(f"{wanted}: cannot hold figures: it is a file; choose a folder")
+    folder = wanted if wanted.is_dir() else Path(os.path.realpath(wanted)).parent
     if not folder.is_dir():
         raise StoreError(f"{wanted}: cannot be written: folder {folder} not found")
+    trial = _temporary_path(folder)
+    trial.mkdir()
+    trial.rmdir()
+
+
+@contextlib.contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Turn errors of a disk, and of a name that no path can have, into a StoreError."""
     try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise StoreError(f"{wanted}: cannot be written: {error.strerror}") from None
+        yield
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{path}: cannot be written: {reason_of(error)}") from None
 
 
 def write_report(
@@ -134,33 +148,34 @@ def write_report(
     title = data.pipeline.title.strip() or data.pipeline.name
     numbers, origin = answer(data), provenance(data, str(output))
     rendered = [kind.render(data) for kind in figure_kinds(data)]
-    try:
-        with _temporary_folder(output) as temporary:
-            pictures = temporary / "figures"
-            pictures.mkdir(parents=True)
-            if form == "md" or figures is not None:
-                for figure in rendered:
-                    write_figure(figure, pictures)
-            drawn = sorted(pictures.iterdir())
-            scenes = scenes_of(data)
-            folder = figures_folder(output)
-            if form == "md":
-                text = markdown(title, numbers, origin, rendered, scenes, pictures, folder.name)
-            else:
-                text = page(title, numbers, origin, rendered, scenes)
-            written = temporary / "report"
-            # Invalid Unicode, which a file's name may hold, is written as a question mark.
-            written.write_text(text, encoding="utf-8", errors="replace")
-            # Files are moved to their final paths only after all were written.
-            if figures is not None:
-                figures.mkdir(exist_ok=True)
-                for path in drawn:
-                    shutil.copyfile(path, figures / path.name)
-            if form == "md":
-                _replace_folder(folder, pictures, temporary / "old")
-            written.replace(output)
-    except OSError as error:
-        raise StoreError(f"{output}: cannot be written: {error.strerror or error}") from None
+    folder = figures_folder(output) if form == "md" else None
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(_explained(output))
+        temporary = None
+        if folder is not None or figures is not None:
+            beside = Path(os.path.realpath(folder or figures or output)).parent
+            temporary = stack.enter_context(_temporary_folder(beside))
+            for figure in rendered:
+                write_figure(figure, temporary / "figures")
+        drawn = [] if temporary is None else sorted((temporary / "figures").iterdir())
+        scenes = scenes_of(data)
+        if folder is not None and temporary is not None:
+            text = markdown(
+                title, numbers, origin, rendered, scenes, temporary / "figures", folder.name
+            )
+        else:
+            text = page(title, numbers, origin, rendered, scenes)
+        # Files are moved to their final paths only after all were written.
+        if figures is not None:
+            figures.mkdir(exist_ok=True)
+            for path in drawn:
+                write_output_file(figures / path.name, path.read_bytes())
+        if folder is not None and temporary is not None:
+            _replace_folder(
+                Path(os.path.realpath(folder)), temporary / "figures", temporary / "old"
+            )
+        # Invalid Unicode, which a file's name may hold, is written as a question mark.
+        write_output_file(output, text.encode("utf-8", errors="replace"))
     return len(rendered)
 
 
@@ -191,10 +206,15 @@ def _replace_folder(folder: Path, new: Path, old: Path) -> None:
 
 
 @contextlib.contextmanager
-def _temporary_folder(output: Path) -> Iterator[Path]:
-    """Yield the path of a folder beside the output, which is removed in the end."""
-    path = output.absolute().with_name(f".{output.name}.{uuid.uuid4().hex[:8]}.{os.getpid()}")
+def _temporary_folder(parent: Path) -> Iterator[Path]:
+    """Yield a folder with an empty folder ``figures``, which is removed in the end."""
+    path = _temporary_path(parent)
     try:
+        (path / "figures").mkdir(parents=True)
         yield path
     finally:
         shutil.rmtree(path, ignore_errors=True)
+
+
+def _temporary_path(folder: Path) -> Path:
+    return folder / f".sweep-{uuid.uuid4().hex}"

@@ -10,11 +10,13 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import stat
 import tempfile
 import uuid
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import unquote, urlsplit
 
 import zarr
 import zarr.errors
@@ -22,6 +24,7 @@ from zarr.abc.store import Store
 from zarr.storage import FsspecStore, LocalStore
 
 from sweep.errors import StoreError
+from sweep.messages import plain
 from sweep.store.checksums import DigestingStore
 from sweep.store.manifest import put
 from sweep.store.zarr_sync import sync
@@ -70,10 +73,34 @@ def reason_of(error: BaseException) -> str:
 
 
 def checked_url(url: str) -> str:
-    """Return a store's URL; StoreError if it holds what must not be recorded or printed."""
+    """Return a store's path or URL.
+
+    Raises
+    ------
+    StoreError
+        If it holds what must not be recorded or printed, or names a place that other processes
+        cannot see or that a path names.
+    """
+    if not url.strip():
+        raise StoreError(f"{url!r}: expected the path or URL of a store")
+    if "\0" in url:
+        raise StoreError(f"{url}: a path cannot hold a null character; choose another one")
+    scheme = url.partition(":")[0].lower()
+    if scheme in ("file", "local") and ":" in url:
+        path = unquote(urlsplit(url).path)
+        raise StoreError(f"{url}: a store on this machine is named by its path: {path}")
+    if scheme == "memory" and ":" in url:
+        raise StoreError(
+            f"{url}: no other process sees what is in this one's memory; choose a path or s3://"
+        )
+    if url.partition("/")[0] == "~":
+        raise StoreError(
+            f"{url}: ~ is not expanded here; expected {Path(url).expanduser()}, or ./{url} for a "
+            "folder of that name"
+        )
     if is_remote(url):
         scheme, _, rest = url.partition("://")
-        if any(sign in rest for sign in ("@", "?", "#", "://", "::")):
+        if "::" in scheme or any(sign in rest for sign in ("@", "?", "#", "://", "::")):
             raise StoreError(
                 f"{scheme}://...: a store's URL is printed and recorded: expected no credentials "
                 "or options in it; pass them in the environment (AWS_ACCESS_KEY_ID, ...)"
@@ -123,10 +150,22 @@ def is_run_id(text: str) -> bool:
 
 
 def exists(url: str) -> bool:
-    """Return whether anything lies at a store's URL."""
-    if not is_remote(checked_url(url)):
-        return Path(url).exists() or Path(url).is_symlink()
-    return remote_run_id(url) is not None
+    """Return whether anything lies at a store's URL.
+
+    Raises
+    ------
+    StoreError
+        If that cannot be told: a folder cannot be searched, a name is too long, a server is away.
+    """
+    if is_remote(checked_url(url)):
+        return remote_run_id(url) is not None
+    try:
+        os.lstat(url)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError as error:
+        raise StoreError(f"{plain(url, 300)}: cannot be read: {reason_of(error)}") from None
+    return True
 
 
 def open_storage(url: str, mode: str = "r") -> DigestingStore:
@@ -145,14 +184,14 @@ def open_storage(url: str, mode: str = "r") -> DigestingStore:
         raise StoreError(f"{url}: store not found; create one with `sweep run`")
     if is_remote(url):
         return DigestingStore(storage_at(f"{url}/{remote_run_id(url)}", read_only=mode == "r"))
-    if mode == "r" or not Path("/proc/self/fd").is_dir():
-        return DigestingStore(LocalStore(url, read_only=mode == "r"))
     try:
+        if not stat.S_ISDIR(Path(url).stat().st_mode):
+            raise StoreError(not_a_store(url))
+        if mode == "r" or not Path("/proc/self/fd").is_dir():
+            return DigestingStore(LocalStore(url, read_only=mode == "r"))
         folder = _HeldFolder(url)
-    except NotADirectoryError:
-        raise StoreError(not_a_store(url)) from None
     except OSError as error:
-        raise StoreError(f"{url}: cannot be read: {error.strerror}") from None
+        raise StoreError(f"{url}: cannot be read: {reason_of(error)}") from None
     return DigestingStore(LocalStore(f"/proc/self/fd/{folder.descriptor}"), folder)
 
 
@@ -164,15 +203,26 @@ class _HeldFolder:
         weakref.finalize(self, os.close, self.descriptor)
 
 
+def enclosing_store(path: Path) -> Path | None:
+    """Return the outermost store that a local path is, or lies in; None if there is none."""
+    resolved = Path(os.path.realpath(path))
+    for folder in (*reversed(resolved.parents), resolved):
+        if (folder / "zarr.json").is_file():
+            return folder
+    return None
+
+
 def check_writable(url: str) -> None:
     """Check that a store can be created at a URL, before any work is done for it.
 
     Raises
     ------
     StoreError
-        If nothing can be written there.
+        If nothing can be written there, or it is inside another store.
     """
     if is_remote(checked_url(url)):
+        if url.partition("://")[0].lower() in ("http", "https"):
+            raise StoreError(f"{url}: can only be read; choose a path or s3://")
         trial = f".sweep-{uuid.uuid4().hex}"
         with translate_errors(url, "written"):
             storage = storage_at(url, read_only=False)
@@ -180,6 +230,12 @@ def check_writable(url: str) -> None:
             sync(storage.delete(trial))
         return
     with translate_errors(url, "written"):
-        Path(url).parent.mkdir(parents=True, exist_ok=True)
+        around = enclosing_store(Path(url).absolute().parent)
+        if around is not None:
+            raise StoreError(f"{url}: cannot be written: it is inside the store {around}")
+        try:
+            Path(url).parent.mkdir(parents=True, exist_ok=True)
+        except FileExistsError:
+            raise StoreError(f"{url}: cannot be written: Not a directory") from None
         with tempfile.TemporaryDirectory(dir=Path(url).parent, prefix=".sweep-"):
             pass

@@ -580,6 +580,25 @@ def test_a_report_is_never_written_into_a_store(tmp_path):
     assert held() == before
 
 
+def test_a_report_goes_through_links_and_into_devices(tmp_path):
+    url = made(tmp_path, ODD["single pose"], "one")
+    behind = tmp_path / "behind"
+    (behind / "pictures").mkdir(parents=True)
+    for link, target in (("r.md", "real.md"), ("r_figures", "pictures"), ("null", "/dev/null")):
+        (tmp_path / link).symlink_to(behind / target)
+    assert command("report", url, "-o", tmp_path / "r.md")[::2] == (0, "")
+    assert (behind / "real.md").read_text(encoding="utf-8").startswith("# ")
+    assert len(list((behind / "pictures").iterdir())) == 3
+    assert all((tmp_path / link).is_symlink() for link in ("r.md", "r_figures"))
+    assert command("report", url, "-o", tmp_path / "null") == (
+        0, f"{tmp_path / 'null'}: 1 figures\n", "")
+    for device in ("/dev/null", "/dev/full"):
+        code, _, err = command("report", url, "-o", device, "--format", "md")
+        assert code == 2
+        assert err.startswith(f"{device}: cannot be written: Markdown needs a folder")
+        assert Path(device).is_char_device()
+
+
 def chunks_of(url, name):
     return sorted(path for path in (Path(url) / name / "c").rglob("*") if path.is_file())
 

@@ -1,0 +1,126 @@
+"""Files that a command writes for its user: completely, or not at all.
+
+An existing file is replaced at once. A link stays: the file that it points to is replaced. What
+cannot be replaced, a device or a pipe, is written into.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+import sys
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+from sweep.errors import StoreError
+from sweep.messages import plain
+from sweep.store.locations import reason_of
+
+
+def check_output_file(path: Path) -> None:
+    """Check that a file can be written, before there is anything to write.
+
+    Raises
+    ------
+    StoreError
+        If it is a folder, a disk, or a pipe that no process reads, or if it cannot be written.
+    """
+    with _explained(path):
+        if _is_replaced(path):
+            temporary = _beside(_target(path))
+            temporary.touch(exist_ok=False)
+            temporary.unlink()
+        else:
+            os.close(_opened(path))
+
+
+def write_output_file(path: Path, content: bytes) -> None:
+    """Write a file.
+
+    Raises
+    ------
+    StoreError
+        As :func:`check_output_file`, or if the disk is full.
+    """
+    with _explained(path):
+        if not _is_replaced(path):
+            with os.fdopen(_opened(path), "wb") as file:
+                file.write(content)
+            return
+        real = _target(path)
+        temporary = _beside(real)
+        try:
+            temporary.write_bytes(content)
+            if real.exists():
+                temporary.chmod(stat.S_IMODE(real.stat().st_mode))
+            temporary.replace(real)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def is_standard_stream(path: Path) -> bool:
+    """Return whether a path is where this process prints, such as ``/dev/stdout``."""
+    try:
+        status = path.stat()
+    except (OSError, ValueError):
+        return False
+    return any(os.path.samestat(status, opened) for _, opened in _streams())
+
+
+@contextlib.contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{plain(path, 300)}: cannot be written: {reason_of(error)}") from None
+
+
+def _is_replaced(path: Path) -> bool:
+    """Return whether a path is, or will be, a file of its own; StoreError if it is no file."""
+    try:
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return True
+    if stat.S_ISDIR(mode):
+        raise StoreError(f"{path}: cannot be written: it is a folder; choose a file in it")
+    if stat.S_ISBLK(mode):
+        raise StoreError(f"{path}: cannot be written: it is a disk; choose a file")
+    return stat.S_ISREG(mode) and not is_standard_stream(path)
+
+
+def _opened(path: Path) -> int:
+    """Return a descriptor that writes into a device, a pipe, or where this process prints.
+
+    A pipe that no process reads is an error rather than an endless wait.
+    """
+    status = path.stat()
+    for stream, opened in _streams():
+        if os.path.samestat(status, opened):
+            return os.dup(stream)
+    descriptor = os.open(path, os.O_WRONLY | os.O_NONBLOCK)
+    os.set_blocking(descriptor, True)
+    return descriptor
+
+
+def _streams() -> Iterator[tuple[int, os.stat_result]]:
+    """Yield the descriptors of standard output and error that are open, with their status."""
+    for file in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError, OSError, ValueError):
+            yield file.fileno(), os.fstat(file.fileno())
+
+
+def _target(path: Path) -> Path:
+    """Return the file that a path names, behind links; StoreError if its folder is missing.
+
+    Without a link it stays relative: the folders above the current one need not be readable.
+    """
+    target = Path(os.path.realpath(path)) if path.is_symlink() else path
+    if not target.parent.is_dir():
+        raise StoreError(f"{path}: cannot be written: folder {target.parent} not found")
+    return target
+
+
+def _beside(path: Path) -> Path:
+    return path.with_name(f".sweep-{uuid.uuid4().hex}")

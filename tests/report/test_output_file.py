@@ -1,0 +1,142 @@
+"""Files that commands write: whole, through links, and never in place of a device."""
+
+import os
+import stat
+import threading
+from pathlib import Path
+
+import pytest
+
+from sweep.errors import StoreError
+from sweep.report.output_file import check_output_file, is_standard_stream, write_output_file
+
+
+def told(path):
+    """Return the one line that a path is refused with, before and while it is written."""
+    lines = set()
+    for refused in (check_output_file, lambda path: write_output_file(path, b"new")):
+        with pytest.raises(StoreError) as error:
+            refused(path)
+        lines.add(str(error.value))
+    assert len(lines) == 1
+    return lines.pop()
+
+
+def test_an_existing_file_is_replaced_at_once_and_keeps_its_mode(tmp_path):
+    path = tmp_path / "report.html"
+    path.write_bytes(b"old")
+    path.chmod(0o640)
+    with path.open("rb") as held:
+        check_output_file(path)
+        write_output_file(path, b"new")
+        assert held.read() == b"old"
+    assert path.read_bytes() == b"new"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_link_stays_and_its_file_is_written(tmp_path):
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    link = tmp_path / "link.html"
+    link.symlink_to(folder / "real.html")
+    for content in (b"first", b"second"):
+        check_output_file(link)
+        write_output_file(link, content)
+        assert link.is_symlink()
+        assert (folder / "real.html").read_bytes() == content
+    assert len(list(folder.iterdir())) == 1
+
+
+def test_a_device_is_written_into_and_stays(tmp_path):
+    write_output_file(Path("/dev/null"), b"text")
+    assert Path("/dev/null").is_char_device()
+    full = tmp_path / "full.svg"
+    full.symlink_to("/dev/full")
+    for path in (full, Path("/dev/full")):
+        check_output_file(path)
+        with pytest.raises(StoreError, match="cannot be written: No space left on device"):
+            write_output_file(path, b"text")
+        assert path.is_char_device()
+    assert full.is_symlink()
+
+
+def test_a_pipe_is_written_into_if_a_process_reads_it(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    assert "No such device or address" in told(pipe)
+    read = []
+    reader = threading.Thread(target=lambda: read.append(pipe.read_bytes()), daemon=True)
+    reader.start()
+    content = bytes(300_000)
+    for _ in range(500):
+        try:
+            write_output_file(pipe, content)
+        except StoreError:
+            reader.join(0.01)
+        else:
+            break
+    reader.join(10)
+    assert read == [content]
+
+
+def test_standard_output_is_written_into_where_it_is(tmp_path, capfd):
+    assert is_standard_stream(Path("/dev/stdout"))
+    write_output_file(Path("/dev/stdout"), b"page")
+    assert capfd.readouterr().out == "page"
+    assert not is_standard_stream(tmp_path)
+    assert not is_standard_stream(tmp_path / "none")
+
+
+def test_what_cannot_be_written_is_told_in_a_line(tmp_path):
+    file, loop = tmp_path / "file", tmp_path / "loop"
+    file.write_text("mine")
+    loop.symlink_to(loop)
+    dangling = tmp_path / "dangling"
+    dangling.symlink_to(tmp_path / "none" / "file")
+    for path, line in {
+        tmp_path: "it is a folder; choose a file in it",
+        tmp_path / "none" / "file": f"folder {tmp_path / 'none'} not found",
+        dangling: f"folder {tmp_path / 'none'} not found",
+        file / "x": f"folder {file} not found",
+        loop: "Too many levels of symbolic links",
+        tmp_path / ("x" * 300): "File name too long",
+        Path("x/" * 3000): "File name too long",
+        tmp_path / "a\0b": "embedded null byte",
+    }.items():
+        assert told(path).endswith(f": cannot be written: {line}")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dangling", "file", "loop"]
+
+
+def test_a_failed_write_leaves_the_file_before(tmp_path, monkeypatch):
+    path = tmp_path / "report.html"
+    path.write_bytes(b"old")
+
+    def full(path, _):
+        path.touch()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    assert "No space left on device" in told_while_writing(path)
+    monkeypatch.undo()
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def told_while_writing(path):
+    with pytest.raises(StoreError) as error:
+        write_output_file(path, b"new")
+    return str(error.value)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may become another user")
+def test_a_folder_that_may_not_be_searched_is_told(tmp_path):
+    folder = tmp_path / "private"
+    folder.mkdir(mode=0o700)
+    tmp_path.chmod(0o755)
+    os.seteuid(54321)
+    try:
+        with pytest.raises(StoreError, match="cannot be written: Permission denied"):
+            check_output_file(folder / "report.html")
+    finally:
+        os.seteuid(0)

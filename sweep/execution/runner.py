@@ -19,6 +19,7 @@ from sweep.execution import BLOCK_TASK
 from sweep.execution.calibration import Calibration, block_extents, calibrate_isolated
 from sweep.execution.finalize import close
 from sweep.execution.limits import (
+    BLOCK_S,
     CALIBRATION_S,
     CALIBRATION_SHARE,
     QUICK_CALIBRATION_S,
@@ -253,10 +254,10 @@ def _work_s(
 
 
 def _block_s(store: RunStore) -> float:
-    """Return the mean seconds of some committed blocks; infinity if there are none."""
+    """Return the mean seconds of some committed blocks; without any, what blocks are cut for."""
     some = sorted(committed(store))[:SAMPLED_RECEIPTS]
     spent = [receipt.wall_s for _, receipt in receipts(store, some)]
-    return statistics.fmean(spent) if spent else math.inf
+    return statistics.fmean(spent) if spent else BLOCK_S
 
 
 def _new_store(

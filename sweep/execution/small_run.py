@@ -66,11 +66,10 @@ class BlocksInChild:
         deadline = time.monotonic() + SMALL_RUN_LIMIT_S
         with ThreadPoolExecutor(1) as thread:
             try:
-                while time.monotonic() < deadline and not tally.hopeless:
-                    number = next(waiting, None)
-                    if number is None:
-                        break
+                for number in waiting:
                     self._compute_block(thread, number, tally)
+                    if tally.hopeless or time.monotonic() > deadline:
+                        break
             except BaseException:
                 self._child.close()  # the thread waits for its answer
                 raise

@@ -1,0 +1,118 @@
+"""A small run: one child process instead of a cluster, with the same numbers and guarantees."""
+
+import contextlib
+import os
+import signal
+
+import pytest
+from distributed import Client
+
+from support.stores import by_hand, same
+from sweep.errors import RunError, StoreError
+from sweep.execution import small_run
+from sweep.execution.runner import execute, recompute
+from sweep.isolation.child_process import Child
+from sweep.isolation.interrupts import Interrupts
+from sweep.plan.experiment import Pipeline
+from sweep.store.blocks import committed, drop_block
+from sweep.store.lifecycle import open_store
+from sweep.store.lock import locked
+
+TEXT = """
+seed = 3
+pose = { jitter_px = 0.5, azimuth_deg = { uniform = [0, 360] } }
+axes = { side_px = [20, 40], trial = 6 }
+"""
+
+
+@pytest.fixture(scope="module")
+def pipeline():
+    return Pipeline.from_text(TEXT, name="small")
+
+
+@pytest.fixture(scope="module")
+def undisturbed(pipeline, tmp_path_factory):
+    url = str(tmp_path_factory.mktemp("undisturbed") / "whole.zarr")
+    by_hand(url, pipeline, (2, 6))
+    return url
+
+
+@pytest.fixture
+def no_cluster(monkeypatch):
+    def refused(*_args, **_options):
+        pytest.fail("a cluster was started")
+
+    monkeypatch.setattr("sweep.execution.cluster.connected", refused)
+
+
+@pytest.fixture
+def client(cluster):
+    with Client(cluster, set_as_default=False) as connected:
+        yield connected
+
+
+@pytest.mark.usefixtures("no_cluster")
+def test_small_run_and_small_repair_start_no_cluster(pipeline, undisturbed, tmp_path):
+    url = str(tmp_path / "small.zarr")
+    summary = execute(pipeline, url, block_s=0.01)
+    assert (summary.computed_scenes, summary.failed, summary.crashed) == (12, 0, 0)
+    assert same(url, undisturbed)
+    store = open_store(url, "r+")
+    with locked(store):
+        drop_block(store, store.blocks[0])
+        recompute(store, [0])
+    assert same(url, undisturbed)
+
+
+def test_what_takes_longer_than_it_was_measured_goes_to_a_cluster(
+    pipeline, undisturbed, client, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(small_run, "SMALL_RUN_LIMIT_S", 0.0)
+    asked = []
+
+    @contextlib.contextmanager
+    def connected(_):
+        asked.append(True)
+        yield client
+
+    monkeypatch.setattr("sweep.execution.cluster.connected", connected)
+    url = str(tmp_path / "long.zarr")
+    summary = execute(pipeline, url, block_s=1e-6)
+    assert asked == [True]
+    assert summary.computed_blocks == summary.blocks == 12
+    assert same(url, undisturbed)
+
+
+def suicide(*_):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def refuse(*_):
+    raise StoreError("full")
+
+
+def fail(*_):
+    raise ZeroDivisionError("no")
+
+
+def compute(store, monkeypatch, task):
+    """Compute all blocks with another task; return the child."""
+    from sweep.execution.tally import Tally  # noqa: PLC0415
+
+    monkeypatch.setattr(small_run, "compute_block", task)
+    with Child() as child, Interrupts() as interrupts:
+        small_run.BlocksInChild(
+            store, child, store.url, time_limit_s=60, interrupts=interrupts
+        ).compute(iter(range(len(store.blocks))), Tally(store))
+
+
+@pytest.mark.parametrize(("task", "error", "reason"), [
+    (suicide, RunError, r"1 blocks failed\n  block 0-2,0-6: its process ended: SIGKILL"),
+    (fail, RunError, r"1 blocks failed\n  block 0-2,0-6: ZeroDivisionError: no"),
+    (refuse, StoreError, "full"),
+])
+def test_block_that_fails_is_named(task, error, reason, undisturbed, monkeypatch):
+    monkeypatch.setattr(small_run, "MAX_DEATHS", 1)
+    with pytest.raises(error, match=reason):
+        compute(open_store(undisturbed), monkeypatch, task)
+    assert len(committed(open_store(undisturbed))) == 1

@@ -6,8 +6,10 @@ characters escaped, so that they neither forge a line nor control a terminal.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import itertools
+import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -39,6 +41,16 @@ def plain(text: object, most: int = MAX_QUOTE_LENGTH) -> str:
     if cut.isprintable():
         return cut
     return "".join(c if c.isprintable() else _escape(c) for c in cut)
+
+
+def notice(line: str) -> None:
+    """Write a line to stderr about what goes on, without control characters; errors follow apart.
+
+    Nobody may listen: a line that cannot be written is left out.
+    """
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        sys.stderr.write(f"{plain(line, MAX_LINE_LENGTH)}\n")
+        sys.stderr.flush()
 
 
 def _escape(character: str) -> str:

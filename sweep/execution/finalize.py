@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.errors import StoreError
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plan.axes import Axis
 from sweep.plan.parameters import Stage
-from sweep.store.blocks import committed, receipts
+from sweep.store.blocks import check_not_replaced, committed, receipts
 from sweep.store.failures import MAX_ROWS, FailedCell, failed_cells, failure_table
 from sweep.store.lifecycle import finish
 from sweep.store.run_store import RunStore
+from sweep.store.snapshot import missing_chunks
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -28,13 +30,21 @@ def close(store: RunStore) -> None:
     Raises
     ------
     StoreError
-        If a receipt is damaged or the store cannot be written.
+        If a receipt is damaged, a chunk is missing, or the store cannot be written.
     """
+    check_not_replaced(store)
+    done = committed(store)
+    if missing := missing_chunks(store, done):
+        number, key = next(iter(missing.items()))
+        raise StoreError(
+            f"{store.url}: damaged: {len(missing):,} committed blocks lack chunks, such as {key} "
+            f"of block {number}"
+        )
     blocks: list[tuple[int, Mapping[str, Sequence[float]]]] = []
     cells: list[FailedCell] = []
     kept: Counter[str] = Counter()
     counts = {"detection": [0] * len(DetectionStatus), "estimate": [0] * len(EstimateStatus)}
-    for number, receipt in receipts(store, committed(store)):
+    for number, receipt in receipts(store, done):
         if receipt.seconds["scene"]:
             blocks.append((number, receipt.seconds))
         for name, flags in (("detection", receipt.detection), ("estimate", receipt.estimate)):

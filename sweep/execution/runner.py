@@ -33,14 +33,16 @@ from sweep.execution.summary import Summary, summary_of, summary_of_complete
 from sweep.execution.tally import Tally
 from sweep.isolation.child_process import Child
 from sweep.isolation.interrupts import Interrupts
+from sweep.messages import notice
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
-from sweep.store.blocks import committed, receipts
+from sweep.store.blocks import committed, drop_block, receipts
 from sweep.store.lifecycle import create_store, open_store, read_run_metadata, remove_store
 from sweep.store.locations import check_writable, checked_url, exists, is_remote, open_storage
 from sweep.store.lock import locked, refuse_if_held
 from sweep.store.provenance import differences
 from sweep.store.run_store import RunStore
+from sweep.store.snapshot import missing_chunks
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -284,15 +286,32 @@ def _compute_and_close(
     time_limit_s: float, interrupts: Interrupts, progress: ProgressReport | None,
 ) -> Mapping[str, int]:
     """Compute the blocks that are not committed; return counts of what was computed."""
-    with ThreadPoolExecutor(1) as thread, locked(store):
+    with ThreadPoolExecutor(1) as thread, locked(store) as lock:
         thread.submit(importlib.import_module, "xarray")  # to close the store
-        done = committed(store)
+        done = _committed_whole(store)
         tally = Tally(store, progress)
         tally.begin(done)
-        waiting = (number for number in range(len(store.blocks)) if number not in done)
+        waiting = lock.checked(
+            number for number in range(len(store.blocks)) if number not in done
+        )
         _compute(store, waiting, tally, child, client, sources, time_limit_s, interrupts)
+        lock.check(now=True)
         close(store)
     return tally.computed
+
+
+def _committed_whole(store: RunStore) -> set[int]:
+    """Return the blocks that are committed; drop those of which chunks are missing, and say so."""
+    done = committed(store)
+    if missing := missing_chunks(store, done):
+        number, key = next(iter(missing.items()))
+        notice(
+            f"{store.url}: {len(missing):,} committed blocks lack chunks, such as {key} of block "
+            f"{number}, as in a copy that was made during a run; they are computed again"
+        )
+        for number in missing:
+            drop_block(store, store.blocks[number])
+    return done - missing.keys()
 
 
 def _compute(

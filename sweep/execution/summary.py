@@ -13,6 +13,7 @@ from sweep.measure.flags import DetectionStatus
 from sweep.plan.parameters import Stage
 from sweep.store.blocks import committed
 from sweep.store.run_store import RunStore
+from sweep.store.snapshot import missing_chunks
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,13 +62,14 @@ def summary_of_complete(store: RunStore, started: float) -> Summary:
     Raises
     ------
     StoreError
-        If blocks are missing.
+        If blocks, or chunks of them, are missing.
     """
-    done = len(committed(store))
+    whole = committed(store)
+    done = len(whole) - len(missing_chunks(store, whole))
     if done != len(store.blocks):
         raise StoreError(
-            f"{store.url}: damaged: finished, but {done} of {len(store.blocks)} blocks exist; "
-            "repair it with `sweep verify --repair`"
+            f"{store.url}: damaged: finished, but {done:,} of {len(store.blocks):,} blocks are "
+            "complete; repair it with `sweep verify --repair`"
         )
     return summary_of(store, {}, time.perf_counter() - started)
 

@@ -71,7 +71,7 @@ def receipt_key(number: int) -> str:
 def begin_block(store: RunStore, block: Block) -> bool:
     """Mark a block as begun; return whether it had been begun before."""
     with translate_errors(store.url, "written"):
-        _check_not_replaced(store)
+        check_not_replaced(store)
         key = f"{BEGUN}/{store.blocks.number(block)}"
         if sync(store.storage.exists(key)):
             return True
@@ -85,13 +85,13 @@ def write_block(
     """Write a block's values, then commit them by its receipt, to which the digests are added."""
     number = store.blocks.number(block)
     with translate_errors(store.url, "written"):
-        _check_not_replaced(store)
+        check_not_replaced(store)
         if sync(store.storage.exists(receipt_key(number))):
             return  # another worker was given it too, perhaps of another processor
         for variable in in_writing_order(store.variables):
             array = store.array(variable.name)
             array[region(variable, store.pipeline, block)] = values[variable.name]
-        _check_not_replaced(store)
+        check_not_replaced(store)
         digests = {
             variable.name: _take_digest(store, chunk_key(store, variable, block))
             for variable in store.variables
@@ -132,7 +132,7 @@ def drop_block(store: RunStore, block: Block) -> None:
                 sync(store.storage.delete(key))
 
 
-def _check_not_replaced(store: RunStore) -> None:
+def check_not_replaced(store: RunStore) -> None:
     """Raise StoreReplacedError if another run has replaced the store since it was opened."""
     current: str | None
     if is_remote(store.url):

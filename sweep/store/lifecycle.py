@@ -6,8 +6,6 @@ store; a remote one exists once its URL points to it.
 
 from __future__ import annotations
 
-import contextlib
-import glob
 import os
 import shutil
 import time
@@ -27,7 +25,6 @@ from sweep.errors import StoreError
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.schema import SCHEMA
-from sweep.store.blocks import BEGUN, committed
 from sweep.store.checksums import DigestingStore, is_special
 from sweep.store.layout import FORMAT, FORMATS, planned_arrays
 from sweep.store.locations import (
@@ -43,12 +40,14 @@ from sweep.store.locations import (
     storage_at,
     translate_errors,
 )
+from sweep.store.lock import hold
 from sweep.store.manifest import Manifest, parsed, put, read_manifest, write_manifest
 from sweep.store.provenance import environment, fingerprint
 from sweep.store.receipt import are_counts
 from sweep.store.run_store import RunStore, list_folder
-from sweep.store.schema_check import GROUPS, schema_faults
+from sweep.store.schema_check import schema_faults
 from sweep.store.snapshot import snapshot
+from sweep.store.tidying import beside, tidy_beside
 from sweep.store.zarr_sync import sync
 
 if TYPE_CHECKING:
@@ -65,9 +64,6 @@ RUN_METADATA = {
     "environment": dict, "finished": bool,
 }
 """What every store records of its run, and the types; a newer version may record more."""
-
-ABANDONED_S = 3600.0
-"""Age from which a partly created store counts as abandoned."""
 
 
 def open_store(url: str, mode: str = "r") -> RunStore:
@@ -150,24 +146,6 @@ def _refused_format(recorded: object) -> str:
     )
 
 
-def tidy(store: RunStore) -> None:
-    """Delete what killed processes left in a local store; no other process may be writing it.
-
-    Zarr warns of unknown files among its groups; elsewhere they are harmless.
-    """
-    if is_remote(store.url):
-        return
-    root = Path(store.url).resolve()
-    for folder in ("", *GROUPS, *(f"{name}/*" for name in GROUPS)):
-        for path in root.glob(f"{folder}/*.partial".lstrip("/")):
-            if path.parent.resolve().is_relative_to(root):
-                path.unlink(missing_ok=True)
-    done = committed(store)
-    for mark in sync(list_folder(store.storage, BEGUN)):
-        if mark.isdecimal() and int(mark) in done:
-            sync(store.storage.delete(f"{BEGUN}/{mark}"))
-
-
 def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunStore:
     """Create an empty store for a pipeline, its chunks equal to blocks of ``extents``.
 
@@ -186,8 +164,8 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
             })
         else:
             check_writable(url)
-            _tidy_beside(url)
-            building = _beside(url, "new")
+            tidy_beside(url)
+            building = beside(url, "new")
             try:
                 _lay_out(LocalStore(building), pipeline, extents, run_id)
                 building.rename(Path(url).resolve())
@@ -206,22 +184,6 @@ def _remove_unfinished(folder: Path) -> None:
         if not folder.exists():
             return
         time.sleep(0.02)
-
-
-def _beside(url: str, ending: str) -> Path:
-    """Return an unused path in the folder of a local store, which may lie behind a link."""
-    path = Path(url).resolve()
-    return path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.{ending}")
-
-
-def _tidy_beside(url: str) -> None:
-    """Delete what killed processes left of stores that they were creating or deleting here."""
-    real = Path(url).resolve()
-    for ending, age_s in (("deleted", 0.0), ("new", ABANDONED_S)):
-        for path in real.parent.glob(f".{glob.escape(real.name)}.*.{ending}"):
-            with contextlib.suppress(OSError):
-                if path.stat().st_mtime <= time.time() - age_s:
-                    shutil.rmtree(path, ignore_errors=True)
 
 
 def _lay_out(to: Store, pipeline: Pipeline, extents: tuple[int, ...], run_id: str) -> None:
@@ -258,23 +220,26 @@ def _now() -> str:
 
 
 def remove_store(url: str) -> None:
-    """Delete a sweep store, and nothing else.
+    """Delete a sweep store of which this process can take the lock, and nothing else.
 
     Raises
     ------
     StoreError
-        If something else lies there, or it cannot be deleted.
+        If something else lies there, another process writes it, or it cannot be deleted.
     """
-    metadata = read_run_metadata(url, open_storage(url, "r+"))
+    storage = open_storage(url, "r+")
+    metadata = read_run_metadata(url, storage)
     with translate_errors(url, "overwritten"):
         if is_remote(url):
             pointer = storage_at(url, read_only=False)
-            sync(pointer.delete("zarr.json"))
+            with hold(url, storage):
+                sync(pointer.delete("zarr.json"))
             sync(pointer.delete_dir(str(metadata["run_id"])))
             return
         # Renamed at once, then deleted: a kill in between leaves no partial store.
-        doomed = _beside(url, "deleted")
-        Path(url).resolve().rename(doomed)
+        doomed = beside(url, "deleted")
+        with hold(url, storage):
+            Path(url).resolve().rename(doomed)
         shutil.rmtree(doomed, ignore_errors=True)
 
 

@@ -5,6 +5,8 @@ A writer may be at any block meanwhile, or may have been killed in the midst of 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from operator import floordiv
 from typing import Self
 
 import numpy as np
@@ -43,6 +45,28 @@ def block_of_chunk(key: str, blocks: Blocks, where: AxisPositions) -> int | None
     except (IndexError, ValueError):
         return None
     return blocks.number(Block(starts, starts))
+
+
+def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
+    """Return those of the committed blocks of which chunks are missing, each with the key of one.
+
+    A copy that was made while the store was written has such blocks, for instance.
+    """
+    starts = {number: store.blocks[number].starts for number in numbers}
+    extents = store.blocks.extents
+    missing: dict[int, str] = {}
+    for name, positions in axis_positions(store).items():
+        # Formatted, not encoded one by one: there may be millions.
+        parts = ["0"] * len(store.array(name).shape)
+        for axis, position in enumerate(positions):
+            parts[position] = f"{{{axis}}}"
+        template = "/".join([name, "c", *parts])
+        keys = {
+            template.format(*map(floordiv, start, extents)): number
+            for number, start in starts.items() if number not in missing
+        }
+        missing |= {keys[key]: key for key in store.storage.absent(keys, f"{name}/c")}
+    return missing
 
 
 class Snapshot(WrapperStore[Store]):

@@ -1,0 +1,151 @@
+"""Copies that were made while the store was written, and stores that are moved meanwhile."""
+
+import random
+import shutil
+from pathlib import Path
+
+import pytest
+
+from support.lengths import lengths
+from support.stores import by_hand, same
+from sweep.errors import StoreError, StoreReplacedError
+from sweep.execution import runner
+from sweep.execution.block_task import compute_block
+from sweep.execution.finalize import close
+from sweep.execution.runner import execute
+from sweep.integrity.verification import verify
+from sweep.plan.experiment import Pipeline
+from sweep.plan.schema import VARIABLES
+from sweep.store.blocks import chunk_key, committed
+from sweep.store.lifecycle import create_store, open_store
+from sweep.store.snapshot import missing_chunks
+
+TEXT = """
+seed = 3
+[pose]
+distance_m = 0.3
+jitter_px = 0.5
+[axes]
+tilt_deg = [0, 30, 60]
+cornerRefinementMethod = ["none", "subpix"]
+trial = 8
+"""
+
+SEED = 12
+
+EXTENTS = (1, 2)
+"""Twelve blocks."""
+
+
+@pytest.fixture(scope="module")
+def pipeline():
+    return Pipeline.from_text(TEXT, name="copied")
+
+
+@pytest.fixture(scope="module")
+def written(pipeline, tmp_path_factory):
+    """A store of which every block is committed, and that is not finished."""
+    url = tmp_path_factory.mktemp("written") / "written.zarr"
+    by_hand(str(url), pipeline, EXTENTS)
+    return url
+
+
+@pytest.fixture(scope="module")
+def finished(written):
+    url = written.with_name("finished.zarr")
+    shutil.copytree(written, url)
+    close(open_store(str(url), "r+"))
+    return url
+
+
+def copy_of(url, to, draw):
+    """Copy a store as one that was written meanwhile: receipts without some of their chunks."""
+    shutil.copytree(url, to)
+    store = open_store(str(to))
+    lost = set()
+    for number in draw.sample(range(12), draw.randint(1, 4)):
+        for name in draw.sample(sorted(VARIABLES), draw.randint(1, len(VARIABLES))):
+            path = to / chunk_key(store, VARIABLES[name], store.blocks[number])
+            path.write_bytes(b"") if draw.random() < 0.2 else path.unlink()
+        lost.add(number)
+    return lost
+
+
+@lengths(1, 100)
+def test_blocks_whose_chunks_are_missing_are_found(count, written, tmp_path):
+    draw = random.Random(SEED)
+    assert missing_chunks(open_store(str(written)), range(12)) == {}
+    for k in range(count):
+        copied = tmp_path / f"{k}.zarr"
+        lost = copy_of(written, copied, draw)
+        store = open_store(str(copied), "r+")
+        found = missing_chunks(store, committed(store))
+        assert found.keys() == lost
+        for key in found.values():
+            path = copied / key
+            assert not path.exists() or path.stat().st_size == 0
+        with pytest.raises(StoreError, match=rf"{len(lost)} committed blocks lack chunks, such as"):
+            close(store)
+        assert not open_store(str(copied)).finished
+        shutil.rmtree(copied)
+
+
+def test_copy_that_was_made_during_a_run_is_continued_to_the_same_store(
+    pipeline, written, finished, tmp_path, capsys
+):
+    copied = tmp_path / "copied.zarr"
+    lost = copy_of(written, copied, random.Random(SEED))
+    summary = execute(pipeline, copied)
+    assert summary.computed_blocks == len(lost)
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert f"{len(lost)} committed blocks lack chunks, such as" in said
+    assert same(copied, finished)
+    assert verify(str(copied), 0).damage == []
+
+
+def test_finished_store_that_lacks_chunks_is_not_said_to_be_complete(pipeline, finished, tmp_path):
+    copied = tmp_path / "copied.zarr"
+    lost = copy_of(finished, copied, random.Random(SEED))
+    with pytest.raises(StoreError, match=rf"finished, but {12 - len(lost)} of 12 blocks are compl"):
+        execute(pipeline, copied)
+    assert {damage.block for damage in verify(str(copied), 0).damage} == lost
+
+
+def test_store_without_scene_axes_has_its_chunks(tmp_path):
+    single = Pipeline.from_text("[pose]\nside_px = 40", name="single")
+    url = str(tmp_path / "single.zarr")
+    store = by_hand(url, single, ())
+    assert missing_chunks(store, [0]) == {}
+    Path(url, "true_rvec/c/0").unlink()
+    assert missing_chunks(store, [0]) == {0: "true_rvec/c/0"}
+
+
+def test_store_that_is_moved_while_it_is_written_is_told_in_a_line(
+    pipeline, finished, tmp_path
+):
+    url, moved = tmp_path / "here.zarr", tmp_path / "moved.zarr"
+    store = create_store(str(url), pipeline, EXTENTS)
+    compute_block(str(url), store.run_id, store.blocks[0])
+    url.rename(moved)
+    for work in (
+        lambda: compute_block(str(url), store.run_id, store.blocks[1]), lambda: close(store)
+    ):
+        with pytest.raises(StoreReplacedError, match="moved, or replaced by another run") as told:
+            work()
+        assert str(told.value).isprintable()
+    for block in list(store.blocks)[1:]:
+        compute_block(str(moved), store.run_id, block)
+    close(open_store(str(moved), "r+"))
+    assert same(moved, finished)
+
+
+def test_continuing_drops_what_is_not_whole_once(written, tmp_path, capsys):
+    copied = tmp_path / "copied.zarr"
+    lost = copy_of(written, copied, random.Random(SEED))
+    store = open_store(str(copied), "r+")
+    assert runner._committed_whole(store) == set(range(12)) - lost
+    assert committed(store) == set(range(12)) - lost
+    capsys.readouterr()
+    assert runner._committed_whole(store) == set(range(12)) - lost
+    assert capsys.readouterr().err == ""

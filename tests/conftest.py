@@ -94,6 +94,15 @@ def pytest_terminal_summary(terminalreporter, config):
             terminalreporter.write_line(f"{seconds:.1f} s of processor time: {name}")
 
 
+@pytest.fixture
+def no_child():
+    """Small runs are computed in this process, for tests to which it does not matter where."""
+    from support.here import calls_here  # noqa: PLC0415  (its assertions are rewritten by then)
+
+    with calls_here():
+        yield
+
+
 @pytest.fixture(scope="session")
 def cluster():
     """A cluster of two worker processes, for tests to which it does not matter whose it is."""

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import pytest
 
+from support.here import calls_here
 from support.room_picture import PICTURE, drawn
 from sweep.cli import main
 from sweep.plan.experiment import Pipeline
@@ -71,8 +72,10 @@ def workspace(tmp_path_factory):
     folder = tmp_path_factory.mktemp("clone")
     for name in FOLDERS:
         (folder / name).symlink_to(TOP / name)
-    with contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()) as output:
-        assert main(["run", "pipelines/smoke.toml", "--workers", "1"]) == 0
+    with (
+        calls_here(), contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()) as output
+    ):
+        assert main(["run", "pipelines/smoke.toml"]) == 0
     assert 'xarray.open_zarr("runs/smoke.zarr")' in output.getvalue()
     return folder
 
@@ -88,6 +91,7 @@ def commands_run():
     return set()
 
 
+@pytest.mark.usefixtures("no_child")
 @pytest.mark.parametrize("name", NAMES)
 def test_blocks_of_a_guide_run_in_their_order(name, workspace, commands_run, monkeypatch, capsys):
     monkeypatch.chdir(workspace)
@@ -107,8 +111,7 @@ def test_blocks_of_a_guide_run_in_their_order(name, workspace, commands_run, mon
             for command, *arguments in commands_of(block):
                 assert command == "sweep", "other commands are not run: say why"
                 if tuple(arguments) not in commands_run:
-                    few = ["--workers", "1"] if arguments[0] == "run" else []  # quicker to start
-                    assert main([*arguments, *few]) == 0, (arguments, capsys.readouterr().err)
+                    assert main(arguments) == 0, (arguments, capsys.readouterr().err)
                 commands_run.add(tuple(arguments))
 
 

@@ -58,17 +58,17 @@ def outcomes(tmp_path_factory):
 
 
 @pytest.fixture
-def kernel(cluster, tmp_path, monkeypatch):
-    """Run a cell in this process, on the shared cluster; return how many figures it shows.
+def kernel(no_child, tmp_path, monkeypatch):  # noqa: ARG001  (used by being there)
+    """Run a cell in this process; return how many figures it shows.
 
     A kernel and workers of each notebook's own take longer to start than the cells to run.
     """
     run = sweep.run
     figures = []
 
-    def run_on_cluster(*arguments, workers, **options):
+    def run_here(*arguments, workers, **options):
         assert workers > 0
-        return run(*arguments, client=cluster, **options)
+        return run(*arguments, **options)
 
     def show():
         figures.extend(plt.get_fignums())
@@ -88,7 +88,7 @@ def kernel(cluster, tmp_path, monkeypatch):
         return len(figures)
 
     names = {"__name__": "__main__", "display": display}
-    monkeypatch.setattr(sweep, "run", run_on_cluster)
+    monkeypatch.setattr(sweep, "run", run_here)
     monkeypatch.setattr(plt, "show", show)
     monkeypatch.setenv("SWEEP_RUNS", str(tmp_path))
     monkeypatch.chdir(NOTEBOOKS)

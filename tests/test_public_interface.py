@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import sweep
+from support.here import calls_here
 from sweep.errors import ArgumentError, PipelineError, SweepError
 from sweep.execution.progress import progress_report
 
@@ -24,7 +25,8 @@ TEXT = "pose = { side_px = 40, jitter_px = 0.5 }\naxes.trial = 3\n"
 def finished(tmp_path_factory):
     """A finished store; running its pipeline again computes nothing and starts no cluster."""
     store = tmp_path_factory.mktemp("finished") / "few.zarr"
-    sweep.run(FEW, store=store, workers=1)
+    with calls_here():
+        sweep.run(FEW, store=store)
     return store
 
 
@@ -67,6 +69,7 @@ def test_pipeline_is_given_as_a_mapping_a_path_or_a_pipeline(finished, tmp_path)
         sweep.run({"pose": {"side_pxx": 40}}, store=finished)
 
 
+@pytest.mark.usefixtures("no_child")
 def test_progress_is_reported_to_a_function_or_in_lines(tmp_path, capsys):
     seen = []
 
@@ -75,7 +78,7 @@ def test_progress_is_reported_to_a_function_or_in_lines(tmp_path, capsys):
         lines(progress)
 
     with progress_report(progress=True) as lines:
-        sweep.run(FEW, store=tmp_path / "seen.zarr", workers=1, progress=report)
+        sweep.run(FEW, store=tmp_path / "seen.zarr", progress=report)
     assert [progress.done for progress in seen] == [0, 3]
     assert {progress.total for progress in seen} == {3}
     assert capsys.readouterr().err == "0 of 3 poses\n3 of 3 poses\n"
@@ -118,7 +121,7 @@ def test_arguments_of_version_0_5_are_accepted_with_a_warning(finished, tmp_path
     seen = []
     with pytest.warns(DeprecationWarning, match="use progress=|sized by") as warned:
         sweep.run(
-            pipeline, store=tmp_path / "few.zarr", workers=1, on_progress=seen.append, block_s=0.1
+            pipeline, store=tmp_path / "few.zarr", on_progress=seen.append, block_s=0.1
         )
     assert {str(each.message) for each in warned} == {
         "sweep.run: on_progress=; use progress=",

@@ -74,7 +74,7 @@ from sweep.plan.reference import TABLES
 
 if __name__ == "__main__":
     pipeline, old, new = sys.argv[1:]
-    results = sweep.run(pipeline, store=new, workers=1)
+    results = sweep.run(pipeline, store=new)
     solved = results["estimate"].values == 1
     error = results["range_error"]
     assert error.dims == results["nees"].dims and error.dtype == "f4"
@@ -108,8 +108,7 @@ def test_a_record_and_a_function_make_a_variable(tmp_path):
     pipeline.write_text(PIPELINE)
     (tmp_path / "script.py").write_text(SCRIPT)
     old, new = tmp_path / "old.zarr", tmp_path / "new.zarr"
-    run = [sys.executable, "-m", "sweep", "run", str(pipeline), "--store", str(old),
-           "--workers", "1"]
+    run = [sys.executable, "-m", "sweep", "run", str(pipeline), "--store", str(old)]
     env = os.environ | {"PYTHONPATH": os.pathsep.join([str(overlay), str(TOP)])}
     script = [sys.executable, str(tmp_path / "script.py"), str(pipeline), str(old), str(new)]
     for command, environment in ((run, None), (script, env)):

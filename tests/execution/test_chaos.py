@@ -343,7 +343,7 @@ def small(tmp_path_factory):
 
 @lengths(3, ALL)
 def test_kill_between_any_two_writes_of_a_block_loses_that_block_alone(
-    count, small, cluster, tmp_path
+    count, small, tmp_path
 ):
     pipeline, path, reference = small
     url = str(tmp_path / "small.zarr")
@@ -365,8 +365,7 @@ def test_kill_between_any_two_writes_of_a_block_loses_that_block_alone(
     assert state.returncode == 0, state.stderr
     assert json.loads(state.stdout)["blocks_done"] == len(committed(store))
     before = len(committed(store))
-    ran = command(
-        "run", path, "--store", url, "--scheduler", cluster.scheduler_address, "--json")
+    ran = command("run", path, "--store", url, "--json")
     assert (ran.returncode, ran.stderr) == (0, "")
     told = json.loads(ran.stdout)
     assert told["computed_blocks"] == len(store.blocks) - before

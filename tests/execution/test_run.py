@@ -91,8 +91,9 @@ def test_number_of_workers_changes_no_bit(workers, pipeline, undisturbed, tmp_pa
     assert open_store(url).finished
 
 
+@pytest.mark.usefixtures("no_child")
 def test_stopped_run_continues_and_finished_one_is_left_alone(
-    pipeline, undisturbed, cluster, tmp_path
+    pipeline, undisturbed, tmp_path
 ):
     url = str(tmp_path / "stopped.zarr")
     store = create_store(url, pipeline, (1, 2, 1, 3))
@@ -100,10 +101,10 @@ def test_stopped_run_continues_and_finished_one_is_left_alone(
         compute_block(url, store.run_id, block)
     assert len(committed(store)) == 3
     assert not open_store(url).finished
-    summary = execute(pipeline, url, client=cluster)
+    summary = execute(pipeline, url)
     assert summary.computed_blocks == len(store.blocks) - 3
     assert same(url, undisturbed)
-    assert execute(pipeline, url, client=cluster).computed_blocks == 0
+    assert execute(pipeline, url).computed_blocks == 0
 
 
 def test_block_computed_twice_is_harmless(pipeline, undisturbed, tmp_path):
@@ -113,8 +114,9 @@ def test_block_computed_twice_is_harmless(pipeline, undisturbed, tmp_path):
     assert same(url, undisturbed)
 
 
-def test_xarray_opens_a_finished_store_with_labels_units_and_flags(pipeline, cluster, tmp_path):
-    dataset = sweep.run(pipeline, store=tmp_path / "labelled.zarr", client=cluster)
+@pytest.mark.usefixtures("no_child")
+def test_xarray_opens_a_finished_store_with_labels_units_and_flags(pipeline, tmp_path):
+    dataset = sweep.run(pipeline, store=tmp_path / "labelled.zarr")
     with xr.open_zarr(tmp_path / "labelled.zarr") as opened:
         assert opened.identical(dataset)
     assert list(dataset.detection.dims) == [
@@ -143,7 +145,8 @@ def test_side_px_gives_the_distance_as_a_coordinate(tmp_path):
         np.testing.assert_array_equal(dataset.true_tvec_m.sel(xyz="z"), dataset.distance_m)
 
 
-def test_store_of_another_experiment_is_not_continued(pipeline, cluster, tmp_path):
+@pytest.mark.usefixtures("no_child")
+def test_store_of_another_experiment_is_not_continued(pipeline, tmp_path):
     url = str(tmp_path / "one.zarr")
     by_hand(url, pipeline, (2, 4, 2, 3))
     other = Pipeline.from_text(TEXT, ["tilt_deg=[0, 51]", "seed=6", "white=200"], name="small")
@@ -153,7 +156,7 @@ def test_store_of_another_experiment_is_not_continued(pipeline, cluster, tmp_pat
     assert "seed: the store has 5, this run 6" in text
     assert "axes.tilt_deg: the store has 0.0, 50.0, this run 0.0, 51.0" in text
     assert "white: the store has 255.0, this run 200.0" in text
-    assert execute(other, url, client=cluster, overwrite=True).poses == 48
+    assert execute(other, url, overwrite=True).poses == 48
     assert open_store(url).pipeline.seed == 6
 
 
@@ -180,11 +183,17 @@ GROWN = {
     "new axis": ["background=[128, 60]"],
 }
 
+GROWN_SHORT = ("front", "trial", "solver", "new axis")
+"""One of each kind: an axis that is cut into blocks, draws, configurations, another axis."""
+
 GROWN_EXTENTS = {"dictionary": 2, "background": 1, "distance_m": 3, "tilt_deg": 2, "trial": 2}
 """Extents of blocks that cut each axis that grows."""
 
 
-@pytest.mark.parametrize("settings", GROWN.values(), ids=GROWN)
+@pytest.mark.parametrize("settings", [
+    pytest.param(settings, id=name, marks=() if name in GROWN_SHORT else pytest.mark.long)
+    for name, settings in GROWN.items()
+])
 def test_grown_grid_reuses_what_there_is_bit_for_bit(settings, undisturbed, tmp_path):
     grown = Pipeline.from_text(TEXT, settings, name="grown")
     fresh, reusing = str(tmp_path / "fresh.zarr"), str(tmp_path / "reusing.zarr")
@@ -244,12 +253,13 @@ def test_halves_of_a_grid_are_joined(pipeline, undisturbed, cluster, tmp_path):
     assert same(joined, undisturbed)
 
 
-def test_nothing_is_reused_from_an_unfinished_block(pipeline, undisturbed, cluster, tmp_path):
+@pytest.mark.usefixtures("no_child")
+def test_nothing_is_reused_from_an_unfinished_block(pipeline, undisturbed, tmp_path):
     part = str(tmp_path / "part.zarr")
     store = create_store(part, pipeline, (1, 4, 2, 3))
     compute_block(part, store.run_id, next(iter(store.blocks)))
     new = str(tmp_path / "new.zarr")
-    summary = execute(pipeline, new, client=cluster, reuse=[part])
+    summary = execute(pipeline, new, reuse=[part])
     assert summary.computed_scenes == 24
     assert same(new, undisturbed)
 
@@ -289,7 +299,8 @@ def test_an_unwritable_path_is_told_in_a_line(tmp_path):
     assert (ran.returncode, ran.stderr.strip()) == (2, "--workers 0: expected at least 1")
 
 
-def test_store_in_use_is_refused_and_a_dead_lock_is_not(pipeline, cluster, tmp_path):
+@pytest.mark.usefixtures("no_child")
+def test_store_in_use_is_refused_and_a_dead_lock_is_not(pipeline, tmp_path):
     url = str(tmp_path / "held.zarr")
     store = create_store(url, pipeline, (2, 4, 2, 3))
     here = {"token": "x", "host": socket.gethostname(), "beat": time.time()}
@@ -299,7 +310,7 @@ def test_store_in_use_is_refused_and_a_dead_lock_is_not(pipeline, cluster, tmp_p
     with subprocess.Popen([sys.executable, "-c", ""]) as ended:
         pass
     put(store.storage, KEY, {**here, "pid": ended.pid})
-    assert execute(pipeline, url, client=cluster).computed_blocks == 1
+    assert execute(pipeline, url).computed_blocks == 1
     assert not (Path(url) / KEY).exists()
 
 
@@ -320,11 +331,10 @@ def test_silent_scheduler_is_given_up(pipeline, tmp_path, monkeypatch):
     assert not (tmp_path / "none.zarr").exists()
 
 
-def test_json_is_one_object_and_progress_goes_elsewhere(cluster, tmp_path):
+def test_json_is_one_object_and_progress_goes_elsewhere(tmp_path):
     path = tmp_path / "small.toml"
     path.write_text(TEXT)
-    ran = sweep_command(
-        "run", path, "--json", "--scheduler", cluster.scheduler_address, cwd=tmp_path)
+    ran = sweep_command("run", path, "--json", cwd=tmp_path)
     assert ran.returncode == 0, ran.stderr
     assert ran.stderr == ""
     told = json.loads(ran.stdout)

@@ -281,10 +281,7 @@ def test_scene_that_raises_fails_alone(pipeline, clean, tmp_path):
                .values()) == 0
 
 
-FEW = [
-    Poison(59, "detection", "abort", SUBPIX), Poison(70, "estimation", "segv", (), ITERATIVE),
-    Poison(50, "detection", "raise", SUBPIX),
-]
+FEW = [Poison(59, "detection", "abort", SUBPIX), Poison(50, "detection", "raise", SUBPIX)]
 
 MANY = [
     # First of a block; last and the one before it; one that does not end anything between.

@@ -3,6 +3,7 @@
 import base64
 import contextlib
 import dataclasses
+import functools
 import html
 import math
 import os
@@ -69,6 +70,13 @@ def opened(url, trade=None):
 @pytest.fixture(scope="module")
 def full(tmp_path_factory):
     return made(tmp_path_factory.mktemp("full"), FULL, "full")
+
+
+@pytest.fixture(scope="module")
+def odd(tmp_path_factory):
+    """Return the store of an odd pipeline, which is computed once and must not be changed."""
+    folder = tmp_path_factory.mktemp("odd")
+    return functools.cache(lambda name: made(folder, ODD[name], name.replace(" ", "_")))
 
 
 @pytest.fixture(scope="module")
@@ -174,13 +182,12 @@ def kinds(url):
     return [kind.name for kind in figure_kinds(opened(url))]
 
 
-def test_each_figure_applies_where_it_should(full, tmp_path):
+def test_each_figure_applies_where_it_should(full, odd):
     assert kinds(full) == [
         "detection", "errors", "maps", "failures", "flips", "ranking", "configurations", "paired",
         "bound",
     ]
-    found = {name: kinds(made(tmp_path, text, name.replace(" ", "_")))
-             for name, text in ODD.items() if name != "long axes"}
+    found = {name: kinds(odd(name)) for name in ODD if name != "long axes"}
     assert found == {
         "single pose": ["failures"],
         "one axis of one value": ["failures"],
@@ -206,9 +213,12 @@ def test_an_axis_of_too_many_configurations_has_a_figure_of_its_own(tmp_path):
     assert command("report", url, "-o", tmp_path / "report.html")[::2] == (0, "")
 
 
-@pytest.mark.parametrize("name", ODD)
-def test_odd_stores_have_a_report_without_a_warning(name, tmp_path):
-    url = made(tmp_path, ODD[name], "odd")
+@pytest.mark.parametrize("name", [
+    name if name in ("nothing visible", "no draws", "distances drawn")
+    else pytest.param(name, marks=pytest.mark.long) for name in ODD
+])
+def test_odd_stores_have_a_report_without_a_warning(name, odd, tmp_path):
+    url = odd(name)
     output = tmp_path / "report.html"
     assert command("report", url, "-o", output)[::2] == (0, "")
     text = output.read_text(encoding="utf-8")
@@ -276,7 +286,7 @@ def test_the_answer_is_that_of_plain_arithmetic(full, page):
     assert f'<span class="value">{poses}</span>' in page
 
 
-def test_the_answer_s_numbers_have_their_own_denominators(full, page, tmp_path):
+def test_the_answer_s_numbers_have_their_own_denominators(full, page, odd):
     results = open_dataset(full).load()
     paragraph = re.search(r'<p class="answer">(.*?)</p>', page)[1]
     assert (f"looked for {results.detection.size} times, pooled over 2 detector settings,"
@@ -286,7 +296,7 @@ def test_the_answer_s_numbers_have_their_own_denominators(full, page, tmp_path):
             "configurations." in paragraph)
     assert f"to {number(100 * float(error_statistics(results)['solved_rate_high']))} %, of " + str(
         results.estimate.size) in page
-    single = answer(opened(made(tmp_path, ODD["single pose"], "single"))).paragraph
+    single = answer(opened(odd("single pose"))).paragraph
     assert single.startswith("The marker was looked for once and detected in 100 %; a pose was ")
 
 
@@ -457,8 +467,8 @@ def small_trade():
                       {"side_px": [14.0, 40.0], "treatment": np.array(names, dtype=object)})
 
 
-def test_a_trade_is_shown_where_the_store_has_one(tmp_path):
-    url = made(tmp_path, ODD["no draws"], "trade")
+def test_a_trade_is_shown_where_the_store_has_one(odd, tmp_path):
+    url = shutil.copytree(odd("no draws"), str(tmp_path / "trade.zarr"))
     write_group(open_store(url, "r+"), "cost/tradeoff", small_trade())
     output = tmp_path / "report.html"
     assert command("report", url, "-o", output)[::2] == (0, "")
@@ -603,8 +613,8 @@ def chunks_of(url, name):
     return sorted(path for path in (Path(url) / name / "c").rglob("*") if path.is_file())
 
 
-def test_poses_that_are_missing_are_told(tmp_path):
-    url = made(tmp_path, ODD["no draws"], "lost")
+def test_poses_that_are_missing_are_told(odd, tmp_path):
+    url = shutil.copytree(odd("no draws"), str(tmp_path / "lost.zarr"))
     output = tmp_path / "report.html"
     chunks_of(url, "detection")[0].unlink()
     again = "`sweep verify --repair` repairs it\n"
@@ -616,8 +626,8 @@ def test_poses_that_are_missing_are_told(tmp_path):
     assert not output.exists()
 
 
-@pytest.mark.parametrize("loaded", [200_000_000, 0])
-def test_a_damaged_store_is_told_in_one_line(loaded, tmp_path, monkeypatch):
+@pytest.mark.parametrize("loaded", [pytest.param(200_000_000, marks=pytest.mark.long), 0])
+def test_a_damaged_store_is_told_in_one_line(loaded, odd, tmp_path, monkeypatch):
     monkeypatch.setattr(report_data, "MAX_LOADED_BYTES", loaded)
     output = tmp_path / "report.html"
 
@@ -632,7 +642,7 @@ def test_a_damaged_store_is_told_in_one_line(loaded, tmp_path, monkeypatch):
         (lambda url: shutil.rmtree(Path(url) / "side_px"), "side_px: missing;"),
         (lambda url: shutil.rmtree(Path(url) / "solver"), "solver: missing;"),
     )):
-        url = made(tmp_path, ODD["no draws"], f"damaged{k}")
+        url = shutil.copytree(odd("no draws"), str(tmp_path / f"damaged{k}.zarr"))
         damage(url)
         code, out, err = command("report", url, "-o", output)
         assert (code, out, len(err.splitlines())) == (2, "", 1)

@@ -18,13 +18,13 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _execute(options: argparse.Namespace) -> int:
     pipeline = read_pipeline(options)
-    from sweep.execution.forecast import forecast_isolated  # noqa: PLC0415
+    from sweep.execution.forecast import forecast  # noqa: PLC0415
     from sweep.plan.active_parts import parts  # noqa: PLC0415
     from sweep.report.formatting import byte_count, duration  # noqa: PLC0415
 
     listed = parts(pipeline)
     switches = [part.switch for part in listed if part.switch and part.active]
-    expected, costs = forecast_isolated(pipeline, options.workers, switches)
+    expected, costs = forecast(pipeline, options.workers, switches)
     if options.json:
         print_json(
             {
@@ -47,17 +47,22 @@ def _execute(options: argparse.Namespace) -> int:
         print(f"  {axis.name:{width}}  {len(axis):>11,}  {stage:10}  {values} {axis.unit}".rstrip())
     print("\nParts")
     for part in listed:
-        cost = f"; {costs[part.switch] * 1e3:.3g} ms a pose" if part.switch in costs else ""
+        cost = ""
+        if part.switch in costs:
+            cost = f"; {costs[part.switch] * 1e3:.3g} ms a pose"
+        elif part.switch in switches:
+            cost = "; cost not measured, poses take too long"
         print(f"  {part.name:17} {'on ' if part.active else 'off'}  {part.reason}{cost}")
     print("\nExpected")
+    over, ended = ("over ", ", then the measurement was ended") if expected.over else ("", "")
     rows = {
         "poses": f"{expected.poses:,}",
         "results": f"{expected.results:,}",
         "blocks": f"{expected.blocks:,} of {' x '.join(map(str, expected.block)) or '1'} poses",
         "store": f"{byte_count(expected.bytes)} before compression",
         "memory": f"{byte_count(expected.worker_bytes)} a worker",
-        "cost": f"{1e3 * expected.pose_s:.3g} ms a pose ({expected.sampled} sampled)",
-        "time": f"{duration(expected.seconds)} with {expected.workers} workers",
+        "cost": f"{over}{1e3 * expected.pose_s:.3g} ms a pose ({expected.sampled} sampled{ended})",
+        "time": f"{over}{duration(expected.seconds)} with {expected.workers} workers",
     }
     for name, text in rows.items():
         print(f"  {name:8} {text}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,27 +14,38 @@ from sweep.evaluation.cells import run_cells
 from sweep.execution.limits import (
     BLOCK_S,
     BLOCKS_PER_WORKER,
+    CALIBRATION_LIMIT_S,
     MAX_BLOCK_BYTES,
     MAX_BLOCK_SCENES,
     MIN_BLOCK_S,
 )
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
+from sweep.isolation.watchdog import compilation_s
 from sweep.plan.axes import Axis
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import bytes_per_block
 
-MIN_BATCH, MAX_BATCH = 24, 1536
-"""Scenes measured at a time: more if they are cheap, because a call has a cost of its own."""
+MAX_BATCH = 1536
+"""Most scenes measured at a time."""
 
-LONG_BATCH_S = 0.06
-"""Batches that take longer are large enough."""
+BATCH_S = 0.06
+"""Batches that take as long are large enough: a call has a cost of its own."""
+
+GROWTH = 8
+"""By how much a batch may exceed the one before: a few scenes may cost far more than the others."""
 
 MAX_BATCHES = 40
 
 UNEVEN = 0.25
 """Axes whose two halves differ in cost by more than this share are not cut if possible."""
+
+MIN_LIMIT_S = 1.0
+"""Every batch gets as long, whatever those before took: on a busy machine all take longer."""
+
+COMPILATION_LIMIT_S = 900.0
+"""How long a measurement may compile; its own limit stands still meanwhile."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,47 +62,107 @@ class Calibration:
         Scenes in the sample.
     unevenness
         For each scene axis, the difference of the mean costs of its two halves, as a share.
+    over
+        Whether the last scenes of the sample took too long and were abandoned, so that a scene
+        takes more than ``scene_s``.
     """
 
     scene_s: float
     error_s: float
     sampled: int
     unevenness: tuple[float, ...]
+    over: bool = False
 
 
-def calibrate(pipeline: Pipeline, budget_s: float) -> Calibration:
+@dataclass(frozen=True, slots=True)
+class BatchCost:
+    """What a batch of scenes cost.
+
+    Attributes
+    ----------
+    spent_s
+        Seconds of this thread's own time: others use the processors meanwhile.
+    scene_s
+        Seconds of each scene (N,).
+    running_s
+        Seconds on the clock, compilation not counted.
+    """
+
+    spent_s: float
+    scene_s: NDArray[np.float64]
+    running_s: float
+
+
+Indices = list[NDArray[np.intp]]
+
+
+def batch_cost(pipeline: Pipeline, indices: Indices) -> BatchCost:
+    """Compute the scenes at ``indices``, an array (N,) for each scene axis, and return the cost."""
+    compiled, wall, working = compilation_s(), time.perf_counter(), time.thread_time()
+    result = run_cells(pipeline, indices)
+    spent, wall = time.thread_time() - working, time.perf_counter() - wall
+    own = result.row_seconds * (spent / wall)
+    # Time that is not measured by scene (solving, projecting) is spread over the batch.
+    rest = (spent - own.sum()) / len(own)
+    return BatchCost(spent, own + rest, max(wall - (compilation_s() - compiled), 0.0))
+
+
+def calibrate(
+    pipeline: Pipeline, budget_s: float, cost: Callable[[Pipeline, Indices], BatchCost] = batch_cost
+) -> Calibration:
     """Measure a seeded random sample of scenes for about ``budget_s`` seconds.
 
-    A few scenes are computed first, so that code is compiled and caches are filled.
+    One scene is computed first, so that code is compiled and caches are filled.
+
+    Parameters
+    ----------
+    pipeline
+        Measured on its own grid.
+    budget_s
+        Seconds.
+    cost
+        Computes a batch; it may raise ``TimeoutError`` with the seconds that it was given, to end
+        the measurement.
     """
     axes = scene_axes(pipeline)
     generator = np.random.Generator(np.random.PCG64(0))
-    total = pipeline.size(Stage.scene)
-    run_cells(pipeline, sample(axes, generator, min(4, total)))
-    rows: list[NDArray[np.float64]] = []
-    picks: list[list[NDArray[np.intp]]] = []
-    total_s, batch = 0.0, MIN_BATCH
-    started = time.perf_counter()
-    while True:
-        indices = sample(axes, generator, batch)
-        wall, working = time.perf_counter(), time.thread_time()
-        result = run_cells(pipeline, indices)
-        # This thread's own time: the workers' processes start meanwhile and use the processors.
-        spent = time.thread_time() - working
-        own = result.row_seconds * (spent / (time.perf_counter() - wall))
-        # Time that is not measured by scene (solving, projecting) is spread over the batch.
-        count = len(own)
-        rows.append(own + (spent - own.sum()) / count)
-        picks.append(indices)
-        total_s += spent
-        if spent < LONG_BATCH_S:
-            batch = min(2 * batch, MAX_BATCH)
-        used = time.perf_counter() - started
-        if used >= budget_s or len(rows) >= MAX_BATCHES:
-            break
-    cost = np.concatenate(rows)
+    costs: list[BatchCost] = []
+    picks: list[Indices] = []
+    batch, growing = 1, True
+    indices = sample(axes, generator, batch)
+    try:
+        cost(pipeline, indices)
+        started = time.perf_counter()
+        while len(costs) < MAX_BATCHES:
+            indices = sample(axes, generator, batch)
+            costs.append(cost(pipeline, indices))
+            picks.append(indices)
+            left = budget_s - (time.perf_counter() - started)
+            if left <= 0:
+                break
+            scene_s = max(sum(c.spent_s for c in costs) / sum(len(c.scene_s) for c in costs), 1e-9)
+            wanted = min(max(int(BATCH_S / scene_s), 1), MAX_BATCH)
+            if growing and wanted <= GROWTH * batch:
+                # The batches so far were small: the cost of a call is much of theirs.
+                growing = False
+                costs.clear()
+                picks.clear()
+            batch = min(wanted, GROWTH * batch, max(int(left / scene_s), 1))
+    except TimeoutError as error:
+        over_s = error.args[0]
+        count = batch if axes else 1
+        costs.append(BatchCost(over_s, np.full(count, over_s / count), over_s))
+        return _calibration(pipeline, [*picks, indices], costs, over=True)
+    return _calibration(pipeline, picks, costs)
+
+
+def _calibration(
+    pipeline: Pipeline, picks: list[Indices], costs: list[BatchCost], *, over: bool = False
+) -> Calibration:
+    """Return what batches, at indices ``picks``, say of the grid."""
+    cost = np.concatenate([one.scene_s for one in costs])
     unevenness = []
-    for k, axis in enumerate(axes):
+    for k, axis in enumerate(scene_axes(pipeline)):
         index = np.concatenate([chosen[k] for chosen in picks])
         low = index < len(axis) / 2
         if len(axis) < 2 or low.all() or not low.any():
@@ -99,7 +171,8 @@ def calibrate(pipeline: Pipeline, budget_s: float) -> Calibration:
         a, b = cost[low].mean(), cost[~low].mean()
         unevenness.append(float(abs(a - b) / (a + b) * 2))
     error = float(cost.std(ddof=1) / math.sqrt(len(cost))) if len(cost) > 1 else 0.0
-    return Calibration(total_s / len(cost), error, len(cost), tuple(unevenness))
+    mean = sum(one.spent_s for one in costs) / len(cost)
+    return Calibration(mean, error, len(cost), tuple(unevenness), over)
 
 
 UNMEASURED_S = 0.01
@@ -109,15 +182,45 @@ UNMEASURED_S = 0.01
 def calibrate_isolated(
     child: Child, pipeline: Pipeline, budget_s: float, limit_s: float
 ) -> Calibration:
-    """Call :func:`calibrate` in a child process, which a scene may crash.
+    """Call :func:`calibrate` with a child process, which a scene may crash.
 
-    If it crashes, raises or takes longer than ``limit_s`` seconds, :data:`UNMEASURED_S` is assumed.
+    If it crashes or raises, :data:`UNMEASURED_S` is assumed. What takes longer than ``limit_s``
+    seconds, or :data:`CALIBRATION_LIMIT_S`, compilation not counted, is abandoned, and the child
+    ends.
     """
     try:
-        measured: Calibration = child.call(calibrate, pipeline, budget_s, limit_s=limit_s)
+        return calibrate_in(child, pipeline, budget_s, min(limit_s, CALIBRATION_LIMIT_S))
     except (ChildDiedError, ChildRaisedError):
         return Calibration(UNMEASURED_S, 0.0, 0, (0.0,) * len(scene_axes(pipeline)))
-    return measured
+
+
+def calibrate_in(child: Child, pipeline: Pipeline, budget_s: float, limit_s: float) -> Calibration:
+    """Call :func:`calibrate` with a child process and a time limit.
+
+    Raises
+    ------
+    ChildDiedError
+        If a scene crashes the child.
+    ChildRaisedError
+        If a scene raises.
+    """
+    left = limit_s
+
+    def cost(pipeline: Pipeline, indices: Indices) -> BatchCost:
+        nonlocal left
+        try:
+            spent: BatchCost = child.call(
+                batch_cost, pipeline, indices, limit_s=max(left, MIN_LIMIT_S),
+                grace_s=COMPILATION_LIMIT_S,
+            )
+        except ChildDiedError as error:
+            if error.timed_out:
+                raise TimeoutError(max(left, MIN_LIMIT_S)) from None
+            raise
+        left -= spent.running_s
+        return spent
+
+    return calibrate(pipeline, budget_s, cost)
 
 
 def sample(

@@ -14,10 +14,16 @@ import numpy as np
 
 from sweep.errors import ArgumentError, RunError
 from sweep.evaluation.cells import run_cells
-from sweep.execution.calibration import block_extents, calibrate, sample
+from sweep.execution.calibration import (
+    COMPILATION_LIMIT_S,
+    block_extents,
+    calibrate_in,
+    sample,
+)
 from sweep.execution.cluster import default_workers
-from sweep.execution.limits import CALIBRATION_S, PLAN_LIMIT_S
+from sweep.execution.limits import CALIBRATION_S, PLAN_LIMIT_S, PLAN_SCENES_LIMIT_S
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
+from sweep.isolation.watchdog import compilation_s
 from sweep.model.effects import SWITCHES
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
@@ -28,7 +34,10 @@ EFFECT_SCENES = 24
 """Most scenes on which an effect is measured."""
 
 EFFECT_S = 0.6
-"""Least seconds of measurement for each effect."""
+"""Seconds of measurement for each effect, if the time limit of all leaves them."""
+
+MIN_PAIRS = 3
+"""Pairs of measurements of an effect, of which the median is taken."""
 
 START_S = 3.0
 """Seconds of a run apart from its blocks: processes start and end, packages are imported."""
@@ -48,6 +57,8 @@ class Forecast:
         Size of the store before compression; memory of a worker.
     pose_s, sampled
         Mean seconds a pose, all configurations included; scenes that were measured.
+    over
+        Whether the measurement was abandoned: a pose takes more than ``pose_s``.
     workers, seconds
         Number of workers, and how long they would take.
     """
@@ -60,46 +71,50 @@ class Forecast:
     worker_bytes: int
     pose_s: float
     sampled: int
+    over: bool
     workers: int
     seconds: float
 
 
-def effect_costs(
-    pipeline: Pipeline, switches: Sequence[str], pose_s: float
-) -> dict[str, float]:
-    """Return the seconds that each effect adds to a pose: medians of pairs with and without it.
+def effect_cost(
+    pipeline: Pipeline, switch: str, count: int, budget_s: float
+) -> tuple[float, float]:
+    """Return the seconds that an effect adds to a pose, and those that this took.
 
-    All other parameters stay as they are, so that effects that multiply one another's work are each
-    charged with all of it.
+    It is the median of pairs with and without the effect. All other parameters stay as they are, so
+    that effects that multiply one another's work are each charged with all of it. Compilation does
+    not count.
 
     Parameters
     ----------
     pipeline
         Measured on a seeded sample of its scenes.
-    switches
-        Parameters that switch an effect on.
-    pose_s
-        Seconds that a pose takes with all effects, from :func:`forecast`.
+    switch
+        The parameter that switches the effect on.
+    count
+        Scenes in the sample.
+    budget_s
+        Seconds of measurement; at least :data:`MIN_PAIRS` pairs are measured.
     """
     axes = scene_axes(pipeline)
-    generator = np.random.Generator(np.random.PCG64(1))
-    count = min(max(int(EFFECT_S / (6 * pose_s)), 8), EFFECT_SCENES) if axes else 1
-    indices = sample(axes, generator, count)
-    costs = {}
-    for switch in switches:
-        pair = pipeline, _without(pipeline, switch)
-        differences: list[float] = []
-        started = time.perf_counter()
-        while len(differences) < 3 or time.perf_counter() - started < EFFECT_S:
-            spent = []
-            for variant in pair:
-                start = time.thread_time()
-                run_cells(variant, indices)
-                spent.append(time.thread_time() - start)
-            differences.append((spent[0] - spent[1]) / count)
-        # A difference below 0 is measurement noise.
-        costs[switch] = max(statistics.median(differences), 0.0)
-    return costs
+    scenes = count if axes else 1
+    indices = sample(axes, np.random.Generator(np.random.PCG64(1)), scenes)
+    pair = pipeline, _without(pipeline, switch)
+    differences: list[float] = []
+    started, compiled = time.perf_counter(), compilation_s()
+
+    def used_s() -> float:
+        return time.perf_counter() - started - (compilation_s() - compiled)
+
+    while len(differences) < MIN_PAIRS or used_s() < budget_s:
+        spent = []
+        for variant in pair:
+            start = time.thread_time()
+            run_cells(variant, indices)
+            spent.append(time.thread_time() - start)
+        differences.append((spent[0] - spent[1]) / scenes)
+    # A difference below 0 is measurement noise.
+    return max(statistics.median(differences), 0.0), used_s()
 
 
 def _without(pipeline: Pipeline, switch: str) -> Pipeline:
@@ -116,56 +131,54 @@ def _without(pipeline: Pipeline, switch: str) -> Pipeline:
     )
 
 
-def forecast_isolated(
-    pipeline: Pipeline, workers: int | None, switches: Sequence[str]
+def forecast(
+    pipeline: Pipeline, workers: int | None = None, switches: Sequence[str] = ()
 ) -> tuple[Forecast, dict[str, float]]:
-    """Return :func:`forecast` and :func:`effect_costs`, measured in a child process.
+    """Return what a run would take, and the seconds that effects add to a pose; write nothing.
+
+    A seeded sample of scenes is measured in a child process, for :data:`PLAN_LIMIT_S` seconds at
+    most, compilation not counted. The costs lack effects for which that is too short.
+
+    Parameters
+    ----------
+    pipeline
+        Measured on its own grid.
+    workers
+        Number of workers (default: the available processors).
+    switches
+        Parameters that switch effects on.
 
     Raises
     ------
+    ArgumentError
+        If there are no workers.
     RunError
-        If a measured scene crashes its process, never returns, or raises.
+        If a measured scene crashes its process, or raises.
     """
+    if workers is None:
+        workers = default_workers()
+    if workers < 1:
+        raise ArgumentError("workers", workers, "expected at least 1")
+    costs: dict[str, float] = {}
     try:
-        with Child() as child:
-            expected: Forecast = child.call(forecast, pipeline, workers, limit_s=PLAN_LIMIT_S)
-            costs: dict[str, float] = child.call(
-                effect_costs, pipeline, switches, expected.pose_s, limit_s=PLAN_LIMIT_S
-            )
+        with Child("sweep.execution.forecast") as child:
+            started = time.monotonic()
+            calibration = calibrate_in(child, pipeline, CALIBRATION_S, PLAN_SCENES_LIMIT_S)
+            if not calibration.over:
+                left = PLAN_LIMIT_S - min(time.monotonic() - started, PLAN_SCENES_LIMIT_S)
+                costs = _effect_costs(child, pipeline, switches, calibration.scene_s, left)
     except (ChildDiedError, ChildRaisedError) as error:
         reason = str(error).strip().splitlines()[-1]
         raise RunError(
             f"a measured scene crashed its process ({reason}); `sweep run` isolates it and "
             "computes the others"
         ) from None
-    return expected, costs
-
-
-def forecast(pipeline: Pipeline, workers: int | None = None) -> Forecast:
-    """Return what a run would take; nothing is written.
-
-    Parameters
-    ----------
-    pipeline
-        Measured on a seeded sample of its scenes, for less than a second.
-    workers
-        Number of workers (default: the available processors).
-
-    Raises
-    ------
-    ArgumentError
-        If there are no workers.
-    """
-    if workers is None:
-        workers = default_workers()
-    if workers < 1:
-        raise ArgumentError("workers", workers, "expected at least 1")
-    calibration = calibrate(pipeline, CALIBRATION_S)
     extents = block_extents(pipeline, calibration, workers)
     blocks = Blocks(tuple(len(axis) for axis in scene_axes(pipeline)), extents)
     poses = pipeline.size(Stage.scene)
     busy = min(workers, default_workers(), len(blocks))
-    process = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    # The child ended: its memory was at most this.
+    process = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
     return Forecast(
         poses=poses,
         results=pipeline.size(*Stage),
@@ -175,6 +188,30 @@ def forecast(pipeline: Pipeline, workers: int | None = None) -> Forecast:
         worker_bytes=process + 3 * bytes_per_block(pipeline, math.prod(extents)),
         pose_s=calibration.scene_s,
         sampled=calibration.sampled,
+        over=calibration.over,
         workers=workers,
         seconds=START_S + poses * calibration.scene_s / busy,
-    )
+    ), costs
+
+
+def _effect_costs(
+    child: Child, pipeline: Pipeline, switches: Sequence[str], pose_s: float, left_s: float
+) -> dict[str, float]:
+    """Return the seconds that each effect adds to a pose, for as many as can be measured."""
+    costs: dict[str, float] = {}
+    for number, switch in enumerate(switches):
+        budget_s = min(EFFECT_S, left_s / (len(switches) - number))
+        count = min(int(budget_s / (2 * MIN_PAIRS * pose_s)), EFFECT_SCENES)
+        if count < 1:
+            break
+        try:
+            costs[switch], used_s = child.call(
+                effect_cost, pipeline, switch, count, budget_s, limit_s=left_s,
+                grace_s=COMPILATION_LIMIT_S,
+            )
+        except ChildDiedError as error:
+            if not error.timed_out:
+                raise
+            break
+        left_s -= used_s
+    return costs

@@ -43,8 +43,14 @@ QUICK_CALIBRATION_S = 0.1
 CALIBRATION_SHARE = 1 / 8
 """Share of a block's time limit after which the measurement is abandoned."""
 
-PLAN_LIMIT_S = 600.0
-"""Time limit of all measurements of a forecast; a scene that never returns would block it."""
+CALIBRATION_LIMIT_S = 5.0
+"""Seconds after which it is abandoned in any case: it is known by then that blocks are small."""
+
+PLAN_LIMIT_S = 3.2
+"""Time limit of all measurements of a forecast, which is answered within 5 s."""
+
+PLAN_SCENES_LIMIT_S = 2.5
+"""The part of it that the cost of a scene may take; the rest is for the effects."""
 
 # The cluster (`sweep.execution.cluster`)
 

@@ -144,7 +144,8 @@ def execute(
             from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
 
             # Measured while the workers' processes start.
-            future = measuring(CALIBRATION_S) if unfinished is None else None
+            again = unfinished is None and not (calibration is not None and calibration.over)
+            future = measuring(CALIBRATION_S) if again else None
             connection = stack.enter_context(
                 connected(pipeline, workers=workers, scheduler=scheduler, client=client)
             )

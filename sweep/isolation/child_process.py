@@ -97,7 +97,10 @@ class Child:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def call(self, function: Callable[..., Any], *arguments: Any, limit_s: float) -> Any:
+    def call(
+        self, function: Callable[..., Any], *arguments: Any, limit_s: float,
+        grace_s: float = GRACE_S,
+    ) -> Any:
         """Call a function of a module in the child and return its result.
 
         Parameters
@@ -106,6 +109,8 @@ class Child:
             What is called; it is pickled, so a function of a module.
         limit_s
             Time limit in seconds; it stands still while code is compiled.
+        grace_s
+            How long after its limit a child that did not end itself is killed, in seconds.
 
         Raises
         ------
@@ -115,7 +120,7 @@ class Child:
             If the call raised; a `SweepError` is raised as it is.
         """
         started = time.monotonic()
-        killer = threading.Timer(limit_s + GRACE_S, self._kill_late)
+        killer = threading.Timer(limit_s + grace_s, self._kill_late)
         killer.daemon = True
         killer.start()
         try:

@@ -52,6 +52,7 @@ class _Compiling(numba.core.event.Listener):
 
     depth = 0
     began = 0.0
+    total_s = 0.0
 
     def on_start(self, event: object) -> None:  # noqa: ARG002
         with _lock:
@@ -65,9 +66,15 @@ class _Compiling(numba.core.event.Listener):
             _Compiling.depth -= 1
             if not _Compiling.depth:
                 took = time.monotonic() - _Compiling.began
+                _Compiling.total_s += took
                 for number in _deadlines:
                     _deadlines[number] += took
             _arm()
+
+
+def compilation_s() -> float:
+    """Return the seconds for which this process has compiled or loaded code so far."""
+    return _Compiling.total_s
 
 
 _register: Any = numba.core.event.register

@@ -1,0 +1,115 @@
+"""What scenes cost is measured within a limit, whatever they cost."""
+
+import itertools
+import math
+import time
+
+import numpy as np
+import pytest
+
+from support.reports import command
+from sweep.execution import forecast as forecast_module
+from sweep.execution.calibration import (
+    MIN_LIMIT_S,
+    BatchCost,
+    block_extents,
+    calibrate,
+    calibrate_in,
+    calibrate_isolated,
+)
+from sweep.execution.forecast import forecast
+from sweep.execution.limits import BLOCK_S
+from sweep.isolation.child_process import Child
+from sweep.plan.experiment import Pipeline
+
+HUGE = """
+[camera]
+width_px = 20000
+height_px = 20000
+fx_px = 20000
+[scene]
+renderer = "supersample-16"
+window = "full"
+noise_grey = 3
+[pose]
+jitter_px = 0.5
+[axes]
+side_px = [6000, 12000]
+trial = 50
+"""
+
+
+def grid(scenes):
+    return Pipeline.from_text(
+        f"[pose]\njitter_px = 0.5\n[axes]\nside_px = [20, 40]\ntrial = {scenes // 2}")
+
+
+def simulated(scene_s, endless=math.inf):
+    """Return a cost function whose scenes take ``scene_s``; the batch with the scene of number
+    ``endless`` is ended after 1 s. It notes the sizes of its batches."""
+    sizes = []
+
+    def cost(_, indices):
+        sizes.append(len(indices[0]))
+        if sum(sizes) > endless:
+            raise TimeoutError(1.0)
+        seconds = np.full(sizes[-1], scene_s)
+        time.sleep(min(seconds.sum(), 0.02))
+        return BatchCost(seconds.sum(), seconds, seconds.sum())
+
+    return cost, sizes
+
+
+@pytest.mark.parametrize("scene_s", [1e-5, 1e-3, 0.02, 0.5])
+def test_batches_grow_to_what_is_measured_well_and_no_further(scene_s):
+    cost, sizes = simulated(scene_s)
+    measured = calibrate(grid(1000), 0.15, cost)
+    assert measured.scene_s == pytest.approx(scene_s)
+    assert not measured.over
+    assert sizes[0] == 1
+    assert all(b <= 8 * a for a, b in itertools.pairwise(sizes))
+    assert max(sizes) * scene_s <= max(0.07, scene_s)
+
+
+def test_scenes_that_never_return_leave_what_was_measured_before():
+    cost, sizes = simulated(1e-3, endless=40)
+    measured = calibrate(grid(1000), 0.6, cost)
+    assert measured.over
+    # The mean is at least that of the scenes and of the batch that was ended.
+    assert 1.0 / sum(sizes) < measured.scene_s < 1.1 / sizes[-1]
+    assert calibrate(grid(1000), 0.6, simulated(1.0, endless=0)[0]).scene_s == 1.0
+
+
+def test_a_scene_that_takes_too_long_ends_the_measurement_and_makes_blocks_of_single_scenes():
+    pipeline = Pipeline.from_text(HUGE)
+    with Child("sweep.execution.calibration") as child:
+        began = time.monotonic()
+        measured = calibrate_in(child, pipeline, 0.1, limit_s=0.2)
+    assert measured.over
+    assert time.monotonic() - began < 30  # half of it if the machine is idle
+    assert min(0.2, MIN_LIMIT_S) <= measured.scene_s
+    assert math.prod(block_extents(pipeline, measured, 2)) <= max(BLOCK_S / measured.scene_s, 1)
+    with Child() as child:
+        child.close()
+        unmeasured = calibrate_isolated(child, pipeline, 0.1, 1.0)
+    assert (unmeasured.sampled, unmeasured.over) == (0, False)
+
+
+def test_plan_answers_whatever_a_scene_costs(tmp_path, monkeypatch):
+    monkeypatch.setattr(forecast_module, "PLAN_SCENES_LIMIT_S", 0.2)
+    (tmp_path / "huge.toml").write_text(HUGE)
+    code, out, err = command("plan", tmp_path / "huge.toml")
+    assert (code, err) == (0, "")
+    assert "ms a pose (1 sampled, then the measurement was ended)" in out
+    assert "  time     over " in out
+    assert "grey noise        on   noise_grey is 3; cost not measured, poses take too long" in out
+
+
+def test_plan_measures_each_effect_within_its_share():
+    pipeline = Pipeline.from_text(
+        "[scene]\nnoise_grey = 3\n[axes]\nside_px = [20, 40]\ntrial = 9")
+    expected, costs = forecast(pipeline, 2, ["noise_grey"])
+    assert not expected.over
+    assert expected.worker_bytes > 50e6
+    assert 0 < expected.pose_s < 1
+    assert all(0 <= cost < expected.pose_s for cost in costs.values())

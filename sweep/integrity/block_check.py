@@ -71,7 +71,10 @@ class BlockCheck:
         chunks = {variable.name: chunk_key(store, variable, block) for variable in store.variables}
         keys = [key, *chunks.values()]
         contents = dict(zip(keys, store.storage.contents(keys), strict=True))
-        faults = {key: "missing" for key, content in contents.items() if content is None}
+        faults = {
+            key: store.storage.unreadable(key) or "missing"
+            for key, content in contents.items() if content is None
+        }
         receipt = None
         if contents[key] is not None:
             receipt = self._receipt(number)

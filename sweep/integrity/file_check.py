@@ -84,10 +84,11 @@ class FileCheck:
 
     def _check_digests(self, recorded: dict[str, int]) -> None:
         for key, expected in recorded.items():
-            content = sync(self._storage.get(key, default_buffer_prototype()))
+            reason = self._storage.unreadable(key)
+            content = None if reason else sync(self._storage.get(key, default_buffer_prototype()))
             if content is None or self._storage.digests.pop(key) != expected:
                 self._wrong.add(key)
-                what = "missing" if content is None else "changed"
+                what = reason or ("missing" if content is None else "changed")
                 self._findings.damage.append(FileDamage(key, what))
                 self._substitute(key)
             else:

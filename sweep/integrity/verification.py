@@ -139,7 +139,8 @@ class Verification:
         changed = recorded is not None and recorded != self.storage.digests.get("zarr.json")
         if content is not None and isinstance(content.get("attributes"), dict) and not changed:
             return dict(content["attributes"])
-        self._damage.append(FileDamage("zarr.json", "missing" if buffer is None else "changed"))
+        what = self.storage.unreadable("zarr.json") or ("missing" if buffer is None else "changed")
+        self._damage.append(FileDamage("zarr.json", what))
         if self.manifest is None:
             raise StoreError(
                 f"{url}: zarr.json and both copies of the manifest are damaged, so that its "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import stat
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 from zlib import crc32
@@ -23,13 +23,45 @@ def digest(content: bytes | memoryview) -> int:
     return crc32(content)
 
 
-def is_special(path: Path) -> bool:
-    """Return whether a path is neither a file nor a folder: reading a pipe would never end."""
+MAX_DOCUMENT_BYTES = 1 << 24
+"""Size from which on metadata, a receipt, a lock or a coordinate is no such thing."""
+
+MAX_TABLE_BYTES = 1 << 30
+"""The same of a chunk of the groups of costs and failures."""
+
+TOO_LARGE = "larger than it can be"
+
+
+def unreadable(path: str | Path, limit: int) -> str:
+    """Return why a path must not be read; empty if it may be, or if nothing lies there.
+
+    Reading a pipe would never end, and a file of holes may be larger than the memory.
+    """
     try:
-        mode = path.stat().st_mode
+        status = os.stat(path)  # noqa: PTH116  (a path is made for every chunk that is read)
     except OSError:
-        return False
-    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
+        return ""
+    if stat.S_ISREG(status.st_mode):
+        return TOO_LARGE if status.st_size > limit else ""
+    return "" if stat.S_ISDIR(status.st_mode) else "not a file"
+
+
+def limit_of(key: str, chunk_limits: Mapping[str, int]) -> int:
+    """Return the most bytes that a key's file may have; ``chunk_limits`` are those of variables."""
+    name = key.partition("/c/")[0].removesuffix("/c")
+    if name in chunk_limits and name != key:
+        return chunk_limits[name]
+    table = key.startswith(("cost/", "failures/")) and name != key
+    return MAX_TABLE_BYTES if table else MAX_DOCUMENT_BYTES
+
+
+def check_chunk(key: str, reason: str) -> None:
+    """Raise ValueError for a chunk that is too large; what must not be read else is as if missing.
+
+    Zarr takes a missing chunk for one of fill values.
+    """
+    if reason == TOO_LARGE and "/c/" in f"{key}/":
+        raise ValueError(f"{key}: {reason}")
 
 
 class DigestingStore(WrapperStore[Store]):
@@ -50,6 +82,8 @@ class DigestingStore(WrapperStore[Store]):
         Key -> CRC-32 of its content.
     substitutes
         Key -> content that is read in place of a damaged one, until the key is written.
+    chunk_limits
+        Variable -> most bytes that a chunk of it may have.
     """
 
     def __init__(self, store: Store, keep_alive: object = None) -> None:
@@ -57,6 +91,7 @@ class DigestingStore(WrapperStore[Store]):
         self._keep_alive = keep_alive
         self.digests: dict[str, int] = {}
         self.substitutes: dict[str, Buffer] = {}
+        self.chunk_limits: dict[str, int] = {}
         self._root = store.root if isinstance(store, LocalStore) else None
 
     def contents(self, keys: Sequence[str]) -> list[bytes | None]:
@@ -67,10 +102,16 @@ class DigestingStore(WrapperStore[Store]):
         for key in keys:
             path = Path(self._root, key)
             try:
-                contents.append(None if is_special(path) else path.read_bytes())
+                contents.append(None if self.unreadable(key) else path.read_bytes())
             except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
                 contents.append(None)
         return contents
+
+    def unreadable(self, key: str) -> str:
+        """Return why a local file must not be read; empty if it may be, or if it is missing."""
+        if self._root is None:
+            return ""
+        return unreadable(f"{self._root}/{key}", limit_of(key, self.chunk_limits))
 
     def absent(self, keys: Iterable[str], folder: str) -> Iterator[str]:
         """Yield the keys, all below a folder, that are missing or empty."""
@@ -104,15 +145,23 @@ class DigestingStore(WrapperStore[Store]):
     def _with_store(self, store: Store) -> Self:
         new = type(self)(store, self._keep_alive)
         new.digests, new.substitutes = self.digests, self.substitutes
+        new.chunk_limits = self.chunk_limits
         return new
 
     async def get(
         self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
-        """Return a key's content, and record its digest."""
+        """Return a key's content, and record its digest.
+
+        Raises
+        ------
+        ValueError
+            If it is a chunk that is larger than it can be; such a document is None, as if missing.
+        """
         if key in self.substitutes:
             return self.substitutes[key]
-        if self._root is not None and is_special(Path(self._root, key)):
+        if reason := self.unreadable(key):
+            check_chunk(key, reason)
             return None
         content = await super().get(key, prototype, byte_range)
         if content is not None and byte_range is None:

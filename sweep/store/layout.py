@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, cast
@@ -198,6 +199,19 @@ def planned_arrays(
         PlannedArray(RECEIPTS, (len(Blocks(lengths, extents)),), (1,), "string", ("block",))
     )
     return planned
+
+
+def chunk_limits(
+    pipeline: Pipeline, extents: tuple[int, ...], store_format: int
+) -> dict[str, int]:
+    """Return the most bytes that a chunk of each variable may have when it is compressed."""
+    scene_extent = dict(zip((axis.name for axis in scene_axes(pipeline)), extents, strict=True))
+    limits = {}
+    for variable in variables_of(store_format):
+        planned = _variable(variable, pipeline, scene_extent)
+        size = math.prod(planned.chunks) * np.dtype(variable.dtype).itemsize
+        limits[variable.name] = size + size // 128 + 1024
+    return limits
 
 
 def _variable(

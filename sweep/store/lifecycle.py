@@ -25,8 +25,8 @@ from sweep.errors import StoreError
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.schema import SCHEMA
-from sweep.store.checksums import DigestingStore, is_special
-from sweep.store.layout import FORMAT, FORMATS, planned_arrays
+from sweep.store.checksums import DigestingStore
+from sweep.store.layout import FORMAT, FORMATS, chunk_limits, planned_arrays
 from sweep.store.locations import (
     POINTER,
     check_writable,
@@ -123,6 +123,7 @@ def store_of(
             raise ValueError(extents)
         if not is_run_id(metadata["run_id"]):
             raise ValueError(metadata["run_id"])
+        storage.chunk_limits.update(chunk_limits(pipeline, extents, metadata["format"]))
         return RunStore(
             url, open_group(storage, mode), pipeline, metadata["run_id"],
             Blocks(lengths, extents), metadata["format"],
@@ -339,11 +340,15 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
     if not is_remote(store.url):
         for planned in planned_arrays(store.pipeline, store.blocks.extents, store.format):
             for key in planned.value_keys():
-                if is_special(Path(store.url, key)):
-                    raise StoreError(f"{store.url}: {key} is not a file")
+                if reason := store.storage.unreadable(key):
+                    raise StoreError(
+                        f"{store.url}: damaged: {key} is {reason}; `sweep verify --repair` repairs "
+                        "it"
+                    )
     try:
-        source = store.source if store.finished else snapshot(store)
-        dataset: xr.Dataset = xr.open_zarr(source, consolidated=False, zarr_format=3)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)  # of files not its own
+            dataset: xr.Dataset = xr.open_zarr(snapshot(store), consolidated=False, zarr_format=3)
         # Much of xarray and pandas does not support NumPy's strings of variable length.
         texts = {name: (value.dims, value.to_numpy().astype(object), value.attrs)
                  for name, value in dataset.coords.items() if value.dtype.kind == "T"}

@@ -12,10 +12,11 @@ from typing import Self
 import numpy as np
 from zarr.abc.buffer import Buffer, BufferPrototype
 from zarr.abc.store import ByteRequest, Store
-from zarr.storage import WrapperStore
+from zarr.storage import LocalStore, WrapperStore
 
 from sweep.plan.grid import Block, Blocks, scene_axes
 from sweep.store.blocks import committed
+from sweep.store.checksums import check_chunk, limit_of, unreadable
 from sweep.store.run_store import RunStore
 
 AxisPositions = dict[str, tuple[int, ...]]
@@ -52,8 +53,10 @@ def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
 
     A copy that was made while the store was written has such blocks, for instance.
     """
-    starts = {number: store.blocks[number].starts for number in numbers}
     extents = store.blocks.extents
+    indices = {
+        number: tuple(map(floordiv, store.blocks[number].starts, extents)) for number in numbers
+    }
     missing: dict[int, str] = {}
     for name, positions in axis_positions(store).items():
         # Formatted, not encoded one by one: there may be millions.
@@ -62,8 +65,8 @@ def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
             parts[position] = f"{{{axis}}}"
         template = "/".join([name, "c", *parts])
         keys = {
-            template.format(*map(floordiv, start, extents)): number
-            for number, start in starts.items() if number not in missing
+            template.format(*index): number
+            for number, index in indices.items() if number not in missing
         }
         missing |= {keys[key]: key for key in store.storage.absent(keys, f"{name}/c")}
     return missing
@@ -75,12 +78,16 @@ class Snapshot(WrapperStore[Store]):
     It holds only what can be pickled, so that a dataset on it can be sent to other processes.
     """
 
-    def __init__(self, store: Store, blocks: Blocks, where: AxisPositions, done: bytes) -> None:
+    def __init__(
+        self, store: Store, blocks: Blocks, where: AxisPositions, done: bytes,
+        chunk_limits: dict[str, int],
+    ) -> None:
         super().__init__(store)
         self._blocks, self._where, self._done = blocks, where, done
+        self._chunk_limits = chunk_limits
 
     def _with_store(self, store: Store) -> Self:
-        return type(self)(store, self._blocks, self._where, self._done)
+        return type(self)(store, self._blocks, self._where, self._done, self._chunk_limits)
 
     def __eq__(self, other: object) -> bool:
         """Return whether two show the same blocks of the same storage."""
@@ -91,15 +98,30 @@ class Snapshot(WrapperStore[Store]):
     async def get(
         self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
-        """Return a key's content; None if it is of a block that was not committed."""
+        """Return a key's content; None if it is of a block that was not committed.
+
+        Raises
+        ------
+        ValueError
+            If it is a chunk that is larger than it can be.
+        """
         number = block_of_chunk(key, self._blocks, self._where)
         if number is not None and not self._done[number]:
             return None
+        if isinstance(self._store, LocalStore):
+            path = f"{self._store.root}/{key}"
+            if reason := unreadable(path, limit_of(key, self._chunk_limits)):
+                check_chunk(key, reason)
+                return None
         return await super().get(key, prototype, byte_range)
 
 
 def snapshot(store: RunStore) -> Snapshot:
-    """Return the storage of a store as it is now."""
-    done = np.zeros(len(store.blocks), dtype=np.uint8)
-    done[list(committed(store))] = 1
-    return Snapshot(store.storage.below, store.blocks, axis_positions(store), done.tobytes())
+    """Return the storage of a store as it is now; a finished one shows every block."""
+    done = np.full(len(store.blocks), store.finished, dtype=np.uint8)
+    if not store.finished:
+        done[list(committed(store))] = 1
+    return Snapshot(
+        store.storage.below, store.blocks, axis_positions(store), done.tobytes(),
+        store.storage.chunk_limits,
+    )

@@ -619,6 +619,50 @@ def test_fifo_in_place_of_a_file_hangs_nothing(key, copied):
         assert said["verify"].damage
 
 
+HUGE_BYTES = 100 << 30
+
+HUGE = {
+    "zarr.json": "damaged: zarr.json", MANIFEST: None, COPY: None,
+    "detection/zarr.json": "detection: missing", "trial/c/0": "trial/c/0 is larger than it can be",
+    "cost/zarr.json": None, "detection/c/0/0": None, "commits/receipt/c/0": None,
+    "commits/receipt/lock.json": None,
+}
+"""File -> what `sweep.open` says if it is larger than it can be; None: it opens."""
+
+
+@pytest.mark.parametrize("key", HUGE)
+def test_file_that_is_larger_than_it_can_be_is_damaged_and_not_read(key, copied, tmp_path, capsys):
+    (copied / key).touch()
+    os.truncate(copied / key, HUGE_BYTES)
+    begun = time.monotonic()
+    said = looks(copied)
+    assert time.monotonic() - begun < 5
+    if not key.endswith("lock.json"):
+        faults = {damage.where: damage.what for damage in said["verify"].damage}
+        assert faults.keys() == {key}
+        assert key in (MANIFEST, COPY) or faults[key] == "larger than it can be"
+    assert (said["open"] is None) == (HUGE[key] is None)
+    assert (HUGE[key] or "") in str(said["open"])
+    if "/receipt/c/" in key:
+        assert "commits/receipt/c/0: larger than it can be" in str(said["status"])
+    if key in ("detection/c/0/0", "zarr.json"):
+        assert main(["report", str(copied), "-o", str(tmp_path / "r.html")]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+    if key == "detection/c/0/0":
+        with sweep.open(copied) as results, pytest.raises(ValueError, match="larger than it can"):
+            results.detection.load()
+
+
+@pytest.mark.usefixtures("here")
+def test_files_that_are_larger_than_they_can_be_are_repaired(sound, copied):
+    for key in HUGE:
+        if key != COPY:
+            (copied / key).touch()
+            os.truncate(copied / key, HUGE_BYTES)
+    assert repair(str(copied), 0).damage == []
+    see_same(copied, sound)
+
+
 BOMB_BYTES = 1_500_000_000
 
 

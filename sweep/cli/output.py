@@ -1,4 +1,4 @@
-"""Output that commands share: JSON, and a picture."""
+"""Output that commands share: lines, JSON, and a picture."""
 
 from __future__ import annotations
 
@@ -8,6 +8,14 @@ from typing import Any
 
 MAX_LINES = 50
 """Lines of each kind that `sweep status` and `sweep verify` print."""
+
+
+def say(text: str = "") -> None:
+    """Print lines without control characters, whosever names and texts they quote."""
+    from sweep.messages import plain  # noqa: PLC0415
+
+    for line in text.split("\n"):
+        print(plain(line, len(line)))
 
 
 def print_json(content: dict[str, Any]) -> None:

@@ -7,7 +7,7 @@ import dataclasses
 
 from sweep.cli.arguments import add_json, add_pipeline, add_workers, read_pipeline
 from sweep.cli.command import Command, Example
-from sweep.cli.output import print_json
+from sweep.cli.output import print_json, say
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,22 +38,22 @@ def _execute(options: argparse.Namespace) -> int:
             }
         )
         return 0
-    print(pipeline.title or pipeline.name)
-    print("\nDimensions")
+    say(pipeline.heading)
+    say("\nDimensions")
     width = max((len(axis.name) for axis in pipeline.axes), default=0)
     for axis in pipeline.axes:
         stage = axis.stage.name
         values = f"{axis.values[0]} ... {axis.values[-1]}" if len(axis) > 1 else axis.values[0]
-        print(f"  {axis.name:{width}}  {len(axis):>11,}  {stage:10}  {values} {axis.unit}".rstrip())
-    print("\nParts")
+        say(f"  {axis.name:{width}}  {len(axis):>11,}  {stage:10}  {values} {axis.unit}".rstrip())
+    say("\nParts")
     for part in listed:
         cost = ""
         if part.switch in costs:
             cost = f"; {costs[part.switch] * 1e3:.3g} ms a pose"
         elif part.switch in switches:
             cost = "; cost not measured, poses take too long"
-        print(f"  {part.name:17} {'on ' if part.active else 'off'}  {part.reason}{cost}")
-    print("\nExpected")
+        say(f"  {part.name:17} {'on ' if part.active else 'off'}  {part.reason}{cost}")
+    say("\nExpected")
     over, ended = ("over ", ", then the measurement was ended") if expected.over else ("", "")
     rows = {
         "poses": f"{expected.poses:,}",
@@ -65,7 +65,7 @@ def _execute(options: argparse.Namespace) -> int:
         "time": f"{over}{duration(expected.seconds)} with {expected.workers} workers",
     }
     for name, text in rows.items():
-        print(f"  {name:8} {text}")
+        say(f"  {name:8} {text}")
     return 0
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sweep.cli.arguments import add_store
 from sweep.cli.command import Command, Example
+from sweep.cli.output import say
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +43,7 @@ def _execute(options: argparse.Namespace) -> int:
     if is_standard_stream(output):
         return 0  # a line more would not be HTML
     size = f", {byte_count(output.stat().st_size)}" if output.is_file() else ""
-    print(f"{output}: {count} figures{size}")
+    say(f"{output}: {count} figures{size}")
     return 0
 
 

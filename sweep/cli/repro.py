@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from sweep.cli.arguments import add_cell, add_picture, add_store
 from sweep.cli.command import Command, Example
-from sweep.cli.output import check_png, write_png
+from sweep.cli.output import check_png, say, write_png
 
 if TYPE_CHECKING:
     from sweep.integrity.reproduction import Reproduction
@@ -38,30 +38,30 @@ def _execute(options: argparse.Namespace) -> int:
     again = reproduce(
         options.store, options.at, whole_frame=options.full, time_limit_s=options.time_limit_s
     )
-    print(f"--at {again.at}")
+    say(f"--at {again.at}")
     for line in again.changes:
-        print(f"changed since the store was created: {line}")
-    print("\n".join(value_lines(again.recomputed, again.stored)))
+        say(f"changed since the store was created: {line}")
+    say("\n".join(value_lines(again.recomputed, again.stored)))
     if again.inspection is not None:
         left, top, right, bottom = again.inspection.window
         ids = ", ".join(str(marker_id) for marker_id, _ in again.inspection.decoded) or "none"
-        print(
+        say(
             f"columns {left} to {right - 1}, rows {top} to {bottom - 1} of the frame; "
             f"IDs decoded: {ids}; candidates rejected: {len(again.inspection.rejected)}"
         )
     times = ", ".join(f"{stage} {1e3 * seconds:.3g} ms" for stage, seconds in again.seconds.items())
-    print(f"time: {times}")
+    say(f"time: {times}")
     for failure in again.failures:
         kind = "the process died" if failure.crashed else "an exception was raised"
-        print(f"{failure.stage}: {kind}:")
-        print("\n".join(plain(line, 1000) for line in failure.text.strip().splitlines()))
+        say(f"{failure.stage}: {kind}:")
+        say("\n".join(plain(line, 1000) for line in failure.text.strip().splitlines()))
     _write_image(again, options)
     return _print_verdict(again)
 
 
 def _write_image(again: Reproduction, options: argparse.Namespace) -> None:
     if again.image is None:
-        print("no image: rendering failed")
+        say("no image: rendering failed")
         return
     from sweep.plan.cell_selection import coordinates_text  # noqa: PLC0415
     from sweep.report.scene_drawing import draw_scene  # noqa: PLC0415
@@ -70,20 +70,20 @@ def _write_image(again: Reproduction, options: argparse.Namespace) -> None:
     if again.inspection is not None and not options.plain:
         image = draw_scene(again.inspection, coordinates_text(again.pipeline, again.cell_pipeline))
     write_png(options.output, image)
-    print(f"{options.output}: image of the cell")
+    say(f"{options.output}: image of the cell")
 
 
 def _print_verdict(again: Reproduction) -> int:
     """Print whether the values are the stored ones; return the exit status."""
     if again.stored is None:
-        print("the store does not hold this cell yet")
+        say("the store does not hold this cell yet")
         return 0
     if again.difference:
-        print(f"differs from the store: {again.difference}")
+        say(f"differs from the store: {again.difference}")
         return 1
     how = "bit for bit" if again.exact else (
         "within the tolerances for another processor or version")
-    print(f"agrees with the store {how}")
+    say(f"agrees with the store {how}")
     return 0
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from sweep.cli.arguments import add_json, add_pipeline, add_workers, read_pipeline
 from sweep.cli.command import Command, Example
-from sweep.cli.output import print_json
+from sweep.cli.output import print_json, say
 
 if TYPE_CHECKING:
     from sweep.isolation.child_process import Child
@@ -57,16 +57,16 @@ def _execute_beside(child: Child, options: argparse.Namespace) -> int:
         print_json(dataclasses.asdict(summary))
         return 0
     if summary.computed_blocks == 0:
-        print(f"{summary.store} is already finished; --overwrite recomputes it")
+        say(f"{summary.store} is already finished; --overwrite recomputes it")
     rate = summary.poses / summary.seconds if summary.computed_blocks else 0
-    print(
+    say(
         f"{summary.poses:,} poses, {summary.results:,} results, {summary.detected:,} detected"
         + (f", {summary.seconds:.1f} s ({rate:,.0f} poses/s)" if rate else "")
     )
     for flag, count in (("crashed", summary.crashed), ("failed", summary.failed)):
         if count:
-            print(f"{count:,} flagged {flag}; `sweep status {summary.store}` lists them")
-    print(f'xarray.open_zarr("{summary.data}")')
+            say(f"{count:,} flagged {flag}; `sweep status {summary.store}` lists them")
+    say(f'xarray.open_zarr("{summary.data}")')
     return 0
 
 

@@ -6,7 +6,7 @@ import argparse
 
 from sweep.cli.arguments import add_cell, add_picture, add_pipeline, read_pipeline
 from sweep.cli.command import Command, Example
-from sweep.cli.output import check_png, write_png
+from sweep.cli.output import check_png, say, write_png
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,7 +26,7 @@ def _execute(options: argparse.Namespace) -> int:
     scene = inspect_scene(single, whole_frame=options.full)
     image = scene.image if options.plain else draw_scene(scene, coordinates_text(pipeline, single))
     write_png(options.output, image)
-    print(f"{options.output}: {scene.detection.name}, {scene.estimate.name}")
+    say(f"{options.output}: {scene.detection.name}, {scene.estimate.name}")
     return 0
 
 

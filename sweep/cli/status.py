@@ -7,7 +7,7 @@ import dataclasses
 
 from sweep.cli.arguments import add_json, add_store
 from sweep.cli.command import Command, Example
-from sweep.cli.output import MAX_LINES, print_json
+from sweep.cli.output import MAX_LINES, print_json, say
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,22 +32,22 @@ def _execute(options: argparse.Namespace) -> int:
         what = f"being written by {plain(state.writer)}"
     else:
         what = "stopped; `sweep run` continues it"
-    print(f"{state.title}: {what}")
-    print(f"  blocks      {state.blocks_done:,} of {state.blocks:,}")
-    print(f"  poses       {state.poses_done:,} of {state.poses:,}")
+    say(f"{state.title}: {what}")
+    say(f"  blocks      {state.blocks_done:,} of {state.blocks:,}")
+    say(f"  poses       {state.poses_done:,} of {state.poses:,}")
     for name, counts in (("detection", state.detection), ("estimate", state.estimate)):
         listed = ", ".join(f"{flag} {count:,}" for flag, count in counts.items())
-        print(f"  {name:11} {listed or 'nothing yet'}")
+        say(f"  {name:11} {listed or 'nothing yet'}")
     if state.poses_per_s is not None:
-        print(f"  rate        {state.poses_per_s:,.0f} poses/s")
+        say(f"  rate        {state.poses_per_s:,.0f} poses/s")
     if state.seconds_left is not None:
-        print(f"  time left   {duration(state.seconds_left)}")
+        say(f"  time left   {duration(state.seconds_left)}")
     for kind, cells in (("crashed", state.crashed), ("failed", state.failed)):
         for cell in cells[:MAX_LINES]:
             at = shlex.quote(cell.at)
-            print(f"  {kind:11} --at {at}  {cell.stage}: {plain(cell.reason, 300)}")
+            say(f"  {kind:11} --at {at}  {cell.stage}: {plain(cell.reason, 300)}")
         if len(cells) > MAX_LINES:
-            print(f"  {kind:11} and more; --json lists the first 1,000")
+            say(f"  {kind:11} and more; --json lists the first 1,000")
     return 0
 
 

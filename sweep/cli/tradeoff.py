@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sweep.cli.arguments import add_json
 from sweep.cli.command import Command, Example
-from sweep.cli.output import print_json
+from sweep.cli.output import print_json, say
 
 FIGURE_SUFFIXES = (".png", ".svg")
 
@@ -72,12 +72,12 @@ def _execute(options: argparse.Namespace) -> int:
         print_json(content)
         return 0
     form = table_markdown if options.markdown else table_text
-    print(form(trade, options.criterion))
+    say(form(trade, options.criterion))
     if renderers is not None:
-        print()
-        print("\n".join(renderer_lines(renderers, markdown=options.markdown)))
-    print()
-    print("\n".join(advice(trade, options.criterion)))
+        say()
+        say("\n".join(renderer_lines(renderers, markdown=options.markdown)))
+    say()
+    say("\n".join(advice(trade, options.criterion)))
     return 0
 
 

@@ -6,7 +6,7 @@ import argparse
 
 from sweep.cli.arguments import add_json, add_store, add_workers
 from sweep.cli.command import Command, Example
-from sweep.cli.output import MAX_LINES, print_json
+from sweep.cli.output import MAX_LINES, print_json, say
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,18 +39,18 @@ def _execute(options: argparse.Namespace) -> int:
 
     for what, listed in (("repaired", report.repaired), ("damaged", report.damage)):
         for damage in listed[:MAX_LINES]:
-            print(f"{what:9} {plain(damage.where, 300)}: {plain(damage.what, 300)}")
+            say(f"{what:9} {plain(damage.where, 300)}: {plain(damage.what, 300)}")
         if len(listed) > MAX_LINES:
-            print(f"{what:9} and {len(listed) - MAX_LINES:,} more; --json lists all")
+            say(f"{what:9} and {len(listed) - MAX_LINES:,} more; --json lists all")
     if report.left_over:
         example = plain(report.left_over[0])
-        print(f"{len(report.left_over):,} files do not belong to the store, such as {example}; "
+        say(f"{len(report.left_over):,} files do not belong to the store, such as {example}; "
               "--repair deletes them")
     again = f"{report.sampled} scenes recomputed" if report.sampled else (
         f"no scene recomputed ({report.not_sampled})"
     )
     state = "" if report.finished else ", unfinished"
-    print(
+    say(
         f"{report.store}: {'damaged' if report.damage else 'sound'}{state}: "
         f"{report.blocks_done:,} of {report.blocks:,} blocks, {report.files:,} files, "
         f"{again}"

@@ -86,7 +86,7 @@ def status(url: str) -> Status:
     rate = _rate(written)
     return Status(
         store=url,
-        title=store.pipeline.title or store.pipeline.name,
+        title=store.pipeline.heading,
         finished=store.finished,
         writer=f"process {writer.get('pid')} on {writer.get('host')}" if writer else None,
         blocks=len(store.blocks),

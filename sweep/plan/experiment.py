@@ -67,6 +67,11 @@ class Pipeline:
     files: Mapping[str, str]
     folder: str
 
+    @property
+    def heading(self) -> str:
+        """The title, or without one the name, as it can be printed."""
+        return self.title.strip() or plain(self.name)
+
     @staticmethod
     def from_toml(path: str | Path, settings: Sequence[str] = ()) -> Pipeline:
         """Read a pipeline file.

@@ -145,7 +145,7 @@ def write_report(
         raise StoreError(f"{data.store}: there are no results")
     data = data.in_memory()
     _check_complete(data)
-    title = data.pipeline.title.strip() or data.pipeline.name
+    title = data.pipeline.heading
     numbers, origin = answer(data), provenance(data, str(output))
     rendered = [kind.render(data) for kind in figure_kinds(data)]
     folder = figures_folder(output) if form == "md" else None

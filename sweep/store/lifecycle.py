@@ -197,7 +197,7 @@ def _lay_out(to: Store, pipeline: Pipeline, extents: tuple[int, ...], run_id: st
     derived = [array.path for array in planned if array.path == "distance_m"
                and pipeline.axis("distance_m") is None]
     attributes: dict[str, Any] = {
-        "title": pipeline.title or pipeline.name,
+        "title": pipeline.heading,
         "pipeline": pipeline.text,
         **({"coordinates": " ".join(derived)} if derived else {}),
         "sweep": {

@@ -165,7 +165,7 @@ def _trade(
     add("estimation_ms", "estimation of a frame", "ms", median_interval(1e3 * costs.estimation))
     whole = whole_frames_of(pipeline)
     trade.attrs = {
-        "title": pipeline.title or pipeline.name,
+        "title": pipeline.heading,
         "poses": pipeline.size(Stage.scene),
         "window": "full" if all(whole) else "auto" if not any(whole) else "mixed",
         "baseline": str(trade["treatment"].values[0]),
@@ -300,5 +300,5 @@ def _renderers(
         ("grey_max", "largest difference from the exact image", costs.grey_max),
     ):
         changed[name] = ("renderer", values, {"long_name": meaning, "units": "grey level"})
-    changed.attrs = {"title": pipeline.title or pipeline.name, "reference": REFERENCE}
+    changed.attrs = {"title": pipeline.heading, "reference": REFERENCE}
     return changed

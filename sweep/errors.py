@@ -71,3 +71,23 @@ class StoreReplacedError(StoreError):
 
 class RunError(SweepError):
     """A run that failed; finished blocks stay in the store, and another run continues."""
+
+
+class MachineFaultError(RunError):
+    """A fault of a machine, which no scene's data can cause: it is not a result of the scene.
+
+    Parameters
+    ----------
+    fault
+        One line: "OSError: [Errno 28] No space left on device".
+    machine
+        The name of the machine.
+    """
+
+    def __init__(self, fault: str, machine: str) -> None:
+        super().__init__(f"machine fault on {machine}: {fault}")
+        self.fault, self.machine = fault, machine
+
+    def __reduce__(self) -> tuple[type[MachineFaultError], tuple[str, str]]:
+        """Return how to make it again in another process."""
+        return MachineFaultError, (self.fault, self.machine)

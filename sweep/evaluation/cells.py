@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.evaluation.estimation import detections_for, estimate_poses
+from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import CellsResult, Failure, concatenate
 from sweep.evaluation.search import search, visibility_flags, whole_frames
@@ -49,6 +50,7 @@ KEPT_PX = 1 << 26
 """Pixels of images that are kept for the estimators, if all were whole frames: 67 MB of memory."""
 
 
+@machine_faults_raised()
 def run_cells(
     pipeline: Pipeline,
     indices: Sequence[NDArray[np.intp]],
@@ -74,6 +76,11 @@ def run_cells(
     -------
     CellsResult
         The variables, seconds and failures of the N cells.
+
+    Raises
+    ------
+    MachineFaultError
+        If an exception is raised that no scene's data can cause.
     """
     count = len(indices[0]) if indices else 1
     settings, estimating = detector_settings(pipeline), estimators(pipeline)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.evaluation.machine_faults import raise_machine_fault
 from sweep.evaluation.results import Failure, exception_text
 from sweep.evaluation.search import SearchResult
 from sweep.measure.estimation import Detections, Estimates, PoseEstimator
@@ -80,12 +81,14 @@ def estimate_poses(
     """
     try:
         return estimator(detections)
-    except Exception:
+    except Exception as batch_error:
+        raise_machine_fault(batch_error)
         parts = []
         for i in range(len(rows)):
             try:
                 parts.append(estimator(detections.take(np.array([i]))))
-            except Exception:
+            except Exception as error:
+                raise_machine_fault(error)
                 failures.append(Failure(int(rows[i]), "estimation", exception_text(failures)))
                 parts.append(Estimates.none(1, EstimateStatus.failed))
         return Estimates.concatenate(parts)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.evaluation.machine_faults import raise_machine_fault
 from sweep.evaluation.results import Failure, exception_text
 from sweep.measure.classify import classify
 from sweep.measure.detector import (
@@ -183,7 +184,8 @@ def search(
                     setting_pass.images[row] = searched
                 try:
                     note((row, *find(searched, dictionary[row], sides[row])))
-                except Exception:
+                except Exception as error:
+                    raise_machine_fault(error)
                     failures.append(Failure(row, "detection", exception_text(failures), k))
                     setting_pass.failed.append(row)
                 now = clock()
@@ -246,13 +248,15 @@ def _rendered(
     """Return the images of ``rows`` in their windows; None for those whose rendering raised."""
     try:
         return render_all(scenes, rows, boxes[rows], windows[rows])
-    except Exception:
+    except Exception as batch_error:
+        raise_machine_fault(batch_error)
         images: list[Grey | None] = []
         for row in rows.tolist():
             alone = np.array([row])
             try:
                 images += render_all(scenes, alone, boxes[alone], windows[alone])
-            except Exception:
+            except Exception as error:
+                raise_machine_fault(error)
                 failures.append(Failure(row, "scene", exception_text(failures)))
                 images.append(None)
         return images

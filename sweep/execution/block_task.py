@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -13,19 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import processor
-from sweep.errors import StoreError
+from sweep.errors import MachineFaultError, StoreError
 from sweep.evaluation.cells import run_cells
+from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.evaluation.results import CellsResult, to_dataset_layout
 from sweep.execution.limits import TIME_LIMIT_S
 from sweep.execution.reuse import ReusedCells, Source, match, read_cells
 from sweep.isolation.crash_isolation import WHOLE, run_cells_isolated
+from sweep.isolation.repetition import check_repeatable
 from sweep.isolation.watchdog import ending_after
 from sweep.plan.background_files import file_digest
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import SCHEMA, Variable
-from sweep.store.blocks import begin_block, write_block
+from sweep.store.blocks import begin_block, withdraw_block, write_block
 from sweep.store.failures import MAX_ROWS, recorded
 from sweep.store.lifecycle import open_store
 from sweep.store.provenance import fingerprint
@@ -100,7 +101,18 @@ def compute_block(
     ------
     StoreError
         If the store was replaced or cannot be written, or its numbers cannot be made here.
+    MachineFaultError
+        If this machine cannot compute it; nothing of it is committed.
     """
+    with machine_faults_raised():
+        return _compute_block(url, run_id, block, reuse, time_limit_s, quota)
+
+
+def _compute_block(
+    url: str, run_id: str, block: Block, reuse: Sequence[str], time_limit_s: float,
+    quota: Mapping[str, int],
+) -> Receipt:
+    """Compute, write and commit one block (arguments as :func:`compute_block`)."""
     start = time.perf_counter()
     store = _opened(url, run_id)
     begun_before = begin_block(store, block)
@@ -116,7 +128,12 @@ def compute_block(
     cells = None
     if len(rows):
         indices = [index[rows] for index in block_indices(block)]
-        cells = _compute(pipeline, indices, need[rows], time_limit_s, isolated=begun_before)
+        try:
+            cells = _compute(pipeline, indices, need[rows], time_limit_s, isolated=begun_before)
+        except MachineFaultError:
+            if not begun_before:
+                withdraw_block(store, block)
+            raise
     values = {
         v.name: to_dataset_layout(
             v, pipeline, block, _columns(v, cells, rows, pipeline, len(block))
@@ -149,12 +166,29 @@ def _compute(
     pipeline: Pipeline, indices: Sequence[NDArray[np.intp]], need: NDArray[np.bool_],
     time_limit_s: float, *, isolated: bool,
 ) -> CellsResult:
-    """Compute cells in this process, or in a child if that was tried or the block raises."""
-    if not isolated:
-        # If the block raises as a whole, the scenes that do so are isolated as crashes are.
-        with ending_after(WHOLE * time_limit_s), contextlib.suppress(Exception):
+    """Compute cells in this process, or in a child if that was tried or the block raises.
+
+    What raises is a result only if it raises again in another process.
+    """
+    cells = None if isolated else _computed_here(pipeline, indices, need, time_limit_s)
+    if cells is None:
+        cells = run_cells_isolated(pipeline, indices, need, time_limit_s)
+    check_repeatable(pipeline, indices, need, cells, time_limit_s)
+    return cells
+
+
+def _computed_here(
+    pipeline: Pipeline, indices: Sequence[NDArray[np.intp]], need: NDArray[np.bool_],
+    time_limit_s: float,
+) -> CellsResult | None:
+    """Compute cells in this process; None if that raises as a whole, as single scenes may."""
+    try:
+        with ending_after(WHOLE * time_limit_s):
             return run_cells(pipeline, indices, need)
-    return run_cells_isolated(pipeline, indices, need, time_limit_s)
+    except MachineFaultError:
+        raise
+    except Exception:
+        return None
 
 
 _NO_SECONDS: dict[str, list[float]] = {"scene": [], "detection": [], "estimation": []}

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.errors import MachineFaultError
 from sweep.evaluation.cells import run_cells
 from sweep.execution.limits import (
     BLOCK_S,
@@ -184,13 +185,14 @@ def calibrate_isolated(
 ) -> Calibration:
     """Call :func:`calibrate` with a child process, which a scene may crash.
 
-    If it crashes or raises, :data:`UNMEASURED_S` is assumed. What takes longer than ``limit_s``
+    If it crashes or raises, :data:`UNMEASURED_S` is assumed, also if this machine is at fault:
+    whether the workers' are is seen by their blocks. What takes longer than ``limit_s``
     seconds, or :data:`CALIBRATION_LIMIT_S`, compilation not counted, is abandoned, and the child
     ends.
     """
     try:
         return calibrate_in(child, pipeline, budget_s, min(limit_s, CALIBRATION_LIMIT_S))
-    except (ChildDiedError, ChildRaisedError):
+    except (ChildDiedError, ChildRaisedError, MachineFaultError):
         return Calibration(UNMEASURED_S, 0.0, 0, (0.0,) * len(scene_axes(pipeline)))
 
 

@@ -13,7 +13,9 @@ from distributed.comm.core import CommClosedError, connect
 from distributed.comm.registry import backends
 from distributed.core import send_recv
 
-__all__ = ["CommClosedError", "is_known_protocol", "peer_type", "thread_counts"]
+__all__ = [
+    "CommClosedError", "is_known_protocol", "peer_type", "thread_counts", "worker_that_failed",
+]
 
 
 def is_known_protocol(scheme: str) -> bool:
@@ -50,3 +52,17 @@ def thread_counts(client: Client, timeout_s: float) -> dict[str, int]:
         raise CommClosedError("not connected")
     counts: dict[str, int] = client.sync(client.scheduler.ncores, callback_timeout=timeout_s)
     return counts
+
+
+def worker_that_failed(client: Client, key: str) -> str | None:
+    """Return the address of the worker on which a task raised; None if the scheduler tells none.
+
+    A task whose arguments could not even be unpickled raised, too.
+    """
+    try:
+        addresses: list[str] = client.run_on_scheduler(
+            lambda dask_scheduler: sorted(dask_scheduler.tasks[key].erred_on or ())
+        )
+    except Exception:
+        return None  # it may be configured to unpickle nothing
+    return addresses[-1] if addresses else None

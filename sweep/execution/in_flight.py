@@ -18,6 +18,7 @@ from typing import Any
 from distributed import Client, Future, KilledWorker
 
 from sweep.errors import RunError, StoreError
+from sweep.evaluation.machine_faults import machine_fault
 from sweep.execution.block_task import compute_block
 from sweep.execution.cluster import thread_count
 from sweep.execution.limits import (
@@ -29,6 +30,7 @@ from sweep.execution.limits import (
     TIME_LIMIT_S,
 )
 from sweep.execution.tally import Tally
+from sweep.execution.worker_faults import WorkerFaults
 from sweep.isolation.interrupts import Interrupts
 from sweep.store.run_store import RunStore
 
@@ -94,6 +96,7 @@ class BlocksInFlight:
         self._finished: SimpleQueue[Future[Any]] = SimpleQueue()
         self._numbers: dict[Future[Any], int] = {}
         self._deaths: Counter[int] = Counter()
+        self._worker_faults = WorkerFaults(client)
 
     def compute(self, numbers: Iterable[int], tally: Tally) -> None:
         """Compute blocks by their numbers, and count them.
@@ -125,25 +128,30 @@ class BlocksInFlight:
             number = self._numbers.pop(future)
             if future.status == "finished":
                 tally.add(future.result())
-            elif (reason := self._failure(number, future, tally)) is not None:
-                tally.add_failed(reason)
+                self._worker_faults.computed(number)
+            else:
+                self._note_failure(number, future, tally)
             future.release()
             if not tally.hopeless:
                 for following in itertools.islice(waiting, max(most - len(self._numbers), 0)):
                     self._submit(following, tally)
 
-    def _submit(self, number: int, tally: Tally) -> None:
+    def _submit(
+        self, number: int, tally: Tally, workers: Sequence[str] | None = None
+    ) -> None:
+        """Give a block to the cluster: to one of ``workers``, unless they leave meanwhile."""
         block = self._store.blocks[number]
         future = self._client.submit(
             compute_block, self._url, self._store.run_id, block, self._sources,
             self._time_limit_s, tally.quota(), pure=False,
             key=f"block-{block}-{uuid.uuid4().hex[:8]}",
+            workers=workers, allow_other_workers=workers is not None,
         )
         self._numbers[future] = number
         future.add_done_callback(self._finished.put)
 
-    def _failure(self, number: int, future: Future[Any], tally: Tally) -> str | None:
-        """Return why a block failed; None if it was submitted again."""
+    def _note_failure(self, number: int, future: Future[Any], tally: Tally) -> None:
+        """Submit a block again that may still be computed; else note why it failed."""
         if future.status in ("cancelled", "lost"):
             raise RunError("the scheduler went away")
         error = future.exception()
@@ -154,8 +162,17 @@ class BlocksInFlight:
             # it may have been queued behind one, or its workers were killed from outside.
             self._deaths[number] += 1
             self._submit(number, tally)
-            return None
-        return f"block {self._store.blocks[number]}: {type(error).__name__}: {error}"
+            return
+        block = self._store.blocks[number]
+        fault = None if error is None else machine_fault(error)
+        if fault is None:
+            tally.add_failed(f"block {block}: {type(error).__name__}: {error}")
+            return
+        others = self._worker_faults.others(number, str(future.key), fault)
+        if others:
+            self._submit(number, tally, others)
+        else:
+            tally.add_failed(f"block {block}: {fault}", machine_fault=True)
 
     def _cancel(self) -> None:
         """Take back what is still in flight; a caller's cluster outlives the run."""

@@ -15,6 +15,12 @@ BLOCKS_PER_THREAD = 3
 MAX_DEATHS = 10
 """How often a block is submitted again after its worker died."""
 
+MAX_ATTEMPTS = 10
+"""On how many workers a block is tried that fails by faults of their machines."""
+
+MAX_WORKER_FAULTS = 3
+"""Blocks that a worker fails and others compute, after which it is used no more."""
+
 MAX_FAILED_BLOCKS = 10
 """Failed blocks after which no more are submitted."""
 

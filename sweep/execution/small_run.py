@@ -11,7 +11,8 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-from sweep.errors import StoreError, SweepError
+from sweep.errors import MachineFaultError, StoreError, SweepError
+from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.execution.block_task import compute_block
 from sweep.execution.limits import MAX_DEATHS, SMALL_RUN_LIMIT_S, TIME_LIMIT_S
 from sweep.execution.tally import Tally
@@ -59,12 +60,12 @@ class BlocksInChild:
         Raises
         ------
         RunError
-            If blocks failed.
+            If blocks failed, or this machine cannot start processes.
         StoreError
             If the store cannot be written.
         """
         deadline = time.monotonic() + SMALL_RUN_LIMIT_S
-        with ThreadPoolExecutor(1) as thread:
+        with machine_faults_raised(), ThreadPoolExecutor(1) as thread:
             try:
                 for number in waiting:
                     self._compute_block(thread, number, tally)
@@ -77,6 +78,7 @@ class BlocksInChild:
 
     def _compute_block(self, thread: ThreadPoolExecutor, number: int, tally: Tally) -> None:
         block = self._store.blocks[number]
+        machine_fault = False
         for _ in range(1 + MAX_DEATHS):
             call = thread.submit(
                 self._child.call, compute_block, self._url, self._store.run_id, block,
@@ -92,6 +94,12 @@ class BlocksInChild:
                 reason = f"its process ended: {error}"
                 self._child.restart()
                 continue
+            except MachineFaultError as error:
+                reason = str(error)
+                if not machine_fault:  # once more, in another process
+                    machine_fault = True
+                    self._child.restart()
+                    continue
             except ChildRaisedError as error:
                 reason = str(error).strip().splitlines()[-1]
             except SweepError as error:
@@ -100,4 +108,4 @@ class BlocksInChild:
                 tally.add(receipt)
                 return
             break
-        tally.add_failed(f"block {block}: {reason}")
+        tally.add_failed(f"block {block}: {reason}", machine_fault=machine_fault)

@@ -34,6 +34,7 @@ class Tally:
         self._progress = Progress(0, store.pipeline.size(Stage.scene), 0)
         self._failures = Counter({"failed": 0, "crashed": 0})
         self._failed_blocks: list[str] = []
+        self._machine_faults = 0
         self.computed: Counter[str] = Counter()
         """Blocks, scenes, detections and estimates that were computed and not reused."""
 
@@ -55,9 +56,10 @@ class Tally:
         self._count(receipt)
         self._notify()
 
-    def add_failed(self, reason: str) -> None:
-        """Note why a block failed."""
+    def add_failed(self, reason: str, *, machine_fault: bool = False) -> None:
+        """Note why a block failed: by a machine's fault, or because it raises."""
         self._failed_blocks.append(reason)
+        self._machine_faults += machine_fault
 
     @property
     def hopeless(self) -> bool:
@@ -69,7 +71,11 @@ class Tally:
         return {kind: max(MAX_ROWS - count, 0) for kind, count in self._failures.items()}
 
     def check(self) -> None:
-        """Raise RunError if blocks failed."""
+        """Raise RunError if blocks failed: of one line if faults of machines are all there is."""
+        count = len(self._failed_blocks)
+        if count and count == self._machine_faults:
+            more = f", and {count - 1} blocks more likewise" if count > 1 else ""
+            raise RunError(f"{self._store.url}: {self._failed_blocks[0]}{more}")
         if self._failed_blocks:
             raise RunError(
                 f"{self._store.url}: {len(self._failed_blocks)} blocks failed\n"

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import IO, Any, Self
 
 from sweep.errors import SweepError
+from sweep.evaluation.machine_faults import machine_fault
 
 SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
@@ -117,7 +118,8 @@ class Child:
         ChildDiedError
             If the child crashed, or the call took longer than ``limit_s`` seconds.
         ChildRaisedError
-            If the call raised; a `SweepError` is raised as it is.
+            If the call raised; a `SweepError` is raised as it is, and a fault of the machine as
+            `MachineFaultError`.
         """
         started = time.monotonic()
         killer = threading.Timer(limit_s + grace_s, self._kill_late)
@@ -180,18 +182,18 @@ def serve(module: str) -> None:
     from sweep.isolation.watchdog import ending_after  # noqa: PLC0415
 
     while True:
-        try:
-            function, arguments, limit_s = _receive(sys.stdin.buffer)
-        except EOFError:
-            return
         answer: tuple[bool, Any]
         try:
+            request = _message(sys.stdin.buffer)
+            if request is None:
+                return
+            function, arguments, limit_s = pickle.loads(request)  # noqa: S301  (from the parent)
             with ending_after(limit_s):
                 answer = (False, function(*arguments))
         except SweepError as error:
             answer = (True, error)
-        except Exception:
-            answer = (True, traceback.format_exc())
+        except Exception as error:
+            answer = (True, machine_fault(error) or traceback.format_exc())
         _send(answers, answer)
 
 
@@ -205,13 +207,17 @@ def _send(pipe: IO[bytes] | None, content: Any) -> None:
 
 
 def _receive(pipe: IO[bytes] | None) -> Any:
-    if pipe is None:
+    encoded = None if pipe is None else _message(pipe)
+    if encoded is None:
         raise EOFError
+    return pickle.loads(encoded)  # noqa: S301  (from this program's own child)
+
+
+def _message(pipe: IO[bytes]) -> bytes | None:
+    """Return the next message; None if the pipe was closed."""
     header = pipe.read(_LENGTH.size)
     if len(header) < _LENGTH.size:
-        raise EOFError
+        return None
     (length,) = _LENGTH.unpack(header)
     encoded = pipe.read(length)
-    if len(encoded) < length:
-        raise EOFError
-    return pickle.loads(encoded)  # noqa: S301  (from this program's own child or parent)
+    return encoded if len(encoded) == length else None

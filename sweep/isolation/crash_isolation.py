@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.errors import RunError
 from sweep.evaluation.cells import run_cells
+from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.results import CellsResult, Failure, concatenate
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
@@ -69,18 +69,20 @@ class _IsolatedCells:
         ------
         ChildDiedError, ChildRaisedError
             If the child crashed, ran out of time, or raised.
-        RunError
-            If a child cannot be started.
+        MachineFaultError
+            If a child cannot be started, or raises what no scene's data can cause.
         """
         limit_s = share * self.limit_s
         if self._child is None:
-            child = Child()
+            with machine_faults_raised():
+                child = Child()
             try:
                 child.call(_hold, self._pipeline, limit_s=HOLD_S)
             except (ChildDiedError, ChildRaisedError) as error:
                 child.close()
-                raise RunError(
-                    f"a child process ended before it computed anything: {error}"
+                lines = str(error).strip().splitlines()
+                raise local_fault(
+                    f"a child process ended before it computed anything: {lines[-1]}"
                 ) from None
             self._child = child
             limit_s += min(LOADING * self.limit_s, LOADING_S)
@@ -121,8 +123,8 @@ def run_cells_isolated(
 
     Raises
     ------
-    RunError
-        If no child process can be started.
+    MachineFaultError
+        If no child process can be started, or one raises what no scene's data can cause.
     """
     isolated = _IsolatedCells(pipeline, limit_s)
     done: dict[int, CellsResult] = {}

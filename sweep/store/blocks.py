@@ -79,6 +79,12 @@ def begin_block(store: RunStore, block: Block) -> bool:
     return False
 
 
+def withdraw_block(store: RunStore, block: Block) -> None:
+    """Delete the mark that a block was begun, if that can be: it did not end its process."""
+    with contextlib.suppress(Exception):
+        sync(store.storage.delete(f"{BEGUN}/{store.blocks.number(block)}"))
+
+
 def write_block(
     store: RunStore, block: Block, values: Mapping[str, NDArray[Any]], receipt: Receipt
 ) -> None:

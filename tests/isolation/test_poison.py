@@ -266,8 +266,8 @@ def test_poison_does_nothing_where_its_scene_is_not_asked_for(tmp_path):
 
 def test_scene_that_raises_fails_alone(pipeline, clean, tmp_path):
     poisons = [
-        Poison(20, "scene", "raise"), Poison(21, "detection", "memory", SUBPIX),
-        Poison(39, "estimation", "raise", (), IPPE), Poison(40, "scene", "memory"),
+        Poison(20, "scene", "raise"), Poison(21, "detection", "raise", SUBPIX),
+        Poison(39, "estimation", "raise", (), IPPE), Poison(40, "scene", "raise"),
     ]
     create_store(str(tmp_path / "poisoned.zarr"), pipeline, EXTENTS)
     ran, _, log = run_poisoned(tmp_path, TEXT, poisons, "--workers", 2, "--json")
@@ -375,7 +375,7 @@ AMONG_THOUSANDS = {
         Poison(2_249, "estimation", "segv", (), IPPE),
     ],
     "three that raise": [
-        Poison(100, "scene", "raise"), Poison(5_100, "detection", "memory", SUBPIX),
+        Poison(100, "scene", "raise"), Poison(5_100, "detection", "raise", SUBPIX),
         Poison(9_100, "estimation", "raise", (), IPPE),
     ],
     "one that sleeps": [Poison(3_333, "scene", "sleep")],

@@ -51,10 +51,6 @@ def _raise():
     raise RuntimeError("poisoned")
 
 
-def _memory():
-    raise MemoryError
-
-
 WAYS = {
     "segv": lambda: ctypes.string_at(0),
     "abort": os.abort,
@@ -64,7 +60,6 @@ WAYS = {
     "spin": _spin,
     "hold": _hold,
     "raise": _raise,
-    "memory": _memory,
 }
 
 

@@ -1,0 +1,98 @@
+"""Exceptions that a scene's data cannot cause: faults of the machine, which are never results.
+
+Values that faulty hardware computes without an exception cannot be told from sound ones here;
+`sweep verify` finds those that its sample meets.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+import socket
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+from sweep.errors import MachineFaultError, SweepError
+from sweep.messages import plain
+
+MACHINE_FAULTS: tuple[type[Exception], ...] = (
+    OSError, MemoryError, ImportError, EOFError, pickle.PickleError,
+)
+"""Types of exceptions that say nothing about a scene; Numba's errors are others."""
+
+MAX_FAULT_LENGTH = 300
+"""Characters of an exception that a message quotes."""
+
+
+def machine_fault(error: BaseException) -> MachineFaultError | None:
+    """Return the fault of this machine that an exception tells of, or None.
+
+    An exception that was raised because of a machine's fault, or while one was handled, tells of
+    it too.
+
+    Examples
+    --------
+    >>> machine_fault(ValueError("singular matrix")) is None
+    True
+    >>> machine_fault(MemoryError()).fault
+    'MemoryError'
+    """
+    if isinstance(error, MachineFaultError):
+        return error
+    if isinstance(error, SweepError):
+        return None  # it says itself what is wrong
+    seen: set[int] = set()
+    cause: BaseException | None = error
+    while cause is not None and id(cause) not in seen:
+        if isinstance(cause, MachineFaultError):
+            return cause
+        if _is_fault(cause):
+            return local_fault(exception_line(cause))
+        seen.add(id(cause))
+        following = cause.__cause__
+        if following is None and not cause.__suppress_context__:
+            following = cause.__context__
+        cause = following
+    return None
+
+
+def local_fault(fault: str) -> MachineFaultError:
+    """Return the error that says of this machine what is wrong with it."""
+    return MachineFaultError(plain(fault, MAX_FAULT_LENGTH), socket.gethostname())
+
+
+def raise_machine_fault(error: BaseException) -> None:
+    """Raise MachineFaultError if an exception tells of a fault of this machine."""
+    fault = machine_fault(error)
+    if fault is not None:
+        raise fault from None  # it may be `error` itself, which must not become its own cause
+
+
+@contextlib.contextmanager
+def machine_faults_raised() -> Iterator[None]:
+    """Raise MachineFaultError for exceptions of the body that tell of a fault of this machine."""
+    try:
+        yield
+    except Exception as error:
+        raise_machine_fault(error)
+        raise
+
+
+def exception_line(error: BaseException) -> str:
+    """Return an exception as one line: its type, and the first line of its message."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+
+
+def _is_fault(error: BaseException) -> bool:
+    if isinstance(error, MACHINE_FAULTS):
+        return True
+    # Who raised an error of these packages has imported them; they are slow to import.
+    opencv: Any = sys.modules.get("cv2")
+    numba: Any = sys.modules.get("numba.core.errors")
+    if opencv is not None and isinstance(error, opencv.error):
+        return bool(getattr(error, "code", None) == opencv.Error.StsNoMem)
+    if numba is not None and isinstance(error, numba.NumbaError):
+        return True
+    return isinstance(error, RuntimeError) and "can't start new thread" in str(error)

@@ -1,0 +1,81 @@
+"""Exceptions that say nothing about a scene: they are raised, and never become its flag."""
+
+import errno
+import pickle
+
+import cv2
+import numpy as np
+import pytest
+from numba.core.errors import TypingError
+
+import sweep
+from support import machine_faults
+from sweep.errors import MachineFaultError, StoreError
+from sweep.evaluation.cells import run_cells
+from sweep.evaluation.machine_faults import machine_fault
+
+PIPELINE = sweep.Pipeline.from_dict(
+    {"pose": {"side_px": 40, "jitter_px": 0.5}, "axes": {"trial": 4}}
+)
+
+
+@pytest.mark.parametrize("error", [
+    OSError(errno.EMFILE, "Too many open files"), MemoryError(), ImportError("no libc"), EOFError(),
+    pickle.PicklingError(), pickle.UnpicklingError(), TypingError("x"), PermissionError("no"),
+    RuntimeError("can't start new thread"), machine_faults.ERRORS["opencv memory"](),
+], ids=lambda error: type(error).__name__)
+def test_faults_of_a_machine_are_told_from_results(error):
+    assert machine_fault(error).fault.startswith(type(error).__name__)
+    with pytest.raises(ValueError, match="outer") as raised:
+        raise_while_handling(error, ValueError("outer"))
+    assert machine_fault(raised.value).fault.startswith(type(error).__name__)
+
+
+def raise_while_handling(first, second):
+    try:
+        raise first
+    except type(first):
+        raise second  # noqa: B904  (that is the case)
+
+
+def test_what_data_may_cause_is_no_fault_of_the_machine():
+    with pytest.raises(cv2.error) as raised:
+        cv2.cvtColor(np.zeros((0, 0), np.uint8), 4)
+    assert machine_fault(raised.value) is None
+    for error in (ValueError(), np.linalg.LinAlgError(), RuntimeError("poisoned"), StoreError("x"),
+                  ZeroDivisionError(), AssertionError()):
+        assert machine_fault(error) is None
+    hidden = ValueError("of the data")
+    hidden.__context__, hidden.__suppress_context__ = OSError("handled"), True
+    assert machine_fault(hidden) is None
+
+
+def test_fault_keeps_its_words_in_another_process():
+    fault = machine_fault(OSError(errno.ENOSPC, "No space left on device\nmore"))
+    again = pickle.loads(pickle.dumps(fault))  # noqa: S301
+    assert (str(again), again.fault, again.machine) == (str(fault), fault.fault, fault.machine)
+    assert "\n" not in str(fault)
+
+
+@pytest.mark.parametrize("place", machine_faults.PLACES)
+@pytest.mark.parametrize("fault", ["disk", "memory", "import", "compiler", "opencv memory"])
+def test_no_scene_is_flagged_failed_by_a_fault_of_the_machine(fault, place):
+    machine_faults.inject(fault, place, 0)
+    try:
+        with pytest.raises(MachineFaultError):
+            run_cells(PIPELINE, [np.arange(4)])
+    finally:
+        machine_faults.clear()
+    assert not run_cells(PIPELINE, [np.arange(4)]).failures
+
+
+def test_solver_of_a_user_that_meets_a_fault_of_the_machine_raises_it(monkeypatch):
+    class Solver:
+        needs_images = False
+
+        def __call__(self, _):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("sweep.evaluation.cells.build", lambda _: Solver())
+    with pytest.raises(MachineFaultError, match="No space left on device"):
+        run_cells(PIPELINE, [np.arange(4)])

@@ -1,0 +1,135 @@
+"""A machine's fault is never data: its blocks are computed elsewhere, or the run says so."""
+
+import random
+
+import pytest
+from distributed import Client, LocalCluster
+
+import sweep
+from support import machine_faults
+from support.stores import by_hand, same
+from sweep.errors import MachineFaultError, RunError, StoreError
+from sweep.execution.block_task import compute_block
+from sweep.execution.finalize import close
+from sweep.execution.in_flight import BlocksInFlight
+from sweep.execution.tally import Tally
+from sweep.isolation.interrupts import Interrupts
+from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.store.blocks import committed
+from sweep.store.lifecycle import create_store, open_store
+from sweep.store.locations import exists
+from sweep.store.lock import locked
+
+PIPELINE = sweep.Pipeline.from_dict(
+    {"seed": 5, "pose": {"side_px": 40, "jitter_px": 0.5},
+     "axes": {"solver": ["ippe_square", "iterative"], "trial": 12}}
+)
+SEED = 2024
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    url = str(tmp_path_factory.mktemp("undisturbed") / "whole.zarr")
+    by_hand(url, PIPELINE, (12,))
+    return url
+
+
+@pytest.fixture
+def two_workers():
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0",
+        silence_logs=50,
+    ) as cluster, Client(cluster, set_as_default=False) as client:
+        yield client
+
+
+def run_on(client, url):
+    """Run the pipeline in blocks of one scene, or continue; return how many scenes failed."""
+    store = open_store(str(url), "r+") if exists(str(url)) else create_store(
+        str(url), PIPELINE, (1,)
+    )
+    done = committed(store)
+    waiting = [number for number in range(len(store.blocks)) if number not in done]
+    with locked(store), Interrupts() as interrupts:
+        tally = Tally(store)
+        tally.begin(done)
+        BlocksInFlight(store, client, str(url), interrupts=interrupts).compute(waiting, tally)
+        close(store)
+    counts = open_store(str(url)).run_metadata["counts"]
+    return counts["detection"][DetectionStatus.failed] + counts["estimate"][EstimateStatus.failed]
+
+
+@pytest.mark.parametrize("fault", ["disk", "passing"])
+def test_block_that_a_machine_failed_is_not_committed(fault, tmp_path):
+    store = create_store(str(tmp_path / "faulty.zarr"), PIPELINE, (12,))
+    machine_faults.inject(fault, "render_all", 0)
+    try:
+        with pytest.raises(MachineFaultError) as raised:
+            compute_block(store.url, store.run_id, store.blocks[0])
+    finally:
+        machine_faults.clear()
+    assert len(str(raised.value).splitlines()) == 1
+    assert committed(store) == set()
+
+
+def test_worker_whose_machine_is_at_fault_is_used_no_more(
+    tmp_path, undisturbed, two_workers, capfd
+):
+    faulty, sound = two_workers.nthreads()
+    url = tmp_path / "one.zarr"
+    two_workers.run(machine_faults.inject, "disk", "render_all", 0, workers=[faulty])
+    assert run_on(two_workers, url) == 0
+    assert same(url, undisturbed)
+    told = capfd.readouterr().err
+    assert told.count("\n") == 1
+    assert f"worker {faulty} on " in told
+    assert "is used no more: 3 blocks" in told
+    assert "No space left on device" in told
+    assert list(two_workers.nthreads()) == [sound]
+    # Nobody is left to whom its blocks could be given.
+    two_workers.run(machine_faults.inject, "memory", "render_all", 0, workers=[sound])
+    with pytest.raises(RunError) as raised:
+        run_on(two_workers, tmp_path / "none.zarr")
+    (line,) = str(raised.value).splitlines()
+    assert "machine fault on " in line
+    assert "MemoryError" in line
+    two_workers.run(machine_faults.clear, workers=[sound])
+    assert run_on(two_workers, tmp_path / "none.zarr") == 0
+    assert same(tmp_path / "none.zarr", undisturbed)
+
+
+def outcome(client, url):
+    """Return the error of a run, empty if it finished, and how many scenes are flagged failed."""
+    try:
+        return "", run_on(client, url)
+    except (RunError, StoreError) as error:
+        return str(error), 0
+
+
+@pytest.mark.parametrize("runs", [1, pytest.param(200, marks=pytest.mark.long)])
+def test_random_faults_of_one_of_two_machines_change_no_bit(
+    runs, tmp_path, undisturbed, two_workers
+):
+    generator = random.Random(SEED)
+    print(f"seed {SEED}")
+    ended = {"equal": 0, "a line": 0}
+    for number in range(runs):
+        fault = generator.choice(machine_faults.FAULTS)
+        place = generator.choice(list(machine_faults.PLACES))
+        at = generator.randrange(3)
+        if len(two_workers.nthreads()) < 2:
+            two_workers.cluster.scale(1)
+            two_workers.cluster.scale(2)
+            two_workers.wait_for_workers(2)
+        faulty = generator.choice(list(two_workers.nthreads()))
+        two_workers.run(machine_faults.inject, fault, place, at, workers=[faulty])
+        url = tmp_path / f"{number}.zarr"
+        error, failed = outcome(two_workers, url)
+        assert len(error.splitlines()) <= 1, (fault, place, at, error)
+        assert failed == 0, (fault, place, at)
+        if not error:
+            assert same(url, undisturbed), (fault, place, at)
+        ended["a line" if error else "equal"] += 1
+        if faulty in two_workers.nthreads():
+            two_workers.run(machine_faults.clear, workers=[faulty])
+    print(ended)

@@ -1,0 +1,70 @@
+"""Faults of a machine, put into a process that computes blocks, and taken away again."""
+
+import errno
+import itertools
+import os
+import pickle
+import resource
+from pathlib import Path
+
+import cv2
+from numba.core.errors import LoweringError
+
+from sweep.evaluation import cells, search
+
+FAULTS = (
+    "cache", "compiler", "disk", "memory", "opencv memory", "import", "descriptors", "passing",
+)
+"""What may be at fault; "passing": a batch and a scene raise, and no repetition does."""
+
+_before = {}
+
+
+def _no_memory():
+    error = cv2.error("Failed to allocate 9000000 bytes")
+    error.code = cv2.Error.StsNoMem
+    return error
+
+
+ERRORS = {
+    "cache": lambda: pickle.UnpicklingError("pickle data was truncated"),
+    "compiler": lambda: LoweringError("no module"),
+    "disk": lambda: OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),
+    "memory": MemoryError,
+    "opencv memory": _no_memory,
+    "import": lambda: ImportError("libstdc++.so.6: file too short"),
+    "passing": lambda: RuntimeError("not like this"),
+}
+
+PLACES = {
+    "build_scenes": cells, "detections_for": cells, "build": cells, "render_all": search,
+    "classify": search,
+}
+
+
+def inject(fault, place, at):
+    """From the call number ``at`` on, a function that scenes need fails as on a faulty machine."""
+    _before["limit"] = resource.getrlimit(resource.RLIMIT_NOFILE)
+    _before.update({name: getattr(module, name) for name, module in PLACES.items()})
+    if fault == "descriptors":
+        used = max(int(path.name) for path in Path("/proc/self/fd").iterdir())
+        resource.setrlimit(resource.RLIMIT_NOFILE, (used - 2, _before["limit"][1]))
+        return
+    real, calls = _before[place], itertools.count()
+
+    def faulty(*arguments, **options):
+        call = next(calls)
+        if call >= at and (fault != "passing" or call < at + 2):
+            error = ERRORS[fault]()
+            raise error
+        return real(*arguments, **options)
+
+    setattr(PLACES[place], place, faulty)
+
+
+def clear():
+    """Mend the machine."""
+    if _before:
+        resource.setrlimit(resource.RLIMIT_NOFILE, _before.pop("limit"))
+        for name, module in PLACES.items():
+            setattr(module, name, _before.pop(name))

@@ -18,19 +18,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments
         What follows ``sweep`` on the command line; by default that of this process.
     """
-    from sweep.cli.errors import print_error, print_import_error  # noqa: PLC0415
+    from sweep.cli.errors import (  # noqa: PLC0415
+        print_error,
+        print_import_error,
+        print_system_error,
+    )
     from sweep.cli.installation import check_installation  # noqa: PLC0415
-    from sweep.cli.parser import build_parser  # noqa: PLC0415
+    from sweep.cli.output import accept_any_text, flushed  # noqa: PLC0415
+    from sweep.cli.parser import build_parser, parse  # noqa: PLC0415
     from sweep.errors import SweepError  # noqa: PLC0415
 
+    accept_any_text()
     parser = build_parser()
-    options = parser.parse_args(arguments)
-    if options.command is None:
-        parser.print_help()
-        return 0
     try:
+        options = parse(parser, arguments)
+        if options.command is None:
+            print(parser.format_help(), end="")
+            return flushed(0)
         check_installation()
-        return int(options.command.execute(options))
+        return flushed(options.command.execute(options))
     except SweepError as error:
         return print_error(error, options)
     except ImportError as error:
@@ -42,3 +48,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         sys.stderr.close()
         return 1
+    except (OSError, MemoryError, RuntimeError) as error:
+        return print_system_error(error)

@@ -3,12 +3,29 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import sys
 
 from sweep.errors import ArgumentError, PipelineError, StoreError, SweepError
 from sweep.messages import plain
 
 MAX_LINE_LENGTH = 2000
+
+ADVICE = {
+    errno.EMFILE: "allow more open files (ulimit -n)",
+    errno.EAGAIN: "allow more processes (ulimit -u)",
+    errno.ENOMEM: "free memory, or allow more (ulimit -v)",
+    errno.ENOSPC: "free space on the disk",
+    errno.EFBIG: "allow larger files (ulimit -f)",
+}
+"""What to change after an error of the system."""
+
+
+OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+"""What writing may end with."""
+
+NO_THREAD = "can't start new thread"
+"""What Python says in a RuntimeError where the system allows no more threads."""
 
 REFUSALS = (ArgumentError, PipelineError, StoreError)
 """Errors of what was asked for (exit status 2); others occur while a command runs (1)."""
@@ -38,6 +55,30 @@ def print_import_error(error: ImportError) -> int:
         file=sys.stderr,
     )
     return 2
+
+
+def print_system_error(error: OSError | MemoryError | RuntimeError) -> int:
+    """Print one line if the system refused a file, memory, a thread or a process.
+
+    Any other RuntimeError is a defect, and raised.
+    """
+    from sweep.cli.output import is_refused_output  # noqa: PLC0415
+
+    if isinstance(error, MemoryError):
+        line, number = "out of memory", errno.ENOMEM
+    elif isinstance(error, OSError):
+        if error.filename is None and error.errno in OUTPUT_ERRORS and is_refused_output():
+            subject = "standard output cannot be written"
+        else:
+            subject = str(error.filename or "the system refused a request")
+        line, number = f"{subject}: {error.strerror or error}", error.errno or 0
+    elif str(error) == NO_THREAD:
+        line, number = f"the system refused a request: {error}", errno.EAGAIN
+    else:
+        raise error
+    advice = f"; {ADVICE[number]}" if number in ADVICE else ""
+    print(plain(line + advice, MAX_LINE_LENGTH), file=sys.stderr)
+    return 1
 
 
 def flag_of(argument: str, options: argparse.Namespace) -> str:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
+import logging
+import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +20,43 @@ def say(text: str = "") -> None:
 
     for line in text.split("\n"):
         print(plain(line, len(line)))
+
+
+def accept_any_text() -> None:
+    """Print characters that the encoding of the terminal lacks as escapes, instead of failing."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
+
+
+def flushed(status: int) -> int:
+    """Return a status once everything printed is written; OSError if it cannot be."""
+    if sys.stdout is not None:
+        sys.stdout.flush()
+    return status
+
+
+def is_refused_output() -> bool:
+    """Return whether standard output cannot be written; what it holds back is dropped then.
+
+    It is tried with an empty line, in case nothing is held back.
+    """
+    if sys.stdout is None:
+        return False
+    try:
+        print(flush=True)
+    except OSError:
+        # Python would try again when it ends, and say so.
+        nothing = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nothing, sys.stdout.fileno())
+        os.close(nothing)
+        return True
+    return False
+
+
+def quiet_matplotlib() -> None:
+    """Silence what matplotlib says of places for its caches: it works without them."""
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 
 def print_json(content: dict[str, Any]) -> None:

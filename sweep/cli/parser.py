@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 
 from sweep.cli.command import Command
+from sweep.cli.output import flushed
 from sweep.cli.plan import PLAN
 from sweep.cli.report import REPORT
 from sweep.cli.repro import REPRO
@@ -42,6 +44,25 @@ def build_parser() -> argparse.ArgumentParser:
         command.add_arguments(added)
         added.set_defaults(command=command, flags=_flags(added))
     return parser
+
+
+def parse(
+    parser: argparse.ArgumentParser, arguments: Sequence[str] | None
+) -> argparse.Namespace:
+    """Return the parsed arguments.
+
+    Raises
+    ------
+    SystemExit
+        After the help, the version, or an error was printed.
+    OSError
+        If it could not be printed.
+    """
+    try:
+        return parser.parse_args(arguments)
+    except SystemExit:
+        flushed(0)
+        raise
 
 
 def _sentence(summary: str) -> str:

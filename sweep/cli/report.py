@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sweep.cli.arguments import add_store
 from sweep.cli.command import Command, Example
-from sweep.cli.output import say
+from sweep.cli.output import quiet_matplotlib, say
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,6 +26,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _execute(options: argparse.Namespace) -> int:
+    quiet_matplotlib()
     from sweep.errors import ArgumentError  # noqa: PLC0415
     from sweep.report.formatting import byte_count  # noqa: PLC0415
     from sweep.report.output_file import is_standard_stream  # noqa: PLC0415

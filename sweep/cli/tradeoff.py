@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sweep.cli.arguments import add_json
 from sweep.cli.command import Command, Example
-from sweep.cli.output import print_json, say
+from sweep.cli.output import print_json, quiet_matplotlib, say
 
 FIGURE_SUFFIXES = (".png", ".svg")
 
@@ -38,6 +38,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _execute(options: argparse.Namespace) -> int:
+    quiet_matplotlib()
     from sweep.tradeoff.advice import advice  # noqa: PLC0415
     from sweep.tradeoff.measurement import measure_trade  # noqa: PLC0415
 

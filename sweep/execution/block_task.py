@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import time
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -29,6 +30,7 @@ from sweep.plan.schema import SCHEMA, Variable
 from sweep.store.blocks import begin_block, withdraw_block, write_block
 from sweep.store.failures import MAX_ROWS, recorded
 from sweep.store.lifecycle import open_store
+from sweep.store.locations import exists
 from sweep.store.provenance import fingerprint
 from sweep.store.receipt import Receipt
 from sweep.store.run_store import RunStore
@@ -46,6 +48,11 @@ def _opened(url: str, run_id: str) -> RunStore:
     StoreError
         If the store was replaced, or this machine has other versions or files.
     """
+    if not exists(url):
+        raise StoreError(
+            f"{url}: not found on {socket.gethostname()} by a worker; every machine needs the "
+            "store under this path, or choose an s3:// URL"
+        )
     store = open_store(url, "r+")
     if store.run_id != run_id:
         raise StoreError(f"{url}: replaced by another run while this one was going on")

@@ -11,6 +11,7 @@ import contextlib
 import os
 import re
 import stat
+import sys
 import tempfile
 import uuid
 import weakref
@@ -124,8 +125,18 @@ def storage_at(url: str, *, read_only: bool) -> Store:
         raise StoreError(f"{url}: cannot be reached: {reason_of(error)}") from None
 
 
+def check_assertions() -> None:
+    """Raise StoreError if Python runs without assertions: Zarr reads its groups in one of them."""
+    if sys.flags.optimize:
+        raise StoreError(
+            "Zarr cannot read groups where Python leaves out assertions; unset PYTHONOPTIMIZE, and "
+            "run Python without -O"
+        )
+
+
 def open_group(storage: Store, mode: str) -> zarr.Group:
     """Open the root group of a storage."""
+    check_assertions()
     return zarr.open_group(
         storage, mode=mode, zarr_format=3, use_consolidated=False  # type: ignore[arg-type]
     )
@@ -220,6 +231,7 @@ def check_writable(url: str) -> None:
     StoreError
         If nothing can be written there, or it is inside another store.
     """
+    check_assertions()
     if is_remote(checked_url(url)):
         if url.partition("://")[0].lower() in ("http", "https"):
             raise StoreError(f"{url}: can only be read; choose a path or s3://")

@@ -1,12 +1,20 @@
 """Stores and outputs in places that cannot be: one line each, whatever the command."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from support.reports import command
-from sweep.store.locations import checked_url, exists
+from sweep import cli
+from sweep.errors import StoreError
+from sweep.execution.block_task import compute_block
+from sweep.execution.runner import execute
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import Block
+from sweep.store.locations import check_writable, checked_url, exists
 
 PIPELINE = """
 [pose]
@@ -115,7 +123,83 @@ def test_a_folder_that_may_not_be_searched_is_told(folder):
         for reader in READERS:
             line = line_of(*reader, "private/s.zarr")
             assert line == "private/s.zarr: cannot be read: Permission denied"
-        assert line_of("run", "small.toml", "--store", "private/s.zarr") == (
-            "private/s.zarr: cannot be read: Permission denied")
+        with pytest.raises(StoreError, match="cannot be read: Permission denied"):
+            execute(Pipeline.from_text(PIPELINE), "private/s.zarr")
     finally:
         os.seteuid(0)
+
+
+def test_a_worker_that_does_not_see_the_store_says_what_it_needs(folder):
+    url = str(folder / "elsewhere.zarr")
+    with pytest.raises(StoreError) as told:
+        compute_block(url, "0" * 32, Block((0,), (1,)))
+    assert str(told.value).startswith(f"{url}: not found on ")
+    assert "by a worker; every machine needs the store under this path" in str(told.value)
+
+
+# What the system refuses, and where output goes.
+
+ERRORS = {
+    OSError(24, "Too many open files", "chunk"):
+        "chunk: Too many open files; allow more open files (ulimit -n)",
+    BlockingIOError(11, "Resource temporarily unavailable"):
+        "the system refused a request: Resource temporarily unavailable; "
+        "allow more processes (ulimit -u)",
+    OSError(27, "File too large", "x"): "x: File too large; allow larger files (ulimit -f)",
+    MemoryError(): "out of memory; free memory, or allow more (ulimit -v)",
+    RuntimeError("can't start new thread"):
+        "the system refused a request: can't start new thread; allow more processes (ulimit -u)",
+}
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: str(error)[:20])
+def test_what_the_system_refuses_is_told_in_one_line(error, monkeypatch):
+    def refused():
+        raise error
+
+    monkeypatch.setattr("sweep.cli.installation.check_installation", refused)
+    assert command("status", "x") == (1, "", ERRORS[error] + "\n")
+
+
+def test_a_defect_is_not_taken_for_the_system(monkeypatch):
+    def broken():
+        raise RuntimeError("some defect")
+
+    monkeypatch.setattr("sweep.cli.installation.check_installation", broken)
+    with pytest.raises(RuntimeError, match="some defect"):
+        cli.main(["status", "x"])
+
+
+def test_full_standard_output_is_told_in_one_line():
+    buffered = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
+    for arguments, environment in (
+        ([], {**buffered, "PYTHONUNBUFFERED": "1"}), (["plan", "--help"], buffered),
+    ):
+        with open("/dev/full", "wb") as full:  # noqa: PTH123
+            done = subprocess.run(
+                [sys.executable, "-m", "sweep", *arguments], env=environment, stdout=full,
+                stderr=subprocess.PIPE, text=True, check=False)
+        assert done.returncode == 1
+        assert done.stderr == (
+            "standard output cannot be written: No space left on device; free space on the disk\n")
+
+
+def test_characters_that_a_terminal_lacks_are_printed_as_escapes(tmp_path):
+    (tmp_path / "x.toml").write_text('title = "\u2013"\n[nonsense-\u00e9]\n', encoding="utf-8")
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+    code = ("import sys; from sweep.cli import main\n"
+            "main([]); print(sys.argv[1]); main(sys.argv[2:])")
+    done = subprocess.run(
+        [sys.executable, "-c", code, "\u2013 \u00e9", "plan", tmp_path / "x.toml"],
+        env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert done.stdout.endswith("\\u2013 \\xe9\n")
+    assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize("optimize", [1, 2])
+def test_without_assertions_no_store_is_touched(optimize, monkeypatch, tmp_path):
+    flags = type("Flags", (), {"optimize": optimize})
+    monkeypatch.setattr("sweep.store.locations.sys.flags", flags)
+    with pytest.raises(StoreError, match="unset PYTHONOPTIMIZE"):
+        check_writable(str(tmp_path / "x.zarr"))

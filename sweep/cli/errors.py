@@ -68,10 +68,10 @@ def print_system_error(error: OSError | MemoryError | RuntimeError) -> int:
         line, number = "out of memory", errno.ENOMEM
     elif isinstance(error, OSError):
         if error.filename is None and error.errno in OUTPUT_ERRORS and is_refused_output():
-            subject = "standard output cannot be written"
+            cause = "standard output cannot be written"
         else:
-            subject = str(error.filename or "the system refused a request")
-        line, number = f"{subject}: {error.strerror or error}", error.errno or 0
+            cause = str(error.filename or "the system refused a request")
+        line, number = f"{cause}: {error.strerror or error}", error.errno or 0
     elif str(error) == NO_THREAD:
         line, number = f"the system refused a request: {error}", errno.EAGAIN
     else:

@@ -6,6 +6,7 @@ so that functions which a caller compiles are cached where the caller's Numba ca
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pickle
 import stat
@@ -17,7 +18,12 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    _CacheLocator,
+)
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -118,29 +124,108 @@ class _Implementation(CompileResultCacheImpl):
     _locator_classes: Any = (_Locator,)
 
 
-class _Cache(FunctionCache):
+_CacheFiles: Any = IndexDataCacheFile  # Numba has no type information
+
+
+class _CacheFile(_CacheFiles):  # type: ignore[misc]
+    """The files of one function's compiled code, each headed by a digest of the rest.
+
+    Numba trusts what it reads: a flipped byte of machine code would compute something else. A file
+    that cannot be read, or is not as it was written, counts as missing.
+    """
+
+    def _load_index(self) -> Any:
+        content = _sealed_content(self._index_path)
+        if content is None:
+            return {}
+        stamp, overloads = pickle.loads(content)  # noqa: S301  (what this package has sealed)
+        return overloads if stamp == (self._version, self._source_stamp) else {}
+
+    def _save_index(self, overloads: Any) -> None:
+        self._seal(self._index_path, ((self._version, self._source_stamp), overloads))
+
+    def _load_data(self, name: str) -> Any:
+        content = _sealed_content(self._data_path(name))
+        if content is None:
+            raise FileNotFoundError(name)
+        return pickle.loads(content)  # noqa: S301  (as above)
+
+    def _save_data(self, name: str, data: Any) -> None:
+        self._seal(self._data_path(name), data)
+
+    def _seal(self, path: str, content: Any) -> None:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        encoded = self._dump(content)
+        with self._open_for_write(path) as file:
+            file.write(sha256(encoded).digest() + encoded)
+
+
+def _sealed_content(path: str) -> bytes | None:
+    """Return what a file holds behind its digest; None if it is missing or changed."""
+    try:
+        sealed = Path(path).read_bytes()
+    except OSError:
+        return None
+    size = sha256().digest_size
+    return sealed[size:] if sha256(sealed[size:]).digest() == sealed[:size] else None
+
+
+_FunctionCache: Any = FunctionCache
+
+
+class _Cache(_FunctionCache):  # type: ignore[misc]
     """Numba's cache of one function, in this package's folder.
 
-    A file that cannot be read or written costs a compilation, never the result.
+    A file that cannot be read or written costs a compilation, never the result. If the folder
+    cannot be used (it is full, say), one among the temporary files takes its place.
     """
 
     _impl_class = _Implementation
 
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)
+        self._cache_file = self._file(self._cache_path)
+
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the compiled code for a signature; None if it is not cached."""
-        try:
-            base: Any = super()
-            return base.load_overload(sig, target_context)
-        except (OSError, EOFError, pickle.UnpicklingError):
-            return None
+        target_context.refresh()
+        key = self._index_key(sig, target_context.codegen())
+        for file in self._files(create=False):
+            try:
+                data = file.load(key)
+                if data is not None:
+                    return self._impl.rebuild(target_context, data)
+            except Exception:  # noqa: S112  (an old version of a library may have written it)
+                continue
+        return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Save the compiled code for a signature, if it can be."""
-        try:
-            base: Any = super()
-            base.save_overload(sig, data)
-        except (OSError, EOFError, pickle.UnpicklingError):
-            self._enabled = False
+        if not self._impl.check_cachable(data):
+            return
+        key, reduced = self._index_key(sig, data.codegen), self._impl.reduce(data)
+        for file in self._files(create=True):
+            with contextlib.suppress(Exception):
+                file.save(key, reduced)
+                return
+
+    def _file(self, folder: str) -> Any:
+        return _CacheFile(folder, self._impl.filename_base, self._impl.locator.get_source_stamp())
+
+    def _files(self, *, create: bool) -> Iterator[Any]:
+        """Yield where the code may be: in the package's folder, or in the one in its place."""
+        yield self._cache_file
+        private = _substitute_folder()
+        if create or private.exists():
+            folder = _private_folder()
+            if folder is not None and str(private) != self._cache_path:
+                yield self._file(str(private))
+
+
+def _substitute_folder() -> Path:
+    """Return the folder among the temporary files; it need not exist."""
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    return Path(tempfile.gettempdir()) / f"sweep-{user}" / f"compiled-{sources_digest()}"
 
 
 def compiled(function: Function) -> Function:
@@ -166,8 +251,7 @@ def _compiled(function: Function, forceinline: bool) -> Function:
     dispatcher: Any = numba.njit(nogil=True, error_model="numpy", forceinline=forceinline)(function)
     if hasattr(dispatcher, "enable_caching") and cache_folder() is not None:
         # What `cache=True` does, with a folder of the package's own.
-        make: Any = _Cache
-        dispatcher._cache = make(function)  # noqa: SLF001
+        dispatcher._cache = _Cache(function)  # noqa: SLF001
     return cast("Function", dispatcher)
 
 

@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import ast
+import errno
 import os
+import pickle
+import random
 import shutil
 import subprocess
 import sys
+import tempfile
+from hashlib import sha256
 from pathlib import Path
+
+import numba
+import pytest
 
 from sweep import compilation
 
@@ -84,13 +92,101 @@ def test_read_only_package_without_a_home_uses_a_private_temporary_folder(tmp_pa
     assert run(script + UNIT, TMPDIR=str(tmp_path), HOME=None)[0] == first
 
 
-def test_damaged_cache_costs_a_compilation_and_nothing_else(tmp_path):
-    first = run(UNIT, NUMBA_CACHE_DIR=str(tmp_path))
-    files = [path for path in tmp_path.rglob("*.nb?") if path.is_file()]
+def empty(path):
+    path.write_bytes(b"")
+
+
+def halve(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def flip(path):
+    content = bytearray(path.read_bytes())
+    content[-len(content) // 3] ^= 1
+    path.write_bytes(content)
+
+
+def replace_by_folder(path):
+    path.unlink()
+    (path / "x").mkdir(parents=True)
+
+
+def replace_by_another_object(path):
+    content = pickle.dumps({"not": "code"})
+    path.write_bytes(sha256(content).digest() + content)
+
+
+def replace_by_numbas_own(path):
+    path.write_bytes(pickle.dumps(numba.__version__) + pickle.dumps(("stamp", {})))
+
+
+@pytest.fixture
+def cached(monkeypatch, tmp_path):
+    """A function that compiles anew with a cache in a folder: returns its value and cache hits."""
+    monkeypatch.setattr(compilation, "cache_folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
+    (tmp_path / "tmp").mkdir()
+
+    def call():
+        function = compilation.compiled(_fraction)
+        value = function(5)
+        return value, sum(function.stats.cache_hits.values())
+
+    return call
+
+
+def _fraction(number):
+    return (number * 7 % 11) / 11
+
+
+DAMAGE = (empty, halve, flip, replace_by_folder, replace_by_another_object, replace_by_numbas_own)
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.parametrize("kind", ["*.nbi", "*.nbc", "*.nb?"])
+def test_damaged_cache_costs_a_compilation_and_nothing_else(damage, kind, cached, tmp_path):
+    assert cached() == (_fraction(5), 0)
+    assert cached() == (_fraction(5), 1)
+    files = [path for path in (tmp_path / "cache").glob(kind) if path.is_file()]
     assert files
     for path in files:
-        path.write_bytes(b"")
-    assert run(UNIT, NUMBA_CACHE_DIR=str(tmp_path)) == first
+        damage(path)
+    assert cached() == (_fraction(5), 0)
+    assert cached() == (_fraction(5), 1)  # it was replaced
+
+
+def test_flipped_byte_of_machine_code_is_never_executed(cached, tmp_path):
+    cached()
+    (path,) = (tmp_path / "cache").glob("*.nbc")
+    sound = path.read_bytes()
+    generator = random.Random(7)
+    for _ in range(8):
+        content = bytearray(sound)
+        content[generator.randrange(len(content))] ^= 1 << generator.randrange(8)
+        path.write_bytes(content)
+        assert cached() == (_fraction(5), 0)
+
+
+def test_cache_in_a_folder_without_space_is_replaced_by_a_private_one(
+    cached, monkeypatch, tmp_path
+):
+    real = compilation._CacheFile._open_for_write
+
+    def full(self, path):
+        if str(path).startswith(str(tmp_path / "cache")):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return real(self, path)
+
+    monkeypatch.setattr(compilation._CacheFile, "_open_for_write", full)
+    assert cached() == (_fraction(5), 0)
+    assert cached() == (_fraction(5), 1)
+    (private,) = (tmp_path / "tmp").iterdir()
+    assert private.stat().st_mode & 0o777 == 0o700
+    # Nor is there space for that one: every process compiles.
+    shutil.rmtree(private)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
+    assert cached() == (_fraction(5), 0)
+    assert cached() == (_fraction(5), 0)
 
 
 def test_what_compiled_code_uses_is_declared_in_the_sources_of_the_digest():

@@ -23,10 +23,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print_import_error,
         print_system_error,
     )
-    from sweep.cli.installation import check_installation  # noqa: PLC0415
     from sweep.cli.output import accept_any_text, flushed  # noqa: PLC0415
     from sweep.cli.parser import build_parser, parse  # noqa: PLC0415
     from sweep.errors import SweepError  # noqa: PLC0415
+    from sweep.installation import check_installation  # noqa: PLC0415
 
     accept_any_text()
     parser = build_parser()

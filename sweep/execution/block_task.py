@@ -31,7 +31,7 @@ from sweep.store.blocks import begin_block, withdraw_block, write_block
 from sweep.store.failures import MAX_ROWS, recorded
 from sweep.store.lifecycle import open_store
 from sweep.store.locations import exists
-from sweep.store.provenance import fingerprint
+from sweep.store.provenance import changes, fingerprint
 from sweep.store.receipt import Receipt
 from sweep.store.run_store import RunStore
 
@@ -56,14 +56,12 @@ def _opened(url: str, run_id: str) -> RunStore:
     store = open_store(url, "r+")
     if store.run_id != run_id:
         raise StoreError(f"{url}: replaced by another run while this one was going on")
-    worker, recorded_versions = fingerprint(store.pipeline), store.fingerprint
-    for key, value in recorded_versions.items():
-        if worker.get(key) != value:
-            raise StoreError(
-                f"a worker has {key} {worker.get(key)}, the store was begun with {value}; "
-                "install the same version on every machine"
-            )
-    for path, digest in recorded_versions["files"].items():
+    for key, value, own_value in changes(store.fingerprint, fingerprint(store.pipeline)):
+        raise StoreError(
+            f"a worker has {key} {own_value}, the store was begun with {value}; "
+            "install the same version on every machine"
+        )
+    for path, digest in store.fingerprint["files"].items():
         if file_digest(Path(store.pipeline.folder) / path) != digest:
             raise StoreError(
                 f"{path}: not in {store.pipeline.folder} on a worker as it was when the run began; "

@@ -22,7 +22,7 @@ from sweep.plan.grid import Block, scene_axes
 from sweep.plan.parameters import PARAMETERS, Stage
 from sweep.plan.schema import SCHEMA, Variable
 from sweep.store.blocks import committed
-from sweep.store.provenance import fingerprint
+from sweep.store.provenance import changes, fingerprint
 from sweep.store.run_store import RunStore
 
 MISSING = -1
@@ -68,9 +68,8 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
     for stamp in (mine, theirs):
         stamp["files"] = {path: stamp["files"][path] for path in sorted(shared)}
     faults = [
-        f"{key}: the store has {json.dumps(theirs.get(key))}, this run {json.dumps(mine.get(key))}"
-        for key in sorted({*mine, *theirs})
-        if mine.get(key) != theirs.get(key)
+        f"{key}: the store has {json.dumps(old_value)}, this run {json.dumps(value)}"
+        for key, old_value, value in changes(theirs, mine)
     ]
     present = {variable.name for variable in store.variables}
     faults += [

@@ -12,7 +12,7 @@ from distributed import Client
 from sweep.errors import ArgumentError
 from sweep.execution.limits import ANSWER_S, VERSIONS_S
 from sweep.plan.experiment import Pipeline
-from sweep.store.provenance import fingerprint
+from sweep.store.provenance import changes, fingerprint
 
 
 def check_workers(client: Client, pipeline: Pipeline, argument: str, value: str) -> None:
@@ -56,10 +56,9 @@ def check_workers(client: Client, pipeline: Pipeline, argument: str, value: str)
             "start it with processes=True",
         )
     lines = sorted(
-        f"  {worker}: {key} {versions.get(key)}, here {own_versions[key]}"
+        f"  {worker}: {key} {theirs}, here {own}"
         for worker, (versions, _) in identities.items()
-        for key in own_versions
-        if versions.get(key) != own_versions[key]
+        for key, theirs, own in changes({"builds": {}, **versions}, own_versions)
     )
     if lines:
         raise ArgumentError(

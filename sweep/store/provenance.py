@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
+import json
 import platform
+import runpy
+from collections.abc import Iterator
+from functools import cache
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from sweep.installation import check_installation, check_loaded_opencv
 from sweep.plan.experiment import Pipeline
 from sweep.version import __version__
 
@@ -22,14 +29,86 @@ def versions() -> dict[str, str]:
     return {name: importlib.metadata.version(package) for name, package in packages.items()}
 
 
+@cache
+def builds() -> dict[str, str]:
+    """Return which builds of libraries are loaded in this process, whatever their metadata say.
+
+    Raises
+    ------
+    StoreError
+        If OpenCV is installed in a way that makes it uncertain which one is used.
+    """
+    check_installation()
+    import cv2  # noqa: PLC0415  (slow to import)
+    import llvmlite  # noqa: PLC0415
+    import numpy as np  # noqa: PLC0415
+
+    check_loaded_opencv(cv2.__version__)
+    config: dict[str, Any] = {**np.show_config(mode="dicts")}
+    for dependency in config["Build Dependencies"].values():
+        for path in ("include directory", "lib directory", "pc file directory"):
+            dependency.pop(path, None)
+    # The processor's features have an entry of their own in each receipt.
+    config = {part: config.get(part) for part in ("Compilers", "Build Dependencies")}
+    return {
+        "opencv": f"{cv2.__version__} {_digest(cv2.getBuildInformation())}",
+        "numpy": f"{np.__version__} {_digest(json.dumps(config, sort_keys=True))}",
+        "numba": _numba_version(),
+        "llvmlite": llvmlite.__version__,
+    }
+
+
+def _digest(text: str) -> str:
+    return sha256(text.encode()).hexdigest()[:12]
+
+
+def _numba_version() -> str:
+    """Return ``numba.__version__`` from the file that it comes from: Numba is slow to import."""
+    spec = importlib.util.find_spec("numba")
+    if spec is None or spec.origin is None:
+        raise ModuleNotFoundError("numba", name="numba")
+    content = runpy.run_path(str(Path(spec.origin).parent / "_version.py"))
+    return str(content["get_versions"]()["version"])
+
+
 def fingerprint(pipeline: Pipeline) -> dict[str, Any]:
-    """Return the values that two stores must share for one to reuse cells of the other."""
+    """Return the values that two stores must share for one to reuse cells of the other.
+
+    Raises
+    ------
+    StoreError
+        If OpenCV is installed in a way that makes it uncertain which one is used.
+    """
     return {
         "numbers": NUMBERS_VERSION,
         **versions(),
+        "builds": dict(builds()),
         "seed": pipeline.seed,
         "files": dict(sorted(pipeline.files.items())),
     }
+
+
+def changes(stored: dict[str, Any], own: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Yield name, stored and own value of each entry in which two fingerprints differ.
+
+    Builds are compared one by one; stores up to format 3 may have none, and are not refused.
+
+    Examples
+    --------
+    >>> list(changes({"numba": "1", "builds": {"numpy": "a"}}, {"numba": "1", "builds": {}}))
+    [('builds.numpy', 'a', None)]
+    """
+    for key in sorted({*stored, *own}):
+        theirs, mine = stored.get(key), own.get(key)
+        if key == "builds" and key not in stored:
+            continue
+        if key == "builds" and isinstance(theirs, dict) and isinstance(mine, dict):
+            yield from (
+                (f"{key}.{name}", theirs.get(name), mine.get(name))
+                for name in sorted({*theirs, *mine}) if theirs.get(name) != mine.get(name)
+            )
+        elif theirs != mine:
+            yield key, theirs, mine
 
 
 def environment() -> dict[str, str]:
@@ -61,12 +140,9 @@ def differences(ours: Pipeline, theirs: Pipeline, stored: dict[str, Any]) -> lis
     stored
         The store's fingerprint.
     """
-    lines = []
-    mine = fingerprint(ours)
-    lines += [
-        f"{key}: the store has {stored.get(key)}, this run {mine.get(key)}"
-        for key in sorted({*mine, *stored})
-        if mine.get(key) != stored.get(key)
+    lines = [
+        f"{key}: the store has {stored_value}, this run {own_value}"
+        for key, stored_value, own_value in changes(stored, fingerprint(ours))
     ]
     if [axis.name for axis in ours.axes] != [axis.name for axis in theirs.axes]:
         lines.append(f"axes: the store has {_names(theirs)}, this run {_names(ours)}")

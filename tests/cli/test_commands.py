@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 
 import sweep
-from sweep import cli
-from sweep.cli import installation
+from sweep import cli, installation
 from sweep.cli.errors import flag_of, print_error
 from sweep.cli.parser import COMMANDS, GUIDES, build_parser
 from sweep.errors import ArgumentError, PipelineError, RunError, StoreError

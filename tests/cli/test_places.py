@@ -157,7 +157,7 @@ def test_what_the_system_refuses_is_told_in_one_line(error, monkeypatch):
     def refused():
         raise error
 
-    monkeypatch.setattr("sweep.cli.installation.check_installation", refused)
+    monkeypatch.setattr("sweep.installation.check_installation", refused)
     assert command("status", "x") == (1, "", ERRORS[error] + "\n")
 
 
@@ -165,7 +165,7 @@ def test_a_defect_is_not_taken_for_the_system(monkeypatch):
     def broken():
         raise RuntimeError("some defect")
 
-    monkeypatch.setattr("sweep.cli.installation.check_installation", broken)
+    monkeypatch.setattr("sweep.installation.check_installation", broken)
     with pytest.raises(RuntimeError, match="some defect"):
         cli.main(["status", "x"])
 

@@ -1,4 +1,4 @@
-"""Installations that cannot work: reported in one line before a command starts."""
+"""Installations that cannot work: reported in one line before anything is computed."""
 
 from __future__ import annotations
 
@@ -34,6 +34,29 @@ def check_installation() -> None:
     """
     for problem in _problems():
         raise StoreError(problem)
+
+
+def check_loaded_opencv(loaded: str) -> None:
+    """Refuse an OpenCV that is not the one that is installed.
+
+    Parameters
+    ----------
+    loaded
+        Its own version, ``cv2.__version__``.
+
+    Raises
+    ------
+    StoreError
+        If it contradicts the version that the package's metadata name; in one line.
+    """
+    package = _installed(OPENCV)
+    own = loaded.partition("-")[0].split(".")
+    if package is not None and package.version.split(".")[:3] != own:
+        raise StoreError(
+            f"OpenCV {loaded} is loaded, but {OPENCV} {package.version} is installed: another "
+            "package has overwritten its files, or stands before it in Python's path; "
+            f"`pip install --force-reinstall {OPENCV}`"
+        )
 
 
 def _problems() -> Iterator[str]:

@@ -1,6 +1,6 @@
 """The cluster that computes blocks: embedded, by a scheduler's address, or the caller's own.
 
-The caller's process is left as it was: an embedded cluster's settings hold while it starts, Dask's
+The caller's process is left as it was: an embedded cluster's settings hold while it runs, Dask's
 loggers are silenced while this package's own client lives, and a client or cluster of the caller is
 only used. No client here becomes Dask's default.
 """
@@ -8,6 +8,7 @@ only used. No client here becomes Dask's default.
 from __future__ import annotations
 
 import contextlib
+import copy
 import importlib
 import logging
 import os
@@ -34,8 +35,13 @@ WORKER_ENVIRONMENT = {
 }
 """One thread a worker; images' memory is kept between scenes rather than given back."""
 
+NEVER_PAUSED: dict[str, Any] = {
+    f"distributed.worker.memory.{measure}": False
+    for measure in ("target", "spill", "pause", "terminate")
+}
+"""Results are small, and lie in the store: a worker that waits for memory waits for ever."""
+
 QUIET_DASK_CONFIG: dict[str, Any] = {
-    "distributed.worker.memory.terminate": False,
     "distributed.worker.memory.monitor-interval": "1s",
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "1s",
@@ -102,15 +108,15 @@ def connected(
 def embedded(workers: int) -> Iterator[Client]:
     """Start a cluster of ``workers`` single-threaded processes on this machine; end it quietly.
 
-    It listens on the loopback interface only.
+    It listens on the loopback interface only, and has no limits of memory. The user's own
+    configuration of Dask (files, environment variables, ``dask.config.set``) does not apply to it.
     """
-    settings = {"distributed.nanny.pre-spawn-environ": WORKER_ENVIRONMENT, **QUIET_DASK_CONFIG}
-    with silenced_dask_loggers():
-        with _ignored_interrupts(), dask.config.set(settings):
+    with silenced_dask_loggers(), dask.config.set(own_dask_config()):
+        with _ignored_interrupts():
             cluster = LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1",
                 dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL,
-                scheduler_kwargs={"dashboard": False},
+                memory_limit=0, scheduler_kwargs={"dashboard": False},
             )
         with cluster, Client(cluster, set_as_default=False) as client:
             # The workers import their packages while the caller measures.
@@ -118,6 +124,22 @@ def embedded(workers: int) -> Iterator[Client]:
                 [client.submit(_warm, workers=[worker], pure=False) for worker in client.nthreads()]
             )
             yield client
+
+
+def own_dask_config() -> dict[str, Any]:
+    """Return the whole configuration of an embedded cluster: Dask's defaults, and what is set here.
+
+    Workers are given it by their nannies, in place of what they read themselves.
+    """
+    config: dict[str, Any] = {}
+    for defaults in dask.config.defaults:
+        dask.config.update(config, copy.deepcopy(defaults), priority="old")
+    settings = {
+        "distributed.nanny.pre-spawn-environ": WORKER_ENVIRONMENT,
+        **NEVER_PAUSED, **QUIET_DASK_CONFIG,
+    }
+    with dask.config.set(settings, config=config):
+        return copy.deepcopy(config)
 
 
 def _warm() -> None:

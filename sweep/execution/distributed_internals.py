@@ -14,7 +14,8 @@ from distributed.comm.registry import backends
 from distributed.core import send_recv
 
 __all__ = [
-    "CommClosedError", "is_known_protocol", "peer_type", "thread_counts", "worker_that_failed",
+    "CommClosedError", "is_known_protocol", "peer_type", "thread_counts", "worker_states",
+    "worker_that_failed",
 ]
 
 
@@ -52,6 +53,24 @@ def thread_counts(client: Client, timeout_s: float) -> dict[str, int]:
         raise CommClosedError("not connected")
     counts: dict[str, int] = client.sync(client.scheduler.ncores, callback_timeout=timeout_s)
     return counts
+
+
+def worker_states(client: Client, timeout_s: float) -> dict[str, str]:
+    """Return the status of each worker, by address: "running", "paused", ...
+
+    Raises
+    ------
+    TimeoutError
+        If the scheduler does not answer in time.
+    OSError
+        If the client is not connected.
+    """
+    if client.scheduler is None or client.status != "running":
+        raise CommClosedError("not connected")
+    identity: dict[str, Any] = client.sync(
+        client.scheduler.identity, n_workers=-1, callback_timeout=timeout_s
+    )
+    return {address: str(worker["status"]) for address, worker in identity["workers"].items()}
 
 
 def worker_that_failed(client: Client, key: str) -> str | None:

@@ -29,6 +29,7 @@ from sweep.execution.limits import (
     THREAD_COUNT_INTERVAL_S,
     TIME_LIMIT_S,
 )
+from sweep.execution.stall import StallWatch
 from sweep.execution.tally import Tally
 from sweep.execution.worker_faults import WorkerFaults
 from sweep.isolation.interrupts import Interrupts
@@ -116,6 +117,7 @@ class BlocksInFlight:
 
     def _compute(self, waiting: Iterator[int], tally: Tally) -> None:
         limit = InFlightLimit(self._client)
+        watch = StallWatch(self._client, self._time_limit_s)
         for number in itertools.islice(waiting, limit.blocks()):
             self._submit(number, tally)
         while self._numbers:
@@ -124,7 +126,9 @@ class BlocksInFlight:
             try:
                 future = self._finished.get(timeout=POLL_S)
             except Empty:
+                watch.check(len(self._numbers))
                 continue
+            watch.finished()
             number = self._numbers.pop(future)
             if future.status == "finished":
                 tally.add(future.result())

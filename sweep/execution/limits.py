@@ -75,6 +75,12 @@ THREAD_COUNT_TIMEOUT_S = 2.0
 NO_WORKERS_TIMEOUT_S = 60.0
 """How long a run waits for a first worker, or for another after the last one left."""
 
+STALL_S = 60.0
+"""How long no block may be finished before a line says why, and all workers may be paused."""
+
+STATES_INTERVAL_S = 10.0
+"""How often the scheduler is asked what workers do while no block is finished."""
+
 # The size of blocks (`sweep.execution.calibration`)
 
 BLOCK_S = 2.0

@@ -1,19 +1,28 @@
 """The cluster of a run: embedded, on the loopback interface alone and quiet, or the caller's."""
 
 import contextlib
+import copy
 import logging
 import socket
 import time
 
+import dask
 import psutil
 import pytest
 from distributed import Client, LocalCluster
 
 import sweep
-from sweep.errors import ArgumentError
+from sweep.errors import ArgumentError, RunError
 from sweep.execution import cluster as clusters
+from sweep.execution import stall
 from sweep.execution.cluster import borrowed, embedded
+from sweep.execution.distributed_internals import worker_states
+from sweep.execution.in_flight import BlocksInFlight
 from sweep.execution.runner import execute
+from sweep.execution.tally import Tally
+from sweep.isolation.interrupts import Interrupts
+from sweep.store.lifecycle import create_store
+from sweep.store.lock import locked
 
 PIPELINE = sweep.Pipeline.from_dict(
     {"pose": {"side_px": 40, "jitter_px": 0.5}, "axes": {"trial": 40}}
@@ -103,3 +112,137 @@ def test_cluster_that_adapts_starts_a_worker_for_a_run(tmp_path):
         cluster.adapt(minimum=0, maximum=2, interval="200ms")
         results = sweep.run(PIPELINE, store=tmp_path / "adapted.zarr", client=cluster)
         assert (results.detection == 1).all()
+
+
+HOSTILE = {
+    "distributed.scheduler.idle-timeout": "1ms",
+    "distributed.scheduler.no-workers-timeout": "1ms",
+    "distributed.scheduler.worker-ttl": "1ms",
+    "distributed.scheduler.allowed-failures": -1,
+    "distributed.scheduler.work-stealing": "perhaps",
+    "distributed.scheduler.worker-saturation": 1e-9,
+    "distributed.scheduler.blocked-handlers": ["register-client", "update-graph", "identity"],
+    "distributed.scheduler.preload": ["no_such_module"],
+    "distributed.scheduler.pickle": False,
+    "distributed.scheduler.http.routes": ["no.such.module"],
+    "distributed.worker.blocked-handlers": ["run", "compute-task"],
+    "distributed.worker.preload": ["no_such_module"],
+    "distributed.worker.lifetime.duration": "1s",
+    "distributed.worker.lifetime.stagger": "0s",
+    "distributed.worker.memory.pause": 1e-6,
+    "distributed.worker.memory.target": 1e-6,
+    "distributed.worker.memory.spill": 1e-6,
+    "distributed.worker.memory.terminate": 1e-6,
+    "distributed.worker.resources": {"GPU": 1},
+    "distributed.worker.connections.outgoing": 0,
+    "distributed.worker.daemon": "no",
+    "distributed.worker.http.routes": ["no.such.module"],
+    "distributed.worker.multiprocessing-method": "carrier pigeon",
+    "distributed.nanny.preload": ["no_such_module"],
+    "distributed.nanny.environ": {"PYTHONPATH": "/nowhere", "DASK_SCHEDULER": "sync"},
+    "distributed.comm.require-encryption": True,
+    "distributed.comm.default-scheme": "tls",
+    "distributed.comm.timeouts.connect": "1ms",
+    "distributed.comm.timeouts.tcp": "1ms",
+    "distributed.comm.socket-backlog": 0,
+    "distributed.comm.compression": "no such codec",
+    "distributed.comm.shard": "1 B",
+    "distributed.comm.tls.ca-file": "/nowhere/ca.pem",
+    "distributed.client.heartbeat": "1000h",
+    "distributed.deploy.lost-worker-timeout": "1ms",
+    "distributed.admin.log-format": "%(no such)s",
+    "distributed.admin.event-loop": "no such loop",
+    "distributed.diagnostics.nvml": "perhaps",
+    "distributed.dashboard.link": "{no such}",
+    "temporary-directory": "/proc/nowhere",
+    "scheduler": "sync",
+    "scheduler-address": "tcp://192.0.2.1:8786",
+}
+
+
+def computes():
+    """Tell whether an embedded cluster computes."""
+    with embedded(1) as client:
+        return client.submit(sum, [1, 2]).result(timeout=60) == 3
+
+
+def test_embedded_cluster_computes_whatever_dask_is_configured_to_do(monkeypatch, tmp_path):
+    # As the worker processes read it by themselves: variables, and files.
+    monkeypatch.setenv("DASK_DISTRIBUTED__WORKER__LIFETIME__DURATION", "1s")
+    monkeypatch.setenv("DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION", "True")
+    (tmp_path / "hostile.yaml").write_text("distributed: {worker: {preload: [no_such_module]}}\n")
+    monkeypatch.setenv("DASK_CONFIG", str(tmp_path))
+    before = copy.deepcopy(dask.config.config)
+    with dask.config.set(HOSTILE):
+        assert computes()
+    assert dask.config.config == before
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", HOSTILE)
+def test_embedded_cluster_computes_with_each_hostile_setting_alone(name):
+    with dask.config.set({name: HOSTILE[name]}):
+        assert computes()
+
+
+class Identity:
+    """A client whose scheduler tells what workers do."""
+
+    status = "running"
+
+    def __init__(self, *states):
+        self.scheduler = self
+        self._states = states
+
+    def identity(self):
+        raise AssertionError("asked through sync")
+
+    def sync(self, question, **_):
+        assert question == self.identity
+        if self._states == (None,):
+            raise TimeoutError
+        return {"workers": {str(k): {"status": state} for k, state in enumerate(self._states)}}
+
+
+@pytest.mark.parametrize(("states", "line"), [
+    (("running", "running"), "8 blocks are with 2 workers, which compute; a block ends after"),
+    (("paused", "running"), "1 of 2 workers are paused by Dask, because they use most"),
+    ((), "there are no workers; start some"),
+    ((None,), "the scheduler does not answer"),
+])
+def test_run_without_progress_says_why_once_in_a_while(states, line, monkeypatch, capsys):
+    monkeypatch.setattr(stall, "STALL_S", 0.1)
+    monkeypatch.setattr(stall, "STATES_INTERVAL_S", 0.0)
+    watch = stall.StallWatch(Identity(*states), 600.0)
+    watch.check(8)
+    assert capsys.readouterr().err == ""
+    deadline = time.monotonic() + 0.35
+    while time.monotonic() < deadline:
+        watch.check(8)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2  # after 0.1 s, and after 0.2 s
+    assert all(f"no block was finished for 0 s: {line}" in each for each in lines)
+    watch.finished()
+    watch.check(8)
+    assert capsys.readouterr().err == ""
+
+
+def test_run_whose_workers_are_all_paused_ends_in_a_line(monkeypatch, tmp_path):
+    monkeypatch.setattr(stall, "STALL_S", 1.0)
+    monkeypatch.setattr(stall, "STATES_INTERVAL_S", 0.1)
+    with (
+        dask.config.set({"distributed.worker.memory.pause": 1e-6,
+                         "distributed.worker.memory.terminate": False,
+                         "distributed.worker.memory.monitor-interval": "50ms"}),
+        local_cluster(1, memory_limit="8GiB") as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        store = create_store(str(tmp_path / "paused.zarr"), PIPELINE, (40,))
+        while worker_states(client, 10.0) != {next(iter(client.nthreads())): "paused"}:
+            time.sleep(0.05)
+        with locked(store), Interrupts() as interrupts, pytest.raises(RunError) as raised:
+            BlocksInFlight(store, client, store.url, interrupts=interrupts).compute(
+                [0], Tally(store)
+            )
+    (line,) = str(raised.value).splitlines()
+    assert "1 of 1 workers are paused by Dask" in line

@@ -93,6 +93,7 @@ def run(
     scheduler: str | None = None,
     reuse: Sequence[str | os.PathLike[str]] = (),
     overwrite: bool = False,
+    durable: bool = False,
     progress: bool | Callable[[Progress], None] | None = None,
     time_limit_s: float = TIME_LIMIT_S,
 ) -> xr.Dataset:
@@ -119,6 +120,9 @@ def run(
         Stores whose finished cells are copied where all their parameters agree.
     overwrite
         Delete an existing store.
+    durable
+        Flush each block to the disk before it counts as committed, so that a power failure takes
+        no committed block.
     progress
         True for a progress bar on stderr (lines if that is not a terminal), or a function that is
         called with a `Progress` after each block.
@@ -152,7 +156,7 @@ def run(
     """
     return _run(
         pipeline, store=store, workers=workers, client=client, scheduler=scheduler, reuse=reuse,
-        overwrite=overwrite, progress=progress, time_limit_s=time_limit_s,
+        overwrite=overwrite, durable=durable, progress=progress, time_limit_s=time_limit_s,
     )
 
 

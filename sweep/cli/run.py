@@ -30,6 +30,11 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help="block timeout in seconds (default: 600)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing store")
+    parser.add_argument(
+        "--durable", action="store_true",
+        help="flush each block to the disk before it counts: nothing committed is lost when the "
+        "power fails",
+    )
     add_json(parser)
 
 
@@ -50,8 +55,8 @@ def _execute_beside(child: Child, options: argparse.Namespace) -> int:
     with progress_bar() as bar:
         summary = execute(
             pipeline, options.store, workers=options.workers, scheduler=options.scheduler,
-            reuse=options.reuse, overwrite=options.overwrite, time_limit_s=options.time_limit_s,
-            progress=bar, child=child,
+            reuse=options.reuse, overwrite=options.overwrite, durable=options.durable,
+            time_limit_s=options.time_limit_s, progress=bar, child=child,
         )
     if options.json:
         print_json(dataclasses.asdict(summary))

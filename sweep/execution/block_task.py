@@ -40,7 +40,7 @@ FAILURE_QUOTA: Mapping[str, int] = {"failed": MAX_ROWS, "crashed": MAX_ROWS}
 
 
 @lru_cache(maxsize=4)
-def _opened(url: str, run_id: str) -> RunStore:
+def _opened(url: str, run_id: str, durable: bool = False) -> RunStore:
     """Open a store once in each process; check that this process computes the same numbers.
 
     Raises
@@ -53,7 +53,7 @@ def _opened(url: str, run_id: str) -> RunStore:
             f"{url}: not found on {socket.gethostname()} by a worker; every machine needs the "
             "store under this path, or choose an s3:// URL"
         )
-    store = open_store(url, "r+")
+    store = open_store(url, "r+", durable=durable)
     if store.run_id != run_id:
         raise StoreError(f"{url}: replaced by another run while this one was going on")
     for key, value, own_value in changes(store.fingerprint, fingerprint(store.pipeline)):
@@ -83,6 +83,7 @@ def compute_block(
     reuse: Sequence[str] = (),
     time_limit_s: float = TIME_LIMIT_S,
     quota: Mapping[str, int] = FAILURE_QUOTA,
+    durable: bool = False,
 ) -> Receipt:
     """Compute, write and commit one block; return its receipt, also if it is run twice.
 
@@ -101,6 +102,8 @@ def compute_block(
         Block timeout in seconds.
     quota
         Rows of failures that the receipt may hold of each kind.
+    durable
+        Flush the block to the disk before it counts as committed.
 
     Raises
     ------
@@ -110,16 +113,16 @@ def compute_block(
         If this machine cannot compute it; nothing of it is committed.
     """
     with machine_faults_raised():
-        return _compute_block(url, run_id, block, reuse, time_limit_s, quota)
+        return _compute_block(url, run_id, block, reuse, time_limit_s, quota, durable=durable)
 
 
 def _compute_block(
     url: str, run_id: str, block: Block, reuse: Sequence[str], time_limit_s: float,
-    quota: Mapping[str, int],
+    quota: Mapping[str, int], *, durable: bool,
 ) -> Receipt:
     """Compute, write and commit one block (arguments as :func:`compute_block`)."""
     start = time.perf_counter()
-    store = _opened(url, run_id)
+    store = _opened(url, run_id, durable)
     begun_before = begin_block(store, block)
     pipeline = store.pipeline
     shape = (len(block), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))

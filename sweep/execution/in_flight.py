@@ -147,7 +147,7 @@ class BlocksInFlight:
         block = self._store.blocks[number]
         future = self._client.submit(
             compute_block, self._url, self._store.run_id, block, self._sources,
-            self._time_limit_s, tally.quota(), pure=False,
+            self._time_limit_s, tally.quota(), self._store.durable, pure=False,
             key=f"block-{block}-{uuid.uuid4().hex[:8]}",
             workers=workers, allow_other_workers=workers is not None,
         )

@@ -70,6 +70,7 @@ def execute(
     client: Client | Cluster | None = None,
     reuse: Sequence[str | os.PathLike[str]] = (),
     overwrite: bool = False,
+    durable: bool = False,
     block_s: float | None = None,
     time_limit_s: float = TIME_LIMIT_S,
     progress: ProgressReport | None = None,
@@ -96,6 +97,8 @@ def execute(
         Stores whose finished cells are reused where their parameters agree.
     overwrite
         Delete an existing store.
+    durable
+        Flush each block to the disk before it counts as committed.
     block_s
         Seconds of work in a block (default: about 2, less if there is little to do).
     time_limit_s
@@ -121,6 +124,8 @@ def execute(
     unfinished = _store_to_continue(url, pipeline, overwrite)
     if unfinished is not None and unfinished.finished:
         return summary_of_complete(unfinished, started)
+    if durable and is_remote(url):
+        notice(f"{url}: nothing to flush: an object store answers once it keeps what was written")
     sources = _matching_sources(url, pipeline, reuse)
     if unfinished is None:
         check_writable(url)
@@ -154,7 +159,11 @@ def execute(
         if unfinished is None:
             if calibration is None:
                 raise AssertionError(url)
-            unfinished = _new_store(url, pipeline, calibration, connection, block_s, overwrite)
+            unfinished = _new_store(
+                url, pipeline, calibration, connection, block_s, overwrite, durable=durable
+            )
+        if durable:
+            unfinished = open_store(url, "r+", durable=True)
         with _continuable_errors(without=" without overwrite" if overwrite else ""):
             computed = _compute_and_close(
                 unfinished, child, connection, sources, time_limit_s, interrupts, progress
@@ -265,7 +274,7 @@ def _block_s(store: RunStore) -> float:
 
 def _new_store(
     url: str, pipeline: Pipeline, calibration: Calibration, client: Client | None,
-    block_s: float | None, overwrite: bool,
+    block_s: float | None, overwrite: bool, *, durable: bool = False,
 ) -> RunStore:
     """Create an empty store whose blocks suit the calibration and the cluster, if there is one."""
     threads = 1
@@ -276,7 +285,7 @@ def _new_store(
     extents = block_extents(pipeline, calibration, threads, block_s)
     if overwrite and exists(url):
         remove_store(url)
-    return create_store(url, pipeline, extents)
+    return create_store(url, pipeline, extents, durable=durable)
 
 
 # In the child, or on the cluster

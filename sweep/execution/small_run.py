@@ -82,7 +82,7 @@ class BlocksInChild:
         for _ in range(1 + MAX_DEATHS):
             call = thread.submit(
                 self._child.call, compute_block, self._url, self._store.run_id, block,
-                self._sources, self._time_limit_s, tally.quota(),
+                self._sources, self._time_limit_s, tally.quota(), self._store.durable,
                 # The block keeps its own time limit; this one is for what surrounds it.
                 limit_s=2 * self._time_limit_s,
             )

@@ -23,6 +23,7 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import SCHEMA, Variable
+from sweep.store.durability import DurableStore
 from sweep.store.layout import RECEIPTS
 from sweep.store.locations import is_remote, open_group, remote_run_id, translate_errors
 from sweep.store.manifest import put
@@ -98,10 +99,10 @@ def write_block(
             array = store.array(variable.name)
             array[region(variable, store.pipeline, block)] = values[variable.name]
         check_not_replaced(store)
-        digests = {
-            variable.name: _take_digest(store, chunk_key(store, variable, block))
-            for variable in store.variables
-        }
+        keys = {variable.name: chunk_key(store, variable, block) for variable in store.variables}
+        digests = {name: _take_digest(store, key) for name, key in keys.items()}
+        if isinstance(store.storage.below, DurableStore):
+            store.storage.below.flush(keys.values())
         text = dataclasses.replace(
             receipt, digests=digests, block=number
         ).to_json(store.format)

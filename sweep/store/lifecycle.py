@@ -26,6 +26,7 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.schema import SCHEMA
 from sweep.store.checksums import DigestingStore
+from sweep.store.durability import DurableStore, flush, flush_tree
 from sweep.store.layout import FORMAT, FORMATS, chunk_limits, planned_arrays
 from sweep.store.locations import (
     POINTER,
@@ -66,8 +67,8 @@ RUN_METADATA = {
 """What every store records of its run, and the types; a newer version may record more."""
 
 
-def open_store(url: str, mode: str = "r") -> RunStore:
-    """Open a store that :func:`create_store` made.
+def open_store(url: str, mode: str = "r", *, durable: bool = False) -> RunStore:
+    """Open a store that :func:`create_store` made; ``durable``: one that flushes what it writes.
 
     Raises
     ------
@@ -75,7 +76,7 @@ def open_store(url: str, mode: str = "r") -> RunStore:
         If there is no store, or something else, or its arrays are not those of its pipeline.
     """
     url = checked_url(url)
-    storage = open_storage(url, mode)
+    storage = open_storage(url, mode, durable=durable)
     try:
         attributes = dict(open_group(storage, mode).attrs)
     except PermissionError as error:
@@ -124,6 +125,8 @@ def store_of(
         if not is_run_id(metadata["run_id"]):
             raise ValueError(metadata["run_id"])
         storage.chunk_limits.update(chunk_limits(pipeline, extents, metadata["format"]))
+        if isinstance(storage.below, DurableStore):
+            storage.below.deferred = frozenset(storage.chunk_limits)
         return RunStore(
             url, open_group(storage, mode), pipeline, metadata["run_id"],
             Blocks(lengths, extents), metadata["format"],
@@ -147,8 +150,12 @@ def _refused_format(recorded: object) -> str:
     )
 
 
-def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunStore:
+def create_store(
+    url: str, pipeline: Pipeline, extents: tuple[int, ...], *, durable: bool = False
+) -> RunStore:
     """Create an empty store for a pipeline, its chunks equal to blocks of ``extents``.
+
+    If it is ``durable``, it is complete after a power failure if it is there.
 
     Raises
     ------
@@ -169,10 +176,14 @@ def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunS
             building = beside(url, "new")
             try:
                 _lay_out(LocalStore(building), pipeline, extents, run_id)
+                if durable:
+                    flush_tree(building)
                 building.rename(Path(url).resolve())
+                if durable:
+                    flush(building.parent)
             finally:
                 _remove_unfinished(building)
-    return open_store(url, "r+")
+    return open_store(url, "r+", durable=durable)
 
 
 def _remove_unfinished(folder: Path) -> None:

@@ -27,6 +27,7 @@ from zarr.storage import FsspecStore, LocalStore
 from sweep.errors import StoreError
 from sweep.messages import plain
 from sweep.store.checksums import DigestingStore
+from sweep.store.durability import DurableStore
 from sweep.store.manifest import put
 from sweep.store.zarr_sync import sync
 
@@ -179,11 +180,11 @@ def exists(url: str) -> bool:
     return True
 
 
-def open_storage(url: str, mode: str = "r") -> DigestingStore:
+def open_storage(url: str, mode: str = "r", *, durable: bool = False) -> DigestingStore:
     """Return the storage that holds a store's files.
 
     With ``mode`` "r+" a local store is held by its folder: writes go to that folder even if
-    another store has since taken its path.
+    another store has since taken its path. ``durable``: a local one flushes what it writes.
 
     Raises
     ------
@@ -195,15 +196,16 @@ def open_storage(url: str, mode: str = "r") -> DigestingStore:
         raise StoreError(f"{url}: store not found; create one with `sweep run`")
     if is_remote(url):
         return DigestingStore(storage_at(f"{url}/{remote_run_id(url)}", read_only=mode == "r"))
+    kind = DurableStore if durable else LocalStore
     try:
         if not stat.S_ISDIR(Path(url).stat().st_mode):
             raise StoreError(not_a_store(url))
         if mode == "r" or not Path("/proc/self/fd").is_dir():
-            return DigestingStore(LocalStore(url, read_only=mode == "r"))
+            return DigestingStore(kind(url, read_only=mode == "r"))
         folder = _HeldFolder(url)
     except OSError as error:
         raise StoreError(f"{url}: cannot be read: {reason_of(error)}") from None
-    return DigestingStore(LocalStore(f"/proc/self/fd/{folder.descriptor}"), folder)
+    return DigestingStore(kind(f"/proc/self/fd/{folder.descriptor}"), folder)
 
 
 class _HeldFolder:

@@ -14,6 +14,7 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks
 from sweep.plan.schema import Variable, variables_of
 from sweep.store.checksums import DigestingStore
+from sweep.store.durability import DurableStore
 from sweep.store.locations import is_remote
 from sweep.store.manifest import parsed
 from sweep.store.zarr_sync import sync
@@ -66,6 +67,11 @@ class RunStore:
     def source(self) -> str | Store:
         """The argument with which this process opens the store by ``xarray.open_zarr``."""
         return self.storage.below if is_remote(self.url) else self.url
+
+    @property
+    def durable(self) -> bool:
+        """Whether it flushes what it writes, so that a power failure takes nothing of it."""
+        return isinstance(self.storage.below, DurableStore)
 
     def array(self, name: str) -> zarr.Array[Any]:
         """Return an array by its path; its metadata is read once.

@@ -24,7 +24,7 @@ from sweep.measure.likelihood import (
     marker_view,
     mirrored_state,
     noise_variance,
-    projection_of,
+    plane_of,
     rotation_of,
     squares,
     state_of,
@@ -34,6 +34,7 @@ from sweep.model import coverage
 from sweep.model.declaration import parameter
 from sweep.model.derivatives import POSE, work_space
 from sweep.model.effects import IN_BOUND, NEUTRAL
+from sweep.model.projection import Projection
 from sweep.model.scene import Scenes
 from sweep.typing import Floats
 
@@ -84,20 +85,6 @@ class Bounds:
 
 
 @compiled
-def curvature_at_truth(
-    state: Floats, view: MarkerView, height: int, width: int, spread_free: bool
-) -> tuple[Floats, bool]:
-    """Return the Cramér-Rao bound's covariance (6, 6), and whether it exists."""
-    free = POSE + 1 if spread_free else POSE
-    information, gradient = np.empty((free, free)), np.empty(free)
-    curvature(
-        np.zeros((height, width)), state.copy(), view, work_space(height, width), spread_free,
-        information, gradient,
-    )
-    return pose_covariance(information, view.variance, abs(state[DEPTH]))
-
-
-@compiled
 def depth_nonlinearity(covariance: Floats, state: Floats) -> float:
     """Return κ = z (s₁² + s₂²) / (4 s_z), s₁ and s₂ those of the turns that tilt the normal.
 
@@ -114,27 +101,43 @@ def depth_nonlinearity(covariance: Floats, state: Floats) -> float:
 
 
 @compiled
-def mirror_chi_square(
+def bound_of_scene(
     state: Floats, view: MarkerView, height: int, width: int, spread_free: bool
-) -> float:
-    """Return the noise-free chi-square of the minimum that is reached from the mirrored pose.
+) -> tuple[Floats, bool, float, float]:
+    """Return the bound of one scene, from its true state.
 
-    NaN if that minimum is the pose itself, if none is reached, or if it is so high that no noise
-    leads there.
+    One function, since each that calls :func:`sweep.measure.likelihood.fit` takes a second to
+    compile.
+
+    Returns
+    -------
+    tuple
+        The Cramér-Rao bound's covariance (6, 6) and whether it exists; κ; and the noise-free
+        chi-square of the minimum that is reached from the mirrored pose, NaN if that minimum is
+        the pose itself, if none is reached, or if it is so high that no noise leads there.
     """
-    cover, image = np.zeros((height, width + 2)), np.empty((height, width))
-    levels = state[GREY_LEVELS]
-    coverage.accumulate(cover, view.edges, levels, projection_of(state, view), 0, 0, state[SPREAD])
-    coverage.sum_levels(cover, levels[0], image)
     free = POSE + 1 if spread_free else POSE
-    mirror = mirrored_state(state)
+    information, gradient = np.empty((free, free)), np.empty(free)
+    image, work = np.zeros((height, width)), work_space(height, width)
+    curvature(image, state.copy(), view, work, spread_free, information, gradient)
+    covariance, exists = pose_covariance(information, view.variance, abs(state[DEPTH]))
+    for i in range(3):
+        # Beyond half a turn rounding has made a singular problem a regular one.
+        exists = exists and not covariance[i, i] > math.pi**2
+    if not exists:
+        return covariance, False, math.nan, math.nan
+    kappa = depth_nonlinearity(covariance, state)
+    cover, levels = np.zeros((height, width + 2)), state[GREY_LEVELS]
+    truth = Projection(plane_of(state, view), view.optics)
+    coverage.accumulate(cover, view.edges, levels, truth, 0, 0, state[SPREAD])
+    coverage.sum_levels(cover, levels[0], image)
     chi_square, reached = fit(
-        image, squares(image), mirror, view, work_space(height, width), spread_free,
-        MIRROR_STEPS, SETTLED, MAX_MIRROR_DISTANCE**2, np.empty((free, free)),
+        image, squares(image), mirrored_state(state), view, work, spread_free,
+        MIRROR_STEPS, SETTLED, MAX_MIRROR_DISTANCE**2, information,
     )
     if not reached or chi_square < 1e-2:
-        return math.nan
-    return chi_square
+        chi_square = math.nan
+    return covariance, True, kappa, chi_square
 
 
 def bounds(
@@ -179,12 +182,12 @@ def bounds(
         width, height = (high[i] - low[i]).tolist()
         if unknown_blur:
             state[SPREAD] = max(state[SPREAD], MIN_SPREAD_PX)
-        covariance, exists = curvature_at_truth(state, view, height, width, unknown_blur)
-        # Beyond half a turn rounding has made a singular problem a regular one.
-        if not exists or np.diag(covariance)[:3].max() > math.pi**2:
+        covariance, exists, kappa[i], mirror_chi_square = bound_of_scene(
+            state, view, height, width, unknown_blur
+        )
+        if not exists:
             status[i] = BoundStatus.no_contrast
             continue
         std[i] = np.sqrt(np.diag(covariance))
-        kappa[i] = depth_nonlinearity(covariance, state)
-        mirror[i] = math.sqrt(mirror_chi_square(state, view, height, width, unknown_blur))
+        mirror[i] = math.sqrt(mirror_chi_square)
     return Bounds(status, std, kappa, mirror)

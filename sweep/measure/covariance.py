@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,7 +56,9 @@ def _corner_covariance(
                         information[i, j] += rates[axis, i] * rates[axis, j] * unit
         of_pose, exists = pose_covariance(information, noise_px**2, distance)
         if exists:
-            covariance[n] = of_pose
+            for i in range(POSE):
+                for j in range(POSE):
+                    covariance[n, i, j] = of_pose[i, j]
     return covariance
 
 
@@ -80,9 +84,16 @@ def squared_deviations(
 def _squared_deviations(error: Floats, covariance: Floats) -> Floats:
     """As :func:`squared_deviations`, for errors (N, 6)."""
     deviations = np.full(len(error), np.nan)
+    solved = np.empty((POSE, 1))
     for n in range(len(error)):
-        if np.isfinite(error[n]).all() and np.isfinite(covariance[n]).all():
-            solved = error[n].copy().reshape(POSE, 1)
-            if solve_positive(covariance[n], solved):
-                deviations[n] = np.sum(error[n] * solved[:, 0])
+        finite = True
+        for i in range(POSE):
+            solved[i, 0] = error[n, i]
+            finite = finite and math.isfinite(error[n, i])
+            for j in range(POSE):
+                finite = finite and math.isfinite(covariance[n, i, j])
+        if finite and solve_positive(covariance[n], solved):
+            deviations[n] = 0.0
+            for i in range(POSE):
+                deviations[n] += error[n, i] * solved[i, 0]
     return deviations

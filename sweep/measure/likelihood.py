@@ -116,8 +116,8 @@ def rotation_of(state: Floats) -> Floats:
 
 
 @compiled
-def projection_of(state: Floats, view: MarkerView) -> Projection:
-    """Return the projection at a state; its plane as :class:`sweep.model.scene.Scenes` has it."""
+def plane_of(state: Floats, view: MarkerView) -> Floats:
+    """Return the marker's plane (3, 3) at a state, as :class:`sweep.model.scene.Scenes` has it."""
     module, half = view.size_m / view.modules, 0.5 * view.size_m
     rotation, position = rotation_of(state), state[POSITION]
     plane = np.empty((3, 3))
@@ -125,13 +125,13 @@ def projection_of(state: Floats, view: MarkerView) -> Projection:
         right, up = rotation[i, 0], rotation[i, 1]
         plane[i, 0], plane[i, 1] = right * module, -up * module
         plane[i, 2] = position[i] - (right - up) * half
-    return Projection(plane, view.optics)
+    return plane
 
 
 @compiled
 def is_before_camera(state: Floats, view: MarkerView) -> bool:
     """Return whether the marker faces the camera with its whole outline in front of it."""
-    plane = projection_of(state, view).plane
+    plane = plane_of(state, view)
     rotation, position = rotation_of(state), state[POSITION]
     facing = 0.0
     for i in range(3):
@@ -161,7 +161,8 @@ def curvature(
     matrix, vector = np.empty((free + LEVELS, free + LEVELS)), np.empty(free + LEVELS)
     grey_levels = state[GREY_LEVELS]
     count = differentiate(
-        work, view.edges, grey_levels, projection_of(state, view), state[POSITION], state[SPREAD]
+        work, view.edges, grey_levels, Projection(plane_of(state, view), view.optics),
+        state[POSITION], state[SPREAD],
     )
     distance = abs(state[DEPTH])
     for slot in range(count):
@@ -213,7 +214,10 @@ def moved_state(state: Floats, step: Floats, most: float) -> Floats:
     moved = state.copy()
     before, position = rotation_of(state), state[POSITION]
     after, moved_position = rotation_of(moved), moved[POSITION]
-    rotation = rotations(shrink * step[:3].copy().reshape(1, 3))[0]
+    turned_by = np.empty((1, 3))
+    for k in range(3):
+        turned_by[0, k] = shrink * step[k]
+    rotation = rotations(turned_by)[0]
     for i in range(3):
         for j in range(3):
             after[i, j] = 0.0
@@ -227,6 +231,16 @@ def moved_state(state: Floats, step: Floats, most: float) -> Floats:
         wanted = max(wanted, 0.25 * squared)
         moved[SPREAD] = math.sqrt(wanted) if wanted >= MIN_SPREAD_PX**2 else 0.0
     return moved
+
+
+@compiled
+def overwrite(values: Floats, others: Floats) -> None:
+    """Replace values (n,) by others (n,).
+
+    A loop: assigning a slice makes Numba compile the text of an error, which takes seconds.
+    """
+    for k in range(len(values)):
+        values[k] = others[k]
 
 
 @compiled
@@ -253,8 +267,7 @@ def fit(
     above = 0
     decrement = math.inf
     for _ in range(most_steps):
-        newton = np.empty((free, 1))
-        newton[:, 0] = gradient
+        newton = gradient.copy().reshape(free, 1)
         regular = solve_positive(information, newton)
         decrement = math.inf
         if regular:
@@ -265,14 +278,12 @@ def fit(
             if above > PATIENCE:
                 return chi_square, False
             if decrement < settled * view.variance:
-                last = moved_state(state, newton[:, 0], 1.0)
-                state[:] = last
+                overwrite(state, moved_state(state, newton[:, 0], 1.0))
                 return chi_square, True
         accepted = False
         for _attempt in range(10):
             damped = information.copy()
-            step = np.empty((free, 1))
-            step[:, 0] = gradient
+            step = gradient.copy().reshape(free, 1)
             for k in range(free):
                 damped[k, k] += damping * information[k, k] + 1e-300
             if not solve_positive(damped, step):
@@ -291,9 +302,10 @@ def fit(
         if not accepted:
             break
         chi_square = trial_chi_square
-        state[:] = trial
-        information[:] = trial_information
-        gradient[:] = trial_gradient
+        overwrite(state, trial)
+        overwrite(gradient, trial_gradient)
+        for k in range(free):
+            overwrite(information[k], trial_information[k])
         damping *= 0.1
     return chi_square, decrement < NEARLY_SETTLED * view.variance
 

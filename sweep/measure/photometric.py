@@ -35,6 +35,7 @@ from sweep.measure.likelihood import (
     marker_view,
     mirrored_state,
     noise_variance,
+    overwrite,
     rotation_of,
     squares,
     state_of,
@@ -64,29 +65,26 @@ explain the pixels."""
 
 
 @compiled
-def coarse_fit(
-    coarse: Floats, total: float, state: Floats, view: MarkerView, work: Work, spread_free: bool,
-    worth: float,
-) -> float:
-    """Fit a state to the means of 2 x 2 pixels, whose point spread is half as wide."""
-    free = POSE + 1 if spread_free else POSE
-    state[SPREAD] *= 0.5
-    chi_square, _ = fit(
-        coarse, total, state, view, work, spread_free, COARSE_STEPS, NEARLY_SETTLED, worth,
-        np.empty((free, free)),
-    )
-    state[SPREAD] *= 2.0
-    return chi_square
+def least(values: Floats) -> float:
+    """Return the least of some values; NaN if one is NaN."""
+    lowest = values[0]
+    for value in values:
+        if not value >= lowest:
+            lowest = value
+        if math.isnan(lowest):
+            break
+    return float(lowest)
 
 
 @compiled
 def is_settled(chi_square: Floats, states: Floats, k: int) -> bool:
     """Return whether the k-th coarse fit is hopeless, or the same as an earlier one."""
-    if not chi_square[k] < chi_square.min() + HOPELESS:
+    most = least(chi_square) + HOPELESS
+    if not chi_square[k] < most:
         return True
     for m in range(k):
         same = turn_between(states[k], states[m]) < SAME_TURN_RAD
-        if same and chi_square[m] < chi_square.min() + HOPELESS:
+        if same and chi_square[m] < most:
             return True
     return False
 
@@ -116,25 +114,33 @@ def locate(
         The state (16,), its chi-square, whether it is a maximum of the likelihood, and state and
         chi-square of the next best minimum; NaN if there is none.
     """
-    count = len(starts)
+    count, free = len(starts), len(information)
     coarse, coarse_view = binned(image), binned_view(view)
     coarse_work = work_space(coarse.shape[0], coarse.shape[1])
     coarse_total = squares(coarse)
     states = starts.copy()
+    trial_information = np.empty((free, free))
+
+    def coarse_fit(state: Floats, worth: float) -> float:
+        """Fit a state to the means of 2 x 2 pixels, whose point spread is half as wide."""
+        state[SPREAD] *= 0.5
+        level, _ = fit(
+            coarse, coarse_total, state, coarse_view, coarse_work, spread_free, COARSE_STEPS,
+            NEARLY_SETTLED, worth, trial_information,
+        )
+        state[SPREAD] *= 2.0
+        return level
+
     chi_square = np.full(count, math.inf)
     for k in range(count):
         if is_before_camera(states[k], view):
-            chi_square[k] = coarse_fit(
-                coarse, coarse_total, states[k], coarse_view, coarse_work, spread_free,
-                chi_square.min() + HOPELESS,
-            )
+            chi_square[k] = coarse_fit(states[k], least(chi_square) + HOPELESS)
     work = work_space(image.shape[0], image.shape[1])
     total = squares(image)
-    trial_information = np.empty_like(information)
     best, other = np.full(STATE_LENGTH, math.nan), np.full(STATE_LENGTH, math.nan)
     lowest = next_lowest = math.inf
     reached = False
-    freedom = image.size - len(information) - LEVELS
+    freedom = image.size - free - LEVELS
     likely = freedom + EXCESS * math.sqrt(2.0 * freedom)
     for k in range(2 * count + 1):
         worth = lowest + HOPELESS
@@ -150,11 +156,8 @@ def locate(
             away = turn_between(state, best)
             if turn_between(state, other) < 0.5 * away:
                 continue
-            tried, most = state.copy(), chi_square.min() + HOPELESS
-            level = coarse_fit(
-                coarse, coarse_total, tried, coarse_view, coarse_work, spread_free, most
-            )
-            if not level < most:
+            tried, most = state.copy(), least(chi_square) + HOPELESS
+            if not coarse_fit(tried, most) < most:
                 continue
             if turn_between(tried, best) > 0.5 * away:
                 state = tried
@@ -172,11 +175,15 @@ def locate(
         same = turn_between(state, best) < SAME_TURN_RAD
         if level < lowest:
             if not same:
-                other[:], next_lowest = best, lowest
-            best[:], lowest, reached = state, level, converged
-            information[:] = trial_information
+                overwrite(other, best)
+                next_lowest = lowest
+            overwrite(best, state)
+            lowest, reached = level, converged
+            for m in range(free):
+                overwrite(information[m], trial_information[m])
         elif not same and level < next_lowest:
-            other[:], next_lowest = state, level
+            overwrite(other, state)
+            next_lowest = level
     return best, lowest, reached, other, next_lowest
 
 

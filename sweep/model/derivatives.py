@@ -40,9 +40,6 @@ POSE = 6
 LEVELS = 3
 """Unknown grey levels: outside, black, white."""
 
-JUST_BLACK = np.array([0.0, 1.0, 0.0])
-JUST_WHITE = np.array([0.0, 0.0, 1.0])
-
 
 class Work(NamedTuple):
     """Scratch space of one image size; ``shares`` is 0 and ``slot`` is -1 between calls.
@@ -236,8 +233,11 @@ def differentiate(
     translation
         (3,) position of the marker's centre, about which ω turns it.
     """
-    accumulate(work.shares[0], edges, JUST_BLACK, projection, 0, 0, sigma)
-    accumulate(work.shares[1], edges, JUST_WHITE, projection, 0, 0, sigma)
+    for area in range(2):
+        # Black is 1 and all else 0, then white.
+        area_levels = np.zeros(LEVELS)
+        area_levels[1 + area] = 1.0
+        accumulate(work.shares[area], edges, area_levels, projection, 0, 0, sigma)
     plane, optics = projection.plane, projection.optics
     ends, sides = edges.ends, edges.sides
     height, width = work.slot.shape

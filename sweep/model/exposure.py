@@ -67,6 +67,16 @@ def marker_exposure(scenes: Scenes, row: int, box: Box, levels: Floats) -> Float
     )
     motion = scenes.motion(row)
     spread, varies = _spreads(scenes, row, box)
+    even = not varies and math.isnan(effect["aperture_mm"])
+    if motion is None and even and not scenes.cameras.distorted[row]:
+        # The same blur everywhere: without the functions of moving markers, and compiling them.
+        image = np.empty((box[3] - box[1], box[2] - box[0]))
+        cover = np.zeros((image.shape[0], image.shape[1] + 2))
+        coverage.accumulate(
+            cover, outlines, levels, scenes.projection(row), box[0], box[1], spread[0]
+        )
+        coverage.sum_levels(cover, levels[0], image)
+        return image
     path = path_px(scenes, row, box)
     shape = (len(spread), box[3] - box[1], box[2] - box[0])
     images = np.empty(shape)

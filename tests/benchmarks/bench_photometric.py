@@ -12,7 +12,7 @@ import numpy as np
 from sweep.evaluation.estimation import detections_for
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search, whole_frames
-from sweep.measure.bound import curvature_at_truth
+from sweep.measure.bound import bound_of_scene
 from sweep.measure.flags import DetectionStatus
 from sweep.measure.likelihood import BACKGROUND_MARGIN_PX, marker_view, noise_variance, state_of
 from sweep.measure.photometric import Photometric
@@ -72,7 +72,7 @@ def measured(side, tilt):
     rows = np.flatnonzero(found[0].flags == DetectionStatus.detected)
     seen = detections_for(estimators(pipeline)[0], values, scenes, found[0], rows)
     return (
-        best_ms(lambda: curvature_at_truth(state, view, height, width, False), 1, 50),
+        best_ms(lambda: bound_of_scene(state, view, height, width, False), 1, 50),
         *(best_ms(lambda k=k: Photometric(k, spread_free=False)(seen), len(rows))
           for k in (False, True)),
     )

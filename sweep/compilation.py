@@ -249,10 +249,13 @@ def compiled_inline(function: Function) -> Function:
 
 def _compiled(function: Function, forceinline: bool) -> Function:
     """Return a compiled function, cached in this package's folder."""
-    dispatcher: Any = numba.njit(
+    njit: Any = numba.njit
+    dispatcher: Any = njit(
         nogil=True, error_model="numpy", forceinline=forceinline, no_cfunc_wrapper=True
     )(function)
-    if hasattr(dispatcher, "enable_caching") and cache_folder() is not None:
+    if not hasattr(dispatcher, "enable_caching"):
+        return cast("Function", dispatcher)  # compilation is switched off
+    if cache_folder() is not None:
         # What `cache=True` does, with a folder of the package's own.
         dispatcher._cache = _Cache(function)  # noqa: SLF001
     compile_signature = dispatcher.compile

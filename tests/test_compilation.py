@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import errno
+import gc
 import os
 import pickle
 import random
@@ -15,6 +16,7 @@ from hashlib import sha256
 from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
 
 from sweep import compilation
@@ -212,9 +214,51 @@ def test_what_compiled_code_uses_is_declared_in_the_sources_of_the_digest():
         ]
         for function in functions:
             # Annotations are never evaluated; only what the body uses is compiled.
+            for node in [part for statement in function.body for part in ast.walk(statement)]:
+                if isinstance(node, ast.arg):
+                    node.annotation = None
+                elif isinstance(node, ast.FunctionDef):
+                    node.returns = None
             used = {
                 node.id for statement in function.body for node in ast.walk(statement)
                 if isinstance(node, ast.Name)
             } - {argument.arg for argument in function.args.args}
             for origin in {imported[each] for each in used & imported.keys()}:
                 assert origin in modules, f"{name}.{function.name} uses {origin}"
+
+
+@compilation.compiled
+def _added(values, step):
+    return values[0] + step
+
+
+@compilation.compiled
+def _added_thrice(values, step):
+    return _added(values, 1) + _added(values, 2) + _added(values, step)
+
+
+def test_constants_of_callers_make_no_functions_of_their_own():
+    enabled = gc.isenabled()
+    assert _added_thrice(np.array([3.0]), 4) == 16.0
+    assert len(_added.signatures) == 1  # each constant made one before: `fit` was compiled thrice
+    assert gc.isenabled() == enabled
+
+
+def test_compiled_functions_assign_no_arrays_to_slices():
+    """That makes Numba compile the text of an error: 3 s in one function, and more in callers."""
+    for path in compilation.compiled_sources()[:-1]:
+        for function in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(function, ast.FunctionDef) or not any(
+                isinstance(mark, ast.Name) and mark.id.startswith("compiled")
+                for mark in function.decorator_list
+            ):
+                continue
+            for node in ast.walk(function):
+                if not isinstance(node, ast.Assign):
+                    continue
+                number = isinstance(node.value, (ast.Constant, ast.Call))
+                for target in [] if number else node.targets:
+                    sliced = isinstance(target, ast.Subscript) and any(
+                        isinstance(part, ast.Slice) for part in ast.walk(target.slice)
+                    )
+                    assert not sliced, f"{path.name}:{node.lineno}"

@@ -59,7 +59,7 @@ def _execute(options: argparse.Namespace) -> int:
         "poses": f"{expected.poses:,}",
         "results": f"{expected.results:,}",
         "blocks": f"{expected.blocks:,} of {' x '.join(map(str, expected.block)) or '1'} poses",
-        "store": f"{byte_count(expected.bytes)} before compression",
+        "store": f"{byte_count(expected.bytes)} before compression, in {expected.files:,} files",
         "memory": f"{byte_count(expected.worker_bytes)} a worker",
         "cost": f"{over}{1e3 * expected.pose_s:.3g} ms a pose ({expected.sampled} sampled{ended})",
         "time": f"{over}{duration(expected.seconds)} with {expected.workers} workers",

@@ -14,11 +14,15 @@ from sweep.errors import MachineFaultError
 from sweep.evaluation.cells import run_cells
 from sweep.execution.limits import (
     BLOCK_S,
+    BLOCKS_PER_S,
     BLOCKS_PER_WORKER,
     CALIBRATION_LIMIT_S,
     MAX_BLOCK_BYTES,
     MAX_BLOCK_SCENES,
+    MAX_BLOCK_SHARE,
+    MAX_BLOCKS,
     MIN_BLOCK_S,
+    TIME_LIMIT_S,
 )
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.isolation.watchdog import compilation_s
@@ -232,8 +236,20 @@ def sample(
     return [generator.integers(0, len(axis), count).astype(np.intp) for axis in axes]
 
 
+def block_work_s(total_s: float, workers: int, time_limit_s: float) -> float:
+    """Return the seconds of work in a block of a run that takes ``total_s`` of one worker.
+
+    About 2; more for large clusters and for long runs; less if there is little to do.
+    """
+    wanted = max(BLOCK_S, workers / BLOCKS_PER_S, total_s / MAX_BLOCKS)
+    longest = max(BLOCK_S, MAX_BLOCK_SHARE * time_limit_s)
+    share = max(MIN_BLOCK_S, total_s / (workers * BLOCKS_PER_WORKER))
+    return min(wanted, longest, share)
+
+
 def block_extents(
-    pipeline: Pipeline, calibration: Calibration, workers: int, block_s: float | None = None
+    pipeline: Pipeline, calibration: Calibration, workers: int, block_s: float | None = None,
+    time_limit_s: float = TIME_LIMIT_S,
 ) -> tuple[int, ...]:
     """Return the scenes of a block along each scene axis.
 
@@ -247,13 +263,14 @@ def block_extents(
     workers
         Threads that share the work.
     block_s
-        Seconds of work in a block (default: about 2, less if there is little to do).
+        Seconds of work in a block (default: :func:`block_work_s`).
+    time_limit_s
+        Block timeout in seconds.
     """
     axes = scene_axes(pipeline)
-    total = pipeline.size(Stage.scene)
     if block_s is None:
-        share = total * calibration.scene_s / (workers * BLOCKS_PER_WORKER)
-        block_s = min(BLOCK_S, max(MIN_BLOCK_S, share))
+        total_s = pipeline.size(Stage.scene) * calibration.scene_s
+        block_s = block_work_s(total_s, workers, time_limit_s)
     target = int(block_s / calibration.scene_s)
     target = min(target, MAX_BLOCK_SCENES, MAX_BLOCK_BYTES // bytes_per_block(pipeline, 1))
     target = max(target, 1)

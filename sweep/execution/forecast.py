@@ -28,7 +28,7 @@ from sweep.model.effects import SWITCHES
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.parameters import Stage
-from sweep.plan.schema import bytes_per_block
+from sweep.plan.schema import SCHEMA, bytes_per_block
 
 EFFECT_SCENES = 24
 """Most scenes on which an effect is measured."""
@@ -38,6 +38,9 @@ EFFECT_S = 0.6
 
 MIN_PAIRS = 3
 """Pairs of measurements of an effect, of which the median is taken."""
+
+FILES_PER_BLOCK = len(SCHEMA) + 1
+"""A chunk of each variable, and the receipt."""
 
 START_S = 3.0
 """Seconds of a run apart from its blocks: processes start and end, packages are imported."""
@@ -51,8 +54,8 @@ class Forecast:
     ----------
     poses, results
         Cells of the scene axes; estimates, which are poses times configurations.
-    block, blocks
-        Scenes of a block along each scene axis; number of blocks.
+    block, blocks, files
+        Scenes of a block along each scene axis; number of blocks, and of the files that they make.
     bytes, worker_bytes
         Size of the store before compression; memory of a worker.
     pose_s, sampled
@@ -67,6 +70,7 @@ class Forecast:
     results: int
     block: tuple[int, ...]
     blocks: int
+    files: int
     bytes: int
     worker_bytes: int
     pose_s: float
@@ -184,6 +188,7 @@ def forecast(
         results=pipeline.size(*Stage),
         block=extents,
         blocks=len(blocks),
+        files=len(blocks) * FILES_PER_BLOCK,
         bytes=bytes_per_block(pipeline, poses),
         worker_bytes=process + 3 * bytes_per_block(pipeline, math.prod(extents)),
         pose_s=calibration.scene_s,

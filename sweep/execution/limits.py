@@ -84,9 +84,20 @@ STATES_INTERVAL_S = 10.0
 # The size of blocks (`sweep.execution.calibration`)
 
 BLOCK_S = 2.0
-"""Work in a block: a task costs the scheduler about 1.6 ms, a lost block costs its work."""
+"""Work in a block of most runs: a lost block costs its work."""
 
 MIN_BLOCK_S = 0.1
+
+BLOCKS_PER_S = 75
+"""Blocks that all workers together finish in a second: a scheduler does about 180 of them, so that
+larger clusters get larger blocks."""
+
+MAX_BLOCKS = 100_000
+"""Blocks of a run, of about 25 files each: longer runs get larger blocks."""
+
+MAX_BLOCK_SHARE = 1 / 10
+"""Share of a block's time limit that its work is to take, whatever the cluster and the run: scenes
+may cost more than was measured, and a killed worker loses that much. It bounds the rest."""
 
 BLOCKS_PER_WORKER = 6
 """With little work, blocks are cut smaller so that every worker has some until the end."""

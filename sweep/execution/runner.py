@@ -100,7 +100,8 @@ def execute(
     durable
         Flush each block to the disk before it counts as committed.
     block_s
-        Seconds of work in a block (default: about 2, less if there is little to do).
+        Seconds of work in a block (default: about 2; more on large clusters and in long runs,
+        less if there is little to do).
     time_limit_s
         Block timeout in seconds; the search for a scene that never returns keeps within it.
     progress
@@ -160,7 +161,8 @@ def execute(
             if calibration is None:
                 raise AssertionError(url)
             unfinished = _new_store(
-                url, pipeline, calibration, connection, block_s, overwrite, durable=durable
+                url, pipeline, calibration, connection, block_s, time_limit_s, overwrite,
+                durable=durable,
             )
         if durable:
             unfinished = open_store(url, "r+", durable=True)
@@ -274,7 +276,7 @@ def _block_s(store: RunStore) -> float:
 
 def _new_store(
     url: str, pipeline: Pipeline, calibration: Calibration, client: Client | None,
-    block_s: float | None, overwrite: bool, *, durable: bool = False,
+    block_s: float | None, time_limit_s: float, overwrite: bool, *, durable: bool = False,
 ) -> RunStore:
     """Create an empty store whose blocks suit the calibration and the cluster, if there is one."""
     threads = 1
@@ -282,7 +284,7 @@ def _new_store(
         from sweep.execution.cluster import thread_count  # noqa: PLC0415  (slow to import)
 
         threads = max(thread_count(client), 1)
-    extents = block_extents(pipeline, calibration, threads, block_s)
+    extents = block_extents(pipeline, calibration, threads, block_s, time_limit_s)
     if overwrite and exists(url):
         remove_store(url)
     return create_store(url, pipeline, extents, durable=durable)

@@ -43,7 +43,7 @@ from sweep.measure.likelihood import (
 )
 from sweep.measure.positive_definite import pose_covariance
 from sweep.measure.solver import both_planar_solutions, reprojection_errors_px
-from sweep.model.derivatives import LEVELS, POSE, Work, work_space
+from sweep.model.derivatives import LEVELS, POSE, work_space
 from sweep.model.marker import module_count
 from sweep.typing import Floats
 

@@ -12,15 +12,17 @@ from sweep.execution import forecast as forecast_module
 from sweep.execution.calibration import (
     MIN_LIMIT_S,
     BatchCost,
+    Calibration,
     block_extents,
     calibrate,
     calibrate_in,
     calibrate_isolated,
 )
 from sweep.execution.forecast import forecast
-from sweep.execution.limits import BLOCK_S
+from sweep.execution.limits import BLOCK_S, BLOCKS_PER_S, MAX_BLOCKS
 from sweep.isolation.child_process import Child
 from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import Blocks
 
 HUGE = """
 [camera]
@@ -113,3 +115,28 @@ def test_plan_measures_each_effect_within_its_share():
     assert expected.worker_bytes > 50e6
     assert 0 < expected.pose_s < 1
     assert all(0 <= cost < expected.pose_s for cost in costs.values())
+
+
+@pytest.mark.parametrize(
+    ("poses", "scene_s", "workers", "block_s"),
+    [
+        (10**4, 1e-3, 2, 0.83),  # six blocks a worker
+        (10**6, 1e-3, 8, 2.0),
+        (10**8, 1e-3, 1000, 13.3),  # 75 blocks a second; 500 with blocks of 2 s
+        (10**9, 1e-3, 64, 10.0),  # 100,000 blocks; 500,000 with blocks of 2 s
+        (10**9, 1e-3, 1000, 13.3),
+        (10**9, 0.05, 1000, 60.0),  # a tenth of the time limit
+    ],
+)
+def test_blocks_grow_with_the_cluster_and_with_the_run(poses, scene_s, workers, block_s):
+    pipeline = Pipeline.from_text(
+        f"[pose]\njitter_px = 0.5\n[axes]\nside_px = [20, 40]\ntrial = {poses // 2}"
+    )
+    extents = block_extents(pipeline, Calibration(scene_s, 0.0, 1, (0.0, 0.0)), workers)
+    assert math.prod(extents) * scene_s == pytest.approx(block_s, rel=0.15)
+    blocks = len(Blocks((2, poses // 2), extents))
+    assert blocks <= 1.1 * max(BLOCKS_PER_S * poses * scene_s / workers, 6 * workers)
+    assert blocks <= 1.1 * MAX_BLOCKS or block_s == 60.0
+    limited = block_extents(
+        pipeline, Calibration(scene_s, 0.0, 1, (0.0, 0.0)), workers, None, 30.0)
+    assert math.prod(limited) * scene_s == pytest.approx(min(block_s, 3.0), rel=0.15)

@@ -27,7 +27,7 @@ from sweep.evaluation.cells import run_cells
 from sweep.evaluation.search import visibility_flags
 from sweep.measure.bound import BACKGROUND_MARGIN_PX, MAX_MIRROR_DISTANCE, bounds
 from sweep.measure.flags import BoundStatus, DetectionStatus
-from sweep.measure.likelihood import projection_of, state_of
+from sweep.measure.likelihood import plane_of, state_of
 from sweep.model.coverage import MarkerEdges, accumulate, sum_levels
 from sweep.model.effects import Effects
 from sweep.model.extent import marker_boxes
@@ -758,7 +758,7 @@ def test_plane_of_a_state_is_what_places_the_marker():
         size, n = value["size_m"], len(modules_of(value)) - 2
         view = SimpleNamespace(size_m=size, modules=float(n), optics=None)
         corners = np.array([[0, 0], [n, 0], [n, n], [0, n]], dtype=float)
-        plane = projection_of.py_func(state, view).plane
+        plane = plane_of.py_func(state, view)
         flat = np.column_stack([corners, np.ones(4)]) @ plane.T
         signs = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
         expected = (size / 2 * signs) @ drawing.rotation.T + drawing.translation

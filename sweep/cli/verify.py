@@ -17,7 +17,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--sample", type=int, default=20, metavar="N",
-        help="number of scenes to recompute and compare (default: 20)",
+        help="number of scenes to recompute and compare, beside all that failed (default: 20); "
+        "0 recomputes nothing",
     )
     add_workers(parser)
     add_json(parser)
@@ -49,6 +50,8 @@ def _execute(options: argparse.Namespace) -> int:
     again = f"{report.sampled} scenes recomputed" if report.sampled else (
         f"no scene recomputed ({report.not_sampled})"
     )
+    if report.retried:
+        again += f", {report.retried:,} that had failed"
     state = "" if report.finished else ", unfinished"
     say(
         f"{report.store}: {'damaged' if report.damage else 'sound'}{state}: "

@@ -16,10 +16,19 @@ import signal
 from collections.abc import Iterator
 from typing import Any, Protocol, runtime_checkable
 
-import dask
-from distributed import Client, LocalCluster, fire_and_forget
-
 from sweep.errors import ArgumentError, RunError
+
+try:
+    import dask
+    from distributed import Client, LocalCluster, fire_and_forget
+except (ValueError, TypeError, KeyError, AttributeError) as error:
+    # Dask interprets its configuration while it is imported.
+    raise RunError(
+        "Dask cannot be imported with its configuration (~/.config/dask, /etc/dask, DASK_... "
+        f"variables): {type(error).__name__}: {error}"
+    ) from None
+
+from sweep.evaluation.machine_faults import exception_line
 from sweep.execution.distributed_internals import thread_counts
 from sweep.execution.limits import ANSWER_S, NO_WORKERS_TIMEOUT_S, THREAD_COUNT_TIMEOUT_S
 from sweep.execution.scheduler_connection import connect_to_scheduler
@@ -113,17 +122,27 @@ def embedded(workers: int) -> Iterator[Client]:
     """
     with silenced_dask_loggers(), dask.config.set(own_dask_config()):
         with _ignored_interrupts():
-            cluster = LocalCluster(
-                n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1",
-                dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL,
-                memory_limit=0, scheduler_kwargs={"dashboard": False},
-            )
+            cluster = _started(workers)
         with cluster, Client(cluster, set_as_default=False) as client:
             # The workers import their packages while the caller measures.
             fire_and_forget(
                 [client.submit(_warm, workers=[worker], pure=False) for worker in client.nthreads()]
             )
             yield client
+
+
+def _started(workers: int) -> LocalCluster:
+    try:
+        return LocalCluster(
+            n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1",
+            dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL,
+            memory_limit=0, scheduler_kwargs={"dashboard": False},
+        )
+    except (RuntimeError, OSError) as error:
+        cause = error.__cause__ or error
+        raise RunError(
+            f"{workers} worker processes cannot be started: {exception_line(cause)}"
+        ) from None
 
 
 def own_dask_config() -> dict[str, Any]:

@@ -38,8 +38,8 @@ class CheckedBlock:
         Keys of its receipt and its chunks.
     bytes
         Their size.
-    processor
-        Features of the processor that computed it; empty if the receipt is damaged.
+    receipt
+        Its receipt; None if that is damaged.
     damage
         What is damaged.
     """
@@ -47,7 +47,7 @@ class CheckedBlock:
     number: int
     keys: Sequence[str]
     bytes: int
-    processor: str
+    receipt: Receipt | None
     damage: Sequence[Damage]
 
 
@@ -97,7 +97,7 @@ class BlockCheck:
                 damage.append(BlockDamage(number, str(block), fault))
         return CheckedBlock(
             number, keys, sum(len(content) for content in contents.values() if content is not None),
-            receipt.processor if receipt is not None else "", damage,
+            receipt, damage,
         )
 
     def _receipt(self, number: int) -> Receipt | None:

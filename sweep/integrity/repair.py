@@ -81,6 +81,7 @@ def repair(
             close(store)
     after = Verification(url, "r").report(0)
     after.sampled, after.not_sampled = before.sampled, before.not_sampled
+    after.retried = before.retried
     after.damage += [each for each in before.damage if isinstance(each, SampleDamage)]
     remaining = {damage.where for damage in after.damage}
     after.repaired = [damage for damage in before.damage if damage.where not in remaining]

@@ -12,6 +12,7 @@ from zarr.buffer import cpu, default_buffer_prototype
 from sweep.errors import ArgumentError, StoreError
 from sweep.integrity.block_check import BlockCheck
 from sweep.integrity.damage import Damage, FileDamage, as_json
+from sweep.integrity.failure_check import FailureCheck, is_doubtful
 from sweep.integrity.file_check import FileCheck
 from sweep.integrity.sample_check import SampleCheck
 from sweep.store.blocks import BEGUN, committed
@@ -45,6 +46,8 @@ class IntegrityReport:
         Scenes that were recomputed.
     not_sampled
         Why none was, if none was.
+    retried
+        Scenes flagged ``failed``, or ended by a signal from outside, that were recomputed.
     damage
         What is damaged; empty for a sound store.
     repaired
@@ -61,6 +64,7 @@ class IntegrityReport:
     bytes: int = 0
     sampled: int = 0
     not_sampled: str = ""
+    retried: int = 0
     damage: list[Damage] = field(default_factory=list)
     repaired: list[Damage] = field(default_factory=list)
     left_over: list[str] = field(default_factory=list)
@@ -71,6 +75,7 @@ class IntegrityReport:
             "store": self.store, "finished": self.finished, "blocks": self.blocks,
             "blocks_done": self.blocks_done, "files": self.files, "bytes": self.bytes,
             "sampled": self.sampled, "not_sampled": self.not_sampled,
+            "retried": self.retried,
             "damage": [as_json(damage) for damage in self.damage],
             "repaired": [as_json(damage) for damage in self.repaired],
             "left_over": self.left_over,
@@ -79,6 +84,9 @@ class IntegrityReport:
 
 def verify(url: str, sample: int = SAMPLE) -> IntegrityReport:
     """Check every file against its digest and flags against numbers, and recompute a sample.
+
+    All scenes that are flagged ``failed`` are recomputed, too, unless the sample is 0: those that
+    succeed now are damage of their block.
 
     Parameters
     ----------
@@ -150,7 +158,10 @@ class Verification:
         return self.manifest.attributes
 
     def report(self, sample: int) -> IntegrityReport:
-        """Check the store, and recompute up to ``sample`` scenes."""
+        """Check the store, and recompute up to ``sample`` scenes and all that failed.
+
+        With a sample of 0, nothing is recomputed.
+        """
         store = self.store
         done = committed(store)
         left = sync(self._listed())
@@ -163,18 +174,23 @@ class Verification:
         if not files.grid_fits:
             numbers = []  # the blocks of the pipeline's grid are not those of the arrays
         sound: dict[int, str] = {}
+        doubtful = []
         for block in BlockCheck(store).run(numbers):
             left.difference_update(block.keys)
             size += block.bytes
             self._damage += block.damage
-            if not block.damage:
-                sound[block.number] = block.processor
+            if not block.damage and block.receipt is not None:
+                sound[block.number] = block.receipt.processor
+                if is_doubtful(block.receipt):
+                    doubtful.append(block.number)
         sampled = SampleCheck(store).run(sample, sound)
         self._damage += sampled.damage
+        retried = FailureCheck(store).run(doubtful if sample else [])
+        self._damage += retried.damage
         held = holder(self.storage) is not None
         return IntegrityReport(
             store.url, store.finished, len(store.blocks), len(done), listed - len(left), size,
-            sampled.count, sampled.reason, self._damage,
+            sampled.count, sampled.reason, retried.count, self._damage,
             left_over=[] if held else sorted(
                 key for key in left if not self._of_unfinished_block(key, done)
             ),

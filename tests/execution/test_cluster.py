@@ -52,6 +52,18 @@ def test_embedded_cluster_listens_on_loopback_only_and_needs_no_certain_port(cap
     assert told.out == told.err == ""
 
 
+def test_cluster_that_cannot_start_is_told_in_a_line(monkeypatch):
+    def refuse(**_):
+        raise RuntimeError("Cluster failed to start") from OSError(24, "Too many open files")
+
+    monkeypatch.setattr(clusters, "LocalCluster", refuse)
+    with pytest.raises(RunError) as raised, embedded(3):
+        pass
+    assert str(raised.value) == (
+        "3 worker processes cannot be started: OSError: [Errno 24] Too many open files"
+    )
+
+
 @contextlib.contextmanager
 def local_cluster(workers=1, **options):
     with LocalCluster(

@@ -1,5 +1,6 @@
 """Verify and repair: every damage is named, exactly it is mended, and a sound store is sound."""
 
+import dataclasses
 import json
 import os
 import random
@@ -22,11 +23,13 @@ from sweep.cli import main
 from sweep.errors import StoreError
 from sweep.execution.block_task import compute_block
 from sweep.execution.finalize import close
+from sweep.integrity.failure_check import FailureCheck, is_doubtful
 from sweep.integrity.repair import repair
 from sweep.integrity.verification import verify
+from sweep.measure.flags import DetectionStatus
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
-from sweep.store.blocks import begin_block
+from sweep.store.blocks import begin_block, receipts
 from sweep.store.lifecycle import create_store, open_store
 
 TEXT = """
@@ -249,6 +252,39 @@ def test_recomputed_sample_of_a_sound_store_agrees_to_the_bit(sound, tmp_path):
         found = verify(str(sound), 40)
     assert (found.damage, found.not_sampled) == ([], "")
     assert 8 <= found.sampled <= 15
+
+
+def test_scene_that_failed_and_succeeds_now_is_damage_of_its_block_and_repaired(
+    copied, tmp_path, monkeypatch
+):
+    with poison(tmp_path / "notes.jsonl"):
+        findings = FailureCheck(open_store(str(copied))).run([FAILED_BLOCK])
+    assert (findings.count, findings.damage) == (1, [])  # it fails again
+
+    def recompute(store, numbers, **_):
+        for number in numbers:
+            compute_block(store.url, store.run_id, store.blocks[number])
+
+    monkeypatch.setattr("sweep.integrity.repair.recompute", recompute)
+    repaired = repair(str(copied), 1)
+    assert (repaired.retried, repaired.damage) == (1, [])
+    (damage,) = repaired.repaired
+    assert damage.block == FAILED_BLOCK
+    assert "scenes that had failed and succeed when recomputed: 1, such as --at " in damage.what
+    assert not (zarr.open_array(f"{copied}/detection", mode="r")[...] == DetectionStatus.failed
+                ).any()
+
+
+def test_scene_that_a_signal_from_outside_ended_is_tried_again(copied):
+    edit_receipt(copied, FAILED_BLOCK, lambda content: content["failures"][0].update(
+        kind="crashed", text="SIGKILL"))
+    _, receipt = next(iter(receipts(open_store(str(copied)), [FAILED_BLOCK])))
+    assert is_doubtful(receipt)
+    assert is_doubtful(dataclasses.replace(receipt, detection=[0], estimate=[0]))
+    assert not is_doubtful(
+        dataclasses.replace(receipt, detection=[0], estimate=[0], failures=[
+            dataclasses.replace(receipt.failures[0], text="SIGSEGV")])
+    )
 
 
 def test_file_is_named_when_it_alone_is_damaged(sound, copied):

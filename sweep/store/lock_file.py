@@ -34,6 +34,12 @@ BUSY_S = 10.0
 """Seconds that a process waits for another one that is changing the lock."""
 
 
+REFUSED_CODES = {
+    "PreconditionFailed", "ConditionalRequestConflict", "NoSuchKey", "404", "409", "412",
+}
+"""What an S3 server answers if the content is not the expected one."""
+
+
 class LockFile:
     """The content of the lock's key in a storage."""
 
@@ -109,13 +115,13 @@ class LockFile:
             return True
         try:
             await call("put_object", **where, Body=content, **condition)
-        except NotImplementedError:
-            return None
-        except (FileExistsError, FileNotFoundError):
-            return False
-        except OSError as error:
-            if "PreconditionFailed" in str(error) or "ConditionalRequest" in str(error):
+        except Exception as error:
+            answer = getattr(error.__cause__ or error, "response", None) or {}
+            code = answer.get("Error", {}).get("Code")
+            if code in REFUSED_CODES:
                 return False
+            if code == "NotImplemented" or isinstance(error, NotImplementedError):
+                return None
             raise
         return True
 

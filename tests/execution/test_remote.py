@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import boto3
@@ -26,7 +27,10 @@ from sweep.execution.cluster import external
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
 from sweep.store.blocks import committed
+from sweep.store.checksums import DigestingStore
 from sweep.store.lifecycle import open_store
+from sweep.store.locations import storage_at
+from sweep.store.lock_file import LockFile
 
 TIMEOUT_S = 240.0
 
@@ -218,6 +222,31 @@ def _account():
         aws_access_key_id=key["AccessKeyId"], aws_secret_access_key=key["SecretAccessKey"]
     )
     return key
+
+
+@pytest.mark.usefixtures("bucket")
+def test_server_lets_one_of_many_take_or_replace_a_lock(monkeypatch):
+    monkeypatch.setattr("sweep.store.lock_file.SETTLE_S", 0.0)
+    url = "s3://bucket/lock.zarr"
+
+    def race(expected, names):
+        files = [LockFile(DigestingStore(storage_at(url, read_only=False)), "lock.json")
+                 for _ in names]
+        with ThreadPoolExecutor(len(names)) as pool:
+            got = list(pool.map(lambda f, n: f.exchange(expected, n), files, names))
+        assert sum(got) == 1
+        assert files[0].read() == names[got.index(True)]
+        return files[0]
+
+    stale = None
+    for names in ((b"a", b"b", b"c"), (b"d", b"e", b"f")):
+        file = race(stale, names)
+        stale = file.read()
+    assert not file.exchange(b"other", b"new")
+    assert not file.exchange(None, b"new")
+    assert file.exchange(stale, None)
+    assert file.read() is None
+    assert not file.exchange(stale, b"new")
 
 
 # --- the cluster ---

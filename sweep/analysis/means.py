@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
@@ -17,6 +18,7 @@ from sweep.analysis.mean_intervals import (
     symmetric,
 )
 from sweep.analysis.moments import Moments
+from sweep.analysis.pose_view import component_sum
 from sweep.analysis.states import BlockState, CellDeviations, CellDraws, Spread, State
 from sweep.analysis.statistic import (
     OVER_ALL,
@@ -116,7 +118,7 @@ class Mean(Statistic[DrawnT, MeanState, CentredState, Spread], Generic[DrawnT]):
         return interval_variables(self.name, self._interval(estimate, known.moments))
 
     def _used(self, poses: DrawnT, values: Floats) -> Masks:
-        return np.asarray(self.used(poses) & ~np.isnan(values).any(axis=-1))
+        return np.asarray(self.used(poses) & ~missing(values))
 
     def _centre(self, moments: Moments) -> Floats:
         return np.asarray(moments.mean[:, 0])
@@ -129,6 +131,12 @@ class Mean(Statistic[DrawnT, MeanState, CentredState, Spread], Generic[DrawnT]):
     ) -> tuple[Floats, Floats, Floats]:
         """Return value, low and high, from the mean of the scores."""
         return symmetric(estimate)
+
+
+def missing(values: Floats) -> Masks:
+    """Return which vectors (..., components) have a component that is NaN."""
+    return functools.reduce(np.logical_or, (
+        np.isnan(values[..., k]) for k in range(values.shape[-1])))
 
 
 class PositiveMean(Mean[DrawnT]):
@@ -164,7 +172,7 @@ class StandardDeviation(RootMeanSquare[DrawnT]):
     def _scores(self, values: Floats, moments: Moments) -> Floats:
         mean = moments.mean[:, None, None, None]
         count = moments.count[:, :1, None, None]
-        return np.asarray(np.square(values - mean).sum(axis=-1) * (count / (count - 1.0)))
+        return np.asarray(component_sum(np.square(values - mean)) * (count / (count - 1.0)))
 
 
 class MeanLength(Mean[DrawnT]):
@@ -178,7 +186,7 @@ class MeanLength(Mean[DrawnT]):
         unit = np.zeros_like(moments.mean)
         unit[:, 0] = 1.0
         direction = np.where(length > 0.0, moments.mean / length, unit)
-        return np.asarray((values * direction[:, None, None, None]).sum(axis=-1))
+        return np.asarray(component_sum(values * direction[:, None, None, None]))
 
     def _interval(
         self, estimate: MeanEstimate, moments: Moments

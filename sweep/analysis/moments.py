@@ -22,6 +22,9 @@ from numpy.typing import ArrayLike
 from sweep.analysis.groups import interleaved
 from sweep.typing import Floats, Integers
 
+_DTYPES = (np.dtype(np.int64), *(np.dtype(np.float64),) * 3)
+"""Of the fields of `Moments`."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moments:
@@ -50,6 +53,11 @@ class Moments:
     m2: Floats  # sum of the squared deviations from the mean
 
     def __post_init__(self) -> None:
+        arrays = (self.count, self.mean, self.mean_tail, self.m2)
+        shape = np.shape(self.mean)
+        if all(type(array) is np.ndarray and array.dtype == dtype and array.shape == shape
+               for array, dtype in zip(arrays, _DTYPES, strict=True)):
+            return
         for name, dtype in (("count", np.int64), ("mean", np.float64),
                             ("mean_tail", np.float64), ("m2", np.float64)):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=dtype))
@@ -73,15 +81,23 @@ class Moments:
         rows = values.transpose(*kept, *over)
         # NumPy sums pairwise along the last axis in memory only: the error then grows with log n.
         rows = np.ascontiguousarray(rows.reshape(*rows.shape[: len(kept)], size))
-        present = ~np.isnan(rows)
-        count = present.sum(axis=-1)
+        missing = np.isnan(rows)
+        some_missing = bool(missing.any())
+        count = np.asarray(size - missing.sum(axis=-1))
         with np.errstate(all="ignore"):
             n = np.maximum(count, 1)
-            centre = np.where(present, rows, 0.0).sum(axis=-1) / n
-            deviations = np.where(present, rows - centre[..., None], 0.0)
+            filled = np.where(missing, 0.0, rows) if some_missing else rows
+            centre = filled.sum(axis=-1) / n
+            # In place, which is what takes least time.
+            deviations = filled - centre[..., None]
+            if some_missing:
+                deviations[missing] = 0.0
             correction = deviations.sum(axis=-1) / n
-            deviations = np.where(present, deviations - correction[..., None], 0.0)
-            m2 = (deviations * deviations).sum(axis=-1)
+            deviations -= correction[..., None]
+            if some_missing:
+                deviations[missing] = 0.0
+            np.multiply(deviations, deviations, out=deviations)
+            m2 = deviations.sum(axis=-1)
             mean, tail = _two_sum(centre, np.where(np.isfinite(centre), correction, 0.0))
         empty = count == 0
         return cls(count, np.where(empty, np.nan, mean), np.where(empty, 0.0, tail), m2)

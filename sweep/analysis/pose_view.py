@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -70,6 +71,8 @@ class Poses:
     def __init__(self, arrays: dict[str, NDArray[Any]], prefix: str = "") -> None:
         self._arrays = arrays
         self._prefix = prefix
+        self.squares: dict[str, Floats] = {}
+        """Squared absolute errors (..., 1) by the name of their `Quantity`, once computed."""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """Return an array, of flags 0 (not run) for the poses that do not count."""
@@ -171,11 +174,13 @@ class Quantity:
 
     def norm(self, poses: Poses) -> Floats:
         """Return the absolute errors (...)."""
-        return np.sqrt(norm_squared(self.vector(poses)))
+        return np.sqrt(self.squares(poses)[..., 0])
 
     def squares(self, poses: Poses) -> Floats:
         """Return the squared absolute errors (..., 1)."""
-        return norm_squared(self.vector(poses))[..., None]
+        if self.name not in poses.squares:
+            poses.squares[self.name] = norm_squared(self.vector(poses))[..., None]
+        return poses.squares[self.name]
 
     def named(self, statistic: str) -> str:
         """Return a variable's name, such as ``rotation_p95_deg``."""
@@ -198,4 +203,12 @@ def relative(length: NDArray[Any], depth: NDArray[Any]) -> Floats:
 
 def norm_squared(vectors: NDArray[Any]) -> Floats:
     """Return the squared norms of (..., components)."""
-    return np.asarray(np.square(vectors, dtype=np.float64).sum(axis=-1))
+    return component_sum(np.square(vectors, dtype=np.float64))
+
+
+def component_sum(vectors: Floats) -> Floats:
+    """Return the sums of the few components of (..., components), bit for bit as NumPy does.
+
+    NumPy's loop along a short last axis takes three times as long.
+    """
+    return functools.reduce(np.add, (vectors[..., k] for k in range(vectors.shape[-1])), 0.0)

@@ -55,7 +55,11 @@ def is_refused_output() -> bool:
 
 
 def quiet_matplotlib() -> None:
-    """Silence what matplotlib says of places for its caches: it works without them."""
+    """Silence what matplotlib says of places for its caches, and drop a choice of windows for it.
+
+    It works without caches, and files need no windows; a choice that it does not know is an error.
+    """
+    os.environ.pop("MPLBACKEND", None)
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 

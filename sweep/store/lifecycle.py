@@ -26,6 +26,7 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.schema import SCHEMA
 from sweep.store.checksums import DigestingStore
+from sweep.store.direct_reading import read_directly
 from sweep.store.durability import DurableStore, flush, flush_tree
 from sweep.store.layout import FORMAT, FORMATS, chunk_limits, planned_arrays
 from sweep.store.locations import (
@@ -359,7 +360,9 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)  # of files not its own
-            dataset: xr.Dataset = xr.open_zarr(snapshot(store), consolidated=False, zarr_format=3)
+            storage = snapshot(store)
+            dataset: xr.Dataset = xr.open_zarr(storage, consolidated=False, zarr_format=3)
+            dataset = read_directly(dataset, store, storage)
         # Much of xarray and pandas does not support NumPy's strings of variable length.
         texts = {name: (value.dims, value.to_numpy().astype(object), value.attrs)
                  for name, value in dataset.coords.items() if value.dtype.kind == "T"}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from operator import floordiv
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -105,15 +106,36 @@ class Snapshot(WrapperStore[Store]):
         ValueError
             If it is a chunk that is larger than it can be.
         """
+        if not self._may_be_read(key):
+            return None
+        return await super().get(key, prototype, byte_range)
+
+    @property
+    def below(self) -> Store:
+        """The storage itself."""
+        return self._store
+
+    def local_content(self, key: str) -> bytes | None:
+        """Return what :meth:`get` returns, of a local storage, without leaving this thread."""
+        if not isinstance(self._store, LocalStore):
+            raise TypeError(self._store)
+        if not self._may_be_read(key):
+            return None
+        try:
+            return Path(f"{self._store.root}/{key}").read_bytes()
+        except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
+            return None
+
+    def _may_be_read(self, key: str) -> bool:
         number = block_of_chunk(key, self._blocks, self._where)
         if number is not None and not self._done[number]:
-            return None
+            return False
         if isinstance(self._store, LocalStore):
             path = f"{self._store.root}/{key}"
             if reason := unreadable(path, limit_of(key, self._chunk_limits)):
                 check_chunk(key, reason)
-                return None
-        return await super().get(key, prototype, byte_range)
+                return False
+        return True
 
 
 def snapshot(store: RunStore) -> Snapshot:

@@ -211,4 +211,5 @@ def component_sum(vectors: Floats) -> Floats:
 
     NumPy's loop along a short last axis takes three times as long.
     """
-    return functools.reduce(np.add, (vectors[..., k] for k in range(vectors.shape[-1])), 0.0)
+    components = (vectors[..., k] for k in range(vectors.shape[-1]))
+    return np.asarray(functools.reduce(np.add, components, np.zeros(())))

@@ -229,6 +229,12 @@ def _substitute_folder() -> Path:
     return Path(tempfile.gettempdir()) / f"sweep-{user}" / f"compiled-{sources_digest()}"
 
 
+def is_compiled(name: str) -> bool:
+    """Return whether a function, as ``"module.function"``, is in the cache of these sources."""
+    folders = {cache_folder(), _substitute_folder()} - {None}
+    return any(any(folder.glob(f"{name}-*.nbi")) for folder in folders if folder is not None)
+
+
 def compiled(function: Function) -> Function:
     """Compile ``function`` to machine code on its first call and cache it on disk.
 

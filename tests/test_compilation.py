@@ -20,6 +20,8 @@ import numpy as np
 import pytest
 
 from sweep import compilation
+from sweep.cli.first_use import announce_compilation
+from sweep.plan.experiment import Pipeline
 
 TOP = Path(compilation.__file__).parent.parent
 UNIT = "from sweep.model.supersampling import _unit; print(_unit(5), _unit.py_func(5))"
@@ -262,3 +264,22 @@ def test_compiled_functions_assign_no_arrays_to_slices():
                         isinstance(part, ast.Slice) for part in ast.walk(target.slice)
                     )
                     assert not sliced, f"{path.name}:{node.lineno}"
+
+
+def test_first_use_is_announced_and_no_later_one(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(compilation, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(compilation, "_substitute_folder", lambda: tmp_path / "none")
+    plain = Pipeline.from_text("[pose]\nside_px = 50")
+    bound = Pipeline.from_text(
+        "[pose]\nside_px = 50\n[scene]\nnoise_grey = 2\nbound = 'known_blur'")
+    for pipeline, compiled, line in (
+        (plain, "", "compiling, once for this version: about 8 s\n"),
+        (bound, "", "compiling, once for this version: about 18 s\n"),
+        (bound, "coverage.accumulate-1", "compiling, once for this version: about 10 s\n"),
+        (plain, "", ""),
+        (bound, "likelihood.fit-1", ""),
+    ):
+        if compiled:
+            (tmp_path / f"{compiled}.py311.nbi").touch()
+        announce_compilation(pipeline)
+        assert capsys.readouterr().err == line

@@ -18,10 +18,12 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _execute(options: argparse.Namespace) -> int:
     pipeline = read_pipeline(options)
+    from sweep.cli.first_use import announce_compilation  # noqa: PLC0415
     from sweep.execution.forecast import forecast  # noqa: PLC0415
     from sweep.plan.active_parts import parts  # noqa: PLC0415
     from sweep.report.formatting import byte_count, duration  # noqa: PLC0415
 
+    announce_compilation(pipeline)
     listed = parts(pipeline)
     switches = [part.switch for part in listed if part.switch and part.active]
     expected, costs = forecast(pipeline, options.workers, switches)

@@ -49,9 +49,11 @@ def _execute(options: argparse.Namespace) -> int:
 
 def _execute_beside(child: Child, options: argparse.Namespace) -> int:
     pipeline = read_pipeline(options)
+    from sweep.cli.first_use import announce_compilation  # noqa: PLC0415
     from sweep.execution.progress import progress_bar  # noqa: PLC0415
     from sweep.execution.runner import execute  # noqa: PLC0415
 
+    announce_compilation(pipeline)
     with progress_bar() as bar:
         summary = execute(
             pipeline, options.store, workers=options.workers, scheduler=options.scheduler,

@@ -10,7 +10,7 @@ import contextlib
 import dataclasses
 import os
 import time
-from collections.abc import AsyncIterator, Iterable, Mapping
+from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -28,6 +28,7 @@ from sweep.store.layout import RECEIPTS
 from sweep.store.locations import is_remote, open_group, remote_run_id, translate_errors
 from sweep.store.manifest import put
 from sweep.store.receipt import NAMING_FORMAT, Receipt
+from sweep.store.receipt_text import decoded, is_decodable
 from sweep.store.run_store import RunStore
 from sweep.store.zarr_sync import sync
 
@@ -181,7 +182,7 @@ def receipts(store: RunStore, numbers: Iterable[int]) -> Iterable[tuple[int, Rec
     for start in range(0, len(ordered), RECEIPTS_AT_ONCE):
         some = ordered[start : start + RECEIPTS_AT_ONCE]
         try:
-            texts = np.asarray(store.array(RECEIPTS).oindex[np.array(some)]).tolist()
+            texts = receipt_texts(store, some)
             contents = [
                 parsed_receipt(store, number, text)
                 for number, text in zip(some, texts, strict=True)
@@ -192,6 +193,20 @@ def receipts(store: RunStore, numbers: Iterable[int]) -> Iterable[tuple[int, Rec
                 "`sweep verify --repair` repairs it"
             ) from None
         yield from zip(some, contents, strict=True)
+
+
+def receipt_texts(store: RunStore, numbers: Sequence[int]) -> list[str]:
+    """Return the texts of committed blocks' receipts; ValueError if one is missing or damaged."""
+    array = store.array(RECEIPTS)
+    if not is_decodable(array):
+        return cast("list[str]", np.asarray(array.oindex[np.array(numbers)]).tolist())
+    keys = [receipt_key(number) for number in numbers]
+    texts = []
+    for key, content in zip(keys, store.storage.contents(keys), strict=True):
+        if content is None:
+            raise ValueError(f"{key}: {store.storage.unreadable(key) or 'missing'}")
+        texts.append(decoded(content))
+    return texts
 
 
 def parsed_receipt(store: RunStore, number: int, text: str) -> Receipt:

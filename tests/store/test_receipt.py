@@ -3,10 +3,16 @@
 import dataclasses
 import json
 
+import numpy as np
 import pytest
 
+from sweep.plan.experiment import Pipeline
 from sweep.plan.schema import SCHEMA, variables_of
+from sweep.store.blocks import receipt_key, receipt_texts
+from sweep.store.layout import RECEIPTS
+from sweep.store.lifecycle import create_store
 from sweep.store.receipt import Receipt, RecordedFailure
+from sweep.store.receipt_text import decoded, is_decodable
 
 NAMES = [variable.name for variable in variables_of(2)]
 
@@ -94,3 +100,23 @@ def test_texts_that_are_no_receipt_are_refused(text):
 def test_receipts_may_hold_more_than_this_version_knows():
     content = json.loads(RECEIPT.to_json(3)) | {"memory_bytes": 5}
     assert Receipt.from_json(json.dumps(content)) == RECEIPT
+
+
+def test_texts_are_those_that_zarr_reads_and_damage_is_seen(tmp_path):
+    """Decoded without Zarr's threads: 10^5 receipts in 7 s of processor time in place of 30 s."""
+    grid = Pipeline.from_text("[pose]\njitter_px = 0.5\nside_px = 50\n[axes]\ntrial = 4")
+    store = create_store(str(tmp_path / "s.zarr"), grid, (1,))
+    array = store.array(RECEIPTS)
+    assert is_decodable(array)
+    texts = ["short", "", "μ" * 10_000]
+    array[:3] = np.array(texts, dtype=object)
+    assert receipt_texts(store, [0, 2]) == [texts[0], texts[2]]
+    assert receipt_texts(store, [0, 2]) == array.oindex[np.array([0, 2])].tolist()
+    with pytest.raises(ValueError, match="missing"):
+        receipt_texts(store, [3])
+    content = (tmp_path / "s.zarr" / receipt_key(2)).read_bytes()
+    for damaged in (
+        content[:-1], content[:3], b"", content[:9] + bytes([content[9] ^ 1]) + content[10:],
+    ):
+        with pytest.raises(ValueError, match=r"."):
+            decoded(damaged)

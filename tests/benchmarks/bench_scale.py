@@ -1,0 +1,261 @@
+"""The client, a Dask scheduler and a store under many simulated workers.
+
+    python tests/benchmarks/bench_scale.py [--workers 64 256 1000] [--waves 4] [--stored 100000]
+        [--block-s 2.0] [--record]
+
+Many `distributed.Worker`s live in two processes; a block's work is replaced by waiting its time,
+after which a real receipt is written. Blocks are as long as a run of this size would have them.
+The second table is of a store of ``--stored`` committed blocks, of which only receipts are made.
+``--record`` appends the figures to ``scale_history.csv``, which later changes are held against.
+"""
+
+import argparse
+import asyncio
+import csv
+import importlib.metadata
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from functools import lru_cache
+from pathlib import Path
+
+import dask
+import numpy as np
+import psutil
+from distributed import Client, Worker
+
+import sweep
+from sweep.execution import in_flight
+from sweep.execution.calibration import block_work_s
+from sweep.execution.cluster import QUIET_DASK_CONFIG
+from sweep.execution.limits import TIME_LIMIT_S
+from sweep.execution.status import status
+from sweep.execution.tally import Tally
+from sweep.isolation.interrupts import Interrupts
+from sweep.plan.experiment import Pipeline
+from sweep.store.blocks import committed
+from sweep.store.layout import RECEIPTS
+from sweep.store.lifecycle import create_store, open_store
+from sweep.store.receipt import Receipt
+
+HISTORY = Path(__file__).with_name("scale_history.csv")
+PROCESSES = 2
+SCENES = 1000
+"""Poses of a block."""
+
+GRID = """
+[pose]
+jitter_px = 0.5
+side_px = 50
+[axes]
+trial = {trials}
+"""
+
+MONITORS = {
+    **QUIET_DASK_CONFIG,
+    "distributed.admin.system-monitor.interval": "600s",
+    "distributed.worker.memory.monitor-interval": "600s",
+}
+
+
+def receipt_text(store, number, wall_s):
+    """Return the text of a receipt of a block whose poses were all detected and solved."""
+    scenes = len(store.blocks[number])
+    receipt = Receipt(
+        run_id=store.run_id, processor="simulated", scenes=scenes,
+        computed={"scenes": scenes, "detections": scenes, "estimates": scenes},
+        detection=[0, scenes], estimate=[0, scenes],
+        seconds={"scene": [1.0], "detection": [1.0], "estimation": [1.0]}, failures=[],
+        wall_s=wall_s, written=time.time(), block=number,
+        digests={variable.name: 123456789 for variable in store.variables},
+    )
+    return receipt, receipt.to_json(store.format)
+
+
+@lru_cache(maxsize=1)
+def opened(url, run_id):  # noqa: ARG001  (a store of its own for each run)
+    return open_store(url, "r+")
+
+
+def simulated_block(url, run_id, block, _sources, time_limit_s, *_others, **_options):
+    """Wait a block's time, here passed as its time limit; write its receipt and return it."""
+    begun = time.perf_counter()
+    store = opened(url, run_id)
+    receipt, text = receipt_text(store, store.blocks.number(block), time_limit_s)
+    time.sleep(max(time_limit_s - (time.perf_counter() - begun), 0.0))
+    number = store.blocks.number(block)
+    store.array(RECEIPTS)[number : number + 1] = np.array([text], dtype=object)
+    return receipt
+
+
+async def live(address, count):
+    """Be ``count`` workers of a scheduler until it goes away."""
+    workers = []
+    with dask.config.set(MONITORS):
+        while len(workers) < count:
+            some = [
+                Worker(address, nthreads=1, memory_limit=0, dashboard=False)
+                for _ in range(min(25, count - len(workers)))
+            ]
+            await asyncio.gather(*some)
+            workers += some
+        await asyncio.gather(*(worker.finished() for worker in workers))
+
+
+def many_files():
+    """Allow as many open files as the system does: a worker needs several."""
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+
+
+def cpu_s(process):
+    times = process.cpu_times()
+    return times.user + times.system
+
+
+def simulated(count, waves, block_s, folder):
+    """Return the figures of a run of ``waves`` blocks a worker."""
+    blocks = count * waves
+    if block_s is None:
+        # As in a run of 100,000 blocks.
+        block_s = block_work_s(1e5 * max(2.0, count / 75), count, TIME_LIMIT_S)
+    pipeline = Pipeline.from_text(GRID.format(trials=SCENES * blocks))
+    store = create_store(f"{folder}/{count}.zarr", pipeline, (SCENES,))
+    address = Path(folder) / f"{count}.json"
+    paths = [str(Path(__file__).parent), str(Path(sweep.__file__).parents[1])]
+    environment = {
+        **os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+    }
+    children = [subprocess.Popen(
+        [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port",
+         "0", "--no-dashboard", "--scheduler-file", str(address)],
+        env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        preexec_fn=many_files,  # noqa: PLW1509  (no threads yet that hold locks)
+    )]
+    try:
+        while not address.exists():
+            time.sleep(0.1)
+        url = json.loads(address.read_text())["address"]
+        begun = time.perf_counter()
+        children += [subprocess.Popen(
+            [sys.executable, __file__, "--live", url, str(count // PROCESSES)], env=environment,
+            stderr=subprocess.DEVNULL, preexec_fn=many_files,  # noqa: PLW1509
+        ) for _ in range(PROCESSES)]
+        with Client(url, set_as_default=False) as client, Interrupts() as interrupts:
+            client.wait_for_workers(count // PROCESSES * PROCESSES, timeout=300)
+            start_s = time.perf_counter() - begun
+            return {
+                "workers": count, "blocks": blocks, "block_s": round(block_s, 2),
+                "start_s": round(start_s, 1),
+                **measured(store, client, block_s, interrupts, psutil.Process(children[0].pid)),
+            }
+    finally:
+        for child in reversed(children):
+            child.kill()
+            child.wait()
+
+
+def measured(store, client, block_s, interrupts, scheduler):
+    """Return the figures of a run of all blocks of a store on a cluster that is there."""
+    client_process, number = psutil.Process(), len(store.blocks)
+    threads = sum(client.nthreads().values())
+    memory = [process.memory_info().rss for process in (scheduler, client_process)]
+    spent = [cpu_s(scheduler), cpu_s(client_process)]
+    halfway = []
+
+    def report(progress):
+        if 2 * progress.done >= progress.total and not halfway:
+            halfway.extend([scheduler.memory_info().rss, client_process.memory_info().rss])
+
+    begun = time.perf_counter()
+    running = in_flight.BlocksInFlight(
+        store, client, store.url, (), block_s, interrupts=interrupts
+    )
+    running.compute(range(number), Tally(store, report))
+    wall = time.perf_counter() - begun
+    after = [process.memory_info().rss for process in (scheduler, client_process)]
+    return {
+        "blocks_a_s": round(number / wall, 1),
+        "efficiency": round(number * block_s / threads / wall, 3),
+        "scheduler_core": round((cpu_s(scheduler) - spent[0]) / wall, 2),
+        "client_core": round((cpu_s(client_process) - spent[1]) / wall, 2),
+        "scheduler_mb": [round(b / 1e6) for b in (memory[0], halfway[0], after[0])],
+        "client_mb": [round(b / 1e6) for b in (memory[1], halfway[1], after[1])],
+    }
+
+
+def stored(count, folder):
+    """Return the seconds that a store of ``count`` receipts takes to list, count and open."""
+    pipeline = Pipeline.from_text(GRID.format(trials=SCENES * count))
+    begun = time.perf_counter()
+    store = create_store(f"{folder}/stored.zarr", pipeline, (SCENES,))
+    seconds = {"create": time.perf_counter() - begun}
+    for first in range(0, count, 1000):
+        texts = [receipt_text(store, k, 2.0)[1] for k in range(first, min(first + 1000, count))]
+        store.array(RECEIPTS)[first : first + len(texts)] = np.array(texts, dtype=object)
+    for name, call in (
+        ("open_store", lambda: open_store(store.url)),
+        ("committed", lambda: committed(store)),
+        ("continue", lambda: Tally(store).begin(committed(store))),
+        ("status", lambda: status(store.url)),
+        ("sweep.open", lambda: sweep.open(store.url)),
+    ):
+        begun = time.perf_counter()
+        call()
+        seconds[name] = time.perf_counter() - begun
+    return {name: round(value, 2) for name, value in seconds.items()}
+
+
+def record(rows):
+    """Append figures to the history."""
+    new = not HISTORY.exists()
+    with HISTORY.open("a", newline="") as file:
+        writer = csv.writer(file)
+        if new:
+            writer.writerow(["date", "sweep", "distributed", "figure", "value"])
+        for name, value in rows:
+            writer.writerow([
+                time.strftime("%Y-%m-%d"), sweep.__version__,
+                importlib.metadata.version("distributed"), name, json.dumps(value),
+            ])
+
+
+def main():
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--workers", type=int, nargs="*", default=[64, 256, 1000])
+    parser.add_argument("--waves", type=int, default=4)
+    parser.add_argument("--block-s", type=float)
+    parser.add_argument("--stored", type=int, default=0)
+    parser.add_argument("--record", action="store_true")
+    parser.add_argument("--live", nargs=2)
+    options = parser.parse_args()
+    if options.live:
+        asyncio.run(live(options.live[0], int(options.live[1])))
+        return
+    sys.path.insert(0, str(Path(__file__).parent))
+    import bench_scale  # noqa: PLC0415  (tasks name their function by its module)
+
+    in_flight.compute_block = bench_scale.simulated_block
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        many_files()
+        for count in options.workers:
+            figures = simulated(count, options.waves, options.block_s, folder)
+            print(json.dumps(figures), flush=True)
+            rows.append((f"{count} workers", figures))
+        if options.stored:
+            figures = stored(options.stored, folder)
+            print(json.dumps(figures), flush=True)
+            rows.append((f"store of {options.stored} blocks", figures))
+    if options.record:
+        record(rows)
+
+
+if __name__ == "__main__":
+    main()

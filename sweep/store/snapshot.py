@@ -59,10 +59,12 @@ def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
         number: tuple(map(floordiv, store.blocks[number].starts, extents)) for number in numbers
     }
     missing: dict[int, str] = {}
-    for name, positions in axis_positions(store).items():
+    positions = axis_positions(store)
+    for variable in store.variables:
+        name = variable.name
         # Formatted, not encoded one by one: there may be millions.
-        parts = ["0"] * len(store.array(name).shape)
-        for axis, position in enumerate(positions):
+        parts = ["0"] * len(variable.dimensions(store.pipeline))
+        for axis, position in enumerate(positions[name]):
             parts[position] = f"{{{axis}}}"
         template = "/".join([name, "c", *parts])
         keys = {

@@ -17,6 +17,7 @@ from sweep.errors import MachineFaultError, StoreError
 from sweep.evaluation.cells import run_cells
 from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.evaluation.results import CellsResult, to_dataset_layout
+from sweep.evaluation.warm_up import warm_up
 from sweep.execution.limits import TIME_LIMIT_S
 from sweep.execution.reuse import ReusedCells, Source, match, read_cells
 from sweep.isolation.crash_isolation import WHOLE, run_cells_isolated
@@ -43,10 +44,14 @@ FAILURE_QUOTA: Mapping[str, int] = {"failed": MAX_ROWS, "crashed": MAX_ROWS}
 def _opened(url: str, run_id: str, durable: bool = False) -> RunStore:
     """Open a store once in each process; check that this process computes the same numbers.
 
+    The compiled code that its blocks need is loaded, by computing a scene of known pose.
+
     Raises
     ------
     StoreError
         If the store was replaced, or this machine has other versions or files.
+    MachineFaultError
+        If this machine cannot compute a scene of known pose.
     """
     if not exists(url):
         raise StoreError(
@@ -67,6 +72,7 @@ def _opened(url: str, run_id: str, durable: bool = False) -> RunStore:
                 f"{path}: not in {store.pipeline.folder} on a worker as it was when the run began; "
                 "every machine needs the same file there"
             )
+    warm_up(store.pipeline)
     return store
 
 

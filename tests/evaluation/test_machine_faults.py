@@ -13,6 +13,7 @@ from support import machine_faults
 from sweep.errors import MachineFaultError, StoreError
 from sweep.evaluation.cells import run_cells
 from sweep.evaluation.machine_faults import machine_fault
+from sweep.evaluation.warm_up import warm_up
 
 PIPELINE = sweep.Pipeline.from_dict(
     {"pose": {"side_px": 40, "jitter_px": 0.5}, "axes": {"trial": 4}}
@@ -79,3 +80,34 @@ def test_solver_of_a_user_that_meets_a_fault_of_the_machine_raises_it(monkeypatc
     monkeypatch.setattr("sweep.evaluation.cells.build", lambda _: Solver())
     with pytest.raises(MachineFaultError, match="No space left on device"):
         run_cells(PIPELINE, [np.arange(4)])
+
+
+@pytest.mark.parametrize("place", ["render_all", "build"])
+def test_machine_that_cannot_compute_a_standard_scene_is_told_before_any_block(place):
+    warm_up(PIPELINE)
+    machine_faults.inject("import", place, 0)
+    try:
+        with pytest.raises(MachineFaultError, match="file too short"):
+            warm_up(PIPELINE)
+    finally:
+        machine_faults.clear()
+
+
+def test_machine_that_computes_a_standard_scene_wrongly_is_at_fault(monkeypatch):
+    def white(*arguments):
+        return [np.full((y1 - y0, x1 - x0), 255, np.uint8)
+                for x0, y0, x1, y1 in arguments[-1].tolist()]
+
+    monkeypatch.setattr("sweep.evaluation.search.render_all", white)
+    with pytest.raises(MachineFaultError, match="computed wrongly"):
+        warm_up(PIPELINE)
+
+
+@pytest.mark.parametrize("renderer", [
+    "exact", "warp", *(pytest.param(f"supersample-{n}", marks=pytest.mark.long)
+                       for n in (1, 2, 16, 64))])
+def test_standard_scene_is_computed_with_what_a_pipeline_uses(renderer):
+    warm_up(sweep.Pipeline.from_dict({
+        "pose": {"side_px": 40, "jitter_px": 0.5},
+        "scene": {"renderer": renderer, "noise_grey": 1.0, "bound": "known_blur"},
+        "axes": {"solver": ["p3p", "photometric"], "trial": 2}}))

@@ -210,6 +210,9 @@ def borrowed(client: Client | Cluster, pipeline: Pipeline) -> Iterator[Client]:
         if isinstance(client, Client):
             connection = client
         else:
+            state = getattr(getattr(client, "status", None), "name", "running")
+            if state in ("closing", "closed", "failed"):
+                raise ArgumentError("client", _name(client), f"it is {state}")
             try:
                 connection = stack.enter_context(
                     Client(client, timeout=ANSWER_S, set_as_default=False)

@@ -6,11 +6,13 @@ that a new version of ``distributed`` can break a run in this module alone.
 
 from __future__ import annotations
 
+import asyncio
 from typing import Any
 
 from distributed import Client
-from distributed.comm.core import CommClosedError, connect
-from distributed.comm.registry import backends
+from distributed.comm.addressing import parse_address
+from distributed.comm.core import CommClosedError, FatalCommClosedError
+from distributed.comm.registry import backends, get_backend
 from distributed.core import send_recv
 
 __all__ = [
@@ -24,13 +26,42 @@ def is_known_protocol(scheme: str) -> bool:
     return scheme in backends
 
 
-async def peer_type(address: str, timeout_s: float, options: dict[str, Any]) -> str:
+RETRY_S = 0.1
+"""Seconds between two attempts to connect."""
+
+
+async def peer_type(address: str, options: dict[str, Any]) -> str:
     """Return the type of server at an address: Scheduler, Worker, Nanny.
 
-    ``options`` are Dask's connection arguments, such as ``ssl_context``.
+    It tries until it is cancelled; ``distributed.comm.core.connect`` leaves a connection open if it
+    is cancelled during the handshake.
+
+    Parameters
+    ----------
+    address
+        Such as tcp://host:8786.
+    options
+        Dask's connection arguments, such as ``ssl_context``.
+
+    Raises
+    ------
+    OSError
+        If the server refuses.
     """
-    comm = await connect(address, timeout=timeout_s, **options)
+    scheme, location = parse_address(address)
+    connector = get_backend(scheme).get_connector()
+    while True:
+        try:
+            comm = await connector.connect(location, **options)
+            break
+        except FatalCommClosedError:
+            raise
+        except OSError:
+            await asyncio.sleep(RETRY_S)
     try:
+        ours = comm.handshake_info()
+        await comm.write(ours)
+        comm.handshake_options = comm.handshake_configuration(ours, await comm.read())
         identity: dict[str, Any] = await send_recv(comm, op="identity")
     finally:
         comm.abort()

@@ -53,7 +53,7 @@ def _is_address(address: str) -> bool:
 async def _peer(address: str) -> str:
     options = _connection_options(address)
     async with asyncio.timeout(ANSWER_S):
-        return await peer_type(address, ANSWER_S, options)
+        return await peer_type(address, options)
 
 
 def _run_in_thread(question: Coroutine[Any, Any, str]) -> str:

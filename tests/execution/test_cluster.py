@@ -89,7 +89,7 @@ def test_clients_and_clusters_that_cannot_be_used_are_refused_in_a_line(monkeypa
         address = cluster.scheduler_address
         client.close()
         assert refusal(client) == "client = Client(None): it is closed"
-    assert refusal(cluster).startswith("client = LocalCluster(")
+    assert refusal(cluster) == f"client = LocalCluster({address}): it is closed"
     for given in (address, 3, object()):
         assert "expected a distributed.Client or a cluster object" in refusal(given)
 

@@ -23,6 +23,7 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import SCHEMA, Variable
+from sweep.store.checksums import DigestingStore
 from sweep.store.durability import DurableStore
 from sweep.store.layout import RECEIPTS
 from sweep.store.locations import is_remote, open_group, remote_run_id, translate_errors
@@ -147,7 +148,8 @@ def check_not_replaced(store: RunStore) -> None:
         current = remote_run_id(store.url)
     else:
         try:
-            group = open_group(LocalStore(store.url, read_only=True), "r")
+            storage = DigestingStore(LocalStore(store.url, read_only=True))
+            group = open_group(storage, "r")
             current = cast("dict[str, Any]", group.attrs["sweep"])["run_id"]
         except (KeyError, FileNotFoundError):
             current = None

@@ -31,6 +31,7 @@ from sweep.report.grouping import (
 )
 from sweep.store.blocks import committed
 from sweep.store.lifecycle import open_dataset, open_store
+from sweep.store.snapshot import snapshot
 
 MAX_LOADED_BYTES = 300_000_000
 """Results up to this size are loaded at once: many figures read the same values, and many small
@@ -242,7 +243,7 @@ def read_report_data(url: str) -> ReportData:
     with store_errors(store.url):
         if "cost/tradeoff" in store.group:
             trade = xr.open_zarr(
-                store.source, group="cost/tradeoff", consolidated=False, zarr_format=3
+                snapshot(store), group="cost/tradeoff", consolidated=False, zarr_format=3
             ).load()
         results = open_dataset(store.url)
     return ReportData(store.url, results, store.pipeline, store.run_metadata, trade)

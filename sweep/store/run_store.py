@@ -64,11 +64,6 @@ class RunStore:
         return f"{self.url}/{self.run_id}" if is_remote(self.url) else self.url
 
     @property
-    def source(self) -> str | Store:
-        """The argument with which this process opens the store by ``xarray.open_zarr``."""
-        return self.storage.below if is_remote(self.url) else self.url
-
-    @property
     def durable(self) -> bool:
         """Whether it flushes what it writes, so that a power failure takes nothing of it."""
         return isinstance(self.storage.below, DurableStore)

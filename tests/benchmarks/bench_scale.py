@@ -6,6 +6,8 @@
 Many `distributed.Worker`s live in two processes; a block's work is replaced by waiting its time,
 after which a real receipt is written. Blocks are as long as a run of this size would have them.
 The second table is of a store of ``--stored`` committed blocks, of which only receipts are made.
+Efficiency is the workers' busy share between their first and their last block; start and end count
+in the other figure, so more with few ``--waves`` (blocks a worker).
 ``--record`` appends the figures to ``scale_history.csv``, which later changes are held against.
 """
 
@@ -14,11 +16,13 @@ import asyncio
 import csv
 import importlib.metadata
 import json
+import math
 import os
 import resource
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from functools import lru_cache
 from pathlib import Path
@@ -37,7 +41,7 @@ from sweep.execution.status import status
 from sweep.execution.tally import Tally
 from sweep.isolation.interrupts import Interrupts
 from sweep.plan.experiment import Pipeline
-from sweep.store.blocks import committed
+from sweep.store.blocks import committed, receipts
 from sweep.store.layout import RECEIPTS
 from sweep.store.lifecycle import create_store, open_store
 from sweep.store.receipt import Receipt
@@ -52,6 +56,7 @@ GRID = """
 jitter_px = 0.5
 side_px = 50
 [axes]
+tilt_deg = {{ linspace = [0, 60, 100] }}
 trial = {trials}
 """
 
@@ -62,14 +67,14 @@ MONITORS = {
 }
 
 
-def receipt_text(store, number, wall_s):
+def receipt_text(store, number, wall_s, idle_s=0.0):
     """Return the text of a receipt of a block whose poses were all detected and solved."""
     scenes = len(store.blocks[number])
     receipt = Receipt(
         run_id=store.run_id, processor="simulated", scenes=scenes,
         computed={"scenes": scenes, "detections": scenes, "estimates": scenes},
         detection=[0, scenes], estimate=[0, scenes],
-        seconds={"scene": [1.0], "detection": [1.0], "estimation": [1.0]}, failures=[],
+        seconds={"scene": [idle_s], "detection": [0.0], "estimation": [0.0]}, failures=[],
         wall_s=wall_s, written=time.time(), block=number,
         digests={variable.name: 123456789 for variable in store.variables},
     )
@@ -81,14 +86,26 @@ def opened(url, run_id):  # noqa: ARG001  (a store of its own for each run)
     return open_store(url, "r+")
 
 
+LAST = threading.local()
+"""When the worker of this thread was to end its last block."""
+
+
+def share_of(number):
+    """Return how long a block takes, 0.5 to 1.5: workers do not finish all at once."""
+    return 0.5 + number * 0.6180339887498949 % 1.0
+
+
 def simulated_block(url, run_id, block, _sources, time_limit_s, *_others, **_options):
     """Wait a block's time, here passed as its time limit; write its receipt and return it."""
     begun = time.perf_counter()
+    idle_s = begun - getattr(LAST, "end", math.nan)
     store = opened(url, run_id)
-    receipt, text = receipt_text(store, store.blocks.number(block), time_limit_s)
-    time.sleep(max(time_limit_s - (time.perf_counter() - begun), 0.0))
     number = store.blocks.number(block)
+    wanted = time_limit_s * share_of(number)
+    receipt, text = receipt_text(store, number, wanted, 0.0 if math.isnan(idle_s) else idle_s)
+    time.sleep(max(wanted - (time.perf_counter() - begun), 0.0))
     store.array(RECEIPTS)[number : number + 1] = np.array([text], dtype=object)
+    LAST.end = begun + wanted
     return receipt
 
 
@@ -117,14 +134,18 @@ def cpu_s(process):
     return times.user + times.system
 
 
+def created(blocks, url):
+    """Return an empty store of at least ``blocks`` blocks, a multiple of 100."""
+    trials = SCENES * -(-blocks // 100)
+    return create_store(url, Pipeline.from_text(GRID.format(trials=trials)), (1, SCENES))
+
+
 def simulated(count, waves, block_s, folder):
     """Return the figures of a run of ``waves`` blocks a worker."""
-    blocks = count * waves
     if block_s is None:
         # As in a run of 100,000 blocks.
         block_s = block_work_s(1e5 * max(2.0, count / 75), count, TIME_LIMIT_S)
-    pipeline = Pipeline.from_text(GRID.format(trials=SCENES * blocks))
-    store = create_store(f"{folder}/{count}.zarr", pipeline, (SCENES,))
+    store = created(count * waves, f"{folder}/{count}.zarr")
     address = Path(folder) / f"{count}.json"
     paths = [str(Path(__file__).parent), str(Path(sweep.__file__).parents[1])]
     environment = {
@@ -150,7 +171,7 @@ def simulated(count, waves, block_s, folder):
             client.wait_for_workers(count // PROCESSES * PROCESSES, timeout=300)
             start_s = time.perf_counter() - begun
             return {
-                "workers": count, "blocks": blocks, "block_s": round(block_s, 2),
+                "workers": count, "blocks": len(store.blocks), "block_s": round(block_s, 2),
                 "start_s": round(start_s, 1),
                 **measured(store, client, block_s, interrupts, psutil.Process(children[0].pid)),
             }
@@ -178,10 +199,15 @@ def measured(store, client, block_s, interrupts, scheduler):
     )
     running.compute(range(number), Tally(store, report))
     wall = time.perf_counter() - begun
+    found = [receipt for _, receipt in receipts(store, range(number))]
+    busy_s = sum(receipt.wall_s for receipt in found)
+    # From the end of a worker's block to the start of its next one, with the writing of receipts.
+    idle_s = sum(receipt.seconds["scene"][0] for receipt in found)
     after = [process.memory_info().rss for process in (scheduler, client_process)]
     return {
         "blocks_a_s": round(number / wall, 1),
-        "efficiency": round(number * block_s / threads / wall, 3),
+        "efficiency": round(busy_s / (busy_s + idle_s), 3),
+        "with_start_and_end": round(busy_s / threads / wall, 3),
         "scheduler_core": round((cpu_s(scheduler) - spent[0]) / wall, 2),
         "client_core": round((cpu_s(client_process) - spent[1]) / wall, 2),
         "scheduler_mb": [round(b / 1e6) for b in (memory[0], halfway[0], after[0])],
@@ -191,9 +217,9 @@ def measured(store, client, block_s, interrupts, scheduler):
 
 def stored(count, folder):
     """Return the seconds that a store of ``count`` receipts takes to list, count and open."""
-    pipeline = Pipeline.from_text(GRID.format(trials=SCENES * count))
     begun = time.perf_counter()
-    store = create_store(f"{folder}/stored.zarr", pipeline, (SCENES,))
+    store = created(count, f"{folder}/stored.zarr")
+    count = len(store.blocks)
     seconds = {"create": time.perf_counter() - begun}
     for first in range(0, count, 1000):
         texts = [receipt_text(store, k, 2.0)[1] for k in range(first, min(first + 1000, count))]

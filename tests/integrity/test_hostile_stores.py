@@ -226,7 +226,10 @@ class Evil:
         return open, (str(self._path), "w")
 
 
-@pytest.mark.parametrize("place", ["", "nees", "cost/tradeoff", "cost/scene_s", "trial"])
+@pytest.mark.parametrize("place", [
+    "nees", "cost/tradeoff",
+    *(pytest.param(place, marks=pytest.mark.long) for place in ("", "cost/scene_s", "trial")),
+])
 @pytest.mark.usefixtures("here")
 def test_nothing_is_unpickled(place, copied, tmp_path):
     proof = tmp_path / "unpickled"
@@ -424,7 +427,7 @@ def test_manifest_names_no_file_outside(copied, tmp_path):
 WRONG = (None, "x", -1, [], 1 << 80, [None], {}, 1.5, [[[]]], {"scene": "x"}, [{}])
 
 
-@lengths(3, len(WRONG))
+@lengths(1, len(WRONG))
 @pytest.mark.parametrize(
     "name",
     ["run_id", "processor", "scenes", "detection", "estimate", "seconds", "failures", "written",

@@ -1,11 +1,17 @@
 """Which tests run and in which order, what they take, and the cluster that they share."""
 
+import os
 import resource
+import sys
 from collections import defaultdict
 from pathlib import Path
 
 import pytest
 from distributed import LocalCluster
+
+# Hundreds of processes import the same modules: they are compiled once, wherever the tests run.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 pytest.register_assert_rewrite("support")
 

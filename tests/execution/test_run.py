@@ -19,6 +19,7 @@ import zarr
 import sweep
 from support.blocks import run_block
 from support.stores import by_hand, same
+from sweep.cli import main
 from sweep.errors import ArgumentError, StoreError
 from sweep.execution.block_task import compute_block
 from sweep.execution.runner import execute
@@ -289,14 +290,14 @@ def test_places_that_hold_something_else_are_left_unharmed(pipeline, tmp_path):
     assert "x" in zarr.open_group(str(foreign), mode="r")
 
 
-def test_an_unwritable_path_is_told_in_a_line(tmp_path):
-    path = tmp_path / "p.toml"
-    path.write_text(TEXT)
-    ran = sweep_command("run", path, "--store", "/proc/none/s.zarr")
-    assert ran.returncode == 2
-    assert ran.stderr.strip() == "/proc/none/s.zarr: cannot be written: No such file or directory"
-    ran = sweep_command("run", path, "--workers", "0")
-    assert (ran.returncode, ran.stderr.strip()) == (2, "--workers 0: expected at least 1")
+def test_an_unwritable_path_is_told_in_a_line(tmp_path, capsys):
+    path = str(tmp_path / "p.toml")
+    Path(path).write_text(TEXT)
+    assert main(["run", path, "--store", "/proc/none/s.zarr"]) == 2
+    told = capsys.readouterr().err
+    assert told == "/proc/none/s.zarr: cannot be written: No such file or directory\n"
+    assert main(["run", path, "--workers", "0"]) == 2
+    assert capsys.readouterr().err == "--workers 0: expected at least 1\n"
 
 
 @pytest.mark.usefixtures("no_child")
@@ -331,7 +332,7 @@ def test_silent_scheduler_is_given_up(pipeline, tmp_path, monkeypatch):
     assert not (tmp_path / "none.zarr").exists()
 
 
-def test_json_is_one_object_and_progress_goes_elsewhere(tmp_path):
+def test_json_is_one_object_and_progress_goes_elsewhere(tmp_path, monkeypatch, capsys):
     path = tmp_path / "small.toml"
     path.write_text(TEXT)
     ran = sweep_command("run", path, "--json", cwd=tmp_path)
@@ -341,7 +342,9 @@ def test_json_is_one_object_and_progress_goes_elsewhere(tmp_path):
     assert told["poses"] == 48
     assert told["results"] == 192
     assert told["store"] == "runs/small.zarr"
-    state = json.loads(sweep_command("status", "runs/small.zarr", "--json", cwd=tmp_path).stdout)
+    monkeypatch.chdir(tmp_path)
+    assert main(["status", "runs/small.zarr", "--json"]) == 0
+    state = json.loads(capsys.readouterr().out)
     assert state["finished"]
     assert state["poses_done"] == 48
     assert sum(state["detection"].values()) == 96
@@ -351,12 +354,15 @@ def test_json_is_one_object_and_progress_goes_elsewhere(tmp_path):
 LONG = "[axes]\ntrial = 40000\ndistance_m = [0.05, 0.08]\n[pose]\njitter_px = 0.5\n"
 
 
-def test_interrupted_run_says_how_to_go_on_and_goes_on(tmp_path):
+@pytest.mark.parametrize("workers", [
+    [], pytest.param(["--workers", "2"], marks=pytest.mark.long)], ids=["small", "cluster"])
+def test_interrupted_run_says_how_to_go_on_and_goes_on(workers, tmp_path, capsys):
     path = tmp_path / "long.toml"
-    path.write_text(LONG)
+    path.write_text(LONG if workers else LONG.replace("40000", "4000"))
     (tmp_path / "runs").mkdir()
-    create_store(str(tmp_path / "runs" / "long.zarr"), Pipeline.from_toml(path), (500, 1))
-    command = [sys.executable, "-m", "sweep", "run", str(path), "--workers", "2"]
+    if workers:
+        create_store(str(tmp_path / "runs" / "long.zarr"), Pipeline.from_toml(path), (500, 1))
+    command = [sys.executable, "-m", "sweep", "run", str(path), *workers]
     with subprocess.Popen(
         command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         start_new_session=True,
@@ -376,7 +382,8 @@ def test_interrupted_run_says_how_to_go_on_and_goes_on(tmp_path):
     store = open_store(str(tmp_path / "runs" / "long.zarr"))
     done = len(committed(store))
     assert 0 < done < len(store.blocks)
-    state = json.loads(sweep_command("status", store.url, "--json").stdout)
+    assert main(["status", store.url, "--json"]) == 0
+    state = json.loads(capsys.readouterr().out)
     assert state["writer"] is None
     assert state["blocks_done"] == done
 
@@ -529,13 +536,12 @@ def test_background_axis_of_levels_and_images(tmp_path):
         compute_block(other.url, other.run_id, next(iter(other.blocks)))
 
 
-def test_progress_is_shown_on_a_terminal(cluster, tmp_path):
+def test_progress_is_shown_on_a_terminal(tmp_path):
     path = tmp_path / "small.toml"
     path.write_text(TEXT)
     ours, theirs = pty.openpty()
     with subprocess.Popen(
-        [sys.executable, "-m", "sweep", "run", str(path), "--scheduler",
-         cluster.scheduler_address],
+        [sys.executable, "-m", "sweep", "run", str(path)],
         cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=theirs,
         env={**os.environ, "TERM": "xterm", "COLUMNS": "100"},
     ) as running:

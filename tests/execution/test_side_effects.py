@@ -104,8 +104,9 @@ if __name__ == "__main__":
                 pass
             while client.futures:  # released futures go in the client's own time
                 time.sleep(0.05)
-            run("cluster", client=cluster)
-            run("scheduler", scheduler=cluster.scheduler_address)
+            if how == "all of the caller's":
+                run("cluster", client=cluster)
+                run("scheduler", scheduler=cluster.scheduler_address)
             assert client.status == "running"
             assert client.submit(sum, [1, 2, 3]).result(timeout=30) == 6
             assert distributed.default_client() is client
@@ -116,7 +117,8 @@ if __name__ == "__main__":
 
 
 @pytest.mark.parametrize("how", [
-    pytest.param("embedded", marks=pytest.mark.long), "cluster of the caller"])
+    "client of the caller", pytest.param("all of the caller's", marks=pytest.mark.long),
+    pytest.param("embedded", marks=pytest.mark.long)])
 def test_settings_of_the_caller_are_as_before_and_the_callers_client_still_computes(how, tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)

@@ -7,14 +7,16 @@ import signal
 import pytest
 from distributed import Client
 
+from support.here import Here
 from support.stores import by_hand, same
 from sweep.errors import RunError, StoreError
 from sweep.execution import small_run
 from sweep.execution.runner import execute, recompute
-from sweep.isolation.child_process import Child
+from sweep.execution.tally import Tally
+from sweep.isolation.child_process import Child, ChildRaisedError
 from sweep.isolation.interrupts import Interrupts
 from sweep.plan.experiment import Pipeline
-from sweep.store.blocks import committed, drop_block
+from sweep.store.blocks import drop_block
 from sweep.store.lifecycle import open_store
 from sweep.store.lock import locked
 
@@ -87,32 +89,36 @@ def suicide(*_):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def refuse(*_):
-    raise StoreError("full")
+class Failing(Here):
+    """A child whose calls fail."""
+
+    def __init__(self, error):
+        self._error = error
+
+    def call(self, *_, **__):
+        raise self._error
 
 
-def fail(*_):
-    raise ZeroDivisionError("no")
-
-
-def compute(store, monkeypatch, task):
-    """Compute all blocks with another task; return the child."""
-    from sweep.execution.tally import Tally  # noqa: PLC0415
-
-    monkeypatch.setattr(small_run, "compute_block", task)
-    with Child() as child, Interrupts() as interrupts:
+def compute(store, child):
+    with child, Interrupts() as interrupts:
         small_run.BlocksInChild(
             store, child, store.url, time_limit_s=60, interrupts=interrupts
         ).compute(iter(range(len(store.blocks))), Tally(store))
 
 
-@pytest.mark.parametrize(("task", "error", "reason"), [
-    (suicide, RunError, r"1 blocks failed\n  block 0-2,0-6: its process ended: SIGKILL"),
-    (fail, RunError, r"1 blocks failed\n  block 0-2,0-6: ZeroDivisionError: no"),
-    (refuse, StoreError, "full"),
-])
-def test_block_that_fails_is_named(task, error, reason, undisturbed, monkeypatch):
+def test_block_that_ends_its_process_each_time_is_named(undisturbed, monkeypatch):
     monkeypatch.setattr(small_run, "MAX_DEATHS", 1)
+    monkeypatch.setattr(small_run, "compute_block", suicide)
+    failed = r"1 blocks failed\n  block 0-2,0-6: its process ended: SIGKILL"
+    with pytest.raises(RunError, match=failed):
+        compute(open_store(undisturbed), Child())
+
+
+@pytest.mark.parametrize(("raised", "error", "reason"), [
+    (ChildRaisedError("Traceback:\n  ...\nZeroDivisionError: no"), RunError,
+     r"1 blocks failed\n  block 0-2,0-6: ZeroDivisionError: no"),
+    (StoreError("full"), StoreError, "full"),
+])
+def test_block_that_fails_is_named(raised, error, reason, undisturbed):
     with pytest.raises(error, match=reason):
-        compute(open_store(undisturbed), monkeypatch, task)
-    assert len(committed(open_store(undisturbed))) == 1
+        compute(open_store(undisturbed), Failing(raised))

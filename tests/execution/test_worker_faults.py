@@ -113,7 +113,8 @@ def outcome(client, url):
         return str(error), 0
 
 
-@pytest.mark.parametrize("runs", [1, pytest.param(200, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("runs", [10, 200])
 def test_random_faults_of_one_of_two_machines_change_no_bit(runs, tmp_path, undisturbed):
     generator = random.Random(SEED)
     print(f"seed {SEED}")

@@ -309,7 +309,7 @@ def test_one_damage_is_named_and_mended_alone(key, block, manner, sound, copied,
 
 @pytest.mark.parametrize(
     "manner",
-    [pytest.param(manner, id=name, marks=() if number < 3 else pytest.mark.long)
+    [pytest.param(manner, id=name, marks=pytest.mark.long if number else ())
      for number, (name, manner) in enumerate(MANNERS.items())],
 )
 def test_many_damages_at_once_are_named_and_mended(manner, sound, copied, here):

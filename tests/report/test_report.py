@@ -214,7 +214,7 @@ def test_an_axis_of_too_many_configurations_has_a_figure_of_its_own(tmp_path):
 
 
 @pytest.mark.parametrize("name", [
-    name if name in ("nothing visible", "no draws", "distances drawn")
+    name if name in ("nothing visible", "distances drawn")
     else pytest.param(name, marks=pytest.mark.long) for name in ODD
 ])
 def test_odd_stores_have_a_report_without_a_warning(name, odd, tmp_path):

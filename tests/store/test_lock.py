@@ -276,7 +276,8 @@ def test_store_that_another_process_began_to_write_meanwhile_is_not_removed(pipe
         pytest.raises(StoreError, match="is writing it"),
     ):
         runner._new_store(
-            store.url, pipeline, Calibration(0.001, 0.0, 1, (0.0,)), None, None, overwrite=True
+            store.url, pipeline, Calibration(0.001, 0.0, 1, (0.0,)), None, None, 600.0,
+            overwrite=True,
         )
     assert open_store(store.url).run_id == store.run_id
     remove_store(store.url)

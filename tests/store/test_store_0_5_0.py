@@ -168,7 +168,8 @@ def test_cell_of_an_old_store_is_reproduced(unpacked):
     assert again.stored["detection"] == DetectionStatus.detected
 
 
-@pytest.mark.parametrize("form", ["html", pytest.param("md", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("form", ["html", "md"])
 def test_old_store_is_reported(form, finished, tmp_path, capsys):
     output = tmp_path / f"report.{form}"
     assert main(["report", str(finished), "-o", str(output)]) == 0, capsys.readouterr().err
@@ -176,6 +177,7 @@ def test_old_store_is_reported(form, finished, tmp_path, capsys):
 
 
 @same_versions
+@pytest.mark.long
 def test_costs_are_measured_into_an_old_store(finished, capsys):
     assert main(["tradeoff", str(finished), "--seconds", "0.3"]) == 0, capsys.readouterr().err
     assert "photometric" in capsys.readouterr().out

@@ -341,7 +341,8 @@ def test_a_figure_that_cannot_be_written_is_told_in_one_line(store, tmp_path):
     (tmp_path / "folder.png").mkdir()
     code, _, err = command(store, "--seconds", "0.05", "-o", tmp_path / "folder.png")
     assert code == 2
-    assert err == f"{tmp_path / 'folder.png'}: cannot be written: Is a directory\n"
+    refused = f"{tmp_path / 'folder.png'}: cannot be written: it is a folder; choose a file in it"
+    assert err == f"{refused}\n"
 
 
 def test_a_figure_that_cannot_be_written_is_told_before_anything_is_measured(

@@ -21,8 +21,11 @@ SLOW = Path(__file__).parent / "slow.txt"
 QUICK_LIMIT_S = 0.5
 """Processor time of all default cases of a test function, in seconds, from which on it is slow."""
 
-COMPILES_MOST = "measure/test_photometric.py"
-COMPILES_NOTHING = "analysis/"
+FIRST = (
+    "measure/test_photometric.py", "analysis/", "execution/", "integrity/", "isolation/",
+    "report/", "store/", "tradeoff/", "test_guides",
+)
+"""The order of files: what compiles most, what compiles nothing, what takes longest, the rest."""
 
 
 def pytest_addoption(parser):
@@ -40,10 +43,11 @@ def turn(item):
     """Return an item's place in the order of files.
 
     In a fresh clone one process compiles while the other runs what needs no compiled code; in
-    alphabetical order both would compile the same functions.
+    alphabetical order both would compile the same functions. Short files come last, so that the
+    processes end together.
     """
     name = function_of(item.nodeid)
-    return 0 if name.startswith(COMPILES_MOST) else 1 if name.startswith(COMPILES_NOTHING) else 2
+    return next((k for k, start in enumerate(FIRST) if name.startswith(start)), len(FIRST))
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -420,7 +420,8 @@ def test_kill_between_any_two_writes_of_a_new_store_leaves_all_or_none(
         assert committed(open_store(str(url))) == set()
 
 
-@lengths(1, ALL)
+@pytest.mark.long
+@pytest.mark.parametrize("count", [2, ALL])
 def test_orphan_that_goes_on_after_an_overwrite_harms_nothing(count, small, cluster, tmp_path):
     pipeline, path, _ = small
     url = str(tmp_path / "small.zarr")

@@ -265,6 +265,7 @@ def test_poison_does_nothing_where_its_scene_is_not_asked_for(tmp_path):
     assert [note["event"] for note in notes(log)] == ["start", "start"]
 
 
+@pytest.mark.long
 def test_scene_that_raises_fails_alone(pipeline, clean, tmp_path):
     poisons = [
         Poison(20, "scene", "raise"), Poison(21, "detection", "raise", SUBPIX),

@@ -99,5 +99,5 @@ def read_directly(dataset: xr.Dataset, store: RunStore, storage: Snapshot) -> xr
             direct, chunks=lazy.chunks, name=f"chunks-{lazy.data.name}",
             meta=np.empty((0,) * direct.ndim, dtype=direct.dtype),
         )
-        replaced[variable.name] = lazy.copy(data=values)
+        replaced[variable.name] = lazy.copy(deep=False, data=values)
     return dataset.assign(replaced)

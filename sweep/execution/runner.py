@@ -299,7 +299,8 @@ def _compute_and_close(
 ) -> Mapping[str, int]:
     """Compute the blocks that are not committed; return counts of what was computed."""
     with ThreadPoolExecutor(1) as thread, locked(store) as lock:
-        thread.submit(importlib.import_module, "xarray")  # to close the store
+        for module in ("xarray", "dask.array"):  # to close the store; xarray imports the second
+            thread.submit(importlib.import_module, module)
         done = _committed_whole(store)
         tally = Tally(store, progress)
         tally.begin(done)

@@ -156,12 +156,14 @@ class BlocksInFlight:
 
     def _note_failure(self, number: int, future: Future[Any], tally: Tally) -> None:
         """Submit a block again that may still be computed; else note why it failed."""
-        if future.status in ("cancelled", "lost"):
+        # "lost": the worker died after it committed the block, and its receipt died with it.
+        lost = future.status == "lost" and self._client.status == "running"
+        if not lost and future.status in ("cancelled", "lost"):
             raise RunError("the scheduler went away")
-        error = future.exception()
+        error = None if lost else future.exception()
         if isinstance(error, StoreError):
             raise error
-        if isinstance(error, KilledWorker) and self._deaths[number] < MAX_DEATHS:
+        if (lost or isinstance(error, KilledWorker)) and self._deaths[number] < MAX_DEATHS:
             # A block that ends its process is computed in isolation when it is begun again, but
             # it may have been queued behind one, or its workers were killed from outside.
             self._deaths[number] += 1

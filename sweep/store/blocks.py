@@ -96,6 +96,7 @@ def write_block(
     with translate_errors(store.url, "written"):
         check_not_replaced(store)
         if sync(store.storage.exists(receipt_key(number))):
+            withdraw_block(store, block)
             return  # another worker was given it too, perhaps of another processor
         for variable in in_writing_order(store.variables):
             array = store.array(variable.name)

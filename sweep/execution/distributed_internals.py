@@ -80,9 +80,7 @@ def thread_counts(client: Client, timeout_s: float) -> dict[str, int]:
     OSError
         If the client is not connected.
     """
-    if client.scheduler is None or client.status != "running":
-        raise CommClosedError("not connected")
-    counts: dict[str, int] = client.sync(client.scheduler.ncores, callback_timeout=timeout_s)
+    counts: dict[str, int] = client.sync(_scheduler(client).ncores, callback_timeout=timeout_s)
     return counts
 
 
@@ -96,12 +94,17 @@ def worker_states(client: Client, timeout_s: float) -> dict[str, str]:
     OSError
         If the client is not connected.
     """
-    if client.scheduler is None or client.status != "running":
-        raise CommClosedError("not connected")
     identity: dict[str, Any] = client.sync(
-        client.scheduler.identity, n_workers=-1, callback_timeout=timeout_s
+        _scheduler(client).identity, n_workers=-1, callback_timeout=timeout_s
     )
     return {address: str(worker["status"]) for address, worker in identity["workers"].items()}
+
+
+def _scheduler(client: Client) -> Any:
+    """Return the scheduler to which a client is connected; OSError if it is to none."""
+    if client.scheduler is None or client.status != "running":
+        raise CommClosedError("not connected")
+    return client.scheduler
 
 
 def worker_that_failed(client: Client, key: str) -> str | None:

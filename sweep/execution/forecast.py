@@ -22,7 +22,7 @@ from sweep.execution.calibration import (
 )
 from sweep.execution.cluster import default_workers
 from sweep.execution.limits import CALIBRATION_S, PLAN_LIMIT_S, PLAN_SCENES_LIMIT_S
-from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
+from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
 from sweep.isolation.watchdog import compilation_s
 from sweep.model.effects import SWITCHES
 from sweep.plan.experiment import Pipeline
@@ -172,10 +172,9 @@ def forecast(
                 left = PLAN_LIMIT_S - min(time.monotonic() - started, PLAN_SCENES_LIMIT_S)
                 costs = _effect_costs(child, pipeline, switches, calibration.scene_s, left)
     except (ChildDiedError, ChildRaisedError) as error:
-        reason = str(error).strip().splitlines()[-1]
         raise RunError(
-            f"a measured scene crashed its process ({reason}); `sweep run` isolates it and "
-            "computes the others"
+            f"a measured scene crashed its process ({last_line(error)}); `sweep run` isolates it "
+            "and computes the others"
         ) from None
     extents = block_extents(pipeline, calibration, workers)
     blocks = Blocks(tuple(len(axis) for axis in scene_axes(pipeline)), extents)

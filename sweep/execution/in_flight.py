@@ -25,14 +25,13 @@ from sweep.execution.limits import (
     BLOCKS_PER_THREAD,
     MAX_DEATHS,
     NO_WORKERS_TIMEOUT_S,
-    POLL_S,
     THREAD_COUNT_INTERVAL_S,
     TIME_LIMIT_S,
 )
 from sweep.execution.stall import StallWatch
 from sweep.execution.tally import Tally
 from sweep.execution.worker_faults import WorkerFaults
-from sweep.isolation.interrupts import Interrupts
+from sweep.isolation.interrupts import POLL_S, Interrupts
 from sweep.store.run_store import RunStore
 
 

@@ -24,9 +24,6 @@ MAX_WORKER_FAULTS = 3
 MAX_FAILED_BLOCKS = 10
 """Failed blocks after which no more are submitted."""
 
-POLL_S = 0.2
-"""How often a run that waits for blocks checks for Ctrl-C."""
-
 # Small runs (`sweep.execution.small_run`)
 
 SMALL_RUN_S = 3.0

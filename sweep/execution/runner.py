@@ -10,6 +10,7 @@ import os
 import statistics
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -193,7 +194,7 @@ def recompute(
         interrupts = stack.enter_context(Interrupts())
         child = stack.enter_context(Child(BLOCK_TASK))
         connection: Client | None = None
-        if workers is not None or _block_s(store) * len(chosen) >= SMALL_RUN_S:
+        if workers is not None or _block_s(store, committed(store)) * len(chosen) >= SMALL_RUN_S:
             from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
 
             connection = stack.enter_context(connected(store.pipeline, workers=workers))
@@ -260,16 +261,16 @@ def _work_s(
 ) -> float:
     """Return the estimated seconds of work that are left."""
     if unfinished is not None:
-        left = len(unfinished.blocks) - len(committed(unfinished))
-        return left * _block_s(unfinished)
+        done = committed(unfinished)
+        return (len(unfinished.blocks) - len(done)) * _block_s(unfinished, done)
     if calibration is None:
         return math.inf
     return pipeline.size(Stage.scene) * calibration.scene_s
 
 
-def _block_s(store: RunStore) -> float:
+def _block_s(store: RunStore, done: AbstractSet[int]) -> float:
     """Return the mean seconds of some committed blocks; without any, what blocks are cut for."""
-    some = sorted(committed(store))[:SAMPLED_RECEIPTS]
+    some = sorted(done)[:SAMPLED_RECEIPTS]
     spent = [receipt.wall_s for _, receipt in receipts(store, some)]
     return statistics.fmean(spent) if spent else BLOCK_S
 

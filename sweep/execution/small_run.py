@@ -16,7 +16,7 @@ from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.execution.block_task import compute_block
 from sweep.execution.limits import MAX_DEATHS, SMALL_RUN_LIMIT_S, TIME_LIMIT_S
 from sweep.execution.tally import Tally
-from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
+from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
 from sweep.isolation.interrupts import Interrupts
 from sweep.store.receipt import Receipt
 from sweep.store.run_store import RunStore
@@ -101,7 +101,7 @@ class BlocksInChild:
                     self._child.restart()
                     continue
             except ChildRaisedError as error:
-                reason = str(error).strip().splitlines()[-1]
+                reason = last_line(error)
             except SweepError as error:
                 reason = f"{type(error).__name__}: {error}"
             else:

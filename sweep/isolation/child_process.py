@@ -59,6 +59,11 @@ class ChildRaisedError(Exception):
     """A call raised in the child process; the message is the traceback."""
 
 
+def last_line(error: ChildDiedError | ChildRaisedError) -> str:
+    """Return how a child process ended, or the line of its traceback that names the exception."""
+    return str(error).strip().splitlines()[-1]
+
+
 class Child:
     """A child process that calls functions, one at a time.
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from sweep.evaluation.cells import run_cells
 from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.results import CellsResult, Failure, concatenate
-from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
+from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.experiment import Pipeline
 
@@ -80,9 +80,8 @@ class _IsolatedCells:
                 child.call(_hold, self._pipeline, limit_s=HOLD_S)
             except (ChildDiedError, ChildRaisedError) as error:
                 child.close()
-                lines = str(error).strip().splitlines()
                 raise local_fault(
-                    f"a child process ended before it computed anything: {lines[-1]}"
+                    f"a child process ended before it computed anything: {last_line(error)}"
                 ) from None
             self._child = child
             limit_s += min(LOADING * self.limit_s, LOADING_S)

@@ -27,7 +27,7 @@ def check_output_file(path: Path) -> None:
     StoreError
         If it is a folder, a disk, or a pipe that no process reads, or if it cannot be written.
     """
-    with _explained(path):
+    with write_errors_explained(path):
         if _is_replaced(path):
             temporary = _beside(_target(path))
             temporary.touch(exist_ok=False)
@@ -44,7 +44,7 @@ def write_output_file(path: Path, content: bytes) -> None:
     StoreError
         As :func:`check_output_file`, or if the disk is full.
     """
-    with _explained(path):
+    with write_errors_explained(path):
         if not _is_replaced(path):
             with os.fdopen(_opened(path), "wb") as file:
                 file.write(content)
@@ -70,7 +70,8 @@ def is_standard_stream(path: Path) -> bool:
 
 
 @contextlib.contextmanager
-def _explained(path: Path) -> Iterator[None]:
+def write_errors_explained(path: Path) -> Iterator[None]:
+    """Turn errors of a disk, and of a name that no path can have, into a StoreError."""
     try:
         yield
     except (OSError, ValueError) as error:

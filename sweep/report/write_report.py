@@ -18,11 +18,15 @@ from sweep.report.figures import figure_kinds
 from sweep.report.gallery import scenes_of
 from sweep.report.grouping import AREA
 from sweep.report.markdown import markdown, write_figure
-from sweep.report.output_file import check_output_file, write_output_file
+from sweep.report.output_file import (
+    check_output_file,
+    write_errors_explained,
+    write_output_file,
+)
 from sweep.report.page import page
 from sweep.report.provenance_facts import provenance
 from sweep.report.report_data import ReportData, store_errors
-from sweep.store.locations import enclosing_store, is_remote, reason_of
+from sweep.store.locations import enclosing_store, is_remote
 
 FORMATS = ("html", "md")
 PICTURES = (".svg", ".png")
@@ -54,7 +58,7 @@ def check_output(
     folder = figures_folder(output) if form == "md" else None
     for wanted in (output, figures, folder):
         if wanted is not None:
-            with _explained(wanted):
+            with write_errors_explained(wanted):
                 _check_outside(wanted, store)
     check_output_file(output)
     if folder is not None and output.exists() and not output.is_file():
@@ -64,7 +68,7 @@ def check_output(
         )
     for wanted in (figures, folder):
         if wanted is not None:
-            with _explained(wanted):
+            with write_errors_explained(wanted):
                 _check_folder(wanted)
     if figures is not None and folder is not None and (
         Path(os.path.realpath(folder)) in Path(os.path.realpath(figures)).parents):
@@ -104,15 +108,6 @@ def _check_folder(wanted: Path) -> None:
     trial.rmdir()
 
 
-@contextlib.contextmanager
-def _explained(path: Path) -> Iterator[None]:
-    """Turn errors of a disk, and of a name that no path can have, into a StoreError."""
-    try:
-        yield
-    except (OSError, ValueError) as error:
-        raise StoreError(f"{path}: cannot be written: {reason_of(error)}") from None
-
-
 def write_report(
     data: ReportData, output: Path, form: str = "html", figures: Path | None = None
 ) -> int:
@@ -150,7 +145,7 @@ def write_report(
     rendered = [kind.render(data) for kind in figure_kinds(data)]
     folder = figures_folder(output) if form == "md" else None
     with contextlib.ExitStack() as stack:
-        stack.enter_context(_explained(output))
+        stack.enter_context(write_errors_explained(output))
         temporary = None
         if folder is not None or figures is not None:
             beside = Path(os.path.realpath(folder or figures or output)).parent

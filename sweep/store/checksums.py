@@ -55,13 +55,18 @@ def limit_of(key: str, chunk_limits: Mapping[str, int]) -> int:
     return MAX_TABLE_BYTES if table else MAX_DOCUMENT_BYTES
 
 
-def check_chunk(key: str, reason: str) -> None:
-    """Raise ValueError for a chunk that is too large; what must not be read else is as if missing.
+def may_be_read(root: str | Path, key: str, chunk_limits: Mapping[str, int]) -> bool:
+    """Return whether a local file may be read; what must not be read is as if missing.
 
-    Zarr takes a missing chunk for one of fill values.
+    Raises
+    ------
+    ValueError
+        If it is a chunk that is too large: Zarr takes a missing chunk for one of fill values.
     """
+    reason = unreadable(f"{root}/{key}", limit_of(key, chunk_limits))
     if reason == TOO_LARGE and "/c/" in f"{key}/":
         raise ValueError(f"{key}: {reason}")
+    return not reason
 
 
 class DigestingStore(WrapperStore[Store]):
@@ -160,8 +165,7 @@ class DigestingStore(WrapperStore[Store]):
         """
         if key in self.substitutes:
             return self.substitutes[key]
-        if reason := self.unreadable(key):
-            check_chunk(key, reason)
+        if self._root is not None and not may_be_read(self._root, key, self.chunk_limits):
             return None
         content = await super().get(key, prototype, byte_range)
         if content is not None and byte_range is None:

@@ -17,7 +17,7 @@ from zarr.storage import LocalStore, WrapperStore
 
 from sweep.plan.grid import Block, Blocks, scene_axes
 from sweep.store.blocks import committed
-from sweep.store.checksums import check_chunk, limit_of, unreadable
+from sweep.store.checksums import may_be_read
 from sweep.store.run_store import RunStore
 
 AxisPositions = dict[str, tuple[int, ...]]
@@ -132,12 +132,9 @@ class Snapshot(WrapperStore[Store]):
         number = block_of_chunk(key, self._blocks, self._where)
         if number is not None and not self._done[number]:
             return False
-        if isinstance(self._store, LocalStore):
-            path = f"{self._store.root}/{key}"
-            if reason := unreadable(path, limit_of(key, self._chunk_limits)):
-                check_chunk(key, reason)
-                return False
-        return True
+        return not isinstance(self._store, LocalStore) or may_be_read(
+            self._store.root, key, self._chunk_limits
+        )
 
 
 def snapshot(store: RunStore) -> Snapshot:

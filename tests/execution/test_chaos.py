@@ -21,7 +21,6 @@ from support.stores import by_hand, same
 from sweep.errors import StoreError
 from sweep.execution.block_task import compute_block
 from sweep.plan.experiment import Pipeline
-from sweep.plan.grid import scene_axes
 from sweep.plan.parameters import Stage
 from sweep.store.blocks import committed, receipts
 from sweep.store.lifecycle import create_store, open_store
@@ -82,7 +81,7 @@ def prepared(folder, text, name):
     pipeline = Pipeline.from_text(text, name=name)
     path, url = folder / f"{name}.toml", str(folder / f"{name}.zarr")
     path.write_text(text)
-    by_hand(url, pipeline, tuple(len(axis) for axis in scene_axes(pipeline)))
+    by_hand(url, pipeline)
     return pipeline, path, url
 
 

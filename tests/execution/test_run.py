@@ -60,8 +60,7 @@ def pipeline():
 def undisturbed(pipeline, tmp_path_factory):
     """The store of one process that computes the whole grid as one block."""
     url = str(tmp_path_factory.mktemp("undisturbed") / "whole.zarr")
-    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
-    by_hand(url, pipeline, lengths)
+    by_hand(url, pipeline)
     return url
 
 
@@ -513,7 +512,7 @@ def test_cells_of_a_grid_without_scene_axes_are_reused(tmp_path):
 def test_every_kind_of_axis_gives_a_store_that_opens(text, tmp_path):
     url = str(tmp_path / "kinds.zarr")
     pipeline = Pipeline.from_text(text)
-    by_hand(url, pipeline, tuple(len(axis) for axis in scene_axes(pipeline)))
+    by_hand(url, pipeline)
     with sweep.open(url) as results:
         assert (results.detection.to_numpy() == 1).all()
 

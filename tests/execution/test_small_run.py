@@ -35,7 +35,7 @@ def pipeline():
 @pytest.fixture(scope="module")
 def undisturbed(pipeline, tmp_path_factory):
     url = str(tmp_path_factory.mktemp("undisturbed") / "whole.zarr")
-    by_hand(url, pipeline, (2, 6))
+    by_hand(url, pipeline)
     return url
 
 

@@ -31,7 +31,7 @@ SEED = 2024
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
     url = str(tmp_path_factory.mktemp("undisturbed") / "whole.zarr")
-    by_hand(url, PIPELINE, (12,))
+    by_hand(url, PIPELINE)
     return url
 
 

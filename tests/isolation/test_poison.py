@@ -205,7 +205,7 @@ def pipeline():
 def clean(pipeline, tmp_path_factory):
     """The short grid's results without poison."""
     url = str(tmp_path_factory.mktemp("clean") / "clean.zarr")
-    by_hand(url, pipeline, tuple(len(axis) for axis in scene_axes(pipeline)))
+    by_hand(url, pipeline)
     with xr.open_zarr(url, consolidated=False) as opened:
         loaded = opened.load()
         assert (loaded.estimate == EstimateStatus.solved).all()

@@ -3,12 +3,14 @@
 import xarray as xr
 
 from sweep.execution.block_task import compute_block
+from sweep.plan.grid import scene_axes
 from sweep.store.lifecycle import create_store
 
 
-def by_hand(url, pipeline, extents):
-    """Compute a store in this process, without a cluster."""
-    store = create_store(url, pipeline, extents)
+def by_hand(url, pipeline, extents=None):
+    """Compute a store in this process, without a cluster; as one block unless extents are given."""
+    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
+    store = create_store(url, pipeline, extents or lengths)
     for block in store.blocks:
         compute_block(url, store.run_id, block)
     return store

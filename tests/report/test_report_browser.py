@@ -97,8 +97,8 @@ def test_a_page_that_asked_for_something_would_be_told(tmp_path):
 
 
 SMALLER = {
-    "paper_fig3": ["marker_id=[0, 1]", "distance_m={ linspace = [0.1, 0.5, 45] }", "trial=2"],
-    "paper_fig4": ["marker_id=[0, 1]", "distance_m={ linspace = [0.02, 0.3, 9] }", "trial=2"],
+    "paper_fig3": ["marker_id=[0, 1]", "distance_m={ linspace = [0.02, 0.3, 9] }", "trial=2"],
+    "paper_fig4": ["marker_id=[0, 1]", "distance_m={ linspace = [0.1, 0.5, 45] }", "trial=2"],
     "smoke": ["trial=2"],
     "bound": ["trial=3", "side_px=[20, 50]", "tilt_deg=[0, 30, 60]"],
     "renderers": ["trial=2", "renderer=['exact', 'warp', 'supersample-2']", "side_px=[20, 50]"],

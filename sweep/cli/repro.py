@@ -41,7 +41,7 @@ def _execute(options: argparse.Namespace) -> int:
     say(f"--at {again.at}")
     for line in again.changes:
         say(f"changed since the store was created: {line}")
-    say("\n".join(value_lines(again.recomputed, again.stored)))
+    say("\n".join(value_lines(again.variables, again.recomputed, again.stored)))
     if again.inspection is not None:
         left, top, right, bottom = again.inspection.window
         ids = ", ".join(str(marker_id) for marker_id, _ in again.inspection.decoded) or "none"

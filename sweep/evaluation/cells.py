@@ -43,7 +43,7 @@ from sweep.model.extent import marker_boxes
 from sweep.model.scene import Scenes, build_scenes
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings, estimators, scene_values
-from sweep.plan.schema import SCHEMA
+from sweep.plan.schema import drawn_variables, variables_of
 from sweep.typing import Masks
 
 KEPT_PX = 1 << 26
@@ -128,7 +128,9 @@ def _run_batch(
     results, render_s, row_s = search(
         scenes, to_search, settings, whole_frames(values, count), failures, keep=keep
     )
-    columns: dict[str, list[NDArray[Any]]] = {variable.name: [] for variable in SCHEMA}
+    columns: dict[str, list[NDArray[Any]]] = {
+        variable.name: [] for variable in variables_of(pipeline)
+    }
 
     def add(computed: dict[str, NDArray[Any]]) -> None:
         for name, column in computed.items():
@@ -136,6 +138,10 @@ def _run_batch(
 
     start = time.perf_counter()
     add(compute(SCENE, SceneResults(scenes, _bounds(values, scenes, visibility))))
+    add({
+        variable.name: values[variable.drawn_as].broadcast(count)
+        for variable in drawn_variables(pipeline)
+    })
     seconds = {
         "scene": [geometry_s + render_s + time.perf_counter() - start],
         "detection": [result.seconds for result in results],

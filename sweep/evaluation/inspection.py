@@ -23,7 +23,7 @@ from sweep.model.scene import Scenes, build_scenes
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings, estimators, scene_values
 from sweep.plan.parameters import Stage
-from sweep.plan.schema import SCHEMA
+from sweep.plan.schema import SCHEMA, variables_of
 from sweep.typing import Floats, Grey, Integers, Masks
 
 
@@ -161,5 +161,7 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
             for v in SCHEMA
             if v.flags is None and v.inner in ((), ("xyz",)) and v.stage is Stage.estimation
         },
-        values={v.name: np.asarray(columns[v.name], dtype=v.dtype) for v in SCHEMA},
+        values={
+            v.name: np.asarray(columns[v.name], dtype=v.dtype) for v in variables_of(pipeline)
+        },
     )

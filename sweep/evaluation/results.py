@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block
 from sweep.plan.parameters import Stage
-from sweep.plan.schema import SCHEMA, Variable
+from sweep.plan.schema import Variable, variables_of
 from sweep.typing import Floats
 
 
@@ -85,7 +85,7 @@ class CellsResult:
                     np.full((count, *variable.inner_shape), variable.fill, dtype=variable.dtype)
                     for _ in range(variable.configurations(pipeline))
                 ]
-                for variable in SCHEMA
+                for variable in variables_of(pipeline)
             },
             {
                 "scene": [0.0],

@@ -27,7 +27,7 @@ from sweep.plan.background_files import file_digest
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices
 from sweep.plan.parameters import Stage
-from sweep.plan.schema import SCHEMA, Variable
+from sweep.plan.schema import Variable
 from sweep.store.blocks import begin_block, withdraw_block, write_block
 from sweep.store.failures import MAX_ROWS, recorded
 from sweep.store.lifecycle import open_store
@@ -152,10 +152,10 @@ def _compute_block(
         v.name: to_dataset_layout(
             v, pipeline, block, _columns(v, cells, rows, pipeline, len(block))
         )
-        for v in SCHEMA
+        for v in store.variables
     }
     if reused is not None:
-        values = {v.name: _merged(v, values, reused) for v in SCHEMA}
+        values = {v.name: _merged(v, values, reused) for v in store.variables}
     receipt = Receipt(
         run_id=store.run_id,
         processor=processor(),

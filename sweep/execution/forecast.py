@@ -28,7 +28,7 @@ from sweep.model.effects import SWITCHES
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.parameters import Stage
-from sweep.plan.schema import SCHEMA, bytes_per_block
+from sweep.plan.schema import bytes_per_block, variables_of
 
 EFFECT_SCENES = 24
 """Most scenes on which an effect is measured."""
@@ -38,9 +38,6 @@ EFFECT_S = 0.6
 
 MIN_PAIRS = 3
 """Pairs of measurements of an effect, of which the median is taken."""
-
-FILES_PER_BLOCK = len(SCHEMA) + 1
-"""A chunk of each variable, and the receipt."""
 
 START_S = 3.0
 """Seconds of a run apart from its blocks: processes start and end, packages are imported."""
@@ -187,7 +184,8 @@ def forecast(
         results=pipeline.size(*Stage),
         block=extents,
         blocks=len(blocks),
-        files=len(blocks) * FILES_PER_BLOCK,
+        # A chunk of each variable, and the receipt.
+        files=len(blocks) * (len(variables_of(pipeline)) + 1),
         bytes=bytes_per_block(pipeline, poses),
         worker_bytes=process + 3 * bytes_per_block(pipeline, math.prod(extents)),
         pose_s=calibration.scene_s,

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from sweep.errors import StoreError
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.experiment import Pipeline
-from sweep.plan.grid import Block, scene_axes
+from sweep.plan.grid import Block, scene_axes, scene_values
 from sweep.plan.parameters import PARAMETERS, Stage
-from sweep.plan.schema import SCHEMA, Variable
+from sweep.plan.schema import VARIABLES, Variable, variables_of
 from sweep.store.blocks import committed
 from sweep.store.provenance import changes, fingerprint
 from sweep.store.run_store import RunStore
@@ -74,7 +74,8 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
     present = {variable.name for variable in store.variables}
     faults += [
         f"{variable.name}: not a variable of the store's format {store.format}"
-        for variable in SCHEMA if variable.name not in present
+        for variable in variables_of(pipeline)
+        if variable.name not in present and not variable.drawn_as
     ]
     old_index: dict[str, NDArray[np.int64]] = {}
     pinned: dict[str, int] = {}
@@ -164,7 +165,7 @@ def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> R
             [shape[n] for n in v.dimensions(pipeline) if n in shape] + list(v.inner_shape),
             v.fill, dtype=v.dtype,
         )
-        for v in SCHEMA
+        for v in variables_of(pipeline)
     }
     available = np.zeros([shape[name] for name in order], dtype=bool)
     for source in sources:
@@ -193,18 +194,24 @@ def _read_from(
     ready = _committed_cells(source, order, positions, indices)
     if not ready.any():
         return
+    variables = variables_of(pipeline)
+    present = {variable.name for variable in source.store.variables}
     old = {
-        v.name: _read(source, pipeline, v, indices) for v in SCHEMA
+        v.name: _read(source, pipeline, v, indices) for v in variables if v.name in present
     }
+    old |= _drawn(
+        pipeline, [v for v in variables if v.name not in present], cuts, positions,
+        np.isfinite(old["true_tvec_m"]).all(axis=-1),
+    )
     # A cell is finished if its block is committed and its flag says that it was run.
-    estimate = next(v for v in SCHEMA if v.name == "estimate")
+    estimate = VARIABLES["estimate"]
     names = [name for name in estimate.dimensions(pipeline) if name in positions]
     flags = np.transpose(old["estimate"], [names.index(name) for name in order])
     fresh = ready & (flags != 0) & ~available[np.ix_(*(positions[name] for name in order))]
     if not fresh.any():
         return
     available[np.ix_(*(positions[name] for name in order))] |= fresh
-    for variable in SCHEMA:
+    for variable in variables:
         names = [name for name in variable.dimensions(pipeline) if name in positions]
         # With a configuration of a scene (or of a detection), what it shares is reused.
         away = tuple(k for k, name in enumerate(order) if name not in names)
@@ -216,6 +223,28 @@ def _read_from(
         part = target[grid]
         part[chosen] = old[variable.name][chosen]
         target[grid] = part
+
+
+def _drawn(
+    pipeline: Pipeline, variables: Sequence[Variable], cuts: dict[str, slice],
+    positions: dict[str, NDArray[np.int64]], computed: NDArray[np.bool_],
+) -> dict[str, NDArray[np.float64]]:
+    """Return drawn quantities that the old store's format lacks, NaN where no truth was stored."""
+    if not variables:
+        return {}
+    along = [
+        cuts[axis.name].start + positions[axis.name].astype(np.intp)
+        for axis in scene_axes(pipeline)
+    ]
+    indices = [grid.ravel() for grid in np.meshgrid(*along, indexing="ij")]
+    values = scene_values(pipeline, indices)
+    return {
+        variable.name: np.where(
+            computed, values[variable.drawn_as].broadcast(computed.size).reshape(computed.shape),
+            np.nan,
+        )
+        for variable in variables
+    }
 
 
 def _committed_cells(

@@ -75,7 +75,7 @@ class FileCheck:
         self._check_schema()
         self._findings.grid_fits = RECEIPTS not in self._wrong
         self._findings.keys = set(recorded) | {"commits/zarr.json"}
-        self._check_arrays()
+        self._check_arrays(recorded.keys() | listed)
         if self._manifest is None:
             self._findings.keys |= {
                 key for key in listed if key.startswith(("cost/", "failures/"))
@@ -103,12 +103,17 @@ class FileCheck:
             self._findings.damage.append(ArrayDamage(path, fault))
             self._substitute(document)
 
-    def _check_arrays(self) -> None:
-        """Check values, attributes, and the copies of the metadata, of the sound arrays."""
+    def _check_arrays(self, known: set[str]) -> None:
+        """Check values, attributes, and the copies of the metadata, of the sound arrays.
+
+        Optional ones of which no file is ``known`` are not there.
+        """
         consolidated = self._consolidated_metadata()
         for planned in self._planned:
             document = f"{planned.path}/zarr.json"
             own = {document, *planned.value_keys()}
+            if planned.optional and not own & known:
+                continue
             self._findings.keys |= own
             if self._wrong & {planned.path, *own}:
                 continue

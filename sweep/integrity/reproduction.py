@@ -20,6 +20,7 @@ from sweep.plan.cell_selection import cell, parse_selection, selection_text
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
 from sweep.plan.parameters import Stage
+from sweep.plan.schema import Variable
 from sweep.store.lifecycle import open_store
 
 
@@ -31,6 +32,8 @@ class Reproduction:
     ----------
     at
         Its value of every axis, as text.
+    variables
+        Those of the store.
     recomputed, stored
         Variable -> value, of the dimensions that are no axes; ``stored`` is None if the block is
         not committed.
@@ -54,6 +57,7 @@ class Reproduction:
     """
 
     at: str
+    variables: tuple[Variable, ...]
     recomputed: Values
     stored: Values | None
     difference: str
@@ -115,13 +119,14 @@ def reproduce(
     stored = stored_cell(store, index)
     exact = stored is not None and stored.same_processor and not changes
     difference = "" if stored is None else compare(
-        recomputed, stored.values, same_processor=exact
+        recomputed, stored.values, store.variables, same_processor=exact
     ).difference
     full_at = selection_text({axis.name: axis.values[index[axis.name]] for axis in pipeline.axes})
     cell_pipeline = cell(pipeline, full_at)
     inspected, image = _inspected(cell_pipeline, whole_frame, time_limit_s)
     return Reproduction(
-        full_at, recomputed, None if stored is None else stored.values, difference, exact,
+        full_at, store.variables, recomputed, None if stored is None else stored.values,
+        difference, exact,
         {"scene": cells.seconds["scene"][0], "detection": cells.seconds["detection"][setting],
          "estimation": cells.seconds["estimation"][configuration[Stage.estimation]]},
         cells.failures, changes, pipeline, cell_pipeline, inspected, image,

@@ -129,7 +129,9 @@ class SampleCheck:
         for scene, values in zip(scenes, recomputed, strict=True):
             same_processor = sound[scene.block] == processor()
             other_processor += not same_processor
-            comparison = compare(values, scene.stored, same_processor=same_processor)
+            comparison = compare(
+                values, scene.stored, self._store.variables, same_processor=same_processor
+            )
             at = self._at(scene)
             if comparison.departure:
                 findings.damage.append(SceneDamage(

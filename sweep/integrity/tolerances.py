@@ -9,7 +9,7 @@ pipeline of extremes, lie outside them, because a last bit can decide between tw
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sweep.model.pose import rotation_of_vector
 from sweep.plan.parameters import Stage
-from sweep.plan.schema import SCHEMA, Tolerance
+from sweep.plan.schema import SCHEMA, Tolerance, Variable
 
 Values = Mapping[str, NDArray[Any]]
 """Variable -> values of one scene, of its inner dimensions last."""
@@ -53,7 +53,10 @@ class Comparison:
         return self.departure or self.outside
 
 
-def compare(recomputed: Values, stored: Values, *, same_processor: bool) -> Comparison:
+def compare(
+    recomputed: Values, stored: Values, variables: Sequence[Variable] = SCHEMA, *,
+    same_processor: bool,
+) -> Comparison:
     """Compare a recomputed scene with the stored one, in the variables that both have.
 
     Parameters
@@ -61,6 +64,8 @@ def compare(recomputed: Values, stored: Values, *, same_processor: bool) -> Comp
     recomputed, stored
         The values by variable, of the same shapes. A tolerance of the kind "distance" needs
         ``true_tvec_m`` among the stored ones.
+    variables
+        Those that are compared, in this order.
     same_processor
         Whether both were computed by the same versions on processors with the same features, so
         that every bit must agree.
@@ -75,7 +80,7 @@ def compare(recomputed: Values, stored: Values, *, same_processor: bool) -> Comp
     'reprojection_error_px 0.201000005, stored 0.200000003'
     """
     outside = ""
-    for variable in SCHEMA:
+    for variable in variables:
         if variable.name not in recomputed or variable.name not in stored:
             continue
         ours, theirs = recomputed[variable.name], stored[variable.name]

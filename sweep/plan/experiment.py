@@ -36,6 +36,8 @@ class Pipeline:
         As the document says; the seed of all random draws.
     fixed
         Value of every parameter that is neither an axis nor drawn.
+    given
+        Names of the parameters that the document has.
     distributions
         Distribution of every parameter that is drawn per trial.
     axes
@@ -61,6 +63,7 @@ class Pipeline:
     title: str
     seed: int
     fixed: Mapping[str, Any]
+    given: frozenset[str]
     distributions: Mapping[str, Distribution]
     axes: tuple[Axis, ...]
     text: str
@@ -256,6 +259,7 @@ def _checked(
         raise refusal(reading.faults)
     return Pipeline(
         name=name, title=reading.title, seed=reading.seed, fixed=reading.fixed,
-        distributions=reading.distributions, axes=tuple(reading.axes.values()), text=text,
-        files=reading.files, folder=str(folder.resolve()),
+        given=frozenset(reading.given), distributions=reading.distributions,
+        axes=tuple(reading.axes.values()), text=text, files=reading.files,
+        folder=str(folder.resolve()),
     )

@@ -15,6 +15,7 @@ import numpy as np
 
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flag, Flipped
 from sweep.plan.axes import Axis
+from sweep.plan.coordinates import drawn_quantities
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
 
@@ -127,6 +128,9 @@ class Variable:
         No scene may lie outside the tolerance of a scene's variable, few may outside the others'.
     since_format
         The store format that introduced it: stores of an older format do not have it.
+    drawn_as
+        Name among the scene's values of the drawn quantity that it holds; such a variable is a
+        coordinate of the dataset. Empty for what is computed.
 
     Examples
     --------
@@ -145,6 +149,7 @@ class Variable:
     present_when: FlagRule | None = None
     tolerance: Tolerance | None = None
     since_format: int = 2
+    drawn_as: str = ""
 
     @property
     def fill(self) -> float | int:
@@ -256,13 +261,43 @@ VARIABLES: dict[str, Variable] = {variable.name: variable for variable in SCHEMA
 """Every variable by its name."""
 
 
-def variables_of(store_format: int) -> tuple[Variable, ...]:
-    """Return the variables that a store of a format has.
+DRAWN_FORMAT = 5
+"""The store format from which on drawn quantities are variables."""
 
-    >>> variables_of(2)[0].name
+
+def schema_of(store_format: float) -> tuple[Variable, ...]:
+    """Return the variables that every store of a format has.
+
+    >>> schema_of(2)[0].name
     'true_rvec'
     """
     return tuple(variable for variable in SCHEMA if variable.since_format <= store_format)
+
+
+def drawn_variables(pipeline: Pipeline) -> tuple[Variable, ...]:
+    """Return the variables that hold what is drawn for each scene of a pipeline."""
+    return tuple(
+        Variable(
+            drawn.name, Stage.scene, "f8", drawn.meaning, drawn.unit, present_when=_TRUTH,
+            tolerance=(
+                Tolerance("absolute", TRUTH_RTOL * drawn.scale) if drawn.scale
+                else Tolerance("relative", TRUTH_RTOL)
+            ),
+            since_format=DRAWN_FORMAT, drawn_as=drawn.column,
+        )
+        for drawn in drawn_quantities(pipeline)
+    )
+
+
+def variables_of(pipeline: Pipeline, store_format: float = math.inf) -> tuple[Variable, ...]:
+    """Return the variables that a pipeline's store of a format has: the schema's, then draws.
+
+    >>> pipeline = Pipeline.from_dict({"pose": {"distance_m": 1, "jitter_px": 0.5}})
+    >>> [variable.name for variable in variables_of(pipeline)[-2:]]
+    ['jitter_u_px', 'jitter_v_px']
+    """
+    drawn = drawn_variables(pipeline) if store_format >= DRAWN_FORMAT else ()
+    return schema_of(store_format) + drawn
 
 
 def bytes_per_block(pipeline: Pipeline, scenes: int) -> int:
@@ -271,5 +306,5 @@ def bytes_per_block(pipeline: Pipeline, scenes: int) -> int:
         variable.configurations(pipeline)
         * math.prod(variable.inner_shape)
         * np.dtype(variable.dtype).itemsize
-        for variable in SCHEMA
+        for variable in variables_of(pipeline)
     )

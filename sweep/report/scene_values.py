@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.plan.schema import SCHEMA, Variable
+from sweep.plan.schema import Variable
 from sweep.report.formatting import coordinate
 
 NAME_WIDTH, VALUE_WIDTH = 34, 44
 
 
 def value_lines(
-    recomputed: Mapping[str, NDArray[Any]], stored: Mapping[str, NDArray[Any]] | None
+    variables: Sequence[Variable], recomputed: Mapping[str, NDArray[Any]],
+    stored: Mapping[str, NDArray[Any]] | None,
 ) -> list[str]:
-    """Return a line for each variable that ``recomputed`` has.
+    """Return a line for each of the variables.
 
     Each has the recomputed value with its unit, and the stored value if that differs.
     """
     lines = []
-    for variable in SCHEMA:
-        if variable.name not in recomputed:
-            continue
+    for variable in variables:
         value = recomputed[variable.name]
         text = _text(variable, value)
         line = f"  {variable.name:{NAME_WIDTH}} {text:{VALUE_WIDTH}} {variable.units}".rstrip()

@@ -10,7 +10,7 @@ from sweep.compilation import processor
 from sweep.integrity.stored_values import Values, current_pipeline
 from sweep.integrity.tolerances import compare
 from sweep.plan.grid import Block, scene_axes
-from sweep.plan.schema import SCHEMA
+from sweep.plan.schema import variables_of
 from sweep.report.report_data import ReportData, store_errors
 from sweep.store.blocks import receipts
 from sweep.store.lifecycle import open_store
@@ -24,7 +24,8 @@ def stored_cell(data: ReportData, index: Mapping[str, int]) -> Values:
     StoreError
         If the store cannot be read.
     """
-    names = [variable.name for variable in SCHEMA if variable.name in data.results]
+    variables = variables_of(data.pipeline)
+    names = [variable.name for variable in variables if variable.name in data.results.variables]
     with store_errors(data.store):
         cell = data.results[names].isel(index).load()
     return {name: np.asarray(cell[name].values) for name in names}
@@ -46,7 +47,8 @@ def difference_from_store(
         If a file of the pipeline is missing.
     """
     exact = _computed_alike(data, index)
-    difference = compare(recomputed, stored, same_processor=exact).difference
+    variables = variables_of(data.pipeline)
+    difference = compare(recomputed, stored, variables, same_processor=exact).difference
     if not difference or exact:
         return difference
     return f"{difference}, outside the tolerance for another processor or version"

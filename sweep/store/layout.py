@@ -18,16 +18,17 @@ from zarr.dtype import parse_dtype
 from zarr.storage import MemoryStore
 
 from sweep.plan.axes import Axis
+from sweep.plan.coordinates import FixedValue, fixed_values
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import DISTANCE_PARAMETERS, Blocks, distance_of_side, scene_axes
-from sweep.plan.schema import LABELS, Variable, variables_of
+from sweep.plan.schema import DRAWN_FORMAT, LABELS, VARIABLES, Variable, variables_of
 from sweep.store.zarr_sync import sync
 
-FORMAT = 4
+FORMAT = 5
 """Version of the layout of the stores that are created."""
 
 FORMATS = range(2, FORMAT + 1)
-"""Versions that can be read and continued; 2 is that of sweep 0.5, 3 of 0.6.
+"""Versions that can be read and continued; 2 is that of sweep 0.5, 3 of 0.6, 5 of 0.7.
 
 A store keeps its format; it lacks the variables that a later format introduced.
 """
@@ -58,6 +59,10 @@ class PlannedArray:
     values
         Returns its values in [start, stop) along the first dimension; None for an array to which
         blocks or receipts are written later.
+    coordinate
+        Whether it is a coordinate that is no dimension.
+    optional
+        Whether a store may lack it: that of a version which did not have the parameter.
     """
 
     path: str
@@ -68,6 +73,8 @@ class PlannedArray:
     fill: Any = None
     attributes: dict[str, Any] = field(default_factory=dict)
     values: Callable[[int, int], NDArray[Any]] | None = None
+    coordinate: bool = False
+    optional: bool = False
 
     def create(self, group: zarr.Group) -> None:
         """Create the array and write its values."""
@@ -187,12 +194,14 @@ def planned_arrays(
     pipeline: Pipeline, extents: tuple[int, ...], store_format: int = FORMAT
 ) -> list[PlannedArray]:
     """Return the arrays of a pipeline's store whose chunks are blocks of ``extents``."""
-    variables = variables_of(store_format)
+    variables = variables_of(pipeline, store_format)
     scene_extent = dict(zip((axis.name for axis in scene_axes(pipeline)), extents, strict=True))
     planned = [_axis(axis) for axis in pipeline.axes]
     used = {name for variable in variables for name in variable.inner}
     planned += [_labels(name, LABELS[name], {}) for name in sorted(used)]
     planned += _distance(pipeline)
+    if store_format >= DRAWN_FORMAT:
+        planned += [_fixed(each) for each in fixed_values(pipeline) if each.name not in VARIABLES]
     planned += [_variable(variable, pipeline, scene_extent) for variable in variables]
     lengths = tuple(len(axis) for axis in scene_axes(pipeline))
     planned.append(
@@ -207,7 +216,7 @@ def chunk_limits(
     """Return the most bytes that a chunk of each variable may have when it is compressed."""
     scene_extent = dict(zip((axis.name for axis in scene_axes(pipeline)), extents, strict=True))
     limits = {}
-    for variable in variables_of(store_format):
+    for variable in variables_of(pipeline, store_format):
         planned = _variable(variable, pipeline, scene_extent)
         size = math.prod(planned.chunks) * np.dtype(variable.dtype).itemsize
         limits[variable.name] = size + size // 128 + 1024
@@ -222,7 +231,8 @@ def _variable(
         scene_extent.get(name, length) for name, length in zip(names, shape, strict=True)
     )
     return PlannedArray(
-        variable.name, shape, chunks, variable.dtype, names, variable.fill, variable.attributes()
+        variable.name, shape, chunks, variable.dtype, names, variable.fill, variable.attributes(),
+        coordinate=bool(variable.drawn_as),
     )
 
 
@@ -267,8 +277,20 @@ def _distance(pipeline: Pipeline) -> list[PlannedArray]:
             tuple(axis.name for axis in axes), None,
             {"long_name": "depth of the marker's centre along the optical axis", "units": "m"},
             lambda start, stop: distance[start:stop] if distance.ndim else distance,
+            coordinate=True,
         )
     ]
+
+
+def _fixed(fixed: FixedValue) -> PlannedArray:
+    """Return the coordinate without dimensions of a parameter that is fixed."""
+    text = isinstance(fixed.value, str)
+    value = np.array(fixed.value, dtype=object if text else None)
+    return PlannedArray(
+        fixed.name, (), (), "string" if text else value.dtype.str.lstrip("<>|="), (), None,
+        dict(fixed.attributes), lambda start, stop: value,  # noqa: ARG005  (it has no dimension)
+        coordinate=True, optional=True,
+    )
 
 
 def documents(planned: Iterable[PlannedArray]) -> dict[str, cpu.Buffer]:

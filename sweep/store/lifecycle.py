@@ -203,15 +203,14 @@ def _lay_out(to: Store, pipeline: Pipeline, extents: tuple[int, ...], run_id: st
     """Write a store's coordinates, its empty arrays, its attributes, and its manifest."""
     storage = DigestingStore(to)
     group = open_group(storage, "w-")
-    planned = planned_arrays(pipeline, extents)
+    planned = planned_arrays(pipeline, extents, FORMAT)
     for array in planned:
         array.create(group)
-    derived = [array.path for array in planned if array.path == "distance_m"
-               and pipeline.axis("distance_m") is None]
+    coordinates = [array.path for array in planned if array.coordinate]
     attributes: dict[str, Any] = {
         "title": pipeline.heading,
         "pipeline": pipeline.text,
-        **({"coordinates": " ".join(derived)} if derived else {}),
+        **({"coordinates": " ".join(coordinates)} if coordinates else {}),
         "sweep": {
             "format": FORMAT,
             "name": pipeline.name,

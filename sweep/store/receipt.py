@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from sweep.plan.schema import variables_of
+from sweep.plan.schema import schema_of
 
 POSITIONAL_FORMAT = 2
 """The store format whose receipts list digests by position."""
@@ -124,7 +124,7 @@ class Receipt:
         content = asdict(self)
         if store_format == POSITIONAL_FORMAT:
             content["digests"] = [
-                self.digests[variable.name] for variable in variables_of(store_format)
+                self.digests[variable.name] for variable in schema_of(store_format)
             ]
         if store_format < NAMING_FORMAT:
             del content["block"]
@@ -226,7 +226,7 @@ def _computed(values: Any) -> dict[str, int]:
 def _digests(values: Any) -> dict[str, int]:
     """Return the digests by variable."""
     if isinstance(values, list):
-        names = [variable.name for variable in variables_of(POSITIONAL_FORMAT)]
+        names = [variable.name for variable in schema_of(POSITIONAL_FORMAT)]
         if len(values) != len(names):
             raise ValueError("digests: another number of variables")
         values = dict(zip(names, values, strict=True))

@@ -55,8 +55,8 @@ class RunStore:
 
     @property
     def variables(self) -> tuple[Variable, ...]:
-        """The variables of the store's format."""
-        return variables_of(self.format)
+        """The variables of the pipeline in the store's format."""
+        return variables_of(self.pipeline, self.format)
 
     @property
     def data_url(self) -> str:

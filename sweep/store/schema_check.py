@@ -46,7 +46,10 @@ def schema_faults(store: RunStore) -> dict[str, str]:
                 faults[name] = "not an array of a sweep store"
             elif misfit := _misfit(planned[name], member):
                 faults[name] = misfit
-    faults.update({name: "missing" for name in planned if name not in present})
+    faults.update({
+        name: "missing" for name, array in planned.items()
+        if name not in present and not array.optional
+    })
     return faults
 
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from sweep.plan.experiment import Pipeline
-from sweep.plan.schema import SCHEMA, variables_of
+from sweep.plan.schema import SCHEMA, schema_of
 from sweep.store.blocks import receipt_key, receipt_texts
 from sweep.store.layout import RECEIPTS
 from sweep.store.lifecycle import create_store
 from sweep.store.receipt import Receipt, RecordedFailure
 from sweep.store.receipt_text import decoded, is_decodable
 
-NAMES = [variable.name for variable in variables_of(2)]
+NAMES = [variable.name for variable in schema_of(2)]
 
 RECEIPT = Receipt(
     run_id="a" * 32, processor="avx2", scenes=3,
@@ -51,8 +51,8 @@ def test_receipts_of_format_2_list_digests_in_the_order_of_sweep_0_5():
 
 
 def test_every_variable_has_a_format():
-    assert variables_of(1) == ()
-    assert variables_of(99) == SCHEMA
+    assert schema_of(1) == ()
+    assert schema_of(99) == SCHEMA
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from typing import Any
 from sweep.evaluation.cells import run_cells
 from sweep.evaluation.results import Failure, to_dataset_layout
 from sweep.plan.grid import block_indices
-from sweep.plan.schema import SCHEMA
+from sweep.plan.schema import variables_of
 
 
 @dataclass
@@ -22,7 +22,10 @@ def run_block(pipeline, block):
     """Render, detect and estimate every scene of a block."""
     cells = run_cells(pipeline, block_indices(block))
     return BlockResult(
-        {v.name: to_dataset_layout(v, pipeline, block, cells.columns[v.name]) for v in SCHEMA},
+        {
+            v.name: to_dataset_layout(v, pipeline, block, cells.columns[v.name])
+            for v in variables_of(pipeline)
+        },
         cells.seconds,
         cells.failures,
     )

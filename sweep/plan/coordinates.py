@@ -1,0 +1,127 @@
+"""Coordinates of the dataset beside its axes: what is fixed, and what is drawn for each scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sweep.messages import label
+from sweep.model.columns import Column
+from sweep.plan.axes import MAX_DEVIATIONS, Distribution
+from sweep.plan.experiment import Pipeline
+from sweep.plan.parameters import PARAMETERS, Parameter
+from sweep.typing import Floats
+
+ALWAYS_GIVEN = ("marker", "pose")
+"""Sections whose fixed parameters are coordinates also where the file does not give them."""
+
+
+@dataclass(frozen=True, slots=True)
+class FixedValue:
+    """A parameter with one value on the whole grid: a coordinate without dimensions.
+
+    Attributes
+    ----------
+    name
+        The parameter's.
+    value
+        A number, a truth value, or a text (a list of numbers as "0.1, 0").
+    attributes
+        ``long_name``, and ``units`` if it has a unit.
+    """
+
+    name: str
+    value: float | bool | str
+    attributes: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnQuantity:
+    """A number of each scene that is drawn, or follows from one that is.
+
+    Attributes
+    ----------
+    name
+        Of the coordinate: the parameter's name.
+    column
+        Its name among the scene's values (:func:`sweep.plan.grid.scene_values`).
+    meaning, unit
+        Its ``long_name`` and ``units``.
+    scale
+        The largest numbers that it is added up from, by which rounding is measured; 0 if it is
+        a product.
+    """
+
+    name: str
+    column: str
+    meaning: str
+    unit: str
+    scale: float
+
+    def of(self, values: Mapping[str, Column], count: int) -> Floats:
+        """Return its values (count,) among those of scenes."""
+        return values[self.column].broadcast(count)
+
+
+def fixed_values(pipeline: Pipeline) -> list[FixedValue]:
+    """Return the fixed parameters that are coordinates, in the order of their declaration.
+
+    They are those of marker and pose that have a value, and all that the pipeline gives.
+    """
+    return [
+        FixedValue(parameter.name, value, _attributes(parameter))
+        for parameter in PARAMETERS.values()
+        if parameter.section in ALWAYS_GIVEN or parameter.name in pipeline.given
+        if (value := _scalar(pipeline.fixed.get(parameter.name))) is not None
+    ]
+
+
+def _scalar(value: Any) -> float | bool | str | None:
+    return label(value) if isinstance(value, tuple) else value
+
+
+def _attributes(parameter: Parameter) -> dict[str, str]:
+    unit = {"units": parameter.unit} if parameter.unit else {}
+    return {"long_name": parameter.declaration.meaning, **unit}
+
+
+def drawn_quantities(pipeline: Pipeline) -> list[DrawnQuantity]:
+    """Return what is drawn for each scene of a pipeline, except the noise of pixels.
+
+    Examples
+    --------
+    >>> pipeline = Pipeline.from_dict({"pose": {"side_px": {"uniform": [20, 40]}}})
+    >>> [quantity.name for quantity in drawn_quantities(pipeline)]
+    ['side_px', 'distance_m']
+    """
+    quantities = [
+        _of_parameter(PARAMETERS[name], _scale(distribution))
+        for name, distribution in pipeline.distributions.items()
+    ]
+    if "side_px" in pipeline.distributions:
+        quantities.append(_of_parameter(PARAMETERS["distance_m"], 0.0))
+    jitter = [float(value) for value in pipeline.values_of("jitter_px")]
+    if any(jitter):
+        quantities += [
+            DrawnQuantity(
+                f"jitter_{axis}_px", f"shift_{axis}_px",
+                f"shift of the centre's undistorted projection along {axis}", "px", max(jitter),
+            )
+            for axis in ("u", "v")
+        ]
+    return quantities
+
+
+def _of_parameter(parameter: Parameter, scale: float) -> DrawnQuantity:
+    return DrawnQuantity(
+        parameter.name, parameter.name, parameter.declaration.meaning, parameter.unit, scale
+    )
+
+
+def _scale(distribution: Distribution) -> float:
+    """Return the largest number that a draw is added up from."""
+    a, b = abs(distribution.a), abs(distribution.b)
+    return float(np.maximum(a, b * (MAX_DEVIATIONS if distribution.kind == "normal" else 1.0)))

@@ -1,0 +1,175 @@
+"""What was drawn, and what is fixed, is in the dataset under the parameter's own name."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.spatial.transform import Rotation
+
+import sweep
+from sweep.analysis import compare, detection_rate, error_statistics
+from sweep.execution.block_task import compute_block
+from sweep.execution.finalize import close
+from sweep.integrity.reproduction import reproduce
+from sweep.integrity.verification import verify
+from sweep.plan.schema import variables_of
+from sweep.store.lifecycle import create_store
+from tests.support.here import calls_here
+
+PIPELINE = {
+    "seed": 5,
+    "camera": {"fx_px": 500},
+    "marker": {"size_m": 0.05},
+    "pose": {
+        "side_px": {"uniform": [25, 60]},
+        "tilt_deg": {"uniform": [0, 60]},
+        "roll_deg": {"normal": [0, 40]},
+        "bearing_x_deg": {"uniform": [-10, 10]},
+        "jitter_px": 0.5,
+    },
+    "scene": {"background": 255, "noise_grey": {"uniform": [0, 4]}},
+    "estimator": {"believed_fx_px": {"normal": [500, 5]}},
+    "axes": {"azimuth_deg": [0, 30], "trial": 40, "solver": ["ippe", "iterative"]},
+}
+DRAWN = {
+    "side_px", "tilt_deg", "roll_deg", "bearing_x_deg", "noise_grey", "believed_fx_px",
+    "distance_m", "jitter_u_px", "jitter_v_px",
+}
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory):
+    url = str(tmp_path_factory.mktemp("drawn") / "drawn.zarr")
+    with calls_here():
+        sweep.run(PIPELINE, store=url, progress=False)
+    return url
+
+
+@pytest.fixture(scope="module")
+def results(url):
+    return sweep.open(url)
+
+
+def test_the_true_pose_follows_from_the_coordinates(results):
+    r = results.load()
+    zeros = xr.zeros_like(r.tilt_deg)
+    tilt, azimuth, roll = (np.radians(x + zeros).values.ravel() for x in (
+        r.tilt_deg, r.azimuth_deg, r.roll_deg))
+    axis = np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=-1)
+    expected = (
+        Rotation.from_rotvec(axis * tilt[:, None]) * Rotation.from_euler("z", roll[:, None])
+        * Rotation.from_euler("x", 180, degrees=True)
+    )
+    rvec = r.true_rvec.transpose(..., "xyz").values.reshape(-1, 3)
+    assert (expected * Rotation.from_rotvec(rvec).inv()).magnitude().max() < 1e-14
+    z = 500 * 0.05 / r.side_px
+    np.testing.assert_allclose(r.distance_m, z, rtol=1e-15)
+    x = z * np.tan(np.radians(r.bearing_x_deg)) + r.jitter_u_px * z / 500
+    y = r.jitter_v_px * z / 500
+    np.testing.assert_allclose(
+        r.true_tvec_m.transpose("xyz", ...), np.stack([x, y, z]), rtol=0, atol=1e-14
+    )
+    assert (abs(r.jitter_u_px) <= 0.5).all()
+    assert r.jitter_u_px.std() > 0.2
+
+
+def test_every_parameter_is_a_coordinate_whether_fixed_an_axis_or_drawn(results, url):
+    for opened in (results, xr.open_zarr(url)):
+        assert set(opened.coords) >= DRAWN
+        for name in DRAWN:
+            assert opened[name].dims == ("azimuth_deg", "trial"), name
+            assert opened[name].dtype == "f8"
+            assert opened[name].chunks == opened["marker_area_px"].chunks
+        assert opened.azimuth_deg.dims == ("azimuth_deg",)
+        fixed = {"size_m": 0.05, "fx_px": 500.0, "jitter_px": 0.5, "bearing_y_deg": 0.0,
+                 "marker_id": 0, "background": 255.0, "quiet_zone_modules": 1.0}
+        assert {name: opened[name].item() for name in fixed} == fixed
+        assert opened["dictionary"].item() == "DICT_5X5_50"
+        assert opened["tilt_deg"].attrs["units"] == "degree"
+        assert "distortion" not in opened.variables  # neither given, nor of marker or pose
+        assert not DRAWN & set(opened.data_vars)
+
+
+def test_a_store_with_draws_is_sound_and_its_cells_are_reproduced(url):
+    assert verify(url, 2).damage == []
+    again = reproduce(url, "azimuth_deg=30,trial=7")
+    assert again.exact
+    assert not again.difference
+    cell = sweep.open(url).sel(azimuth_deg=30, trial=7)
+    assert {name: float(again.recomputed[name]) for name in DRAWN} == {
+        name: float(cell[name]) for name in DRAWN
+    }
+    assert dict(cell[["true_rvec"]].coords).keys() >= DRAWN
+
+
+def test_analyses_bin_by_what_was_drawn(results):
+    edges = [0, 15, 45, 60]
+    table = error_statistics(results, per=["solver"], bins={"tilt_deg": edges}).compute()
+    deg = results.rotation_error_deg.transpose("azimuth_deg", "trial", "solver").values
+    solved = (results.estimate == 1).transpose("azimuth_deg", "trial", "solver").values
+    number = np.digitize(results.tilt_deg.values, edges) - 1
+    for k, solver in enumerate(results.solver.values):
+        for b in range(3):
+            chosen = deg[number == b][:, k][solved[number == b][:, k]].astype(float)
+            assert table.rotation_rmse_deg.sel(solver=solver)[b].item() == pytest.approx(
+                np.sqrt(np.mean(chosen**2)), rel=1e-6
+            )
+    rate = detection_rate(results, bins={"noise_grey": [0, 2, 4]})
+    assert rate.looked_for.sum() == 2 * 40
+    pair = compare(
+        results.sel(solver="ippe"), results.sel(solver="iterative"), bins={"side_px": [25, 40, 60]}
+    )
+    assert pair.compared.sum() == 2 * 40
+
+
+def test_blocks_that_were_not_computed_have_no_draws(tmp_path):
+    pipeline = sweep.Pipeline.from_dict(PIPELINE)
+    url = str(tmp_path / "half.zarr")
+    store = create_store(url, pipeline, (1, 40))
+    compute_block(url, store.run_id, store.blocks[1])
+    half = sweep.open(url)
+    for name in DRAWN:
+        assert np.isnan(half[name].sel(azimuth_deg=0)).all()
+        assert np.isfinite(half[name].sel(azimuth_deg=30)).all()
+    grown = sweep.Pipeline.from_dict(
+        PIPELINE | {"axes": PIPELINE["axes"] | {"azimuth_deg": [30, 60]}}
+    )
+    other = str(tmp_path / "grown.zarr")
+    store = create_store(other, grown, (2, 10))
+    computed = [compute_block(other, store.run_id, block, (url,)) for block in store.blocks]
+    assert sum(receipt.computed["scenes"] for receipt in computed) == 40
+    close(store)
+    for name in DRAWN:
+        xr.testing.assert_identical(
+            half[name].sel(azimuth_deg=30), sweep.open(other)[name].sel(azimuth_deg=30)
+        )
+
+
+def test_cells_of_an_older_format_are_reused_and_their_draws_recomputed(tmp_path, monkeypatch):
+    pipeline = sweep.Pipeline.from_dict(PIPELINE)
+    old, new = str(tmp_path / "old.zarr"), str(tmp_path / "new.zarr")
+    with monkeypatch.context() as then:
+        then.setattr("sweep.store.lifecycle.FORMAT", 4)
+        store = create_store(old, pipeline, (2, 40))
+    compute_block(old, store.run_id, store.blocks[0])
+    close(store)
+    assert verify(old, 0).damage == []
+    assert not DRAWN & set(sweep.open(old).variables)
+    assert len(store.variables) + len(DRAWN) == len(variables_of(pipeline))
+    store = create_store(new, pipeline, (1, 20))
+    computed = [compute_block(new, store.run_id, block, (old,)) for block in store.blocks]
+    assert sum(receipt.computed["scenes"] for receipt in computed) == 0
+    close(store)
+    assert verify(new, 0).damage == []
+    assert all(np.isfinite(sweep.open(new)[name]).all() for name in DRAWN)
+
+
+def test_a_fixed_parameter_of_a_later_version_is_missed_by_no_check(tmp_path, monkeypatch):
+    from sweep.plan import coordinates  # noqa: PLC0415
+
+    store = str(tmp_path / "older.zarr")
+    with monkeypatch.context() as then:
+        then.setattr(coordinates, "ALWAYS_GIVEN", ("marker",))
+        with calls_here():
+            sweep.run({"pose": {"distance_m": 0.5}}, store=store, progress=False)
+    assert "roll_deg" not in sweep.open(store).variables
+    assert verify(store, 0).damage == []

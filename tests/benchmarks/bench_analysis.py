@@ -20,7 +20,7 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.experiment import Pipeline
 from sweep.plan.schema import SCHEMA
 from sweep.store.blocks import region
-from sweep.store.lifecycle import create_store
+from sweep.store.lifecycle import create_store, finish
 
 GRID = """
 seed = 1
@@ -87,6 +87,9 @@ def write_store(folder, poses):
         for name, values in chunk(rng, pipeline, block).items():
             variable = variables[name]
             store.array(name)[region(variable, pipeline, block)] = values
+    # Readers see committed blocks alone, and all of a finished store.
+    finish(store, {}, {"detection": [0] * len(DetectionStatus),
+                       "estimate": [0] * len(EstimateStatus)})
     return store.url, trials * POSES_A_TRIAL
 
 

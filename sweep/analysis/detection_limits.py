@@ -15,6 +15,7 @@ from sweep.analysis.dimensions import (
     axes_of,
     fingerprint_of,
     kept_dimensions,
+    pipeline_text,
     require_dimension,
 )
 from sweep.analysis.intervals import LEVEL, wilson
@@ -218,7 +219,7 @@ def _value(results: xr.Dataset, name: str) -> Any:
         return results[name].reset_coords(drop=True)
     try:
         files = fingerprint_of(results).get("files", {})
-        pipeline = Pipeline.from_text(results.attrs["pipeline"], files=files)
+        pipeline = Pipeline.from_text(pipeline_text(results), files=files)
     except (KeyError, SweepError):
         raise DatasetError(f"{name}: not a coordinate, and the attributes hold no pipeline "
                            "that has it") from None

@@ -9,6 +9,7 @@ import xarray as xr
 
 from sweep.analysis.pose_view import REQUIRED_VARIABLES
 from sweep.errors import ArgumentError, DatasetError
+from sweep.plan.camera_values import SQUARE_FORMAT, stored_text
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS, Stage
 from sweep.plan.schema import LABELS, SCHEMA
 
@@ -34,6 +35,15 @@ def fingerprint_of(results: xr.Dataset) -> Mapping[str, Any]:
     metadata = results.attrs.get("sweep")
     fingerprint = metadata.get("fingerprint") if isinstance(metadata, Mapping) else None
     return fingerprint if isinstance(fingerprint, Mapping) else {}
+
+
+def pipeline_text(results: xr.Dataset) -> str:
+    """Return the text of the pipeline in a dataset's attributes; KeyError if they have none."""
+    metadata = results.attrs.get("sweep")
+    store_format = metadata.get("format") if isinstance(metadata, Mapping) else None
+    return stored_text(
+        results.attrs["pipeline"], SQUARE_FORMAT if store_format is None else store_format
+    )
 
 
 def as_names(per: Sequence[str]) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ def _execute(options: argparse.Namespace) -> int:
     from sweep.cli.first_use import announce_compilation  # noqa: PLC0415
     from sweep.execution.forecast import forecast  # noqa: PLC0415
     from sweep.plan.active_parts import parts  # noqa: PLC0415
+    from sweep.plan.camera_facts import camera_facts, notes  # noqa: PLC0415
     from sweep.report.formatting import byte_count, duration  # noqa: PLC0415
 
     announce_compilation(pipeline)
@@ -31,6 +32,8 @@ def _execute(options: argparse.Namespace) -> int:
         print_json(
             {
                 "title": pipeline.title,
+                "camera": dataclasses.asdict(camera_facts(pipeline)),
+                "notes": notes(pipeline),
                 "dimensions": {axis.name: len(axis) for axis in pipeline.axes},
                 **dataclasses.asdict(expected),
                 "parts": [
@@ -41,6 +44,9 @@ def _execute(options: argparse.Namespace) -> int:
         )
         return 0
     say(pipeline.heading)
+    say(f"\nCamera\n  {camera_facts(pipeline).line()}")
+    for line in notes(pipeline):
+        say(f"  {line}")
     say("\nDimensions")
     width = max((len(axis.name) for axis in pipeline.axes), default=0)
     for axis in pipeline.axes:

@@ -52,7 +52,10 @@ def _execute_beside(child: Child, options: argparse.Namespace) -> int:
     from sweep.cli.first_use import announce_compilation  # noqa: PLC0415
     from sweep.execution.progress import progress_bar  # noqa: PLC0415
     from sweep.execution.runner import execute  # noqa: PLC0415
+    from sweep.plan.camera_facts import camera_facts  # noqa: PLC0415
 
+    if not options.json:
+        say(f"camera: {camera_facts(pipeline).line()}")
     announce_compilation(pipeline)
     with progress_bar() as bar:
         summary = execute(

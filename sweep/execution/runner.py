@@ -35,6 +35,7 @@ from sweep.execution.tally import Tally
 from sweep.isolation.child_process import Child
 from sweep.isolation.interrupts import Interrupts
 from sweep.messages import notice
+from sweep.plan.camera_facts import notes
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
 from sweep.store.blocks import committed, drop_block, receipts
@@ -126,6 +127,8 @@ def execute(
     unfinished = _store_to_continue(url, pipeline, overwrite)
     if unfinished is not None and unfinished.finished:
         return summary_of_complete(unfinished, started)
+    for line in notes(pipeline):
+        notice(line)
     if durable and is_remote(url):
         notice(f"{url}: nothing to flush: an object store answers once it keeps what was written")
     sources = _matching_sources(url, pipeline, reuse)

@@ -10,6 +10,7 @@ from sweep.measure.estimation import PoseEstimator
 from sweep.measure.photometric import Photometric
 from sweep.measure.solver import OPENCV_SOLVERS, CornerSolver, OpenCVSolver
 from sweep.model.declaration import parameter
+from sweep.model.lens import COUNTS
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +112,7 @@ class EstimatorSetting:
         None, f"principal point, y, {_ASSUMED}", unit="px", low=-1e9, high=1e9, drawable=True
     )
     believed_distortion: tuple[float, ...] | None = parameter(
-        None, f"lens coefficients {_ASSUMED}"
+        None, f"lens coefficients {_ASSUMED}", lengths=COUNTS
     )
     believed_size_m: float | None = parameter(
         None, f"side of the black square {_ASSUMED}", unit="m", low=1e-9, high=1e9, drawable=True

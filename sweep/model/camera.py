@@ -14,24 +14,45 @@ from sweep.model import lens
 from sweep.model.declaration import parameter
 from sweep.model.projection import Optics
 
+DEFAULT_SENSOR_MM = (4.8, 3.6)
+"""Width and height of the sensor where the pipeline gives neither."""
+
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """A camera's parameters: in millimetres, or the focal lengths in pixels."""
+    """A camera's parameters: focal lengths in pixels, a field of view, or millimetres.
+
+    Pixels are square unless both sides of the sensor, or ``fx_px`` and ``fy_px``, are given.
+    """
 
     width_px: int = parameter(640, "width of the frame", unit="px", low=1, high=100_000)
     height_px: int = parameter(480, "height of the frame", unit="px", low=1, high=100_000)
-    sensor_width_mm: float = parameter(
-        4.8, "width of the sensor's active area", unit="mm", low=1e-6, high=1e6
+    sensor_width_mm: float | None = parameter(
+        None, "width of the sensor's active area (default: 4.8, or with sensor_height_mm what "
+        "makes the pixels square)", unit="mm", low=1e-6, high=1e6,
     )
-    sensor_height_mm: float = parameter(
-        3.6, "height of the sensor's active area", unit="mm", low=1e-6, high=1e6
+    sensor_height_mm: float | None = parameter(
+        None, "height of the sensor's active area (default: what makes the pixels square)",
+        unit="mm", low=1e-6, high=1e6,
     )
     focal_length_mm: float = parameter(
         4.0, "focal length of the lens", unit="mm", low=1e-6, high=1e6
     )
+    pixel_size_um: float | None = parameter(
+        None, "side of a square pixel; with focal_length_mm, replaces the sensor's sides",
+        unit="um", low=0.05, high=1e4,
+    )
+    hfov_deg: float | None = parameter(
+        None, "horizontal field of view between the frame's edges, without lens distortion: "
+        "2 atan(width_px / (2 fx)); replaces focal lengths and the sensor's sides",
+        unit="degree", low=1e-5, high=179.9,
+    )
+    vfov_deg: float | None = parameter(
+        None, "vertical field of view: 2 atan(height_px / (2 fy)); as hfov_deg, and not both",
+        unit="degree", low=1e-5, high=179.9,
+    )
     fx_px: float | None = parameter(
-        None, "focal length along x; replaces the three parameters in mm", unit="px", low=1e-3,
+        None, "focal length along x; replaces the parameters in mm", unit="px", low=1e-3,
         high=1e9,
     )
     fy_px: float | None = parameter(
@@ -44,15 +65,19 @@ class Camera:
         None, "principal point, y (default: (height_px - 1) / 2)", unit="px", low=-1e9, high=1e9
     )
     distortion: tuple[float, ...] = parameter(
-        (), "lens coefficients in OpenCV's order: 0, 4, 5, 8, 12 or 14 numbers"
+        (), "lens coefficients in OpenCV's order: 0, 4, 5, 8, 12 or 14 numbers",
+        lengths=lens.COUNTS,
     )
 
 
 VIEW_PARAMETERS = (
     "width_px", "height_px", "sensor_width_mm", "sensor_height_mm", "focal_length_mm", "fx_px",
-    "fy_px", "cx_px", "cy_px",
+    "fy_px", "cx_px", "cy_px", "hfov_deg", "vfov_deg", "pixel_size_um",
 )
 """The arguments of :func:`intrinsics`, in order."""
+
+SQUARE_RTOL = 1e-12
+"""Focal lengths that differ by less, relatively, are those of square pixels."""
 
 
 def intrinsics(
@@ -65,17 +90,59 @@ def intrinsics(
     fy_px: Any,
     cx_px: Any,
     cy_px: Any,
+    hfov_deg: Any = None,
+    vfov_deg: Any = None,
+    pixel_size_um: Any = None,
 ) -> tuple[Any, Any, Any, Any]:
     """Return fx, fy, cx, cy in pixels (numbers or arrays, as the arguments of :class:`Camera`)."""
-    if fx_px is None:
-        fx = focal_length_mm / sensor_width_mm * width_px
-        fy = focal_length_mm / sensor_height_mm * height_px
-    else:
+    if fx_px is not None:
         fx = fx_px
         fy = fx_px if fy_px is None else fy_px
+    elif hfov_deg is not None:
+        fx = fy = width_px / (2 * np.tan(np.radians(hfov_deg) / 2))
+    elif vfov_deg is not None:
+        fx = fy = height_px / (2 * np.tan(np.radians(vfov_deg) / 2))
+    elif pixel_size_um is not None:
+        fx = fy = 1e3 * focal_length_mm / pixel_size_um
+    else:
+        fx, fy = _of_sensor(
+            width_px, height_px, sensor_width_mm, sensor_height_mm, focal_length_mm
+        )
     cx = (width_px - 1) / 2 if cx_px is None else cx_px
     cy = (height_px - 1) / 2 if cy_px is None else cy_px
     return fx, fy, cx, cy
+
+
+def _of_sensor(
+    width_px: Any, height_px: Any, sensor_width_mm: Any, sensor_height_mm: Any,
+    focal_length_mm: Any,
+) -> tuple[Any, Any]:
+    """Return fx and fy of a lens before a sensor; square pixels if one of its sides is missing.
+
+    Where the default side makes them square, it is used: the bits are those of the side given.
+    """
+    width, height = DEFAULT_SENSOR_MM
+    fx = focal_length_mm / (width if sensor_width_mm is None else sensor_width_mm) * width_px
+    fy = focal_length_mm / (height if sensor_height_mm is None else sensor_height_mm) * height_px
+    if sensor_width_mm is not None and sensor_height_mm is not None:
+        return fx, fy
+    known = fx if sensor_height_mm is None else fy
+    square = are_square(fx, fy)
+    # Exact: what is added is a difference of almost equal numbers, or 0.
+    return known + (fx - known) * square, known + (fy - known) * square
+
+
+def are_square(fx: Any, fy: Any) -> Any:
+    """Return whether pixels are square, of focal lengths in pixels (numbers or arrays)."""
+    return np.abs(fx - fy) <= SQUARE_RTOL * np.abs(fx)
+
+
+def field_of_view_deg(length_px: Any, focal_px: Any) -> Any:
+    """Return the angle between a frame's opposite edges, without lens distortion, in degrees.
+
+    ``2 atan(length / (2 focal))`` of a frame that lies symmetrically about the optical axis.
+    """
+    return np.degrees(2 * np.arctan(np.asarray(length_px) / (2 * np.asarray(focal_px))))
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,8 @@ class Declaration:
     """The declaration of a parameter: meaning, unit, allowed values.
 
     ``low`` and ``high`` are inclusive unless ``open_low`` excludes the lower end. ``drawable``
-    parameters may be drawn from a distribution per trial.
+    parameters may be drawn from a distribution per trial. ``lengths`` are those that a list of
+    numbers may have.
     """
 
     meaning: str
@@ -23,6 +24,7 @@ class Declaration:
     open_low: bool = False
     choices: tuple[str, ...] = ()
     drawable: bool = False
+    lengths: tuple[int, ...] = ()
 
     def range_text(self) -> str:
         """Return the allowed values in words, as error messages and the reference print them."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model import lens as lens_model
-from sweep.model.camera import VIEW_PARAMETERS, Cameras, intrinsics
+from sweep.model.camera import VIEW_PARAMETERS, Camera, Cameras, intrinsics
 from sweep.model.columns import Column, map_columns
 from sweep.model.declaration import parameter
 from sweep.model.effects import EFFECTS, NEUTRAL, SWITCHES, VELOCITIES, is_active
@@ -156,6 +157,9 @@ class Scenes:
 
 
 _NEUTRAL_COLUMNS = {name: Column.of(value) for name, value in NEUTRAL.items()}
+_DEFAULT_CAMERA = {
+    field.name: Column.of(field.default) for field in dataclasses.fields(Camera)
+}
 
 
 def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
@@ -165,7 +169,7 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
     ``distortion`` canonical) and ``shift_u_px``, ``shift_v_px``: the drawn jitter. Each is a
     :class:`Column`, or a value that :meth:`Column.of` takes.
     """
-    values = {**_NEUTRAL_COLUMNS, "noise_key": 0, **values}
+    values = {**_NEUTRAL_COLUMNS, **_DEFAULT_CAMERA, "noise_key": 0, **values}
 
     def column(name: str) -> Column:
         return Column.of(values[name])

@@ -10,6 +10,7 @@ from typing import Any
 from sweep.messages import MAX_FAULTS, label, nearest, plain, refusal
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.experiment import Pipeline
+from sweep.plan.overrides import displaced_by
 from sweep.plan.parameters import PARAMETERS
 from sweep.plan.toml_text import read_value
 
@@ -37,9 +38,8 @@ def cell(pipeline: Pipeline, at: str) -> Pipeline:
     chosen = {axis.name: axis.values[0] for axis in pipeline.axes} | named
     trial = chosen.pop(TRIAL, 0)
     axes = (Axis(TRIAL, range(trial, trial + 1)),)
-    for name, other in (("distance_m", "side_px"), ("side_px", "distance_m")):
-        if name in named and other not in named:
-            chosen.pop(other, None)
+    for other in displaced_by(named):
+        chosen.pop(other, None)
     return dataclasses.replace(pipeline.fixed_at(chosen), axes=axes)
 
 

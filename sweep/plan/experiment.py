@@ -13,6 +13,7 @@ import tomlkit
 from sweep.messages import plain, refusal
 from sweep.model.image_file import read_regular
 from sweep.plan.axes import Axis, Distribution
+from sweep.plan.camera_values import resolve_sensor
 from sweep.plan.overrides import apply_settings, fix_values, parse_settings
 from sweep.plan.parameters import Stage
 from sweep.plan.reader import read_keys
@@ -254,6 +255,7 @@ def _checked(
 ) -> Pipeline:
     """Return the pipeline of a document; PipelineError with all its faults."""
     reading = read_keys(document, source, folder, files)
+    resolve_sensor(reading)
     check_rules(reading)
     if reading.faults:
         raise refusal(reading.faults)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import tomlkit
@@ -13,6 +13,23 @@ from sweep.plan.axes import DISTRIBUTION_FORMS, TRIAL
 from sweep.plan.parameters import PARAMETERS
 from sweep.plan.reader import HEADER, section_of
 from sweep.plan.toml_text import quoted_if_bare, read_value
+
+_PX = ("fx_px", "fy_px")
+_SIDES = ("sensor_width_mm", "sensor_height_mm")
+_MM = ("focal_length_mm", *_SIDES, "pixel_size_um")
+_FIELDS = ("hfov_deg", "vfov_deg")
+
+ALTERNATIVES: dict[str, tuple[str, ...]] = {
+    "distance_m": ("side_px",),
+    "side_px": ("distance_m",),
+    **dict.fromkeys(_PX, (*_MM, *_FIELDS)),
+    "focal_length_mm": (*_PX, *_FIELDS),
+    **dict.fromkeys(_SIDES, (*_PX, *_FIELDS, "pixel_size_um")),
+    "pixel_size_um": (*_PX, *_FIELDS, *_SIDES),
+    "hfov_deg": (*_PX, *_MM, "vfov_deg"),
+    "vfov_deg": (*_PX, *_MM, "hfov_deg"),
+}
+"""Parameter -> those that say the same in another way: choosing it drops them."""
 
 
 def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
@@ -58,12 +75,31 @@ def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
     return chosen
 
 
+def displaced_by(chosen: Collection[str]) -> set[str]:
+    """Return the parameters that give way to chosen ones: other ways to say the same.
+
+    >>> sorted(displaced_by(["distance_m"])), sorted(displaced_by(["side_px", "distance_m"]))
+    (['side_px'], [])
+    """
+    others = {name for each in chosen for name in ALTERNATIVES.get(each, ())}
+    return others.difference(chosen)
+
+
+def _delete(document: Any, names: Collection[str]) -> None:
+    """Delete parameters from all tables of a document."""
+    for table in document.values():
+        if isinstance(table, dict):
+            for name in table.keys() & names:
+                del table[name]
+
+
 def apply_settings(document: Any, chosen: Mapping[str, Any]) -> None:
     """Write chosen values into a document, of plain tables or of tomlkit's.
 
     A list or a table of values makes (or replaces) an axis; a single value or a distribution
-    makes the parameter fixed or drawn.
+    makes the parameter fixed or drawn. What the chosen values displace goes.
     """
+    _delete(document, displaced_by(chosen))
     for name, value in chosen.items():
         if name in HEADER:
             document[name] = value
@@ -75,16 +111,9 @@ def apply_settings(document: Any, chosen: Mapping[str, Any]) -> None:
 def fix_values(document: Any, chosen: Mapping[str, Any]) -> None:
     """Fix parameters of a document at chosen values.
 
-    The axis ``trial`` goes; if ``distance_m`` or ``side_px`` is chosen, the other goes.
+    The axis ``trial`` goes, and what the chosen values displace.
     """
-    dropped = {TRIAL}
-    for name, other in (("distance_m", "side_px"), ("side_px", "distance_m")):
-        if name in chosen and other not in chosen:
-            dropped.add(other)
-    for table in document.values():
-        if isinstance(table, dict):
-            for name in dropped & table.keys():
-                del table[name]
+    _delete(document, {TRIAL, *displaced_by(chosen)})
     for name, value in chosen.items():
         _write(document, name, list(value) if isinstance(value, tuple) else value)
 

@@ -16,7 +16,6 @@ from sweep.measure.estimators import EstimatorSetting
 from sweep.model.camera import Camera
 from sweep.model.declaration import Declaration
 from sweep.model.effects import Effects
-from sweep.model.lens import COUNTS
 from sweep.model.marker import Marker
 from sweep.model.pose import Pose
 from sweep.model.renderers import renderer_fault
@@ -64,8 +63,8 @@ class Parameter:
     def expected(self) -> str:
         """Return the allowed values in words."""
         if tuple in self.types:
-            counts = ", ".join(str(count) for count in COUNTS[:-1])
-            return f"a list of {counts} or {COUNTS[-1]} finite numbers"
+            *counts, last = self.declaration.lengths
+            return f"a list of {', '.join(map(str, counts))} or {last} finite numbers"
         words = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
         kind = " or ".join(words[kind] for kind in self.types)
         extent = self.declaration.range_text()
@@ -77,7 +76,7 @@ class Parameter:
         """Return ``value`` in the parameter's type; ValueError(expectation) if not allowed."""
         if tuple in self.types and isinstance(value, (list, tuple)):
             numbers = all(_is_number(item) and abs(item) < 1e300 for item in value)
-            if numbers and len(value) in COUNTS:
+            if numbers and len(value) in self.declaration.lengths:
                 return tuple(float(item) for item in value)
         elif bool in self.types and isinstance(value, bool):
             return value

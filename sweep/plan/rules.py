@@ -14,6 +14,7 @@ from sweep.model.image_file import MAX_PIXELS
 from sweep.model.marker import marker_count
 from sweep.plan.axes import TRIAL
 from sweep.plan.background_files import check_backgrounds
+from sweep.plan.camera_values import one_camera
 from sweep.plan.parameters import PARAMETERS, Stage
 from sweep.plan.reader import Reading
 
@@ -36,23 +37,6 @@ def distance_or_side(reading: Reading) -> None:
         reading.faults.append(
             f"{reading.source}: pose: expected distance_m or side_px, fixed or under [axes]"
         )
-
-
-def camera_in_one_unit(reading: Reading) -> None:
-    """Demand a camera in pixels or in millimetres, not in both."""
-    in_mm = [
-        name for name in ("sensor_width_mm", "sensor_height_mm", "focal_length_mm")
-        if name in reading.given
-    ]
-    for name in ("fx_px", "fy_px"):
-        if name in reading.given and in_mm:
-            reading.fault(
-                name, reading.written(name),
-                f"a camera in pixels or in millimetres, not both; delete it or "
-                f"{', '.join(in_mm)}",
-            )
-    if "fy_px" in reading.given and "fx_px" not in reading.given:
-        reading.fault("fy_px", reading.written("fy_px"), "fx_px beside it")
 
 
 def ids_in_dictionary(reading: Reading) -> None:
@@ -170,7 +154,7 @@ def size_of_whole_frames(reading: Reading) -> None:
 
 RULES: tuple[Callable[[Reading], None], ...] = (
     distance_or_side,
-    camera_in_one_unit,
+    one_camera,
     ids_in_dictionary,
     effects_need_partners,
     effects_need_the_exact_renderer,

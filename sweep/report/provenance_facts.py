@@ -12,6 +12,7 @@ from typing import Any
 
 from sweep.messages import label
 from sweep.plan.axes import TRIAL, Axis
+from sweep.plan.camera_facts import camera_facts, notes
 from sweep.plan.parameters import PARAMETERS
 from sweep.report.formatting import coordinates
 from sweep.report.gallery import pipeline_file
@@ -60,6 +61,7 @@ def provenance(data: ReportData, output: str) -> Provenance:
     digest = hashlib.sha256(json.dumps(fingerprint, sort_keys=True).encode()).hexdigest()
     facts = {
         "Store": data.store,
+        "Camera": "; ".join([camera_facts(data.pipeline).line(), *notes(data.pipeline)]),
         "Run": _dates(data.run_metadata),
         "Versions": versions,
         "Processor": str(environment.get("cpu", "unknown")),

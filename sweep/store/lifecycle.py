@@ -22,6 +22,8 @@ from zarr.buffer import default_buffer_prototype
 from zarr.storage import LocalStore
 
 from sweep.errors import StoreError
+from sweep.plan.camera_facts import camera_facts
+from sweep.plan.camera_values import stored_text
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.schema import SCHEMA
@@ -114,8 +116,9 @@ def store_of(
                 if not are_counts(metadata["counts"][name]):
                     raise TypeError(name)
         pipeline = Pipeline.from_text(
-            str(attributes["pipeline"]), name=metadata["name"], source=f"{url} (its pipeline)",
-            folder=metadata["folder"], files=metadata["fingerprint"]["files"],
+            stored_text(str(attributes["pipeline"]), metadata["format"]), name=metadata["name"],
+            source=f"{url} (its pipeline)", folder=metadata["folder"],
+            files=metadata["fingerprint"]["files"],
         )
         lengths, extents = tuple(len(a) for a in scene_axes(pipeline)), tuple(metadata["block"])
         if len(extents) != len(lengths) or not all(
@@ -210,6 +213,7 @@ def _lay_out(to: Store, pipeline: Pipeline, extents: tuple[int, ...], run_id: st
     attributes: dict[str, Any] = {
         "title": pipeline.heading,
         "pipeline": pipeline.text,
+        **camera_facts(pipeline).attributes(),
         **({"coordinates": " ".join(coordinates)} if coordinates else {}),
         "sweep": {
             "format": FORMAT,

@@ -1,0 +1,184 @@
+"""What a pipeline's camera is: focal lengths, fields of view, the marker's side in pixels."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+from sweep.model.camera import VIEW_PARAMETERS, are_square, field_of_view_deg, intrinsics
+from sweep.plan.experiment import Pipeline
+
+Range = tuple[float, float]
+"""The least and the largest value on the grid."""
+
+NORMAL_SDS = 3.0
+"""Standard deviations from the mean at which the ends of a normal distribution are stated."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFacts:
+    """The camera of a grid; each quantity has its least and its largest value.
+
+    Attributes
+    ----------
+    width_px, height_px, fx_px, fy_px, cx_px, cy_px
+        Frame, focal lengths and principal point.
+    hfov_deg, vfov_deg
+        Angle between the frame's edges, without lens distortion: 2 atan(width / (2 fx)).
+    square
+        Whether the pixels are square everywhere on the grid.
+    side_px
+        Side of the black square parallel to the image plane, at the farthest and the nearest
+        pose; None if the distance is not one of the pipeline's numbers.
+    """
+
+    width_px: Range
+    height_px: Range
+    fx_px: Range
+    fy_px: Range
+    cx_px: Range
+    cy_px: Range
+    hfov_deg: Range
+    vfov_deg: Range
+    square: bool
+    side_px: Range | None
+
+    def line(self) -> str:
+        """Return the camera in one line."""
+        focal = f"fx = fy = {_text(self.fx_px)} px"
+        if not self.square:
+            ratios = sorted({y / x for x, y in zip(self.fx_px, self.fy_px, strict=True)})
+            focal = (
+                f"fx = {_text(self.fx_px)} px, fy = {_text(self.fy_px)} px "
+                f"(pixels are not square: fy/fx = {_text((ratios[0], ratios[-1]), 4)})"
+            )
+        parts = [
+            f"{_text(self.width_px)} x {_text(self.height_px)} px", focal,
+            f"HFOV {_text(self.hfov_deg, 4)}°", f"VFOV {_text(self.vfov_deg, 4)}°",
+        ]
+        if self.side_px is not None:
+            far, near = self.side_px
+            parts.append(
+                f"the marker's side is {far:.4g} px" if far == near else
+                f"the marker's side is {near:.4g} px at the nearest pose, {far:.4g} px at the "
+                "farthest"
+            )
+        return ", ".join(parts)
+
+    def attributes(self) -> dict[str, Any]:
+        """Return the dataset's attributes: a number, or the least and the largest one."""
+        named = {
+            "camera_fx_px": self.fx_px, "camera_fy_px": self.fy_px,
+            "camera_hfov_deg": self.hfov_deg, "camera_vfov_deg": self.vfov_deg,
+        }
+        attributes: dict[str, Any] = {
+            name: low if low == high else [low, high] for name, (low, high) in named.items()
+        }
+        if self.side_px is not None:
+            far, near = self.side_px
+            attributes |= {"nearest_side_px": near, "farthest_side_px": far}
+        return attributes
+
+
+def _text(ends: Range, digits: int = 6) -> str:
+    low, high = (f"{end:.{digits}g}" for end in ends)
+    return low if low == high else f"{low} to {high}"
+
+
+def camera_facts(pipeline: Pipeline) -> CameraFacts:
+    """Return what a pipeline's camera is.
+
+    Every quantity is monotonic in each parameter, so that the ends of the axes have its ends.
+    """
+    chosen = [
+        [ends[0]] if ends[0] == ends[1] else list(ends)
+        for ends in (_ends(pipeline, name) or (None, None) for name in VIEW_PARAMETERS)
+    ]
+    rows: dict[str, list[float]] = {}
+    for values in itertools.product(*chosen):
+        fx, fy, cx, cy = intrinsics(*values)
+        width, height = values[:2]
+        for name, number in {
+            "width_px": width, "height_px": height, "fx_px": fx, "fy_px": fy, "cx_px": cx,
+            "cy_px": cy, "hfov_deg": field_of_view_deg(width, fx),
+            "vfov_deg": field_of_view_deg(height, fy),
+        }.items():
+            rows.setdefault(name, []).append(float(number))
+    ranges = {name: (min(column), max(column)) for name, column in rows.items()}
+    square = all(map(are_square, rows["fx_px"], rows["fy_px"]))
+    return CameraFacts(square=square, side_px=_side(pipeline, ranges["fx_px"]), **ranges)
+
+
+def _ends(pipeline: Pipeline, name: str) -> tuple[Any, Any] | None:
+    """Return the least and the largest value of a parameter; None if it is not given."""
+    if name in pipeline.distributions:
+        drawn = pipeline.distributions[name]
+        if drawn.kind == "uniform":
+            return drawn.a, drawn.b
+        return drawn.a - NORMAL_SDS * drawn.b, drawn.a + NORMAL_SDS * drawn.b
+    values = pipeline.values_of(name)
+    if not len(values) or values[0] is None:
+        return None
+    return min(values), max(values)
+
+
+def _side(pipeline: Pipeline, fx: Range) -> Range | None:
+    """Return the least and the largest side in pixels, fx · size / distance."""
+    if (sides := _ends(pipeline, "side_px")) is not None:
+        return sides
+    size, distance = _ends(pipeline, "size_m"), _ends(pipeline, "distance_m")
+    if size is None or distance is None or not distance[0] > 0:
+        return None
+    return fx[0] * size[0] / distance[1], fx[1] * size[1] / distance[0]
+
+
+OFF_CENTRE = 0.15
+"""Distance of the principal point from the frame's centre, as a share of its side, that is told."""
+
+NOT_SQUARE = 0.01
+"""Difference of fy/fx from 1 that is told; calibrations of square pixels differ by less."""
+
+
+def notes(pipeline: Pipeline) -> list[str]:
+    """Return a line for each property of the camera, or of beliefs about it, that may surprise."""
+    facts = camera_facts(pipeline)
+    return [*_focal_notes(pipeline, facts), *_centre_notes(facts)]
+
+
+def _focal_notes(pipeline: Pipeline, facts: CameraFacts) -> list[str]:
+    lines = []
+    ratios = [y / x for x, y in zip(facts.fx_px, facts.fy_px, strict=True)]
+    if max(abs(ratio - 1) for ratio in ratios) > NOT_SQUARE:
+        lines.append(
+            f"pixels are not square: fy/fx = {_text((min(ratios), max(ratios)), 4)}; a single side "
+            "of the sensor, or fx_px alone, makes them square"
+        )
+    if _varies(pipeline, "width_px") and pipeline.fixed.get("fx_px") is not None:
+        lines.append(
+            "fx_px is fixed while width_px varies: HFOV goes from "
+            f"{_text(facts.hfov_deg, 4)}°; hfov_deg in place of fx_px keeps it"
+        )
+    return lines
+
+
+def _centre_notes(facts: CameraFacts) -> list[str]:
+    lines = []
+    frame = f"{_text(facts.width_px)} x {_text(facts.height_px)} px"
+    for name, ends, sides in (
+        ("cx_px", facts.cx_px, facts.width_px), ("cy_px", facts.cy_px, facts.height_px),
+    ):
+        off = max(abs(end - (side - 1) / 2) / side for end, side in zip(ends, sides, strict=True))
+        if off > 0.5:
+            lines.append(f"{name} = {_text(ends)}: outside the frame of {frame}")
+        elif off > OFF_CENTRE:
+            lines.append(
+                f"{name} = {_text(ends)}: far from the centre of the frame of {frame}; is it that "
+                "of another frame size?"
+            )
+    return lines
+
+
+def _varies(pipeline: Pipeline, name: str) -> bool:
+    axis = pipeline.axis(name)
+    return axis is not None and len(axis) > 1

@@ -1,0 +1,291 @@
+"""A camera as users know it: fields of view, pixel sizes, square pixels, and no silent trap."""
+
+import dataclasses
+import itertools
+import math
+import tomllib
+
+import numpy as np
+import pytest
+
+import sweep
+from sweep.cli import main
+from sweep.errors import PipelineError, StoreError
+from sweep.execution.runner import execute
+from sweep.model.camera import VIEW_PARAMETERS, intrinsics
+from sweep.plan.camera_facts import camera_facts, notes
+from sweep.plan.camera_values import stored_text
+from sweep.plan.cell_selection import cell
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import scene_axes, scene_values
+from sweep.store.lifecycle import create_store, open_store
+from tests.support.here import calls_here
+
+
+def pipeline(camera=None, settings=(), **sections):
+    return Pipeline.from_dict(
+        {"camera": camera or {}, "pose": {"distance_m": 1.0}, **sections}, settings
+    )
+
+
+def view(camera):
+    fixed = pipeline(camera).fixed
+    return [float(number) for number in intrinsics(*(fixed[name] for name in VIEW_PARAMETERS))]
+
+
+# 1. Ways to give a camera.
+
+@pytest.mark.parametrize("width", [640, 1280, 1921])
+@pytest.mark.parametrize("fov", [1e-3, 30.0, 60.0, 90.0, 179.0])
+def test_a_field_of_view_reaches_from_edge_to_edge_of_the_frame(fov, width):
+    fx, fy, cx, cy = view({"width_px": width, "height_px": 700, "hfov_deg": fov})
+    assert fx == fy == pytest.approx(width / 2 / math.tan(math.radians(fov / 2)), rel=1e-14)
+    # The rays through the outer edges of the first and the last pixel.
+    left, right = math.atan((-0.5 - cx) / fx), math.atan((width - 0.5 - cx) / fx)
+    assert math.degrees(right - left) == pytest.approx(fov, rel=1e-10)
+    fx, fy, cx, cy = view({"width_px": 700, "height_px": width, "vfov_deg": fov})
+    top, bottom = math.atan((-0.5 - cy) / fy), math.atan((width - 0.5 - cy) / fy)
+    assert fx == fy
+    assert math.degrees(bottom - top) == pytest.approx(fov, rel=1e-10)
+
+
+def test_a_pixel_size_gives_the_focal_length_in_pixels():
+    # 8 mm before pixels of 3.45 um.
+    assert view({"pixel_size_um": 3.45, "focal_length_mm": 8.0})[:2] == pytest.approx(
+        [8.0 / 3.45e-3] * 2, rel=1e-15
+    )
+
+
+@pytest.mark.parametrize(("camera", "focal"), [
+    ({"width_px": 1280, "height_px": 720}, 4.0 / 4.8 * 1280),
+    ({"width_px": 100, "height_px": 100}, 4.0 / 4.8 * 100),
+    ({"height_px": 400}, 4.0 / 4.8 * 640),
+    ({"sensor_width_mm": 6.4}, 4.0 / 6.4 * 640),
+    ({"sensor_height_mm": 4.8}, 4.0 / 4.8 * 480),
+    ({"sensor_height_mm": 2.7, "width_px": 1280, "height_px": 720}, 4.0 / 2.7 * 720),
+    ({"focal_length_mm": 8.0, "width_px": 1920, "height_px": 1200}, 8.0 / 4.8 * 1920),
+    ({"fx_px": 700}, 700.0),
+])
+def test_pixels_are_square_unless_both_sides_are_given(camera, focal):
+    fx, fy, _, _ = view(camera)
+    assert fx == fy == pytest.approx(focal, rel=1e-15)
+    assert camera_facts(pipeline(camera)).square
+    assert not notes(pipeline(camera))
+
+
+@pytest.mark.parametrize("camera", [
+    {"sensor_width_mm": 4.8, "sensor_height_mm": 3.6, "width_px": 1280, "height_px": 720},
+    {"fx_px": 500, "fy_px": 600},
+])
+def test_pixels_that_are_not_square_are_said_to_be(camera):
+    fx, fy, _, _ = view(camera)
+    facts = camera_facts(pipeline(camera))
+    assert not facts.square
+    assert f"pixels are not square: fy/fx = {fy / fx:.4g}" in facts.line()
+    assert notes(pipeline(camera))[0].startswith(f"pixels are not square: fy/fx = {fy / fx:.4g};")
+
+
+@pytest.mark.parametrize("focal_length", [3.6, 4.0, 6.0, 12.5])
+def test_frames_of_the_default_shape_keep_the_bits_that_the_default_sensor_gave(focal_length):
+    rng = np.random.default_rng(3)
+    for k in rng.integers(1, 20_000, 300).tolist():
+        camera = {"width_px": 4 * k, "height_px": 3 * k, "focal_length_mm": focal_length}
+        both = {"sensor_width_mm": 4.8, "sensor_height_mm": 3.6}
+        expected = [focal_length / 4.8 * (4 * k), focal_length / 3.6 * (3 * k)]
+        sides = [{name: both[name] for name in given} for given in ((), both, ["sensor_width_mm"])]
+        for given in sides:
+            assert view(camera | given)[:2] == expected
+            assert pipeline(camera | given).fixed == pipeline(camera | both).fixed
+
+
+def test_axes_of_the_camera_give_what_each_value_gives_on_its_own():
+    axes = {
+        "hfov_deg": [40.0, 60.0], "width_px": [640, 1280], "height_px": [480, 720],
+        "side_px": [20.0, 50.0],
+    }
+    grid = Pipeline.from_dict({"marker": {"size_m": 0.04}, "axes": axes})
+    lengths = [len(axis) for axis in scene_axes(grid)]
+    values = scene_values(grid, [index.ravel() for index in np.indices(lengths)])
+    columns = [values[name].values for name in VIEW_PARAMETERS]
+    fx, fy, _, _ = intrinsics(*columns)
+    for k, chosen in enumerate(itertools.product(*axes.values())):
+        camera = dict(zip(("hfov_deg", "width_px", "height_px"), chosen[:3], strict=True))
+        assert [fx[k], fy[k]] == view(camera)[:2]
+        alone = Pipeline.from_dict(
+            {"marker": {"size_m": 0.04}, "camera": camera, "pose": {"side_px": chosen[3]}}
+        )
+        distance = scene_values(alone, [])["distance_m"].values
+        assert values["distance_m"].values[k] == distance == fx[k] * 0.04 / chosen[3]
+
+
+def test_a_frame_size_on_an_axis_keeps_pixels_square():
+    grid = Pipeline.from_dict({
+        "pose": {"distance_m": 1}, "axes": {"width_px": [640, 1280], "height_px": [480, 720]},
+    })
+    facts = camera_facts(grid)
+    assert facts.square
+    assert facts.fx_px == facts.fy_px == (4 / 4.8 * 640, 4 / 4.8 * 1280)
+
+
+@pytest.mark.parametrize(("camera", "lines"), [
+    ({"hfov_deg": 60, "vfov_deg": 40}, ["vfov_deg = 40: expected hfov_deg or vfov_deg, not both"]),
+    ({"hfov_deg": 60, "fx_px": 500},
+     ["hfov_deg = 60: expected a field of view or focal lengths, not both; delete it or fx_px"]),
+    ({"vfov_deg": 60, "focal_length_mm": 5, "sensor_width_mm": 6},
+     ["vfov_deg = 60: expected a field of view or focal lengths, not both; delete it or "
+      "sensor_width_mm, focal_length_mm"]),
+    ({"hfov_deg": 60, "fy_px": 500},
+     ["hfov_deg = 60: expected a field of view or focal lengths, not both; delete it or fy_px",
+      "fy_px = 500: expected fx_px beside it"]),
+    ({"pixel_size_um": 3, "sensor_width_mm": 6, "focal_length_mm": 4},
+     ["pixel_size_um = 3: expected the size of a pixel or the sensor's sides, not both; delete it "
+      "or sensor_width_mm"]),
+    ({"pixel_size_um": 3}, ["pixel_size_um = 3: expected focal_length_mm beside it"]),
+    ({"pixel_size_um": 3, "fx_px": 500},
+     ["fx_px = 500: expected a camera in pixels or in millimetres, not both; delete it or "
+      "pixel_size_um"]),
+    ({"pixel_size_um": 0.003, "focal_length_mm": 4},
+     ["camera.pixel_size_um = 0.003: expected a number from 0.05 to 10000"]),
+    *(({"hfov_deg": bad}, [f"camera.hfov_deg = {bad}: expected a number from 1e-05 to 179.9"])
+      for bad in (180, 360, 0, -60)),
+    ({"fov_deg": 60}, ["camera.fov_deg: unknown key; did you mean"]),
+])
+def test_a_camera_given_in_two_ways_is_refused_in_a_line_for_each(camera, lines):
+    with pytest.raises(PipelineError) as refused:
+        pipeline(camera)
+    told = str(refused.value).split("\n")
+    assert len(told) == len(lines)
+    for line, expected in zip(told, lines, strict=True):
+        assert expected in line
+
+
+# 2. --set and --at.
+
+@pytest.mark.parametrize(("camera", "setting", "left"), [
+    ({"fx_px": 500, "fy_px": 510}, "hfov_deg=50", {"hfov_deg": 50}),
+    ({"focal_length_mm": 8, "sensor_width_mm": 6}, "hfov_deg=50", {"hfov_deg": 50}),
+    ({"hfov_deg": 50}, "vfov_deg=40", {"vfov_deg": 40}),
+    ({"hfov_deg": 50}, "fx_px=600", {"fx_px": 600}),
+    ({"hfov_deg": 50, "width_px": 1280}, "focal_length_mm=6",
+     {"width_px": 1280, "focal_length_mm": 6}),
+    ({"focal_length_mm": 8, "sensor_width_mm": 6}, "pixel_size_um=3",
+     {"focal_length_mm": 8, "pixel_size_um": 3}),
+    ({"focal_length_mm": 8, "pixel_size_um": 3}, "sensor_width_mm=6",
+     {"focal_length_mm": 8, "sensor_width_mm": 6}),
+])
+def test_choosing_one_way_to_give_a_camera_drops_the_others(camera, setting, left):
+    chosen = pipeline(camera, [setting])
+    assert tomllib.loads(chosen.to_toml())["camera"] == left
+    name = setting.partition("=")[0]
+    on_axis = Pipeline.from_dict({
+        "camera": {k: v for k, v in camera.items() if k != "fx_px"} if "fy_px" not in camera
+        else {"fy_px": 510},
+        "axes": {"distance_m": [1, 2], **({"fx_px": [500, 600]} if "fx_px" in camera else {})},
+    })
+    selected = cell(on_axis, f"{setting},distance_m=2")
+    assert selected.fixed[name] == left[name]
+    assert selected.fixed["fx_px"] == left.get("fx_px")
+
+
+def test_an_axis_of_fields_of_view_is_set_on_the_command_line():
+    chosen = pipeline({"fx_px": 500}, ["hfov_deg=[40, 50]"])
+    assert chosen.axis("hfov_deg").values == (40.0, 50.0)
+
+
+# 3. What is told.
+
+def test_plan_names_focal_lengths_fields_of_view_and_sides(tmp_path, capsys):
+    file = tmp_path / "p.toml"
+    file.write_text(
+        "[marker]\nsize_m = 0.1\n[camera]\nwidth_px = 1280\nheight_px = 720\nhfov_deg = 90\n"
+        "[axes]\ndistance_m = [0.5, 2]\n"
+    )
+    assert main(["plan", str(file)]) == 0
+    # fx = 640; VFOV = 2 atan(360 / 640); sides 640 · 0.1 / 0.5 and 640 · 0.1 / 2.
+    assert (
+        "  1280 x 720 px, fx = fy = 640 px, HFOV 90°, VFOV 58.72°, the marker's side is 128 px at "
+        "the nearest pose, 32 px at the farthest\n"
+    ) in capsys.readouterr().out
+
+
+def test_run_report_and_dataset_name_the_camera(tmp_path, capsys):
+    file, store = tmp_path / "p.toml", tmp_path / "p.zarr"
+    file.write_text(
+        "[camera]\nhfov_deg = 60\n[marker]\nsize_m = 0.1\n[axes]\ndistance_m = [0.5, 1]\n"
+    )
+    with calls_here():
+        assert main(["run", str(file), "--store", str(store)]) == 0
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.startswith("camera: 640 x 480 px, fx = fy = 554.256 px, HFOV 60°, VFOV 46.83°")
+    attributes = sweep.open(store).attrs
+    fx = 320 / math.tan(math.radians(30))
+    assert attributes["camera_fx_px"] == attributes["camera_fy_px"] == pytest.approx(fx)
+    assert attributes["camera_hfov_deg"] == pytest.approx(60)
+    assert attributes["nearest_side_px"] == pytest.approx(fx * 0.1 / 0.5)
+    assert attributes["farthest_side_px"] == pytest.approx(fx * 0.1)
+    page = tmp_path / "p.html"
+    assert main(["report", str(store), "-o", str(page)]) == 0
+    assert "fx = fy = 554.256 px, HFOV 60°" in page.read_text()
+
+
+@pytest.mark.parametrize(("sections", "line"), [
+    ({"camera": {"cx_px": 640, "cy_px": 360, "fx_px": 500}}, "cx_px = 640: outside the frame of"),
+    ({"camera": {"width_px": 1280, "height_px": 720, "cx_px": 320, "fx_px": 500}},
+     "cx_px = 320: far from the centre of the frame of 1280 x 720 px; is it that of another frame"),
+    ({"camera": {"fx_px": 500}, "axes": {"width_px": [640, 1280]}},
+     "fx_px is fixed while width_px varies: HFOV goes from 65.24 to 104°"),
+    ({"camera": {"cx_px": 319.5}, "axes": {"width_px": [640, 1280]}},
+     "cx_px = 319.5: far from the centre of the frame of 640 to 1280 x 480 px"),
+])
+def test_what_may_surprise_of_a_camera_is_told(sections, line):
+    camera = sections.pop("camera")
+    told = notes(pipeline(camera, **sections))
+    assert [each for each in told if line in each], told
+
+
+def test_notes_are_told_by_a_run_from_python(tmp_path, capfd):
+    with calls_here():
+        execute(pipeline({"fx_px": 400, "fy_px": 500}), tmp_path / "s.zarr")
+    assert "pixels are not square: fy/fx = 1.25" in capfd.readouterr().err
+
+
+# 4. Stores of versions whose pixels were not square by default.
+
+WIDE = "[camera]\nwidth_px = 128\nheight_px = 72\n[pose]\nside_px = 30\n"
+
+
+def test_an_old_store_keeps_its_camera_and_is_not_continued_with_another(tmp_path, monkeypatch):
+    url = str(tmp_path / "s.zarr")
+    old = dataclasses.replace(Pipeline.from_text(stored_text(WIDE, 4)), text=WIDE)
+    with monkeypatch.context() as then:
+        then.setattr("sweep.store.lifecycle.FORMAT", 4)
+        create_store(url, old, ())
+    store = open_store(url)
+    fixed = store.pipeline.fixed
+    fx, fy, _, _ = intrinsics(*(fixed[name] for name in VIEW_PARAMETERS))
+    assert (fx, fy) == (4.0 / 4.8 * 128, 4.0 / 3.6 * 72)
+    at = cell(store.pipeline, "")
+    assert [at.fixed[name] for name in VIEW_PARAMETERS] == [fixed[name] for name in VIEW_PARAMETERS]
+    with pytest.raises(StoreError, match=r"sensor_height_mm: the store has 3\.6, this run None"):
+        execute(Pipeline.from_text(WIDE), url)
+    stated = WIDE.replace("[pose]", "sensor_width_mm = 4.8\nsensor_height_mm = 3.6\n[pose]")
+    with calls_here():
+        assert execute(Pipeline.from_text(stated), url).poses == 1
+    assert sweep.open(url).attrs["pipeline"] == WIDE
+    assert float(sweep.open(url)["true_tvec_m"][2]) == fx * fixed["size_m"] / 30
+
+
+@pytest.mark.parametrize("text", [
+    "[pose]\ndistance_m = 1\n",
+    "[camera]\nfx_px = 500\nwidth_px = 1280\n[pose]\ndistance_m = 1\n",
+    "[camera]\nsensor_width_mm = 5\nsensor_height_mm = 3\nwidth_px = 9\n[pose]\ndistance_m = 1\n",
+])
+def test_old_texts_in_which_nothing_was_left_to_the_default_are_read_as_written(text):
+    assert stored_text(text, 4) == text
+
+
+def test_old_texts_without_a_section_camera_get_their_sensor():
+    text = stored_text("[axes]\ndistance_m = [1]\nwidth_px = [64, 128]\n", 3)
+    grid = Pipeline.from_text(text)
+    assert [grid.fixed[name] for name in ("sensor_width_mm", "sensor_height_mm")] == [4.8, 3.6]
+    assert stored_text(WIDE, 5) == WIDE

@@ -68,7 +68,7 @@ def test_a_pixel_size_gives_the_focal_length_in_pixels():
 ])
 def test_pixels_are_square_unless_both_sides_are_given(camera, focal):
     fx, fy, _, _ = view(camera)
-    assert fx == fy == pytest.approx(focal, rel=1e-15)
+    assert [fx, fy] == pytest.approx([focal] * 2, rel=1e-15)
     assert camera_facts(pipeline(camera)).square
     assert not notes(pipeline(camera))
 
@@ -88,7 +88,7 @@ def test_pixels_that_are_not_square_are_said_to_be(camera):
 @pytest.mark.parametrize("focal_length", [3.6, 4.0, 6.0, 12.5])
 def test_frames_of_the_default_shape_keep_the_bits_that_the_default_sensor_gave(focal_length):
     rng = np.random.default_rng(3)
-    for k in rng.integers(1, 20_000, 300).tolist():
+    for k in rng.integers(1, 20_000, 60).tolist():
         camera = {"width_px": 4 * k, "height_px": 3 * k, "focal_length_mm": focal_length}
         both = {"sensor_width_mm": 4.8, "sensor_height_mm": 3.6}
         expected = [focal_length / 4.8 * (4 * k), focal_length / 3.6 * (3 * k)]
@@ -132,18 +132,18 @@ def test_a_frame_size_on_an_axis_keeps_pixels_square():
     ({"hfov_deg": 60, "fx_px": 500},
      ["hfov_deg = 60: expected a field of view or focal lengths, not both; delete it or fx_px"]),
     ({"vfov_deg": 60, "focal_length_mm": 5, "sensor_width_mm": 6},
-     ["vfov_deg = 60: expected a field of view or focal lengths, not both; delete it or "
-      "sensor_width_mm, focal_length_mm"]),
+     [("vfov_deg = 60: expected a field of view or focal lengths, not both; delete it or "
+      "sensor_width_mm, focal_length_mm")]),
     ({"hfov_deg": 60, "fy_px": 500},
      ["hfov_deg = 60: expected a field of view or focal lengths, not both; delete it or fy_px",
       "fy_px = 500: expected fx_px beside it"]),
     ({"pixel_size_um": 3, "sensor_width_mm": 6, "focal_length_mm": 4},
-     ["pixel_size_um = 3: expected the size of a pixel or the sensor's sides, not both; delete it "
-      "or sensor_width_mm"]),
+     [("pixel_size_um = 3: expected the size of a pixel or the sensor's sides, not both; delete it "
+      "or sensor_width_mm")]),
     ({"pixel_size_um": 3}, ["pixel_size_um = 3: expected focal_length_mm beside it"]),
     ({"pixel_size_um": 3, "fx_px": 500},
-     ["fx_px = 500: expected a camera in pixels or in millimetres, not both; delete it or "
-      "pixel_size_um"]),
+     [("fx_px = 500: expected a camera in pixels or in millimetres, not both; delete it or "
+      "pixel_size_um")]),
     ({"pixel_size_um": 0.003, "focal_length_mm": 4},
      ["camera.pixel_size_um = 0.003: expected a number from 0.05 to 10000"]),
     *(({"hfov_deg": bad}, [f"camera.hfov_deg = {bad}: expected a number from 1e-05 to 179.9"])

@@ -20,7 +20,7 @@ from sweep.measure.flags import (
     present_values,
 )
 from sweep.plan.experiment import Pipeline
-from sweep.plan.schema import LOST, VARIABLES, Variable
+from sweep.plan.schema import LOST, UNSEEN, VARIABLES, Variable
 from sweep.store.receipt import Receipt
 
 Values = Mapping[str, NDArray[Any]]
@@ -65,8 +65,9 @@ def _number_fault(pipeline: Pipeline, variable: Variable, values: Values) -> str
     if governing.flags is None:
         raise AssertionError(rule)
     numbers, flags = values[variable.name], values[rule.flag]
-    if rule.number == "unless_lost":
-        computed = _any_configuration(pipeline, governing, variable, ~np.isin(flags, LOST))
+    if rule.number in ("unless_lost", "if_seen"):
+        without = LOST if rule.number == "unless_lost" else UNSEEN
+        computed = _any_configuration(pipeline, governing, variable, ~np.isin(flags, without))
         computed = computed.reshape(computed.shape + (1,) * len(variable.inner))
         missing = ~np.isfinite(numbers) & computed
         return "no number" if missing.any() else ""

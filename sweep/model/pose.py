@@ -33,12 +33,26 @@ class Pose:
         0.0, "angle between the marker's plane and the image plane", unit="degree", low=-360,
         high=360, drawable=True,
     )
+    view_angle_deg: float | None = parameter(
+        None,
+        "angle between the marker's normal and the line of sight to its centre; replaces tilt_deg",
+        unit="degree", low=-180, high=180, drawable=True,
+    )
     azimuth_deg: float = parameter(
-        0.0, "direction of the tilt axis in the image plane", unit="degree", low=-360,
-        high=360, drawable=True,
+        0.0, "direction of the tilt axis: in the image plane, with view_angle_deg across the line "
+        "of sight", unit="degree", low=-360, high=360, drawable=True,
+    )
+    yaw_deg: float | None = parameter(
+        None,
+        "turn about the camera's y axis; with pitch_deg it replaces tilt_deg and azimuth_deg "
+        "(default: 0 beside pitch_deg)", unit="degree", low=-360, high=360, drawable=True,
+    )
+    pitch_deg: float | None = parameter(
+        None, "turn about the x axis that yaw_deg has turned (default: 0 beside yaw_deg)",
+        unit="degree", low=-360, high=360, drawable=True,
     )
     roll_deg: float = parameter(
-        0.0, "rotation of the marker in its own plane, before the tilt", unit="degree", low=-360,
+        0.0, "rotation of the marker in its own plane, before all others", unit="degree", low=-360,
         high=360, drawable=True,
     )
     bearing_x_deg: float = parameter(
@@ -48,6 +62,24 @@ class Pose:
     bearing_y_deg: float = parameter(
         0.0, "direction of the centre, below the optical axis", unit="degree", low=-89.999,
         high=89.999, drawable=True,
+    )
+    x_m: float | None = parameter(
+        None, "place of the centre, right of the optical axis; replaces bearing_x_deg", unit="m",
+        low=-1e12, high=1e12, drawable=True,
+    )
+    y_m: float | None = parameter(
+        None, "place of the centre, below the optical axis; replaces bearing_y_deg", unit="m",
+        low=-1e12, high=1e12, drawable=True,
+    )
+    frame_x: float | None = parameter(
+        None,
+        "place between the leftmost (0) and the rightmost (1) at which the marker and its quiet "
+        "zone are wholly in the frame; replaces bearing_x_deg", low=0, high=1, drawable=True,
+    )
+    frame_y: float | None = parameter(
+        None,
+        "place between the uppermost (0) and the lowest (1) at which the marker and its quiet "
+        "zone are wholly in the frame; replaces bearing_y_deg", low=0, high=1, drawable=True,
     )
     jitter_px: float = parameter(
         0.0,

@@ -165,11 +165,15 @@ _DEFAULT_CAMERA = {
 def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
     """Return ``count`` scenes from parameter values.
 
-    ``values`` has every parameter of camera, marker, pose and scene (``distance_m`` resolved,
-    ``distortion`` canonical) and ``shift_u_px``, ``shift_v_px``: the drawn jitter. Each is a
-    :class:`Column`, or a value that :meth:`Column.of` takes.
+    ``values`` has every parameter of camera, marker and scene (``distortion`` canonical);
+    ``distance_m``, and ``x_m``, ``y_m`` or, without these, the bearings; ``tilt_deg``,
+    ``azimuth_deg``, ``roll_deg``, instead of which ``resolved_tilt_deg`` and so on count if they
+    are there; and ``shift_u_px``, ``shift_v_px``: the drawn jitter. Each is a :class:`Column`, or
+    a value that :meth:`Column.of` takes.
     """
-    values = {**_NEUTRAL_COLUMNS, **_DEFAULT_CAMERA, "noise_key": 0, **values}
+    values = {
+        **_NEUTRAL_COLUMNS, **_DEFAULT_CAMERA, "noise_key": 0, "x_m": None, "y_m": None, **values,
+    }
 
     def column(name: str) -> Column:
         return Column.of(values[name])
@@ -180,28 +184,25 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
     def mapped(function: Callable[..., Any], *names: str) -> list[Any]:
         return map_columns(function, [column(name) for name in names]).listed(count)
 
-    fx, fy, cx, cy = (
-        np.broadcast_to(np.asarray(number, dtype=np.float64), (count,))
-        for number in intrinsics(
-            *(None if column(name).missing else numbers(name) for name in VIEW_PARAMETERS)
-        )
-    )
-    lenses, lens = distinct(mapped(tuple, "distortion"))
-    cameras = Cameras(
-        np.stack([fx, fy, cx, cy], axis=1),
-        np.array([lens_model.pack(coefficients) for coefficients in lenses])[lens],
-        np.array([len(coefficients) > 0 for coefficients in lenses], dtype=bool)[lens],
-    )
+    cameras = build_cameras(values, count)
+    fx, fy = cameras.view[:, 0], cameras.view[:, 1]
 
     # Step 4: the pose.
     rotation = rotation_of_angles(
-        *(np.radians(numbers(name)) for name in ("tilt_deg", "azimuth_deg", "roll_deg"))
+        *(np.radians(numbers(f"resolved_{name}" if f"resolved_{name}" in values else name))
+          for name in ("tilt_deg", "azimuth_deg", "roll_deg"))
     )
     distance = numbers("distance_m")
+
+    def across(metres: str, bearing: str, shift: Floats) -> Floats:
+        if column(metres).missing:
+            return distance * (np.tan(np.radians(numbers(bearing))) + shift)
+        return numbers(metres) + distance * shift
+
     translation = np.stack(
         [
-            distance * (np.tan(np.radians(numbers("bearing_x_deg"))) + numbers("shift_u_px") / fx),
-            distance * (np.tan(np.radians(numbers("bearing_y_deg"))) + numbers("shift_v_px") / fy),
+            across("x_m", "bearing_x_deg", numbers("shift_u_px") / fx),
+            across("y_m", "bearing_y_deg", numbers("shift_v_px") / fy),
             distance,
         ],
         axis=1,
@@ -273,6 +274,24 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
         effects=effects,
         affected=affected,
         noise_key=column("noise_key").broadcast(count, np.uint64),
+    )
+
+
+def build_cameras(values: Mapping[str, Any], count: int) -> Cameras:
+    """Return ``count`` cameras from the camera's parameters, as :func:`build_scenes` has them."""
+    columns = {name: Column.of(values[name]) for name in (*VIEW_PARAMETERS, "distortion")}
+    view = [
+        np.broadcast_to(np.asarray(number, dtype=np.float64), (count,))
+        for number in intrinsics(
+            *(None if columns[name].missing else columns[name].broadcast(count)
+              for name in VIEW_PARAMETERS)
+        )
+    ]
+    lenses, lens = distinct(columns["distortion"].map(tuple).listed(count))
+    return Cameras(
+        np.stack(view, axis=1),
+        np.array([lens_model.pack(coefficients) for coefficients in lenses])[lens],
+        np.array([len(coefficients) > 0 for coefficients in lenses], dtype=bool)[lens],
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from sweep.messages import label
 from sweep.model.columns import Column
+from sweep.plan.alternatives import superseded
 from sweep.plan.axes import MAX_DEVIATIONS, Distribution
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import PARAMETERS, Parameter
@@ -69,12 +70,15 @@ class DrawnQuantity:
 def fixed_values(pipeline: Pipeline) -> list[FixedValue]:
     """Return the fixed parameters that are coordinates, in the order of their declaration.
 
-    They are those of marker and pose that have a value, and all that the pipeline gives.
+    They are those of marker and pose that have a value (unless the pose is given otherwise), and
+    all that the pipeline gives.
     """
+    without = superseded(pipeline.given)
     return [
         FixedValue(parameter.name, value, _attributes(parameter))
         for parameter in PARAMETERS.values()
         if parameter.section in ALWAYS_GIVEN or parameter.name in pipeline.given
+        if parameter.name not in without
         if (value := _scalar(pipeline.fixed.get(parameter.name))) is not None
     ]
 

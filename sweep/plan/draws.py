@@ -1,8 +1,9 @@
 """Random draws: a function of (seed, quantity, geometry key, trial), and of nothing else.
 
 The geometry key of a cell is the text of its own camera, marker and pose values: canonical
-(``side_px`` as ``distance_m``, a camera in mm as one in pixels), sorted by name, defaults left
-out, numbers rounded to 12 significant digits. Whether a value is fixed or an axis, in which
+(a camera in mm as one in pixels, the pose in whichever way it is given as tilt, azimuth, roll,
+distance and bearings, unless these depend on a draw), sorted by name, defaults left out, numbers
+rounded to 12 significant digits. Whether a value is fixed or an axis, in which
 order and on which grid, does not matter; nor do renderer, window, levels, detector or estimator.
 """
 
@@ -21,6 +22,7 @@ from sweep.model.columns import Column, map_columns
 from sweep.model.splitmix import mixed
 from sweep.plan.axes import Distribution
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
+from sweep.plan.pose_values import canonical_pose
 from sweep.typing import Floats, Integers
 
 _DEFAULT_VIEW = dict(
@@ -64,9 +66,9 @@ def geometry_keys(
 ) -> NDArray[np.uint64]:
     """Return the hashed geometry keys (count,) of scenes.
 
-    ``values`` has every parameter of camera, marker and pose that is not drawn, with
-    ``distance_m`` resolved from ``side_px``.
+    ``values`` has every parameter of camera, marker and pose that is not drawn.
     """
+    values = canonical_pose(values, distributions)
     fx, fy, cx, cy = map(Column.of, intrinsics(*(values[name].values for name in VIEW_PARAMETERS)))
     columns = {
         "fx_px": _texts("fx_px", fx, _DEFAULT_VIEW["fx_px"]),

@@ -206,7 +206,7 @@ class Pipeline:
     def fixed_at(self, chosen: Mapping[str, Any], source: str = "--at") -> Pipeline:
         """Return the pipeline with parameters fixed at chosen values, checked as a file is.
 
-        The axis ``trial`` goes; if ``distance_m`` or ``side_px`` is chosen, the other goes.
+        The axis ``trial`` goes, and what they replace, such as ``side_px`` for ``distance_m``.
 
         Raises
         ------

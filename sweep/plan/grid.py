@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from sweep.measure.detector import DetectorSetting
 from sweep.measure.estimators import EstimatorSetting
-from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion, intrinsics
+from sweep.model.camera import canonical_distortion
 from sweep.model.columns import Column
 from sweep.model.effects import RANDOM, SWITCHES
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.draws import bits, geometry_keys, uniform
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import PARAMETERS, Stage
+from sweep.plan.pose_values import resolve_pose
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -120,7 +121,7 @@ def scene_values(
 ) -> dict[str, Column]:
     """Return the scene parameters' values for scenes at ``indices`` (N,) along each scene axis.
 
-    Random ones are drawn (those of later stages too), ``distance_m`` is resolved, lenses are
+    Random ones are drawn (those of later stages too), the pose is resolved, lenses are
     canonical, images are absolute paths, and ``shift_u_px``, ``shift_v_px`` are the jitter.
     """
     axes = scene_axes(pipeline)
@@ -140,50 +141,28 @@ def scene_values(
     drawn = pipeline.distributions
     if "background" not in drawn:
         values["background"] = values["background"].map(partial(_absolute, pipeline.folder))
-    if "distance_m" not in drawn and "side_px" not in drawn:
-        _resolve_distance(values)
     jitter = np.asarray(values["jitter_px"].values, dtype=np.float64)
     values["shift_u_px"] = values["shift_v_px"] = Column.of(0.0)
     noisy = any(name in drawn or values[name].differs_from(SWITCHES[name]) for name in RANDOM)
     if not drawn and not noisy and not (jitter > 0).any():
+        resolve_pose(values)
         return values
     keys = geometry_keys(values, drawn, count)
     for name, distribution in drawn.items():
         values[name] = Column.of(distribution.at(uniform(pipeline.seed, name, keys, trials)))
-    if "side_px" in drawn:
-        _resolve_distance(values)
     if (jitter > 0).any():
         for name in ("shift_u_px", "shift_v_px"):
             draw = uniform(pipeline.seed, name, keys, trials)
             values[name] = Column.of(jitter * (2 * draw - 1))
     if noisy:
         values["noise_key"] = Column.of(bits(pipeline.seed, "noise", keys, trials))
+    resolve_pose(values)
     return values
 
 
 def _absolute(folder: str, background: Any) -> Any:
     """Return an image's absolute path; a grey level as it is."""
     return str((Path(folder) / background).resolve()) if isinstance(background, str) else background
-
-
-def _resolve_distance(values: dict[str, Column]) -> None:
-    """Turn ``side_px`` into ``distance_m`` if it is given."""
-    if "side_px" in values and not values["side_px"].missing:
-        numbers = {name: values[name].values for name in DISTANCE_PARAMETERS}
-        values["distance_m"] = Column.of(distance_of_side(numbers))
-
-
-DISTANCE_PARAMETERS = (*VIEW_PARAMETERS, "size_m", "side_px")
-"""The parameters that :func:`distance_of_side` needs."""
-
-
-def distance_of_side(values: Mapping[str, Any]) -> Any:
-    """Return the distance in m at which the black square's side is ``side_px`` long.
-
-    ``fx · size / side``; ``values`` has numbers or arrays for :data:`DISTANCE_PARAMETERS`.
-    """
-    fx = intrinsics(*(values[name] for name in VIEW_PARAMETERS))[0]
-    return fx * values["size_m"] / values["side_px"]
 
 
 def block_indices(block: Block) -> list[NDArray[np.intp]]:

@@ -9,6 +9,7 @@ import tomlkit
 import tomlkit.items
 
 from sweep.messages import MAX_FAULTS, nearest, plain, refusal
+from sweep.plan.alternatives import RIVALS
 from sweep.plan.axes import DISTRIBUTION_FORMS, TRIAL
 from sweep.plan.parameters import PARAMETERS
 from sweep.plan.reader import HEADER, section_of
@@ -19,9 +20,8 @@ _SIDES = ("sensor_width_mm", "sensor_height_mm")
 _MM = ("focal_length_mm", *_SIDES, "pixel_size_um")
 _FIELDS = ("hfov_deg", "vfov_deg")
 
-ALTERNATIVES: dict[str, tuple[str, ...]] = {
-    "distance_m": ("side_px",),
-    "side_px": ("distance_m",),
+ALTERNATIVES: dict[str, Collection[str]] = {
+    **RIVALS,
     **dict.fromkeys(_PX, (*_MM, *_FIELDS)),
     "focal_length_mm": (*_PX, *_FIELDS),
     **dict.fromkeys(_SIDES, (*_PX, *_FIELDS, "pixel_size_um")),

@@ -20,6 +20,7 @@ from sweep.model.marker import Marker
 from sweep.model.pose import Pose
 from sweep.model.renderers import renderer_fault
 from sweep.model.scene import Scene
+from sweep.model.world import WorldPose
 
 
 class Stage(IntEnum):
@@ -33,7 +34,7 @@ class Stage(IntEnum):
 SECTIONS: dict[str, tuple[tuple[type, ...], Stage]] = {
     "camera": ((Camera,), Stage.scene),
     "marker": ((Marker,), Stage.scene),
-    "pose": ((Pose,), Stage.scene),
+    "pose": ((Pose, WorldPose), Stage.scene),
     "scene": ((Scene, Effects, BoundSetting), Stage.scene),
     "detector": ((DetectorSetting,), Stage.detection),
     "estimator": ((EstimatorSetting,), Stage.estimation),

@@ -91,6 +91,8 @@ def _presence(variable: Variable) -> str:
         return ""
     if rule.number == "unless_lost":
         return "always, unless the scene's computation failed"
+    if rule.number == "if_seen":
+        return "unless the scene's computation failed, or a corner is behind the camera"
     names = " or ".join(flag.name for flag in _flags()[rule.flag] if flag.present)
     return f"{'if' if rule.number == 'always' else 'only if'} `{rule.flag}` is {names}"
 

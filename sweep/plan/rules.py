@@ -12,6 +12,7 @@ from sweep.measure.detector import DetectorSetting
 from sweep.model.effects import GEOMETRIC, NEEDS, RANDOM, is_on
 from sweep.model.image_file import MAX_PIXELS
 from sweep.model.marker import marker_count
+from sweep.plan.alternatives import IN_CAMERA, WORLD, contradictions
 from sweep.plan.axes import TRIAL
 from sweep.plan.background_files import check_backgrounds
 from sweep.plan.camera_values import one_camera
@@ -25,15 +26,21 @@ MAX_CONFIGURATIONS = 10_000
 """The most configurations: they are listed, and each has its share of every block."""
 
 
-def distance_or_side(reading: Reading) -> None:
-    """Demand ``distance_m`` or ``side_px``, not both."""
-    distance, side = "distance_m" in reading.given, "side_px" in reading.given
-    if distance and side:
+def pose_in_one_way(reading: Reading) -> None:
+    """Demand a distance, and each quantity of the pose in one way."""
+    for first, other in contradictions(reading.given):
         reading.fault(
-            "side_px", reading.written("side_px"),
-            "distance_m or side_px, not both; delete one of them",
+            other, reading.written(other), f"{first} or {other}, not both; delete one of them"
         )
-    if not distance and not side:
+    world = [name for name in WORLD if name in reading.given]
+    in_camera = [name for name in IN_CAMERA if name in reading.given]
+    if world and in_camera:
+        reading.fault(
+            world[0], reading.written(world[0]),
+            "a pose in the world or in the camera's frame, not both; delete "
+            f"{', '.join(world)}, or {', '.join(in_camera)}",
+        )
+    if not world and not {"distance_m", "side_px"} & reading.given:
         reading.faults.append(
             f"{reading.source}: pose: expected distance_m or side_px, fixed or under [axes]"
         )
@@ -153,7 +160,7 @@ def size_of_whole_frames(reading: Reading) -> None:
 
 
 RULES: tuple[Callable[[Reading], None], ...] = (
-    distance_or_side,
+    pose_in_one_way,
     one_camera,
     ids_in_dictionary,
     effects_need_partners,

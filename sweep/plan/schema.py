@@ -55,11 +55,11 @@ class FlagRule:
     number
         "always": a number wherever the flag is present, NaN elsewhere; "only": NaN wherever the
         flag is not present; "unless_lost": a number unless every flag of the scene is in
-        :data:`LOST`.
+        :data:`LOST`; "if_seen": a number unless every flag of the scene is in :data:`UNSEEN`.
     """
 
     flag: str
-    number: Literal["always", "only", "unless_lost"]
+    number: Literal["always", "only", "unless_lost", "if_seen"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +86,9 @@ class Tolerance:
 
 LOST = (DetectionStatus.failed, DetectionStatus.crashed)
 """Detections of a scene for which not even the truth may have been computed."""
+
+UNSEEN = (*LOST, DetectionStatus.not_visible)
+"""Detections of a scene in which a corner may be behind the camera: the marker has no image."""
 
 TRUTH_RTOL = 1e-12
 """Of the true pose (relative to its length) and of the marker's area."""
@@ -204,7 +207,8 @@ SCHEMA: tuple[Variable, ...] = (
     Variable("true_tvec_m", _S, "f8", "true position of the marker's centre", "m", ("xyz",),
              present_when=_TRUTH, tolerance=Tolerance("length", TRUTH_RTOL)),
     Variable("marker_area_px", _S, "f8", "area of the projected black square", "px2",
-             present_when=_TRUTH, tolerance=Tolerance("relative", TRUTH_RTOL)),
+             present_when=FlagRule("detection", "if_seen"),
+             tolerance=Tolerance("relative", TRUTH_RTOL)),
     Variable("bound", _S, "u1", "what became of the accuracy bound", flags=BoundStatus,
              tolerance=_EQUAL),
     Variable("bound_std", _S, "f4",

@@ -20,7 +20,8 @@ from zarr.storage import MemoryStore
 from sweep.plan.axes import Axis
 from sweep.plan.coordinates import FixedValue, fixed_values
 from sweep.plan.experiment import Pipeline
-from sweep.plan.grid import DISTANCE_PARAMETERS, Blocks, distance_of_side, scene_axes
+from sweep.plan.grid import Blocks, scene_axes
+from sweep.plan.pose_values import DISTANCE_PARAMETERS, distance_of_side
 from sweep.plan.schema import DRAWN_FORMAT, LABELS, VARIABLES, Variable, variables_of
 from sweep.store.zarr_sync import sync
 

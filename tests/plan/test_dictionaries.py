@@ -11,12 +11,16 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from sweep.errors import PipelineError
+from sweep.plan.alternatives import IN_CAMERA, superseded
 from sweep.plan.axes import TRIAL
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import PARAMETERS
 from sweep.plan.toml_text import document_text, read_document
 
-DRAWABLE = [p for p in PARAMETERS.values() if p.declaration.drawable and p.section == "pose"]
+DRAWABLE = [
+    name for name in IN_CAMERA
+    if PARAMETERS[name].declaration.drawable and name not in ("side_px", "frame_x", "frame_y")
+]
 
 
 def numbers(parameter):
@@ -38,8 +42,8 @@ def documents(draw):
                                          max_size=20)).replace("\xa0", " ")
         document["title"] = "".join(c for c in document["title"] if c.isprintable())
         document["seed"] = draw(st.integers(0, 2**63 - 1))
-    names = draw(st.lists(st.sampled_from([p.name for p in DRAWABLE if p.name != "side_px"]),
-                          unique=True, max_size=4))
+    names = draw(st.lists(st.sampled_from(DRAWABLE), unique=True, max_size=4))
+    names = [name for k, name in enumerate(names) if name not in superseded(names[:k])]
     for name in {*names, "distance_m"}:
         number = numbers(PARAMETERS[name])
         kind = draw(st.sampled_from(["fixed", "list", "range", "linspace", "uniform"]))

@@ -1,0 +1,161 @@
+"""Rotations by the angles that users give, against SciPy's Rotation and closed forms."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sweep.model.pose import rotation_of_angles
+from sweep.model.rotations import (
+    ABOUT_X_180,
+    angles_of_rotation,
+    rotation_of_view_angle,
+    rotation_of_yaw_pitch_roll,
+    towards,
+)
+from sweep.model.world import orientation, pose_in_camera
+
+TOLERANCE = 4e-15
+"""Of an element: some ten roundings of sines, cosines and their products, each of 1.1e-16."""
+
+
+def random_angles(count, seed=0):
+    rng = np.random.default_rng(seed)
+    angles = rng.uniform(-2 * np.pi, 2 * np.pi, (3, count))
+    special = np.radians([0, 90, -90, 180, -180, 360, 89.9, 1e-9, 179.999999999])
+    grid = np.stack(np.meshgrid(special, special, special), axis=0).reshape(3, -1)
+    return np.concatenate([angles, grid], axis=1)
+
+
+def test_yaw_pitch_and_roll_are_scipys_intrinsic_y_x_z_angles():
+    yaw, pitch, roll = random_angles(2000)
+    expected = Rotation.from_euler("YXZ", np.stack([yaw, pitch, roll], axis=1)).as_matrix()
+    found = rotation_of_yaw_pitch_roll(yaw, pitch, roll)
+    np.testing.assert_allclose(found, expected @ ABOUT_X_180, atol=TOLERANCE)
+    upright = rotation_of_yaw_pitch_roll(*np.zeros((3, 1)))[0]
+    np.testing.assert_array_equal(upright, np.diag([1, -1, -1]))  # faces the camera
+
+
+@pytest.mark.parametrize(
+    ("angles", "corner", "direction"),
+    [((30, 0, 0), (0, 0, 1), (-0.5, 0, -np.sqrt(0.75))),   # its face turns to the image's left
+     ((0, 30, 0), (0, 0, 1), (0, 0.5, -np.sqrt(0.75))),    # its face turns down
+     ((0, 0, 30), (1, 0, 0), (np.sqrt(0.75), 0.5, 0))],    # clockwise in the image
+)
+def test_the_senses_of_yaw_pitch_and_roll(angles, corner, direction):
+    rotation = rotation_of_yaw_pitch_roll(*np.radians(angles)[:, None])[0]
+    np.testing.assert_allclose(rotation @ corner, direction, atol=TOLERANCE)
+
+
+def test_tilt_azimuth_and_roll_of_a_rotation_are_those_that_make_it():
+    tilt, azimuth, roll = random_angles(2000, 1)
+    for rotation in (
+        rotation_of_angles(tilt, azimuth, roll),
+        Rotation.random(5000, rng=2).as_matrix(),
+        Rotation.from_rotvec(1e-12 * np.eye(3)).as_matrix() @ ABOUT_X_180,
+    ):
+        angles = angles_of_rotation(rotation)
+        np.testing.assert_allclose(rotation_of_angles(*angles), rotation, atol=TOLERANCE)
+        assert (angles[0] >= 0).all()
+        assert (angles[0] <= np.pi).all()
+        assert (np.abs(angles[1:]) <= np.pi).all()
+
+
+def test_angles_come_back_as_they_were_given_from_tiny_tilts_to_179_degrees():
+    rng = np.random.default_rng(3)
+    tilt = np.concatenate([np.geomspace(1e-12, 1, 500), np.radians(np.linspace(1, 179.9, 500))])
+    azimuth, roll = rng.uniform(0, 2 * np.pi, 1000), rng.uniform(-np.pi, np.pi, 1000)
+    found = angles_of_rotation(rotation_of_angles(tilt, azimuth, roll))
+    np.testing.assert_allclose(found[0], tilt, rtol=1e-13, atol=1e-15)
+    # What a direction in the plane is worth grows with 1/sin of the angle that spans it.
+    leeway = 1e-15 / np.minimum(np.sin(tilt / 2), np.cos(tilt / 2)) + 2e-15
+    assert (np.abs(np.angle(np.exp(1j * (found[1] - azimuth)))) < 4 * leeway).all()
+    assert (np.abs(np.angle(np.exp(1j * (found[2] - roll)))) < 4 * leeway).all()
+
+
+def sights(count):
+    """Lines of sight up to 89.9° off the axis, from 1 mm to 1 km away."""
+    rng = np.random.default_rng(4)
+    off = np.radians(np.concatenate([rng.uniform(0, 89.9, count), [0, 1e-9, 80, 89.9]]))
+    around = rng.uniform(0, 2 * np.pi, len(off))
+    length = 10.0 ** rng.uniform(-3, 3, len(off))
+    return (length * np.array(
+        [np.sin(off) * np.cos(around), np.sin(off) * np.sin(around), np.cos(off)]
+    )).T
+
+
+def test_the_smallest_rotation_to_a_line_of_sight_is_scipys():
+    sight = sights(1000)
+    expected = []
+    for each in sight / np.linalg.norm(sight, axis=1, keepdims=True):
+        axis = np.cross([0, 0, 1], each)
+        sine = np.linalg.norm(axis)
+        angle = np.arctan2(sine, each[2])
+        expected.append(Rotation.from_rotvec(axis * (angle / sine if sine else 1.0)).as_matrix())
+    np.testing.assert_allclose(towards(sight), np.array(expected), atol=TOLERANCE)
+
+
+def test_the_viewing_angle_is_the_one_given_wherever_the_marker_is():
+    sight = sights(5000)
+    rng = np.random.default_rng(5)
+    view = np.radians(rng.choice([0, 1e-6, 30, 60, 89.9, 120, 180], len(sight)))
+    azimuth, roll = rng.uniform(-7, 7, (2, len(sight)))
+    rotation = rotation_of_view_angle(view, azimuth, roll, sight)
+    np.testing.assert_allclose(
+        rotation @ np.swapaxes(rotation, 1, 2), np.tile(np.eye(3), (len(sight), 1, 1)),
+        atol=TOLERANCE,
+    )
+    normal = rotation[:, :, 2]
+    line = -sight / np.linalg.norm(sight, axis=1, keepdims=True)
+    found = np.arctan2(
+        np.linalg.norm(np.cross(normal, line), axis=1), np.sum(normal * line, axis=1)
+    )
+    np.testing.assert_allclose(found, view, atol=TOLERANCE)
+    # On the axis it is the tilt.
+    on_axis = rotation_of_view_angle(view, azimuth, roll, np.tile([0.0, 0, 2], (len(view), 1)))
+    np.testing.assert_array_equal(on_axis, rotation_of_angles(view, azimuth, roll))
+
+
+def test_a_pose_in_the_world_is_scipys():
+    rng = np.random.default_rng(6)
+    camera, marker = rng.uniform(-100, 100, (2, 3000, 3))
+    of_camera, of_marker = rng.uniform(-2 * np.pi, 2 * np.pi, (2, 3, 3000))
+    # A camera's image: right is its body's -y, down is -z, forward is x (REP 103, "optical").
+    image = Rotation.from_matrix([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    # The marker's right, for whoever sees its face, is its body's y, up is z, out is x.
+    face = Rotation.from_matrix([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    body, other = (Rotation.from_euler("ZYX", angles.T) for angles in (of_camera, of_marker))
+    rotation, position = pose_in_camera(
+        camera, orientation(*of_camera), marker, orientation(*of_marker)
+    )
+    expected = image * body.inv() * other * face
+    np.testing.assert_allclose(rotation, expected.as_matrix(), atol=TOLERANCE)
+    moved = image.apply(body.inv().apply(marker - camera))
+    np.testing.assert_allclose(position, moved, atol=100 * TOLERANCE)
+
+
+@pytest.mark.parametrize(
+    ("camera", "marker", "position", "normal", "up"),
+    [
+        # A camera at the origin that looks along x, a marker 2 m ahead that faces it.
+        ([0, 0, 0, 0, 0, 0], [2, 0, 0, 180, 0, 0], [0, 0, 2], [0, 0, -1], [0, -1, 0]),
+        # The marker lies 1 m to the left and 0.5 m up.
+        ([0, 0, 0, 0, 0, 0], [2, 1, 0.5, 180, 0, 0], [-1, -0.5, 2], [0, 0, -1], [0, -1, 0]),
+        # A camera 3 m up that looks straight down at a marker on the floor, face up, whose upper
+        # side points along x, as the image's does.
+        ([0, 0, 3, 0, 90, 0], [0, 0, 0, 180, -90, 0], [0, 0, 3], [0, 0, -1], [0, -1, 0]),
+        # A camera that is turned to the left by 90° sees what lies to the left.
+        ([1, 0, 0, 90, 0, 0], [1, 5, 0, -90, 0, 0], [0, 0, 5], [0, 0, -1], [0, -1, 0]),
+        # A camera rolled by 90° to its right sees up at its left.
+        ([0, 0, 0, 0, 0, 90], [2, 0, 0, 180, 0, 0], [0, 0, 2], [0, 0, -1], [-1, 0, 0]),
+        # Behind the camera.
+        ([0, 0, 0, 0, 0, 0], [-2, 0, 0, 0, 0, 0], [0, 0, -2], [0, 0, 1], [0, -1, 0]),
+    ],
+)
+def test_places_in_the_world_by_hand(camera, marker, position, normal, up):
+    parts = []
+    for x, y, z, *angles in (camera, marker):
+        parts += [np.array([[x, y, z]], float), orientation(*np.radians(angles)[:, None])]
+    rotation, found = pose_in_camera(*parts)
+    np.testing.assert_allclose(found[0], position, atol=1e-15 * 10)
+    np.testing.assert_allclose(rotation[0] @ [0, 0, 1], normal, atol=TOLERANCE)
+    np.testing.assert_allclose(rotation[0] @ [0, 1, 0], up, atol=TOLERANCE)

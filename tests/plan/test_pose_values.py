@@ -1,0 +1,345 @@
+"""Ways of giving a pose: each against SciPy's Rotation and closed forms, and all against draws."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import sweep
+from support.here import calls_here
+from sweep.errors import PipelineError
+from sweep.model.scene import build_scenes
+from sweep.plan.alternatives import IN_CAMERA, RIVALS, WORLD
+from sweep.plan.cell_selection import cell
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import scene_axes, scene_values
+
+FLIP = np.diag([1.0, -1.0, -1.0])
+ANGLE_DEG = 1e-12
+"""Of an angle in degrees: 2e-14 rad, some hundred roundings."""
+
+LENS = [-0.3, 0.1, 0.001, -0.002]
+
+
+def made(pose, axes=None, seed=1, **sections):
+    """Return the values and scenes of a pipeline's whole grid."""
+    pipeline = Pipeline.from_dict({"seed": seed, "pose": pose, "axes": axes or {}, **sections})
+    lengths = [len(axis) for axis in scene_axes(pipeline)]
+    indices = [index.ravel() for index in np.indices(lengths, dtype=np.intp)]
+    values = scene_values(pipeline, indices)
+    return values, build_scenes(values, int(np.prod(lengths)))
+
+
+def viewing_angle_deg(scenes):
+    normal = scenes.rotation[:, :, 2]
+    line = -scenes.translation / np.linalg.norm(scenes.translation, axis=1, keepdims=True)
+    sine = np.linalg.norm(np.cross(normal, line), axis=1)
+    return np.degrees(np.arctan2(sine, np.sum(normal * line, axis=1)))
+
+
+EXTREME = {
+    "distance_m": [0.001, 0.7, 1000], "bearing_x_deg": [-80, 0, 33], "bearing_y_deg": [-5, 80],
+    "azimuth_deg": [0, 77, 251], "roll_deg": [0, -130],
+}
+
+
+def test_view_angle_is_the_angle_to_the_line_of_sight_at_the_extremes():
+    angles = [0, 1e-6, 45, 89.9, 180]
+    values, scenes = made({}, {"view_angle_deg": angles, **EXTREME})
+    expected = values["view_angle_deg"].broadcast(len(scenes))
+    np.testing.assert_allclose(viewing_angle_deg(scenes), expected, atol=ANGLE_DEG)
+    np.testing.assert_allclose(
+        scenes.translation[:, 2], values["distance_m"].values, rtol=0, atol=0
+    )
+
+
+def test_view_angle_is_as_given_where_places_angles_and_jitter_are_drawn():
+    values, scenes = made(
+        {"view_angle_deg": {"uniform": [0, 90]}, "azimuth_deg": {"uniform": [0, 360]},
+         "distance_m": {"uniform": [0.2, 3]}, "x_m": {"normal": [0, 0.5]},
+         "frame_y": {"uniform": [0, 1]}, "jitter_px": 40},
+        {"trial": 500},
+    )
+    drawn = values["view_angle_deg"].values
+    assert np.ptp(drawn) > 80
+    np.testing.assert_allclose(viewing_angle_deg(scenes), drawn, atol=ANGLE_DEG)
+
+
+def test_yaw_pitch_and_roll_are_scipys():
+    turns = [-170, 0, 30, 90, 180]
+    values, scenes = made(
+        {"distance_m": 1}, {"yaw_deg": turns, "pitch_deg": turns, "roll_deg": turns}
+    )
+    angles = [values[f"{name}_deg"].values for name in ("yaw", "pitch", "roll")]
+    expected = Rotation.from_euler("YXZ", np.stack(angles, axis=1), degrees=True).as_matrix()
+    np.testing.assert_allclose(scenes.rotation, expected @ FLIP, atol=1e-14)
+    one = made({"distance_m": 1, "pitch_deg": 20})[1]
+    np.testing.assert_allclose(
+        one.rotation[0], Rotation.from_euler("X", 20, degrees=True).as_matrix() @ FLIP, atol=1e-15
+    )
+
+
+def test_places_in_metres_are_the_truth():
+    values, scenes = made(
+        {}, {"x_m": [-1000, -0.001, 0, 2.5], "y_m": [0, 0.3], "distance_m": [0.001, 1, 1000]}
+    )
+    expected = [values[name].values for name in ("x_m", "y_m", "distance_m")]
+    np.testing.assert_array_equal(scenes.translation, np.stack(expected, axis=1))
+    mixed = made({"x_m": 0.2, "bearing_y_deg": 10, "distance_m": 2})[1].translation[0]
+    np.testing.assert_array_equal(mixed, [0.2, 2 * np.tan(np.radians(10)), 2])
+
+
+def test_jitter_moves_a_place_in_metres_as_it_does_a_bearing():
+    camera = {"fx_px": 700, "fy_px": 650}
+    values, scenes = made({"x_m": 0.1, "y_m": -0.2, "distance_m": 2, "jitter_px": 5},
+                          {"trial": 50}, camera=camera)
+    for axis, (shift, focal, place) in enumerate(
+        (("shift_u_px", 700, 0.1), ("shift_v_px", 650, -0.2))
+    ):
+        pixel = focal * scenes.translation[:, axis] / 2
+        np.testing.assert_allclose(pixel - focal * place / 2, values[shift].values, atol=1e-10)
+
+
+# A share of the frame
+
+def outline(scenes, quiet_modules, points):
+    """Return points (N, M, 3) along the sides of the quiet zone, in the marker's frame."""
+    half = scenes.size_m / 2 * (1 + 2 * quiet_modules / scenes.modules)
+    t = np.linspace(-1, 1, points)
+    one = np.ones_like(t)
+    sides = [np.stack(side, axis=1) for side in ((t, one), (t, -one), (one, t), (-one, t))]
+    square = np.column_stack([np.concatenate(sides), np.zeros(4 * points)])
+    return half[:, None, None] * square
+
+
+def projected(scenes, points, distortion):
+    """Return their pixels by ``cv2.projectPoints``."""
+    pixels = []
+    for k in range(len(scenes)):
+        rvec = Rotation.from_matrix(scenes.rotation[k]).as_rotvec()
+        image, _ = cv2.projectPoints(
+            points[k], rvec, scenes.translation[k], scenes.cameras.matrix(k),
+            np.array(distortion, float) if distortion else None,
+        )
+        pixels.append(image[:, 0])
+    return np.array(pixels)
+
+
+@pytest.mark.parametrize("distortion", [[], LENS, [0.25, 0.1, 0, 0]])
+@pytest.mark.parametrize("turn", ["tilt_deg", "view_angle_deg", "yaw_deg"])
+def test_share_of_the_frame_never_leaves_it_and_reaches_its_edges(distortion, turn):
+    """No scene may be outside; that 600 leave a tenth empty has a chance below 0.9^600 = 1e-27."""
+    values, scenes = made(
+        {"frame_x": {"uniform": [0, 1]}, "frame_y": {"uniform": [0, 1]},
+         "distance_m": {"uniform": [0.5, 4]}, turn: {"uniform": [-75, 75]},
+         "roll_deg": {"uniform": [0, 360]}, "jitter_px": 2},
+        {"trial": 600}, marker={"size_m": 0.1, "quiet_zone_modules": 2},
+        camera={"fx_px": 500, "distortion": distortion},
+    )
+    pixels = projected(scenes, outline(scenes, 2, 50), distortion)
+    assert (pixels > -0.5 - 1e-6).all()
+    assert (pixels < np.array([639.5, 479.5]) + 1e-6).all()
+    for axis, (name, length) in enumerate((("frame_x", 640), ("frame_y", 480))):
+        share = values[name].values
+        low, high = pixels[:, :, axis].min(axis=1), pixels[:, :, axis].max(axis=1)
+        # The free space before the marker is to all free space as the share, but for jitter and,
+        # as that is measured in pixels here, perspective.
+        free = (low + 0.5) / (length - 1 - (high - low) + 1)
+        assert np.abs(free - share).max() < 0.12
+        assert free.min() < 0.1
+        assert free.max() > 0.9
+
+
+@pytest.mark.parametrize("distortion", [[], LENS])
+def test_shares_of_0_and_1_touch_the_edges(distortion):
+    for share, edge, end in ((0, -0.5, np.min), (1, np.array([639.5, 479.5]), np.max)):
+        _, scenes = made(
+            {"frame_x": share, "frame_y": share, "distance_m": 1},
+            {"view_angle_deg": [0, 60], "azimuth_deg": [0, 200]}, marker={"size_m": 0.1},
+            camera={"fx_px": 500, "distortion": distortion},
+        )
+        pixels = projected(scenes, outline(scenes, 1, 50), distortion)
+        # Under a lens, 0.05 px are kept free.
+        tolerance = 0.06 if distortion else 1e-9
+        np.testing.assert_allclose(
+            end(pixels, axis=1), np.broadcast_to(edge, (4, 2)), atol=tolerance
+        )
+
+
+@pytest.mark.parametrize("distortion", [[], LENS])
+def test_a_marker_larger_than_the_frame_is_cut_off_alike_at_both_edges(distortion):
+    _, scenes = made(
+        {"frame_y": 0.9, "distance_m": 0.1}, {"frame_x": [0, 0.2, 1]}, marker={"size_m": 0.12},
+        camera={"fx_px": 500, "distortion": distortion},
+    )
+    assert np.isfinite(scenes.translation).all()
+    if not distortion:
+        np.testing.assert_allclose(scenes.translation[:, :2], 0, atol=1e-15)
+
+
+def test_a_marker_beside_the_camera_has_a_place_all_the_same():
+    _, scenes = made({"frame_x": 0.5, "frame_y": 0, "distance_m": 0.001, "tilt_deg": 80})
+    assert np.isfinite(scenes.translation).all()
+
+
+def test_a_scenes_place_does_not_depend_on_the_others():
+    axes = {"frame_x": [0.1, 0.9], "view_angle_deg": [0, 70], "distortion": [[], LENS],
+            "distance_m": [0.02, 0.3, 2]}
+    _, scenes = made({"frame_y": 0.3}, axes)
+    together = scenes.translation.reshape(2, 2, 2, 3, 3)
+    for index in np.ndindex(2, 2, 2, 3):
+        chosen = {name: values[k] for (name, values), k in zip(axes.items(), index, strict=True)}
+        camera = {"distortion": chosen.pop("distortion")}
+        _, alone = made({"frame_y": 0.3, **chosen}, camera=camera)
+        np.testing.assert_array_equal(alone.translation[0], together[index])
+
+
+# The world
+
+def test_places_in_the_world_are_scipys():
+    axes = {
+        "camera_x_m": [0, -3], "camera_y_m": [1], "camera_z_m": [0.5, 1000], "camera_yaw_deg": [20],
+        "camera_pitch_deg": [-10, 90], "camera_roll_deg": [5], "marker_x_m": [2, -2],
+        "marker_z_m": [0.2], "marker_yaw_deg": [180, 30], "marker_pitch_deg": [-90, 0, 12],
+        "marker_roll_deg": [0, 40],
+    }
+    values, scenes = made({}, axes)
+    count = len(scenes)
+    of = {name: values[name].broadcast(count) if not values[name].missing else np.zeros(count)
+          for name in WORLD}
+
+    def part(whose):
+        place = np.stack([of[f"{whose}_{axis}_m"] for axis in "xyz"], axis=1)
+        angles = [of[f"{whose}_{name}_deg"] for name in ("yaw", "pitch", "roll")]
+        return place, Rotation.from_euler("ZYX", np.stack(angles, axis=1), degrees=True)
+
+    (camera, body), (marker, other) = part("camera"), part("marker")
+    image = Rotation.from_matrix([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    face = Rotation.from_matrix([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    expected = (image * body.inv() * other * face).as_matrix()
+    np.testing.assert_allclose(scenes.rotation, expected, atol=1e-14)
+    np.testing.assert_allclose(
+        scenes.translation, image.apply(body.inv().apply(marker - camera)), atol=1e-12
+    )
+
+
+# Draws
+
+def key_draws(pose, axes=None, **sections):
+    values, _ = made({"jitter_px": 0.5, **pose}, {**(axes or {}), "trial": 3}, **sections)
+    return values["shift_u_px"].values
+
+
+@pytest.mark.parametrize(
+    ("given", "same"),
+    [({"yaw_deg": 30}, {"tilt_deg": 30, "azimuth_deg": 90}),
+     ({"pitch_deg": 30, "roll_deg": 10}, {"tilt_deg": 30, "roll_deg": 10}),
+     ({"yaw_deg": 0, "pitch_deg": 0}, {}),
+     ({"view_angle_deg": 40, "azimuth_deg": 20}, {"tilt_deg": 40, "azimuth_deg": 20}),
+     ({"view_angle_deg": 0, "roll_deg": 7}, {"roll_deg": 7}),
+     ({"x_m": 0.5}, {"bearing_x_deg": 45}), ({"x_m": 0, "y_m": 0}, {}),
+     ({"frame_x": 0.5, "frame_y": 0.5}, {})],
+)
+def test_a_fixed_pose_has_the_same_draws_in_whichever_way_it_is_given(given, same):
+    place = {"distance_m": 0.5}
+    np.testing.assert_array_equal(key_draws(place | given), key_draws(place | same))
+    roll = {"roll_deg": 33} if "roll_deg" not in given else {}
+    assert (key_draws(place | given) != key_draws({"distance_m": 0.6} | given)).all()
+    assert roll == {} or (key_draws(place | given) != key_draws(place | given | roll)).all()
+
+
+def test_a_pose_in_the_world_has_the_draws_of_that_in_the_camera():
+    world = {"camera_z_m": 1, "camera_pitch_deg": 90, "marker_yaw_deg": 180,
+             "marker_pitch_deg": -90}
+    np.testing.assert_array_equal(key_draws(world), key_draws({"distance_m": 1}))
+
+
+def test_draws_depend_on_the_distribution_and_not_on_axis_or_fixed():
+    drawn = {"distance_m": 1, "view_angle_deg": {"uniform": [0, 60]}}
+    one = key_draws({"azimuth_deg": 30, **drawn})
+    two = key_draws(drawn, {"azimuth_deg": [30, 60]})
+    np.testing.assert_array_equal(one, two[:3])
+    assert (one != two[3:]).all()
+    other = {"distance_m": 1, "view_angle_deg": {"uniform": [0, 61]}, "azimuth_deg": 30}
+    assert (key_draws(other) != one).all()
+    tilt = {"distance_m": 1, "tilt_deg": {"uniform": [0, 60]}, "azimuth_deg": 30}
+    assert (key_draws(tilt) != one).all()
+
+
+def test_coordinates_are_what_was_given_and_none_that_has_no_meaning(tmp_path):
+    pose = {"distance_m": 0.3, "yaw_deg": 10, "pitch_deg": 5, "roll_deg": {"uniform": [20, 40]},
+            "frame_x": {"uniform": [0, 1]}}
+    with calls_here():
+        results = sweep.run({"pose": pose, "axes": {"y_m": [0, 0.01], "trial": 2}},
+                            store=str(tmp_path / "given.zarr"))
+    coordinates = {name for name in (*IN_CAMERA, *WORLD) if name in results.coords}
+    assert coordinates == {"distance_m", "yaw_deg", "pitch_deg", "roll_deg", "frame_x", "y_m"}
+    turns = results.roll_deg.to_numpy().ravel()
+    assert turns.min() > 20
+    expected = Rotation.from_euler(
+        "YXZ", np.column_stack([np.full(4, 10), np.full(4, 5), turns]), degrees=True
+    ).as_matrix() @ FLIP
+    found = Rotation.from_rotvec(results.true_rvec.to_numpy().reshape(-1, 3)).as_matrix()
+    np.testing.assert_allclose(found, expected, atol=1e-14)
+
+
+# Rules and choices
+
+@pytest.mark.parametrize(
+    ("pose", "line"),
+    [({"distance_m": 1, "tilt_deg": 3, "view_angle_deg": 4},
+      "view_angle_deg = 4: expected tilt_deg or view_angle_deg, not both; delete one of them"),
+     ({"distance_m": 1, "tilt_deg": 3, "yaw_deg": 4},
+      "yaw_deg = 4: expected tilt_deg or yaw_deg, not both; delete one of them"),
+     ({"distance_m": 1, "azimuth_deg": 3, "pitch_deg": 4},
+      "pitch_deg = 4: expected azimuth_deg or pitch_deg, not both; delete one of them"),
+     ({"distance_m": 1, "view_angle_deg": 3, "pitch_deg": 4},
+      "pitch_deg = 4: expected view_angle_deg or pitch_deg, not both; delete one of them"),
+     ({"distance_m": 1, "x_m": 3, "bearing_x_deg": 4},
+      "x_m = 3: expected bearing_x_deg or x_m, not both; delete one of them"),
+     ({"distance_m": 1, "frame_y": 0.3, "y_m": 4},
+      "frame_y = 0.3: expected y_m or frame_y, not both; delete one of them"),
+     ({"distance_m": 1, "camera_x_m": 3, "marker_z_m": 0, "roll_deg": 2},
+      ("camera_x_m = 3: expected a pose in the world or in the camera's frame, not both; delete "
+       "camera_x_m, marker_z_m, or distance_m, roll_deg")),
+     ({"x_m": 3}, "pose: expected distance_m or side_px, fixed or under [axes]"),
+     ({"distance_m": 1, "view_angle_deg": 181},
+      "pose.view_angle_deg = 181: expected a number from -180 to 180"),
+     ({"distance_m": 1, "frame_x": 1.01}, "pose.frame_x = 1.01: expected a number from 0 to 1"),
+     ({"distance_m": 1, "frame_x": {"normal": [0.5, 0.2]}},
+      "pose.frame_x = {normal = [0.5, 0.2]}: expected mean - 8.3 sd and mean + 8.3 sd from 0 to 1"),
+     ({"camera_x_m": "left"},
+      'pose.camera_x_m = "left": expected a number from -1e+12 to 1e+12')],
+)
+def test_contradictions_are_refused_in_a_line_that_says_what_to_delete(pose, line):
+    with pytest.raises(PipelineError) as refused:
+        Pipeline.from_dict({"pose": pose})
+    assert [fault.removeprefix("pipeline: ") for fault in refused.value.faults] == [line]
+
+
+def test_every_parameter_of_a_pose_can_be_drawn_and_be_an_axis():
+    for name in (*IN_CAMERA, *WORLD):
+        ends = [0.2, 0.4]
+        base = {} if name in (*WORLD, "distance_m", "side_px") else {"distance_m": 1}
+        drawn = made({**base, name: {"uniform": ends}}, {"trial": 2})[1]
+        axis = made(base, {name: ends})[1]
+        for scenes in (drawn, axis):
+            moved = np.abs(np.diff(scenes.translation, axis=0)).max()
+            turned = np.abs(np.diff(scenes.rotation, axis=0)).max()
+            assert moved + turned > 0 or name == "azimuth_deg", name
+
+
+@pytest.mark.parametrize(("name", "value"), [
+    ("view_angle_deg", 30), ("yaw_deg", 30), ("x_m", 0.1), ("frame_x", 0.2), ("side_px", 40),
+])
+def test_choosing_one_way_drops_the_others(name, value):
+    others = {"tilt_deg": 5, "azimuth_deg": 3, "bearing_x_deg": 2, "distance_m": 1}
+    pipeline = Pipeline.from_dict({"pose": others, "axes": {"roll_deg": [0, 1]}})
+    at = cell(pipeline, f"{name}={value}")
+    reset = Pipeline.from_dict({"pose": others}, [f"{name}={value}"])
+    for chosen in (at, reset):
+        assert chosen.fixed[name] == value
+        assert not RIVALS[name] & chosen.given
+    assert at.fixed["roll_deg"] == 0
+    with pytest.raises(PipelineError, match="not both"):
+        Pipeline.from_dict({"pose": others}, ["tilt_deg=3", "view_angle_deg=4"])

@@ -93,7 +93,9 @@ def run(
     scheduler: str | None = None,
     reuse: Sequence[str | os.PathLike[str]] = (),
     overwrite: bool = False,
+    retry_failed: bool = False,
     durable: bool = False,
+    yes: bool = False,
     progress: bool | Callable[[Progress], None] | None = None,
     time_limit_s: float = TIME_LIMIT_S,
 ) -> xr.Dataset:
@@ -105,7 +107,8 @@ def run(
     Parameters
     ----------
     pipeline
-        A `Pipeline`, the path of a TOML file, or a mapping with the content of such a file.
+        A `Pipeline`, the path of a TOML file, a mapping with the content of such a file, or the
+        path or URL of a store, which is continued with its own pipeline.
     store
         Path or URL of the store (default: ``runs/NAME.zarr`` with the pipeline's name).
     workers
@@ -120,9 +123,14 @@ def run(
         Stores whose finished cells are copied where all their parameters agree.
     overwrite
         Delete an existing store.
+    retry_failed
+        Compute the blocks again in which cells failed or crashed, also of a finished store.
     durable
         Flush each block to the disk before it counts as committed, so that a power failure takes
         no committed block.
+    yes
+        Run also what is predicted to take more than a day, or more than is free on the disk; such
+        a run is refused otherwise. Reused cells are not predicted, so that it is not then.
     progress
         True for a progress bar on stderr (lines if that is not a terminal), or a function that is
         called with a `Progress` after each block.
@@ -156,7 +164,8 @@ def run(
     """
     return _run(
         pipeline, store=store, workers=workers, client=client, scheduler=scheduler, reuse=reuse,
-        overwrite=overwrite, durable=durable, progress=progress, time_limit_s=time_limit_s,
+        overwrite=overwrite, retry_failed=retry_failed, durable=durable, yes=yes,
+        progress=progress, time_limit_s=time_limit_s,
     )
 
 
@@ -175,20 +184,26 @@ def _run(
         from sweep.execution.runner import execute  # noqa: PLC0415
 
         read = _pipeline(pipeline)
+        if options.get("store") is None and isinstance(pipeline, (str, os.PathLike)):
+            from sweep.store.stored_pipeline import names_store  # noqa: PLC0415
+
+            options["store"] = pipeline if names_store(pipeline) else None
         return open(execute(read, progress=report, child=child, **options).store)
 
 
 def _pipeline(given: Pipeline | Mapping[str, Any] | str | os.PathLike[str]) -> Pipeline:
     from sweep.plan.experiment import Pipeline  # noqa: PLC0415
+    from sweep.store.stored_pipeline import read_pipeline  # noqa: PLC0415
 
     if isinstance(given, Pipeline):
         return given
     if isinstance(given, Mapping):
         return Pipeline.from_dict(given)
     if isinstance(given, (str, os.PathLike)):
-        return Pipeline.from_toml(os.fspath(given))
+        return read_pipeline(given)
     raise ArgumentError(
-        "pipeline", given, "expected a Pipeline, the path of a TOML file, or a mapping"
+        "pipeline", given,
+        "expected a Pipeline, the path of a TOML file or of a store, or a mapping",
     )
 
 

@@ -65,6 +65,36 @@ class DatasetError(StoreError):
     """
 
 
+class OtherExperimentError(StoreError):
+    """A store that holds another experiment than the one that is to be run into it.
+
+    Parameters
+    ----------
+    url
+        The store.
+    differences
+        One line for each difference.
+    reusable
+        Whether a run into another store could reuse its cells.
+    """
+
+    def __init__(self, url: str, differences: Sequence[str], reusable: bool) -> None:
+        advice = (
+            "its cells can be reused: give another store, and this one as reuse"
+            if reusable else "choose another store, or overwrite it"
+        )
+        super().__init__(
+            "\n".join([
+                f"{url}: holds another experiment; {advice}", *(f"  {d}" for d in differences)
+            ])
+        )
+        self.url, self.differences, self.reusable = url, tuple(differences), reusable
+
+    def __reduce__(self) -> tuple[type[OtherExperimentError], tuple[str, tuple[str, ...], bool]]:
+        """Return how to make it again in another process."""
+        return OtherExperimentError, (self.url, self.differences, self.reusable)
+
+
 class StoreReplacedError(StoreError):
     """A store that was moved, deleted or replaced by another run's while a run wrote it."""
 

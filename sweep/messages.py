@@ -126,11 +126,48 @@ MAX_WORD_LENGTH = 60
 def nearest(word: str, known: Sequence[str]) -> str:
     """Return "; did you mean ...?" with the most similar known word, or "" if none is similar.
 
-    >>> nearest("tilt", ["roll_deg", "tilt_deg"])
-    '; did you mean tilt_deg?'
+    Letters' cases, underscores and hyphens do not count.
+
+    >>> nearest("tilt", ["roll_deg", "tilt_deg"]), nearest("MarkerID", ["marker_id"])
+    ('; did you mean tilt_deg?', '; did you mean marker_id?')
     """
     if len(word) > MAX_WORD_LENGTH:
         return ""
-    close = [name for name in known if word and name.startswith(word)]
+    close = [name for name in known if _letters(name) == _letters(word)]
+    close = close or [name for name in known if word and name.startswith(word)]
+    simple = {_letters(name): name for name in known}
+    close = close or [
+        simple[each]
+        for each in difflib.get_close_matches(_letters(word), list(simple), n=1, cutoff=0.6)
+    ]
     close = close or difflib.get_close_matches(word, known, n=1, cutoff=0.5)
     return f"; did you mean {close[0]}?" if close else ""
+
+
+def _letters(word: str) -> str:
+    return word.casefold().replace("_", "").replace("-", "")
+
+
+BYTE_UNITS = ("bytes", "kB", "MB", "GB", "TB", "PB")
+
+
+def byte_count(count: int) -> str:
+    """Return a number of bytes with a decimal prefix.
+
+    >>> byte_count(999), byte_count(332_000), byte_count(10**9)
+    ('999 bytes', '332 kB', '1 GB')
+    """
+    power = min((len(str(count)) - 1) // 3, len(BYTE_UNITS) - 1)
+    return f"{count / 1000**power:.3g} {BYTE_UNITS[power]}"
+
+
+def duration(seconds: float) -> str:
+    """Return a time in the largest unit of which there are at least two.
+
+    >>> duration(90.0), duration(150.0), duration(1e6)
+    ('90.0 s', '2.5 min', '11.6 days')
+    """
+    for unit, length in (("days", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.1f} {unit}"
+    return f"{seconds:.1f} s"

@@ -11,7 +11,10 @@ if TYPE_CHECKING:
 
 def add_pipeline(parser: argparse.ArgumentParser) -> None:
     """Add the pipeline file and the settings that replace its values."""
-    parser.add_argument("pipeline", metavar="PIPELINE", help="TOML file of the experiment")
+    parser.add_argument(
+        "pipeline", metavar="PIPELINE",
+        help="TOML file of the experiment, or a store that was made from it",
+    )
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
         help="replace a value of the file by this TOML value; a list makes an axis; "
@@ -26,10 +29,12 @@ def read_pipeline(options: argparse.Namespace) -> Pipeline:
     ------
     PipelineError
         If the file or a setting is invalid.
+    StoreError
+        If it is given as a folder that is no store.
     """
-    from sweep.plan.experiment import Pipeline  # noqa: PLC0415
+    from sweep.store.stored_pipeline import read_pipeline as read  # noqa: PLC0415
 
-    return Pipeline.from_toml(options.pipeline, options.settings)
+    return read(options.pipeline, options.settings)
 
 
 def add_store(parser: argparse.ArgumentParser) -> None:
@@ -45,19 +50,22 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_cell(parser: argparse.ArgumentParser, meaning: str) -> None:
-    """Add the selection of one cell."""
+def add_cell(parser: argparse.ArgumentParser, meaning: str, *, several: bool = False) -> None:
+    """Add the selection of one cell, or of several."""
     parser.add_argument(
-        "--at", default="", metavar="NAME=VALUE,...",
-        help=f"{meaning}; an axis that is not named takes its first value",
+        "--at", metavar="NAME=VALUE,...",
+        help=f"{meaning}; an axis that is not named takes its first value"
+        + ("; may be repeated" if several else ""),
+        **({"action": "append", "default": None} if several else {"default": ""}),
     )
 
 
-def add_picture(parser: argparse.ArgumentParser) -> None:
-    """Add where and how one scene is drawn."""
+def add_picture(parser: argparse.ArgumentParser, default: str | None = None) -> None:
+    """Add where and how one scene is drawn; without a default, nothing is unless asked for."""
+    written = f"default: {default}" if default else "default: no file is written"
     parser.add_argument(
-        "-o", "--output", default="scene.png", metavar="PNG",
-        help="file to write (default: scene.png)",
+        "-o", "--output", default=default, metavar="PNG",
+        help=f"file to write the image to ({written})",
     )
     parser.add_argument("--plain", action="store_true", help="draw the image without annotations")
     parser.add_argument(

@@ -22,6 +22,11 @@ def say(text: str = "") -> None:
         print(plain(line, len(line)))
 
 
+def say_next(command: str, meaning: str = "") -> None:
+    """Print the last line of a command: what to do next."""
+    say(f"next: {command}" + (f"  # {meaning}" if meaning else ""))
+
+
 def accept_any_text() -> None:
     """Print characters that the encoding of the terminal lacks as escapes, instead of failing."""
     for stream in (sys.stdout, sys.stderr):

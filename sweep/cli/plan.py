@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import shlex
 
 from sweep.cli.arguments import add_json, add_pipeline, add_workers, read_pipeline
 from sweep.cli.command import Command, Example
-from sweep.cli.output import print_json, say
+from sweep.cli.output import print_json, say, say_next
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,10 +20,11 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _execute(options: argparse.Namespace) -> int:
     pipeline = read_pipeline(options)
     from sweep.cli.first_use import announce_compilation  # noqa: PLC0415
+    from sweep.execution.affordability import Demand, free_disk, objections  # noqa: PLC0415
     from sweep.execution.forecast import forecast  # noqa: PLC0415
+    from sweep.messages import byte_count, duration  # noqa: PLC0415
     from sweep.plan.active_parts import parts  # noqa: PLC0415
     from sweep.plan.camera_facts import camera_facts, notes  # noqa: PLC0415
-    from sweep.report.formatting import byte_count, duration  # noqa: PLC0415
 
     announce_compilation(pipeline)
     listed = parts(pipeline)
@@ -63,6 +65,7 @@ def _execute(options: argparse.Namespace) -> int:
         say(f"  {part.name:17} {'on ' if part.active else 'off'}  {part.reason}{cost}")
     say("\nExpected")
     over, ended = ("over ", ", then the measurement was ended") if expected.over else ("", "")
+    how = "in one process" if expected.small else f"with {expected.workers} workers"
     rows = {
         "poses": f"{expected.poses:,}",
         "results": f"{expected.results:,}",
@@ -70,10 +73,17 @@ def _execute(options: argparse.Namespace) -> int:
         "store": f"{byte_count(expected.bytes)} before compression, in {expected.files:,} files",
         "memory": f"{byte_count(expected.worker_bytes)} a worker",
         "cost": f"{over}{1e3 * expected.pose_s:.3g} ms a pose ({expected.sampled} sampled{ended})",
-        "time": f"{over}{duration(expected.seconds)} with {expected.workers} workers",
+        "time": f"{over}{duration(expected.seconds)} {how}",
     }
     for name, text in rows.items():
         say(f"  {name:8} {text}")
+    demand = Demand(expected.seconds, expected.workers, expected.bytes, expected.files)
+    refused = objections(demand, free_disk(f"runs/{pipeline.name}.zarr"))
+    for line in refused:
+        say(f"warning: the run {line}")
+    settings = [word for setting in options.settings for word in ("--set", setting)]
+    settings += ["--yes"] if refused else []
+    say_next(shlex.join(["sweep", "run", options.pipeline, *settings]))
     return 0
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from pathlib import Path
 
 from sweep.cli.arguments import add_store
 from sweep.cli.command import Command, Example
-from sweep.cli.output import quiet_matplotlib, say
+from sweep.cli.output import quiet_matplotlib, say, say_next
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +29,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _execute(options: argparse.Namespace) -> int:
     quiet_matplotlib()
     from sweep.errors import ArgumentError  # noqa: PLC0415
-    from sweep.report.formatting import byte_count  # noqa: PLC0415
+    from sweep.messages import byte_count  # noqa: PLC0415
     from sweep.report.output_file import is_standard_stream  # noqa: PLC0415
     from sweep.report.report_data import read_report_data  # noqa: PLC0415
     from sweep.report.write_report import write_report  # noqa: PLC0415
@@ -40,11 +41,18 @@ def _execute(options: argparse.Namespace) -> int:
     form = options.form or ("md" if str(options.output).lower().endswith(".md") else "html")
     output = Path(options.output or f"report.{form}")
     figures = Path(options.figures) if options.figures else None
-    count = write_report(read_report_data(options.store), output, form, figures)
+    data = read_report_data(options.store)
+    count = write_report(data, output, form, figures)
     if is_standard_stream(output):
         return 0  # a line more would not be HTML
     size = f", {byte_count(output.stat().st_size)}" if output.is_file() else ""
     say(f"{output}: {count} figures{size}")
+    for line in data.warnings:
+        say(line)
+    if data.trade is None and data.setting_axes:
+        say_next(f"sweep tradeoff {shlex.quote(options.store)}", "what each configuration costs")
+    else:
+        say_next(f"look at {output}")
     return 0
 
 

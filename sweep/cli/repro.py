@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from sweep.cli.arguments import add_cell, add_picture, add_store
 from sweep.cli.command import Command, Example
-from sweep.cli.output import check_png, say, write_png
+from sweep.cli.output import check_png, say, say_next, write_png
 
 if TYPE_CHECKING:
     from sweep.integrity.reproduction import Reproduction
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add_store(parser)
-    add_cell(parser, "the cell")
+    add_cell(parser, "the cell", several=True)
     add_picture(parser)
     parser.add_argument(
         "--time-limit", type=float, default=60.0, metavar="S", dest="time_limit_s",
-        help="timeout in seconds (default: 60)",
+        help="timeout in seconds for each cell (default: 60)",
     )
 
 
@@ -30,14 +30,34 @@ def _execute(options: argparse.Namespace) -> int:
 
     if not 0 < options.time_limit_s < math.inf:
         raise ArgumentError("time_limit_s", options.time_limit_s, "expected seconds above 0")
-    check_png(options.output)
-    from sweep.integrity.reproduction import reproduce  # noqa: PLC0415
+    chosen: list[str] = options.at or [""]
+    if options.output is None and (options.plain or options.full):
+        raise ArgumentError("output", "is missing", "--plain and --full are for the file of -o")
+    if options.output is not None:
+        if len(chosen) > 1:
+            raise ArgumentError("output", options.output, "expected one --at beside it")
+        check_png(options.output)
+    from sweep.integrity.reproduction import check_selection, reproduce  # noqa: PLC0415
+
+    check_selection(options.store, chosen)
+    status = 0
+    for number, at in enumerate(chosen):
+        if number:
+            say()
+        again = reproduce(
+            options.store, at, whole_frame=options.full, time_limit_s=options.time_limit_s
+        )
+        _print_cell(again)
+        _write_image(again, options)
+        status = max(status, _print_verdict(again))
+    _say_next(options, again, status)
+    return status
+
+
+def _print_cell(again: Reproduction) -> None:
     from sweep.messages import plain  # noqa: PLC0415
     from sweep.report.scene_values import value_lines  # noqa: PLC0415
 
-    again = reproduce(
-        options.store, options.at, whole_frame=options.full, time_limit_s=options.time_limit_s
-    )
     say(f"--at {again.at}")
     for line in again.changes:
         say(f"changed since the store was created: {line}")
@@ -55,11 +75,11 @@ def _execute(options: argparse.Namespace) -> int:
         kind = "the process died" if failure.crashed else "an exception was raised"
         say(f"{failure.stage}: {kind}:")
         say("\n".join(plain(line, 1000) for line in failure.text.strip().splitlines()))
-    _write_image(again, options)
-    return _print_verdict(again)
 
 
 def _write_image(again: Reproduction, options: argparse.Namespace) -> None:
+    if options.output is None:
+        return
     if again.image is None:
         say("no image: rendering failed")
         return
@@ -87,13 +107,26 @@ def _print_verdict(again: Reproduction) -> int:
     return 0
 
 
+def _say_next(options: argparse.Namespace, again: Reproduction, status: int) -> None:
+    import shlex  # noqa: PLC0415
+
+    store = shlex.quote(options.store)
+    if status:
+        say_next(f"sweep verify {store} --repair", "recomputes the blocks that differ")
+    elif options.output is None and again.inspection is not None:
+        at = f" --at {shlex.quote(again.at)}" if again.at else ""
+        say_next(f"sweep repro {store}{at} -o scene.png", "draws the cell")
+    else:
+        say_next(f"sweep verify {store}", "checks the rest of the store")
+
+
 REPRO = Command(
     "repro", "recompute one cell of a store and compare it with the stored one",
     "sweep/integrity/README.md",
     (
         Example(
-            "sweep repro runs/smoke.zarr --at distance_m=0.3,tilt_deg=45",
-            "prints both values of each variable and draws the image",
+            "sweep repro runs/smoke.zarr --at distance_m=0.3,tilt_deg=45 -o cell.png",
+            "prints both values of each variable, and draws the image into cell.png",
         ),
         Example(
             "sweep repro runs/faults.zarr --time-limit 10",

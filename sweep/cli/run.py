@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
+import shlex
 from typing import TYPE_CHECKING
 
 from sweep.cli.arguments import add_json, add_pipeline, add_workers, read_pipeline
 from sweep.cli.command import Command, Example
-from sweep.cli.output import print_json, say
+from sweep.cli.output import print_json, say, say_next
 
 if TYPE_CHECKING:
     from sweep.isolation.child_process import Child
@@ -31,9 +33,17 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing store")
     parser.add_argument(
+        "--retry-failed", action="store_true",
+        help="compute the blocks again in which cells failed or crashed, also of a finished store",
+    )
+    parser.add_argument(
         "--durable", action="store_true",
         help="flush each block to the disk before it counts: nothing committed is lost when the "
         "power fails",
+    )
+    parser.add_argument(
+        "--yes", action="store_true",
+        help="run also what would take more than a day, or more than is free on the disk",
     )
     add_json(parser)
 
@@ -50,34 +60,73 @@ def _execute(options: argparse.Namespace) -> int:
 def _execute_beside(child: Child, options: argparse.Namespace) -> int:
     pipeline = read_pipeline(options)
     from sweep.cli.first_use import announce_compilation  # noqa: PLC0415
-    from sweep.execution.progress import progress_bar  # noqa: PLC0415
+    from sweep.errors import OtherExperimentError, StoreError  # noqa: PLC0415
+    from sweep.execution.progress import progress_display  # noqa: PLC0415
     from sweep.execution.runner import execute  # noqa: PLC0415
     from sweep.plan.camera_facts import camera_facts  # noqa: PLC0415
+    from sweep.store.stored_pipeline import names_store  # noqa: PLC0415
 
     if not options.json:
         say(f"camera: {camera_facts(pipeline).line()}")
     announce_compilation(pipeline)
-    with progress_bar() as bar:
-        summary = execute(
-            pipeline, options.store, workers=options.workers, scheduler=options.scheduler,
-            reuse=options.reuse, overwrite=options.overwrite, durable=options.durable,
-            time_limit_s=options.time_limit_s, progress=bar, child=child,
-        )
+    store = options.store or (options.pipeline if names_store(options.pipeline) else None)
+    try:
+        with progress_display() as display:
+            summary = execute(
+                pipeline, store, workers=options.workers, scheduler=options.scheduler,
+                reuse=options.reuse, overwrite=options.overwrite, retry_failed=options.retry_failed,
+                durable=options.durable, yes=options.yes, time_limit_s=options.time_limit_s,
+                progress=display, child=child,
+            )
+    except OtherExperimentError as error:
+        if not error.reusable:
+            raise
+        listed = "\n".join(f"  {line}" for line in error.differences)
+        raise StoreError(
+            f"{error.url}: holds another experiment; reuse its cells in a new store: "
+            f"{_growing_command(options, error.url)}\n{listed}"
+        ) from None
     if options.json:
         print_json(dataclasses.asdict(summary))
-        return 0
-    if summary.computed_blocks == 0:
-        say(f"{summary.store} is already finished; --overwrite recomputes it")
-    rate = summary.poses / summary.seconds if summary.computed_blocks else 0
+        return int(summary.nothing_computed)
+    if summary.retried:
+        say(f"{summary.retried:,} failed cells tried again, {summary.recovered:,} computed now")
+    elif summary.computed_blocks == 0:
+        failed = " and --retry-failed what failed" if summary.failures else ""
+        say(f"{summary.store} is already finished; --overwrite recomputes it{failed}")
+    rate = summary.computed_scenes / max(summary.seconds, 1e-3)
     say(
         f"{summary.poses:,} poses, {summary.results:,} results, {summary.detected:,} detected"
         + (f", {summary.seconds:.1f} s ({rate:,.0f} poses/s)" if rate else "")
     )
-    for flag, count in (("crashed", summary.crashed), ("failed", summary.failed)):
-        if count:
-            say(f"{count:,} flagged {flag}; `sweep status {summary.store}` lists them")
     say(f'xarray.open_zarr("{summary.data}")')
-    return 0
+    for line in summary.warnings:
+        say(line)
+    if summary.advice:
+        say_next(summary.advice)
+    else:
+        say_next(f"sweep report {shlex.quote(summary.store)}")
+    return int(summary.nothing_computed)
+
+
+def _growing_command(options: argparse.Namespace, url: str) -> str:
+    """Return the command that runs the same into a new store, and reuses the cells of another."""
+    from sweep.store.locations import exists  # noqa: PLC0415
+
+    stem = url.removesuffix(".zarr")
+    grown = next(
+        name for name in (f"{stem}-{number}.zarr" for number in itertools.count(2))
+        if not exists(name)
+    )
+    words = ["sweep", "run", options.pipeline]
+    for setting in options.settings:
+        words += ["--set", setting]
+    words += ["--store", grown]
+    for source in (url, *options.reuse):
+        words += ["--reuse", source]
+    for flag, value in (("--workers", options.workers), ("--scheduler", options.scheduler)):
+        words += [flag, str(value)] if value is not None else []
+    return shlex.join(words)
 
 
 RUN = Command(

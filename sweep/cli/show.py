@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 
 from sweep.cli.arguments import add_cell, add_picture, add_pipeline, read_pipeline
 from sweep.cli.command import Command, Example
-from sweep.cli.output import check_png, say, write_png
+from sweep.cli.output import check_png, say, say_next, write_png
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add_pipeline(parser)
     add_cell(parser, "the pose and its configuration")
-    add_picture(parser)
+    add_picture(parser, "scene.png")
 
 
 def _execute(options: argparse.Namespace) -> int:
@@ -27,6 +28,8 @@ def _execute(options: argparse.Namespace) -> int:
     image = scene.image if options.plain else draw_scene(scene, coordinates_text(pipeline, single))
     write_png(options.output, image)
     say(f"{options.output}: {scene.detection.name}, {scene.estimate.name}")
+    settings = [word for setting in options.settings for word in ("--set", setting)]
+    say_next(shlex.join(["sweep", "plan", options.pipeline, *settings]))
     return 0
 
 

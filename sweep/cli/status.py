@@ -7,7 +7,7 @@ import dataclasses
 
 from sweep.cli.arguments import add_json, add_store
 from sweep.cli.command import Command, Example
-from sweep.cli.output import MAX_LINES, print_json, say
+from sweep.cli.output import MAX_LINES, print_json, say, say_next
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,8 +19,7 @@ def _execute(options: argparse.Namespace) -> int:
     import shlex  # noqa: PLC0415
 
     from sweep.execution.status import status  # noqa: PLC0415
-    from sweep.messages import plain  # noqa: PLC0415
-    from sweep.report.formatting import duration  # noqa: PLC0415
+    from sweep.messages import duration, plain  # noqa: PLC0415
 
     state = status(options.store)
     if options.json:
@@ -31,7 +30,7 @@ def _execute(options: argparse.Namespace) -> int:
     elif state.writer is not None:
         what = f"being written by {plain(state.writer)}"
     else:
-        what = "stopped; `sweep run` continues it"
+        what = "stopped"
     say(f"{state.title}: {what}")
     say(f"  blocks      {state.blocks_done:,} of {state.blocks:,}")
     say(f"  poses       {state.poses_done:,} of {state.poses:,}")
@@ -48,6 +47,14 @@ def _execute(options: argparse.Namespace) -> int:
             say(f"  {kind:11} --at {at}  {cell.stage}: {plain(cell.reason, 300)}")
         if len(cells) > MAX_LINES:
             say(f"  {kind:11} and more; --json lists the first 1,000")
+    for line in state.warnings:
+        say(line)
+    store = shlex.quote(options.store)
+    if not state.finished:
+        again = f"sweep status {store}" if state.writer is not None else f"sweep run {store}"
+        say_next(again)
+    else:
+        say_next(state.advice or f"sweep report {store}")
     return 0
 
 

@@ -46,11 +46,11 @@ def _execute(options: argparse.Namespace) -> int:
     output = _checked_output(options.output)
     store = options.source
     if store.endswith(".toml"):
-        from sweep.execution.progress import progress_bar  # noqa: PLC0415
+        from sweep.execution.progress import progress_display  # noqa: PLC0415
         from sweep.execution.runner import execute  # noqa: PLC0415
         from sweep.plan.experiment import Pipeline  # noqa: PLC0415
 
-        with progress_bar() as bar:
+        with progress_display() as bar:
             store = execute(Pipeline.from_toml(store), None, progress=bar).store
     trade, renderers = measure_trade(store, options.per, options.limit_s)
     if output is not None:

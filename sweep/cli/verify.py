@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 
 from sweep.cli.arguments import add_json, add_store, add_workers
 from sweep.cli.command import Command, Example
-from sweep.cli.output import MAX_LINES, print_json, say
+from sweep.cli.output import MAX_LINES, print_json, say, say_next
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,9 +58,15 @@ def _execute(options: argparse.Namespace) -> int:
         f"{report.store}: {'damaged' if report.damage else 'sound'}{state}: "
         f"{report.blocks_done:,} of {report.blocks:,} blocks, {report.files:,} files, "
         f"{again}"
-        + (f"; damaged: {len(report.damage):,}, `sweep verify --repair` repairs them"
-           if report.damage and not options.repair else "")
+        + (f"; damaged: {len(report.damage):,}" if report.damage else "")
     )
+    store = shlex.quote(options.store)
+    if (report.damage or report.left_over) and not options.repair:
+        say_next(f"sweep verify {store} --repair", "repairs it")
+    elif report.damage:
+        say_next(f"sweep run {store} --overwrite", "computes all of it again")
+    else:
+        say_next(f"sweep report {store}" if report.finished else f"sweep run {store}")
     return 1 if report.damage else 0
 
 

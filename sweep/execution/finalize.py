@@ -13,8 +13,8 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plan.axes import Axis
 from sweep.plan.parameters import Stage
 from sweep.store.blocks import check_not_replaced, committed, receipts
+from sweep.store.closing import finish
 from sweep.store.failures import MAX_ROWS, FailedCell, failed_cells, failure_table
-from sweep.store.lifecycle import finish
 from sweep.store.run_store import RunStore
 from sweep.store.snapshot import missing_chunks
 
@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 def close(store: RunStore) -> None:
     """Close a store of which every block is committed.
 
-    Its receipts are summed up in the groups ``cost`` and ``failures``; then it is marked finished.
+    Its receipts are summed up in the groups ``cost`` and ``failures``, which may be empty; then it
+    is marked finished.
 
     Raises
     ------
@@ -54,10 +55,8 @@ def close(store: RunStore) -> None:
             kept[cell.kind] += 1
             if kept[cell.kind] <= MAX_ROWS:
                 cells.append(cell)
-    groups = {"cost": _cost(store, blocks)}
-    if cells:
-        groups["failures"] = failure_table(cells, lost(counts["detection"], counts["estimate"]))
-    finish(store, groups, counts)
+    failures = failure_table(cells, lost(counts["detection"], counts["estimate"]))
+    finish(store, {"cost": _cost(store, blocks), "failures": failures}, counts)
 
 
 def lost(detection: list[int], estimate: list[int]) -> dict[str, int]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from sweep.errors import ArgumentError, RunError
 from sweep.evaluation.cells import run_cells
+from sweep.execution.affordability import files_per_block
 from sweep.execution.calibration import (
     COMPILATION_LIMIT_S,
     block_extents,
@@ -21,14 +22,19 @@ from sweep.execution.calibration import (
     sample,
 )
 from sweep.execution.cluster import default_workers
-from sweep.execution.limits import CALIBRATION_S, PLAN_LIMIT_S, PLAN_SCENES_LIMIT_S
+from sweep.execution.limits import (
+    CALIBRATION_S,
+    PLAN_LIMIT_S,
+    PLAN_SCENES_LIMIT_S,
+    SMALL_RUN_S,
+)
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
 from sweep.isolation.watchdog import compilation_s
 from sweep.model.effects import SWITCHES
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.parameters import Stage
-from sweep.plan.schema import bytes_per_block, variables_of
+from sweep.plan.schema import bytes_per_block
 
 EFFECT_SCENES = 24
 """Most scenes on which an effect is measured."""
@@ -41,6 +47,9 @@ MIN_PAIRS = 3
 
 START_S = 3.0
 """Seconds of a run apart from its blocks: processes start and end, packages are imported."""
+
+SMALL_START_S = 1.2
+"""The same of a small run, which is computed in one child process without a cluster."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +70,8 @@ class Forecast:
         Whether the measurement was abandoned: a pose takes more than ``pose_s``.
     workers, seconds
         Number of workers, and how long they would take.
+    small
+        Whether the run is so small that one process computes it, without a cluster.
     """
 
     poses: int
@@ -75,6 +86,7 @@ class Forecast:
     over: bool
     workers: int
     seconds: float
+    small: bool
 
 
 def effect_cost(
@@ -156,6 +168,7 @@ def forecast(
     RunError
         If a measured scene crashes its process, or raises.
     """
+    chosen = workers is not None
     if workers is None:
         workers = default_workers()
     if workers < 1:
@@ -173,10 +186,12 @@ def forecast(
             f"a measured scene crashed its process ({last_line(error)}); `sweep run` isolates it "
             "and computes the others"
         ) from None
-    extents = block_extents(pipeline, calibration, workers)
-    blocks = Blocks(tuple(len(axis) for axis in scene_axes(pipeline)), extents)
     poses = pipeline.size(Stage.scene)
-    busy = min(workers, default_workers(), len(blocks))
+    work_s = poses * calibration.scene_s
+    small = not chosen and work_s < SMALL_RUN_S
+    extents = block_extents(pipeline, calibration, 1 if small else workers)
+    blocks = Blocks(tuple(len(axis) for axis in scene_axes(pipeline)), extents)
+    busy = 1 if small else min(workers, default_workers(), len(blocks))
     # The child ended: its memory was at most this.
     process = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
     return Forecast(
@@ -185,14 +200,15 @@ def forecast(
         block=extents,
         blocks=len(blocks),
         # A chunk of each variable, and the receipt.
-        files=len(blocks) * (len(variables_of(pipeline)) + 1),
+        files=len(blocks) * files_per_block(pipeline),
         bytes=bytes_per_block(pipeline, poses),
         worker_bytes=process + 3 * bytes_per_block(pipeline, math.prod(extents)),
         pose_s=calibration.scene_s,
         sampled=calibration.sampled,
         over=calibration.over,
         workers=workers,
-        seconds=START_S + poses * calibration.scene_s / busy,
+        seconds=(SMALL_START_S if small else START_S) + work_s / busy,
+        small=small,
     ), costs
 
 

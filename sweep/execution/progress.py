@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from sweep.errors import ArgumentError
+from sweep.messages import duration, notice
 
-LINE_INTERVAL_S = 10.0
+LINE_INTERVAL_S = 30.0
 """Seconds between two lines of progress where stderr is not a terminal."""
 
 
@@ -57,16 +59,25 @@ def progress_report(progress: bool | ProgressReport | None) -> Iterator[Progress
         if not callable(progress):
             raise ArgumentError("progress", progress, "expected True, False, None or a function")
         yield progress
-    elif sys.stderr.isatty():
-        with progress_bar() as bar:
-            yield bar
     else:
-        yield _lines()
+        with progress_display(ends=True) as display:
+            yield display
 
 
 @contextlib.contextmanager
-def progress_bar() -> Iterator[ProgressReport]:
-    """Show a bar on stderr if that is a terminal; it disappears at the end."""
+def progress_display(*, ends: bool = False) -> Iterator[ProgressReport]:
+    """Show progress on stderr: a bar on a terminal, else a line every 30 s.
+
+    ``ends``: with a line for the beginning and one for the end, however short the run is.
+    """
+    terminal = sys.stderr is not None and sys.stderr.isatty()
+    with _bar() if terminal else _lines(ends=ends) as display:
+        yield display
+
+
+@contextlib.contextmanager
+def _bar() -> Iterator[ProgressReport]:
+    """Show a bar on stderr; it disappears at the end."""
     from rich.console import Console  # noqa: PLC0415  (slow to import)
     from rich.progress import (  # noqa: PLC0415
         BarColumn,
@@ -94,16 +105,70 @@ def progress_bar() -> Iterator[ProgressReport]:
         yield report
 
 
-def _lines() -> ProgressReport:
-    """Return a report that prints a line at most every :data:`LINE_INTERVAL_S`, and the last."""
-    last = -LINE_INTERVAL_S
+@contextlib.contextmanager
+def _lines(*, ends: bool) -> Iterator[ProgressReport]:
+    """Print a line every :data:`LINE_INTERVAL_S`, also while no block is finished."""
+    lines = ProgressLines(ends=ends)
+    done = threading.Event()
 
-    def report(progress: Progress) -> None:
-        nonlocal last
-        now = time.monotonic()
-        if now >= last + LINE_INTERVAL_S or progress.done == progress.total:
-            last = now
-            sys.stderr.write(f"{progress.done:,} of {progress.total:,} poses\n")
-            sys.stderr.flush()
+    def print_lines() -> None:
+        while not done.wait(LINE_INTERVAL_S):
+            notice(lines.line(time.monotonic()))
 
-    return report
+    thread = threading.Thread(target=print_lines, daemon=True, name="progress")
+    thread.start()
+    try:
+        yield lines
+    finally:
+        done.set()
+        thread.join()
+
+
+class ProgressLines:
+    """How far a run is, in lines: poses, rate, and time left.
+
+    The rate is that since the first report, which a run makes before its first block.
+
+    Examples
+    --------
+    >>> lines = ProgressLines()
+    >>> lines.report(Progress(1000, 5000, 0), now=0.0)
+    >>> lines.line(now=5.0)
+    '1,000 of 5,000 poses'
+    >>> lines.report(Progress(2000, 5000, 0), now=10.0)
+    >>> lines.line(now=10.0)
+    '2,000 of 5,000 poses (40 %), 100 poses/s, 30.0 s left'
+    """
+
+    def __init__(self, *, ends: bool = False) -> None:
+        self._ends = ends
+        self._first: tuple[float, int] | None = None
+        self._last: Progress | None = None
+
+    def __call__(self, progress: Progress) -> None:
+        """Take a run's progress; with ``ends``, print the first and the last."""
+        first = self._last is None
+        self.report(progress, time.monotonic())
+        if self._ends and (first or progress.done == progress.total):
+            notice(f"{progress.done:,} of {progress.total:,} poses")
+
+    def report(self, progress: Progress, now: float) -> None:
+        """Take a run's progress at a time in seconds."""
+        self._first = self._first or (now, progress.done)
+        self._last = progress
+
+    def line(self, now: float) -> str:
+        """Return the line at a time in seconds."""
+        if self._first is None or self._last is None:
+            return "starting"
+        started, before = self._first
+        progress = self._last
+        line = f"{progress.done:,} of {progress.total:,} poses"
+        computed = progress.done - before
+        if not computed or now <= started:
+            return line
+        rate = computed / (now - started)
+        left = duration((progress.total - progress.done) / rate)
+        share = progress.done / progress.total
+        poses_per_s = f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
+        return f"{line} ({100 * share:.0f} %), {poses_per_s} poses/s, {left} left"

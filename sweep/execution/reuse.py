@@ -102,6 +102,14 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
     return Source(store, old_index, pinned, frozenset(committed(store)))
 
 
+def is_reusable(pipeline: Pipeline, store: RunStore) -> bool:
+    """Return whether a new grid could reuse cells of a store that have been computed."""
+    try:
+        return bool(match(pipeline, store).done)
+    except StoreError:
+        return False
+
+
 def _values(pipeline: Pipeline, name: str, axis: Axis | None) -> Sequence[Any] | None:
     """Return a parameter's values, None if it is drawn from a distribution."""
     if axis is not None:

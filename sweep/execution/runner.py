@@ -7,20 +7,24 @@ import importlib
 import itertools
 import math
 import os
-import statistics
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sweep.errors import ArgumentError, RunError, StoreError, StoreReplacedError
+from sweep.errors import (
+    ArgumentError,
+    OtherExperimentError,
+    RunError,
+    StoreError,
+    StoreReplacedError,
+)
 from sweep.execution import BLOCK_TASK
+from sweep.execution.affordability import check_affordable
 from sweep.execution.calibration import Calibration, block_extents, calibrate_isolated
 from sweep.execution.finalize import close
 from sweep.execution.limits import (
-    BLOCK_S,
     CALIBRATION_S,
     CALIBRATION_SHARE,
     QUICK_CALIBRATION_S,
@@ -28,17 +32,18 @@ from sweep.execution.limits import (
     TIME_LIMIT_S,
 )
 from sweep.execution.progress import ProgressReport
-from sweep.execution.reuse import match
+from sweep.execution.retry import Retry, drop_failed
+from sweep.execution.reuse import is_reusable, match
 from sweep.execution.small_run import BlocksInChild
 from sweep.execution.summary import Summary, summary_of, summary_of_complete
 from sweep.execution.tally import Tally
+from sweep.execution.work_left import block_s_of, demand_left, demand_of, thread_count_of, work_s
 from sweep.isolation.child_process import Child
 from sweep.isolation.interrupts import Interrupts
 from sweep.messages import notice
 from sweep.plan.camera_facts import notes
 from sweep.plan.experiment import Pipeline
-from sweep.plan.parameters import Stage
-from sweep.store.blocks import committed, drop_block, receipts
+from sweep.store.blocks import committed, drop_block
 from sweep.store.lifecycle import create_store, open_store, read_run_metadata, remove_store
 from sweep.store.locations import check_writable, checked_url, exists, is_remote, open_storage
 from sweep.store.lock import locked, refuse_if_held
@@ -53,9 +58,6 @@ if TYPE_CHECKING:
 
 # `sweep.execution.cluster` and `in_flight` are imported where they are used: Dask is slow to
 # import, and finished stores and small runs need none of it.
-
-SAMPLED_RECEIPTS = 100
-"""Committed blocks from which the work that is left is estimated."""
 
 
 def absolute_url(url: str) -> str:
@@ -72,7 +74,9 @@ def execute(
     client: Client | Cluster | None = None,
     reuse: Sequence[str | os.PathLike[str]] = (),
     overwrite: bool = False,
+    retry_failed: bool = False,
     durable: bool = False,
+    yes: bool = False,
     block_s: float | None = None,
     time_limit_s: float = TIME_LIMIT_S,
     progress: ProgressReport | None = None,
@@ -99,8 +103,12 @@ def execute(
         Stores whose finished cells are reused where their parameters agree.
     overwrite
         Delete an existing store.
+    retry_failed
+        Compute the blocks again in which cells failed or crashed, also of a finished store.
     durable
         Flush each block to the disk before it counts as committed.
+    yes
+        Run also what would take more than a day, or more than is free on the disk.
     block_s
         Seconds of work in a block (default: about 2; more on large clusters and in long runs,
         less if there is little to do).
@@ -124,7 +132,12 @@ def execute(
     started = time.perf_counter()
     _check_arguments(workers, scheduler, client, block_s, time_limit_s)
     url = os.fspath(store) if store is not None else f"runs/{pipeline.name}.zarr"
+    if retry_failed and reuse:
+        raise ArgumentError("reuse", os.fspath(reuse[0]), "expected no retry_failed beside it")
     unfinished = _store_to_continue(url, pipeline, overwrite)
+    retry = Retry()
+    if retry_failed and unfinished is not None:
+        unfinished, retry = drop_failed(unfinished)
     if unfinished is not None and unfinished.finished:
         return summary_of_complete(unfinished, started)
     for line in notes(pipeline):
@@ -150,7 +163,7 @@ def execute(
         embedded = workers is None and scheduler is None and client is None
         if embedded and unfinished is None:
             calibration = interrupts.await_result(measuring(QUICK_CALIBRATION_S))
-        if not (embedded and _work_s(pipeline, unfinished, calibration) < SMALL_RUN_S):
+        if not (embedded and work_s(pipeline, unfinished, calibration) < SMALL_RUN_S):
             from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
 
             # Measured while the workers' processes start.
@@ -166,15 +179,17 @@ def execute(
                 raise AssertionError(url)
             unfinished = _new_store(
                 url, pipeline, calibration, connection, block_s, time_limit_s, overwrite,
-                durable=durable,
+                durable=durable, yes=yes or bool(sources),
             )
+        elif not (yes or sources):
+            check_affordable(url, demand_left(unfinished, connection))
         if durable:
             unfinished = open_store(url, "r+", durable=True)
         with _continuable_errors(without=" without overwrite" if overwrite else ""):
             computed = _compute_and_close(
                 unfinished, child, connection, sources, time_limit_s, interrupts, progress
             )
-    return summary_of(open_store(url), computed, time.perf_counter() - started)
+    return summary_of(open_store(url), computed, time.perf_counter() - started, retry)
 
 
 def recompute(
@@ -197,7 +212,7 @@ def recompute(
         interrupts = stack.enter_context(Interrupts())
         child = stack.enter_context(Child(BLOCK_TASK))
         connection: Client | None = None
-        if workers is not None or _block_s(store, committed(store)) * len(chosen) >= SMALL_RUN_S:
+        if workers is not None or block_s_of(store, committed(store)) * len(chosen) >= SMALL_RUN_S:
             from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
 
             connection = stack.enter_context(connected(store.pipeline, workers=workers))
@@ -237,10 +252,7 @@ def _store_to_continue(url: str, pipeline: Pipeline, overwrite: bool) -> RunStor
     refuse_if_held(url, store.storage)
     lines = differences(pipeline, store.pipeline, store.fingerprint)
     if lines:
-        listed = "\n".join(f"  {line}" for line in lines)
-        raise StoreError(
-            f"{url}: holds another experiment; choose another store, or overwrite it\n{listed}"
-        )
+        raise OtherExperimentError(url, lines, is_reusable(pipeline, store))
     return store
 
 
@@ -256,39 +268,16 @@ def _matching_sources(
     return sources
 
 
-# What the run takes
-
-
-def _work_s(
-    pipeline: Pipeline, unfinished: RunStore | None, calibration: Calibration | None
-) -> float:
-    """Return the estimated seconds of work that are left."""
-    if unfinished is not None:
-        done = committed(unfinished)
-        return (len(unfinished.blocks) - len(done)) * _block_s(unfinished, done)
-    if calibration is None:
-        return math.inf
-    return pipeline.size(Stage.scene) * calibration.scene_s
-
-
-def _block_s(store: RunStore, done: AbstractSet[int]) -> float:
-    """Return the mean seconds of some committed blocks; without any, what blocks are cut for."""
-    some = sorted(done)[:SAMPLED_RECEIPTS]
-    spent = [receipt.wall_s for _, receipt in receipts(store, some)]
-    return statistics.fmean(spent) if spent else BLOCK_S
-
-
 def _new_store(
     url: str, pipeline: Pipeline, calibration: Calibration, client: Client | None,
     block_s: float | None, time_limit_s: float, overwrite: bool, *, durable: bool = False,
+    yes: bool = False,
 ) -> RunStore:
     """Create an empty store whose blocks suit the calibration and the cluster, if there is one."""
-    threads = 1
-    if client is not None:
-        from sweep.execution.cluster import thread_count  # noqa: PLC0415  (slow to import)
-
-        threads = max(thread_count(client), 1)
+    threads = thread_count_of(client)
     extents = block_extents(pipeline, calibration, threads, block_s, time_limit_s)
+    if not yes:
+        check_affordable(url, demand_of(pipeline, calibration, threads, extents))
     if overwrite and exists(url):
         remove_store(url)
     return create_store(url, pipeline, extents, durable=durable)

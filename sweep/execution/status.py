@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 
+from sweep.execution.outcome import FailureGroup, outcome_of
+from sweep.execution.summary import first_cell
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plan.parameters import Stage
 from sweep.store.blocks import committed, receipts
@@ -12,8 +15,17 @@ from sweep.store.failures import MAX_ROWS, FailedCell, failed_cells
 from sweep.store.lifecycle import open_store
 from sweep.store.lock import holder
 
-RATE_BLOCKS = 50
-"""The rate is measured over this many blocks, those written last."""
+RATE_S = 60.0
+"""Seconds over which the rate is measured, up to the last block that was written."""
+
+RATE_BLOCKS = 10
+"""At least so many times the longest block is measured: with many workers, blocks come in waves."""
+
+RATE_RECEIPTS = 1000
+"""Blocks of which the longest counts for that."""
+
+PAUSE_S = 2.0
+"""Seconds in which no block was computed: the run was stopped and continued in between."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +45,12 @@ class Status:
     detection, estimate
         Cells by flag; flags without cells are left out.
     poses_per_s, seconds_left
-        Rate over the last blocks; time to the end if somebody writes. None if unknown.
+        Rate of the run that writes now, over its last minute; time to the end at that rate. Of a
+        store that nobody writes, the rate of the last minute of work, and None. None if unknown.
     crashed, failed
         Cells whose process died and cells that raised, at most 1,000 of each.
+    nothing_computed, failed_share, failures, warnings, advice
+        As `sweep.execution.summary.Summary` has them, of the committed blocks.
     """
 
     store: str
@@ -52,6 +67,11 @@ class Status:
     seconds_left: float | None
     crashed: list[FailedCell]
     failed: list[FailedCell]
+    nothing_computed: bool
+    failed_share: float
+    failures: list[FailureGroup]
+    warnings: list[str]
+    advice: str
 
 
 def status(url: str) -> Status:
@@ -65,7 +85,7 @@ def status(url: str) -> Status:
     store = open_store(url)
     detection: Counter[str] = Counter()
     estimate: Counter[str] = Counter()
-    written: list[tuple[float, int]] = []
+    written: list[WrittenBlock] = []
     cells: dict[str, list[FailedCell]] = {"crashed": [], "failed": []}
     done = poses = 0
     for number, receipt in receipts(store, committed(store)):
@@ -77,13 +97,18 @@ def status(url: str) -> Status:
         ):
             for flag, count in zip(flags, counts, strict=False):
                 counter[flag.name] += count
-        written.append((receipt.written, receipt.scenes))
+        written.append(WrittenBlock(receipt.written, receipt.wall_s, receipt.scenes))
         for cell in failed_cells(store, number, receipt):
             if len(cells[cell.kind]) < MAX_ROWS:
                 cells[cell.kind].append(cell)
     total = store.pipeline.size(Stage.scene)
     writer = holder(store.storage)
-    rate = _rate(written)
+    rate = poses_per_second(written, writer.get("since", 0.0) if writer else 0.0)
+    outcome = outcome_of(
+        url, [detection[flag.name] for flag in DetectionStatus],
+        [estimate[flag.name] for flag in EstimateStatus],
+        [*cells["failed"], *cells["crashed"]], first_cell(store),
+    )
     return Status(
         store=url,
         title=store.pipeline.heading,
@@ -98,15 +123,50 @@ def status(url: str) -> Status:
         poses_per_s=rate,
         seconds_left=(total - poses) / rate if rate and writer else None,
         **cells,
+        nothing_computed=outcome.nothing_computed,
+        failed_share=round(outcome.failed_share, 6),
+        failures=outcome.failures,
+        warnings=outcome.warnings,
+        advice=outcome.advice,
     )
 
 
-def _rate(written: list[tuple[float, int]]) -> float | None:
-    """Return poses per second over the last blocks, None if there are too few.
+@dataclass(frozen=True, slots=True)
+class WrittenBlock:
+    """A committed block: when it was written (s since 1970), the seconds it took, its scenes."""
 
-    ``written`` has the time at which each block was written, in seconds, and its scenes.
+    at: float
+    took_s: float
+    scenes: int
+
+
+def poses_per_second(blocks: Iterable[WrittenBlock], since: float = 0.0) -> float | None:
+    """Return the rate at the last of some blocks, None if it is not known.
+
+    Parameters
+    ----------
+    blocks
+        Committed blocks, in any order.
+    since
+        When the run that writes took the store over (s since 1970); what was written before counts
+        only where nothing was written since.
+
+    Examples
+    --------
+    >>> poses_per_second([WrittenBlock(at, 2.0, 100) for at in (12.0, 14.0, 9000.0, 9002.0)])
+    50.0
     """
-    last = sorted(written)[-RATE_BLOCKS:]
-    if len(last) < 2 or last[-1][0] <= last[0][0]:
+    ordered = sorted(blocks, key=lambda block: -block.at)
+    if not ordered or ordered[0].at < since:
         return None
-    return sum(scenes for _, scenes in last[1:]) / (last[-1][0] - last[0][0])
+    last = ordered[0].at
+    window_s = max(RATE_S, RATE_BLOCKS * max(block.took_s for block in ordered[:RATE_RECEIPTS]))
+    earliest = max(since, last - window_s)
+    begin, scenes = last, 0
+    for block in ordered:
+        if block.at < max(earliest, begin - PAUSE_S):
+            break
+        begin = min(begin, block.at - block.took_s)
+        scenes += block.scenes
+    begin = max(begin, earliest)
+    return scenes / (last - begin) if last > begin else None

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 
 from sweep.errors import StoreError
 from sweep.execution.finalize import lost
+from sweep.execution.outcome import FailureGroup, Outcome, outcome_of
+from sweep.execution.retry import Retry
 from sweep.measure.flags import DetectionStatus
+from sweep.plan.cell_selection import selection_text
 from sweep.plan.parameters import Stage
-from sweep.store.blocks import committed
+from sweep.store.blocks import committed, receipts
+from sweep.store.failures import FailedCell, failed_cells
 from sweep.store.run_store import RunStore
 from sweep.store.snapshot import missing_chunks
 
@@ -40,6 +44,18 @@ class Summary:
         Duration of this run.
     crashed, failed
         Cells that are flagged so.
+    nothing_computed
+        Whether a stage was tried and failed on every cell; ``sweep run`` ends with status 1 then.
+    failed_share
+        Share of the cells that failed or crashed, of those that a stage was tried on.
+    failures
+        The same cells by reason, each with one that ``sweep repro --at`` takes.
+    warnings
+        The lines of ``sweep run`` on failures, and on a run in which nothing was detected.
+    advice
+        The command that recomputes a cell for each reason; empty without warnings.
+    retried, recovered
+        Failed and crashed cells that were tried again, and those that did not fail again.
     """
 
     store: str
@@ -54,6 +70,13 @@ class Summary:
     seconds: float
     crashed: int = 0
     failed: int = 0
+    nothing_computed: bool = False
+    failed_share: float = 0.0
+    failures: list[FailureGroup] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    advice: str = ""
+    retried: int = 0
+    recovered: int = 0
 
 
 def summary_of_complete(store: RunStore, started: float) -> Summary:
@@ -74,10 +97,14 @@ def summary_of_complete(store: RunStore, started: float) -> Summary:
     return summary_of(store, {}, time.perf_counter() - started)
 
 
-def summary_of(store: RunStore, computed: Mapping[str, int], seconds: float) -> Summary:
+def summary_of(
+    store: RunStore, computed: Mapping[str, int], seconds: float, retry: Retry | None = None
+) -> Summary:
     """Return the summary of a finished store from the counts that it recorded."""
+    retry = retry or Retry()
     counts = store.run_metadata["counts"]
     missing = lost(counts["detection"], counts["estimate"])
+    outcome = outcome_of_finished(store)
     return Summary(
         store=store.url,
         data=store.data_url,
@@ -90,4 +117,35 @@ def summary_of(store: RunStore, computed: Mapping[str, int], seconds: float) -> 
         computed_estimates=computed.get("estimates", 0),
         seconds=round(seconds, 3),
         **missing,
+        nothing_computed=outcome.nothing_computed,
+        failed_share=round(outcome.failed_share, 6),
+        failures=outcome.failures,
+        warnings=outcome.warnings,
+        advice=outcome.advice,
+        retried=retry.cells,
+        recovered=retry.recovered(store),
     )
+
+
+def outcome_of_finished(store: RunStore) -> Outcome:
+    """Return what became of the cells of a finished store.
+
+    Raises
+    ------
+    StoreError
+        If cells failed, and a receipt that may record them is damaged.
+    """
+    detection, estimate = (store.run_metadata["counts"][name] for name in ("detection", "estimate"))
+    cells = _recorded_failures(store) if any(lost(detection, estimate).values()) else ()
+    return outcome_of(store.url, detection, estimate, cells, first_cell(store))
+
+
+def first_cell(store: RunStore) -> str:
+    """Return the first cell of a store's grid, as ``sweep repro --at`` takes it."""
+    return selection_text({axis.name: axis.values[0] for axis in store.pipeline.axes})
+
+
+def _recorded_failures(store: RunStore) -> Iterator[FailedCell]:
+    """Yield the failed cells that the receipts of a store record."""
+    for number, receipt in receipts(store, committed(store)):
+        yield from failed_cells(store, number, receipt)

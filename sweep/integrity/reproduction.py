@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -131,6 +132,21 @@ def reproduce(
          "estimation": cells.seconds["estimation"][configuration[Stage.estimation]]},
         cells.failures, changes, pipeline, cell_pipeline, inspected, image,
     )
+
+
+def check_selection(url: str, chosen: Sequence[str]) -> None:
+    """Check that cells are on a store's grid, before any is computed.
+
+    Raises
+    ------
+    PipelineError
+        If one is not.
+    StoreError
+        If there is no store.
+    """
+    pipeline = open_store(url).pipeline
+    for at in chosen:
+        _index(pipeline, at)
 
 
 def _index(pipeline: Pipeline, at: str) -> dict[str, int]:

@@ -98,7 +98,7 @@ class Pipeline:
             encoded = read_regular(path, MAX_BYTES)
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
-            raise refusal([f"{source}: cannot be read: {reason}"]) from None
+            raise refusal([f"{source}: cannot be read: {reason}{_similar(path)}"]) from None
         if len(encoded) > MAX_BYTES:
             raise refusal([f"{source}: expected at most {MAX_BYTES:,} bytes"])
         try:
@@ -240,6 +240,19 @@ class Pipeline:
     def any_value(self, name: str, condition: Callable[[Any], bool]) -> bool:
         """Return whether a parameter takes a value for which ``condition`` holds."""
         return any(condition(value) for value in self.values_of(name) if value is not None)
+
+
+def _similar(path: Path) -> str:
+    """Return the pipeline file that may be meant where there is none; else nothing."""
+    candidates = (
+        path.with_name(f"{path.name}.toml"), path.with_suffix(".toml"),
+        Path("pipelines") / path.name, Path("pipelines") / f"{path.name}.toml",
+    )
+    try:
+        similar = [each for each in candidates if each != path and each.is_file()]
+    except (OSError, ValueError):
+        return ""
+    return f"; did you mean {plain(similar[0])}?" if similar and not path.exists() else ""
 
 
 def _document(text: str, source: str) -> dict[str, Any]:

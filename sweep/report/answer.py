@@ -47,7 +47,9 @@ def answer(data: ReportData) -> Answer:
         _error_tile("rotation error, p95", errors, "rotation_p95_deg"),
         *limits_tile(limits),
     )
-    return Answer(_paragraph(data, limits), tiles, (_errors_table(errors), *limits_table(limits)))
+    warnings = "".join(f"{line.strip()[:1].upper()}{line.strip()[1:]}. " for line in data.warnings)
+    paragraph = warnings + _paragraph(data, limits)
+    return Answer(paragraph, tiles, (_errors_table(errors), *limits_table(limits)))
 
 
 def _results(data: ReportData, poses: int) -> str:

@@ -11,8 +11,6 @@ from sweep.tradeoff.labels import digits
 MAX_SHORT = 5
 """Characters of a number that needs no rounding to be short."""
 
-BYTE_UNITS = ("bytes", "kB", "MB", "GB", "TB", "PB")
-
 
 def number(value: float) -> str:
     """Return a number with three significant digits and typographic signs; a dash for NaN.
@@ -101,25 +99,3 @@ def shortened(text: str, most: int) -> str:
     'dist\u2026'
     """
     return text if len(text) <= most else text[: most - 1] + "\u2026"
-
-
-def byte_count(count: int) -> str:
-    """Return a number of bytes with a decimal prefix.
-
-    >>> byte_count(999), byte_count(332_000), byte_count(10**9)
-    ('999 bytes', '332 kB', '1 GB')
-    """
-    power = min((len(str(count)) - 1) // 3, len(BYTE_UNITS) - 1)
-    return f"{count / 1000**power:.3g} {BYTE_UNITS[power]}"
-
-
-def duration(seconds: float) -> str:
-    """Return a time in the largest unit of which there are at least two.
-
-    >>> duration(90.0), duration(150.0), duration(1e6)
-    ('90.0 s', '2.5 min', '11.6 days')
-    """
-    for unit, length in (("days", 86400), ("h", 3600), ("min", 60)):
-        if seconds >= 2 * length:
-            return f"{seconds / length:.1f} {unit}"
-    return f"{seconds:.1f} s"

@@ -14,6 +14,7 @@ import xarray as xr
 
 from sweep.analysis.detection_limits import SIZE_AXES
 from sweep.errors import StoreError, SweepError
+from sweep.execution.summary import outcome_of_finished
 from sweep.measure.flags import DetectionStatus, uncounted_values
 from sweep.model.camera import VIEW_PARAMETERS
 from sweep.plan.axes import TRIAL
@@ -59,6 +60,8 @@ class ReportData:
         Fingerprint, environment and dates of the run.
     trade
         The store's group ``cost/tradeoff``, or None.
+    warnings
+        Lines on cells that failed, or a run in which nothing was detected.
     """
 
     store: str
@@ -66,6 +69,7 @@ class ReportData:
     pipeline: Pipeline
     run_metadata: Mapping[str, Any]
     trade: xr.Dataset | None = None
+    warnings: tuple[str, ...] = ()
     _analyses: dict[Any, xr.Dataset] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -246,4 +250,7 @@ def read_report_data(url: str) -> ReportData:
                 snapshot(store), group="cost/tradeoff", consolidated=False, zarr_format=3
             ).load()
         results = open_dataset(store.url)
-    return ReportData(store.url, results, store.pipeline, store.run_metadata, trade)
+    return ReportData(
+        store.url, results, store.pipeline, store.run_metadata, trade,
+        tuple(outcome_of_finished(store).warnings),
+    )

@@ -51,9 +51,12 @@ class FailedCell:
 
     @property
     def reason(self) -> str:
-        """The text's last line."""
+        """The first line of the exception's message in a traceback; of other texts the last."""
         lines = self.text.strip().splitlines()
-        return lines[-1] if lines else ""
+        frames = [number for number, line in enumerate(lines) if line.startswith('  File "')]
+        raised = (line for line in lines[frames[-1] + 1 :] if not line[:1].isspace()) \
+            if frames else iter(())
+        return next(raised, lines[-1] if lines else "")
 
 
 def recorded(

@@ -11,14 +11,13 @@ import shutil
 import time
 import uuid
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import zarr
 import zarr.errors
 from zarr.abc.store import Store
-from zarr.buffer import default_buffer_prototype
 from zarr.storage import LocalStore
 
 from sweep.errors import StoreError
@@ -45,10 +44,10 @@ from sweep.store.locations import (
     translate_errors,
 )
 from sweep.store.lock import hold
-from sweep.store.manifest import Manifest, parsed, put, read_manifest, write_manifest
+from sweep.store.manifest import Manifest, put, read_manifest, write_manifest
 from sweep.store.provenance import environment, fingerprint
 from sweep.store.receipt import are_counts
-from sweep.store.run_store import RunStore, list_folder
+from sweep.store.run_store import RunStore
 from sweep.store.schema_check import schema_faults
 from sweep.store.snapshot import snapshot
 from sweep.store.tidying import beside, tidy_beside
@@ -223,7 +222,7 @@ def _lay_out(to: Store, pipeline: Pipeline, extents: tuple[int, ...], run_id: st
             "block": list(extents),
             "fingerprint": fingerprint(pipeline),
             "environment": environment(),
-            "created": _now(),
+            "created": utc_now(),
             "finished": False,
         },
     }
@@ -231,7 +230,8 @@ def _lay_out(to: Store, pipeline: Pipeline, extents: tuple[int, ...], run_id: st
     write_manifest(storage, Manifest(attributes, dict(storage.digests)))
 
 
-def _now() -> str:
+def utc_now() -> str:
+    """Return the date and time as stores record them."""
     return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
 
 
@@ -273,72 +273,6 @@ def read_run_metadata(url: str, storage: DigestingStore) -> dict[str, Any]:
         return dict(cast("dict[str, Any]", attributes["sweep"]))
     except UNREADABLE:
         raise StoreError(not_a_store(url)) from None
-
-
-def finish(store: RunStore, groups: Mapping[str, xr.Dataset], counts: dict[str, Any]) -> None:
-    """Close a complete store: write its groups, consolidate the metadata, mark it finished."""
-    metadata = {
-        **store.run_metadata, "finished": True, "finished_at": _now(), "counts": counts,
-    }
-    _write_groups(store, groups, metadata)
-
-
-def write_group(store: RunStore, name: str, content: xr.Dataset) -> None:
-    """Write a dataset to a group of a finished store, and consolidate the metadata again."""
-    _write_groups(store, {name: content}, store.run_metadata)
-
-
-def _write_groups(
-    store: RunStore, groups: Mapping[str, xr.Dataset], metadata: dict[str, Any]
-) -> None:
-    manifest, _ = read_manifest(store.storage)
-    files = dict(manifest.files) if manifest is not None else {}
-    with translate_errors(store.url, "written"), warnings.catch_warnings():
-        # Consolidated metadata is not part of the Zarr 3 specification; xarray reads it, and
-        # warns if it is missing.
-        warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
-        old = tuple(path for name in groups for path in sync(_arrays_in(store, name, files)))
-        files = {
-            key: value for key, value in files.items()
-            if key not in ("zarr.json", *(f"{name}/zarr.json" for name in groups))
-            and not key.startswith(tuple(f"{path}/" for path in old))
-        }
-        # The manifest vouches for no file while it is being written.
-        write_manifest(store.storage, Manifest(dict(store.group.attrs), files))
-        for path in old:
-            sync(store.storage.delete_dir(path))
-        store.storage.digests.clear()
-        for name, content in groups.items():
-            # Zarr 3 specifies strings of variable length, none of a fixed one.
-            texts = [label for label in content.variables if content[label].dtype.kind == "U"]
-            content.assign({label: content[label].astype(object) for label in texts}).to_zarr(
-                store.storage, group=name, mode="a", zarr_format=3, consolidated=False
-            )
-        zarr.consolidate_metadata(store.storage, zarr_format=3)
-        digests = {
-            key: value for key, value in list(store.storage.digests.items())
-            if any(key.startswith(f"{name}/") for name in groups)
-        }
-        files |= digests
-        write_manifest(store.storage, Manifest(dict(store.group.attrs), files))
-        # The root is written last: a kill before it leaves a store that is closed again.
-        root = parsed(sync(store.storage.get("zarr.json", default_buffer_prototype()))) or {}
-        root["attributes"]["sweep"] = metadata
-        put(store.storage, "zarr.json", root)
-        files["zarr.json"] = store.storage.digests["zarr.json"]
-        write_manifest(store.storage, Manifest(dict(root["attributes"]), files))
-
-
-async def _arrays_in(store: RunStore, name: str, known: Collection[str]) -> list[str]:
-    """Return the paths of a group's arrays, and of those of ``known`` keys that are damaged."""
-    paths = []
-    for child in await list_folder(store.storage, name):
-        path = f"{name}/{child}"
-        document = await store.storage.get(f"{path}/zarr.json", default_buffer_prototype())
-        kind = (parsed(document) or {}).get("node_type")
-        if kind == "array" or (kind is None and f"{path}/zarr.json" in known):
-            paths.append(path)
-    return paths
 
 
 def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:

@@ -42,6 +42,11 @@ def is_remote(url: str) -> bool:
 
 def not_a_store(url: str) -> str:
     """Return the message for something that ``sweep run`` did not create."""
+    if not is_remote(url) and Path(url).is_file() and Path(url).suffix.lower() == ".toml":
+        return (
+            f"{url}: not a sweep store, but a pipeline file; `sweep run {plain(url)}` makes its "
+            f"store, by default runs/{plain(Path(url).stem)}.zarr"
+        )
     return f"{url}: not a sweep store; choose another path"
 
 
@@ -193,7 +198,7 @@ def open_storage(url: str, mode: str = "r", *, durable: bool = False) -> Digesti
     """
     url = checked_url(url)
     if not exists(url):
-        raise StoreError(f"{url}: store not found; create one with `sweep run`")
+        raise StoreError(f"{url}: store not found{_similar(url)}")
     if is_remote(url):
         return DigestingStore(storage_at(f"{url}/{remote_run_id(url)}", read_only=mode == "r"))
     kind = DurableStore if durable else LocalStore
@@ -206,6 +211,15 @@ def open_storage(url: str, mode: str = "r", *, durable: bool = False) -> Digesti
     except OSError as error:
         raise StoreError(f"{url}: cannot be read: {reason_of(error)}") from None
     return DigestingStore(kind(f"/proc/self/fd/{folder.descriptor}"), folder)
+
+
+def _similar(url: str) -> str:
+    """Return the store that may be meant where there is none, or how one is made."""
+    if not is_remote(url):
+        for other in (f"{url}.zarr", f"runs/{Path(url).name}", f"runs/{Path(url).name}.zarr"):
+            if (Path(other) / "zarr.json").is_file():
+                return f"; did you mean {plain(other)}?"
+    return "; create one with `sweep run`"
 
 
 class _HeldFolder:

@@ -49,8 +49,8 @@ _unchanged: dict[str, tuple[bytes, float]] = {}
 class HeldLock:
     """A lock that this process holds, with the thread that renews it."""
 
-    def __init__(self, url: str, file: LockFile, token: str) -> None:
-        self._url, self._file, self._token = url, file, token
+    def __init__(self, url: str, file: LockFile, token: str, since: float) -> None:
+        self._url, self._file, self._token, self._since = url, file, token, since
         self._renewed = time.monotonic()
         self._lost = False
         self._done = threading.Event()
@@ -97,7 +97,7 @@ class HeldLock:
             # Whatever error a disk or a server reports now, the next beat may succeed.
             with contextlib.suppress(Exception):
                 own = self._own()
-                if own is None or not self._file.exchange(own, _content(self._token)):
+                if own is None or not self._file.exchange(own, _content(self._token, self._since)):
                     self._lost = self._own() is None
                 if self._lost:
                     return
@@ -127,11 +127,11 @@ def hold(url: str, storage: DigestingStore) -> Iterator[HeldLock]:
     StoreError
         If another client holds it, or it cannot be written.
     """
-    file, token = LockFile(storage, KEY), uuid.uuid4().hex
+    file, token, since = LockFile(storage, KEY), uuid.uuid4().hex, time.time()
     with translate_errors(url, "written"):
-        while not file.exchange(_free(url, file), _content(token)):
+        while not file.exchange(_free(url, file), _content(token, since)):
             pass  # another process was faster: it is judged in its turn
-    lock = HeldLock(url, file, token)
+    lock = HeldLock(url, file, token, since)
     try:
         yield lock
     finally:
@@ -186,12 +186,12 @@ def _free(url: str, file: LockFile) -> bytes | None:
         time.sleep(WATCH_S)
 
 
-def _content(token: str) -> bytes:
-    """Return a lock of this process, renewed now."""
+def _content(token: str, since: float = 0.0) -> bytes:
+    """Return a lock that this process holds since a time (seconds since 1970), renewed now."""
     return encoded({
         "token": token, "host": socket.gethostname(), "pid": os.getpid(), "boot": _boot(),
         "namespace": _namespace(), "started": _started(os.getpid()),
-        "beat": time.time(), "clock": time.monotonic(),
+        "beat": time.time(), "clock": time.monotonic(), "since": since,
     })
 
 
@@ -208,6 +208,7 @@ def _parsed(content: bytes | None) -> Content | None:
         and type(lock.get("pid")) is int and lock["pid"] > 0
         and type(lock.get("beat")) in (int, float) and math.isfinite(lock["beat"])
         and type(lock.get("clock", 0.0)) in (int, float)
+        and type(lock.get("since", 0.0)) in (int, float)
     )
     return lock if valid else None
 

@@ -21,7 +21,8 @@ from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import combinations, estimators
 from sweep.plan.parameters import Stage
-from sweep.store.lifecycle import open_dataset, open_store, write_group
+from sweep.store.closing import write_group
+from sweep.store.lifecycle import open_dataset, open_store
 from sweep.store.lock import locked
 from sweep.store.provenance import differences
 from sweep.tradeoff.configuration_costs import measure

@@ -49,7 +49,7 @@ NOT_FOUND = "store not found; create one with `sweep run`"
 PLACES = {
     "none.zarr": NOT_FOUND,
     "small.toml/s.zarr": NOT_FOUND,
-    "small.toml": "not a sweep store; choose another path",
+    "small.toml": "makes its store, by default runs/small.zarr",
     "/dev/null": "not a sweep store; choose another path",
     "loop.zarr": "cannot be read: Too many levels of symbolic links",
     "x" * 300: "cannot be read: File name too long",
@@ -82,7 +82,7 @@ def test_a_place_without_a_store_is_told_as_what_it_is_by_every_command(place, f
         *((place, PLACES[place]) for place in (
             "loop.zarr", "x" * 300, "file:/a/b.zarr", "memory://x.zarr", "~/x.zarr", "a\0b")),
         ("http://127.0.0.1:9/x.zarr", "cannot be reached"),
-        ("small.toml", "not a sweep store; choose another path"),
+        ("small.toml", "not a sweep store, but a pipeline file"),
         ("group.zarr/inner.zarr", "cannot be written: it is inside the store {}/group.zarr"),
         ("group.zarr/deep/inner.zarr", "cannot be written: it is inside the store {}/group.zarr"),
     ],

@@ -307,8 +307,10 @@ def test_scenes_that_end_their_process_are_found_and_no_other_is_touched(
     assert (ran.returncode, ran.stderr) == (0, "")
     assert differing(url, clean, pipeline, poisons) == {}
     counts = numbers(clean, pipeline, poisons)
-    assert f"{counts['crashed']:,} flagged crashed" in ran.stdout
-    assert f"{counts['failed']:,} flagged failed" in ran.stdout
+    for kind in ("crashed", "failed"):
+        told = re.findall(rf"([\d,]+) {kind}\b.* of [\d,]+ (?:detections|estimates)", ran.stdout)
+        assert sum(int(count.replace(",", "")) for count in told) == counts[kind], ran.stdout
+    assert ran.stdout.splitlines()[-1].startswith(f"next: sweep repro {url} --at ")
     kinds = see_who_died(log, poisons, store, 2)
     print(f"{seconds:.1f} s; deaths: {kinds}")
     assert committed(store) == set(range(6))

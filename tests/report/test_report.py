@@ -40,7 +40,8 @@ from sweep.report.gallery import scenes_of
 from sweep.report.grouping import Grouping
 from sweep.report.report_data import ReportData, read_report_data
 from sweep.report.write_report import write_report
-from sweep.store.lifecycle import open_dataset, open_store, write_group
+from sweep.store.closing import write_group
+from sweep.store.lifecycle import open_dataset, open_store
 
 ODD = {
     "single pose": f"{CAMERA}[pose]\nside_px = 40\n",

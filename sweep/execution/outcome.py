@@ -1,0 +1,229 @@
+"""The outcome of a run in words: what failed and why, and whether anything was computed."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag
+from sweep.messages import plain
+from sweep.store.failures import FailedCell
+
+LOUD_SHARE = 0.1
+"""Share of the cells that were tried, above which failures are told first."""
+
+MAX_GROUPS = 5
+"""Groups of failures that are listed; the others are counted."""
+
+MAX_REASON = 200
+
+NOT_TRIED = (
+    "not_run", "no_detection", DetectionStatus.not_visible.name, DetectionStatus.not_modelled.name
+)
+"""Flags of cells on which a stage was not tried."""
+
+_VARYING = re.compile(r"0x[0-9a-fA-F]+|[-+]?\d[\d_,]*(?:\.\d*)?(?:[eE][-+]?\d+)?")
+"""Parts of messages that differ from cell to cell: addresses and numbers."""
+
+
+@dataclass(frozen=True, slots=True)
+class FailureGroup:
+    """Cells that failed for the same reason.
+
+    Attributes
+    ----------
+    kind
+        "failed" (an exception was raised) or "crashed" (the process died).
+    stage
+        "scene", "detection" or "estimation".
+    reason
+        Type and message of the first cell's exception, or how its process died.
+    count
+        Recorded cells; a store records 1,000 of each kind.
+    at
+        The first cell, as ``sweep repro --at`` takes it.
+    """
+
+    kind: str
+    stage: str
+    reason: str
+    count: int
+    at: str
+
+
+def failure_groups(cells: Iterable[FailedCell]) -> list[FailureGroup]:
+    """Group failed cells by kind, stage, and message without its numbers; the largest first.
+
+    Examples
+    --------
+    >>> cells = [FailedCell(f"trial={n}", "failed", "scene", f"ValueError: {n} px") for n in (3, 8)]
+    >>> [(group.reason, group.count, group.at) for group in failure_groups(cells)]
+    [('ValueError: 3 px', 2, 'trial=3')]
+    """
+    first: dict[tuple[str, str, str], FailedCell] = {}
+    counts: dict[tuple[str, str, str], int] = {}
+    for cell in cells:
+        key = cell.kind, cell.stage, _VARYING.sub("#", cell.reason)
+        first.setdefault(key, cell)
+        counts[key] = counts.get(key, 0) + 1
+    groups = [
+        FailureGroup(cell.kind, cell.stage, plain(cell.reason, MAX_REASON), counts[key], cell.at)
+        for key, cell in first.items()
+    ]
+    return sorted(groups, key=lambda group: -group.count)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of the cells of a store.
+
+    Attributes
+    ----------
+    nothing_computed
+        Whether a stage was tried and failed on every cell.
+    failed_share
+        Share of the cells that failed or crashed, of those that a stage was tried on; the largest
+        of the stages.
+    failures
+        The cells that failed or crashed, by reason.
+    warnings
+        The same for a reader; and that nothing was detected, or no pose estimated. Empty if there
+        is nothing to tell.
+    advice
+        The command that recomputes one cell of each reason; empty where there is nothing to tell.
+    """
+
+    nothing_computed: bool
+    failed_share: float
+    failures: list[FailureGroup]
+    warnings: list[str]
+    advice: str
+
+
+def outcome_of(
+    url: str, detection: Sequence[int], estimate: Sequence[int], cells: Iterable[FailedCell],
+    first: str = "",
+) -> Outcome:
+    """Return the outcome of the cells that a store holds.
+
+    Parameters
+    ----------
+    url
+        The store, for the command that repeats failures.
+    detection, estimate
+        Counts of cells; the flag is the index.
+    cells
+        The recorded failures.
+    first
+        A cell to look at where nothing was detected, as ``--at`` takes it.
+    """
+    groups = failure_groups(cells)
+    stages = [
+        _Counts("detections", DetectionStatus, detection),
+        _Counts("estimates", EstimateStatus, estimate),
+    ]
+    warnings = [stage.line() for stage in stages if stage.lost]
+    advice = ""
+    if groups:
+        warnings += _listed(groups)
+        advice = repro_command(url, [group.at for group in groups])
+    if nothing := _nothing_found(*stages):
+        warnings.append(nothing)
+        advice = advice or f"{repro_command(url, [first])} -o scene.png"
+    return Outcome(
+        any(stage.nothing_computed for stage in stages), max(stage.share for stage in stages),
+        groups, warnings, advice,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Counts:
+    """Cells of a stage by flag."""
+
+    name: str
+    flags: type[Flag]
+    counts: Sequence[int]
+
+    def of(self, *names: str) -> int:
+        return sum(
+            count for flag, count in zip(self.flags, self.counts, strict=False)
+            if flag.name in names
+        )
+
+    @property
+    def lost(self) -> int:
+        return self.of("failed", "crashed")
+
+    @property
+    def tried(self) -> int:
+        return sum(self.counts) - self.of(*NOT_TRIED)
+
+    @property
+    def share(self) -> float:
+        return self.lost / self.tried if self.tried else 0.0
+
+    @property
+    def nothing_computed(self) -> bool:
+        return 0 < self.lost == self.tried
+
+    def line(self) -> str:
+        kinds = " and ".join(
+            f"{self.of(kind):,} {kind}" for kind in ("failed", "crashed") if self.of(kind)
+        )
+        if self.nothing_computed:
+            return f"nothing computed: all {self.lost:,} {self.name} {_verb(self)}"
+        loud = "warning: " if self.share > LOUD_SHARE else ""
+        return f"{loud}{kinds} of {self.tried:,} {self.name} ({_percent(self.share)})"
+
+    def most(self) -> tuple[Flag, int] | None:
+        """Return the most frequent flag and its count; None if there are no cells."""
+        counted = [pair for pair in zip(self.flags, self.counts, strict=False) if pair[1]]
+        return max(counted, key=lambda pair: pair[1]) if counted else None
+
+
+def _verb(stage: _Counts) -> str:
+    if not stage.of("crashed"):
+        return "failed"
+    return "failed or crashed" if stage.of("failed") else "crashed"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.4g} %"
+
+
+def _listed(groups: Sequence[FailureGroup]) -> list[str]:
+    lines = [
+        f"  {group.count:,} x {group.kind} in {group.stage}: {group.reason}"
+        for group in groups[:MAX_GROUPS]
+    ]
+    if len(groups) > MAX_GROUPS:
+        rest = sum(group.count for group in groups[MAX_GROUPS:])
+        lines.append(f"  {rest:,} x for {len(groups) - MAX_GROUPS:,} other reasons")
+    return lines
+
+
+def repro_command(url: str, cells: Sequence[str]) -> str:
+    """Return the command that recomputes cells of a store.
+
+    >>> repro_command("runs/a.zarr", ["trial=3", "dictionary=DICT_4X4_50"])
+    'sweep repro runs/a.zarr --at trial=3 --at dictionary=DICT_4X4_50'
+    """
+    chosen = [f"--at {shlex.quote(at)}" for at in cells[:MAX_GROUPS] if at]
+    return " ".join(["sweep repro", shlex.quote(url), *chosen])
+
+
+def _nothing_found(detection: _Counts, estimate: _Counts) -> str:
+    """Return a line that says that nothing was detected, or no pose estimated; or nothing."""
+    if not detection.of("detected"):
+        stage, what = detection, "nothing was detected"
+    elif not estimate.of(*(flag.name for flag in EstimateStatus if flag.present)):
+        stage, what = estimate, "no pose was estimated"
+    else:
+        return ""
+    most = stage.most()
+    if most is None or stage.nothing_computed:
+        return ""
+    flag, count = most
+    return f"warning: {what}: {count:,} {flag.name} ({flag.meaning.rstrip('.')})"

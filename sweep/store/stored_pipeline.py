@@ -1,0 +1,43 @@
+"""A pipeline by the path of its file, or of a store that was made from it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from sweep.plan.experiment import Pipeline
+
+
+def names_store(path: str | os.PathLike[str]) -> bool:
+    """Return whether a path or URL leads to a folder or a server, where no pipeline file is."""
+    return "://" in os.fspath(path) or Path(path).is_dir()
+
+
+def read_pipeline(path: str | os.PathLike[str], settings: Sequence[str] = ()) -> Pipeline:
+    """Return the pipeline of a TOML file, or that of a store.
+
+    Parameters
+    ----------
+    path
+        A TOML file, or the path or URL of a store.
+    settings
+        "key=value" with TOML values, as ``--set`` takes them.
+
+    Raises
+    ------
+    PipelineError
+        If the file or a setting is invalid.
+    StoreError
+        If a folder is no store.
+    """
+    if not names_store(path):
+        return Pipeline.from_toml(os.fspath(path), settings)
+    from sweep.store.lifecycle import open_store  # noqa: PLC0415  (slow to import)
+
+    url = os.fspath(path)
+    stored = open_store(url).pipeline
+    return Pipeline.from_text(
+        stored.text, settings, name=stored.name, source=f"{url} (its pipeline)",
+        folder=stored.folder,
+    )

@@ -1,0 +1,183 @@
+"""What a run says of failures, of nothing detected, and of its rate."""
+
+import json
+
+import numpy as np
+import pytest
+
+from support.commands import command
+from support.poison import Poison, poisoned
+from sweep.execution.outcome import failure_groups, outcome_of
+from sweep.execution.progress import Progress, ProgressLines, progress_display
+from sweep.execution.status import WrittenBlock, poses_per_second
+from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.store.failures import FailedCell
+
+TEXT = """
+pose = { jitter_px = 0.5 }
+axes = { side_px = [30, 60], solver = ["ippe_square", "iterative"], trial = 2 }
+"""
+
+TRACEBACK = """Traceback (most recent call last):
+  File "a.py", line 3, in f
+    raise ValueError("x")
+    ^^^^^^^^^^^^^^^^^^^^^
+{}
+"""
+
+
+def counts(flags, **given):
+    return [given.get(flag.name, 0) for flag in flags]
+
+
+def outcome(detection, estimate, cells=()):
+    return outcome_of(
+        "a b.zarr", counts(DetectionStatus, **detection), counts(EstimateStatus, **estimate), cells,
+        "trial=0",
+    )
+
+
+def failed(message, at, kind="failed", stage="estimation"):
+    return FailedCell(at, kind, stage, TRACEBACK.format(message))
+
+
+def test_failures_are_grouped_by_exception_without_its_numbers_and_by_stage():
+    cells = [
+        failed(f"ValueError: pose {n} at 0x7f{n:04x}: {n / 7} px\n  more lines: {n}", f"trial={n}")
+        for n in range(9)
+    ]
+    cells += [failed("ValueError: other", "trial=20"), failed("KeyError: 'a'", "trial=21")]
+    cells += [failed("ValueError: other", "trial=22", stage="detection")]
+    cells += [FailedCell("trial=23", "crashed", "scene", "ended by SIGSEGV")]
+    found = [(group.count, group.kind, group.stage, group.reason, group.at)
+             for group in failure_groups(cells)]
+    assert found == [
+        (9, "failed", "estimation", "ValueError: pose 0 at 0x7f0000: 0.0 px", "trial=0"),
+        (1, "failed", "estimation", "ValueError: other", "trial=20"),
+        (1, "failed", "estimation", "KeyError: 'a'", "trial=21"),
+        (1, "failed", "detection", "ValueError: other", "trial=22"),
+        (1, "crashed", "scene", "ended by SIGSEGV", "trial=23"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("detection", "estimate", "nothing", "share", "first"),
+    [
+        ({"detected": 40}, {"failed": 40}, True, 1.0, "nothing computed: all 40 estimates failed"),
+        ({"failed": 30, "crashed": 10}, {"no_detection": 40}, True, 1.0,
+         "nothing computed: all 40 detections failed or crashed"),
+        ({"detected": 30, "not_visible": 10}, {"failed": 30, "no_detection": 10}, True, 1.0,
+         "nothing computed: all 30 estimates failed"),
+        ({"detected": 80, "crashed": 20}, {"solved": 80, "no_detection": 20}, False, 0.2,
+         "warning: 20 crashed of 100 detections (20 %)"),
+        ({"detected": 990, "failed": 10}, {"solved": 990, "no_detection": 10}, False, 0.01,
+         "10 failed of 1,000 detections (1 %)"),
+        ({"no_candidate": 7}, {"no_detection": 7}, False, 0.0,
+         "warning: nothing was detected: 7 no_candidate (No candidate at the marker)"),
+        ({"not_visible": 7}, {"no_detection": 7}, False, 0.0,
+         "warning: nothing was detected: 7 not_visible (The marker is wholly outside"),
+        ({"detected": 7}, {"solver_failed": 7}, False, 0.0,
+         "warning: no pose was estimated: 7 solver_failed (The solver returned no solution"),
+        ({"detected": 7}, {"solved": 7}, False, 0.0, None),
+        ({"detected": 7}, {"not_explained": 7}, False, 0.0, None),
+        ({}, {}, False, 0.0, None),
+    ],
+)
+def test_what_failed_is_said_first_and_loudest(detection, estimate, nothing, share, first):
+    cells = [failed("E: 1", "trial=3")] if share else []
+    found = outcome(detection, estimate, cells)
+    assert (found.nothing_computed, found.failed_share) == (nothing, pytest.approx(share))
+    if first is None:
+        assert (found.warnings, found.advice) == ([], "")
+        return
+    assert found.warnings[0].startswith(first)
+    expected = "--at trial=3" if share else "--at trial=0 -o scene.png"
+    assert found.advice == f"sweep repro 'a b.zarr' {expected}"
+
+
+def test_few_reasons_are_listed_and_the_others_counted():
+    cells = [failed(f"Error{letter}: x", f"trial={n}") for n, letter in enumerate("abcdefgh")]
+    found = outcome({"detected": 92, "failed": 8}, {"solved": 92}, cells)
+    assert found.warnings[-1] == "  3 x for 3 other reasons"
+    assert found.advice.count("--at") == 5
+
+
+def test_solver_that_raises_on_every_scene_ends_with_status_1_and_one_command(tmp_path):
+    path, url = tmp_path / "bad.toml", str(tmp_path / "bad.zarr")
+    path.write_text(TEXT.replace('["ippe_square", "iterative"]', '["iterative"]'))
+    poisons = [Poison(cell, "estimation", "raise") for cell in range(4)]
+    env = poisoned(poisons, tmp_path / "log")
+    ran = command("run", path, "--store", url, "--json", env=env)
+    assert (ran.returncode, ran.stderr) == (1, "")
+    told = json.loads(ran.stdout)
+    assert (told["nothing_computed"], told["failed_share"], told["failed"]) == (True, 1.0, 4)
+    assert [(group["count"], group["reason"]) for group in told["failures"]] == [
+        (4, "RuntimeError: poisoned")]
+    assert told["warnings"][0] == "nothing computed: all 4 estimates failed"
+    assert told["advice"].startswith(f"sweep repro {url} --at side_px=30.0,solver=iterative,trial=")
+    again = command("run", path, "--store", url)  # a finished store tells it as well
+    assert again.returncode == 1
+    assert again.stdout.splitlines()[-3:] == [*told["warnings"], f"next: {told['advice']}"]
+    status = command("status", url)
+    assert (status.returncode, status.stdout.splitlines()[-3:]) == (
+        0, [*told["warnings"], f"next: {told['advice']}"])
+    report = command("report", url, "-o", tmp_path / "report.html")
+    assert report.stdout.splitlines()[1:3] == told["warnings"]
+    assert "Nothing computed: all 4 estimates failed" in (tmp_path / "report.html").read_text()
+
+
+# Rates.
+
+def blocks(workers, count, *, begin, took=2.0, scenes=100, lockstep=True):
+    """Return blocks of workers that are always busy, from ``begin`` on."""
+    shift = 0.0 if lockstep else took / workers
+    return [
+        WrittenBlock(begin + took * (n // workers + 1) + shift * (n % workers), took, scenes)
+        for n in range(count)
+    ]
+
+
+@pytest.mark.parametrize("lockstep", [True, False])
+@pytest.mark.parametrize(("workers", "count"), [(1, 8), (2, 20), (2, 400), (64, 640), (1000, 9000)])
+def test_rate_is_within_a_fifth_of_the_true_one(workers, count, lockstep):
+    truth = workers * 100 / 2.0
+    run = blocks(workers, count, begin=5000.0, lockstep=lockstep)
+    before = blocks(workers, count, begin=0.0, lockstep=lockstep)
+    np.random.default_rng(0).shuffle(run)
+    for written, since in ((run, 0.0), (run, 4990.0), ([*before, *run], 4990.0),
+                           ([*before, *run], 0.0)):
+        assert poses_per_second(written, since) == pytest.approx(truth, rel=0.2)
+
+
+def test_rate_of_a_continued_run_is_not_that_of_a_faster_one_before():
+    before = blocks(2, 100, begin=0.0, took=0.5)
+    run = blocks(2, 8, begin=110.0, took=5.0)
+    assert poses_per_second([*before, *run], 109.0) == pytest.approx(40, rel=0.2)
+
+
+def test_rate_is_unknown_until_the_run_has_written_a_block():
+    before = blocks(2, 10, begin=0.0)
+    assert poses_per_second(before, 100.0) is None
+    assert poses_per_second([]) is None
+
+
+# Progress.
+
+def test_lines_tell_poses_rate_and_time_left_of_this_run_alone():
+    lines = ProgressLines()
+    assert lines.line(0.0) == "starting"
+    lines.report(Progress(500_000, 1_000_000, 0), 10.0)
+    assert lines.line(40.0) == "500,000 of 1,000,000 poses"
+    lines.report(Progress(515_000, 1_000_000, 0), 40.0)
+    assert lines.line(40.0) == "515,000 of 1,000,000 poses (52 %), 500 poses/s, 16.2 min left"
+
+
+def test_a_line_comes_every_interval_even_if_no_block_is_finished(monkeypatch, capsys):
+    monkeypatch.setattr("sweep.execution.progress.LINE_INTERVAL_S", 0.02)
+    with progress_display() as display:
+        display(Progress(0, 10, 0))
+        import time  # noqa: PLC0415
+        time.sleep(0.2)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) >= 3
+    assert set(lines) <= {"starting", "0 of 10 poses"}

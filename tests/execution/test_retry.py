@@ -1,0 +1,146 @@
+"""Failed cells that are tried again: what comes is what a run without failures has."""
+
+import shutil
+
+import pytest
+import xarray as xr
+
+from support.here import calls_here
+from support.poison import Poison, poisoned
+from support.stores import by_hand, same
+from sweep.errors import ArgumentError
+from sweep.execution.block_task import compute_block
+from sweep.execution.finalize import close
+from sweep.execution.retry import drop_failed
+from sweep.execution.runner import execute
+from sweep.execution.status import status
+from sweep.integrity.verification import verify
+from sweep.plan.experiment import Pipeline
+from sweep.store.blocks import begin_block, committed
+from sweep.store.lifecycle import create_store, open_store
+
+TEXT = """
+seed = 3
+pose = { jitter_px = 0.5, azimuth_deg = { uniform = [0, 360] } }
+axes = { side_px = [30, 60, 90], solver = ["ippe_square", "iterative"], trial = 2 }
+"""
+
+EXTENTS = (1, 2)
+
+
+@pytest.fixture(scope="module")
+def pipeline():
+    return Pipeline.from_text(TEXT, name="retried")
+
+
+@pytest.fixture(scope="module")
+def clean(pipeline, tmp_path_factory):
+    url = str(tmp_path_factory.mktemp("clean") / "clean.zarr")
+    close(by_hand(url, pipeline, EXTENTS))
+    return url
+
+
+@pytest.fixture(scope="module")
+def failed(pipeline, tmp_path_factory):
+    """A finished store: of its three blocks two have cells that raised or ended their process."""
+    folder = tmp_path_factory.mktemp("failed")
+    url = str(folder / "failed.zarr")
+    store = create_store(url, pipeline, EXTENTS)
+    poisons = [Poison(1, "estimation", "raise", (), (("solver", "iterative"),)),
+               Poison(4, "detection", "segv")]
+    for number, block in enumerate(store.blocks):
+        with pytest.MonkeyPatch.context() as patch:
+            if number != 1:
+                begin_block(store, block)  # so that it is computed in a child, which is poisoned
+                for name, value in poisoned(poisons, folder / "notes").items():
+                    patch.setenv(name, value)
+            compute_block(url, store.run_id, block)
+    close(store)
+    return url
+
+
+@pytest.fixture
+def copied(failed, tmp_path):
+    return shutil.copytree(failed, str(tmp_path / "copied.zarr"))
+
+
+def test_retry_computes_what_failed_and_nothing_else(pipeline, clean, copied):
+    before = status(copied)
+    assert [len(before.failed), len(before.crashed)] == [1, 1]
+    assert execute(pipeline, copied).computed_blocks == 0
+    with calls_here():
+        summary = execute(pipeline, copied, retry_failed=True)
+    assert (summary.retried, summary.recovered, summary.computed_blocks) == (2, 2, 2)
+    assert (summary.failures, summary.warnings) == ([], [])
+    assert same(copied, clean)
+    assert (verify(copied, 0).damage, verify(copied, 0).left_over) == ([], [])
+    with xr.open_zarr(copied, group="failures") as table:
+        assert table.sizes["failure"] == 0
+        assert (table.attrs["failed_cells"], table.attrs["crashed_cells"]) == (0, 0)
+    again = execute(pipeline, copied, retry_failed=True)
+    assert (again.retried, again.computed_blocks) == (0, 0)
+
+
+def test_what_fails_again_stays_as_it_was(pipeline, failed, copied, tmp_path, monkeypatch):
+    poisons = [Poison(1, "estimation", "raise", (), (("solver", "iterative"),))]
+    for name, value in poisoned(poisons, tmp_path / "notes").items():
+        monkeypatch.setenv(name, value)
+    summary = execute(pipeline, copied, retry_failed=True)
+    assert (summary.retried, summary.recovered, summary.failed, summary.crashed) == (2, 1, 1, 0)
+    assert not same(copied, failed)
+    with xr.open_zarr(copied, group="failures") as table:
+        assert table.sizes["failure"] == 1
+
+
+def test_retry_that_is_stopped_at_any_write_is_continued(pipeline, clean, copied, monkeypatch):
+    import zarr.storage._local as local  # noqa: PLC0415
+
+    class StoppedError(Exception):
+        pass
+
+    left = 0
+    put, delete = local._put, local.LocalStore.delete_dir
+
+    def counted(function):
+        def wrapped(*arguments, **options):
+            nonlocal left
+            left -= 1
+            if left < 0:
+                raise StoppedError
+            return function(*arguments, **options)
+        return wrapped
+
+    template = shutil.copytree(copied, copied.replace("copied", "template"))
+    instants = 0
+    while True:
+        shutil.rmtree(copied)
+        shutil.copytree(template, copied)
+        left = instants
+        with monkeypatch.context() as patch:
+            patch.setattr(local, "_put", counted(put))
+            patch.setattr(local.LocalStore, "delete_dir", counted(delete))
+            try:
+                drop_failed(open_store(copied, "r+"))
+            except StoppedError:
+                stopped = True
+            else:
+                stopped = False
+        store = open_store(copied, "r")
+        if not store.finished:
+            assert committed(store) >= {1}
+            with xr.open_zarr(copied, consolidated=False):
+                pass
+        else:
+            assert committed(store) == {0, 1, 2}
+        instants += 1
+        if not stopped:
+            break
+    assert instants > 4
+    with calls_here():
+        execute(pipeline, copied, retry_failed=True)
+    assert same(copied, clean)
+
+
+def test_retry_and_reuse_exclude_each_other(pipeline, copied, clean):
+    with pytest.raises(ArgumentError, match="expected no retry_failed beside it"):
+        execute(pipeline, copied, retry_failed=True, reuse=[clean])

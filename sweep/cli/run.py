@@ -13,6 +13,7 @@ from sweep.cli.command import Command, Example
 from sweep.cli.output import print_json, say, say_next
 
 if TYPE_CHECKING:
+    from sweep.execution.progress import Progress
     from sweep.isolation.child_process import Child
 
 
@@ -66,17 +67,22 @@ def _execute_beside(child: Child, options: argparse.Namespace) -> int:
     from sweep.plan.camera_facts import camera_facts  # noqa: PLC0415
     from sweep.store.stored_pipeline import names_store  # noqa: PLC0415
 
-    if not options.json:
-        say(f"camera: {camera_facts(pipeline).line()}")
     announce_compilation(pipeline)
     store = options.store or (options.pipeline if names_store(options.pipeline) else None)
+    camera = [] if options.json else [f"camera: {camera_facts(pipeline).line()}"]
+
+    def report(progress: Progress) -> None:
+        while camera:  # once the run is not refused
+            say(camera.pop())
+        display(progress)
+
     try:
         with progress_display() as display:
             summary = execute(
                 pipeline, store, workers=options.workers, scheduler=options.scheduler,
                 reuse=options.reuse, overwrite=options.overwrite, retry_failed=options.retry_failed,
                 durable=options.durable, yes=options.yes, time_limit_s=options.time_limit_s,
-                progress=display, child=child,
+                progress=report, child=child,
             )
     except OtherExperimentError as error:
         if not error.reusable:
@@ -89,6 +95,8 @@ def _execute_beside(child: Child, options: argparse.Namespace) -> int:
     if options.json:
         print_json(dataclasses.asdict(summary))
         return int(summary.nothing_computed)
+    for line in camera:
+        say(line)
     if summary.retried:
         say(f"{summary.retried:,} failed cells tried again, {summary.recovered:,} computed now")
     elif summary.computed_blocks == 0:

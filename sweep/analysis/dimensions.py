@@ -25,9 +25,16 @@ def axes_of(results: xr.Dataset, *stages: Stage) -> list[str]:
     return [dim for dim in dict.fromkeys(dims) if dim not in LABELS]
 
 
-def is_grid_axis(name: object) -> bool:
-    """Return whether a dimension is of the camera, the marker or the pose: it makes cells."""
-    return name in PARAMETERS and PARAMETERS[str(name)].section in GEOMETRY_SECTIONS
+def is_grid_axis(name: object, results: xr.Dataset) -> bool:
+    """Return whether a dimension is of the camera, the marker or the pose: it makes cells.
+
+    Of parameters that go together one such suffices.
+    """
+    attributes = results[name].attrs if name in results.coords else {}
+    return any(
+        each in PARAMETERS and PARAMETERS[each].section in GEOMETRY_SECTIONS
+        for each in str(attributes.get("zip", name)).split()
+    )
 
 
 def fingerprint_of(results: xr.Dataset) -> Mapping[str, Any]:

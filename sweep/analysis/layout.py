@@ -55,7 +55,7 @@ class Layout:
     def of(cls, dataset: xr.Dataset, kept: Sequence[str]) -> Layout:
         """Return that of a dataset's arrays."""
         pooled = [str(dim) for dim in dataset.dims if dim not in LABELS and dim not in kept]
-        cells = tuple(name for name in pooled if name != DRAWS and is_grid_axis(name))
+        cells = tuple(name for name in pooled if name != DRAWS and is_grid_axis(name, dataset))
         draws = tuple(name for name in pooled if name == DRAWS)
         return cls(
             {str(name): tuple(map(str, array.dims)) for name, array in dataset.items()},

@@ -62,7 +62,7 @@ def paired_arrays(
 def require_pairs(first: xr.Dataset, second: xr.Dataset) -> None:
     """Raise DatasetError unless two datasets are of the same scenes and draws."""
     for name, value in first.coords.items():
-        if (is_grid_axis(name) and not value.dims
+        if (is_grid_axis(name, first) and not value.dims
                 and name in second.coords and not second[name].dims):
             values = value.item(), second[name].item()
             if values[0] != values[1]:

@@ -81,7 +81,7 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     if DRAWS in kept:
         raise ArgumentError("per", DRAWS, "the ranking is over the trials; they cannot be kept")
     cells = [name for name in axes_of(results) if name in results["detection"].dims
-             and name not in (*kept, DRAWS) and is_grid_axis(name)]
+             and name not in (*kept, DRAWS) and is_grid_axis(name, results)]
     table = detection_rate(results, kept)[
         ["looked_for", "detection_rate", "detection_rate_low", "detection_rate_high"]]
     counts = detection_rate(results, (*kept, *cells))

@@ -138,7 +138,7 @@ def _without(pipeline: Pipeline, switch: str) -> Pipeline:
         fixed={**pipeline.fixed, switch: off},
         distributions={k: v for k, v in pipeline.distributions.items() if k != switch},
         axes=tuple(
-            dataclasses.replace(axis, values=[off] * len(axis)) if axis.name == switch else axis
+            axis.replaced(switch, off) if switch in axis.columns else axis
             for axis in pipeline.axes
         ),
     )

@@ -6,9 +6,10 @@ has finished follows from its receipts and flags; the old store is only read.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import StoreError
-from sweep.plan.axes import TRIAL, Axis
+from sweep.execution.grid_match import (
+    MISSING,
+    Group,
+    cells_in,
+    fixed_value,
+    groups,
+    rows_in,
+)
+from sweep.plan.axes import TRIAL
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes, scene_values
 from sweep.plan.parameters import PARAMETERS, Stage
@@ -25,8 +34,8 @@ from sweep.store.blocks import committed
 from sweep.store.provenance import changes, fingerprint
 from sweep.store.run_store import RunStore
 
-MISSING = -1
-"""In place of the index of a value that the old grid does not have."""
+PINNED = ""
+"""In place of the name of an old dimension of which one index is read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,17 +47,23 @@ class Source:
     store
         The old store.
     old_index
-        New axis -> (length,) index along the old axis of that name, or ``MISSING``; 0 if the
-        parameter is fixed in the old store.
+        New axis -> (length,) index along the old axis of its parameters, or ``MISSING``; 0 if they
+        are fixed in the old store.
+    renamed
+        Old axis -> the new axis of its parameters.
     pinned
         Old axis that is fixed in the new grid -> the index of the fixed value.
+    tangled
+        Axes whose cells are matched one by one.
     done
         Numbers of the old store's committed blocks.
     """
 
     store: RunStore
     old_index: dict[str, NDArray[np.int64]]
+    renamed: dict[str, str]
     pinned: dict[str, int]
+    tangled: list[Group]
     done: frozenset[int]
 
 
@@ -77,29 +92,37 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
         for variable in variables_of(pipeline)
         if variable.name not in present and not variable.drawn_as
     ]
-    old_index: dict[str, NDArray[np.int64]] = {}
-    pinned: dict[str, int] = {}
     for name in (*PARAMETERS, TRIAL):
-        new_axis, old_axis = pipeline.axis(name), old.axis(name)
-        new_values = _values(pipeline, name, new_axis)
-        old_values = _values(old, name, old_axis)
-        if new_values is None or old_values is None:
-            if pipeline.distributions.get(name) != old.distributions.get(name):
-                faults.append(f"{name}: not drawn from the same distribution in both")
+        if pipeline.distributions.get(name) != old.distributions.get(name):
+            faults.append(f"{name}: not drawn from the same distribution in both")
+        elif (
+            name in pipeline.fixed and name in old.fixed
+            and pipeline.fixed[name] != old.fixed[name]
+        ):
+            faults.append(_difference(pipeline, old, name))
+    source = Source(store, {}, {}, {}, [], frozenset(committed(store)))
+    for group in groups(pipeline, old):
+        if group.parameters & (pipeline.distributions.keys() | old.distributions.keys()):
+            continue  # a fault that is noted already
+        if len(group.new) > 1 or len(group.old) > 1:
+            source.tangled.append(group)
             continue
-        index = _indices(new_values, old_values)
+        index = rows_in(group, pipeline, old)
         if not (index != MISSING).any():
+            first, *others = sorted(group.parameters)
             faults.append(
-                f"{name}: the store has {_excerpt(old_values)}, this run {_excerpt(new_values)}"
+                f"{group.names}: no values of {', '.join([first, *others])} go together in both"
+                if others else _difference(pipeline, old, first)
             )
-        if new_axis is not None:
-            old_index[name] = index
-        if old_axis is not None and new_axis is None:
-            pinned[name] = int(index[0])
+        for axis in group.new:
+            source.old_index[axis.name] = index
+            source.renamed.update({other.name: axis.name for other in group.old})
+        if not group.new:
+            source.pinned[group.old[0].name] = int(index[0])
     if faults:
         listed = "\n".join(f"  {fault}" for fault in faults)
         raise StoreError(f"{store.url}: no cell of it can be reused\n{listed}")
-    return Source(store, old_index, pinned, frozenset(committed(store)))
+    return source
 
 
 def is_reusable(pipeline: Pipeline, store: RunStore) -> bool:
@@ -110,28 +133,16 @@ def is_reusable(pipeline: Pipeline, store: RunStore) -> bool:
         return False
 
 
-def _values(pipeline: Pipeline, name: str, axis: Axis | None) -> Sequence[Any] | None:
-    """Return a parameter's values, None if it is drawn from a distribution."""
-    if axis is not None:
-        return axis.values
-    if name == TRIAL:
-        return (0,)
-    return None if name in pipeline.distributions else (pipeline.fixed[name],)
+def _difference(pipeline: Pipeline, old: Pipeline, name: str) -> str:
+    """Return a line on the values that a parameter has in either grid."""
+    ours, theirs = (_excerpt(_values(grid, name)) for grid in (pipeline, old))
+    return f"{name}: the store has {theirs}, this run {ours}"
 
 
-def _indices(new: Sequence[Any], old: Sequence[Any]) -> NDArray[np.int64]:
-    """Return the index in ``old`` of each value of ``new``, or ``MISSING``."""
-    if isinstance(new, range) and isinstance(old, range):
-        low, step = old.start, old.step
-        values = np.arange(new.start, new.stop, new.step, dtype=np.int64)
-        index, remainder = np.divmod(values - low, step)
-        exists = (remainder == 0) & (index >= 0) & (index < len(old))
-        return np.where(exists, index, MISSING)
-    if isinstance(old, range):
-        indices = [old.index(value) if value in old else MISSING for value in new]
-        return np.array(indices, dtype=np.int64)
-    index_of = {value: i for i, value in enumerate(old)}
-    return np.array([index_of.get(value, MISSING) for value in new], dtype=np.int64)
+def _values(pipeline: Pipeline, name: str) -> Sequence[Any]:
+    """Return a parameter's values."""
+    axis = pipeline.axis_of(name)
+    return (fixed_value(pipeline, name),) if axis is None else axis.columns[name]
 
 
 def _excerpt(values: Sequence[Any]) -> str:
@@ -177,9 +188,31 @@ def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> R
     }
     available = np.zeros([shape[name] for name in order], dtype=bool)
     for source in sources:
-        _read_from(source, pipeline, cuts, order, values, available)
+        for untangled in _untangled(source, pipeline, cuts):
+            _read_from(untangled, pipeline, cuts, order, values, available)
     searches = pipeline.size(Stage.detection)
     return ReusedCells(values, available.reshape(len(block), searches, -1))
+
+
+def _untangled(source: Source, pipeline: Pipeline, cuts: dict[str, slice]) -> Iterator[Source]:
+    """Yield a source for each cell of the tangled axes: of new ones one value, old ones pinned."""
+    old = source.store.pipeline
+    cells = (
+        cells_in(group, pipeline, old, [
+            range(*cuts.get(axis.name, slice(None)).indices(len(axis))) for axis in group.new
+        ])
+        for group in source.tangled
+    )
+    for chosen in itertools.product(*cells):
+        new = {name: index for indices, _ in chosen for name, index in indices.items()}
+        one_value = {
+            axis.name: np.where(np.arange(len(axis)) == new[axis.name], 0, MISSING)
+            for axis in pipeline.axes if axis.name in new
+        }
+        yield dataclasses.replace(
+            source, tangled=[], old_index=source.old_index | one_value,
+            pinned=source.pinned | {name: k for _, at in chosen for name, k in at.items()},
+        )
 
 
 def _read_from(
@@ -267,11 +300,12 @@ def _committed_cells(
     along: list[NDArray[np.int64]] = []
     names = []
     for axis in scene_axes(store.pipeline):
-        names.append(axis.name)
         if axis.name in source.pinned:
+            names.append(PINNED)
             along.append(np.array([source.pinned[axis.name]]))
         else:
-            along.append(indices[axis.name])
+            names.append(source.renamed[axis.name])
+            along.append(indices[names[-1]])
     numbers = [
         index // extent for index, extent in zip(along, blocks.extents, strict=True)
     ]
@@ -282,7 +316,7 @@ def _committed_cells(
             ready[np.ix_(*(n == c for n, c in zip(numbers, chosen, strict=True)))] = True
     # Pinned dimensions are dropped; new ones that are fixed in the old store get length 1.
     for k in reversed(range(len(names))):
-        if names[k] in source.pinned:
+        if names[k] == PINNED:
             ready = ready.take(0, axis=k)
             del names[k]
     full = ready.transpose([names.index(name) for name in order if name in names])
@@ -299,16 +333,18 @@ def _read(
     array = source.store.array(variable.name)
     names = list(variable.dimensions(source.store.pipeline))
     selection: list[Any] = []
-    for name in names:
+    for k, name in enumerate(names):
         if name in variable.inner:
             selection.append(slice(None))
         elif name in source.pinned:
             selection.append(np.array([source.pinned[name]]))
+            names[k] = PINNED
         else:
-            selection.append(indices[name])
+            names[k] = source.renamed[name]
+            selection.append(indices[names[k]])
     part = np.asarray(array.oindex[tuple(selection)]) if names else np.asarray(array[...])
     for k in reversed(range(len(names))):
-        if names[k] in source.pinned:
+        if names[k] == PINNED:
             part = part.take(0, axis=k)
             del names[k]
     new_names = list(variable.dimensions(pipeline))

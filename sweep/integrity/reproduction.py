@@ -122,7 +122,7 @@ def reproduce(
     difference = "" if stored is None else compare(
         recomputed, stored.values, store.variables, same_processor=exact
     ).difference
-    full_at = selection_text({axis.name: axis.values[index[axis.name]] for axis in pipeline.axes})
+    full_at = selection_text(pipeline.cell_at(index))
     cell_pipeline = cell(pipeline, full_at)
     inspected, image = _inspected(cell_pipeline, whole_frame, time_limit_s)
     return Reproduction(
@@ -153,16 +153,17 @@ def _index(pipeline: Pipeline, at: str) -> dict[str, int]:
     """Return the index of a cell along each axis."""
     index = {axis.name: 0 for axis in pipeline.axes}
     faults = []
-    for name, value in parse_selection(at).items():
-        axis = pipeline.axis(name)
+    named = parse_selection(at, pipeline)
+    for name, value in named.items():
+        axis = pipeline.axis_of(name)
         if axis is None:
-            names = [other.name for other in pipeline.axes]
+            names = [name for other in pipeline.axes for name in other.columns]
             advice = nearest(name, names) or f"; its axes are {', '.join(names) or 'none'}"
             faults.append(f"--at {name}: not an axis of the store{advice}")
-        elif value in axis.values:
-            index[name] = axis.values.index(value)
+        elif (row := axis.index_of(named)) is not None:
+            index[axis.name] = row
         else:
-            known = ", ".join(str(each) for each in axis.values[:6])
+            known = ", ".join(f"({each})" if axis.zipped else str(each) for each in axis.values[:6])
             more = f", ... {axis.values[-1]}" if len(axis) > 6 else ""
             faults.append(
                 f"--at {name}={plain(value)}: not on the grid; its values are {known}{more}"

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.messages import label, nearest, shown
+from sweep.messages import label, nearest, plain, shown
 from sweep.plan.parameters import PARAMETERS, Parameter, Stage
 from sweep.typing import Floats
 
@@ -26,27 +26,70 @@ MAX_LISTED = 10**6
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """A dimension of the grid: its name and its values, without repeats."""
+    """A dimension of the grid.
+
+    Attributes
+    ----------
+    name
+        A parameter's, ``trial``, or a name of the user's own if parameters go together along it.
+    values
+        Its values, without repeats; labels if parameters go together.
+    zipped
+        The parameters that go together, each with its values; empty for an axis of one parameter.
+    """
 
     name: str
     values: Sequence[Any]
+    zipped: tuple[tuple[str, Sequence[Any]], ...] = ()
 
     def __len__(self) -> int:
         return len(self.values)
 
     @property
+    def columns(self) -> dict[str, Sequence[Any]]:
+        """Parameter (or ``trial``) -> its values along the axis."""
+        return dict(self.zipped) or {self.name: self.values}
+
+    def at(self, index: int) -> dict[str, Any]:
+        """Return the value of each of its parameters at an index."""
+        return {name: values[index] for name, values in self.columns.items()}
+
+    def index_of(self, wanted: Mapping[str, Any]) -> int | None:
+        """Return the first index at which its parameters have the wanted values; None without."""
+        columns = [
+            (values, wanted[name]) for name, values in self.columns.items() if name in wanted
+        ]
+        if len(columns) == 1:
+            values, value = columns[0]
+            return values.index(value) if value in values else None
+        rows = range(len(self))
+        return next((i for i in rows if all(values[i] == value for values, value in columns)), None)
+
+    def replaced(self, name: str, value: Any) -> Axis:
+        """Return the axis with one value in place of all those of a parameter."""
+        same = (value,) * len(self)
+        if not self.zipped:
+            return Axis(self.name, same)
+        return Axis(self.name, self.values, tuple(
+            (other, same if other == name else values) for other, values in self.zipped
+        ))
+
+    @property
     def stage(self) -> Stage:
         """The first stage that the axis touches."""
-        return Stage.scene if self.name == TRIAL else PARAMETERS[self.name].stage
+        first = next(iter(self.columns))
+        return Stage.scene if first == TRIAL else PARAMETERS[first].stage
 
     @property
     def unit(self) -> str:
         """The unit of its values; empty if they have none."""
-        return "" if self.name == TRIAL else PARAMETERS[self.name].unit
+        return "" if self.zipped or self.name == TRIAL else PARAMETERS[self.name].unit
 
     @property
     def meaning(self) -> str:
         """Meaning of the values, in words."""
+        if self.zipped:
+            return f"{', '.join(self.columns)}, which go together"
         return "number of the draw" if self.name == TRIAL else (
             PARAMETERS[self.name].declaration.meaning
         )
@@ -54,6 +97,8 @@ class Axis:
     @property
     def labelled(self) -> bool:
         """Whether its coordinates are strings: its values are not all numbers, or all booleans."""
+        if self.zipped:
+            return True
         if isinstance(self.values, range):
             return False
         return {type(value) for value in self.values} not in ({bool}, {int}, {float})
@@ -143,7 +188,9 @@ def parse_trial(value: Any) -> Axis:
     return Axis(TRIAL, range(value))
 
 
-def parse_axis(parameter: Parameter, given: Any, quota: int = MAX_LISTED) -> Axis:
+def parse_axis(
+    parameter: Parameter, given: Any, quota: int = MAX_LISTED, *, repeats: bool = False
+) -> Axis:
     """Return the axis of a list or of a table such as ``{ geom = [0.05, 1, 40] }``.
 
     Parameters
@@ -154,6 +201,8 @@ def parse_axis(parameter: Parameter, given: Any, quota: int = MAX_LISTED) -> Axi
         The list or table of the document.
     quota
         The most values that are listed; a ``range`` is not.
+    repeats
+        Whether a value may be repeated.
 
     Raises
     ------
@@ -172,6 +221,11 @@ def parse_axis(parameter: Parameter, given: Any, quota: int = MAX_LISTED) -> Axi
         form, ends = next(iter(given.items()))
     else:
         raise ValueError(f"a list, or a table with one of {forms}")
+    if form == "zip":
+        raise ValueError(
+            f"an axis of {parameter.name} alone; parameters that go together need a name of "
+            "your own, such as pair = { zip = { ... } }"
+        )
     if form not in AXIS_FORMS:
         if form in DISTRIBUTION_FORMS:
             raise ValueError(f"an axis; a distribution goes under [{parameter.section}]")
@@ -194,13 +248,52 @@ def parse_axis(parameter: Parameter, given: Any, quota: int = MAX_LISTED) -> Axi
         checked = values
     else:
         checked = [_checked(parameter, value) for value in values]
-    if len(set(checked)) < len(checked):
+    if not repeats and len(set(checked)) < len(checked):
         seen: set[Any] = set()
         for value in checked:
             if value in seen:
                 raise ValueError(f"each value once ({shown(value)} is repeated)")
             seen.add(value)
     return Axis(parameter.name, tuple(checked))
+
+
+def zipped_axis(name: str, columns: Mapping[str, Sequence[Any]]) -> Axis:
+    """Return the axis along which parameters go together.
+
+    Raises
+    ------
+    ValueError
+        The expectation, if their values are not equally many, they belong to different stages, or
+        a combination is repeated.
+
+    Examples
+    --------
+    >>> zipped_axis("lens", {"fx_px": (600.0, 800.0), "fy_px": (600.0, 802.5)}).values
+    ('600, 600', '800, 802.5')
+    """
+    lengths = {parameter: len(values) for parameter, values in columns.items()}
+    if len(set(lengths.values())) > 1:
+        counts = ", ".join(f"{parameter} has {length:,}" for parameter, length in lengths.items())
+        raise ValueError(f"equally many values of each parameter: {counts}")
+    stages = {parameter: PARAMETERS[parameter].stage.name for parameter in columns}
+    if len(set(stages.values())) > 1:
+        listed = ", ".join(f"{parameter} is of the {stage}" for parameter, stage in stages.items())
+        raise ValueError(f"parameters of one stage: {listed}")
+    rows = list(zip(*columns.values(), strict=True))
+    labels = tuple(", ".join(map(_short, row)) for row in rows)
+    first_of = {row: k for k, row in reversed(list(enumerate(rows)))}
+    repeated = next((k for k, row in enumerate(rows) if first_of[row] != k), None)
+    if repeated is not None:
+        raise ValueError(f"each combination once ({plain(labels[repeated])} is repeated)")
+    if len(set(labels)) < len(labels):
+        labels = tuple(f"{k}: {text}" for k, text in enumerate(labels))
+    return Axis(name, labels, tuple((key, tuple(values)) for key, values in columns.items()))
+
+
+def _short(value: Any) -> str:
+    """Return a value as a label; a whole number without its decimals."""
+    whole = isinstance(value, float) and value == int(value) and abs(value) < 1e15
+    return str(int(value)) if whole else label(value)
 
 
 def _checked(parameter: Parameter, value: Any) -> Any:

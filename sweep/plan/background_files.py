@@ -26,11 +26,11 @@ def check_backgrounds(reading: Reading) -> None:
         path = os.path.join(reading.folder, value)  # noqa: PTH118  (it may be of any length)
         try:
             width, height = image_size(path)
-            problem = _wrong_size(reading, width, height)
-            if problem is None or _wrong_size(reading, height, width) is None:
+            problem = _wrong_size(reading, value, width, height)
+            if problem is None or _wrong_size(reading, value, height, width) is None:
                 # Its EXIF tag may turn it.
                 height, width = background_image(str(Path(path).resolve())).shape
-                problem = _wrong_size(reading, width, height)
+                problem = _wrong_size(reading, value, width, height)
                 reading.files[value] = file_digest(Path(path)) or ""
         except ValueError as error:
             reading.fault("scene.background", value, f"a level or an image file ({error})")
@@ -39,10 +39,14 @@ def check_backgrounds(reading: Reading) -> None:
             reading.fault("scene.background", value, problem)
 
 
-def _wrong_size(reading: Reading, width: int, height: int) -> str | None:
-    """Return the expectation that an image of a size in pixels misses; None if it fits."""
+def _wrong_size(reading: Reading, background: str, width: int, height: int) -> str | None:
+    """Return the expectation that a background of a size in pixels misses; None if it fits."""
     for name, length in (("width_px", width), ("height_px", height)):
-        if reading.values(name) and set(reading.values(name)) != {length}:
+        frames = {
+            frame for backgrounds, frames in reading.together("background", name)
+            if background in backgrounds for frame in frames
+        }
+        if frames - {length}:
             return (
                 f"an image of exactly the frame's size: it is {width} x {height}, but "
                 f"{name} = {shown(reading.written(name))}"

@@ -14,8 +14,8 @@ from sweep.plan.overrides import displaced_by
 from sweep.plan.parameters import PARAMETERS
 from sweep.plan.toml_text import read_value
 
-_PART = re.compile(r"(?:\[[^\]]*\]?|[^,\[])+")
-"""A part between commas; commas within a list do not separate."""
+_PART = re.compile(r"""(?:\[[^\]]*\]?|"[^"]*"?|[^,\["])+""")
+"""A part between commas; commas within a list or within quotes do not separate."""
 
 
 def cell(pipeline: Pipeline, at: str) -> Pipeline:
@@ -34,8 +34,13 @@ def cell(pipeline: Pipeline, at: str) -> Pipeline:
     PipelineError
         One line for each invalid part of ``at``.
     """
-    named = parse_selection(at)
-    chosen = {axis.name: axis.values[0] for axis in pipeline.axes} | named
+    named = parse_selection(at, pipeline)
+    chosen: dict[str, Any] = {}
+    for axis in pipeline.axes:
+        # Values that are not on the grid replace those of its first cell.
+        index = axis.index_of(named) if axis.columns.keys() & named.keys() else 0
+        chosen |= axis.at(index or 0)
+    chosen |= named
     trial = chosen.pop(TRIAL, 0)
     axes = (Axis(TRIAL, range(trial, trial + 1)),)
     for other in displaced_by(named):
@@ -43,8 +48,11 @@ def cell(pipeline: Pipeline, at: str) -> Pipeline:
     return dataclasses.replace(pipeline.fixed_at(chosen), axes=axes)
 
 
-def parse_selection(at: str) -> dict[str, Any]:
+def parse_selection(at: str, pipeline: Pipeline | None = None) -> dict[str, Any]:
     """Return the values of the parameters that ``--at`` names.
+
+    An axis of the pipeline along which parameters go together is named by one of its labels, in
+    quotes, or by a number from 0.
 
     Raises
     ------
@@ -58,12 +66,24 @@ def parse_selection(at: str) -> dict[str, Any]:
     """
     faults: list[str] = []
     named: dict[str, Any] = {}
+    axes = () if pipeline is None else pipeline.axes
+    together = {axis.name: axis for axis in axes if axis.zipped}
     for part in map(str, _PART.findall(at)):
         name, equals, written = (piece.strip() for piece in part.partition("="))
         if not equals or not written:
             faults.append(f"--at {plain(part)}: expected name=value, such as tilt_deg=45")
+        elif (axis := together.get(name)) is not None:
+            try:
+                row = axis.at(_row(axis, written))
+            except ValueError as error:
+                faults.append(f"--at {plain(part)}: expected {error}")
+                continue
+            faults += [
+                f"--at {plain(part)}: {other} is given twice" for other in row if other in named
+            ]
+            named |= row
         elif name != TRIAL and name not in PARAMETERS:
-            known = [*PARAMETERS, TRIAL]
+            known = [*PARAMETERS, TRIAL, *together]
             hint = nearest(name, known) if len(faults) < MAX_FAULTS else ""
             faults.append(f"--at {plain(part)}: unknown parameter{hint}")
         elif name in named:
@@ -76,6 +96,19 @@ def parse_selection(at: str) -> dict[str, Any]:
     if faults:
         raise refusal(faults)
     return named
+
+
+def _row(axis: Axis, written: str) -> int:
+    """Return the index along an axis that a label or a number names; ValueError for others."""
+    try:
+        value = read_value(written)
+    except ValueError:
+        value = written
+    if isinstance(value, str) and value in axis.values:
+        return axis.values.index(value)
+    if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < len(axis):
+        return value
+    raise ValueError(f'a number from 0 to {len(axis) - 1}, or a label such as "{axis.values[0]}"')
 
 
 def _value(name: str, written: str) -> Any:
@@ -108,8 +141,8 @@ def _written(value: Any) -> str:
 def coordinates_text(pipeline: Pipeline, chosen: Pipeline) -> str:
     """Return the coordinates of a cell on its grid, in words: "distance_m 0.3, tilt_deg 45"."""
     parts = []
-    for axis in pipeline.axes:
-        value = chosen.axes[0].values[0] if axis.name == TRIAL else chosen.fixed[axis.name]
+    for name in (name for axis in pipeline.axes for name in axis.columns):
+        value = chosen.axes[0].values[0] if name == TRIAL else chosen.fixed[name]
         shown = f"{value:.6g}" if isinstance(value, float) else str(value)
-        parts.append(f"{axis.name} {shown}")
+        parts.append(f"{name} {shown}")
     return ", ".join(parts)

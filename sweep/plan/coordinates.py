@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,9 +12,11 @@ from sweep.messages import label
 from sweep.model.columns import Column
 from sweep.plan.alternatives import superseded
 from sweep.plan.axes import MAX_DEVIATIONS, Distribution
-from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import PARAMETERS, Parameter
 from sweep.typing import Floats
+
+if TYPE_CHECKING:
+    from sweep.plan.experiment import Pipeline
 
 ALWAYS_GIVEN = ("marker", "pose")
 """Sections whose fixed parameters are coordinates also where the file does not give them."""
@@ -97,6 +99,7 @@ def drawn_quantities(pipeline: Pipeline) -> list[DrawnQuantity]:
 
     Examples
     --------
+    >>> from sweep.plan.experiment import Pipeline
     >>> pipeline = Pipeline.from_dict({"pose": {"side_px": {"uniform": [20, 40]}}})
     >>> [quantity.name for quantity in drawn_quantities(pipeline)]
     ['side_px', 'distance_m']

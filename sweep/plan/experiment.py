@@ -222,6 +222,20 @@ class Pipeline:
         """Return an axis by name."""
         return next((axis for axis in self.axes if axis.name == name), None)
 
+    def axis_of(self, parameter: str) -> Axis | None:
+        """Return the axis along which a parameter varies, alone or together with others."""
+        return next((axis for axis in self.axes if parameter in axis.columns), None)
+
+    def cell_at(self, index: Mapping[str, int]) -> dict[str, Any]:
+        """Return the value of each parameter that varies, and ``trial``, at indices along axes.
+
+        Axes that ``index`` does not name are left out.
+        """
+        return {
+            name: value for axis in self.axes if axis.name in index
+            for name, value in axis.at(index[axis.name]).items()
+        }
+
     def axes_of(self, *stages: Stage) -> tuple[Axis, ...]:
         """Return the axes that bind to the given stages, in the document's order."""
         return tuple(axis for axis in self.axes if axis.stage in stages)
@@ -232,9 +246,9 @@ class Pipeline:
 
     def values_of(self, name: str) -> Sequence[Any]:
         """Return all values that a parameter takes on the grid; empty if it is drawn."""
-        axis = self.axis(name)
+        axis = self.axis_of(name)
         if axis is not None:
-            return axis.values
+            return axis.columns[name]
         return (self.fixed[name],) if name in self.fixed else ()
 
     def any_value(self, name: str, condition: Callable[[Any], bool]) -> bool:

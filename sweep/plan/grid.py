@@ -105,10 +105,10 @@ def scene_axes(pipeline: Pipeline) -> tuple[Axis, ...]:
     return pipeline.axes_of(Stage.scene)
 
 
-def _column(axis: Axis, indices: NDArray[np.intp]) -> Column:
-    """Return an axis' values at indices (N,)."""
+def _column(values: Sequence[Any], indices: NDArray[np.intp]) -> Column:
+    """Return a parameter's values along an axis at indices (N,)."""
     low, high = int(indices.min()), int(indices.max()) + 1
-    part = axis.values[low:high]
+    part = values[low:high]
     if isinstance(part, range):
         return Column.of(part.start + part.step * (indices - low))
     if isinstance(part[0], (int, float)) and not any(isinstance(v, (bool, str)) for v in part):
@@ -130,13 +130,10 @@ def scene_values(
         name: Column(value, constant=True)
         for name, value in pipeline.fixed.items() if PARAMETERS[name].stage is Stage.scene
     }
-    trials = np.zeros(count, dtype=np.int64)
     for axis, index in zip(axes, indices, strict=True):
-        column = _column(axis, index)
-        if axis.name == TRIAL:
-            trials = column.broadcast(count, np.int64)
-        else:
-            values[axis.name] = column
+        for name, along in axis.columns.items():
+            values[name] = _column(along, index)
+    trials = values.pop(TRIAL, Column(0, constant=True)).broadcast(count, np.int64)
     values["distortion"] = values["distortion"].map(canonical_distortion)
     drawn = pipeline.distributions
     if "background" not in drawn:
@@ -174,10 +171,11 @@ def block_indices(block: Block) -> list[NDArray[np.intp]]:
 
 
 def combinations(axes: Sequence[Axis]) -> list[dict[str, Any]]:
-    """Return all combinations of the axes' values, the last axis fastest."""
+    """Return the parameters' values at all combinations of axes, the last axis fastest."""
+    rows = ([axis.at(index) for index in range(len(axis))] for axis in axes)
     return [
-        dict(zip((axis.name for axis in axes), chosen, strict=True))
-        for chosen in itertools.product(*(axis.values for axis in axes))
+        {name: value for row in chosen for name, value in row.items()}
+        for chosen in itertools.product(*rows)
     ]
 
 

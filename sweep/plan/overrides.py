@@ -12,7 +12,7 @@ from sweep.messages import MAX_FAULTS, nearest, plain, refusal
 from sweep.plan.alternatives import RIVALS
 from sweep.plan.axes import DISTRIBUTION_FORMS, TRIAL
 from sweep.plan.parameters import PARAMETERS
-from sweep.plan.reader import HEADER, section_of
+from sweep.plan.reader import HEADER, is_zip, section_of
 from sweep.plan.toml_text import quoted_if_bare, read_value
 
 _PX = ("fx_px", "fy_px")
@@ -62,10 +62,12 @@ def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
             faults.append(f"{start}expected a TOML value, such as [0, 45] or 'text'")
             continue
         home = section_of(name)
-        if not home and name not in HEADER:
+        if not home and name not in HEADER and not is_zip(value):
             known = [*PARAMETERS, TRIAL, *HEADER]
             hint = nearest(name, known) if len(faults) < MAX_FAULTS else ""
             faults.append(f"{start}unknown parameter{hint}")
+        elif is_zip(value) and section in ("", "axes"):
+            chosen[name] = value
         elif home and section not in ("", home, "axes"):
             faults.append(f"{start}expected {name} or {home}.{name}")
         else:
@@ -111,9 +113,13 @@ def apply_settings(document: Any, chosen: Mapping[str, Any]) -> None:
 def fix_values(document: Any, chosen: Mapping[str, Any]) -> None:
     """Fix parameters of a document at chosen values.
 
-    The axis ``trial`` goes, and what the chosen values displace.
+    The axis ``trial`` goes, axes of parameters that go together, each of which must be chosen, and
+    what the chosen values displace.
     """
-    _delete(document, {TRIAL, *displaced_by(chosen)})
+    axes = document.get("axes", {})
+    _delete(document, {
+        TRIAL, *displaced_by(chosen), *(name for name, value in axes.items() if is_zip(value)),
+    })
     for name, value in chosen.items():
         _write(document, name, list(value) if isinstance(value, tuple) else value)
 
@@ -138,6 +144,8 @@ def _inline(table: dict[str, Any]) -> tomlkit.items.InlineTable:
 
 def _is_axis(name: str, value: Any) -> bool:
     """Return whether a value of ``--set`` makes an axis."""
+    if name not in PARAMETERS:
+        return True
     if isinstance(value, dict):
         return not DISTRIBUTION_FORMS.keys() & value.keys()
     if not isinstance(value, list):

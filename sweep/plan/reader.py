@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from sweep.plan.axes import (
     parse_axis,
     parse_distribution,
     parse_trial,
+    zipped_axis,
 )
 from sweep.plan.parameters import PARAMETERS, SECTIONS
 
@@ -71,9 +72,24 @@ class Reading:
 
     def values(self, name: str) -> Sequence[Any]:
         """Return the values of a parameter on the grid; empty if it is drawn or at fault."""
-        if name in self.axes:
-            return self.axes[name].values
+        axis = self.axis_of(name)
+        if axis is not None:
+            return axis.columns[name]
         return (self.fixed[name],) if name in self.fixed else ()
+
+    def axis_of(self, name: str) -> Axis | None:
+        """Return the axis along which a parameter varies, alone or together with others."""
+        return next((axis for axis in self.axes.values() if name in axis.columns), None)
+
+    def together(self, a: str, b: str) -> Iterator[tuple[Sequence[Any], Sequence[Any]]]:
+        """Yield values of two parameters of which each of the one meets each of the other."""
+        axis = self.axis_of(a)
+        if axis is not None and b in axis.columns and a != b:
+            for index in range(len(axis)):
+                row = axis.at(index)
+                yield (row[a],), (row[b],)
+        else:
+            yield self.values(a), self.values(b)
 
     def written(self, name: str) -> Any:
         """Return the value that the document gives a parameter, for messages."""
@@ -81,6 +97,9 @@ class Reading:
             table = self.document.get(section)
             if isinstance(table, dict) and name in table:
                 return table[name]
+            for given in table.values() if section == "axes" and isinstance(table, dict) else ():
+                if is_zip(given) and name in given["zip"]:
+                    return given["zip"][name]
         return self.fixed.get(name)
 
 
@@ -162,20 +181,81 @@ def _read_axes(reading: Reading) -> None:
         return
     quota = MAX_LISTED
     for key, value in table.items():
-        path = f"axes.{key}"
-        try:
-            if key == TRIAL:
-                reading.axes[key] = parse_trial(value)
-            elif key not in PARAMETERS:
-                reading.unknown(path, "unknown parameter", key, [*PARAMETERS, TRIAL])
-            elif key in reading.given:
-                section = PARAMETERS[key].section
-                reading.fault(
-                    path, value, f"it once: {section}.{key} is given too; delete one of them"
-                )
-            else:
-                reading.given.add(key)
-                axis = reading.axes[key] = parse_axis(PARAMETERS[key], value, quota)
-                quota -= 0 if isinstance(axis.values, range) else len(axis)
-        except ValueError as error:
-            reading.fault(path, value, str(error))
+        if key not in PARAMETERS and key != TRIAL and is_zip(value):
+            axis = _read_zip(reading, key, value["zip"], quota)
+        else:
+            axis = _read_axis(reading, key, value, quota)
+        if axis is not None:
+            reading.axes[key] = axis
+            listed = [v for v in axis.columns.values() if not isinstance(v, range)]
+            quota -= len(axis) * len(listed)
+
+
+def _read_axis(reading: Reading, key: str, value: Any, quota: int, table: str = "") -> Axis | None:
+    """Return the axis of one parameter, or note why there is none.
+
+    Of a parameter that goes together with others, ``table`` is the name of their axis.
+    """
+    path = f"axes.{table}.{key}" if table else f"axes.{key}"
+    try:
+        if key == TRIAL and not table:
+            return parse_trial(value)
+        if key == TRIAL:
+            reading.fault(path, value, "it as an axis of its own: every cell has the same trials")
+        elif key not in PARAMETERS:
+            reading.unknown(path, "unknown parameter", key, [*PARAMETERS, TRIAL])
+        elif key in reading.given:
+            reading.fault(
+                path, value, f"it once: {_place(reading, key, path)} is given too; delete one of them"
+            )
+        else:
+            reading.given.add(key)
+            return parse_axis(PARAMETERS[key], value, quota, repeats=bool(table))
+    except ValueError as error:
+        reading.fault(path, value, str(error))
+    return None
+
+
+def _place(reading: Reading, name: str, here: str) -> str:
+    """Return where else than ``here`` a document gives a parameter, for messages."""
+    section = PARAMETERS[name].section
+    tables = {section: reading.document.get(section), "axes": reading.document.get("axes")}
+    tables |= {
+        f"axes.{key}": value["zip"]
+        for key, value in reading.document.get("axes", {}).items() if is_zip(value)
+    }
+    places = [f"{key}.{name}" for key, table in tables.items()
+              if isinstance(table, dict) and name in table]
+    return next((place for place in places if place != here), "it")
+
+
+def is_zip(value: Any) -> bool:
+    """Return whether a value under [axes] makes an axis of parameters that go together."""
+    return isinstance(value, dict) and value.keys() == {"zip"} and isinstance(value["zip"], dict)
+
+
+def _read_zip(reading: Reading, key: str, members: dict[str, Any], quota: int) -> Axis | None:
+    """Return the axis of parameters that go together, or note why there is none."""
+    path = f"axes.{key}"
+    if not key.isidentifier():
+        reading.faults.append(
+            f"{reading.source}: {plain(path)}: expected a name of letters, digits and underscores"
+        )
+        return None
+    columns: dict[str, Sequence[Any]] = {}
+    quota //= max(len(members), 1)
+    for name, value in members.items():
+        axis = _read_axis(reading, name, value, quota, key)
+        if axis is not None and len(axis) > quota:
+            reading.fault(f"{path}.{name}", value, "at most 10^6 values, all axes together")
+        elif axis is not None:
+            columns[name] = axis.values
+    if len(members) < 2:
+        reading.fault(path, {"zip": members}, "at least two parameters that go together")
+    if len(columns) < max(len(members), 2):
+        return None
+    try:
+        return zipped_axis(key, columns)
+    except ValueError as error:
+        reading.faults.append(f"{reading.source}: {path}: expected {error}")
+        return None

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 
 from sweep.measure.detector import DetectorSetting
+from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.model.effects import GEOMETRIC, NEEDS, RANDOM, is_on
 from sweep.model.image_file import MAX_PIXELS
 from sweep.model.marker import marker_count
@@ -16,8 +17,9 @@ from sweep.plan.alternatives import IN_CAMERA, WORLD, contradictions
 from sweep.plan.axes import TRIAL
 from sweep.plan.background_files import check_backgrounds
 from sweep.plan.camera_values import one_camera
-from sweep.plan.parameters import PARAMETERS, Stage
-from sweep.plan.reader import Reading
+from sweep.plan.parameters import PARAMETERS, SECTIONS, Stage
+from sweep.plan.reader import HEADER, Reading
+from sweep.plan.schema import LABELS, VARIABLES
 
 MAX_POSES = 10**12
 """The largest grid."""
@@ -48,17 +50,17 @@ def pose_in_one_way(reading: Reading) -> None:
 
 def ids_in_dictionary(reading: Reading) -> None:
     """Demand that every ID of the grid exists in every dictionary of the grid."""
-    ids = reading.values("marker_id")
-    if not ids:
-        return
-    largest = max(ids[0], ids[-1]) if isinstance(ids, range) else max(ids)
-    for dictionary in reading.values("dictionary"):
-        count = marker_count(dictionary)
-        if largest >= count:
-            reading.fault(
-                "marker_id", reading.written("marker_id"),
-                f"IDs from 0 to {count - 1}, which is what {dictionary} has",
-            )
+    too_few: dict[str, int] = {}
+    for ids, dictionaries in reading.together("marker_id", "dictionary"):
+        if ids:
+            largest = max(ids[0], ids[-1]) if isinstance(ids, range) else max(ids)
+            counts = {dictionary: marker_count(dictionary) for dictionary in dictionaries}
+            too_few |= {name: count for name, count in counts.items() if largest >= count}
+    for dictionary, count in too_few.items():
+        reading.fault(
+            "marker_id", reading.written("marker_id"),
+            f"IDs from 0 to {count - 1}, which is what {dictionary} has",
+        )
 
 
 def is_active(reading: Reading, switch: str) -> bool:
@@ -93,8 +95,10 @@ def effects_need_the_exact_renderer(reading: Reading) -> None:
 def threshold_windows_in_order(reading: Reading) -> None:
     """Demand that the largest threshold window is not below the smallest."""
     low, high = "adaptiveThreshWinSizeMin", "adaptiveThreshWinSizeMax"
-    smallest, largest = reading.values(low), reading.values(high)
-    if smallest and largest and max(smallest) > min(largest):
+    if any(
+        smallest and largest and max(smallest) > min(largest)
+        for smallest, largest in reading.together(low, high)
+    ):
         reading.fault(high, reading.written(high), f"at least {low}")
 
 
@@ -118,6 +122,26 @@ def something_random_to_repeat(reading: Reading) -> None:
         )
 
 
+def names_of_axes(reading: Reading) -> None:
+    """Demand names that nothing else of the dataset has for axes of parameters that go together."""
+    for axis in reading.axes.values():
+        if axis.zipped and (axis.name in RESERVED or axis.name.startswith("_")):
+            reading.faults.append(
+                f"{reading.source}: axes.{axis.name}: expected another name: the dataset or its "
+                "analyses have this one"
+            )
+
+
+RESERVED = {
+    *VARIABLES, *LABELS, *HEADER, *SECTIONS, "axes", TRIAL,
+    *(flag.name for flags in (BoundStatus, DetectionStatus, EstimateStatus, Flipped)
+      for flag in flags),
+    "block", "commits", "compared", "cost", "count", "draws", "failure", "failures",
+    "jitter_u_px", "jitter_v_px", "level", "looked_for", "outcome", "share", "treatment",
+}
+"""Names in datasets and tables that no axis may take."""
+
+
 def size_of_the_grid(reading: Reading) -> None:
     """Limit the number of poses and of configurations."""
     lengths = {axis: len(axis) for axis in reading.axes.values()}
@@ -139,7 +163,10 @@ def size_of_the_grid(reading: Reading) -> None:
 
 def size_of_whole_frames(reading: Reading) -> None:
     """Refuse settings that search the whole frame if the frame is too large."""
-    frame = max(reading.values("width_px") or (0,)) * max(reading.values("height_px") or (0,))
+    frame = max(
+        max(widths or (0,)) * max(heights or (0,))
+        for widths, heights in reading.together("width_px", "height_px")
+    )
     if frame <= MAX_PIXELS:
         return
     if "full" in reading.values("window"):
@@ -169,6 +196,7 @@ RULES: tuple[Callable[[Reading], None], ...] = (
     check_backgrounds,
     fields_of_the_installed_opencv,
     something_random_to_repeat,
+    names_of_axes,
     size_of_the_grid,
     size_of_whole_frames,
 )

@@ -9,15 +9,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flag, Flipped
 from sweep.plan.axes import Axis
 from sweep.plan.coordinates import drawn_quantities
-from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
+
+if TYPE_CHECKING:
+    from sweep.plan.experiment import Pipeline
 
 XYZ = ("x", "y", "z")
 CORNERS = ("top_left", "top_right", "bottom_right", "bottom_left")
@@ -296,6 +298,7 @@ def drawn_variables(pipeline: Pipeline) -> tuple[Variable, ...]:
 def variables_of(pipeline: Pipeline, store_format: float = math.inf) -> tuple[Variable, ...]:
     """Return the variables that a pipeline's store of a format has: the schema's, then draws.
 
+    >>> from sweep.plan.experiment import Pipeline
     >>> pipeline = Pipeline.from_dict({"pose": {"distance_m": 1, "jitter_px": 0.5}})
     >>> [variable.name for variable in variables_of(pipeline)[-2:]]
     ['jitter_u_px', 'jitter_v_px']

@@ -107,11 +107,17 @@ def _axes(data: ReportData) -> Table | None:
         return None
     rows = [
         [axis.name, f"{len(axis):,}", _values(axis), axis.unit,
-         "draws" if axis.name == TRIAL else PARAMETERS[axis.name].section, _meaning(axis)]
+         _section(axis), _meaning(axis)]
         for axis in data.pipeline.axes
     ]
     return Table("Axes of the grid", ["axis", "values", "which", "unit", "of", "meaning"], rows,
                  words=True)
+
+
+def _section(axis: Axis) -> str:
+    """Return the sections of an axis' parameters."""
+    names = [name for name in axis.columns if name != TRIAL]
+    return ", ".join(dict.fromkeys(PARAMETERS[name].section for name in names)) or "draws"
 
 
 def _meaning(axis: Axis) -> str:

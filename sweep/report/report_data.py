@@ -111,7 +111,8 @@ class ReportData:
         reasons = {*VIEW_PARAMETERS, *SIZE_AXES, TILT, "size_m"}
         drawn = bool(reasons & self.pipeline.distributions.keys())
         axes = {axis.name for axis in self.pipeline.axes if len(axis) > 1}
-        if not drawn and not axes & (reasons - {*SIZE_AXES, TILT}):
+        together = {name for axis in self.pipeline.axes for name, _ in axis.zipped}
+        if not drawn and not axes & (reasons - {*SIZE_AXES, TILT}) and not together & reasons:
             return False
         low, high = self.area_range
         return high > AREA_RATIO * low

@@ -91,24 +91,25 @@ def failed_cells(store: RunStore, number: int, receipt: Receipt) -> Iterator[Fai
 def _coordinates(
     pipeline: Pipeline, block: Block, failure: RecordedFailure
 ) -> dict[str, Any]:
-    """Return the value of each axis, in the pipeline's order, that a failure's cell has."""
-    values = {
-        axis.name: axis.values[index]
+    """Return the values that vary, in the order of the axes, of a failure's cell."""
+    indices = {
+        axis.name: index
         for axis, index in zip(scene_axes(pipeline), block.cell(failure.scene), strict=True)
     }
     for number, stage in (
         (failure.setting, Stage.detection), (failure.estimator, Stage.estimation),
     ):
         if number is not None:
-            values |= _configuration(pipeline.axes_of(stage), number)
-    return {axis.name: values[axis.name] for axis in pipeline.axes if axis.name in values}
+            indices |= _configuration(pipeline.axes_of(stage), number)
+    return pipeline.cell_at(indices)
 
 
-def _configuration(axes: Sequence[Axis], number: int) -> dict[str, Any]:
+def _configuration(axes: Sequence[Axis], number: int) -> dict[str, int]:
+    """Return the index along each axis of a configuration."""
     if not axes:
         return {}
     index = np.unravel_index(number, [len(axis) for axis in axes])
-    return {axis.name: axis.values[int(i)] for axis, i in zip(axes, index, strict=True)}
+    return {axis.name: int(i) for axis, i in zip(axes, index, strict=True)}
 
 
 def failure_table(cells: Sequence[FailedCell], counts: Mapping[str, int]) -> xr.Dataset:

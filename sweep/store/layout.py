@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -197,7 +198,7 @@ def planned_arrays(
     """Return the arrays of a pipeline's store whose chunks are blocks of ``extents``."""
     variables = variables_of(pipeline, store_format)
     scene_extent = dict(zip((axis.name for axis in scene_axes(pipeline)), extents, strict=True))
-    planned = [_axis(axis) for axis in pipeline.axes]
+    planned = [each for axis in pipeline.axes for each in _axis(axis)]
     used = {name for variable in variables for name in variable.inner}
     planned += [_labels(name, LABELS[name], {}) for name in sorted(used)]
     planned += _distance(pipeline)
@@ -237,16 +238,30 @@ def _variable(
     )
 
 
-def _axis(axis: Axis) -> PlannedArray:
-    attributes: dict[str, Any] = {"long_name": axis.meaning}
+def _axis(axis: Axis) -> list[PlannedArray]:
+    """Return the coordinates of a dimension, and those of the parameters that go together there."""
+    attributes = {"zip": " ".join(axis.columns)} if axis.zipped else {}
+    return [
+        _coordinate(axis, axis.name, attributes),
+        *(_coordinate(Axis(name, values), axis.name, {}) for name, values in axis.zipped),
+    ]
+
+
+def _coordinate(axis: Axis, dimension: str, attributes: dict[str, Any]) -> PlannedArray:
+    """Return the values along an axis as a coordinate over a dimension."""
+    attributes = {"long_name": axis.meaning, **attributes}
     if axis.unit:
         attributes["units"] = axis.unit
     if axis.labelled:
-        return _labels(axis.name, axis.coordinates().tolist(), attributes)
+        labels = axis.coordinates().tolist()
+        return dataclasses.replace(
+            _labels(dimension, labels, attributes), path=axis.name,
+            coordinate=axis.name != dimension,
+        )
     return PlannedArray(
         axis.name, (len(axis),), (min(len(axis), COORDINATE_CHUNK),),
-        axis.coordinates(0, 1).dtype.str.lstrip("<>|="), (axis.name,), None, attributes,
-        axis.coordinates,
+        axis.coordinates(0, 1).dtype.str.lstrip("<>|="), (dimension,), None, attributes,
+        axis.coordinates, coordinate=axis.name != dimension,
     )
 
 
@@ -263,12 +278,14 @@ def _distance(pipeline: Pipeline) -> list[PlannedArray]:
     sides = pipeline.values_of("side_px")
     if not sides or sides[0] is None:
         return []
-    axes = [axis for axis in scene_axes(pipeline) if axis.name in DISTANCE_PARAMETERS]
-    grids = np.meshgrid(
-        *(np.array(axis.values, dtype=np.float64) for axis in axes), indexing="ij", sparse=True
-    )
-    values = {**{name: pipeline.fixed.get(name) for name in DISTANCE_PARAMETERS},
-              **{axis.name: grid for axis, grid in zip(axes, grids, strict=True)}}
+    axes = [
+        axis for axis in scene_axes(pipeline) if axis.columns.keys() & set(DISTANCE_PARAMETERS)
+    ]
+    values = {name: pipeline.fixed.get(name) for name in DISTANCE_PARAMETERS}
+    for k, axis in enumerate(axes):
+        for name in axis.columns.keys() & set(DISTANCE_PARAMETERS):
+            column = np.array(axis.columns[name], dtype=np.float64)
+            values[name] = column.reshape([-1 if j == k else 1 for j in range(len(axes))])
     distance = np.broadcast_to(
         np.asarray(distance_of_side(values), dtype=np.float64), tuple(len(axis) for axis in axes)
     )

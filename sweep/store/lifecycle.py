@@ -300,6 +300,9 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
             storage = snapshot(store)
             dataset: xr.Dataset = xr.open_zarr(storage, consolidated=False, zarr_format=3)
             dataset = read_directly(dataset, store, storage)
+            # Short, and asked for one by one.
+            together = [name for axis in store.pipeline.axes for name, _ in axis.zipped]
+            dataset = dataset.assign_coords({name: dataset[name].compute() for name in together})
         # Much of xarray and pandas does not support NumPy's strings of variable length.
         texts = {name: (value.dims, value.to_numpy().astype(object), value.attrs)
                  for name, value in dataset.coords.items() if value.dtype.kind == "T"}

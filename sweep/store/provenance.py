@@ -151,7 +151,10 @@ def differences(ours: Pipeline, theirs: Pipeline, stored: dict[str, Any]) -> lis
         f"this run {_values(axis.values)}"
         for axis in ours.axes
         if (other := theirs.axis(axis.name)) is not None
-        and not same_values(axis.values, other.values)
+        and not (
+            axis.columns.keys() == other.columns.keys()
+            and all(same_values(axis.columns[name], other.columns[name]) for name in axis.columns)
+        )
     ]
     for our_values, their_values in (
         (ours.fixed, theirs.fixed), (ours.distributions, theirs.distributions),
@@ -159,7 +162,7 @@ def differences(ours: Pipeline, theirs: Pipeline, stored: dict[str, Any]) -> lis
         lines += [
             f"{name}: the store has {their_values.get(name)}, this run {our_values.get(name)}"
             for name in sorted({*our_values, *their_values})
-            if ours.axis(name) is None and theirs.axis(name) is None
+            if ours.axis_of(name) is None and theirs.axis_of(name) is None
             and their_values.get(name) != our_values.get(name)
         ]
     return lines

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -19,7 +20,7 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.messages import nearest
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.experiment import Pipeline
-from sweep.plan.grid import combinations, estimators
+from sweep.plan.grid import estimators
 from sweep.plan.parameters import Stage
 from sweep.store.closing import write_group
 from sweep.store.lifecycle import open_dataset, open_store
@@ -223,10 +224,14 @@ def _add(
 
 def _flattened(accuracy: xr.Dataset, axes: Sequence[Axis]) -> xr.Dataset:
     """Return a dataset with one dimension ``treatment``, by label, for the settings' axes."""
-    labels = [configuration_label(chosen) for chosen in combinations(axes)]
+    names = [axis.name for axis in axes]
+    labels = [
+        configuration_label(dict(zip(names, chosen, strict=True)))
+        for chosen in itertools.product(*(axis.values for axis in axes))
+    ]
     if not axes:
         return accuracy.expand_dims(treatment=labels)
-    flat = accuracy.stack(treatment=[axis.name for axis in axes], create_index=False)
+    flat = accuracy.stack(treatment=names, create_index=False)
     return flat.assign_coords(treatment=("treatment", labels))
 
 

@@ -89,16 +89,22 @@ def _text(ends: Range, digits: int = 6) -> str:
 def camera_facts(pipeline: Pipeline) -> CameraFacts:
     """Return what a pipeline's camera is.
 
-    Every quantity is monotonic in each parameter, so that the ends of the axes have its ends.
+    Every quantity is monotonic in each parameter, so that the ends of the axes have its ends; of
+    parameters that go together every row is looked at.
     """
-    chosen = [
-        [ends[0]] if ends[0] == ends[1] else list(ends)
-        for ends in (_ends(pipeline, name) or (None, None) for name in VIEW_PARAMETERS)
+    together = [axis for axis in pipeline.axes
+                if axis.zipped and axis.columns.keys() & set(VIEW_PARAMETERS)]
+    apart = [name for name in VIEW_PARAMETERS
+             if not any(name in axis.columns for axis in together)]
+    chosen: list[list[dict[str, Any]]] = [
+        [{name: end} for end in dict.fromkeys(_ends(pipeline, name) or (None,))] for name in apart
     ]
+    chosen += [[axis.at(index) for index in range(len(axis))] for axis in together]
     rows: dict[str, list[float]] = {}
-    for values in itertools.product(*chosen):
-        fx, fy, cx, cy = intrinsics(*values)
-        width, height = values[:2]
+    for parts in itertools.product(*chosen):
+        values = {name: value for part in parts for name, value in part.items()}
+        fx, fy, cx, cy = intrinsics(*(values[name] for name in VIEW_PARAMETERS))
+        width, height = values["width_px"], values["height_px"]
         for name, number in {
             "width_px": width, "height_px": height, "fx_px": fx, "fy_px": fy, "cx_px": cx,
             "cy_px": cy, "hfov_deg": field_of_view_deg(width, fx),
@@ -180,5 +186,5 @@ def _centre_notes(facts: CameraFacts) -> list[str]:
 
 
 def _varies(pipeline: Pipeline, name: str) -> bool:
-    axis = pipeline.axis(name)
+    axis = pipeline.axis_of(name)
     return axis is not None and len(axis) > 1

@@ -205,9 +205,8 @@ def _read_axis(reading: Reading, key: str, value: Any, quota: int, table: str = 
         elif key not in PARAMETERS:
             reading.unknown(path, "unknown parameter", key, [*PARAMETERS, TRIAL])
         elif key in reading.given:
-            reading.fault(
-                path, value, f"it once: {_place(reading, key, path)} is given too; delete one of them"
-            )
+            place = _place(reading, key, path)
+            reading.fault(path, value, f"it once: {place} is given too; delete one of them")
         else:
             reading.given.add(key)
             return parse_axis(PARAMETERS[key], value, quota, repeats=bool(table))

@@ -104,7 +104,8 @@ def test_cells_are_reused_between_both_declarations(folder, zipped, apart):
     assert count == 2
 
 
-def test_grids_without_a_common_cell_are_refused(folder, zipped):
+@pytest.mark.usefixtures("zipped")
+def test_grids_without_a_common_cell_are_refused(folder):
     crossed = sweep.Pipeline.from_dict(BASE | {"axes": {
         **ZIPPED, "lens": {"zip": {"fx_px": [600, 800], "fy_px": [805, 600]}},
     }})

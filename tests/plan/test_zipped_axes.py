@@ -63,33 +63,59 @@ def test_draws_are_those_of_the_same_values_on_axes_of_their_own():
 
 @pytest.mark.parametrize(("given", "line"), [
     ({"fx_px": [600, 800], "fy_px": [600]},
-     "axes.lens: expected equally many values of each parameter: fx_px has 2, fy_px has 1"),
+     (
+        "axes.lens: expected equally many values of each parameter: fx_px has 2, fy_px ha"
+        "s 1"
+    )),
     ({"fx_px": [600, 800]},
-     "axes.lens = {zip = {fx_px = [600, 800]}}: expected at least two parameters that go together"),
-    ({}, "axes.lens = {zip = {}}: expected at least two parameters that go together"),
+     (
+        "axes.lens = {zip = {fx_px = [600, 800]}}: expected at least two parameters that "
+        "go together"
+    )),
+    ({},
+     "axes.lens = {zip = {}}: expected at least two parameters that go together"),
     ({"fx_px": [600, 800], "solver": ["ippe", "iterative"]},
-     "axes.lens: expected parameters of one stage: fx_px is of the scene, solver is of the "
-     "estimation"),
+     (
+        "axes.lens: expected parameters of one stage: fx_px is of the scene, solver is of"
+        " the estimation"
+    )),
     ({"fx_px": [600, 800, 600], "fy_px": [600, 800, 600]},
      "axes.lens: expected each combination once (600, 600 is repeated)"),
     ({"fx_px": [600, 800], "fy": [600, 800]},
      "axes.lens.fy: unknown parameter; did you mean fy_px?"),
     ({"fx_px": [600, 800], "trial": 2},
-     "axes.lens.trial = 2: expected it as an axis of its own: every cell has the same trials"),
+     (
+        "axes.lens.trial = 2: expected it as an axis of its own: every cell has the same "
+        "trials"
+    )),
     ({"fx_px": [600, 800], "fy_px": {"uniform": [600, 800]}},
-     "axes.lens.fy_px = {uniform = [600, 800]}: expected an axis; a distribution goes under "
-     "[camera]"),
+     (
+        "axes.lens.fy_px = {uniform = [600, 800]}: expected an axis; a distribution goes "
+        "under [camera]"
+    )),
     ({"fx_px": [600, 800], "fy_px": {"zip": {"cx_px": [1, 2], "cy_px": [1, 2]}}},
-     "axes.lens.fy_px = {zip = {cx_px = [1, 2], cy_px = [1, 2]}}: expected an axis of fy_px "
-     "alone; parameters that go together need a name of your own, such as pair = { zip = { ... } }"),
-    ({"fx_px": [600, -1], "fy_px": [600, 800]}, "axes.lens.fx_px = [600, -1]: expected a number "
-     "from 0.001 to 1e+09 (not -1)"),
-    ({"fx_px": [], "fy_px": []}, "axes.lens.fx_px = []: expected at least one value\n"
-     "pipeline: axes.lens.fy_px = []: expected at least one value"),
-    ({"fx_px": 600, "fy_px": [700]}, "axes.lens.fx_px = 600: expected a list, or a table with one "
-     "of range, arange, linspace, geom, values"),
+     (
+        "axes.lens.fy_px = {zip = {cx_px = [1, 2], cy_px = [1, 2]}}: expected an axis of "
+        "fy_px alone; parameters that go together need a name of your own, such as pair ="
+        " { zip = { ... } }"
+    )),
+    ({"fx_px": [600, -1], "fy_px": [600, 800]},
+     "axes.lens.fx_px = [600, -1]: expected a number from 0.001 to 1e+09 (not -1)"),
+    ({"fx_px": [], "fy_px": []},
+     (
+        "axes.lens.fx_px = []: expected at least one value\npipeline: axes.lens.fy_px = []"
+        ": expected at least one value"
+    )),
+    ({"fx_px": 600, "fy_px": [700]},
+     (
+        "axes.lens.fx_px = 600: expected a list, or a table with one of range, arange, li"
+        "nspace, geom, values"
+    )),
     ({"distance_m": [1, 2], "tilt_deg": [1, 2]},
-     "axes.lens.distance_m = [1, 2]: expected it once: pose.distance_m is given too; delete one"),
+     (
+        "axes.lens.distance_m = [1, 2]: expected it once: pose.distance_m is given too; d"
+        "elete one"
+    )),
     ({"side_px": [10, 20], "tilt_deg": [1, 2]},
      "side_px = [10, 20]: expected distance_m or side_px, not both; delete one of them"),
     ({"dictionary": ["DICT_4X4_50", "DICT_4X4_100"], "marker_id": [50, 99]},

@@ -205,8 +205,8 @@ def _read_axis(reading: Reading, key: str, value: Any, quota: int, table: str = 
         elif key not in PARAMETERS:
             reading.unknown(path, "unknown parameter", key, [*PARAMETERS, TRIAL])
         elif key in reading.given:
-            place = _place(reading, key, path)
-            reading.fault(path, value, f"it once: {place} is given too; delete one of them")
+            other = _other_path(reading, key, path)
+            reading.fault(path, value, f"it once: {other} is given too; delete one of them")
         else:
             reading.given.add(key)
             return parse_axis(PARAMETERS[key], value, quota, repeats=bool(table))
@@ -215,17 +215,17 @@ def _read_axis(reading: Reading, key: str, value: Any, quota: int, table: str = 
     return None
 
 
-def _place(reading: Reading, name: str, here: str) -> str:
-    """Return where else than ``here`` a document gives a parameter, for messages."""
+def _other_path(reading: Reading, name: str, path: str) -> str:
+    """Return where else than at ``path`` a document gives a parameter, for messages."""
     section = PARAMETERS[name].section
     tables = {section: reading.document.get(section), "axes": reading.document.get("axes")}
     tables |= {
         f"axes.{key}": value["zip"]
         for key, value in reading.document.get("axes", {}).items() if is_zip(value)
     }
-    places = [f"{key}.{name}" for key, table in tables.items()
+    paths = [f"{key}.{name}" for key, table in tables.items()
               if isinstance(table, dict) and name in table]
-    return next((place for place in places if place != here), "it")
+    return next((other for other in paths if other != path), "it")
 
 
 def is_zip(value: Any) -> bool:

@@ -97,7 +97,8 @@ def camera_facts(pipeline: Pipeline) -> CameraFacts:
     separate = [name for name in VIEW_PARAMETERS
              if not any(name in axis.columns for axis in together)]
     chosen: list[list[dict[str, Any]]] = [
-        [{name: end} for end in dict.fromkeys(_ends(pipeline, name) or (None,))] for name in separate
+        [{name: end} for end in dict.fromkeys(_ends(pipeline, name) or (None,))]
+        for name in separate
     ]
     chosen += [[axis.at(index) for index in range(len(axis))] for axis in together]
     rows: dict[str, list[float]] = {}

@@ -19,7 +19,7 @@ from sweep.measure.covariance import squared_deviations
 from sweep.measure.estimation import Detections, Estimates
 from sweep.measure.flags import EstimateStatus, Flipped
 from sweep.model.extent import areas_px
-from sweep.model.pose import vector_of_rotation
+from sweep.model.pose import vector_of_rotation, viewing_angle
 from sweep.model.scene import Scenes
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import SCHEMA, VARIABLES
@@ -62,6 +62,12 @@ class EstimationResults:
     true_translation: Floats
 
 
+def _of_geometry(
+    function: Callable[[Scenes], NDArray[Any]]
+) -> Callable[[SceneResults], NDArray[Any]]:
+    return lambda results: function(results.scenes)
+
+
 def _flipped(results: EstimationResults) -> NDArray[np.uint8]:
     solved = results.estimates.status == EstimateStatus.solved
     flipped = np.where(results.error.flipped, Flipped.flipped, Flipped.not_flipped)
@@ -73,10 +79,18 @@ def _alternative_angle_deg(results: EstimationResults) -> Floats:
     return np.asarray(np.degrees(np.linalg.norm(other, axis=1)))
 
 
+GEOMETRY: dict[str, Callable[[Scenes], NDArray[Any]]] = {
+    "true_rvec": lambda scenes: vector_of_rotation(scenes.rotation),
+    "true_tvec_m": lambda scenes: scenes.translation,
+    "marker_area_px": areas_px,
+    "viewing_angle_deg": lambda scenes: np.degrees(
+        viewing_angle(scenes.rotation, scenes.translation)
+    ),
+}
+"""Variable that follows from camera, marker and pose -> its values (N, ...)."""
+
 SCENE: dict[str, Callable[[SceneResults], NDArray[Any]]] = {
-    "true_rvec": lambda results: vector_of_rotation(results.scenes.rotation),
-    "true_tvec_m": lambda results: results.scenes.translation,
-    "marker_area_px": lambda results: areas_px(results.scenes),
+    **{name: _of_geometry(function) for name, function in GEOMETRY.items()},
     "bound": lambda results: results.bounds.status,
     "bound_std": lambda results: results.bounds.std,
     "bound_kappa": lambda results: results.bounds.kappa,

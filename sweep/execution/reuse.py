@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import StoreError
+from sweep.evaluation.variables import GEOMETRY
 from sweep.execution.grid_match import (
     MISSING,
     Group,
@@ -25,6 +26,7 @@ from sweep.execution.grid_match import (
     groups,
     rows_in,
 )
+from sweep.model.scene import build_scenes
 from sweep.plan.axes import TRIAL
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes, scene_values
@@ -90,7 +92,7 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
     faults += [
         f"{variable.name}: not a variable of the store's format {store.format}"
         for variable in variables_of(pipeline)
-        if variable.name not in present and not variable.drawn_as
+        if variable.name not in present and not _follows(variable)
     ]
     for name in (*PARAMETERS, TRIAL):
         if pipeline.distributions.get(name) != old.distributions.get(name):
@@ -240,7 +242,7 @@ def _read_from(
     old = {
         v.name: _read(source, pipeline, v, indices) for v in variables if v.name in present
     }
-    old |= _drawn(
+    old |= _computed(
         pipeline, [v for v in variables if v.name not in present], cuts, positions,
         np.isfinite(old["true_tvec_m"]).all(axis=-1),
     )
@@ -266,11 +268,16 @@ def _read_from(
         target[grid] = part
 
 
-def _drawn(
+def _follows(variable: Variable) -> bool:
+    """Return whether a variable follows from the scene's values, without its image."""
+    return bool(variable.drawn_as) or variable.name in GEOMETRY
+
+
+def _computed(
     pipeline: Pipeline, variables: Sequence[Variable], cuts: dict[str, slice],
     positions: dict[str, NDArray[np.int64]], computed: NDArray[np.bool_],
 ) -> dict[str, NDArray[np.float64]]:
-    """Return drawn quantities that the old store's format lacks, NaN where no truth was stored."""
+    """Return variables that the old store's format lacks, NaN where no truth was stored."""
     if not variables:
         return {}
     along = [
@@ -279,12 +286,15 @@ def _drawn(
     ]
     indices = [grid.ravel() for grid in np.meshgrid(*along, indexing="ij")]
     values = scene_values(pipeline, indices)
-    return {
-        variable.name: np.where(
-            computed, values[variable.drawn_as].broadcast(computed.size).reshape(computed.shape),
-            np.nan,
-        )
+    scenes = build_scenes(values, computed.size)
+    columns = {
+        variable.name: values[variable.drawn_as].broadcast(computed.size) if variable.drawn_as
+        else GEOMETRY[variable.name](scenes)
         for variable in variables
+    }
+    return {
+        name: np.where(computed, column.reshape(computed.shape), np.nan)
+        for name, column in columns.items()
     }
 
 

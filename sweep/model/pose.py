@@ -209,6 +209,16 @@ def angle_between(a: Floats, b: Floats) -> Floats:
     return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, other), axis=-1), cosine))
 
 
+def viewing_angle(rotation: Floats, translation: Floats) -> Floats:
+    """Return the angles (N,) in radians between markers' normals and the lines of sight to them.
+
+    0: seen frontally; above π/2: from behind. Rotations (N, 3, 3), positions (N, 3) of the centres;
+    without a line of sight, at the camera's centre, it is 0.
+    """
+    length = np.linalg.norm(translation, axis=1, keepdims=True)
+    return angle_between(rotation[:, :, 2], -translation / np.where(length > 0, length, 1.0))
+
+
 def mirrored(rotation: Floats, translation: Floats) -> Floats:
     """Return the rotations (N, 3, 3) of the second planar solution of exact corners.
 

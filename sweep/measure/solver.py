@@ -210,6 +210,16 @@ lie far above it. Others are compared with ITERATIVE's."""
 _CREDIBLE_RATIO = 2.0
 """The largest ratio of a solution's reprojection error to that of ITERATIVE."""
 
+_FAR_SHARE = 1e-3
+"""Sides below this share of the focal length are compared with IPPE: the perspective across the
+marker, which tells the two planar solutions apart, is below this share of the side, and what all
+solvers but IPPE leave of it is rounding."""
+
+_FAR_RATIO = 4.0
+"""The largest ratio of a far solution's reprojection error to that of IPPE. Without perspective an
+exact solution of three corners has twice the least error of four: c/2 and c/4 if the opposite
+sides differ by a vector of length c."""
+
 
 def _guarded(
     corners: Floats, cameras: Cameras, size_m: Floats, method: int
@@ -235,6 +245,7 @@ def _guarded(
     pinhole = Cameras(cameras.view, cameras.lenses, np.zeros(len(points), dtype=bool))
     unit = np.ones(len(points))
     side = np.linalg.norm(np.roll(points, -1, axis=1) - points, axis=2).mean(axis=1)
+    known = np.isfinite(points).all(axis=(1, 2))
 
     def errors(rows: NDArray[np.intp], r: Floats, t: Floats) -> Floats:
         return reprojection_errors_px(r, t, unit[rows], pixels[rows], pinhole.take(rows))
@@ -242,8 +253,7 @@ def _guarded(
     error = errors(np.arange(len(points)), rotation[:, 0], translation[:, 0])
     with np.errstate(invalid="ignore"):
         doubtful = ~(error <= _CREDIBLE_SHARE * side)
-    doubtful &= np.isfinite(points).all(axis=(1, 2))
-    rows = np.flatnonzero(doubtful)
+    rows = np.flatnonzero(doubtful & known)
     if len(rows):
         for k in range(1, 4):
             others = _solve_turned(points[rows], matrices[rows], (turns[rows] + k) % 4, method)
@@ -262,6 +272,18 @@ def _guarded(
                 better = ~(error[rows] <= _CREDIBLE_RATIO * other) & np.isfinite(other)
             chosen = rows[better]
             rotation[chosen], translation[chosen] = others[0][better], others[1][better]
+            error[chosen] = other[better]
+    far = side < _FAR_SHARE * cameras.view[:, :2].min(axis=1)
+    rows = np.flatnonzero(far & known)
+    if len(rows) and method != cv2.SOLVEPNP_IPPE:
+        others = _guarded(corners[rows], cameras.take(rows), unit[rows], cv2.SOLVEPNP_IPPE)
+        other = errors(rows, others[0][:, 0], others[1][:, 0])
+        with np.errstate(invalid="ignore"):
+            better = ~(error[rows] <= _FAR_RATIO * other) & np.isfinite(other)
+        chosen = rows[better]
+        rotation[chosen], translation[chosen] = others[0][better], others[1][better]
+        if method not in _TWO_SOLUTIONS:
+            rotation[chosen, 1], translation[chosen, 1] = np.nan, np.nan
     return rotation, translation * size_m[:, None, None]
 
 

@@ -4,21 +4,30 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import itertools
 import json
 import platform
 import runpy
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from sweep.installation import check_installation, check_loaded_opencv
+from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.plan.experiment import Pipeline
 from sweep.version import __version__
 
-NUMBERS_VERSION = 3
+NUMBERS_VERSION = 4
 """Raised whenever the numbers change; a test with golden digests fails if it is not."""
+
+NEAR_NUMBERS_VERSION = 3
+"""The version where no marker is far: version 4 changed guarded solvers at sides below 1/1000 of
+the focal length (`sweep.measure.solver`), and nothing else."""
+
+NEAR_FOCAL_PX = 5000.0
+"""Up to this focal length such sides are below 5 px, where no marker is detected."""
 
 
 def versions() -> dict[str, str]:
@@ -80,12 +89,25 @@ def fingerprint(pipeline: Pipeline) -> dict[str, Any]:
         If OpenCV is installed in a way that makes it uncertain which one is used.
     """
     return {
-        "numbers": NUMBERS_VERSION,
+        "numbers": numbers_version(pipeline),
         **versions(),
         "builds": dict(builds()),
         "seed": pipeline.seed,
         "files": dict(sorted(pipeline.files.items())),
     }
+
+
+def numbers_version(pipeline: Pipeline) -> int:
+    """Return the version of the numbers of a pipeline: the earliest with the same ones."""
+    ends = [_ends(pipeline.values_of(name)) for name in VIEW_PARAMETERS]
+    focal_px = max(max(intrinsics(*values)[:2]) for values in itertools.product(*ends))
+    return NUMBERS_VERSION if focal_px > NEAR_FOCAL_PX else NEAR_NUMBERS_VERSION
+
+
+def _ends(values: Sequence[Any]) -> Sequence[Any]:
+    """Return the smallest and the largest value; focal lengths are monotonous in each."""
+    numbers = [value for value in values if value is not None]
+    return (min(numbers), max(numbers)) if len(numbers) > 1 else (numbers or [None])
 
 
 def changes(stored: dict[str, Any], own: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:

@@ -18,13 +18,21 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-import numba
-from numba.core.caching import (
-    CompileResultCacheImpl,
-    FunctionCache,
-    IndexDataCacheFile,
-    _CacheLocator,
-)
+from sweep.errors import RunError
+
+try:
+    import numba
+    from numba.core.caching import (
+        CompileResultCacheImpl,
+        FunctionCache,
+        IndexDataCacheFile,
+        _CacheLocator,
+    )
+except (ValueError, TypeError) as error:
+    # Numba interprets its configuration while it is imported.
+    raise RunError(
+        f"Numba cannot be imported with its NUMBA_... variables: {type(error).__name__}: {error}"
+    ) from None
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

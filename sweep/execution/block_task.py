@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import processor
-from sweep.errors import MachineFaultError, StoreError
+from sweep.errors import MachineFaultError, StoreError, StoreReplacedError
 from sweep.evaluation.cells import run_cells
-from sweep.evaluation.machine_faults import machine_faults_raised
+from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.results import CellsResult, to_dataset_layout
 from sweep.evaluation.warm_up import warm_up
 from sweep.execution.limits import TIME_LIMIT_S
@@ -48,8 +48,10 @@ def _opened(url: str, run_id: str, durable: bool = False) -> RunStore:
 
     Raises
     ------
+    StoreReplacedError
+        If the store was replaced.
     StoreError
-        If the store was replaced, or this machine has other versions or files.
+        If this machine cannot read it, or has other versions or files.
     MachineFaultError
         If this machine cannot compute a scene of known pose.
     """
@@ -60,7 +62,7 @@ def _opened(url: str, run_id: str, durable: bool = False) -> RunStore:
         )
     store = open_store(url, "r+", durable=durable)
     if store.run_id != run_id:
-        raise StoreError(f"{url}: replaced by another run while this one was going on")
+        raise StoreReplacedError(f"{url}: replaced by another run while this one was going on")
     for key, value, own_value in changes(store.fingerprint, fingerprint(store.pipeline)):
         raise StoreError(
             f"a worker has {key} {own_value}, the store was begun with {value}; "
@@ -113,41 +115,50 @@ def compute_block(
 
     Raises
     ------
-    StoreError
-        If the store was replaced or cannot be written, or its numbers cannot be made here.
+    StoreReplacedError
+        If the store was replaced.
     MachineFaultError
-        If this machine cannot compute it; nothing of it is committed.
+        If this machine cannot compute the block, or cannot read or write the store; nothing of the
+        block is committed. Another machine may be able to.
     """
-    with machine_faults_raised():
-        return _compute_block(url, run_id, block, reuse, time_limit_s, quota, durable=durable)
+    try:
+        with machine_faults_raised():
+            store = _opened(url, run_id, durable)
+            begun_before = begin_block(store, block)
+            try:
+                return _compute_begun(
+                    store, url, block, reuse, time_limit_s, quota, isolated=begun_before
+                )
+            except Exception:
+                if not begun_before:  # it did not end this process
+                    withdraw_block(store, block)
+                raise
+    except StoreReplacedError:
+        raise
+    except StoreError as error:
+        raise local_fault(str(error).removeprefix(f"{url}: ")) from None
 
 
-def _compute_block(
-    url: str, run_id: str, block: Block, reuse: Sequence[str], time_limit_s: float,
-    quota: Mapping[str, int], *, durable: bool,
+def _compute_begun(
+    store: RunStore, url: str, block: Block, reuse: Sequence[str], time_limit_s: float,
+    quota: Mapping[str, int], *, isolated: bool,
 ) -> Receipt:
-    """Compute, write and commit one block (arguments as :func:`compute_block`)."""
+    """Compute, write and commit a block that is marked as begun."""
     start = time.perf_counter()
-    store = _opened(url, run_id, durable)
-    begun_before = begin_block(store, block)
     pipeline = store.pipeline
     shape = (len(block), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
     reused: ReusedCells | None = None
     need = np.ones(shape, dtype=bool)
     if reuse:
-        reused = read_cells(pipeline, block, [_source(url, run_id, old) for old in reuse])
+        sources = [_source(url, store.run_id, old) for old in reuse]
+        reused = read_cells(pipeline, block, sources)
         need = ~reused.available.reshape(shape)
     # Scenes of which every cell is reused are not rendered.
     rows = np.flatnonzero(need.any(axis=(1, 2)))
     cells = None
     if len(rows):
         indices = [index[rows] for index in block_indices(block)]
-        try:
-            cells = _compute(pipeline, indices, need[rows], time_limit_s, isolated=begun_before)
-        except MachineFaultError:
-            if not begun_before:
-                withdraw_block(store, block)
-            raise
+        cells = _compute(pipeline, indices, need[rows], time_limit_s, isolated=isolated)
     values = {
         v.name: to_dataset_layout(
             v, pipeline, block, _columns(v, cells, rows, pipeline, len(block))

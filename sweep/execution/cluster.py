@@ -32,6 +32,7 @@ from sweep.evaluation.machine_faults import exception_line
 from sweep.execution.distributed_internals import thread_counts
 from sweep.execution.limits import ANSWER_S, NO_WORKERS_TIMEOUT_S, THREAD_COUNT_TIMEOUT_S
 from sweep.execution.scheduler_connection import connect_to_scheduler
+from sweep.execution.thread_limit import check_threads
 from sweep.execution.worker_versions import check_workers
 from sweep.isolation.child_process import SINGLE_THREADED
 from sweep.isolation.interrupts import in_main_thread
@@ -132,6 +133,7 @@ def embedded(workers: int) -> Iterator[Client]:
 
 
 def _started(workers: int) -> LocalCluster:
+    check_threads(workers)
     try:
         return LocalCluster(
             n_workers=workers, threads_per_worker=1, processes=True, host="127.0.0.1",
@@ -155,6 +157,7 @@ def own_dask_config() -> dict[str, Any]:
         dask.config.update(config, copy.deepcopy(defaults), priority="old")
     settings = {
         "distributed.nanny.pre-spawn-environ": WORKER_ENVIRONMENT,
+        "distributed.worker.preload": ["sweep.execution.worker_start"],
         **NEVER_PAUSED, **QUIET_DASK_CONFIG,
     }
     with dask.config.set(settings, config=config):

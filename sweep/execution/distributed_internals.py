@@ -16,8 +16,8 @@ from distributed.comm.registry import backends, get_backend
 from distributed.core import send_recv
 
 __all__ = [
-    "CommClosedError", "is_known_protocol", "peer_type", "thread_counts", "worker_states",
-    "worker_that_failed",
+    "CommClosedError", "is_known_protocol", "peer_type", "thread_counts", "worker_deaths",
+    "worker_states", "worker_that_failed",
 ]
 
 
@@ -98,6 +98,25 @@ def worker_states(client: Client, timeout_s: float) -> dict[str, str]:
         _scheduler(client).identity, n_workers=-1, callback_timeout=timeout_s
     )
     return {address: str(worker["status"]) for address, worker in identity["workers"].items()}
+
+
+def worker_deaths(client: Client, timeout_s: float) -> int:
+    """Return how many workers went away unasked since the scheduler was started.
+
+    Raises
+    ------
+    TimeoutError
+        If the scheduler does not answer in time.
+    OSError
+        If the client is not connected.
+    """
+    events: list[tuple[float, Any]] = client.sync(
+        _scheduler(client).events, topic="all", callback_timeout=timeout_s
+    )
+    return sum(
+        isinstance(event, dict) and event.get("action") == "remove-worker"
+        and not event.get("expected") for _, event in events
+    )
 
 
 def _scheduler(client: Client) -> Any:

@@ -17,7 +17,7 @@ from typing import Any
 
 from distributed import Client, Future, KilledWorker
 
-from sweep.errors import RunError, StoreError
+from sweep.errors import RunError, StoreReplacedError
 from sweep.evaluation.machine_faults import machine_fault
 from sweep.execution.block_task import compute_block
 from sweep.execution.cluster import thread_count
@@ -32,6 +32,7 @@ from sweep.execution.stall import StallWatch
 from sweep.execution.tally import Tally
 from sweep.execution.worker_faults import WorkerFaults
 from sweep.isolation.interrupts import POLL_S, Interrupts
+from sweep.isolation.machine_memory import deaths_reason, memory_kills, memory_ran_out
 from sweep.store.run_store import RunStore
 
 
@@ -43,6 +44,7 @@ class InFlightLimit:
         self._asked = 0.0
         self._blocks = BLOCKS_PER_THREAD
         self._last_worker = time.monotonic()
+        self._kills = memory_kills()
 
     def blocks(self) -> int:
         """Return the number of blocks that may be in flight now.
@@ -58,9 +60,8 @@ class InFlightLimit:
             if threads:
                 self._blocks, self._last_worker = BLOCKS_PER_THREAD * threads, self._asked
         if time.monotonic() > self._last_worker + NO_WORKERS_TIMEOUT_S:
-            raise RunError(
-                f"there have been no workers for {NO_WORKERS_TIMEOUT_S:.0f} s; start some"
-            )
+            advice = deaths_reason(self._kills) if memory_ran_out(self._kills) else "start some"
+            raise RunError(f"there have been no workers for {NO_WORKERS_TIMEOUT_S:.0f} s; {advice}")
         return self._blocks
 
 
@@ -97,6 +98,7 @@ class BlocksInFlight:
         self._numbers: dict[Future[Any], int] = {}
         self._deaths: Counter[int] = Counter()
         self._worker_faults = WorkerFaults(client)
+        self._kills = memory_kills()
 
     def compute(self, numbers: Iterable[int], tally: Tally) -> None:
         """Compute blocks by their numbers, and count them.
@@ -105,8 +107,8 @@ class BlocksInFlight:
         ------
         RunError
             If blocks failed, the scheduler went away, or there are no workers.
-        StoreError
-            If a worker cannot write the store.
+        StoreReplacedError
+            If the store was moved, deleted or replaced.
         """
         try:
             self._compute(iter(numbers), tally)
@@ -160,9 +162,10 @@ class BlocksInFlight:
         if not lost and future.status in ("cancelled", "lost"):
             raise RunError("the scheduler went away")
         error = None if lost else future.exception()
-        if isinstance(error, StoreError):
+        if isinstance(error, StoreReplacedError):
             raise error
-        if (lost or isinstance(error, KilledWorker)) and self._deaths[number] < MAX_DEATHS:
+        killed = lost or isinstance(error, KilledWorker)
+        if killed and self._deaths[number] < MAX_DEATHS:
             # A block that ends its process is computed in isolation when it is begun again, but
             # it may have been queued behind one, or its workers were killed from outside.
             self._deaths[number] += 1
@@ -171,7 +174,11 @@ class BlocksInFlight:
         block = self._store.blocks[number]
         fault = None if error is None else machine_fault(error)
         if fault is None:
-            tally.add_failed(f"block {block}: {type(error).__name__}: {error}")
+            reason = (
+                f"its workers died again and again; {deaths_reason(self._kills)}" if killed
+                else f"{type(error).__name__}: {error}"
+            )
+            tally.add_failed(f"block {block}: {reason}", machine_fault=killed)
             return
         others = self._worker_faults.others(number, str(future.key), fault)
         if others:

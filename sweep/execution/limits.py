@@ -21,6 +21,12 @@ MAX_ATTEMPTS = 10
 MAX_WORKER_FAULTS = 3
 """Blocks that a worker fails and others compute, after which it is used no more."""
 
+FAULT_WINDOW = 10
+"""Blocks that each worker computes meanwhile: more seldom faults are not the worker's alone."""
+
+MAX_WORKER_DEATHS = 3
+"""Deaths of workers, on average of each, without a finished block, after which a run ends."""
+
 MAX_FAILED_BLOCKS = 10
 """Failed blocks after which no more are submitted."""
 

@@ -11,13 +11,14 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-from sweep.errors import MachineFaultError, StoreError, SweepError
+from sweep.errors import MachineFaultError, StoreReplacedError, SweepError
 from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.execution.block_task import compute_block
 from sweep.execution.limits import MAX_DEATHS, SMALL_RUN_LIMIT_S, TIME_LIMIT_S
 from sweep.execution.tally import Tally
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
 from sweep.isolation.interrupts import Interrupts
+from sweep.isolation.machine_memory import explained, memory_kills
 from sweep.store.receipt import Receipt
 from sweep.store.run_store import RunStore
 
@@ -61,8 +62,8 @@ class BlocksInChild:
         ------
         RunError
             If blocks failed, or this machine cannot start processes.
-        StoreError
-            If the store cannot be written.
+        StoreReplacedError
+            If the store was moved, deleted or replaced.
         """
         deadline = time.monotonic() + SMALL_RUN_LIMIT_S
         with machine_faults_raised(), ThreadPoolExecutor(1) as thread:
@@ -78,7 +79,7 @@ class BlocksInChild:
 
     def _compute_block(self, thread: ThreadPoolExecutor, number: int, tally: Tally) -> None:
         block = self._store.blocks[number]
-        machine_fault = False
+        faults, kills = 0, memory_kills()
         for _ in range(1 + MAX_DEATHS):
             call = thread.submit(
                 self._child.call, compute_block, self._url, self._store.run_id, block,
@@ -88,24 +89,25 @@ class BlocksInChild:
             )
             try:
                 receipt: Receipt = self._interrupts.await_result(call)
-            except StoreError:
+            except StoreReplacedError:
                 raise
             except ChildDiedError as error:
-                reason = f"its process ended: {error}"
+                fault = error.from_outside
+                reason = f"its process ended: {explained(error, kills)}"
                 self._child.restart()
                 continue
             except MachineFaultError as error:
-                reason = str(error)
-                if not machine_fault:  # once more, in another process
-                    machine_fault = True
+                fault, reason = True, str(error)
+                faults += 1
+                if faults == 1:  # once more, in another process
                     self._child.restart()
                     continue
             except ChildRaisedError as error:
-                reason = last_line(error)
+                fault, reason = False, last_line(error)
             except SweepError as error:
-                reason = f"{type(error).__name__}: {error}"
+                fault, reason = False, f"{type(error).__name__}: {error}"
             else:
                 tally.add(receipt)
                 return
             break
-        tally.add_failed(f"block {block}: {reason}", machine_fault=machine_fault)
+        tally.add_failed(f"block {block}: {reason}", machine_fault=fault)

@@ -7,8 +7,14 @@ import time
 from distributed import Client
 
 from sweep.errors import RunError
-from sweep.execution.distributed_internals import worker_states
-from sweep.execution.limits import STALL_S, STATES_INTERVAL_S, THREAD_COUNT_TIMEOUT_S
+from sweep.execution.distributed_internals import worker_deaths, worker_states
+from sweep.execution.limits import (
+    MAX_WORKER_DEATHS,
+    STALL_S,
+    STATES_INTERVAL_S,
+    THREAD_COUNT_TIMEOUT_S,
+)
+from sweep.isolation.machine_memory import deaths_reason, memory_kills
 from sweep.messages import notice
 
 
@@ -16,8 +22,8 @@ class StallWatch:
     """Watches for a run in which nothing is finished.
 
     A line says why after :data:`~sweep.execution.limits.STALL_S`, and again after twice that time,
-    four times, and so on. If all workers are paused for so long, the run ends: they would never
-    go on.
+    four times, and so on. The run ends if it would never go on: if all workers are paused for so
+    long, or die again and again.
 
     Parameters
     ----------
@@ -30,12 +36,15 @@ class StallWatch:
     def __init__(self, client: Client, time_limit_s: float) -> None:
         self._client = client
         self._time_limit_s = time_limit_s
+        self._kills = memory_kills()
         self.finished()
 
     def finished(self) -> None:
         """Note that a block was finished."""
         self._since = self._asked = time.monotonic()
         self._paused_since: float | None = None
+        self._deaths_before: int | None = None
+        self._dying = False
         self._next_line_s = STALL_S
 
     def check(self, blocks: int) -> None:
@@ -44,7 +53,8 @@ class StallWatch:
         Raises
         ------
         RunError
-            If all workers have been paused for :data:`~sweep.execution.limits.STALL_S`.
+            If for :data:`~sweep.execution.limits.STALL_S` all workers have been paused, or each
+            died :data:`~sweep.execution.limits.MAX_WORKER_DEATHS` times on average.
         """
         now = time.monotonic()
         if now < self._asked + STATES_INTERVAL_S:
@@ -52,18 +62,26 @@ class StallWatch:
         self._asked = now
         silent_s = now - self._since
         reason = self._reason(blocks, now)
-        if self._paused_since is not None and now >= self._paused_since + STALL_S:
+        paused = self._paused_since is not None and now >= self._paused_since + STALL_S
+        if paused or (self._dying and silent_s >= STALL_S):
             raise RunError(f"no block was finished for {silent_s:.0f} s: {reason}")
         if silent_s >= self._next_line_s:
             self._next_line_s *= 2
             notice(f"no block was finished for {silent_s:.0f} s: {reason}")
 
     def _reason(self, blocks: int, now: float) -> str:
-        """Return what the workers do; note since when all of them are paused."""
+        """Return what the workers do; note since when all are paused, and whether they die."""
         try:
             states = worker_states(self._client, THREAD_COUNT_TIMEOUT_S)
+            deaths = worker_deaths(self._client, THREAD_COUNT_TIMEOUT_S)
         except (OSError, TimeoutError):
             return "the scheduler does not answer"
+        if self._deaths_before is None:
+            self._deaths_before = deaths
+        deaths -= self._deaths_before
+        self._dying = deaths >= MAX_WORKER_DEATHS * max(len(states), 1)
+        if deaths:
+            return f"workers died {deaths} times meanwhile; {deaths_reason(self._kills)}"
         if not states:
             return "there are no workers; start some"
         paused = sum(status == "paused" for status in states.values())
@@ -77,7 +95,10 @@ class StallWatch:
                 "the memory that they may; give them more (`dask worker --memory-limit`), or set "
                 "distributed.worker.memory.pause to false in Dask's configuration there"
             )
-        return (
+        told = (
             f"{blocks} blocks are with {len(states)} workers, which compute; a block ends after "
             f"at most {self._time_limit_s:.0f} s (time limit)"
         )
+        if now > self._since + self._time_limit_s:
+            told += ": they hang, or do other work first; their logs may tell"
+        return told

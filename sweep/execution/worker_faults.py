@@ -10,7 +10,12 @@ from distributed import Client
 
 from sweep.errors import MachineFaultError
 from sweep.execution.distributed_internals import thread_counts, worker_that_failed
-from sweep.execution.limits import MAX_ATTEMPTS, MAX_WORKER_FAULTS, THREAD_COUNT_TIMEOUT_S
+from sweep.execution.limits import (
+    FAULT_WINDOW,
+    MAX_ATTEMPTS,
+    MAX_WORKER_FAULTS,
+    THREAD_COUNT_TIMEOUT_S,
+)
 from sweep.messages import notice
 
 UNKNOWN = ""
@@ -20,14 +25,17 @@ UNKNOWN = ""
 class WorkerFaults:
     """The machine faults of a run: of which blocks, on which workers.
 
-    A worker fails a block that another one then computes: so the worker is at fault, and after
-    :data:`~sweep.execution.limits.MAX_WORKER_FAULTS` of them it is retired.
+    A worker fails a block that another one then computes: so the worker is at fault. After
+    :data:`~sweep.execution.limits.MAX_WORKER_FAULTS` of them, while each worker computes about
+    :data:`~sweep.execution.limits.FAULT_WINDOW` blocks, it is retired, unless it is the last one.
     """
 
     def __init__(self, client: Client) -> None:
         self._client = client
         self._failed_on: defaultdict[int, list[str]] = defaultdict(list)
-        self._blamed: defaultdict[str, int] = defaultdict(int)
+        self._blamed: defaultdict[str, list[int]] = defaultdict(list)
+        self._computed = 0
+        self._workers = 1
         self._last: dict[str, MachineFaultError] = {}
 
     def others(self, number: int, key: str, fault: MachineFaultError) -> list[str]:
@@ -52,15 +60,21 @@ class WorkerFaults:
             workers = thread_counts(self._client, THREAD_COUNT_TIMEOUT_S)
         except (OSError, TimeoutError):
             return []
+        self._workers = len(workers)
         machines = {_machine(failed) for failed in failed_on}
         left = [each for each in workers if each not in failed_on]
         return [each for each in left if _machine(each) not in machines] or left
 
     def computed(self, number: int) -> None:
         """Note that a block was computed; retire workers that failed too many of these."""
+        self._computed += 1
+        since = self._computed - FAULT_WINDOW * self._workers
         for worker in set(self._failed_on.pop(number, ())) - {UNKNOWN}:
-            self._blamed[worker] += 1
-            if self._blamed[worker] == MAX_WORKER_FAULTS:
+            recent = [at for at in self._blamed[worker] if at > since] + [self._computed]
+            self._blamed[worker] = recent
+            if len(recent) >= MAX_WORKER_FAULTS and self._workers > 1:
+                self._workers -= 1
+                self._blamed[worker] = []
                 self._retire(worker)
 
     def _retire(self, worker: str) -> None:

@@ -15,6 +15,7 @@ from sweep.errors import SweepError
 from sweep.execution.limits import TIME_LIMIT_S
 from sweep.integrity.damage import BlockDamage, Damage
 from sweep.integrity.stored_values import computable
+from sweep.isolation.child_process import OUTSIDE_SIGNALS
 from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plan.cell_selection import selection_text
@@ -25,9 +26,6 @@ from sweep.plan.schema import Variable
 from sweep.store.blocks import receipts, region
 from sweep.store.receipt import Receipt
 from sweep.store.run_store import RunStore
-
-OUTSIDE_SIGNALS = ("SIGKILL", "SIGTERM", "SIGBUS", "SIGHUP", "SIGINT", "SIGXCPU")
-"""Signals that the system or its users send, too little memory or space among their reasons."""
 
 FLAGS = {
     "detection": (DetectionStatus.failed, DetectionStatus.crashed),

@@ -19,11 +19,11 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
-from pathlib import Path
 from typing import IO, Any, Self
 
 from sweep.errors import SweepError
 from sweep.evaluation.machine_faults import machine_fault
+from sweep.isolation.machine_memory import be_killed_before_others
 
 SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
@@ -35,6 +35,10 @@ SINGLE_THREADED = {
 
 GRACE_S = 30.0
 """How long after its limit a child that did not end itself is killed."""
+
+OUTSIDE_SIGNALS = ("SIGKILL", "SIGTERM", "SIGBUS", "SIGHUP", "SIGINT", "SIGXCPU")
+"""Signals that the system or its users send, too little memory or space among their reasons: what
+a scene's data may cause is SIGSEGV, SIGABRT, SIGFPE, SIGILL, an exit status."""
 
 _LENGTH = struct.Struct("<Q")
 
@@ -53,6 +57,11 @@ class ChildDiedError(Exception):
     def __init__(self, how: str, *, timed_out: bool = False) -> None:
         super().__init__(how)
         self.timed_out = timed_out
+
+    @property
+    def from_outside(self) -> bool:
+        """Whether a signal ended it that no scene's data can cause."""
+        return str(self) in OUTSIDE_SIGNALS
 
 
 class ChildRaisedError(Exception):
@@ -178,9 +187,7 @@ def serve(module: str) -> None:
     # What libraries print must not mix with the answers.
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    # If memory runs out, the system kills this process first.
-    with contextlib.suppress(OSError):
-        Path("/proc/self/oom_score_adj").write_text("1000")
+    be_killed_before_others(1000)
     with contextlib.suppress(Exception):
         importlib.import_module(module)  # an error is raised by the call that needs it
     # Numba is slow to import, and the caller needs none of it.

@@ -24,8 +24,11 @@ from sweep.evaluation.cells import run_cells
 from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.results import CellsResult, Failure, concatenate
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
+from sweep.isolation.machine_memory import explained, memory_kills
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.plan.cell_selection import selection_text
 from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import scene_axes
 
 WHOLE, PIECE, PART = 1 / 4, 1 / 16, 1 / 8
 """Shares of a block's time limit: for the block, for a piece of it, for a part of a scene."""
@@ -61,6 +64,7 @@ class _IsolatedCells:
         self._pipeline = pipeline
         self.limit_s = limit_s
         self._child: Child | None = None
+        self._kills = memory_kills()
 
     def run(self, share: float, *arguments: Any) -> CellsResult:
         """Call ``run_cells`` with a share of the time limit.
@@ -80,8 +84,9 @@ class _IsolatedCells:
                 child.call(_hold, self._pipeline, limit_s=HOLD_S)
             except (ChildDiedError, ChildRaisedError) as error:
                 child.close()
+                how = explained(last_line(error), self._kills)
                 raise local_fault(
-                    f"a child process ended before it computed anything: {last_line(error)}"
+                    f"a child process ended before it computed anything: {how}"
                 ) from None
             self._child = child
             limit_s += min(LOADING * self.limit_s, LOADING_S)
@@ -91,6 +96,17 @@ class _IsolatedCells:
             self._child = None
             raise
         return result
+
+    def fault(self, death: ChildDiedError, indices: Sequence[NDArray[np.intp]]) -> Exception:
+        """Return the machine's fault that ended the child again while it computed one scene."""
+        scene = selection_text({
+            axis.name: axis.values[int(index[0])]
+            for axis, index in zip(scene_axes(self._pipeline), indices, strict=True)
+        })
+        return local_fault(
+            f"two processes that computed one scene were ended by {explained(death, self._kills)}; "
+            f"it is --at {scene}"
+        )
 
     def close(self) -> None:
         """End the child process."""
@@ -107,7 +123,8 @@ def run_cells_isolated(
     """Compute cells as `sweep.evaluation.cells.run_cells` does, also if they crash their process.
 
     A detection or estimate that crashes a child process is flagged ``crashed``, one that raises
-    ``failed``. All others have the same values as in one call, bit for bit.
+    ``failed``. A signal from outside, such as the system sends to a process that uses too much
+    memory, is the machine's fault. All others have the same values as in one call, bit for bit.
 
     Parameters
     ----------
@@ -123,7 +140,8 @@ def run_cells_isolated(
     Raises
     ------
     MachineFaultError
-        If no child process can be started, or one raises what no scene's data can cause.
+        If no child process can be started, one raises what no scene's data can cause, or one that
+        computes a single scene is ended twice by a signal from outside.
     """
     isolated = _IsolatedCells(pipeline, limit_s)
     done: dict[int, CellsResult] = {}
@@ -180,7 +198,7 @@ class _Scene:
         if rendered:
             try:
                 # Each part returns, so that together they have all the time.
-                result = self._isolated.run(1.0, self._indices, solved, searched)
+                result = self._undisturbed(1.0, solved, searched)
             except (ChildDiedError, ChildRaisedError) as error:
                 # Each part works alone, but not all of them together.
                 died = isinstance(error, ChildDiedError)
@@ -192,6 +210,26 @@ class _Scene:
         result.failures += self._failures
         return result
 
+    def _undisturbed(
+        self, share: float, solved: NDArray[np.bool_], searched: NDArray[np.bool_]
+    ) -> CellsResult:
+        """Compute parts of the scene, again if a signal from outside ends it.
+
+        Raises
+        ------
+        MachineFaultError
+            If one does so again, which is no chance.
+        """
+        for last in (False, True):
+            try:
+                return self._isolated.run(share, self._indices, solved, searched)
+            except ChildDiedError as death:
+                if not death.from_outside:
+                    raise
+                if last:
+                    raise self._isolated.fault(death, self._indices) from None
+        raise AssertionError(share)
+
     def _works(self, stage: str, setting: int | None = None, estimator: int | None = None) -> bool:
         """Return whether a part of the scene can be computed; note why if it cannot."""
         solve, search = np.zeros_like(self._need), np.zeros_like(self._need[..., 0])
@@ -201,14 +239,13 @@ class _Scene:
             search[0, setting] = True
         for last in (False, True):
             try:
-                self._isolated.run(self._share, self._indices, solve, search)
+                self._undisturbed(self._share, solve, search)
             except ChildRaisedError as error:
                 self._failures.append(Failure(0, stage, str(error), setting, estimator))
                 return False
             except ChildDiedError as death:
                 if death.timed_out:
                     self._share = max(self._share / 2, MIN_S / self._isolated.limit_s)
-                # A process may also be killed from outside; twice is no chance.
                 if death.timed_out or last:
                     self._failures.append(
                         Failure(0, stage, str(death), setting, estimator, crashed=True)

@@ -11,7 +11,6 @@ import contextlib
 import os
 import re
 import stat
-import sys
 import tempfile
 import uuid
 import weakref
@@ -29,6 +28,7 @@ from sweep.messages import plain
 from sweep.store.checksums import DigestingStore
 from sweep.store.durability import DurableStore
 from sweep.store.manifest import put
+from sweep.store.zarr_settings import check_zarr
 from sweep.store.zarr_sync import sync
 
 POINTER = "sweep_run"
@@ -118,6 +118,7 @@ def checked_url(url: str) -> str:
 
 def storage_at(url: str, *, read_only: bool) -> Store:
     """Return the Zarr storage at a URL, whatever lies there."""
+    check_zarr()
     if not is_remote(url):
         return LocalStore(url, read_only=read_only)
     try:
@@ -131,18 +132,9 @@ def storage_at(url: str, *, read_only: bool) -> Store:
         raise StoreError(f"{url}: cannot be reached: {reason_of(error)}") from None
 
 
-def check_assertions() -> None:
-    """Raise StoreError if Python runs without assertions: Zarr reads its groups in one of them."""
-    if sys.flags.optimize:
-        raise StoreError(
-            "Zarr cannot read groups where Python leaves out assertions; unset PYTHONOPTIMIZE, and "
-            "run Python without -O"
-        )
-
-
 def open_group(storage: Store, mode: str) -> zarr.Group:
     """Open the root group of a storage."""
-    check_assertions()
+    check_zarr()
     return zarr.open_group(
         storage, mode=mode, zarr_format=3, use_consolidated=False  # type: ignore[arg-type]
     )
@@ -201,6 +193,7 @@ def open_storage(url: str, mode: str = "r", *, durable: bool = False) -> Digesti
         raise StoreError(f"{url}: store not found{_similar(url)}")
     if is_remote(url):
         return DigestingStore(storage_at(f"{url}/{remote_run_id(url)}", read_only=mode == "r"))
+    check_zarr()
     kind = DurableStore if durable else LocalStore
     try:
         if not stat.S_ISDIR(Path(url).stat().st_mode):
@@ -247,7 +240,7 @@ def check_writable(url: str) -> None:
     StoreError
         If nothing can be written there, or it is inside another store.
     """
-    check_assertions()
+    check_zarr()
     if is_remote(checked_url(url)):
         if url.partition("://")[0].lower() in ("http", "https"):
             raise StoreError(f"{url}: can only be read; choose a path or s3://")

@@ -48,9 +48,18 @@ ENVIRONMENTS = {
     "a folder that is gone": ("cd gone && rmdir ../gone;", "", {}),
     "unknown windows": ("", "", {"MPLBACKEND": "nonsense"}),
     "a strange time zone": ("", "", {"TZ": ":/dev/zero"}),
+    **{f"Zarr's {name} {value}": ("", "", {f"ZARR_{name}": value}) for name, value in (
+        ("ASYNC__CONCURRENCY", "x"), ("ASYNC__CONCURRENCY", "-1"), ("ASYNC__TIMEOUT", "x"),
+        ("THREADING__MAX_WORKERS", "x"), ("ARRAY__ORDER", "Q"), ("JSON_INDENT", "x"),
+        ("CODECS__BYTES", "none"), ("CODEC_PIPELINE__BATCH_SIZE", "x"), ("BUFFER", "none"),
+    )},
+    "no threads of Numba": ("", "", {"NUMBA_NUM_THREADS": "0"}),
+    "features that OpenCV knows not": ("", "", {"OPENCV_FOR_THREADS_NUM": "x"}),
 }
 
-QUICK = (("no home", "status"), ("ASCII", "status"))
+QUICK = (
+    ("no home", "status"), ("ASCII", "status"), ("Zarr's THREADING__MAX_WORKERS x", "verify"),
+)
 
 
 def cases():
@@ -80,3 +89,6 @@ def test_a_command_works_or_is_refused_in_one_line(environment, command, finishe
     lines = done.stderr.decode(errors="replace").splitlines()
     assert done.returncode in (0, 1, 2)
     assert len(lines) == (1 if done.returncode else 0), lines
+    if lines and environment.startswith("Zarr's"):
+        assert done.returncode == 2  # not 1: the store is not damaged
+        assert next(iter(changes)) in lines[0]

@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import itertools
 import logging
 import socket
 import time
@@ -20,6 +21,7 @@ from sweep.execution.distributed_internals import worker_states
 from sweep.execution.in_flight import BlocksInFlight
 from sweep.execution.runner import execute
 from sweep.execution.tally import Tally
+from sweep.isolation import machine_memory
 from sweep.isolation.interrupts import Interrupts
 from sweep.store.lifecycle import create_store
 from sweep.store.lock import locked
@@ -202,17 +204,26 @@ class Identity:
 
     status = "running"
 
-    def __init__(self, *states):
+    def __init__(self, *states, dying=False):
         self.scheduler = self
         self._states = states
+        self._deaths = [(0.0, {"action": "add-worker"}), (0.0, "of another kind"),
+                        (0.0, {"action": "remove-worker", "expected": True})]
+        self._dying = dying
 
     def identity(self):
         raise AssertionError("asked through sync")
 
+    def events(self, topic):
+        raise AssertionError(topic)
+
     def sync(self, question, **_):
-        assert question == self.identity
         if self._states == (None,):
             raise TimeoutError
+        if question == self.events:
+            if self._dying:
+                self._deaths.append((0.0, {"action": "remove-worker", "expected": False}))
+            return self._deaths
         return {"workers": {str(k): {"status": state} for k, state in enumerate(self._states)}}
 
 
@@ -237,6 +248,24 @@ def test_run_without_progress_says_why_once_in_a_while(states, line, monkeypatch
     watch.finished()
     watch.check(8)
     assert capsys.readouterr().err == ""
+
+
+def check_until(watch, deadline):
+    while time.monotonic() < deadline:
+        watch.check(8)
+
+
+def test_run_whose_workers_die_again_and_again_ends_in_a_line(monkeypatch):
+    monkeypatch.setattr(stall, "STALL_S", 0.1)
+    monkeypatch.setattr(stall, "STATES_INTERVAL_S", 0.01)
+    kills = itertools.count()
+    for counted, reason in ((lambda: 7, "if by SIGKILL, as where memory runs out, use fewer"),
+                            (lambda: next(kills), r"SIGKILL, because memory ran out \([0-9,]+ MB")):
+        monkeypatch.setattr(machine_memory, "memory_kills", counted)
+        monkeypatch.setattr(stall, "memory_kills", counted)
+        watch = stall.StallWatch(Identity("running", "running", dying=True), 600.0)
+        with pytest.raises(RunError, match=f"workers died [0-9]+ times meanwhile; {reason}"):
+            check_until(watch, time.monotonic() + 10)
 
 
 def test_run_whose_workers_are_all_paused_ends_in_a_line(monkeypatch, tmp_path):

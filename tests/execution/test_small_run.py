@@ -9,7 +9,7 @@ from distributed import Client
 
 from support.here import Here
 from support.stores import by_hand, same
-from sweep.errors import RunError, StoreError
+from sweep.errors import MachineFaultError, RunError, StoreReplacedError
 from sweep.execution import small_run
 from sweep.execution.runner import execute, recompute
 from sweep.execution.tally import Tally
@@ -98,6 +98,9 @@ class Failing(Here):
     def call(self, *_, **__):
         raise self._error
 
+    def restart(self):
+        """It would fail again."""
+
 
 def compute(store, child):
     with child, Interrupts() as interrupts:
@@ -109,7 +112,7 @@ def compute(store, child):
 def test_block_that_ends_its_process_each_time_is_named(undisturbed, monkeypatch):
     monkeypatch.setattr(small_run, "MAX_DEATHS", 1)
     monkeypatch.setattr(small_run, "compute_block", suicide)
-    failed = r"1 blocks failed\n  block 0-2,0-6: its process ended: SIGKILL"
+    failed = r"block 0-2,0-6: its process ended: SIGKILL, as where memory runs out \(limit "
     with pytest.raises(RunError, match=failed):
         compute(open_store(undisturbed), Child())
 
@@ -117,7 +120,8 @@ def test_block_that_ends_its_process_each_time_is_named(undisturbed, monkeypatch
 @pytest.mark.parametrize(("raised", "error", "reason"), [
     (ChildRaisedError("Traceback:\n  ...\nZeroDivisionError: no"), RunError,
      r"1 blocks failed\n  block 0-2,0-6: ZeroDivisionError: no"),
-    (StoreError("full"), StoreError, "full"),
+    (StoreReplacedError("moved"), StoreReplacedError, "moved"),
+    (MachineFaultError("full", "here"), RunError, "0-2,0-6: machine fault on here: full"),
 ])
 def test_block_that_fails_is_named(raised, error, reason, undisturbed):
     with pytest.raises(error, match=reason):

@@ -10,10 +10,12 @@ import sweep
 from support import machine_faults
 from support.stores import by_hand, same
 from sweep.errors import MachineFaultError, RunError, StoreError
+from sweep.execution import worker_faults
 from sweep.execution.block_task import compute_block
 from sweep.execution.finalize import close
 from sweep.execution.in_flight import BlocksInFlight
 from sweep.execution.tally import Tally
+from sweep.execution.worker_faults import WorkerFaults
 from sweep.isolation.interrupts import Interrupts
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.store.blocks import committed
@@ -103,6 +105,57 @@ def test_worker_whose_machine_is_at_fault_is_used_no_more(
     two_workers.run(machine_faults.clear, workers=[sound])
     assert run_on(two_workers, tmp_path / "none.zarr") == 0
     assert same(tmp_path / "none.zarr", undisturbed)
+
+
+def test_worker_that_cannot_write_the_store_is_used_no_more(
+    tmp_path, undisturbed, two_workers, capfd
+):
+    faulty, sound = two_workers.nthreads()
+    url = tmp_path / "one.zarr"
+    two_workers.run(machine_faults.inject, "disk", "set", 5, workers=[faulty])
+    assert run_on(two_workers, url) == 0
+    assert same(url, undisturbed)
+    assert not list(url.glob("commits/receipt/begun/*"))
+    (line,) = capfd.readouterr().err.splitlines()
+    assert f"worker {faulty} on " in line
+    assert "the last fault: cannot be written: No space left on device" in line
+    # Nobody is left to whom blocks could be given.
+    two_workers.run(machine_faults.inject, "disk", "set", 0, workers=[sound])
+    with pytest.raises(RunError) as raised:
+        run_on(two_workers, tmp_path / "none.zarr")
+    (line,) = str(raised.value).splitlines()
+    assert ": cannot be written: No space left on device" in line
+    two_workers.run(machine_faults.clear, workers=[sound])
+    assert run_on(two_workers, tmp_path / "none.zarr") == 0
+    assert same(tmp_path / "none.zarr", undisturbed)
+
+
+def test_only_a_worker_that_fails_much_of_what_others_compute_is_retired(monkeypatch):
+    retired = []
+    monkeypatch.setattr(worker_faults, "thread_counts", lambda *_: dict.fromkeys("ab", 1))
+    monkeypatch.setattr(worker_faults, "worker_that_failed", lambda _, key: key)
+    monkeypatch.setattr(WorkerFaults, "_retire", lambda _, worker: retired.append(worker))
+    fault = MachineFaultError("full", "here")
+    seldom = WorkerFaults(None)
+    for number in range(300):
+        if number % 10 == 0:
+            assert seldom.others(number, "a", fault) == ["b"]
+        seldom.computed(number)
+    assert retired == []
+    often = WorkerFaults(None)
+    for number in range(30):
+        others = often.others(number, "ab"[number % 2], fault)
+        assert others == ["ba"[number % 2]]
+        often.computed(number)
+        monkeypatch.setattr(worker_faults, "thread_counts",
+                            lambda *_: dict.fromkeys(set("ab") - set(retired), 1))
+        if retired:
+            break
+    assert retired == ["a"]
+    for number in range(30, 40):  # the last one stays
+        assert often.others(number, "b", fault) == []
+        often.computed(number)
+    assert retired == ["a"]
 
 
 def outcome(client, url):

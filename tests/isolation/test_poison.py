@@ -46,7 +46,7 @@ LIMIT_S = 40
 EXTENTS = (1, 1, 20)
 """Blocks of the short grid: block k has the scenes 20 k to 20 k + 19."""
 
-SIGNALS = {"segv": "SIGSEGV", "abort": "SIGABRT", "kill": "SIGKILL"}
+SIGNALS = {"segv": "SIGSEGV", "abort": "SIGABRT", "ill": "SIGILL"}
 ENDLESS = ("sleep", "spin", "hold")
 
 
@@ -252,7 +252,7 @@ def test_poison_does_nothing_where_its_scene_is_not_asked_for(tmp_path):
     path.write_text(TEXT)
     inert = [
         Poison(3, "scene", "segv"), Poison(4, "detection", "abort", SUBPIX),
-        Poison(5, "estimation", "kill", (), ITERATIVE), Poison(33, "truth", "exit"),
+        Poison(5, "estimation", "ill", (), ITERATIVE), Poison(33, "truth", "exit"),
     ]
     digests = []
     for poisons in ([], inert):
@@ -288,7 +288,7 @@ FEW = [Poison(59, "detection", "abort", SUBPIX), Poison(50, "detection", "raise"
 MANY = [
     # First of a block; last and the one before it; one that does not end anything between.
     Poison(20, "scene", "segv"),
-    Poison(58, "scene", "kill"), Poison(59, "detection", "abort", SUBPIX),
+    Poison(58, "scene", "ill"), Poison(59, "detection", "abort", SUBPIX),
     Poison(50, "detection", "raise", SUBPIX),
     Poison(70, "estimation", "segv", (), ITERATIVE),
     Poison(105, "truth", "exit"),
@@ -315,6 +315,24 @@ def test_scenes_that_end_their_process_are_found_and_no_other_is_touched(
     print(f"{seconds:.1f} s; deaths: {kinds}")
     assert committed(store) == set(range(6))
     see_status(url, pipeline, poisons)
+
+
+@pytest.mark.long
+def test_scene_whose_process_is_killed_from_outside_is_no_result(pipeline, clean, tmp_path):
+    """As by the system where memory runs out: the run says so, and another one computes it."""
+    url = str(tmp_path / "poisoned.zarr")
+    store = create_store(url, pipeline, EXTENTS)
+    poisons = [Poison(59, "detection", "kill", SUBPIX)]
+    ran, seconds, _ = run_poisoned(tmp_path, TEXT, poisons, "--workers", 2)
+    print(f"{seconds:.1f} s")
+    assert ran.returncode == 1
+    (line,) = ran.stderr.splitlines()
+    assert "SIGKILL, as where memory runs out (limit " in line
+    assert "use fewer workers, or give them more memory; it is --at distance_m=" in line
+    assert committed(store) == set(range(6)) - {block_of(store, 59)}
+    ran, _, _ = run_poisoned(tmp_path, TEXT, [])
+    assert (ran.returncode, ran.stderr) == (0, "")
+    assert differing(url, clean, pipeline, []) == {}
 
 
 @pytest.mark.long
@@ -361,14 +379,14 @@ SCENES = 10_000
 
 AMONG_THOUSANDS = {
     "one that ends": [Poison(6_543, "scene", "segv")],
-    "one that is killed in the search": [Poison(0, "detection", "kill")],
+    "one that ends in the search": [Poison(0, "detection", "ill")],
     "one estimator that aborts": [Poison(9_999, "estimation", "abort", (), ITERATIVE)],
     "three in three ways": [
         Poison(123, "scene", "segv"), Poison(4_567, "detection", "abort", SUBPIX),
-        Poison(8_901, "estimation", "kill", (), ITERATIVE),
+        Poison(8_901, "estimation", "ill", (), ITERATIVE),
     ],
     "two neighbours and a third": [
-        Poison(5_000, "scene", "kill"), Poison(5_001, "detection", "segv", SUBPIX),
+        Poison(5_000, "scene", "ill"), Poison(5_001, "detection", "segv", SUBPIX),
         Poison(7_250, "truth", "abort"),
     ],
     "first, middle and last of a block": [

@@ -9,7 +9,7 @@ import pytest
 
 import sweep
 from sweep import installation
-from sweep.errors import StoreError
+from sweep.errors import MachineFaultError, StoreError
 from sweep.execution.block_task import compute_block
 from sweep.execution.reuse import match
 from sweep.execution.runner import execute
@@ -60,7 +60,7 @@ def test_another_build_of_the_same_version_is_refused_by_run_reuse_and_workers(
         execute(PIPELINE, url)
     with pytest.raises(StoreError, match=r"builds\.opencv: the store has"):
         match(PIPELINE, open_store(url))
-    with pytest.raises(StoreError, match=f"a worker has builds.opencv {here}") as raised:
+    with pytest.raises(MachineFaultError, match=f"a worker has builds.opencv {here}") as raised:
         compute_block(url, store.run_id, store.blocks[0])
     assert len(str(raised.value).splitlines()) == 1
 
@@ -93,10 +93,10 @@ def test_opencv_that_contradicts_its_metadata_is_refused_by_library_and_workers(
         lambda: sweep.run(PIPELINE, store=tmp_path / "new.zarr"),
         lambda: compute_block(url, store.run_id, store.blocks[0]),
     ):
-        with pytest.raises(StoreError) as raised:
+        with pytest.raises((StoreError, MachineFaultError)) as raised:
             call()
         (line,) = str(raised.value).splitlines()
-        assert line.startswith(f"OpenCV {loaded} is loaded, but opencv-contrib-python-headless ")
+        assert f"OpenCV {loaded} is loaded, but opencv-contrib-python-headless " in line
         assert "`pip install --force-reinstall opencv-contrib-python-headless`" in line
     assert not (tmp_path / "new.zarr").exists()
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 from numba.core.errors import LoweringError
+from zarr.storage import LocalStore
 
 from sweep.evaluation import cells, search
 
@@ -39,17 +40,24 @@ ERRORS = {
 PLACES = {
     "build_scenes": cells, "detections_for": cells, "build": cells, "render_all": search,
     "classify": search,
+    "set": LocalStore,
 }
+"""Functions and what they belong to; "set" writes a file of a store."""
 
 
 def inject(fault, place, at):
-    """From the call number ``at`` on, a function that scenes need fails as on a faulty machine."""
+    """From the call number ``at`` on, a function that blocks need fails as on a faulty machine.
+
+    What is written to a store fails by a fault of the disk, whatever the ``fault``.
+    """
     _before["limit"] = resource.getrlimit(resource.RLIMIT_NOFILE)
     _before.update({name: getattr(module, name) for name, module in PLACES.items()})
     if fault == "descriptors":
         used = max(int(path.name) for path in Path("/proc/self/fd").iterdir())
         resource.setrlimit(resource.RLIMIT_NOFILE, (used - 2, _before["limit"][1]))
         return
+    if place == "set":
+        fault = "disk"
     real, calls = _before[place], itertools.count()
 
     def faulty(*arguments, **options):

@@ -54,6 +54,7 @@ def _raise():
 WAYS = {
     "segv": lambda: ctypes.string_at(0),
     "abort": os.abort,
+    "ill": lambda: os.kill(os.getpid(), signal.SIGILL),
     "kill": lambda: os.kill(os.getpid(), signal.SIGKILL),
     "exit": lambda: os._exit(3),
     "sleep": _sleep,

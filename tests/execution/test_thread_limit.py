@@ -1,0 +1,71 @@
+"""Threads that the system allows: too few for a cluster are told before it is started."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sweep.errors import RunError
+from sweep.execution import thread_limit
+from sweep.execution.thread_limit import check_threads, threads_left
+from sweep.isolation import control_groups as groups
+from sweep.isolation.machine_memory import memory_kills, memory_limit_bytes
+
+TOP = Path(__file__).parents[2]
+
+LEFT = """
+from sweep.execution import thread_limit
+{change}
+print(thread_limit.threads_left())
+"""
+
+
+def allowed(user, limit, change=""):
+    """Return what a process of another user, which may read all files, says is left of a limit."""
+    kept = "+dac_override,+dac_read_search"
+    done = subprocess.run(
+        ["setpriv", f"--reuid={user}", "--clear-groups", f"--inh-caps={kept}",
+         f"--ambient-caps={kept}", "bash", "-c", f"ulimit -u {limit}; exec {sys.executable} -"],
+        input=LEFT.format(change=change), capture_output=True, text=True, check=False, timeout=60,
+        env={**os.environ, "PYTHONPATH": str(TOP)},
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may become another user")
+def test_threads_of_a_user_count_against_the_limit():
+    assert int(allowed(54322, 30)) == 29  # the process itself
+    # As if reading all files were a privilege that exempts.
+    assert allowed(54322, 30, "thread_limit.PRIVILEGES = 1 << 1") == "None"
+
+
+@pytest.fixture
+def container(tmp_path, monkeypatch):
+    """The files of a container's control group, version 2, below the group that is limited."""
+    inner = tmp_path / "pod" / "inner"
+    inner.mkdir(parents=True)
+    text_of = groups.text_of
+    monkeypatch.setattr(groups, "MOUNT", tmp_path)
+    monkeypatch.setattr(groups, "text_of", lambda path: (
+        "0::/pod/inner\n" if str(path) == "/proc/self/cgroup" else text_of(path)
+    ))
+    return tmp_path / "pod"
+
+
+def test_limits_of_a_container_are_read(container, monkeypatch):
+    monkeypatch.setattr(thread_limit, "_left_to_user", lambda: None)
+    (container / "inner" / "pids.max").write_text("max\n")
+    assert threads_left() is None
+    (container / "pids.max").write_text("50\n")
+    (container / "pids.current").write_text("12\n")
+    assert threads_left() == 38
+    check_threads(2)
+    with pytest.raises(RunError, match=r"3 worker processes .* need 45 threads, .* allows 38 more"):
+        check_threads(3)
+    (container / "memory.max").write_text("700000000\n")
+    assert memory_limit_bytes() == 700_000_000
+    (container / "inner" / "memory.events").write_text("low 0\noom 5\noom_kill 3\n")
+    assert memory_kills() == 3

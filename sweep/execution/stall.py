@@ -95,10 +95,10 @@ class StallWatch:
                 "the memory that they may; give them more (`dask worker --memory-limit`), or set "
                 "distributed.worker.memory.pause to false in Dask's configuration there"
             )
-        told = (
+        line = (
             f"{blocks} blocks are with {len(states)} workers, which compute; a block ends after "
             f"at most {self._time_limit_s:.0f} s (time limit)"
         )
         if now > self._since + self._time_limit_s:
-            told += ": they hang, or do other work first; their logs may tell"
-        return told
+            line += ": they hang, or do other work first; their logs may tell"
+        return line

@@ -35,16 +35,19 @@ if TYPE_CHECKING:
     import xarray as xr
     from distributed import Client
 
+    from sweep.analysis.flag_labels import decode_flags
     from sweep.execution.cluster import Cluster
     from sweep.execution.progress import Progress
     from sweep.plan.experiment import Pipeline
 
 __all__ = [
     "ArgumentError", "DatasetError", "Pipeline", "PipelineError", "Progress", "RunError",
-    "StoreError", "SweepError", "__version__", "open", "run",
+    "StoreError", "SweepError", "__version__", "decode_flags",
+    "open", "run",
 ]
 
-_IMPORTED_ON_USE = {"Pipeline": "sweep.plan.experiment", "Progress": "sweep.execution.progress"}
+_IMPORTED_ON_USE = {"Pipeline": "sweep.plan.experiment", "Progress": "sweep.execution.progress",
+                    "decode_flags": "sweep.analysis.flag_labels"}
 
 Arguments = ParamSpec("Arguments")
 Returned = TypeVar("Returned")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -39,18 +41,28 @@ def is_grid_axis(name: object, results: xr.Dataset) -> bool:
 
 def fingerprint_of(results: xr.Dataset) -> Mapping[str, Any]:
     """Return the fingerprint in a dataset's attributes; empty if they have none."""
-    metadata = results.attrs.get("sweep")
-    fingerprint = metadata.get("fingerprint") if isinstance(metadata, Mapping) else None
+    fingerprint = _run_metadata(results).get("fingerprint")
     return fingerprint if isinstance(fingerprint, Mapping) else {}
 
 
 def pipeline_text(results: xr.Dataset) -> str:
     """Return the text of the pipeline in a dataset's attributes; KeyError if they have none."""
-    metadata = results.attrs.get("sweep")
-    store_format = metadata.get("format") if isinstance(metadata, Mapping) else None
+    store_format = _run_metadata(results).get("format")
     return stored_text(
         results.attrs["pipeline"], SQUARE_FORMAT if store_format is None else store_format
     )
+
+
+def _run_metadata(results: xr.Dataset) -> Mapping[str, Any]:
+    """Return what a dataset's attributes record of its run.
+
+    It is JSON as `sweep.open` returns it, a mapping as Zarr has it; empty if there is none.
+    """
+    metadata = results.attrs.get("sweep")
+    if isinstance(metadata, str):
+        with contextlib.suppress(ValueError, RecursionError):
+            metadata = json.loads(metadata)
+    return metadata if isinstance(metadata, Mapping) else {}
 
 
 def as_names(per: Sequence[str]) -> tuple[str, ...]:

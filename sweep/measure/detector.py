@@ -65,7 +65,7 @@ class DetectorSetting:
     )
     cornerRefinementMethod: str = parameter(
         "none", "refinement of the corners (apriltag also replaces the search for candidates)",
-        choices=tuple(REFINEMENTS),
+        choices=tuple(REFINEMENTS), prefix="CORNER_REFINE_", numbers=tuple(REFINEMENTS.items()),
     )
     cornerRefinementWinSize: int = parameter(
         5, "largest half window of the sub-pixel refinement", unit="px", low=1, high=9999

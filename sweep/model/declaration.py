@@ -23,6 +23,8 @@ class Declaration:
     high: float = math.inf
     open_low: bool = False
     choices: tuple[str, ...] = ()
+    prefix: str = ""
+    numbers: tuple[tuple[str, int], ...] = ()
     drawable: bool = False
     lengths: tuple[int, ...] = ()
 
@@ -38,6 +40,29 @@ class Declaration:
         if math.isfinite(self.high):
             return f"at most {high}"
         return ""
+
+    def choice(self, word: str) -> str | None:
+        """Return the choice that a word names, however OpenCV or the user spells it, or None.
+
+        Letters' cases do not count, nor do the module and the prefix of OpenCV's names.
+
+        Examples
+        --------
+        >>> solver = Declaration("", choices=("ippe", "ippe_square"), prefix="SOLVEPNP_")
+        >>> solver.choice("cv2.SOLVEPNP_IPPE_SQUARE"), solver.choice("Ippe"), solver.choice("p3p")
+        ('ippe_square', 'ippe', None)
+        """
+        if word in self.choices:
+            return word
+        bare = self._bare(word.strip().replace("::", ".").rpartition(".")[2])
+        return next((choice for choice in self.choices if self._bare(choice) == bare), None)
+
+    def _bare(self, word: str) -> str:
+        return word.casefold().removeprefix(self.prefix.casefold())
+
+    def of_number(self, number: int) -> str:
+        """Return the choice that OpenCV has a number for; empty if there is none."""
+        return next((name for name, constant in self.numbers if constant == number), "")
 
     def admits(self, number: float) -> bool:
         """Return whether a finite number lies in the declared range."""

@@ -29,7 +29,9 @@ class Marker:
     """A marker's parameters."""
 
     dictionary: str = parameter(
-        "DICT_5X5_50", "the marker's dictionary, by OpenCV's name", choices=dictionary_names()
+        "DICT_5X5_50", "the marker's dictionary, by OpenCV's name", choices=dictionary_names(),
+        prefix="DICT_",
+        numbers=tuple((name, getattr(cv2.aruco, name)) for name in dictionary_names()),
     )
     marker_id: int = parameter(0, "the marker's ID in its dictionary", low=0, high=10**6)
     size_m: float = parameter(

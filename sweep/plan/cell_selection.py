@@ -12,7 +12,7 @@ from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.experiment import Pipeline
 from sweep.plan.overrides import displaced_by
 from sweep.plan.parameters import PARAMETERS
-from sweep.plan.toml_text import read_value
+from sweep.plan.toml_text import python_boolean, read_value
 
 _PART = re.compile(r"""(?:\[[^\]]*\]?|"[^"]*"?|[^,\["])+""")
 """A part between commas; commas within a list or within quotes do not separate."""
@@ -113,7 +113,7 @@ def _row(axis: Axis, written: str) -> int:
 
 def _value(name: str, written: str) -> Any:
     try:
-        value = read_value(written)
+        value = read_value(python_boolean(written))
     except ValueError:
         value = written
     if name != TRIAL:

@@ -13,7 +13,7 @@ from sweep.plan.alternatives import RIVALS
 from sweep.plan.axes import DISTRIBUTION_FORMS, TRIAL
 from sweep.plan.parameters import PARAMETERS
 from sweep.plan.reader import HEADER, is_zip, section_of
-from sweep.plan.toml_text import quoted_if_bare, read_value
+from sweep.plan.toml_text import python_boolean, quoted_if_bare, read_value
 
 _PX = ("fx_px", "fy_px")
 _SIDES = ("sensor_width_mm", "sensor_height_mm")
@@ -57,7 +57,7 @@ def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
             faults.append(f"{start}expected key=value, such as tilt_deg=45")
             continue
         try:
-            value = read_value(quoted_if_bare(written))
+            value = read_value(quoted_if_bare(python_boolean(written)))
         except ValueError:
             faults.append(f"{start}expected a TOML value, such as [0, 45] or 'text'")
             continue

@@ -13,6 +13,7 @@ from typing import Any
 from sweep.measure.bound import BoundSetting
 from sweep.measure.detector import DetectorSetting
 from sweep.measure.estimators import EstimatorSetting
+from sweep.messages import nearest
 from sweep.model.camera import Camera
 from sweep.model.declaration import Declaration
 from sweep.model.effects import Effects
@@ -89,13 +90,26 @@ class Parameter:
                 return float(value)
         elif str in self.types and isinstance(value, str):
             if self.name == "renderer":
-                fault = renderer_fault(value)
+                fault = renderer_fault(value.strip().lower())
                 if fault is None:
-                    return value
+                    return value.strip().lower()
                 raise ValueError(fault)
-            if value and (not self.declaration.choices or value in self.declaration.choices):
+            if self.declaration.choices:
+                choice = self.declaration.choice(value)
+                if choice is not None:
+                    return choice
+            elif value:
                 return value
-        raise ValueError(self.expected())
+        raise ValueError(self.expected() + self._hint(value))
+
+    def _hint(self, value: Any) -> str:
+        """Return the choice that a wrong value may stand for."""
+        choices = self.declaration.choices
+        if isinstance(value, str) and choices:
+            return nearest(value.removeprefix(self.declaration.prefix), choices)
+        if isinstance(value, int) and (name := self.declaration.of_number(value)):
+            return f"; OpenCV's constant {value} is {name}"
+        return ""
 
 
 def _is_number(value: Any) -> bool:

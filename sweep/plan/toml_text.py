@@ -68,6 +68,11 @@ def read_value(written: str) -> Any:
     return value
 
 
+def python_boolean(written: str) -> str:
+    """Return ``True`` and ``False`` as TOML writes them; anything else as it is."""
+    return written.lower() if written in ("True", "False") else written
+
+
 def quoted_if_bare(written: str) -> str:
     """Return a bare word, such as a solver's name, as a TOML string; anything else as it is."""
     if _BARE.fullmatch(written) and written not in ("true", "false", "inf", "nan"):

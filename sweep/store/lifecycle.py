@@ -6,6 +6,7 @@ store; a remote one exists once its URL points to it.
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import time
@@ -310,5 +311,7 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
         raise StoreError(
             f"{store.url}: damaged ({reason_of(error)}); `sweep verify --repair` repairs it"
         ) from None
+    # Text, as netCDF needs it.
+    dataset.attrs["sweep"] = json.dumps(dataset.attrs["sweep"])
     ordered = [variable.name for variable in SCHEMA if variable.name in dataset]
     return dataset.assign_coords(texts)[ordered]

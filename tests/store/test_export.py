@@ -1,0 +1,131 @@
+"""An opened store in the formats and words of others: netCDF, Zarr, tables, labelled flags."""
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import sweep
+from support.stores import by_hand
+from sweep.analysis import detection_rate
+from sweep.execution.finalize import close
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.plan.experiment import Pipeline
+from sweep.store.blocks import drop_block
+
+TEXT = """
+title = "Exported"
+[pose]
+jitter_px = 0.5
+roll_deg = { uniform = [0, 360] }
+[estimator]
+corner_noise_px = 0.3
+[axes]
+dictionary = ["DICT_4X4_50", "DICT_5X5_50"]
+side_px = [5, 60]
+guarded = [true, false]
+trial = 2
+"""
+
+ENGINES = {"scipy": ("scipy",), "netcdf4": ("netCDF4",), "h5netcdf": ("h5netcdf", "h5py")}
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory):
+    """A finished store, and one of which half the blocks are computed."""
+    folder = tmp_path_factory.mktemp("exported")
+    pipeline = Pipeline.from_text(TEXT, name="exported")
+    whole, half = str(folder / "whole.zarr"), str(folder / "half.zarr")
+    close(by_hand(whole, pipeline, (1, 2, 2)))
+    store = by_hand(half, pipeline, (1, 2, 2))
+    drop_block(store, store.blocks[1])
+    return whole, half
+
+
+@pytest.fixture(scope="module", params=["whole", "half"])
+def results(request, stores):
+    return sweep.open(stores[request.param == "half"])
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_an_opened_store_is_written_as_netcdf_and_read_again(engine, results, tmp_path):
+    for package in ENGINES[engine]:
+        pytest.importorskip(package)
+    path = tmp_path / "results.nc"
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "endian-ness")  # of netCDF4, on native numbers
+        results.to_netcdf(path, engine=engine)
+    with xr.open_dataset(path, engine=engine) as again:
+        assert set(again.variables) == set(results.variables)
+        for name, variable in results.variables.items():
+            there = again[name].transpose(*variable.dims)
+            if variable.dtype.kind in "OTU":
+                assert there.values.tolist() == variable.values.tolist(), name
+            else:
+                np.testing.assert_array_equal(there.values, variable.values, err_msg=str(name))
+        assert again.attrs["pipeline"] == TEXT
+        assert json.loads(again.attrs["sweep"]) == json.loads(results.attrs["sweep"])
+        xr.testing.assert_equal(
+            detection_rate(again, ("dictionary",)).transpose(...),
+            detection_rate(results, ("dictionary",)).compute())
+        assert (sweep.decode_flags(again).detection.values
+                == sweep.decode_flags(results).detection.transpose(
+                    *again.detection.dims).values).all()
+
+
+def test_an_opened_store_is_copied_as_zarr_and_as_a_table(results, tmp_path):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Consolidated metadata")
+        results.to_zarr(tmp_path / "copy.zarr")
+    with xr.open_zarr(tmp_path / "copy.zarr") as again:
+        np.testing.assert_array_equal(again.detection.values, results.detection.values)
+        assert json.loads(again.attrs["sweep"])["name"] == "exported"
+    table = results[["detection", "rotation_error_deg"]].to_dataframe()
+    assert len(table) == results.rotation_error_deg.size
+
+
+def words(results, name, flags):
+    return np.array([flags(value).name for value in results[name].values.ravel()]).reshape(
+        results[name].shape)
+
+
+def test_every_flag_is_told_in_words_and_all_else_stays(results):
+    told = sweep.decode_flags(results)
+    named = {"detection": DetectionStatus, "estimate": EstimateStatus, "flipped": Flipped}
+    for name, flags in named.items():
+        assert (told[name].values == words(results, name, flags)).all()
+        assert told[name].attrs.keys() == results[name].attrs.keys() - {
+            "flag_values", "flag_meanings"}
+    flagged = {name for name in results.data_vars if "flag_meanings" in results[name].attrs}
+    assert flagged >= named.keys()
+    xr.testing.assert_identical(
+        told.drop_vars(flagged).compute(), results.drop_vars(flagged).compute())
+    assert {told[name].dtype.kind for name in flagged} == {"U"}
+
+
+def test_labels_are_lazy_and_those_of_any_part(results):
+    told = sweep.decode_flags(results)
+    assert told.detection.chunks is not None
+    part = sweep.decode_flags(results.detection.isel(side_px=1, trial=[0]))
+    assert (part.values == told.detection.isel(side_px=1, trial=[0]).values).all()
+    masked = results.detection.where(results.side_px > 30)
+    assert masked.dtype.kind == "f"
+    again = sweep.decode_flags(masked).transpose(*told.detection.dims)
+    assert (again.isel(side_px=0) == "not_run").all()
+    assert (again.isel(side_px=1) == told.detection.isel(side_px=1)).all()
+    rates = told.detection.groupby("side_px").map(lambda each: (each == "detected").mean())
+    assert float(rates.sel(side_px=5)) == 0
+
+
+def test_a_value_of_a_later_version_is_unknown(results):
+    later = results.detection.copy(data=np.full(results.detection.shape, 77, dtype="u1"))
+    assert (sweep.decode_flags(later) == "unknown").all()
+
+
+def test_cf_xarray_reads_the_flags(results):
+    pytest.importorskip("cf_xarray")
+    found = results.detection.cf == "detected"
+    assert (found.values == (results.detection == 1).values).all()
+    assert results.estimate.cf.isin(["solved", "no_detection"]).shape == results.estimate.shape

@@ -25,17 +25,20 @@ def _execute(options: argparse.Namespace) -> int:
     from sweep.messages import byte_count, duration  # noqa: PLC0415
     from sweep.plan.active_parts import parts  # noqa: PLC0415
     from sweep.plan.camera_facts import camera_facts, notes  # noqa: PLC0415
+    from sweep.plan.pose_facts import pose_facts, pose_notes  # noqa: PLC0415
 
     announce_compilation(pipeline)
     listed = parts(pipeline)
     switches = [part.switch for part in listed if part.switch and part.active]
     expected, costs = forecast(pipeline, options.workers, switches)
+    views = pose_facts(pipeline)
     if options.json:
         print_json(
             {
                 "title": pipeline.title,
                 "camera": dataclasses.asdict(camera_facts(pipeline)),
-                "notes": notes(pipeline),
+                "notes": [*notes(pipeline), *pose_notes(pipeline, views)],
+                "views": views.ranges(),
                 "dimensions": {axis.name: len(axis) for axis in pipeline.axes},
                 **dataclasses.asdict(expected),
                 "parts": [
@@ -48,6 +51,9 @@ def _execute(options: argparse.Namespace) -> int:
     say(pipeline.heading)
     say(f"\nCamera\n  {camera_facts(pipeline).line()}")
     for line in notes(pipeline):
+        say(f"  {line}")
+    say(f"\nPoses\n  {views.line()}")
+    for line in pose_notes(pipeline, views):
         say(f"  {line}")
     say("\nDimensions")
     width = max((len(axis.name) for axis in pipeline.axes), default=0)

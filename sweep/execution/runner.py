@@ -41,8 +41,8 @@ from sweep.execution.work_left import block_s_of, demand_left, demand_of, thread
 from sweep.isolation.child_process import Child
 from sweep.isolation.interrupts import Interrupts
 from sweep.messages import notice
-from sweep.plan.camera_facts import notes
 from sweep.plan.experiment import Pipeline
+from sweep.plan.notes import notes
 from sweep.store.blocks import committed, drop_block
 from sweep.store.lifecycle import create_store, open_store, read_run_metadata, remove_store
 from sweep.store.locations import check_writable, checked_url, exists, is_remote, open_storage

@@ -28,7 +28,6 @@ from sweep.errors import (
     StoreError,
     SweepError,
 )
-from sweep.execution.limits import TIME_LIMIT_S
 from sweep.version import __version__
 
 if TYPE_CHECKING:
@@ -100,7 +99,7 @@ def run(
     durable: bool = False,
     yes: bool = False,
     progress: bool | Callable[[Progress], None] | None = None,
-    time_limit_s: float = TIME_LIMIT_S,
+    time_limit_s: float | None = None,
 ) -> xr.Dataset:
     """Run a pipeline into a store and return its results.
 
@@ -138,7 +137,8 @@ def run(
         True for a progress bar on stderr (lines if that is not a terminal), or a function that is
         called with a `Progress` after each block.
     time_limit_s
-        Block timeout in seconds: a pose that does not return within it is flagged ``crashed``.
+        Block timeout in seconds: a pose that does not return within it is flagged ``crashed``
+        (default: 600, or ten times a block's work if that is more, as in very long runs).
 
     Returns
     -------

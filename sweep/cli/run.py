@@ -29,8 +29,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help="copy the finished cells that this store shares with the experiment; may be repeated",
     )
     parser.add_argument(
-        "--time-limit", type=float, metavar="S", default=600.0, dest="time_limit_s",
-        help="block timeout in seconds (default: 600)",
+        "--time-limit", type=float, metavar="S", dest="time_limit_s",
+        help="block timeout in seconds (default: 600, or ten times a block's work)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing store")
     parser.add_argument(

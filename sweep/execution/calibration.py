@@ -18,6 +18,7 @@ from sweep.execution.limits import (
     BLOCKS_PER_WORKER,
     CALIBRATION_LIMIT_S,
     MAX_BLOCK_BYTES,
+    MAX_BLOCK_S,
     MAX_BLOCK_SCENES,
     MAX_BLOCK_SHARE,
     MAX_BLOCKS,
@@ -28,7 +29,7 @@ from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedErro
 from sweep.isolation.watchdog import compilation_s
 from sweep.plan.axes import Axis
 from sweep.plan.experiment import Pipeline
-from sweep.plan.grid import scene_axes
+from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import bytes_per_block
 
@@ -236,20 +237,36 @@ def sample(
     return [generator.integers(0, len(axis), count).astype(np.intp) for axis in axes]
 
 
-def block_work_s(total_s: float, workers: int, time_limit_s: float) -> float:
+def block_work_s(total_s: float, workers: int, time_limit_s: float | None = None) -> float:
     """Return the seconds of work in a block of a run that takes ``total_s`` of one worker.
 
-    About 2; more for large clusters and for long runs; less if there is little to do.
+    About 2; more for large clusters and for long runs; less if there is little to do, or if the
+    user gives a time limit of which it would be too large a share.
     """
     wanted = max(BLOCK_S, workers / BLOCKS_PER_S, total_s / MAX_BLOCKS)
-    longest = max(BLOCK_S, MAX_BLOCK_SHARE * time_limit_s)
     share = max(MIN_BLOCK_S, total_s / (workers * BLOCKS_PER_WORKER))
-    return min(wanted, longest, share)
+    return min(wanted, longest_block_s(time_limit_s), share)
+
+
+def longest_block_s(time_limit_s: float | None) -> float:
+    """Return the seconds of work that a block may take, under the user's time limit if any."""
+    if time_limit_s is None:
+        return MAX_BLOCK_S
+    return min(max(BLOCK_S, MAX_BLOCK_SHARE * time_limit_s), MAX_BLOCK_S)
+
+
+def block_time_limit_s(time_limit_s: float | None, work_s: float) -> float:
+    """Return the timeout of blocks of ``work_s``: the user's if there is one, else 600 s or more.
+
+    >>> block_time_limit_s(None, 2.0), block_time_limit_s(None, 500.0), block_time_limit_s(40, 2.0)
+    (600.0, 5000.0, 40)
+    """
+    return max(TIME_LIMIT_S, work_s / MAX_BLOCK_SHARE) if time_limit_s is None else time_limit_s
 
 
 def block_extents(
     pipeline: Pipeline, calibration: Calibration, workers: int, block_s: float | None = None,
-    time_limit_s: float = TIME_LIMIT_S,
+    time_limit_s: float | None = None,
 ) -> tuple[int, ...]:
     """Return the scenes of a block along each scene axis.
 
@@ -265,15 +282,33 @@ def block_extents(
     block_s
         Seconds of work in a block (default: :func:`block_work_s`).
     time_limit_s
-        Block timeout in seconds.
+        Block timeout in seconds, if the user gave one.
     """
-    axes = scene_axes(pipeline)
+    total_s = pipeline.size(Stage.scene) * calibration.scene_s
+    work_s = block_work_s(total_s, workers, time_limit_s) if block_s is None else block_s
+    most = min(MAX_BLOCK_SCENES, MAX_BLOCK_BYTES // bytes_per_block(pipeline, 1))
+    target = max(min(int(work_s / calibration.scene_s), most), 1)
+    extents = _cut(pipeline, calibration, target)
     if block_s is None:
-        total_s = pipeline.size(Stage.scene) * calibration.scene_s
-        block_s = block_work_s(total_s, workers, time_limit_s)
-    target = int(block_s / calibration.scene_s)
-    target = min(target, MAX_BLOCK_SCENES, MAX_BLOCK_BYTES // bytes_per_block(pipeline, 1))
-    target = max(target, 1)
+        # Blocks that fit into the axes are smaller than wanted, so that there may be more.
+        most = min(most, int(longest_block_s(time_limit_s) / calibration.scene_s))
+        while target < most and _count(pipeline, extents) > MAX_BLOCKS:
+            target = min(math.ceil(LARGER * target), most)
+            extents = _cut(pipeline, calibration, target)
+    return extents
+
+
+LARGER = 1.2
+"""By how much blocks are made larger until there are few enough."""
+
+
+def _count(pipeline: Pipeline, extents: tuple[int, ...]) -> int:
+    return len(Blocks(tuple(len(axis) for axis in scene_axes(pipeline)), extents))
+
+
+def _cut(pipeline: Pipeline, calibration: Calibration, target: int) -> tuple[int, ...]:
+    """Return the extents of blocks of at most ``target`` scenes."""
+    axes = scene_axes(pipeline)
     order = sorted(
         range(len(axes)),
         key=lambda k: (max(calibration.unevenness[k] - UNEVEN, 0.0), k),

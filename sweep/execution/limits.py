@@ -41,7 +41,8 @@ SMALL_RUN_LIMIT_S = 10.0
 # Time limits
 
 TIME_LIMIT_S = 600.0
-"""Block timeout in seconds; the search for a scene that never returns keeps within it."""
+"""Block timeout in seconds, more if blocks are long (:data:`MAX_BLOCK_SHARE`); the search for a
+scene that never returns keeps within it."""
 
 CALIBRATION_S = 0.6
 """Seconds spent on measuring what scenes cost before blocks are cut."""
@@ -98,9 +99,13 @@ larger clusters get larger blocks."""
 MAX_BLOCKS = 100_000
 """Blocks of a run, of about 25 files each: longer runs get larger blocks."""
 
+MAX_BLOCK_S = 3600.0
+"""Work that a block takes at most: jobs of clusters end after hours, and lose a block each. A
+run of 11 years of one processor has 100,000 of these; longer ones have more."""
+
 MAX_BLOCK_SHARE = 1 / 10
-"""Share of a block's time limit that its work is to take, whatever the cluster and the run: scenes
-may cost more than was measured, and a killed worker loses that much. It bounds the rest."""
+"""Share of a block's time limit that its work is to take: scenes may cost more than was measured.
+A time limit that the user gives bounds the work; else the work raises the limit."""
 
 BLOCKS_PER_WORKER = 6
 """With little work, blocks are cut smaller so that every worker has some until the end."""

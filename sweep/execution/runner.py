@@ -22,7 +22,12 @@ from sweep.errors import (
 )
 from sweep.execution import BLOCK_TASK
 from sweep.execution.affordability import check_affordable
-from sweep.execution.calibration import Calibration, block_extents, calibrate_isolated
+from sweep.execution.calibration import (
+    Calibration,
+    block_extents,
+    block_time_limit_s,
+    calibrate_isolated,
+)
 from sweep.execution.finalize import close
 from sweep.execution.limits import (
     CALIBRATION_S,
@@ -78,7 +83,7 @@ def execute(
     durable: bool = False,
     yes: bool = False,
     block_s: float | None = None,
-    time_limit_s: float = TIME_LIMIT_S,
+    time_limit_s: float | None = None,
     progress: ProgressReport | None = None,
     child: Child | None = None,
 ) -> Summary:
@@ -113,7 +118,8 @@ def execute(
         Seconds of work in a block (default: about 2; more on large clusters and in long runs,
         less if there is little to do).
     time_limit_s
-        Block timeout in seconds; the search for a scene that never returns keeps within it.
+        Block timeout in seconds; the search for a scene that never returns keeps within it
+        (default: 600, or ten times a block's work if that is more).
     progress
         Called before the first block and after each one.
     child
@@ -145,6 +151,7 @@ def execute(
     if durable and is_remote(url):
         notice(f"{url}: nothing to flush: an object store answers once it keeps what was written")
     sources = _matching_sources(url, pipeline, reuse)
+    done = set() if unfinished is None else committed(unfinished)
     if unfinished is None:
         check_writable(url)
 
@@ -155,19 +162,19 @@ def execute(
         stack.callback(child.close)  # the thread waits for it
 
         def measuring(budget_s: float) -> Future[Calibration]:
-            limit_s = CALIBRATION_SHARE * time_limit_s
+            limit_s = CALIBRATION_SHARE * (time_limit_s or TIME_LIMIT_S)
             return thread.submit(calibrate_isolated, child, pipeline, budget_s, limit_s)
 
         calibration: Calibration | None = None
         connection: Client | None = None
         embedded = workers is None and scheduler is None and client is None
-        if embedded and unfinished is None:
+        if embedded and not done:
             calibration = interrupts.await_result(measuring(QUICK_CALIBRATION_S))
-        if not (embedded and work_s(pipeline, unfinished, calibration) < SMALL_RUN_S):
+        if not (embedded and work_s(pipeline, unfinished, done, calibration) < SMALL_RUN_S):
             from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
 
             # Measured while the workers' processes start.
-            again = unfinished is None and not (calibration is not None and calibration.over)
+            again = not done and not (calibration is not None and calibration.over)
             future = measuring(CALIBRATION_S) if again else None
             connection = stack.enter_context(
                 connected(pipeline, workers=workers, scheduler=scheduler, client=client)
@@ -182,12 +189,13 @@ def execute(
                 durable=durable, yes=yes or bool(sources),
             )
         elif not (yes or sources):
-            check_affordable(url, demand_left(unfinished, connection))
+            check_affordable(url, demand_left(unfinished, done, calibration, connection))
         if durable:
             unfinished = open_store(url, "r+", durable=True)
+        limit_s = block_time_limit_s(time_limit_s, block_s_of(unfinished, done, calibration))
         with _continuable_errors(without=" without overwrite" if overwrite else ""):
             computed = _compute_and_close(
-                unfinished, child, connection, sources, time_limit_s, interrupts, progress
+                unfinished, child, connection, sources, limit_s, interrupts, progress
             )
     return summary_of(open_store(url), computed, time.perf_counter() - started, retry)
 
@@ -197,7 +205,7 @@ def recompute(
     numbers: Iterable[int],
     *,
     workers: int | None = None,
-    time_limit_s: float = TIME_LIMIT_S,
+    time_limit_s: float | None = None,
 ) -> None:
     """Compute blocks of a store whose lock this process holds, as :func:`execute` does.
 
@@ -212,19 +220,21 @@ def recompute(
         interrupts = stack.enter_context(Interrupts())
         child = stack.enter_context(Child(BLOCK_TASK))
         connection: Client | None = None
-        if workers is not None or block_s_of(store, committed(store)) * len(chosen) >= SMALL_RUN_S:
+        each_s = block_s_of(store, committed(store))
+        if workers is not None or each_s * len(chosen) >= SMALL_RUN_S:
             from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
 
             connection = stack.enter_context(connected(store.pipeline, workers=workers))
         with _continuable_errors():
             _compute(
-                store, iter(chosen), Tally(store), child, connection, (), time_limit_s, interrupts
+                store, iter(chosen), Tally(store), child, connection, (),
+                block_time_limit_s(time_limit_s, each_s), interrupts,
             )
 
 
 def _check_arguments(
     workers: int | None, scheduler: str | None, client: object, block_s: float | None,
-    time_limit_s: float,
+    time_limit_s: float | None,
 ) -> None:
     if workers is not None and workers < 1:
         raise ArgumentError("workers", workers, "expected at least 1")
@@ -270,7 +280,7 @@ def _matching_sources(
 
 def _new_store(
     url: str, pipeline: Pipeline, calibration: Calibration, client: Client | None,
-    block_s: float | None, time_limit_s: float, overwrite: bool, *, durable: bool = False,
+    block_s: float | None, time_limit_s: float | None, overwrite: bool, *, durable: bool = False,
     yes: bool = False,
 ) -> RunStore:
     """Create an empty store whose blocks suit the calibration and the cluster, if there is one."""

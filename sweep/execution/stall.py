@@ -9,6 +9,7 @@ from distributed import Client
 from sweep.errors import RunError
 from sweep.execution.distributed_internals import worker_deaths, worker_states
 from sweep.execution.limits import (
+    MAX_BLOCK_SHARE,
     MAX_WORKER_DEATHS,
     STALL_S,
     STATES_INTERVAL_S,
@@ -65,12 +66,12 @@ class StallWatch:
         paused = self._paused_since is not None and now >= self._paused_since + STALL_S
         if paused or (self._dying and silent_s >= STALL_S):
             raise RunError(f"no block was finished for {silent_s:.0f} s: {reason}")
-        if silent_s >= self._next_line_s:
+        if silent_s >= self._next_line_s and reason:
             self._next_line_s *= 2
             notice(f"no block was finished for {silent_s:.0f} s: {reason}")
 
     def _reason(self, blocks: int, now: float) -> str:
-        """Return what the workers do; note since when all are paused, and whether they die."""
+        """Return what is wrong, empty if nothing is; note what may end the run."""
         try:
             states = worker_states(self._client, THREAD_COUNT_TIMEOUT_S)
             deaths = worker_deaths(self._client, THREAD_COUNT_TIMEOUT_S)
@@ -95,6 +96,8 @@ class StallWatch:
                 "the memory that they may; give them more (`dask worker --memory-limit`), or set "
                 "distributed.worker.memory.pause to false in Dask's configuration there"
             )
+        if now < self._since + MAX_BLOCK_SHARE * self._time_limit_s:
+            return ""  # a block may well take as long
         line = (
             f"{blocks} blocks are with {len(states)} workers, which compute; a block ends after "
             f"at most {self._time_limit_s:.0f} s (time limit)"

@@ -14,7 +14,7 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import bytes_per_block
-from sweep.store.blocks import committed, receipts
+from sweep.store.blocks import receipts
 from sweep.store.run_store import RunStore
 
 if TYPE_CHECKING:
@@ -25,12 +25,12 @@ SAMPLED_RECEIPTS = 100
 
 
 def work_s(
-    pipeline: Pipeline, unfinished: RunStore | None, calibration: Calibration | None
+    pipeline: Pipeline, unfinished: RunStore | None, done: AbstractSet[int],
+    calibration: Calibration | None,
 ) -> float:
-    """Return the estimated seconds of work that are left."""
+    """Return the estimated seconds of work that are left when the blocks ``done`` are committed."""
     if unfinished is not None:
-        done = committed(unfinished)
-        return (len(unfinished.blocks) - len(done)) * block_s_of(unfinished, done)
+        return (len(unfinished.blocks) - len(done)) * block_s_of(unfinished, done, calibration)
     if calibration is None:
         return math.inf
     return pipeline.size(Stage.scene) * calibration.scene_s
@@ -57,19 +57,27 @@ def demand_of(
     )
 
 
-def demand_left(store: RunStore, client: Client | None) -> Demand:
-    """Return what the blocks take that are not committed."""
-    done, threads = committed(store), thread_count_of(client)
+def demand_left(
+    store: RunStore, done: AbstractSet[int], calibration: Calibration | None,
+    client: Client | None,
+) -> Demand:
+    """Return what the blocks take that are not committed, those ``done``."""
+    threads = thread_count_of(client)
     left = len(store.blocks) - len(done)
     poses = store.pipeline.size(Stage.scene) * left // max(len(store.blocks), 1)
     return Demand(
-        left * block_s_of(store, done) / threads if done else 0.0, threads,
+        left * block_s_of(store, done, calibration) / threads if done or calibration else 0.0,
+        threads,
         bytes_per_block(store.pipeline, poses), left * files_per_block(store.pipeline),
     )
 
 
-def block_s_of(store: RunStore, done: AbstractSet[int]) -> float:
-    """Return the mean seconds of some committed blocks; without any, what blocks are cut for."""
+def block_s_of(
+    store: RunStore, done: AbstractSet[int], calibration: Calibration | None = None
+) -> float:
+    """Return the mean seconds of some committed blocks; without any, what is expected of them."""
     some = sorted(done)[:SAMPLED_RECEIPTS]
     spent = [receipt.wall_s for _, receipt in receipts(store, some)]
-    return statistics.fmean(spent) if spent else BLOCK_S
+    if spent:
+        return statistics.fmean(spent)
+    return BLOCK_S if calibration is None else len(store.blocks[0]) * calibration.scene_s

@@ -9,7 +9,6 @@ from zarr.buffer import cpu, default_buffer_prototype
 
 from sweep.errors import StoreError
 from sweep.execution.finalize import close
-from sweep.execution.limits import TIME_LIMIT_S
 from sweep.execution.runner import recompute
 from sweep.integrity.damage import ArrayDamage, Damage, FileDamage, SampleDamage
 from sweep.integrity.stored_values import computable
@@ -30,7 +29,7 @@ MEASURED = ("cost/tradeoff", "cost/renderers")
 
 def repair(
     url: str, sample: int = SAMPLE, *, workers: int | None = None,
-    time_limit_s: float = TIME_LIMIT_S,
+    time_limit_s: float | None = None,
 ) -> IntegrityReport:
     """Verify a store and repair it: exactly the damaged blocks are recomputed.
 

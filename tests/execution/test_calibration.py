@@ -9,11 +9,13 @@ import pytest
 
 from support.reports import command
 from sweep.execution import forecast as forecast_module
+from sweep.execution.affordability import files_per_block
 from sweep.execution.calibration import (
     MIN_LIMIT_S,
     BatchCost,
     Calibration,
     block_extents,
+    block_time_limit_s,
     calibrate,
     calibrate_in,
     calibrate_isolated,
@@ -125,7 +127,8 @@ def test_plan_measures_each_effect_within_its_share():
         (10**8, 1e-3, 1000, 13.3),  # 75 blocks a second; 500 with blocks of 2 s
         (10**9, 1e-3, 64, 10.0),  # 100,000 blocks; 500,000 with blocks of 2 s
         (10**9, 1e-3, 1000, 13.3),
-        (10**9, 0.05, 1000, 60.0),  # a tenth of the time limit
+        (10**9, 0.05, 1000, 500.0),  # the same, and the time limit grows
+        (10**9, 1.0, 1000, 3600.0),  # an hour at most
     ],
 )
 def test_blocks_grow_with_the_cluster_and_with_the_run(poses, scene_s, workers, block_s):
@@ -136,7 +139,32 @@ def test_blocks_grow_with_the_cluster_and_with_the_run(poses, scene_s, workers, 
     assert math.prod(extents) * scene_s == pytest.approx(block_s, rel=0.15)
     blocks = len(Blocks((2, poses // 2), extents))
     assert blocks <= 1.1 * max(BLOCKS_PER_S * poses * scene_s / workers, 6 * workers)
-    assert blocks <= 1.1 * MAX_BLOCKS or block_s == 60.0
+    assert blocks <= MAX_BLOCKS or block_s == 3600.0
+    assert block_time_limit_s(None, math.prod(extents) * scene_s) == pytest.approx(
+        max(600.0, 10 * block_s), rel=0.15)
     limited = block_extents(
         pipeline, Calibration(scene_s, 0.0, 1, (0.0, 0.0)), workers, None, 30.0)
     assert math.prod(limited) * scene_s == pytest.approx(min(block_s, 3.0), rel=0.15)
+
+
+@pytest.mark.parametrize("lengths", [
+    (50, 200, 100_000), (999, 1001, 1003), (31, 32_258_065), (10,) * 9, (1, 14_999, 66_672),
+])
+@pytest.mark.parametrize("scene_s", [1e-3, 0.05])
+def test_no_grid_of_a_billion_poses_makes_more_blocks_and_files_than_a_disk_can_bear(
+    lengths, scene_s
+):
+    names = ("side_px", "tilt_deg", "azimuth_deg", "roll_deg", "bearing_x_deg", "bearing_y_deg",
+             "noise_grey", "blur_px")[:len(lengths) - 1]
+    axes = "\n".join(
+        f"{name} = {{ linspace = [1, 2, {length}] }}" if length > 1 else f"{name} = [1]"
+        for name, length in zip(names, lengths[:-1], strict=True)
+    )
+    pipeline = Pipeline.from_text(
+        f"[pose]\njitter_px = 0.5\n[axes]\n{axes}\ntrial = {lengths[-1]}")
+    measured = Calibration(scene_s, 0.0, 1, (0.0,) * len(lengths))
+    extents = block_extents(pipeline, measured, 64)
+    blocks = len(Blocks(lengths, extents))
+    assert blocks <= MAX_BLOCKS
+    assert blocks * files_per_block(pipeline) <= 3_000_000
+    assert math.prod(extents) * scene_s < 2.5 * math.prod(lengths) * scene_s / MAX_BLOCKS

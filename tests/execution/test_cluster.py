@@ -236,7 +236,7 @@ class Identity:
 def test_run_without_progress_says_why_once_in_a_while(states, line, monkeypatch, capsys):
     monkeypatch.setattr(stall, "STALL_S", 0.1)
     monkeypatch.setattr(stall, "STATES_INTERVAL_S", 0.0)
-    watch = stall.StallWatch(Identity(*states), 600.0)
+    watch = stall.StallWatch(Identity(*states), 1.0)
     watch.check(8)
     assert capsys.readouterr().err == ""
     deadline = time.monotonic() + 0.35

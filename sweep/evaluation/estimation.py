@@ -14,10 +14,12 @@ from sweep.evaluation.search import SearchResult
 from sweep.measure.estimation import Detections, Estimates, PoseEstimator
 from sweep.measure.estimators import EstimatorSetting
 from sweep.measure.flags import EstimateStatus
+from sweep.model.calibration_error import COEFFICIENTS, VIEW
 from sweep.model.camera import Cameras
 from sweep.model.columns import Column
 from sweep.model.lens import pack
 from sweep.model.scene import Scenes
+from sweep.plan.beliefs import CALIBRATED
 from sweep.typing import Floats
 
 
@@ -27,7 +29,7 @@ def assumed_cameras(
     """Return the N cameras and marker sizes (N,) in m that an estimator assumes.
 
     Those of the scenes, but for the ``believed_`` parameters: of ``values`` if they are drawn,
-    else of the estimator.
+    else of the estimator. A believed calibration is drawn.
     """
     view, size = scenes.cameras.view, scenes.size_m
     lenses, distorted = scenes.cameras.lenses, scenes.cameras.distorted
@@ -36,13 +38,24 @@ def assumed_cameras(
         drawn = name in values and not values[name].constant
         return values[name].values if drawn else getattr(estimator, name)
 
-    for k, name in enumerate(("fx_px", "fy_px", "cx_px", "cy_px")):
-        value = assumed(f"believed_{name}")
+    if assumed("believed_focal_scale") is not None:
+        view = view.copy()
+        view[:, :2] *= np.reshape(assumed("believed_focal_scale"), (-1, 1))
+    calibrated = estimator.believed == "calibration"
+    for k, name in enumerate(VIEW):
+        value = (
+            values[CALIBRATED + name].values if calibrated else assumed(f"believed_{name}")
+        )
         if value is not None:
             view = view.copy() if view is scenes.cameras.view else view
             view[:, k] = value
     if assumed("believed_size_m") is not None:
         size = np.array(np.broadcast_to(assumed("believed_size_m"), size.shape), dtype=np.float64)
+    coefficients = [CALIBRATED + name for name in COEFFICIENTS if CALIBRATED + name in values]
+    if calibrated and coefficients:
+        each = np.stack([values[name].values for name in coefficients], axis=1)
+        lenses = np.array([pack.__wrapped__(tuple(row)) for row in each.tolist()])
+        distorted = np.asarray(lenses[:, :14].any(axis=1))
     if estimator.believed_distortion is not None:
         packed = pack(estimator.believed_distortion)
         lenses = np.repeat(packed[None], len(scenes), axis=0)

@@ -31,6 +31,7 @@ from sweep.plan.axes import TRIAL
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes, scene_values
 from sweep.plan.parameters import PARAMETERS, Stage
+from sweep.plan.same_meaning import alike
 from sweep.plan.schema import VARIABLES, Variable, variables_of
 from sweep.store.blocks import committed
 from sweep.store.provenance import changes, fingerprint
@@ -94,6 +95,7 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
         for variable in variables_of(pipeline)
         if variable.name not in present and not _follows(variable)
     ]
+    pipeline, old = alike(pipeline, old)
     for name in (*PARAMETERS, TRIAL):
         if pipeline.distributions.get(name) != old.distributions.get(name):
             faults.append(f"{name}: not drawn from the same distribution in both")

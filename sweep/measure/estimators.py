@@ -99,6 +99,16 @@ class EstimatorSetting:
     estimate_blur: bool = parameter(
         False, "photometric also estimates the point spread, starting from believed_blur_px"
     )
+    believed: str = parameter(
+        "truth", "the camera that is assumed where no other belief says otherwise. truth: the true "
+        "one; calibration: in each trial the true one with an error drawn from calibration_sd or "
+        "calibration_covariance",
+        choices=("truth", "calibration"),
+    )
+    believed_focal_scale: float | None = parameter(
+        None, "factor on both true focal lengths that is assumed: 1.01 is a focal length believed "
+        "1 % too long", low=1e-3, high=1e3, drawable=True,
+    )
     believed_fx_px: float | None = parameter(
         None, f"focal length along x {_ASSUMED}; that along y stays as it is", unit="px",
         low=1e-3, high=1e9, drawable=True,

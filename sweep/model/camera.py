@@ -14,6 +14,9 @@ from sweep.model import lens
 from sweep.model.declaration import parameter
 from sweep.model.projection import Optics
 
+BELIEF_COUNTS = tuple(4 + count for count in lens.COUNTS)
+"""Numbers that a calibration estimates: fx, fy, cx, cy and the lens coefficients."""
+
 DEFAULT_SENSOR_MM = (4.8, 3.6)
 """Width and height of the sensor where the pipeline gives neither."""
 
@@ -67,6 +70,20 @@ class Camera:
     distortion: tuple[float, ...] = parameter(
         (), "lens coefficients in OpenCV's order: 0, 4, 5, 8, 12 or 14 numbers",
         lengths=lens.COUNTS,
+    )
+    camera_file: str | None = parameter(
+        None, "a calibration's file (OpenCV, ROS camera_info, Kalibr camchain, PhotonVision; path "
+        "relative to the pipeline file): frame size, focal lengths, principal point, distortion; "
+        "FILE#NAME names one of several cameras",
+    )
+    calibration_sd: tuple[float, ...] = parameter(
+        (), "standard deviations of a calibration: of fx, fy, cx, cy in px and of each coefficient "
+        "of distortion, for believed = calibration (default: those of camera_file)",
+        lengths=tuple(sorted({0, *BELIEF_COUNTS})),
+    )
+    calibration_covariance: tuple[float, ...] = parameter(
+        (), "in place of calibration_sd: the covariance matrix of the same numbers, row by row",
+        lengths=tuple(sorted({0, *(count**2 for count in BELIEF_COUNTS)})),
     )
 
 

@@ -65,6 +65,8 @@ def parts(pipeline: Pipeline) -> list[Part]:
         name for name in RANDOM
         if name not in draws and pipeline.any_value(name, partial(is_on, name))
     ]
+    if pipeline.any_value("believed", lambda value: value == "calibration"):
+        draws.append("the believed calibration")
     renderers = sorted(set(pipeline.values_of("renderer")))
     image = pipeline.any_value("background", lambda value: isinstance(value, str))
     asked = pipeline.any_value("window", lambda value: value == "full")
@@ -90,6 +92,8 @@ def parts(pipeline: Pipeline) -> list[Part]:
         name for name in PARAMETERS
         if name.startswith("believed_") and pipeline.fixed.get(name, "varies") is not None
     ]
+    if pipeline.any_value("believed", lambda value: value == "calibration"):
+        assumptions.append("believed: calibration")
     bounds = sorted(set(pipeline.values_of("bound")) - {"none"})
     pixels = [name for name in pipeline.values_of("solver") if SOLVERS[name].needs_images]
     return [

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sweep.model.camera import VIEW_PARAMETERS, are_square, field_of_view_deg, intrinsics
+from sweep.plan.beliefs import belief_notes
 from sweep.plan.experiment import Pipeline
 
 Range = tuple[float, float]
@@ -150,7 +151,10 @@ NOT_SQUARE = 0.01
 def notes(pipeline: Pipeline) -> list[str]:
     """Return a line for each property of the camera, or of beliefs about it, that may surprise."""
     facts = camera_facts(pipeline)
-    return [*_focal_notes(pipeline, facts), *_centre_notes(facts)]
+    return [
+        *_focal_notes(pipeline, facts), *_centre_notes(facts),
+        *belief_notes(pipeline.given, pipeline.fixed, pipeline.values_of("believed")),
+    ]
 
 
 def _focal_notes(pipeline: Pipeline, facts: CameraFacts) -> list[str]:

@@ -7,6 +7,7 @@ millimetres (with the sensor's sides or the size of a pixel), or a calibration's
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from typing import Any
 
 import tomlkit
@@ -106,10 +107,17 @@ def stored_text(text: str, store_format: int) -> str:
     stated = given & {"width_px", "height_px", *SENSOR_SIDES}
     if "fx_px" in given or not missing or not stated:
         return text
+    return with_values(text, "camera", {
+        name: default for name, default in zip(SENSOR_SIDES, DEFAULT_SENSOR_MM, strict=True)
+        if name in missing
+    })
+
+
+def with_values(text: str, section: str, values: Mapping[str, Any]) -> str:
+    """Return the text of a pipeline with values written under a section; its comments stay."""
     written = tomlkit.parse(text)
-    if "camera" not in written:
-        written["camera"] = tomlkit.table()
-    for name, default in zip(SENSOR_SIDES, DEFAULT_SENSOR_MM, strict=True):
-        if name in missing:
-            written["camera"][name] = default
+    if section not in written:
+        written[section] = tomlkit.table()
+    for name, value in values.items():
+        written[section][name] = list(value) if isinstance(value, tuple) else value
     return tomlkit.dumps(written)

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.messages import label
+from sweep.model.calibration_error import VIEW, CalibrationError
 from sweep.model.columns import Column
 from sweep.plan.alternatives import superseded
 from sweep.plan.axes import MAX_DEVIATIONS, Distribution
+from sweep.plan.beliefs import CALIBRATED, believed_calibration
 from sweep.plan.parameters import PARAMETERS, Parameter
 from sweep.typing import Floats
 
@@ -20,6 +22,9 @@ if TYPE_CHECKING:
 
 ALWAYS_GIVEN = ("marker", "pose")
 """Sections whose fixed parameters are coordinates also where the file does not give them."""
+
+CALIBRATION_SCALE_PX = 1e4
+"""Size of a camera's numbers in pixels by which rounding of a calibration's is measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +124,20 @@ def drawn_quantities(pipeline: Pipeline) -> list[DrawnQuantity]:
             )
             for axis in ("u", "v")
         ]
+    error = believed_calibration(pipeline.fixed, pipeline.values_of("believed"))
+    if error is not None:
+        quantities += [_calibrated(error, name) for name in error.names]
     return quantities
+
+
+def _calibrated(error: CalibrationError, name: str) -> DrawnQuantity:
+    """Return a number of the camera that a calibration gives."""
+    unit = "px" if name in VIEW else ""
+    return DrawnQuantity(
+        f"believed_{name}", CALIBRATED + name, f"{name.removesuffix('_px')} as a calibration "
+        "gives it, for estimators that believe it", unit,
+        (CALIBRATION_SCALE_PX if unit else 1.0) + MAX_DEVIATIONS * error.sd(name),
+    )
 
 
 def _of_parameter(parameter: Parameter, scale: float) -> DrawnQuantity:

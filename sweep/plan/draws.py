@@ -35,8 +35,7 @@ _DEFAULT_VIEW = dict(
 _PLAIN = (
     "width_px", "height_px",
     *(p.name for p in PARAMETERS.values()
-      if p.section in GEOMETRY_SECTIONS
-      and p.name not in (*VIEW_PARAMETERS, "distortion", "side_px")),
+      if p.section in GEOMETRY_SECTIONS and p.section != "camera" and p.name != "side_px"),
 )
 
 

@@ -13,7 +13,8 @@ import tomlkit
 from sweep.messages import plain, refusal
 from sweep.model.image_file import read_regular
 from sweep.plan.axes import Axis, Distribution
-from sweep.plan.camera_values import resolve_sensor
+from sweep.plan.camera_files import read_camera_file
+from sweep.plan.camera_values import resolve_sensor, with_values
 from sweep.plan.overrides import apply_settings, fix_values, parse_settings
 from sweep.plan.parameters import Stage
 from sweep.plan.reader import read_keys
@@ -44,7 +45,7 @@ class Pipeline:
     axes
         The grid's dimensions, in the document's order.
     text
-        The effective TOML text.
+        The effective TOML text: settings and the values of a camera file included.
     files
         Path as written -> SHA-256 of every file that the pipeline refers to.
     folder
@@ -119,6 +120,7 @@ class Pipeline:
         source: str = "pipeline",
         folder: str | Path = ".",
         files: Mapping[str, str] | None = None,
+        camera_files: Mapping[str, str] | None = None,
     ) -> Pipeline:
         """Read a pipeline from TOML text.
 
@@ -137,6 +139,8 @@ class Pipeline:
         files
             Path as written -> SHA-256: used instead of reading the files that the text refers to,
             as for a store whose files may have moved.
+        camera_files
+            The same of camera files alone: a store's text has their values.
 
         Raises
         ------
@@ -148,12 +152,12 @@ class Pipeline:
             chosen = parse_settings(settings)
             apply_settings(document, chosen)
             # Checked before tomlkit, which keeps the comments, reads it again: tomlkit is slow.
-            _checked(document, text, name, source, Path(folder), files)
+            _checked(document, text, name, source, Path(folder), files, camera_files)
             written = tomlkit.parse(text)
             apply_settings(written, chosen)
             text = tomlkit.dumps(written)
             document = _document(text, source)
-        return _checked(document, text, name, source, Path(folder), files)
+        return _checked(document, text, name, source, Path(folder), files, camera_files)
 
     @staticmethod
     def from_dict(
@@ -216,7 +220,7 @@ class Pipeline:
         document = _document(self.text, source)
         fix_values(document, chosen)
         text = tomlkit.dumps(document)
-        return _checked(document, text, self.name, source, Path(self.folder), None)
+        return _checked(document, text, self.name, source, Path(self.folder), None, self.files)
 
     def axis(self, name: str) -> Axis | None:
         """Return an axis by name."""
@@ -278,14 +282,17 @@ def _document(text: str, source: str) -> dict[str, Any]:
 
 def _checked(
     document: Mapping[str, Any], text: str, name: str, source: str, folder: Path,
-    files: Mapping[str, str] | None,
+    files: Mapping[str, str] | None, camera_files: Mapping[str, str] | None,
 ) -> Pipeline:
     """Return the pipeline of a document; PipelineError with all its faults."""
-    reading = read_keys(document, source, folder, files)
+    reading = read_keys(document, source, folder, files, camera_files)
+    read_camera_file(reading)
     resolve_sensor(reading)
     check_rules(reading)
     if reading.faults:
         raise refusal(reading.faults)
+    if reading.stated:
+        text = with_values(text, "camera", reading.stated)
     return Pipeline(
         name=name, title=reading.title, seed=reading.seed, fixed=reading.fixed,
         given=frozenset(reading.given), distributions=reading.distributions,

@@ -19,6 +19,7 @@ from sweep.model.camera import canonical_distortion
 from sweep.model.columns import Column
 from sweep.model.effects import RANDOM, SWITCHES
 from sweep.plan.axes import TRIAL, Axis
+from sweep.plan.beliefs import believed_calibration, calibrated_columns
 from sweep.plan.draws import bits, geometry_keys, uniform
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import PARAMETERS, Stage
@@ -141,7 +142,8 @@ def scene_values(
     jitter = np.asarray(values["jitter_px"].values, dtype=np.float64)
     values["shift_u_px"] = values["shift_v_px"] = Column.of(0.0)
     noisy = any(name in drawn or values[name].differs_from(SWITCHES[name]) for name in RANDOM)
-    if not drawn and not noisy and not (jitter > 0).any():
+    calibration = believed_calibration(pipeline.fixed, pipeline.values_of("believed"))
+    if not drawn and not noisy and not (jitter > 0).any() and calibration is None:
         resolve_pose(values)
         return values
     keys = geometry_keys(values, drawn, count)
@@ -151,6 +153,11 @@ def scene_values(
         for name in ("shift_u_px", "shift_v_px"):
             draw = uniform(pipeline.seed, name, keys, trials)
             values[name] = Column.of(jitter * (2 * draw - 1))
+    if calibration is not None:
+        values |= calibrated_columns(
+            calibration, values, count,
+            lambda quantity: uniform(pipeline.seed, quantity, keys, trials),
+        )
     if noisy:
         values["noise_key"] = Column.of(bits(pipeline.seed, "noise", keys, trials))
     resolve_pose(values)

@@ -11,6 +11,7 @@ import tomlkit.items
 from sweep.messages import MAX_FAULTS, nearest, plain, refusal
 from sweep.plan.alternatives import RIVALS
 from sweep.plan.axes import DISTRIBUTION_FORMS, TRIAL
+from sweep.plan.camera_files import FILE_DEVIATIONS, FILE_VALUES, OTHER_WAYS
 from sweep.plan.parameters import PARAMETERS
 from sweep.plan.reader import HEADER, is_zip, section_of
 from sweep.plan.toml_text import python_boolean, quoted_if_bare, read_value
@@ -28,6 +29,10 @@ ALTERNATIVES: dict[str, Collection[str]] = {
     "pixel_size_um": (*_PX, *_FIELDS, *_SIDES),
     "hfov_deg": (*_PX, *_MM, "vfov_deg"),
     "vfov_deg": (*_PX, *_MM, "hfov_deg"),
+    "believed_focal_scale": ("believed_fx_px", "believed_fy_px"),
+    "believed_fx_px": ("believed_focal_scale",),
+    "believed_fy_px": ("believed_focal_scale",),
+    "camera_file": (*FILE_VALUES, *FILE_DEVIATIONS, *OTHER_WAYS),
 }
 """Parameter -> those that say the same in another way: choosing it drops them."""
 
@@ -114,12 +119,15 @@ def fix_values(document: Any, chosen: Mapping[str, Any]) -> None:
     """Fix parameters of a document at chosen values.
 
     The axis ``trial`` goes, axes of parameters that go together, each of which must be chosen, and
-    what the chosen values displace.
+    what the chosen values displace. The document has the values of its camera file, which goes if
+    another value is chosen for one of them.
     """
     axes = document.get("axes", {})
     _delete(document, {
         TRIAL, *displaced_by(chosen), *(name for name, value in axes.items() if is_zip(value)),
     })
+    if "camera_file" not in chosen and chosen.keys() & {*FILE_VALUES, *OTHER_WAYS}:
+        _delete(document, {"camera_file"})
     for name, value in chosen.items():
         _write(document, name, list(value) if isinstance(value, tuple) else value)
 

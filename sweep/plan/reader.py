@@ -40,10 +40,14 @@ class Reading:
         Where relative paths start.
     known_files
         Path as written -> SHA-256, used instead of reading the files; None to read them.
+    known_cameras
+        The same of camera files alone, whose values the document has.
     title, seed, fixed, distributions, axes, files
         As :class:`sweep.plan.experiment.Pipeline` has them; ``axes`` by name.
     given
         Names of the parameters that the document has, even with a value that cannot be.
+    stated
+        Values that a camera file has, by parameter: they are written into the document's text.
     faults
         One line each: source, key, value, expectation.
     """
@@ -52,6 +56,7 @@ class Reading:
     source: str
     folder: Path
     known_files: Mapping[str, str] | None
+    known_cameras: Mapping[str, str] | None = None
     title: str = ""
     seed: int = 0
     fixed: dict[str, Any] = field(default_factory=dict)
@@ -59,6 +64,7 @@ class Reading:
     axes: dict[str, Axis] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)
     given: set[str] = field(default_factory=set)
+    stated: dict[str, Any] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
 
     def fault(self, key: str, value: Any, expected: str) -> None:
@@ -105,10 +111,10 @@ class Reading:
 
 def read_keys(
     document: Mapping[str, Any], source: str, folder: Path,
-    known_files: Mapping[str, str] | None = None,
+    known_files: Mapping[str, str] | None = None, known_cameras: Mapping[str, str] | None = None,
 ) -> Reading:
     """Return what the keys of a document say, each checked on its own (as :class:`Reading`)."""
-    reading = Reading(document, source, folder, known_files)
+    reading = Reading(document, source, folder, known_files, known_cameras)
     _read_header(reading)
     known = [*HEADER, *SECTIONS, "axes"]
     for key, value in document.items():

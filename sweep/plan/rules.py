@@ -16,6 +16,7 @@ from sweep.model.marker import marker_count
 from sweep.plan.alternatives import IN_CAMERA, WORLD, contradictions
 from sweep.plan.axes import TRIAL
 from sweep.plan.background_files import check_backgrounds
+from sweep.plan.beliefs import beliefs_in_one_way
 from sweep.plan.camera_values import one_camera
 from sweep.plan.parameters import PARAMETERS, SECTIONS, Stage
 from sweep.plan.reader import HEADER, Reading
@@ -115,6 +116,7 @@ def something_random_to_repeat(reading: Reading) -> None:
     trials = len(reading.axes[TRIAL]) if TRIAL in reading.axes else 1
     jitter = reading.values("jitter_px")
     noisy = any(is_active(reading, name) for name in RANDOM)
+    noisy = noisy or "calibration" in reading.values("believed")
     if trials > 1 and not reading.distributions and jitter and max(jitter) == 0 and not noisy:
         reading.fault(
             "axes.trial", trials,
@@ -189,6 +191,7 @@ def size_of_whole_frames(reading: Reading) -> None:
 RULES: tuple[Callable[[Reading], None], ...] = (
     pose_in_one_way,
     one_camera,
+    beliefs_in_one_way,
     ids_in_dictionary,
     effects_need_partners,
     effects_need_the_exact_renderer,

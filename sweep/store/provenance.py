@@ -113,7 +113,8 @@ def _ends(values: Sequence[Any]) -> Sequence[Any]:
 def changes(stored: dict[str, Any], own: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
     """Yield name, stored and own value of each entry in which two fingerprints differ.
 
-    Builds are compared one by one; stores up to format 3 may have none, and are not refused.
+    Builds are compared one by one; stores up to format 3 may have none, and are not refused. Files
+    are compared by their contents: a pipeline's values have their paths, where these matter.
 
     Examples
     --------
@@ -129,8 +130,14 @@ def changes(stored: dict[str, Any], own: dict[str, Any]) -> Iterator[tuple[str, 
                 (f"{key}.{name}", theirs.get(name), mine.get(name))
                 for name in sorted({*theirs, *mine}) if theirs.get(name) != mine.get(name)
             )
+        elif key == "files" and _contents(theirs) == _contents(mine):
+            continue
         elif theirs != mine:
             yield key, theirs, mine
+
+
+def _contents(files: Any) -> list[str]:
+    return sorted(map(str, files.values())) if isinstance(files, dict) else []
 
 
 def environment() -> dict[str, str]:
@@ -185,6 +192,7 @@ def differences(ours: Pipeline, theirs: Pipeline, stored: dict[str, Any]) -> lis
             f"{name}: the store has {their_values.get(name)}, this run {our_values.get(name)}"
             for name in sorted({*our_values, *their_values})
             if ours.axis_of(name) is None and theirs.axis_of(name) is None
+            and name != "camera_file"
             and their_values.get(name) != our_values.get(name)
         ]
     return lines

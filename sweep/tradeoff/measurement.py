@@ -83,7 +83,10 @@ def measure_trade(
     per = list(dict.fromkeys(per))
     _check(url, stored, results, per)
     # The same versions and files must be measured as were run.
-    pipeline = Pipeline.from_text(stored.text, name=stored.name, source=url, folder=stored.folder)
+    pipeline = Pipeline.from_text(
+        stored.text, name=stored.name, source=url, folder=stored.folder,
+        camera_files=stored.files,
+    )
     lines = differences(pipeline, stored, store.fingerprint)
     if lines:
         raise StoreError("\n".join([f"{url}: its costs cannot be measured here:", *lines]))

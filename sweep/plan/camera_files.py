@@ -1,0 +1,120 @@
+"""The file of a calibration that a pipeline names: its values take the place of the camera's keys.
+
+The values are written into the pipeline's text: a store does not need the file any more.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+from typing import Any
+
+from sweep.messages import label, plain, shown
+from sweep.model.calibration import Calibration, calibration_of
+from sweep.model.image_file import read_regular
+from sweep.model.structured_text import MAX_BYTES, read_tree
+from sweep.plan.parameters import PARAMETERS
+from sweep.plan.reader import Reading
+
+FILE_VALUES = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "distortion")
+"""The parameters whose values a camera file has."""
+
+FILE_DEVIATIONS = ("calibration_sd", "calibration_covariance")
+
+OTHER_WAYS = (
+    "sensor_width_mm", "sensor_height_mm", "focal_length_mm", "pixel_size_um", "hfov_deg",
+    "vfov_deg",
+)
+
+
+def file_and_camera(written: str) -> tuple[str, str]:
+    """Return the path, and the name of the camera in the file or "".
+
+    >>> file_and_camera("chains/camchain.yaml#cam1")
+    ('chains/camchain.yaml', 'cam1')
+    """
+    path, mark, camera = written.rpartition("#")
+    return (path, camera) if mark else (written, "")
+
+
+def read_camera_file(reading: Reading) -> None:
+    """Give the camera's parameters the values of its file; note the file's digest, and faults."""
+    if "camera_file" in reading.axes:
+        reading.fault(
+            "axes.camera_file", reading.written("camera_file"),
+            "one file; cameras to compare are axes of fx_px, distortion and so on",
+        )
+        return
+    written = reading.fixed.get("camera_file")
+    if written is None:
+        return
+    if not written.isprintable():
+        _fault(reading, "a path without control characters")
+        return
+    path, camera = file_and_camera(written)
+    known = reading.known_files if reading.known_files is not None else reading.known_cameras
+    if known is not None and path in known and reading.given.issuperset(FILE_VALUES):
+        reading.files[path] = known[path]
+        return
+    try:
+        content = read_regular(os.path.join(reading.folder, path), MAX_BYTES)  # noqa: PTH118
+        calibration = calibration_of(read_tree(content), camera)
+    except OSError as error:
+        _fault(reading, f"a camera file ({error.strerror or 'unreadable'})")
+        return
+    except ValueError as error:
+        _fault(reading, f"a camera file ({error})")
+        return
+    reading.files[path] = hashlib.sha256(content).hexdigest()
+    _take(reading, path, calibration)
+
+
+def _fault(reading: Reading, expected: str) -> None:
+    reading.fault("camera.camera_file", reading.written("camera_file"), expected)
+
+
+def _take(reading: Reading, path: str, calibration: Calibration) -> None:
+    """Take a file's values into a reading; keys that say something else are at fault."""
+    name = plain(Path(path).name)
+    for other in OTHER_WAYS:
+        if other in reading.given:
+            reading.fault(
+                other, reading.written(other), f"no other camera beside camera_file; delete it, "
+                f"or camera_file ({name})",
+            )
+    if calibration.width_px is None or calibration.height_px is None:
+        missing = [key for key in ("width_px", "height_px") if key not in reading.given]
+        if missing:
+            _fault(
+                reading, f"{' and '.join(missing)} beside it: {name} does not say which frame size "
+                "it holds for",
+            )
+    values: dict[str, Any] = {
+        **{key: getattr(calibration, key) for key in FILE_VALUES},
+        "calibration_sd": calibration.sd, "calibration_covariance": calibration.covariance,
+    }
+    for key, value in values.items():
+        if value is None or (key in FILE_DEVIATIONS and not value):
+            continue
+        if key in reading.given:
+            if reading.fixed.get(key) != value:
+                hint = "; a calibration holds for its own frame size" if key in (
+                    "width_px", "height_px"
+                ) else ""
+                reading.fault(
+                    key, reading.written(key),
+                    f"{_brief(value)}, which {name} has; delete it, or camera_file{hint}",
+                )
+            continue
+        try:
+            reading.fixed[key] = PARAMETERS[key].check(value)
+        except ValueError as error:
+            _fault(reading, f"a camera file ({key} = {_brief(value)}: expected {error})")
+            continue
+        reading.stated[key] = value
+    reading.given |= reading.stated.keys()
+
+
+def _brief(value: Any) -> str:
+    return plain(shown(list(value)) if isinstance(value, tuple) else label(value))

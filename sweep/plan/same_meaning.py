@@ -1,0 +1,66 @@
+"""Values that mean the same in two pipelines: a belief that is not given, and the truth."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion, intrinsics
+from sweep.plan.beliefs import STATED
+from sweep.plan.experiment import Pipeline
+
+FRAME = ("width_px", "height_px")
+
+
+def alike(first: Pipeline, second: Pipeline) -> tuple[Pipeline, Pipeline]:
+    """Return two pipelines with fixed values that are equal where they mean the same.
+
+    A belief that is not given is the truth, if this is a single value in one of the pipelines:
+    cells that both have are its. A camera's values may be given in other words, or by a file.
+    """
+    views = [_view(pipeline) for pipeline in (first, second)]
+    known = next(
+        ((pipeline, view) for pipeline, view in zip((first, second), views, strict=True)
+         if view is not None), None,
+    )
+    truth = {} if known is None else _truth(*known)
+    ignored: dict[str, Any] = {"camera_file": None}
+    if views[0] is not None and views[0] == views[1]:
+        ignored |= {name: first.fixed[name] for name in VIEW_PARAMETERS if name not in FRAME}
+    if not any("calibration" in each.values_of("believed") for each in (first, second)):
+        ignored |= dict.fromkeys(STATED, ())
+    return _with(first, truth, ignored), _with(second, truth, ignored)
+
+
+def _with(pipeline: Pipeline, truth: dict[str, Any], ignored: dict[str, Any]) -> Pipeline:
+    fixed = {name: ignored.get(name, value) for name, value in pipeline.fixed.items()}
+    for name in ("distortion", "believed_distortion"):
+        if fixed.get(name) is not None:
+            fixed[name] = canonical_distortion(fixed[name])
+    for name, value in truth.items():
+        if name in fixed and fixed[name] is None:
+            fixed[name] = value
+    return dataclasses.replace(pipeline, fixed=fixed)
+
+
+def _view(pipeline: Pipeline) -> tuple[float, ...] | None:
+    """Return fx, fy, cx, cy of a pipeline that has a single camera."""
+    if any(name not in pipeline.fixed for name in VIEW_PARAMETERS):
+        return None
+    numbers = intrinsics(*(pipeline.fixed[name] for name in VIEW_PARAMETERS))
+    return tuple(float(number) for number in numbers)
+
+
+def _truth(pipeline: Pipeline, view: tuple[float, ...]) -> dict[str, Any]:
+    """Return the true value of each belief, None where it varies."""
+    fixed = pipeline.fixed
+    names = ("believed_fx_px", "believed_fy_px", "believed_cx_px", "believed_cy_px")
+    lens = fixed.get("distortion")
+    return {
+        **dict(zip(names, view, strict=True)),
+        "believed_focal_scale": 1.0,
+        "believed_distortion": None if lens is None else canonical_distortion(lens),
+        "believed_size_m": fixed.get("size_m"),
+        "believed_blur_px": fixed.get("blur_px"),
+        "believed_noise_grey": fixed.get("noise_grey"),
+    }

@@ -68,8 +68,10 @@ def _opened(url: str, run_id: str, durable: bool = False) -> RunStore:
             f"a worker has {key} {own_value}, the store was begun with {value}; "
             "install the same version on every machine"
         )
+    # What a camera file says is in the pipeline's text.
+    images = store.pipeline.values_of("background")
     for path, digest in store.fingerprint["files"].items():
-        if file_digest(Path(store.pipeline.folder) / path) != digest:
+        if path in images and file_digest(Path(store.pipeline.folder) / path) != digest:
             raise StoreError(
                 f"{path}: not in {store.pipeline.folder} on a worker as it was when the run began; "
                 "every machine needs the same file there"

@@ -107,13 +107,14 @@ def _take(reading: Reading, path: str, calibration: Calibration) -> None:
                     f"{_brief(value)}, which {name} has; delete it, or camera_file{hint}",
                 )
             continue
+        reading.given.add(key)
         try:
             reading.fixed[key] = PARAMETERS[key].check(value)
         except ValueError as error:
+            del reading.fixed[key]
             _fault(reading, f"a camera file ({key} = {_brief(value)}: expected {error})")
             continue
         reading.stated[key] = value
-    reading.given |= reading.stated.keys()
 
 
 def _brief(value: Any) -> str:

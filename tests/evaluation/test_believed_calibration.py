@@ -1,0 +1,258 @@
+"""What is believed of the camera: a calibration with its errors, or a focal length that is off."""
+
+import numpy as np
+import pytest
+
+import sweep
+from sweep.errors import PipelineError, StoreError
+from sweep.evaluation.cells import run_cells
+from sweep.execution.reuse import match
+from sweep.execution.runner import execute
+from sweep.measure.flags import EstimateStatus
+from sweep.plan.camera_facts import notes
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import scene_axes, scene_values
+from sweep.plan.parameters import Stage
+from sweep.store.lifecycle import create_store, open_store
+from tests.support.here import calls_here
+
+VIEW = {"fx_px": 600.0, "fy_px": 601.0, "cx_px": 320.5, "cy_px": 238.25}
+LENS = [-0.2, 0.05, 0.001, -0.0005, 0.01]
+SD = [0.8, 0.9, 1.5, 1.2, 0.004, 0.02, 2e-4, 3e-4, 0.03]
+NAMES = [*VIEW, "k1", "k2", "p1", "p2", "k3"]
+DRAWS = 100_000
+SIGMAS = 6.0
+"""A normal number lies outside with probability 2e-9: 54 of them, one test, 1.1e-7."""
+
+
+def covariance(sd, seed=7):
+    """A covariance with these standard deviations; fx and fy are correlated by about 0.99."""
+    rng = np.random.default_rng(seed)
+    mixing = rng.normal(size=(len(sd), len(sd)))
+    mixing[1] = mixing[0] + 0.1 * mixing[1]
+    matrix = mixing @ mixing.T
+    scale = np.sqrt(np.diagonal(matrix))
+    return np.outer(sd, sd) * matrix / np.outer(scale, scale)
+
+
+def pipeline(camera, estimator=None, trials=DRAWS, settings=(), **sections):
+    return Pipeline.from_dict({
+        "camera": {**VIEW, "distortion": LENS, **camera}, "marker": {"size_m": 0.1},
+        "pose": {"distance_m": 0.5}, "estimator": estimator or {"believed": "calibration"},
+        "axes": {"trial": trials}, **sections,
+    }, settings)
+
+
+def drawn(chosen, names=NAMES):
+    count = chosen.size(Stage.scene)
+    lengths = [len(axis) for axis in scene_axes(chosen)]
+    values = scene_values(chosen, [index.ravel() for index in np.indices(lengths)])
+    return np.stack([values[f"calibrated_{name}"].broadcast(count) for name in names])
+
+
+@pytest.mark.parametrize("kind", ["sd", "covariance", "covariance of the view"])
+def test_100_000_draws_have_the_calibration_s_covariance(kind):
+    count = 4 if kind == "covariance of the view" else 9
+    expected = np.diag(np.square(SD)) if kind == "sd" else covariance(SD[:count])
+    camera = {"calibration_sd": SD} if kind == "sd" else {
+        "calibration_covariance": expected.ravel().tolist()}
+    beliefs = drawn(pipeline(camera), NAMES[:count])
+    truth = np.array([*VIEW.values(), *LENS])[:count, None]
+    # Independent standard normal numbers, if the covariance is as it should be.
+    normal = np.linalg.solve(np.linalg.cholesky(expected), beliefs - truth)
+    assert np.abs(normal.mean(axis=1)).max() < SIGMAS / np.sqrt(DRAWS)
+    second = normal @ normal.T / DRAWS
+    spread = np.where(np.eye(count, dtype=bool), np.sqrt(2), 1.0) / np.sqrt(DRAWS)
+    assert (np.abs(second - np.eye(count)) < SIGMAS * spread).all()
+
+
+def test_a_singular_covariance_is_drawn_from():
+    # fx and fy have one error; the rest has none.
+    matrix = np.zeros((9, 9))
+    matrix[:2, :2] = 0.25
+    beliefs = drawn(pipeline({"calibration_covariance": matrix.ravel().tolist()}, trials=1000))
+    assert np.std(beliefs[0]) == pytest.approx(0.5, rel=0.15)  # 6.7 standard errors
+    np.testing.assert_allclose(beliefs[0] - 600, beliefs[1] - 601, atol=1e-12)
+    assert (beliefs[2:] == np.array([*VIEW.values(), *LENS])[2:, None]).all()
+
+
+@pytest.mark.parametrize("fixed", [0, 1])
+def test_a_focal_length_without_deviation_keeps_its_aspect_ratio(fixed):
+    sd = [0.0 if k == fixed else deviation for k, deviation in enumerate(SD)]
+    beliefs = drawn(pipeline({"calibration_sd": sd}, trials=100))
+    assert np.ptp(beliefs[0]) > 0.5
+    np.testing.assert_allclose(beliefs[1] / beliefs[0], 601 / 600, rtol=1e-14)
+
+
+def test_draws_of_a_calibration_change_no_other_draw_and_follow_the_cell():
+    plain = Pipeline.from_dict({
+        "camera": VIEW, "pose": {"distance_m": 0.5, "jitter_px": 0.5}, "axes": {"trial": 50},
+    })
+    believing = Pipeline.from_dict({
+        "camera": {**VIEW, "calibration_sd": SD[:4]},
+        "pose": {"distance_m": 0.5, "jitter_px": 0.5}, "axes": {"trial": 50},
+        "estimator": {"believed": "calibration"},
+    })
+    index = [np.arange(50)]
+    ours, theirs = scene_values(believing, index), scene_values(plain, index)
+    np.testing.assert_array_equal(ours["shift_u_px"].values, theirs["shift_u_px"].values)
+    # The same trial of a calibration twice as uncertain is twice as far off.
+    wider = pipeline({"calibration_sd": [2 * d for d in SD]}, trials=50)
+    off = [drawn(p) - np.array([*VIEW.values(), *LENS])[:, None]
+           for p in (wider, pipeline({"calibration_sd": SD}, trials=50))]
+    np.testing.assert_allclose(off[0], 2 * off[1], rtol=1e-9)
+
+
+# Estimates.
+
+FRONTAL = {
+    "scene": {"background": 128}, "detector": {"cornerRefinementMethod": "subpix"},
+}
+
+
+def test_a_believed_calibration_is_what_each_trial_s_numbers_give_on_their_own(tmp_path):
+    chosen = pipeline({"calibration_sd": SD}, trials=4, **FRONTAL, settings=[
+        'believed=["truth", "calibration"]', "tilt_deg=30", "jitter_px=0.5"])
+    with calls_here():
+        execute(chosen, tmp_path / "s.zarr")
+    results = sweep.open(tmp_path / "s.zarr").load()
+    assert (results["estimate"] == EstimateStatus.solved).all()
+    assert set(results["believed_fx_px"].dims) == {"trial"}
+    values = scene_values(chosen, [np.arange(4)])
+    for name in NAMES:
+        np.testing.assert_array_equal(
+            results[f"believed_{name}"], values[f"calibrated_{name}"].values
+        )
+    truth = pipeline({}, {"solver": "ippe_square"}, 4, ["tilt_deg=30", "jitter_px=0.5"], **FRONTAL)
+    for trial in range(4):
+        own = {f"believed_{name}": float(results[f"believed_{name}"][trial]) for name in VIEW}
+        own["believed_distortion"] = [float(results[f"believed_{k}"][trial]) for k in NAMES[4:]]
+        stated = pipeline({}, own, 4, ["tilt_deg=30", "jitter_px=0.5"], **FRONTAL)
+        for believed, alone in (("calibration", stated), ("truth", truth)):
+            expected = run_cells(alone, [np.array([trial])]).columns["translation_error_m"][0][0]
+            found = results["translation_error_m"].sel(believed=believed).isel(trial=trial)
+            np.testing.assert_array_equal(found, expected.astype(np.float32))
+
+
+def test_a_believed_focal_scale_scales_the_distance_of_a_frontal_marker():
+    scales = [0.99, 1.0, 1.01, 1.2]
+    chosen = Pipeline.from_dict({
+        "camera": {"fx_px": 600}, "marker": {"size_m": 0.1}, "pose": {"distance_m": 0.5},
+        **FRONTAL, "axes": {"believed_focal_scale": scales},
+    })
+    columns = run_cells(chosen, []).columns["translation_error_m"]
+    z = 0.5 + np.array([column[0, 2] for column in columns])
+    np.testing.assert_allclose(z / z[1], scales, rtol=1e-6)  # errors are float32
+    # As both focal lengths believed wrongly.
+    both = Pipeline.from_dict({
+        "camera": {"fx_px": 600}, "marker": {"size_m": 0.1}, "pose": {"distance_m": 0.5},
+        **FRONTAL, "estimator": {"believed_fx_px": 606.0, "believed_fy_px": 606.0},
+    })
+    np.testing.assert_array_equal(run_cells(both, []).columns["translation_error_m"][0], columns[2])
+
+
+def test_a_drawn_focal_scale_is_in_the_dataset_and_in_the_distance(tmp_path):
+    chosen = Pipeline.from_dict({
+        "camera": {"fx_px": 600}, "marker": {"size_m": 0.1}, "pose": {"distance_m": 0.5},
+        **FRONTAL, "estimator": {"believed_focal_scale": {"normal": [1, 0.01]}},
+        "axes": {"trial": 20},
+    })
+    with calls_here():
+        execute(chosen, tmp_path / "s.zarr")
+    results = sweep.open(tmp_path / "s.zarr").load()
+    ratio = (0.5 + results["translation_error_m"].sel(xyz="z")) / results["believed_focal_scale"]
+    assert np.ptp(results["believed_focal_scale"].values) > 0.01
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-6)
+
+
+# What is refused and what is told.
+
+@pytest.mark.parametrize(("camera", "estimator", "line"), [
+    ({}, {"believed": "calibration"},
+     ("estimator.believed = \"calibration\": expected a calibration's standard deviations: give "
+     "calibration_sd under [camera] (or a camera_file)")),
+    ({"calibration_sd": SD}, {"believed": "calibration", "believed_fx_px": 600},
+     "believed_fx_px = 600: expected no other belief about the camera beside believed"),
+    ({"calibration_sd": SD}, {"believed": "calibration", "believed_distortion": []},
+     "believed_distortion = []: expected no other belief about the camera"),
+    ({"calibration_sd": [1, 1]}, {}, "calibration_sd = [1, 1]: expected a list of 0, 4, 8, 9"),
+    ({"calibration_sd": [1] * 8}, {},
+     "expected 4 numbers, of fx, fy, cx and cy, or 9, with the 5 coefficients of distortion"),
+    ({"calibration_sd": SD, "distortion": []}, {},
+     "expected 4 numbers, of fx, fy, cx and cy: distortion is empty"),
+    ({"calibration_sd": [-1, 1, 1, 1]}, {}, "expected standard deviations of at least 0"),
+    ({"calibration_sd": [100, 1, 1, 1]}, {},
+     "expected focal lengths with standard deviations below 1/8.3 of them, here 72.29 px"),
+    ({"calibration_sd": SD, "calibration_covariance": np.eye(9).ravel().tolist()}, {},
+     "expected calibration_sd or calibration_covariance, not both"),
+    ({"calibration_covariance": [1, 2, 0, 0, 2, 1, *[0] * 10]}, {}, "no correlation beyond 1"),
+    ({"calibration_covariance": [1, 0.5, 0, 0, 0, 1, *[0] * 10]}, {}, "expected a symmetric"),
+    ({"calibration_covariance": [-1, *[0] * 15]}, {}, "expected a covariance: no variance below 0"),
+    ({}, {"believed_focal_scale": 1.01, "believed_fx_px": 600},
+     ("believed_focal_scale = 1.01: expected a factor or focal lengths, not both; delete it or "
+     "believed_fx_px")),
+])
+def test_beliefs_that_contradict_each_other_are_refused(camera, estimator, line):
+    with pytest.raises(PipelineError) as refused:
+        pipeline(camera, {"solver": "ippe", **estimator}, 1)
+    told = str(refused.value).split("\n")
+    assert len(told) == 1
+    assert line in told[0]
+
+
+def test_trials_without_a_believed_calibration_need_something_random():
+    with pytest.raises(PipelineError, match="something random to repeat"):
+        pipeline({"calibration_sd": SD}, {"believed": "truth"})
+    assert pipeline({"calibration_sd": SD}).size(Stage.scene) == DRAWS
+
+
+@pytest.mark.parametrize(("camera", "estimator", "line"), [
+    ({}, {"believed_fx_px": 606},
+     "believed_fx_px alone: the fy believed stays the true one; believed_focal_scale is a focal"),
+    ({}, {"believed_fy_px": {"normal": [600, 2]}}, "believed_fy_px alone: the fx believed stays"),
+    ({"calibration_sd": SD}, {"believed": "calibration"},
+     "the calibration's numbers are drawn independently of each other"),
+])
+def test_beliefs_that_may_surprise_are_told(camera, estimator, line):
+    assert [each for each in notes(pipeline(camera, estimator, 1)) if line in each]
+    assert not notes(pipeline({}, {"believed_fx_px": 606, "believed_fy_px": 606}, 1))
+
+
+# Reuse.
+
+TRUTH = {
+    "believed_fx_px": 600.0, "believed_fy_px": 601.0, "believed_cx_px": 320.5,
+    "believed_cy_px": 238.25, "believed_size_m": 0.1, "believed_distortion": LENS,
+    "believed_blur_px": 0.4, "believed_noise_grey": 0.0,
+}
+
+
+@pytest.mark.parametrize("name", [*TRUTH, "believed_focal_scale"])
+def test_an_unset_belief_is_the_truth_where_cells_are_reused(name, tmp_path):
+    truth = TRUTH.get(name, 1.0)
+    scene = {"scene": {"blur_px": 0.4}}
+    unset = pipeline({}, {"solver": "ippe"}, 1, **scene)
+    believing = pipeline({}, {"solver": "ippe", name: truth}, 1, **scene)
+    for k, (old, new) in enumerate(((unset, believing), (believing, unset))):
+        store = create_store(str(tmp_path / f"{k}.zarr"), old, (1,))
+        assert match(new, store).pinned == match(old, store).pinned
+    wrong = [*truth[:-1], 0.5] if isinstance(truth, list) else truth + 0.5
+    with pytest.raises(StoreError, match=f"  {name}: the store has"):
+        match(pipeline({}, {"solver": "ippe", name: wrong}, 1, **scene),
+              open_store(str(tmp_path / "0.zarr")))
+
+
+def test_an_axis_of_beliefs_reuses_the_cell_that_believed_the_truth(tmp_path):
+    axes = {"distance_m": [0.5], "believed_focal_scale": [0.99, 1.0]}
+    url = str(tmp_path / "old.zarr")
+    camera = {"camera": {"hfov_deg": 60}, "marker": {"size_m": 0.1}}
+    with calls_here():
+        execute(Pipeline.from_dict({**camera, "axes": {"distance_m": [0.5]}}), url)
+        fx = 320 / np.tan(np.radians(30))
+        grown = Pipeline.from_dict({
+            "camera": {"fx_px": float(fx)}, "marker": {"size_m": 0.1}, "axes": axes})
+        source = match(grown, open_store(url))
+        assert source.old_index["believed_focal_scale"].tolist() == [-1, 0]
+        execute(grown, str(tmp_path / "new.zarr"), reuse=[url])
+    old, new = (sweep.open(path)["translation_error_m"] for path in (url, tmp_path / "new.zarr"))
+    np.testing.assert_array_equal(new.sel(believed_focal_scale=1.0), old)

@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import itertools
 import shlex
+import sys
 from typing import TYPE_CHECKING
 
 from sweep.cli.arguments import add_json, add_pipeline, add_workers, read_pipeline
@@ -71,8 +72,10 @@ def _execute_beside(child: Child, options: argparse.Namespace) -> int:
     store = options.store or (options.pipeline if names_store(options.pipeline) else None)
     camera = [] if options.json else [f"camera: {camera_facts(pipeline).line()}"]
 
+    watched = sys.stdout is not None and sys.stdout.isatty()
+
     def report(progress: Progress) -> None:
-        while camera:  # once the run is not refused
+        while camera and watched:  # once the run is not refused; a pipe gets it with the results
             say(camera.pop())
         display(progress)
 

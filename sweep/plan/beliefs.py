@@ -107,7 +107,7 @@ def _calibration_is_sound(reading: Reading) -> bool:
 
     if any(name in reading.given and name not in reading.fixed for name in STATED):
         for name in STATED:
-            if name in reading.axes:
+            if reading.axis_of(name) is not None:
                 return fault(name, "one list of numbers, not an axis")
         return False
     sd, covariance = (reading.fixed[name] for name in STATED)

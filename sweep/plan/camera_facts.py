@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from sweep.model.camera import VIEW_PARAMETERS, are_square, field_of_view_deg, intrinsics
 from sweep.plan.beliefs import belief_notes
 from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import scene_axes, scene_values
 
 Range = tuple[float, float]
 """The least and the largest value on the grid."""
@@ -27,6 +31,10 @@ class CameraFacts:
         Frame, focal lengths and principal point.
     hfov_deg, vfov_deg
         Angle between the frame's edges, without lens distortion: 2 atan(width / (2 fx)).
+    aspect
+        fy / fx: the width of a pixel over its height.
+    off_centre_x, off_centre_y
+        Principal point minus the frame's centre, as a share of its width and height.
     square
         Whether the pixels are square everywhere on the grid.
     side_px
@@ -42,6 +50,9 @@ class CameraFacts:
     cy_px: Range
     hfov_deg: Range
     vfov_deg: Range
+    aspect: Range
+    off_centre_x: Range
+    off_centre_y: Range
     square: bool
     side_px: Range | None
 
@@ -49,10 +60,9 @@ class CameraFacts:
         """Return the camera in one line."""
         focal = f"fx = fy = {_text(self.fx_px)} px"
         if not self.square:
-            ratios = sorted({y / x for x, y in zip(self.fx_px, self.fy_px, strict=True)})
             focal = (
                 f"fx = {_text(self.fx_px)} px, fy = {_text(self.fy_px)} px "
-                f"(pixels are not square: fy/fx = {_text((ratios[0], ratios[-1]), 4)})"
+                f"(pixels are not square: fy/fx = {_text(self.aspect, 4)})"
             )
         parts = [
             f"{_text(self.width_px)} x {_text(self.height_px)} px", focal,
@@ -110,7 +120,9 @@ def camera_facts(pipeline: Pipeline) -> CameraFacts:
         for name, number in {
             "width_px": width, "height_px": height, "fx_px": fx, "fy_px": fy, "cx_px": cx,
             "cy_px": cy, "hfov_deg": field_of_view_deg(width, fx),
-            "vfov_deg": field_of_view_deg(height, fy),
+            "vfov_deg": field_of_view_deg(height, fy), "aspect": fy / fx,
+            "off_centre_x": (cx - (width - 1) / 2) / width,
+            "off_centre_y": (cy - (height - 1) / 2) / height,
         }.items():
             rows.setdefault(name, []).append(float(number))
     ranges = {name: (min(column), max(column)) for name, column in rows.items()}
@@ -136,9 +148,28 @@ def _side(pipeline: Pipeline, fx: Range) -> Range | None:
     if (sides := _ends(pipeline, "side_px")) is not None:
         return sides
     size, distance = _ends(pipeline, "size_m"), _ends(pipeline, "distance_m")
-    if size is None or distance is None or not distance[0] > 0:
+    if size is None or distance is None:
+        return _side_of_cells(pipeline)
+    if not distance[0] > 0:
         return None
     return fx[0] * size[0] / distance[1], fx[1] * size[1] / distance[0]
+
+
+MAX_CELLS = 10_000
+"""Poses whose distances are computed where they are not numbers of the pipeline."""
+
+
+def _side_of_cells(pipeline: Pipeline) -> Range | None:
+    """Return the least and the largest side in pixels of a small grid's poses before the camera."""
+    lengths = [len(axis) for axis in scene_axes(pipeline)]
+    count = math.prod(lengths)
+    if count > MAX_CELLS:
+        return None
+    values = scene_values(pipeline, [index.ravel() for index in np.indices(lengths, dtype=np.intp)])
+    fx = intrinsics(*(values[name].values for name in VIEW_PARAMETERS))[0]
+    distance = values["distance_m"].broadcast(count)
+    sides = (fx * values["size_m"].broadcast(count) / distance)[distance > 0]
+    return (float(sides.min()), float(sides.max())) if len(sides) else None
 
 
 OFF_CENTRE = 0.15
@@ -159,10 +190,9 @@ def notes(pipeline: Pipeline) -> list[str]:
 
 def _focal_notes(pipeline: Pipeline, facts: CameraFacts) -> list[str]:
     lines = []
-    ratios = [y / x for x, y in zip(facts.fx_px, facts.fy_px, strict=True)]
-    if max(abs(ratio - 1) for ratio in ratios) > NOT_SQUARE:
+    if max(abs(ratio - 1) for ratio in facts.aspect) > NOT_SQUARE:
         lines.append(
-            f"pixels are not square: fy/fx = {_text((min(ratios), max(ratios)), 4)}; a single side "
+            f"pixels are not square: fy/fx = {_text(facts.aspect, 4)}; a single side "
             "of the sensor, or fx_px alone, makes them square"
         )
     if _varies(pipeline, "width_px") and pipeline.fixed.get("fx_px") is not None:
@@ -176,10 +206,10 @@ def _focal_notes(pipeline: Pipeline, facts: CameraFacts) -> list[str]:
 def _centre_notes(facts: CameraFacts) -> list[str]:
     lines = []
     frame = f"{_text(facts.width_px)} x {_text(facts.height_px)} px"
-    for name, ends, sides in (
-        ("cx_px", facts.cx_px, facts.width_px), ("cy_px", facts.cy_px, facts.height_px),
+    for name, ends, shares in (
+        ("cx_px", facts.cx_px, facts.off_centre_x), ("cy_px", facts.cy_px, facts.off_centre_y),
     ):
-        off = max(abs(end - (side - 1) / 2) / side for end, side in zip(ends, sides, strict=True))
+        off = max(map(abs, shares))
         if off > 0.5:
             lines.append(f"{name} = {_text(ends)}: outside the frame of {frame}")
         elif off > OFF_CENTRE:

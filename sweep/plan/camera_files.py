@@ -40,7 +40,7 @@ def file_and_camera(written: str) -> tuple[str, str]:
 
 def read_camera_file(reading: Reading) -> None:
     """Give the camera's parameters the values of its file; note the file's digest, and faults."""
-    if "camera_file" in reading.axes:
+    if reading.axis_of("camera_file") is not None:
         reading.fault(
             "axes.camera_file", reading.written("camera_file"),
             "one file; cameras to compare are axes of fx_px, distortion and so on",

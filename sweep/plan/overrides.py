@@ -106,6 +106,7 @@ def apply_settings(document: Any, chosen: Mapping[str, Any]) -> None:
     A list or a table of values makes (or replaces) an axis; a single value or a distribution
     makes the parameter fixed or drawn. What the chosen values displace goes.
     """
+    _leave_camera_file(document, chosen)
     _delete(document, displaced_by(chosen))
     for name, value in chosen.items():
         if name in HEADER:
@@ -113,6 +114,15 @@ def apply_settings(document: Any, chosen: Mapping[str, Any]) -> None:
         elif all(isinstance(document.get(table, {}), dict) for table in (section_of(name), "axes")):
             _write(document, name, value)
         # Otherwise a section is no table, which reading the document reports.
+
+
+def _leave_camera_file(document: Any, chosen: Collection[str]) -> None:
+    """Delete the name of a camera file whose values the document has, if one of them is chosen."""
+    camera = document.get("camera")
+    if not isinstance(camera, dict) or "camera_file" in chosen:
+        return
+    if camera.keys() >= {"camera_file", *FILE_VALUES} and {*FILE_VALUES, *OTHER_WAYS} & {*chosen}:
+        del camera["camera_file"]
 
 
 def fix_values(document: Any, chosen: Mapping[str, Any]) -> None:
@@ -123,11 +133,10 @@ def fix_values(document: Any, chosen: Mapping[str, Any]) -> None:
     another value is chosen for one of them.
     """
     axes = document.get("axes", {})
+    _leave_camera_file(document, chosen)
     _delete(document, {
         TRIAL, *displaced_by(chosen), *(name for name, value in axes.items() if is_zip(value)),
     })
-    if "camera_file" not in chosen and chosen.keys() & {*FILE_VALUES, *OTHER_WAYS}:
-        _delete(document, {"camera_file"})
     for name, value in chosen.items():
         _write(document, name, list(value) if isinstance(value, tuple) else value)
 

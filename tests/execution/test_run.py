@@ -25,7 +25,7 @@ from sweep.execution.block_task import compute_block
 from sweep.execution.runner import execute
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, Blocks, scene_axes
-from sweep.plan.schema import SCHEMA
+from sweep.plan.schema import variables_of
 from sweep.store.blocks import committed
 from sweep.store.lifecycle import create_store, open_store, remove_store
 from sweep.store.lock import KEY, locked
@@ -400,8 +400,9 @@ def test_running_scheduler_with_two_workers_gives_the_same(
 def test_template_says_what_the_kernel_makes(pipeline):
     lengths = tuple(len(axis) for axis in scene_axes(pipeline))
     result = run_block(pipeline, Block((0,) * len(lengths), lengths))
-    assert list(result.values) == [variable.name for variable in SCHEMA]
-    for variable in SCHEMA:
+    variables = variables_of(pipeline)
+    assert list(result.values) == [variable.name for variable in variables]
+    for variable in variables:
         values = result.values[variable.name]
         assert values.shape == variable.shape(pipeline)
         assert values.dtype == np.dtype(variable.dtype)

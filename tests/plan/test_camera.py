@@ -208,6 +208,25 @@ def test_plan_names_focal_lengths_fields_of_view_and_sides(tmp_path, capsys):
     ) in capsys.readouterr().out
 
 
+def test_sides_of_poses_in_the_world_are_named():
+    # The camera looks along x; fx = 600.
+    world = Pipeline.from_dict({
+        "camera": {"fx_px": 600}, "marker": {"size_m": 0.1}, "pose": {"camera_x_m": 1.0},
+        "axes": {"marker_x_m": [3.0, 2.0, 0.0]},
+    })
+    assert camera_facts(world).side_px == pytest.approx((600 * 0.1 / 2, 600 * 0.1 / 1))
+
+
+def test_facts_of_parameters_that_go_together_are_those_of_each_row():
+    together = Pipeline.from_dict({"pose": {"distance_m": 1}, "axes": {"resolution": {"zip": {
+        "width_px": [640, 1280], "height_px": [480, 720], "fx_px": [500.0, 1000.0],
+        "cx_px": [319.5, 639.5], "cy_px": [239.5, 359.5],
+    }}}})
+    facts = camera_facts(together)
+    assert (facts.aspect, facts.off_centre_x, facts.off_centre_y) == ((1, 1), (0, 0), (0, 0))
+    assert facts.hfov_deg == pytest.approx((2 * math.degrees(math.atan(0.64)),) * 2)
+
+
 def test_run_report_and_dataset_name_the_camera(tmp_path, capsys):
     file, store = tmp_path / "p.toml", tmp_path / "p.zarr"
     file.write_text(

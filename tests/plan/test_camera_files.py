@@ -471,6 +471,14 @@ def test_the_text_of_a_pipeline_has_the_values_of_its_camera_file(tmp_path):
     assert wider.files == {}
 
 
+def test_another_value_for_a_store_s_camera_leaves_its_file(tmp_path):
+    text = camera(write(tmp_path / "c.yaml", GOOD)).to_toml()
+    (tmp_path / "c.yaml").unlink()
+    chosen = Pipeline.from_text(text, ["fx_px=700"], camera_files={"c.yaml": "0" * 64})
+    assert (chosen.fixed["camera_file"], chosen.fixed["fx_px"], chosen.files) == (None, 700, {})
+    assert chosen.fixed["distortion"] == tuple(LENS)
+
+
 def test_set_of_a_camera_file_replaces_the_camera_and_keeps_comments(tmp_path):
     write(tmp_path / "c.yaml", GOOD)
     write(tmp_path / "p.toml", "[camera]  # mine\nfocal_length_mm = 6\nwidth_px = 99\n"

@@ -28,6 +28,8 @@ from sweep.typing import Floats, Masks
 
 PairStatistic = Statistic[Pair, Any, Any, Any]
 
+ROTATION = QUANTITIES[0]
+
 
 def compare(
     first: xr.Dataset, second: xr.Dataset, per: Sequence[str] = (), bins: Bins | None = None
@@ -58,7 +60,7 @@ def compare(
         - Of the poses solved in both: ``*_difference_*``, the mean difference of the absolute
           errors, and ``*_rmse_ratio``, the second's RMSE over the first's. They do not include
           the poses that one configuration alone solved, which as a rule are the hard ones: see
-          the counts.
+          the counts. ``rotation_rmse_unflipped_ratio`` is of those flipped in neither.
 
     Raises
     ------
@@ -73,6 +75,11 @@ def compare(
     counts are scaled to draws. NaN, as is the p-value, if no cell has two draws. The difference of
     rates: Newcombe, Statistics in Medicine 17, 1998, method 10. The test is McNemar's, exact:
     Psychometrika 12, 1947.
+
+    ``rotation_difference_deg`` and ``rotation_rmse_ratio`` include flips, which make most of both
+    where there are any: their intervals hold only if some ten poses are flipped in one of the two
+    (``only_first_flipped`` and ``only_second_flipped`` count them), for no sample says how large a
+    rare flip that it does not have is. ``rotation_rmse_unflipped_ratio`` does not depend on flips.
 
     Examples
     --------
@@ -92,6 +99,7 @@ def compare(
     statistics: list[PairStatistic] = [
         *_agreement("detected", lambda poses: poses.detected),
         *_agreement("solved", lambda poses: poses.solved),
+        *_flipped_in_one(),
         CountOfDraws("compared", "poses that were looked for in both",
                      lambda pair: pair.compared),
         Count("different_scenes", "compared poses whose truth differs, so that they are no pairs",
@@ -120,6 +128,17 @@ def _agreement(ending: str, reached: Callable[[Poses], Masks]) -> list[PairStati
     return statistics
 
 
+def _flipped_in_one() -> list[PairStatistic]:
+    """Return how many of the poses that both solved one of the two alone has flipped."""
+    words = "poses solved in both, flipped in the {} alone"
+    return [
+        Count("only_first_flipped", words.format("first"),
+              lambda pair: pair.both_solved & pair.first.flipped & ~pair.second.flipped),
+        Count("only_second_flipped", words.format("second"),
+              lambda pair: pair.both_solved & pair.second.flipped & ~pair.first.flipped),
+    ]
+
+
 def _differences(quantity: Quantity) -> list[PairStatistic]:
     def both_squares(pair: Pair) -> Floats:
         sides = (pair.first, pair.second)
@@ -129,12 +148,18 @@ def _differences(quantity: Quantity) -> list[PairStatistic]:
         return pair.both_solved
 
     words = quantity.words
-    return [
+    differences: list[PairStatistic] = [
         Mean(quantity.named("difference"), f"mean difference of the absolute {words}",
              quantity.units, lambda pair: np.diff(np.sqrt(both_squares(pair))), solved),
         RootMeanSquareRatio(f"{quantity.name}_rmse_ratio", f"second RMS {words} over the first",
                             "1", both_squares, solved),
     ]
+    if quantity is not ROTATION:
+        return differences
+    return [*differences, RootMeanSquareRatio(
+        f"{quantity.name}_rmse_unflipped_ratio",
+        f"second RMS {words} over the first, flipped in neither", "1", both_squares,
+        lambda pair: pair.first.unflipped & pair.second.unflipped)]
 
 
 def _tested(table: xr.Dataset) -> dict[str, xr.DataArray]:

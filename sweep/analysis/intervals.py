@@ -71,6 +71,28 @@ def jeffreys(successes: ArrayLike, n: ArrayLike, level: float = LEVEL) -> tuple[
     return _with_exact_ends(successes, n, low, high)
 
 
+def clopper_pearson(
+    successes: ArrayLike, n: ArrayLike, level: float = LEVEL
+) -> tuple[Floats, Floats]:
+    """Return the ends (low, high) of Clopper and Pearson's interval, of the broadcast shape.
+
+    Quantiles of Beta(successes, n - successes + 1) and Beta(successes + 1, n - successes), 0 at 0
+    of n and 1 at n of n: each end is right with (1 + level) / 2 at least, whatever the rate.
+    Clopper and Pearson, Biometrika 26(4), 1934, doi:10.1093/biomet/26.4.404.
+
+    ``n = 0``, exact ends and ``ValueError`` as in `wilson`.
+
+    >>> low, high = clopper_pearson([0, 1], 50)
+    >>> low.round(4).tolist(), high.round(4).tolist()
+    ([0.0, 0.0005], [0.0711, 0.1065])
+    """
+    successes, n, level = _checked(successes, n, level)
+    tail, failures = (1.0 - level) / 2.0, n - successes
+    low = special.betaincinv(np.maximum(successes, 1.0), failures + 1.0, tail)
+    high = special.betainccinv(successes + 1.0, np.maximum(failures, 1.0), tail)
+    return _with_exact_ends(successes, n, low, high)
+
+
 def _checked(
     successes: ArrayLike, n: ArrayLike, level: float,
 ) -> tuple[Floats, Floats, float]:

@@ -164,6 +164,8 @@ class Quantity:
         As in meanings.
     vector
         The error vectors (..., components) of poses.
+    bound
+        The largest absolute error that exists; None if there is none.
     """
 
     name: str
@@ -171,6 +173,7 @@ class Quantity:
     units: str
     words: str
     vector: Callable[[Poses], Floats]
+    bound: float | None = None
 
     def norm(self, poses: Poses) -> Floats:
         """Return the absolute errors (...)."""
@@ -188,7 +191,8 @@ class Quantity:
 
 
 QUANTITIES = (
-    Quantity("rotation", "deg", "degree", "rotation error", lambda poses: poses.rotation_deg),
+    Quantity("rotation", "deg", "degree", "rotation error", lambda poses: poses.rotation_deg,
+             bound=180.0),
     Quantity("range", "percent", "percent", "depth error of the true depth",
              lambda poses: poses.range_percent),
     Quantity("position", "m", "m", "position error", lambda poses: poses.position_m),

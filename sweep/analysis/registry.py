@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from sweep.analysis.counts import Count
+from sweep.analysis.flip_mixture import FlipMixture
 from sweep.analysis.means import Mean, MeanLength, RootMeanSquare, StandardDeviation
 from sweep.analysis.pose_view import (
     DETECTION_INPUTS,
@@ -71,6 +72,14 @@ def _bias(quantity: Quantity) -> AnyPoseStatistic:
                 quantity.units, quantity.vector, lambda poses: poses.unflipped)
 
 
+def _root_mean_square(quantity: Quantity) -> AnyPoseStatistic:
+    """Return the RMSE of the solved: of a rotation flips make most, and it is bounded."""
+    labels = quantity.named("rmse"), f"RMS {quantity.words}, solved", quantity.units
+    if quantity.bound is not None:
+        return FlipMixture(*labels, quantity.squares, quantity.bound)
+    return RootMeanSquare(*labels, quantity.squares, lambda poses: poses.solved)
+
+
 POSE_STATISTICS: tuple[PoseStatistic, ...] = (
     PoseStatistic(Count(*LOOKED_FOR, lambda poses: poses.looked_for), DETECTION_INPUTS),
     PoseStatistic(Count(*SOLVED, lambda poses: poses.solved), ESTIMATE_INPUTS),
@@ -89,10 +98,7 @@ ERROR_STATISTICS: tuple[ErrorStatistic, ...] = (
             # Why an end is missing is the same for all kinds of error.
             with_reason=quantity is QUANTITIES[0])),
     ErrorStatistic(
-        {"rmse": "RMSE of the solved"},
-        lambda quantity: RootMeanSquare(
-            quantity.named("rmse"), f"RMS {quantity.words}, solved", quantity.units,
-            quantity.squares, lambda poses: poses.solved)),
+        {"rmse": "RMSE of the solved"}, _root_mean_square),
     ErrorStatistic(
         {"rmse_unflipped": "RMSE without flips"},
         lambda quantity: RootMeanSquare(

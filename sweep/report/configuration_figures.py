@@ -131,6 +131,9 @@ PAIRED = {
     "both solved": ("both_solved", 1.0),
     "rotation difference, deg": ("rotation_difference_deg", 1.0),
     "rotation RMSE ratio": ("rotation_rmse_ratio", 1.0),
+    "rotation RMSE ratio without flips": ("rotation_rmse_unflipped_ratio", 1.0),
+    "flipped by it only": ("only_second_flipped", 1.0),
+    "flipped by the first only": ("only_first_flipped", 1.0),
     "range difference, %": ("range_difference_percent", 1.0),
     "range RMSE ratio": ("range_rmse_ratio", 1.0),
 }
@@ -149,7 +152,8 @@ def _paired(data: ReportData) -> RenderedFigure:
         sentences(
             f"Differences from {names[0]}, on the same scenes: detection rate in percentage "
             "points (to the right: detected more often), and the ratio of the RMSE of rotation "
-            "and range over the scenes that both solve (below 1: smaller errors).",
+            "(where neither is flipped) and range over the scenes that both solve (below 1: "
+            "smaller errors).",
             interval_sentence(others, "detection_difference"),
             denominators(others, "compared", "pairs"), *grouping.notes,
             data.pooled(*grouping.dims),
@@ -157,8 +161,8 @@ def _paired(data: ReportData) -> RenderedFigure:
         _table(f"Against {names[0]}, with 95 % intervals", names[1:], others, PAIRED),
         [_dot_panel(others, names[1:], "detection_difference", "Detection, difference",
                     "points", scale=100, level=0.0),
-         _dot_panel(others, names[1:], "rotation_rmse_ratio", "Rotation RMSE, ratio", "",
-                    level=1.0),
+         _dot_panel(others, names[1:], "rotation_rmse_unflipped_ratio",
+                    "Rotation RMSE without flips, ratio", "", level=1.0),
          _dot_panel(others, names[1:], "range_rmse_ratio", "Range RMSE, ratio", "", level=1.0)],
     )
 

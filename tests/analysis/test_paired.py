@@ -36,7 +36,7 @@ from support.small_datasets import (
 )
 from sweep.analysis import compare, detection_limit, detection_rate, marker_ranking
 from sweep.errors import DatasetError
-from sweep.measure.flags import DetectionStatus
+from sweep.measure.flags import DetectionStatus, Flipped
 
 # Ranking of marker IDs.
 
@@ -326,22 +326,31 @@ def expected_solved(pairs):
     out = {"both_solved": tally[True, True], "only_first_solved": tally[True, False],
            "only_second_solved": tally[False, True], "neither_solved": tally[False, False]}
     solved = [pair for pair in compared if all(map(is_solved, pair))]
+    flips = [tuple(pose["flipped"] == Flipped.flipped for pose in pair) for pair in solved]
+    out |= {"only_first_flipped": flips.count((True, False)),
+            "only_second_flipped": flips.count((False, True))}
     for name, (unit, error) in QUANTITIES.items():
         sizes = [(pose, length(error(pose)), length(error(other))) for pose, other in solved]
         differences = [(pose, second - first) for pose, first, second in sizes]
         out |= named(f"{name}_difference_{unit}", student(*mean_of(differences, run)))
-        ratio = low = high = math.nan
-        if sizes:
-            # The logarithm of the ratio of two mean squares, by the delta method.
-            squares = [math.fsum(pair[k] ** 2 for pair in sizes) / len(sizes) for k in (1, 2)]
-            ratio = math.sqrt(squares[1] / squares[0])
-            relative = [(pose, second**2 / squares[1] - first**2 / squares[0])
-                        for pose, first, second in sizes]
-            _, deviation, freedom = mean_of(relative, run)
-            half = deviation / 2 * students(freedom)
-            low, high = ratio * math.exp(-half), ratio * math.exp(half)
-        out |= named(f"{name}_rmse_ratio", (ratio, low, high))
+        out |= named(f"{name}_rmse_ratio", ratio_of(sizes, run))
+        if name == "rotation":
+            unflipped = [size for size, flip in zip(sizes, flips, strict=True) if not any(flip)]
+            out |= named(f"{name}_rmse_unflipped_ratio", ratio_of(unflipped, run))
     return out
+
+
+def ratio_of(sizes, run):
+    """Return the ratio of two RMS and its interval: of the logarithm, by the delta method."""
+    if not sizes:
+        return math.nan, math.nan, math.nan
+    squares = [math.fsum(pair[k] ** 2 for pair in sizes) / len(sizes) for k in (1, 2)]
+    ratio = math.sqrt(squares[1] / squares[0])
+    relative = [(pose, second**2 / squares[1] - first**2 / squares[0])
+                for pose, first, second in sizes]
+    _, deviation, freedom = mean_of(relative, run)
+    half = deviation / 2 * students(freedom)
+    return ratio, ratio * math.exp(-half), ratio * math.exp(half)
 
 
 PAIRED = {"trial": 40, "tilt_deg": 2, "marker_id": 2}

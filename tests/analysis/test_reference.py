@@ -153,7 +153,11 @@ def expected_errors(found):
         unflipped = [(pose, vector) for pose, vector in vectors if is_unflipped(pose)]
         out |= named(f"{name}_bias_{unit}", bias(unflipped, run))
         out |= named(f"{name}_sd_{unit}", spread(unflipped, run))
-        out |= named(f"{name}_rmse_{unit}", root_mean_square(vectors, run))
+        rmse = root_mean_square(vectors, run)
+        if name == "rotation":
+            flips = [(pose, vector) for pose, vector in vectors if not is_unflipped(pose)]
+            rmse = rmse[0], *ends_with_flips(rmse[0], unflipped, flips, run)
+        out |= named(f"{name}_rmse_{unit}", rmse)
         out |= named(f"{name}_rmse_unflipped_{unit}", root_mean_square(unflipped, run))
         sizes = [length(error(pose)) if is_solved(pose) else math.inf for pose in aimed]
         for label, share in SHARES.items():
@@ -162,6 +166,24 @@ def expected_errors(found):
             given = 2 if freedom_in(aimed) == 0 else 3 if any(map(math.isnan, interval)) else 1
             out[f"{label}_interval"] = given if aimed else 0
     return out
+
+
+def ends_with_flips(value, unflipped, flips, run, bound=180.0):
+    """Return the least and the largest RMS over the ends of the share of flips and of both RMS."""
+    solved = [pose for pose, _ in (*unflipped, *flips)]
+    if freedom_in(solved) == 0:
+        return math.nan, math.nan
+    n, draws = len(solved), draws_in(solved)
+    few, many = len(flips) * draws // n, -(-len(flips) * draws // n)
+    shares = [0.0 if few == 0 else stats.beta.ppf(0.025, few, draws - few + 1),
+              1.0 if many == draws else stats.beta.ppf(0.975, many + 1, draws - many)]
+    (_, *u), (_, *v) = (root_mean_square(part, run) for part in (unflipped, flips))
+    lows = [next((low for low in (own, other) if not math.isnan(low)), 0.0)
+            for own, other in ((u[0], v[0]), (v[0], u[0]))]
+    highs = [bound if math.isnan(high) else min(high, bound) for high in (u[1], v[1])]
+    low, high = ([math.sqrt((1 - p) * parts[0]**2 + p * parts[1]**2) for p in shares]
+                 for parts in (lows, highs))
+    return min(value, *low), max(value, *high)
 
 
 # Comparison.

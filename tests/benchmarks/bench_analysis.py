@@ -20,7 +20,8 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.experiment import Pipeline
 from sweep.plan.schema import SCHEMA
 from sweep.store.blocks import region
-from sweep.store.lifecycle import create_store, finish
+from sweep.store.closing import finish
+from sweep.store.lifecycle import create_store
 
 GRID = """
 seed = 1

@@ -5,7 +5,9 @@ The blocks are the chunks of a lazy dataset, and the result is then lazy, too.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic
@@ -18,6 +20,7 @@ from numpy.typing import NDArray
 from sweep.analysis.binning import Binning, Bins, read_bins
 from sweep.analysis.graph import ChunkReader, ReadBlock, TaskLayer, add_pass, array_of_blocks
 from sweep.analysis.layout import Arrays, Layout, Lengths
+from sweep.analysis.replicates import replicate_order, replicated
 from sweep.analysis.states import BlockState, Nothing, State
 from sweep.analysis.statistic import Output, SinglePass, Statistic, Variables, ViewT
 
@@ -62,6 +65,10 @@ def aggregate(
     dataset = xr.Dataset(
         {name: array.reset_coords(drop=True) for name, array in inputs.items()} | binned)
     layout = Layout.of(dataset, kept)
+    if (order := replicate_order(results, layout.draws)) is not None:
+        settings = math.prod(results.sizes[name] for name in layout.settings)
+        layout = dataclasses.replace(layout, order=order)
+        statistics = [replicated(statistic, settings) for statistic in statistics]
     chunked = layout.rechunk(dataset, lazy=lazy)
     lengths = {name: tuple(chunked.chunks[name]) if name in chunked.sizes
                else (results.sizes[name],) for name in layout.dimensions}

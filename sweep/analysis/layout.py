@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from sweep.analysis.dimensions import DRAWS, is_grid_axis
 from sweep.plan.schema import LABELS
+from sweep.plan.sobol import REPLICATES
 
 MAX_BLOCK = 1 << 18
 """Poses in a block of a dataset that is in memory."""
@@ -42,7 +43,8 @@ Lengths = Mapping[str, tuple[int, ...]]
 class Layout:
     """What each dimension is: kept, of cells, of draws, or of settings.
 
-    ``arrays`` gives the dimensions of each array.
+    ``arrays`` gives the dimensions of each array; ``order`` the indices of the trials by replicate,
+    if they have such (`sweep.analysis.replicates`): then replicates stand in the place of draws.
     """
 
     arrays: Mapping[str, tuple[str, ...]]
@@ -50,6 +52,7 @@ class Layout:
     cells: tuple[str, ...]
     draws: tuple[str, ...]
     settings: tuple[str, ...]
+    order: NDArray[np.intp] | None = None
 
     @classmethod
     def of(cls, dataset: xr.Dataset, kept: Sequence[str]) -> Layout:
@@ -81,23 +84,27 @@ class Layout:
             array = array.reshape(
                 (*(sizes[dim] if dim in dims else 1 for dim in self.dimensions), *rest))
             array = np.broadcast_to(array, (*(sizes[dim] for dim in self.dimensions), *rest))
-            arrays[name] = array.reshape((*shape, *rest))
+            array = array.reshape((*shape, *rest))
+            arrays[name] = array if self.order is None else _by_replicate(array, self.order)
         return arrays
 
     def rechunk(self, dataset: xr.Dataset, *, lazy: bool) -> xr.Dataset:
         """Return the dataset in chunks; settings and inner dimensions are whole in each.
 
+        So are draws that have replicates.
+
         Those of a lazy dataset are joined up to `JOINED_BLOCK` poses, but not along kept
         dimensions; one in memory is cut into blocks of `MAX_BLOCK` poses.
         """
+        together = () if self.order is None else self.draws
         if lazy:
             whole = {name: -1 for name in dataset.dims
-                     if name in LABELS or name in self.settings}
+                     if name in LABELS or name in self.settings or name in together}
             return self._joined(dataset.chunk().unify_chunks().chunk(whole))
         lengths: dict[str, int] = {}
         size = math.prod(dataset.sizes[name] for name in self.dimensions if name in dataset.sizes)
         for name in (*self.cells, *self.draws, *self.kept):
-            if name in dataset.sizes and size > MAX_BLOCK:
+            if name in dataset.sizes and name not in together and size > MAX_BLOCK:
                 length = dataset.sizes[name]
                 lengths[name] = max(1, length * MAX_BLOCK // size)
                 size = size // length * lengths[name]
@@ -118,6 +125,13 @@ class Layout:
                     sum(lengths[k : k + count]) for k in range(0, len(lengths), count))
                 size = size // max(lengths) * max(joined[name])
         return dataset.chunk(joined)
+
+
+def _by_replicate(array: NDArray[Any], order: NDArray[np.intp]) -> NDArray[Any]:
+    """Return (groups, cells, trials, settings, ...) as (groups, cells, replicates, rest, ...)."""
+    groups, cells, trials, settings = array.shape[:4]
+    rest = trials // REPLICATES * settings
+    return array[:, :, order].reshape((groups, cells, REPLICATES, rest, *array.shape[4:]))
 
 
 def block_numbers(names: Sequence[str], lengths: Lengths) -> Iterator[dict[str, int]]:

@@ -78,3 +78,6 @@ def require_pairs(first: xr.Dataset, second: xr.Dataset) -> None:
     seeds = [fingerprint_of(side).get("seed") for side in (first, second)]
     if None not in seeds and seeds[0] != seeds[1]:
         raise DatasetError(f"not the same draws: seeds {seeds[0]} and {seeds[1]}")
+    sampling = [fingerprint_of(side).get("sampling", "independent") for side in (first, second)]
+    if sampling[0] != sampling[1]:
+        raise DatasetError(f"not the same draws: sampling {sampling[0]} and {sampling[1]}")

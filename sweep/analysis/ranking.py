@@ -17,6 +17,7 @@ from sweep.analysis.dimensions import (
     require_dimension,
 )
 from sweep.analysis.rates import detection_rate
+from sweep.analysis.replicates import is_replicated
 from sweep.errors import ArgumentError
 from sweep.typing import Floats
 
@@ -63,7 +64,8 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     The test is that of Cochran, Mantel and Haenszel: J. Natl. Cancer Inst. 22 (1959), 719-748.
     Under the hypothesis the ID's detections in a cell are hypergeometric; the tails of their sum
     are taken from the gamma distribution (Pearson's type III) with the same mean, variance and
-    skewness, with a continuity correction of 1/2, so that they are right if misses are rare. The
+    skewness, with a continuity correction of 1/2, so that they are right if misses are rare. Draws
+    that are Sobol' points (``sampling = "sobol"``) are not independent: no p-values, none weak. The
     correction is Holm's: Scandinavian Journal of Statistics 6 (1979), 65-70. If no cell has two
     draws there are no intervals and no p-values, and no ID is weak.
 
@@ -95,7 +97,8 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     sums = {name: array.sum(cells).transpose(*kept) for name, array in (
         ("n", n), ("hits", hits), ("expected", expected), ("variance", variance),
         ("third", third))}
-    drawn = table["detection_rate_low"].notnull()
+    # The test is of independent draws.
+    drawn = table["detection_rate_low"].notnull() & (not is_replicated(results))
     p_value = xr.apply_ufunc(
         two_sided, sums["hits"] - sums["expected"], sums["variance"], sums["third"],
         dask="parallelized", output_dtypes=[np.float64],

@@ -98,7 +98,11 @@ def parts(pipeline: Pipeline) -> list[Part]:
     pixels = [name for name in pipeline.values_of("solver") if SOLVERS[name].needs_images]
     return [
         Part("lens distortion", lens, "distortion is given" if lens else "distortion is empty"),
-        Part("random draws", bool(draws), ", ".join(draws) if draws else "nothing is random"),
+        Part(
+            "random draws", bool(draws),
+            ", ".join(draws) + (", Sobol' points" if pipeline.sampling == "sobol" else "")
+            if draws else "nothing is random",
+        ),
         Part("background image", image, "background names a file" if image else "a level"),
         Part(
             "window", not (asked or image),

@@ -9,7 +9,7 @@ order and on which grid, does not matter; nor do renderer, window, levels, detec
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from functools import cache
 from hashlib import blake2b
 from typing import Any
@@ -23,6 +23,7 @@ from sweep.model.splitmix import mixed
 from sweep.plan.axes import Distribution
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS
 from sweep.plan.pose_values import canonical_pose
+from sweep.plan.sobol import sobol_uniform
 from sweep.typing import Floats, Integers
 
 _DEFAULT_VIEW = dict(
@@ -109,6 +110,31 @@ def uniform(
     there. 53 bits, in the middle of their interval, so that neither 0 nor 1 occurs.
     """
     return np.asarray(((bits(seed, quantity, keys, trials) >> np.uint64(11)) + 0.5) * 2.0**-53)
+
+
+SAMPLINGS = ("independent", "sobol")
+"""How the draws of a cell's trials relate: not at all, or so that they fill their space evenly."""
+
+
+def jointly_drawn(distributions: Collection[str], others: Sequence[str] = ()) -> list[str]:
+    """Return the quantities that are drawn together, each at its dimension of Sobol's points.
+
+    The jitter comes after the distributions, so that whether there is any changes nothing for them;
+    then come ``others``.
+    """
+    return [*sorted(distributions), "shift_u_px", "shift_v_px", *others]
+
+
+def even_uniform(
+    seed: int, quantity: str, quantities: Sequence[str], keys: NDArray[np.uint64], trials: Integers
+) -> Floats:
+    """Return uniform numbers in (0, 1) of scenes that fill the space of ``quantities`` evenly.
+
+    They are scrambled by (seed, quantity, geometry key, number of the replicate); the other
+    arguments are as of :func:`uniform`.
+    """
+    start = mixed(keys ^ _hash(f"{seed}\nsobol\n{quantity}"))
+    return sobol_uniform(quantities.index(quantity), start, trials)
 
 
 def bits(

@@ -34,8 +34,9 @@ class Pipeline:
     ----------
     name
         What stores are named after: the file's stem.
-    title, seed
-        As the document says; the seed of all random draws.
+    title, seed, sampling
+        As the document says; the seed of all random draws, and how those of a cell's trials relate
+        (:data:`sweep.plan.draws.SAMPLINGS`).
     fixed
         Value of every parameter that is neither an axis nor drawn.
     given
@@ -64,6 +65,7 @@ class Pipeline:
     name: str
     title: str
     seed: int
+    sampling: str
     fixed: Mapping[str, Any]
     given: frozenset[str]
     distributions: Mapping[str, Distribution]
@@ -294,7 +296,8 @@ def _checked(
     if reading.stated:
         text = with_values(text, "camera", reading.stated)
     return Pipeline(
-        name=name, title=reading.title, seed=reading.seed, fixed=reading.fixed,
+        name=name, title=reading.title, seed=reading.seed, sampling=reading.sampling,
+        fixed=reading.fixed,
         given=frozenset(reading.given), distributions=reading.distributions,
         axes=tuple(reading.axes.values()), text=text, files=reading.files,
         folder=str(folder.resolve()),

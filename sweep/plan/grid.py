@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,11 +19,12 @@ from sweep.model.camera import canonical_distortion
 from sweep.model.columns import Column
 from sweep.model.effects import RANDOM, SWITCHES
 from sweep.plan.axes import TRIAL, Axis
-from sweep.plan.beliefs import believed_calibration, calibrated_columns
-from sweep.plan.draws import bits, geometry_keys, uniform
+from sweep.plan.beliefs import CALIBRATED, believed_calibration, calibrated_columns
+from sweep.plan.draws import bits, even_uniform, geometry_keys, jointly_drawn, uniform
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import PARAMETERS, Stage
 from sweep.plan.pose_values import resolve_pose
+from sweep.typing import Floats
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -147,16 +148,22 @@ def scene_values(
         resolve_pose(values)
         return values
     keys = geometry_keys(values, drawn, count)
+    draw: Callable[..., Floats] = uniform
+    if pipeline.sampling == "sobol":
+        calibrated = () if calibration is None else calibration.names
+        quantities = jointly_drawn(drawn, [CALIBRATED + name for name in calibrated])
+        draw = partial(even_uniform, quantities=quantities)
     for name, distribution in drawn.items():
-        values[name] = Column.of(distribution.at(uniform(pipeline.seed, name, keys, trials)))
+        number = draw(pipeline.seed, name, keys=keys, trials=trials)
+        values[name] = Column.of(distribution.at(number))
     if (jitter > 0).any():
         for name in ("shift_u_px", "shift_v_px"):
-            draw = uniform(pipeline.seed, name, keys, trials)
-            values[name] = Column.of(jitter * (2 * draw - 1))
+            number = draw(pipeline.seed, name, keys=keys, trials=trials)
+            values[name] = Column.of(jitter * (2 * number - 1))
     if calibration is not None:
         values |= calibrated_columns(
             calibration, values, count,
-            lambda quantity: uniform(pipeline.seed, quantity, keys, trials),
+            lambda quantity: draw(pipeline.seed, quantity, keys=keys, trials=trials),
         )
     if noisy:
         values["noise_key"] = Column.of(bits(pipeline.seed, "noise", keys, trials))

@@ -18,11 +18,12 @@ from sweep.plan.axes import (
     parse_trial,
     zipped_axis,
 )
+from sweep.plan.draws import SAMPLINGS
 from sweep.plan.parameters import PARAMETERS, SECTIONS
 
 MAX_TITLE_LENGTH = 200
 
-HEADER = ("title", "seed")
+HEADER = ("title", "seed", "sampling")
 """Keys that stand above the sections."""
 
 
@@ -42,7 +43,7 @@ class Reading:
         Path as written -> SHA-256, used instead of reading the files; None to read them.
     known_cameras
         The same of camera files alone, whose values the document has.
-    title, seed, fixed, distributions, axes, files
+    title, seed, sampling, fixed, distributions, axes, files
         As :class:`sweep.plan.experiment.Pipeline` has them; ``axes`` by name.
     given
         Names of the parameters that the document has, even with a value that cannot be.
@@ -59,6 +60,7 @@ class Reading:
     known_cameras: Mapping[str, str] | None = None
     title: str = ""
     seed: int = 0
+    sampling: str = SAMPLINGS[0]
     fixed: dict[str, Any] = field(default_factory=dict)
     distributions: dict[str, Distribution] = field(default_factory=dict)
     axes: dict[str, Axis] = field(default_factory=dict)
@@ -149,6 +151,11 @@ def _read_header(reading: Reading) -> None:
         reading.fault("seed", seed, "a whole number from 0 to 2^63 - 1")
     else:
         reading.seed = seed
+    sampling = reading.document.get("sampling", SAMPLINGS[0])
+    if sampling not in SAMPLINGS:
+        reading.fault("sampling", sampling, f"one of {', '.join(SAMPLINGS)}")
+    else:
+        reading.sampling = sampling
 
 
 def _read_section(reading: Reading, section: str) -> None:

@@ -21,6 +21,7 @@ from sweep.plan.camera_values import one_camera
 from sweep.plan.parameters import PARAMETERS, SECTIONS, Stage
 from sweep.plan.reader import HEADER, Reading
 from sweep.plan.schema import LABELS, VARIABLES
+from sweep.plan.sobol import REPLICATES
 
 MAX_POSES = 10**12
 """The largest grid."""
@@ -124,6 +125,26 @@ def something_random_to_repeat(reading: Reading) -> None:
         )
 
 
+def trials_fill_replicates(reading: Reading) -> None:
+    """Demand trials, and draws, that are the replicates of Sobol's points as a whole."""
+    if reading.sampling != "sobol" or TRIAL not in reading.axes:
+        return
+    trials = len(reading.axes[TRIAL])
+    if trials % REPLICATES or trials < 2 * REPLICATES:
+        reading.fault(
+            "axes.trial", trials,
+            f"a multiple of {REPLICATES}, at least {2 * REPLICATES}, for sampling = sobol: "
+            f"{REPLICATES} replicates of as many points each, best a power of two",
+        )
+    jitter = reading.values("jitter_px")
+    calibrated = "calibration" in reading.values("believed")
+    if not reading.distributions and jitter and max(jitter) == 0 and not calibrated:
+        reading.fault(
+            "sampling", reading.sampling,
+            "a distribution or jitter_px above 0 (the noise of pixels is independent in any case)",
+        )
+
+
 def names_of_axes(reading: Reading) -> None:
     """Demand names that nothing else of the dataset has for axes of parameters that go together."""
     for axis in reading.axes.values():
@@ -199,6 +220,7 @@ RULES: tuple[Callable[[Reading], None], ...] = (
     check_backgrounds,
     fields_of_the_installed_opencv,
     something_random_to_repeat,
+    trials_fill_replicates,
     names_of_axes,
     size_of_the_grid,
     size_of_whole_frames,

@@ -16,6 +16,7 @@ from typing import Any
 
 from sweep.installation import check_installation, check_loaded_opencv
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
+from sweep.plan.draws import SAMPLINGS
 from sweep.plan.experiment import Pipeline
 from sweep.version import __version__
 
@@ -93,6 +94,7 @@ def fingerprint(pipeline: Pipeline) -> dict[str, Any]:
         **versions(),
         "builds": dict(builds()),
         "seed": pipeline.seed,
+        **({} if pipeline.sampling == SAMPLINGS[0] else {"sampling": pipeline.sampling}),
         "files": dict(sorted(pipeline.files.items())),
     }
 

@@ -1,0 +1,69 @@
+"""How much evenly spread draws gain on real scenes: variances of means against independent ones."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import sweep
+from sweep.evaluation.cells import run_cells
+from sweep.plan.sobol import REPLICATES
+
+PIPELINE = {
+    "camera": {"fx_px": 600},
+    "marker": {"size_m": 0.05},
+    "pose": {
+        "side_px": {"uniform": [14, 40]}, "tilt_deg": {"uniform": [0, 70]},
+        "azimuth_deg": {"uniform": [0, 360]}, "jitter_px": 0.5,
+    },
+    "scene": {"background": 120, "black": 40, "white": 220, "noise_grey": 2},
+    "detector": {"cornerRefinementMethod": "subpix"},
+}
+
+
+def quantities(seed, trials, points, sampling):
+    """Return the means of five quantities over each group of points, (groups, 5)."""
+    pipeline = sweep.Pipeline.from_dict(
+        PIPELINE | {"seed": seed, "sampling": sampling, "axes": {"trial": trials}})
+    columns = run_cells(pipeline, [np.arange(trials)]).columns
+    detected = columns["detection"][0] == 1
+    corner = np.linalg.norm(columns["corner_error_px"][0], axis=2).mean(axis=1)
+    angle = columns["rotation_error_deg"][0].astype(float)
+    z = columns["translation_error_m"][0][:, 2].astype(float)
+    # Both samplings in groups of as many draws: replicates, or trials in a row.
+    order = np.arange(trials)
+    if sampling == "sobol":
+        order = np.argsort(order % REPLICATES, kind="stable")
+    groups = order.reshape(-1, points)
+
+    def mean(values):
+        return np.nanmean(values[groups], axis=1)
+
+    return np.stack([
+        mean(detected.astype(float)), mean(np.minimum(angle, 30)), mean(z),
+        np.sqrt(mean(np.minimum(angle, 30) ** 2)), mean(corner),
+    ], axis=1)
+
+
+NAMES = ("detection rate", "mean rotation error", "bias of z", "RMSE of rotation", "corner error")
+
+
+@pytest.mark.parametrize(("seeds", "points", "least"), [
+    (1, 16, 0.05), pytest.param(24, 64, 1.0, marks=pytest.mark.long),
+])
+def test_variances_of_means_are_no_larger(seeds, points, least):
+    # The ratio of two sample variances of equal normal means is Fisher's F: with 15 and 15 degrees
+    # of freedom below 0.05, with 383 and 383 below 0.61, with a chance of 1e-6 at most.
+    trials = points * REPLICATES
+    means = {
+        sampling: np.concatenate([
+            quantities(seed, trials, points, sampling) for seed in range(seeds)
+        ]) for sampling in ("sobol", "independent")
+    }
+    ratios = means["independent"].var(axis=0, ddof=1) / means["sobol"].var(axis=0, ddof=1)
+    print({name: round(float(ratio), 2) for name, ratio in zip(NAMES, ratios, strict=True)})
+    groups = seeds * REPLICATES - 1
+    assert (ratios > min(least, stats.f.ppf(1e-6, groups, groups))).all()
+    # The same is estimated.
+    error = np.sqrt(sum(each.var(axis=0, ddof=1) / len(each) for each in means.values()))
+    difference = means["sobol"].mean(axis=0) - means["independent"].mean(axis=0)
+    assert (abs(difference) < 6 * error).all()

@@ -143,13 +143,13 @@ class Rate(SinglePass[ViewT, RateState], Generic[ViewT]):
         hits = (self.successes(poses) & used).sum(axis=OVER_ALL)
         return BlockRateState(BlockSample.of(used), np.asarray(hits))
 
-    def _draws(self, state: RateState) -> Integers:
+    def draws_of(self, state: RateState) -> Integers:
         """Return the number of draws that the interval is of."""
         return state.sample.draws
 
     def result(self, state: RateState) -> Variables:
         """Return the rate and its intervals."""
-        n, draws, hits = state.sample.n, self._draws(state), state.hits
+        n, draws, hits = state.sample.n, self.draws_of(state), state.hits
         fewest, most = scaled_to_draws(hits, n, draws)
         with np.errstate(invalid="ignore"):
             values: Variables = {self.name: hits / n}

@@ -17,7 +17,7 @@ from sweep.analysis.counts import BlockRateState, Rate, RateState, scaled_to_dra
 from sweep.analysis.intervals import clopper_pearson
 from sweep.analysis.means import BlockMeanState, CentredState, MeanState, RootMeanSquare
 from sweep.analysis.pose_view import Poses
-from sweep.analysis.states import BlockState, CellDeviations, Sample, Spread, State
+from sweep.analysis.states import BlockState, CellDeviations, Spread, State
 from sweep.analysis.statistic import (
     Output,
     Statistic,
@@ -25,7 +25,7 @@ from sweep.analysis.statistic import (
     interval_variables,
     with_interval,
 )
-from sweep.typing import Floats, Masks
+from sweep.typing import Floats, Integers, Masks
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,10 @@ class BlockMixtureSpread(BlockState[MixtureSpread]):
         return MixtureSpread(self.unflipped.fold(), self.flipped.fold())
 
 
+FLIPS: Rate[Poses] = Rate("", "", lambda poses: poses.flipped, lambda poses: poses.solved)
+"""The share of flips among the solved."""
+
+
 @dataclass(frozen=True)
 class FlipMixture(Statistic[Poses, MixtureState, CentredMixture, MixtureSpread]):
     """The root mean square over solved poses, with an interval that holds if flips are rare.
@@ -99,14 +103,12 @@ class FlipMixture(Statistic[Poses, MixtureState, CentredMixture, MixtureSpread])
     squares: Callable[[Poses], Floats]
     bound: float
     """The largest error that exists, in the unit of the errors."""
+    flips: Rate[Poses] = FLIPS
+    """The share of flips, p."""
 
     def outputs(self) -> Sequence[Output]:
         """Return the root mean square and its interval."""
         return with_interval(self.name, self.meaning, self.units)
-
-    @property
-    def _flips(self) -> Rate[Poses]:
-        return Rate("", "", lambda poses: poses.flipped, lambda poses: poses.solved)
 
     def _of(self, used: Callable[[Poses], Masks]) -> RootMeanSquare[Poses]:
         return RootMeanSquare("rms", "", self.units, self.squares, used)
@@ -123,7 +125,7 @@ class FlipMixture(Statistic[Poses, MixtureState, CentredMixture, MixtureSpread])
         """Take the moments of both parts, and count."""
         return BlockMixtureState(
             self._unflipped.first_pass(poses), self._flipped.first_pass(poses),
-            self._flips.first_pass(poses))
+            self.flips.first_pass(poses))
 
     def prepare_second(self, first: MixtureState) -> CentredMixture:
         """Return the moments with their means."""
@@ -151,7 +153,7 @@ class FlipMixture(Statistic[Poses, MixtureState, CentredMixture, MixtureSpread])
         largest = self.bound**2
         lows = _first_known(u_low, v_low), _first_known(v_low, u_low)
         highs = [np.fmin(high, largest) for high in (u_high, v_high)]
-        shares = _shares(known.flips.sample, known.flips)
+        shares = _shares(self.flips.draws_of(known.flips), known.flips)
         low = np.minimum(*((1 - share) * lows[0] + share * lows[1] for share in shares))
         high = np.maximum(*((1 - share) * highs[0] + share * highs[1] for share in shares))
         # What is computed is rounded: the value lies in its interval.
@@ -167,7 +169,7 @@ def _first_known(*values: Floats) -> Floats:
     return np.nan_to_num(np.where(np.isnan(first), second, first), nan=0.0)
 
 
-def _shares(sample: Sample, flips: RateState) -> tuple[Floats, Floats]:
+def _shares(draws: Integers, flips: RateState) -> tuple[Floats, Floats]:
     """Return the ends of the share of flips, counted in draws."""
-    fewest, most = scaled_to_draws(flips.hits, sample.n, sample.draws)
-    return clopper_pearson(fewest, sample.draws)[0], clopper_pearson(most, sample.draws)[1]
+    fewest, most = scaled_to_draws(flips.hits, flips.sample.n, draws)
+    return clopper_pearson(fewest, draws)[0], clopper_pearson(most, draws)[1]

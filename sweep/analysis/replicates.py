@@ -16,16 +16,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 from scipy import special
 
-from sweep.analysis.counts import Rate, RateState
+from sweep.analysis.counts import BlockRateState, Rate, RateState
 from sweep.analysis.dimensions import DRAWS, fingerprint_of
-from sweep.analysis.states import BlockSample, BlockState
+from sweep.analysis.flip_mixture import FlipMixture
+from sweep.analysis.states import BlockSample
 from sweep.analysis.statistic import OVER_ALL, Statistic, ViewT
 from sweep.errors import DatasetError
 from sweep.plan.sobol import REPLICATES
@@ -68,9 +69,16 @@ def replicated(
     statistic: Statistic[ViewT, Any, Any, Any], settings: int
 ) -> Statistic[ViewT, Any, Any, Any]:
     """Return a statistic as it is computed of replicates; ``settings`` see the same draws each."""
-    if not isinstance(statistic, Rate):
-        return statistic
-    fields = {field.name: getattr(statistic, field.name) for field in dataclasses.fields(Rate)}
+    if isinstance(statistic, Rate):
+        return _rate(statistic, settings)
+    if isinstance(statistic, FlipMixture):
+        mixture = dataclasses.replace(statistic, flips=_rate(statistic.flips, settings))
+        return cast("Statistic[ViewT, Any, Any, Any]", mixture)
+    return statistic
+
+
+def _rate(rate: Rate[ViewT], settings: int) -> ReplicateRate[ViewT]:
+    fields = {field.name: getattr(rate, field.name) for field in dataclasses.fields(Rate)}
     return ReplicateRate(**fields, settings=settings)
 
 
@@ -88,11 +96,9 @@ class ReplicateRateState(RateState):
 
 
 @dataclass(frozen=True)
-class BlockReplicateRateState(BlockState[ReplicateRateState]):
+class BlockReplicateRateState(BlockRateState):
     """The same of a block."""
 
-    sample: BlockSample
-    hits: Integers
     hits_hits: Floats
     hits_used: Floats
     used_used: Floats
@@ -116,7 +122,7 @@ class ReplicateRate(Rate[ViewT]):
 
     settings: int = 1
 
-    def first_pass(self, poses: ViewT) -> BlockReplicateRateState:  # type: ignore[override]
+    def first_pass(self, poses: ViewT) -> BlockReplicateRateState:
         """Count, by replicate."""
         used = self.used(poses)
         hit = self.successes(poses) & used
@@ -130,7 +136,7 @@ class ReplicateRate(Rate[ViewT]):
         return BlockReplicateRateState(
             BlockSample.of(used), np.asarray(hit.sum(axis=OVER_ALL)), *sums)
 
-    def _draws(self, state: RateState) -> Integers:
+    def draws_of(self, state: RateState) -> Integers:
         """Return the number of independent draws that the rate is worth."""
         if not isinstance(state, ReplicateRateState):
             raise TypeError(state)

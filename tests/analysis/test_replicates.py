@@ -71,7 +71,7 @@ def true_values():
     variance = np.degrees(np.radians(0.3)) ** 2
     bias = mean(error)
     return {
-        "detection_rate": p, "rotation_rmse_deg": np.sqrt(mean(error**2) + variance),
+        "detection_rate": p, "rotation_rmse_unflipped_deg": np.sqrt(mean(error**2) + variance),
         "rotation_bias_deg": bias, "range_bias_percent": 100 * mean(z),
         "rotation_sd_deg": np.sqrt(mean(error**2) - bias**2 + variance),
         "position_rmse_m": np.sqrt(mean(z**2) + 0.01**2),
@@ -102,7 +102,7 @@ def test_intervals_are_narrower_than_those_of_independent_draws():
     even, independent = dataset(100), dataset(100, sobol=False)
     # Pixel noise is independent in any case, and most of these errors.
     for name, least in (
-        ("detection_rate", 0.9), ("rotation_rmse_deg", 0.9), ("rotation_bias_deg", 0.95),
+        ("detection_rate", 0.9), ("rotation_rmse_unflipped_deg", 0.9), ("rotation_bias_deg", 0.95),
         ("range_bias_percent", 1.0), ("rotation_sd_deg", 1.05), ("position_rmse_m", 1.05),
     ):
         width, other = (covered(each, name, 0.0)[1] for each in (even, independent))
@@ -127,6 +127,17 @@ def test_rare_failures_get_no_more_than_independent_draws():
     one = detection_rate(results, per=["sim"]).isel(sim=0)
     assert one.draws.item() <= 64
     assert one.detection_rate_low.item() < 0.99
+
+
+def test_flips_are_counted_in_draws_and_not_in_replicates():
+    widths = []
+    for sobol in (True, False):
+        results = dataset(50, sobol=sobol)
+        truth = true_values()["rotation_rmse_unflipped_deg"]
+        share, width = covered(results, "rotation_rmse_deg", truth)
+        assert share > 0.8
+        widths.append(width)
+    assert widths[0] == pytest.approx(widths[1], rel=0.1)
 
 
 def test_settings_of_a_trial_count_as_one_draw():

@@ -236,6 +236,8 @@ def _numbers(name: str, value: Any) -> tuple[list[float], tuple[int, int] | None
             shape = int(rows), int(columns)
         single = value.get("dt") == "f"
         value = value["data"]
+    if isinstance(value, str) and value.startswith("$base64$"):
+        raise ValueError(f"{plain(name)}: base64; write the file with numbers")
     if isinstance(value, str):
         value = value.split()
     if value is None:

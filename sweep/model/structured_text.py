@@ -151,6 +151,8 @@ class _Events:
         if isinstance(event, yaml.AliasEvent):
             raise ValueError("YAML with references (*), which no camera file has")  # noqa: TRY004
         tag = event.tag or ""
+        if tag == "tag:yaml.org,2002:binary":
+            raise ValueError("YAML with base64; write the file with numbers")
         if tag.startswith(("tag:", "!")) and tag != "!" and not tag.startswith(_TAGS) and (
             not re.fullmatch("tag:yaml.org,2002:(str|float|int|seq|map|bool|null)", tag)
         ):

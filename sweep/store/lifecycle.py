@@ -22,7 +22,7 @@ from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
 from sweep.errors import StoreError
-from sweep.plan.camera_facts import camera_facts
+from sweep.plan.camera_facts import camera_facts, notes
 from sweep.plan.camera_values import stored_text
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
@@ -210,10 +210,12 @@ def _lay_out(to: Store, pipeline: Pipeline, extents: tuple[int, ...], run_id: st
     for array in planned:
         array.create(group)
     coordinates = [array.path for array in planned if array.coordinate]
+    told = notes(pipeline)
     attributes: dict[str, Any] = {
         "title": pipeline.heading,
         "pipeline": pipeline.text,
         **camera_facts(pipeline).attributes(),
+        **({"camera_notes": "; ".join(told)} if told else {}),
         **({"coordinates": " ".join(coordinates)} if coordinates else {}),
         "sweep": {
             "format": FORMAT,

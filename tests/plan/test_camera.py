@@ -266,6 +266,8 @@ def test_notes_are_told_by_a_run_from_python(tmp_path, capfd):
     with calls_here():
         execute(pipeline({"fx_px": 400, "fy_px": 500}), tmp_path / "s.zarr")
     assert "pixels are not square: fy/fx = 1.25" in capfd.readouterr().err
+    told = sweep.open(tmp_path / "s.zarr").attrs["camera_notes"]
+    assert told.startswith("pixels are not square: fy/fx = 1.25")
 
 
 # 4. Stores of versions whose pixels were not square by default.

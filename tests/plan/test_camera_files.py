@@ -389,6 +389,17 @@ def test_a_file_that_is_no_camera_s_is_refused_in_one_line(tmp_path, case, capfd
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize("ending", ["yml", "json"])
+def test_base64_is_refused_with_what_to_do(tmp_path, ending):
+    path = tmp_path / f"c.{ending}"
+    mode = cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_WRITE_BASE64
+    storage = cv2.FileStorage(str(path), mode)
+    storage.write("camera_matrix", np.array(MATRIX))
+    storage.release()
+    line, = refusals(path)
+    assert "base64; write the file with numbers" in line
+
+
 def test_a_path_without_a_file_is_refused_in_one_line(tmp_path):
     assert "(No such file or directory)" in refusals(tmp_path / "none.yml")[0]
     (tmp_path / "folder").mkdir()

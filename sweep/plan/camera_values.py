@@ -24,7 +24,7 @@ FIELDS_OF_VIEW = ("hfov_deg", "vfov_deg")
 
 def one_camera(reading: Reading) -> None:
     """Demand a camera that is given in one way, and completely."""
-    given = reading.given
+    given = reading.given - reading.stated.keys()
 
     def present(names: tuple[str, ...]) -> list[str]:
         return [name for name in names if name in given]

@@ -427,6 +427,7 @@ def test_a_path_without_a_file_is_refused_in_one_line(tmp_path):
 def test_other_keys_of_the_camera_beside_a_file_are_refused(tmp_path, keys, lines):
     path = write(tmp_path / "c.yaml", GOOD)
     told = refusals(path, **keys)
+    assert len(told) == len(lines)
     for expected in lines:
         assert [line for line in told if expected in line], told
 

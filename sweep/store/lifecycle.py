@@ -210,12 +210,12 @@ def _lay_out(to: Store, pipeline: Pipeline, extents: tuple[int, ...], run_id: st
     for array in planned:
         array.create(group)
     coordinates = [array.path for array in planned if array.coordinate]
-    told = notes(pipeline)
+    surprising = notes(pipeline)
     attributes: dict[str, Any] = {
         "title": pipeline.heading,
         "pipeline": pipeline.text,
         **camera_facts(pipeline).attributes(),
-        **({"camera_notes": "; ".join(told)} if told else {}),
+        **({"camera_notes": "; ".join(surprising)} if surprising else {}),
         **({"coordinates": " ".join(coordinates)} if coordinates else {}),
         "sweep": {
             "format": FORMAT,

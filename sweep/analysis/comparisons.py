@@ -15,14 +15,8 @@ from sweep.analysis.dimensions import kept_dimensions
 from sweep.analysis.means import Mean, RootMeanSquareRatio
 from sweep.analysis.paired_rates import newcombe_and_mcnemar
 from sweep.analysis.pose_pairs import TRUTH, Pair, paired_arrays, require_pairs
-from sweep.analysis.pose_view import (
-    ERROR_INPUTS,
-    QUANTITIES,
-    Poses,
-    Quantity,
-    norm_squared,
-    pose_arrays,
-)
+from sweep.analysis.pose_view import ERROR_INPUTS, Poses, norm_squared, pose_arrays
+from sweep.analysis.quantities import QUANTITIES, Quantity
 from sweep.analysis.statistic import Statistic
 from sweep.typing import Floats, Masks
 

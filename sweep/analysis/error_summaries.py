@@ -11,10 +11,12 @@ from sweep.analysis.aggregate import aggregate
 from sweep.analysis.binning import Bins
 from sweep.analysis.dimensions import kept_dimensions
 from sweep.analysis.pose_view import Poses, pose_arrays
+from sweep.analysis.quantities import chosen_quantities
 
 
 def error_statistics(
-    results: xr.Dataset, per: Sequence[str] = (), bins: Bins | None = None
+    results: xr.Dataset, per: Sequence[str] = (), bins: Bins | None = None,
+    quantities: Sequence[str] | None = None,
 ) -> xr.Dataset:
     """Return rates, errors and their intervals.
 
@@ -22,6 +24,23 @@ def error_statistics(
     ----------
     results, per, bins
         As in `sweep.analysis.detection_rate`.
+    quantities
+        Kinds of error; by default ``rotation``, ``range`` and ``position``. Others have a sign,
+        estimated minus true; of these bias and standard deviation are computed. By groups:
+
+        - ``camera_frame``: ``x``, ``y``, ``z`` of the marker's position in the camera's frame
+          (right, down, forward), in metres.
+        - ``marker_frame``: the same error along the axes of the true marker (right, up, out):
+          ``marker_frame_x``, ``marker_frame_y``, ``marker_frame_z``.
+        - ``camera_in_marker``: of the camera's position in the marker's frame, as a robot has it
+          that localises on the marker: ``camera_in_marker_x``, ``_y``, ``_z``. It has the error
+          of the rotation times the distance in it.
+        - ``yaw_pitch_roll``: ``yaw``, ``pitch``, ``roll``, the differences of the angles of
+          R = Ry(yaw) · Rx(pitch) · Rz(roll) · Rx(180°), those of a pipeline's pose, in degrees.
+        - ``angles``: ``tilt`` (to the image plane) and ``viewing_angle`` (to the line of sight),
+          which are never negative, so that errors of frontal markers are above 0 on average; and
+          ``in_plane``, the rotation error about the true normal (counter-clockwise seen from the
+          camera is positive).
 
     Returns
     -------
@@ -39,7 +58,7 @@ def error_statistics(
           ``p99_interval`` say why an end of the interval is missing
           (`sweep.analysis.quantiles.IntervalOf`).
         - ``*_rmse_*``: over the solved poses; ``*_rmse_unflipped_*`` without flipped ones.
-        - ``*_bias_*``: of rotation and position the length of the mean vector, of the range the
+        - ``*_bias_*``: of rotation and position the length of the mean vector, of the others the
           signed mean; solved and not flipped. A length is never negative, so it is above 0 by
           chance alone; then its low end is 0.
         - ``*_sd_*``: standard deviation of all components about that mean together (n - 1).
@@ -47,7 +66,7 @@ def error_statistics(
     Raises
     ------
     ArgumentError, DatasetError
-        As in `sweep.analysis.detection_rate`.
+        As in `sweep.analysis.detection_rate`; also for a kind of error that does not exist.
 
     Notes
     -----
@@ -76,9 +95,12 @@ def error_statistics(
     [0.376, 0.752]
     >>> table["rotation_p95_deg"].values.tolist()  # 11 of 24 poses are not solved
     [inf, inf]
+    >>> table = error_statistics(results, quantities=["camera_in_marker", "yaw"])
+    >>> float(table["camera_in_marker_x_sd_m"].round(4)), float(table["yaw_sd_deg"].round(2))
+    (0.0074, 0.32)
     """
     kept = kept_dimensions(results, per)
-    records = registry.registered()
+    records = registry.registered(chosen_quantities(quantities))
     inputs = pose_arrays(results, [name for record in records for name in record.inputs])
     return aggregate(
         results, inputs, kept, [record.statistic for record in records], Poses, bins)

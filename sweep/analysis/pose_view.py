@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable
 from functools import cached_property
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from sweep.analysis.signed_errors import SignedErrors
 from sweep.errors import DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, uncounted_values
 from sweep.plan.schema import VARIABLES, XYZ
@@ -29,7 +29,9 @@ DEPTH = "true_depth_m"
 DETECTION_INPUTS = ("detection",)
 ESTIMATE_INPUTS = (*DETECTION_INPUTS, "estimate", "flipped")
 ERROR_INPUTS = (*ESTIMATE_INPUTS, "rotation_error_rad", "translation_error_m", DEPTH)
-"""Names of the arrays that a statistic of detections, of estimates, of errors reads."""
+SIGNED_INPUTS = (*ERROR_INPUTS, "true_rvec", "true_tvec_m")
+"""Names of the arrays that a statistic of detections, of estimates, of errors reads, and one of
+errors along axes and about angles."""
 
 REQUIRED_VARIABLES = tuple("true_tvec_m" if name == DEPTH else name for name in ERROR_INPUTS)
 """Variables that every dataset of results has."""
@@ -143,60 +145,15 @@ class Poses:
         return 100.0 * relative(error, self[DEPTH])[..., None]
 
     @cached_property
+    def signed(self) -> SignedErrors:
+        """Errors along axes and about angles."""
+        return SignedErrors(self["true_rvec"], self["true_tvec_m"], self["rotation_error_rad"],
+                            self["translation_error_m"])
+
+    @cached_property
     def position_m(self) -> Floats:
         """Position error vectors, (..., xyz), in metres."""
         return np.asarray(self["translation_error_m"], dtype=np.float64)
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """A kind of error of poses.
-
-    Attributes
-    ----------
-    name
-        In the names of variables.
-    unit
-        As in names, such as ``deg``.
-    units
-        As in attributes, such as ``degree``.
-    words
-        As in meanings.
-    vector
-        The error vectors (..., components) of poses.
-    bound
-        The largest absolute error that exists; None if there is none.
-    """
-
-    name: str
-    unit: str
-    units: str
-    words: str
-    vector: Callable[[Poses], Floats]
-    bound: float | None = None
-
-    def norm(self, poses: Poses) -> Floats:
-        """Return the absolute errors (...)."""
-        return np.sqrt(self.squares(poses)[..., 0])
-
-    def squares(self, poses: Poses) -> Floats:
-        """Return the squared absolute errors (..., 1)."""
-        if self.name not in poses.squares:
-            poses.squares[self.name] = norm_squared(self.vector(poses))[..., None]
-        return poses.squares[self.name]
-
-    def named(self, statistic: str) -> str:
-        """Return a variable's name, such as ``rotation_p95_deg``."""
-        return f"{self.name}_{statistic}_{self.unit}"
-
-
-QUANTITIES = (
-    Quantity("rotation", "deg", "degree", "rotation error", lambda poses: poses.rotation_deg,
-             bound=180.0),
-    Quantity("range", "percent", "percent", "depth error of the true depth",
-             lambda poses: poses.range_percent),
-    Quantity("position", "m", "m", "position error", lambda poses: poses.position_m),
-)
 
 
 def relative(length: NDArray[Any], depth: NDArray[Any]) -> Floats:

@@ -6,22 +6,16 @@ of its variables and the report's table of errors follow from it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from sweep.analysis.counts import Count
 from sweep.analysis.flip_mixture import FlipMixture
 from sweep.analysis.means import Mean, MeanLength, RootMeanSquare, StandardDeviation
-from sweep.analysis.pose_view import (
-    DETECTION_INPUTS,
-    ERROR_INPUTS,
-    ESTIMATE_INPUTS,
-    QUANTITIES,
-    Poses,
-    Quantity,
-)
+from sweep.analysis.pose_view import DETECTION_INPUTS, ERROR_INPUTS, ESTIMATE_INPUTS, Poses
 from sweep.analysis.quantiles import Quantiles
+from sweep.analysis.quantities import QUANTITIES, Quantity
 from sweep.analysis.rates import DETECTION_RATE, FLIP_RATE, LOOKED_FOR, SOLVED, SOLVED_RATE
 from sweep.analysis.statistic import Statistic
 
@@ -57,17 +51,21 @@ class ErrorStatistic:
         Returns the statistic of a kind of error; its variables have the names
         ``quantity.named("rmse")``.
     inputs
-        Names of the arrays that it reads, as in `sweep.analysis.pose_view.pose_arrays`.
+        Names of the arrays that it reads, as in `sweep.analysis.pose_view.pose_arrays`, beside
+        those that the kind of error reads.
+    of_signed
+        Whether it is computed of the errors along axes and about angles, `SIGNED`, too.
     """
 
     headings: Mapping[str, str]
     make: Callable[[Quantity], AnyPoseStatistic]
     inputs: tuple[str, ...] = field(default=ERROR_INPUTS)
+    of_signed: bool = False
 
 
 def _bias(quantity: Quantity) -> AnyPoseStatistic:
-    """Return the mean error: signed for the range, the mean vector's length for the others."""
-    mean, of = (Mean, "mean") if quantity.name == "range" else (MeanLength, "length of the mean")
+    """Return the mean error: signed if the error is, else the mean vector's length."""
+    mean, of = (Mean, "mean") if quantity.signed else (MeanLength, "length of the mean")
     return mean(quantity.named("bias"), f"{of} {quantity.words}, solved and not flipped",
                 quantity.units, quantity.vector, lambda poses: poses.unflipped)
 
@@ -104,22 +102,24 @@ ERROR_STATISTICS: tuple[ErrorStatistic, ...] = (
         lambda quantity: RootMeanSquare(
             quantity.named("rmse_unflipped"), f"RMS {quantity.words}, solved and not flipped",
             quantity.units, quantity.squares, lambda poses: poses.unflipped)),
-    ErrorStatistic({"bias": "bias without flips"}, _bias),
+    ErrorStatistic({"bias": "bias without flips"}, _bias, of_signed=True),
     ErrorStatistic(
         {"sd": "standard deviation without flips"},
         lambda quantity: StandardDeviation(
             quantity.named("sd"),
             f"standard deviation of the {quantity.words}, solved and not flipped",
-            quantity.units, quantity.vector, lambda poses: poses.unflipped)),
+            quantity.units, quantity.vector, lambda poses: poses.unflipped),
+        of_signed=True),
 )
-"""What is computed of each kind of error, `QUANTITIES`."""
+"""What is computed of each kind of error; of those of `SIGNED` only what says so."""
 
 
-def registered() -> list[PoseStatistic]:
-    """Return all statistics, those of each kind of error among them."""
+def registered(quantities: Sequence[Quantity] = QUANTITIES) -> list[PoseStatistic]:
+    """Return all statistics, those of some kinds of error among them."""
     return [*POSE_STATISTICS, *(
-        PoseStatistic(record.make(quantity), record.inputs)
-        for quantity in QUANTITIES for record in ERROR_STATISTICS)]
+        PoseStatistic(record.make(quantity), (*record.inputs, *quantity.inputs))
+        for quantity in quantities for record in ERROR_STATISTICS
+        if quantity in QUANTITIES or record.of_signed)]
 
 
 def error_headings() -> dict[str, str]:

@@ -10,13 +10,8 @@ from sweep.analysis.counts import Rate
 from sweep.analysis.dimensions import axes_of, require_dimension
 from sweep.analysis.means import Mean, RootMeanSquare
 from sweep.analysis.pose_pairs import Pair, paired_arrays
-from sweep.analysis.pose_view import (
-    DETECTION_INPUTS,
-    ERROR_INPUTS,
-    QUANTITIES,
-    norm_squared,
-    pose_arrays,
-)
+from sweep.analysis.pose_view import DETECTION_INPUTS, ERROR_INPUTS, norm_squared, pose_arrays
+from sweep.analysis.quantities import QUANTITIES
 from sweep.errors import ArgumentError
 from sweep.plan.parameters import Stage
 from sweep.typing import Floats

@@ -18,6 +18,7 @@ from sweep.report.formatting import degrees, interval_text, number
 from sweep.report.grouping import by_configuration
 from sweep.report.limits import Limits, limits_of, limits_sentence, limits_table, limits_tile
 from sweep.report.report_data import ReportData
+from sweep.report.signed_errors_table import signed_errors_table
 from sweep.report.table import Table, cells
 from sweep.report.tile import Tile
 
@@ -49,7 +50,8 @@ def answer(data: ReportData) -> Answer:
     )
     warnings = "".join(f"{line.strip()[:1].upper()}{line.strip()[1:]}. " for line in data.warnings)
     paragraph = warnings + _paragraph(data, limits)
-    return Answer(paragraph, tiles, (_errors_table(errors), *limits_table(limits)))
+    tables = (_errors_table(errors), signed_errors_table(data), *limits_table(limits))
+    return Answer(paragraph, tiles, tables)
 
 
 def _results(data: ReportData, poses: int) -> str:

@@ -274,6 +274,26 @@ def test_each_configuration_is_paired_with_the_first(full, page):
     assert row[rows[0].index("rotation RMSE ratio")] == f"{ratio} ({low} to {high})"
 
 
+def test_bias_and_spread_stand_for_each_configuration(full, page):
+    results = open_dataset(full).sel(cornerRefinementMethod="subpix", solver="photometric")
+    groups = ["camera_frame", "camera_in_marker", "yaw_pitch_roll"]
+    expected = error_statistics(results, quantities=groups).compute()
+    rows = Page(page).tables[
+        "Bias and spread of the solved poses without flips, with 95 % intervals"]
+    found = {row[0]: row[2:] for row in rows if row[1] == "subpix \u00b7 photometric"}
+    for label, name in {
+        "position error along x of the camera, m": "x_{}_m",
+        "position error along z of the camera, m": "z_{}_m",
+        "error of the camera's y in the marker's frame, m": "camera_in_marker_y_{}_m",
+        "yaw error, deg": "yaw_{}_deg", "pitch error, deg": "pitch_{}_deg",
+        "roll error, deg": "roll_{}_deg",
+    }.items():
+        for text, statistic in zip(found[label], ("bias", "sd"), strict=True):
+            value, low, high = (number(float(expected[name.format(statistic) + end]))
+                                for end in ("", "_low", "_high"))
+            assert text == f"{value} ({low} to {high})", label
+
+
 def test_the_answer_is_that_of_plain_arithmetic(full, page):
     results = open_dataset(full).load()
     detected = 100 * float((results["detection"] == DetectionStatus.detected).mean())

@@ -33,6 +33,8 @@ def example_results():
         "side_px", "trial", "solver")
     return xr.Dataset(
         {
+            "true_rvec": ((*scene, "xyz"), np.broadcast_to(
+                [np.pi, 0.0, 0.0], (*detected.shape, 3)).copy()),
             "true_tvec_m": ((*scene, "xyz"), np.stack([0 * depth, 0 * depth, depth], axis=-1)),
             "marker_area_px": (scene, np.broadcast_to(
                 np.square(SIDES)[:, None], detected.shape).copy(), {"units": "px2"}),

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from pathlib import Path
 
 from sweep.cli.arguments import add_json
 from sweep.cli.command import Command, Example
-from sweep.cli.output import print_json, quiet_matplotlib, say
+from sweep.cli.output import print_json, quiet_matplotlib, say, say_next
 
 FIGURE_SUFFIXES = (".png", ".svg")
 
@@ -30,6 +31,10 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help="time limit of the cost measurement, in seconds (default: 60)",
     )
     parser.add_argument(
+        "--budget-ms", type=float, metavar="MS",
+        help="name the most accurate configuration that costs at most so many ms a frame",
+    )
+    parser.add_argument(
         "-o", "--output", metavar="FIGURE", help="draw a figure into this PNG or SVG file"
     )
     form = parser.add_mutually_exclusive_group()
@@ -39,20 +44,24 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _execute(options: argparse.Namespace) -> int:
     quiet_matplotlib()
-    from sweep.tradeoff.advice import advice  # noqa: PLC0415
+    from sweep.execution.progress import stage_display  # noqa: PLC0415
+    from sweep.tradeoff.advice import advice, budget_advice  # noqa: PLC0415
     from sweep.tradeoff.measurement import measure_trade  # noqa: PLC0415
 
     _check(options)
     output = _checked_output(options.output)
     store = options.source
-    if store.endswith(".toml"):
+    if store.lower().endswith(".toml"):
         from sweep.execution.progress import progress_display  # noqa: PLC0415
         from sweep.execution.runner import execute  # noqa: PLC0415
         from sweep.plan.experiment import Pipeline  # noqa: PLC0415
 
         with progress_display() as bar:
             store = execute(Pipeline.from_toml(store), None, progress=bar).store
-    trade, renderers = measure_trade(store, options.per, options.limit_s)
+    with stage_display() as report:
+        trade, renderers = measure_trade(store, options.per, options.limit_s, report)
+    budget = [] if options.budget_ms is None else budget_advice(
+        trade, options.criterion, options.budget_ms)
     if output is not None:
         import io  # noqa: PLC0415
 
@@ -70,6 +79,8 @@ def _execute(options: argparse.Namespace) -> int:
         if renderers is not None:
             content["renderers"] = as_json(renderers)
         content["advice"] = advice(trade, options.criterion)
+        if budget:
+            content["budget"] = budget
         print_json(content)
         return 0
     form = table_markdown if options.markdown else table_text
@@ -78,7 +89,14 @@ def _execute(options: argparse.Namespace) -> int:
         say()
         say("\n".join(renderer_lines(renderers, markdown=options.markdown)))
     say()
-    say("\n".join(advice(trade, options.criterion)))
+    frames, sampled = trade.attrs["frames"], trade.attrs["sampled"]
+    if frames < sampled:
+        say(f"costs are those of {frames:,} of {sampled:,} sampled images; more --seconds, or "
+            "markers that are seen, give more\n")
+    say("\n".join([*budget, *([""] if budget else []), *advice(trade, options.criterion)]))
+    if not options.markdown:
+        say()
+        say_next(f"sweep report {shlex.quote(store)}", "with these costs and a figure of them")
     return 0
 
 
@@ -91,6 +109,8 @@ def _check(options: argparse.Namespace) -> None:
     if options.criterion not in CRITERIA:
         raise ArgumentError(
             "criterion", options.criterion, f"expected one of {', '.join(CRITERIA)}")
+    if options.budget_ms is not None and not 0 < options.budget_ms < math.inf:
+        raise ArgumentError("budget_ms", options.budget_ms, "expected a finite number above 0")
     if not 0 < options.limit_s < math.inf:
         raise ArgumentError("limit_s", options.limit_s, "expected a finite number above 0")
 

@@ -38,6 +38,36 @@ class Progress:
 ProgressReport = Callable[[Progress], None]
 
 
+StageReport = Callable[[str, float], None]
+"""Called with what is being done, and the share of it that is done."""
+
+
+@contextlib.contextmanager
+def stage_display() -> Iterator[StageReport]:
+    """Show what is being done on stderr: a bar on a terminal, else a line for each new thing."""
+    if sys.stderr is not None and sys.stderr.isatty():
+        from rich.console import Console  # noqa: PLC0415  (slow to import)
+        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn  # noqa: PLC0415
+        from rich.progress import Progress as Bar  # noqa: PLC0415
+
+        bar = Bar(
+            TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(),
+            console=Console(stderr=True), transient=True,
+        )
+        with bar:
+            task = bar.add_task("starting", total=1.0)
+            yield lambda what, share: bar.update(task, description=what, completed=share)
+        return
+    told: list[str] = []
+
+    def report(what: str, _share: float) -> None:
+        if told[-1:] != [what]:
+            told.append(what)
+            notice(what)
+
+    yield report
+
+
 @contextlib.contextmanager
 def progress_report(progress: bool | ProgressReport | None) -> Iterator[ProgressReport | None]:
     """Return what is called with a run's progress.

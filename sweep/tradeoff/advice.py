@@ -46,6 +46,45 @@ def advice(trade: xr.Dataset, criterion: str) -> list[str]:
     ]
 
 
+def budget_advice(trade: xr.Dataset, criterion: str, budget_ms: float) -> list[str]:
+    """Return a sentence for each condition: the most accurate configuration within a budget.
+
+    Where none is within it, the sentence names the cheapest with a finite criterion.
+
+    Parameters
+    ----------
+    trade, criterion
+        As :func:`advice` takes them.
+    budget_ms
+        Most milliseconds a frame.
+    """
+    return [
+        f"{label}: {sentence}" if label else sentence
+        for label, condition in by_condition(trade, criterion)
+        for sentence in [_budget_sentence(condition, criterion, budget_ms)]
+    ]
+
+
+def _budget_sentence(condition: xr.Dataset, criterion: str, budget_ms: float) -> str:
+    cost, error = condition["cost_ms"].to_numpy(), condition[criterion].to_numpy()
+    known = np.isfinite(cost) & np.isfinite(error)
+    name, unit = unit_of(criterion)
+    if not known.any():
+        return (
+            f"nothing fits {budget_ms:g} ms: no configuration has a finite {criterion}: "
+            f"{_reason_for_none(condition, criterion)}"
+        )
+    fits = known & (cost <= budget_ms)
+    if fits.any():
+        best = int(np.argmin(np.where(fits, error, np.inf)))
+        start = f"within {budget_ms:g} ms a frame take"
+    else:
+        best = int(np.argmin(np.where(known, cost, np.inf)))
+        start = f"nothing fits {budget_ms:g} ms a frame; the nearest is"
+    label = condition["treatment"].to_numpy()[best]
+    return f"{start} {label}: {digits(cost[best])} ms, {name} {digits(error[best])} {unit}"
+
+
 def _sentence(condition: xr.Dataset, criterion: str) -> str:
     cost = condition["cost_ms"].to_numpy()
     error = condition[criterion].to_numpy()

@@ -7,6 +7,7 @@ a call is that of a run.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -22,18 +23,21 @@ from sweep.evaluation.search import SearchResult, search, visibility_flags, whol
 from sweep.isolation.interrupts import Interrupts
 from sweep.measure.detector import Detector, DetectorOutput
 from sweep.measure.estimation import Detections, PoseEstimator
-from sweep.measure.estimators import build
+from sweep.measure.estimators import EstimatorSetting, build
 from sweep.measure.flags import DetectionStatus
 from sweep.model.renderers import Grey
 from sweep.model.scene import Scenes, build_scenes
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings, estimators, scene_values
-from sweep.tradeoff.paired_timing import time_in_turns
+from sweep.tradeoff.paired_timing import LEAST_ROUNDS, time_in_turns
 from sweep.tradeoff.scene_sample import Indices
 from sweep.typing import Floats
 
 BATCH = 16
 """Detections that an estimator gets in one call."""
+
+TRIAL_SCENES = 2
+"""Scenes of each condition that are timed first, to see how many the time limit allows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +84,7 @@ class _Condition:
 @single_threaded()
 def measure(
     pipeline: Pipeline, conditions: Sequence[Sequence[Indices]], limit_s: float,
-    interrupts: Interrupts,
+    interrupts: Interrupts, progress: Callable[[float], None] | None = None,
 ) -> Costs:
     """Measure detection and estimation of every configuration on the scenes of each condition.
 
@@ -91,34 +95,37 @@ def measure(
     conditions
         For each condition, the (n,) indices of its scenes along each scene axis.
     limit_s
-        Time limit in seconds, without the preparation; at least
-        `sweep.tradeoff.paired_timing.MIN_ROUNDS` rounds are measured.
+        Time limit in seconds. Where it does not do for
+        `sweep.tradeoff.paired_timing.LEAST_ROUNDS` rounds, fewer scenes of each condition are
+        measured.
     interrupts
         Checked between two measurements.
+    progress
+        Called after each round with the share of the time limit that is used.
     """
+    started = time.perf_counter()
     settings, estimating = detector_settings(pipeline), estimators(pipeline)
-    prepared = []
-    for indices in conditions:
-        interrupts.check()
-        prepared.append(_prepare(pipeline, indices))
-    finders = [Detector(setting).find for setting in settings]
-    builds = [build(estimator) for estimator in estimating]
-    shape = (len(prepared), len(settings), len(builds))
-    parts: list[Callable[[], Any]] = []
-    detected_share = np.zeros(shape[:2])
-    for c, condition in enumerate(prepared):
-        sides = condition.scenes.frame.max(axis=1).tolist()
-        for d, find in enumerate(finders):
-            images = condition.searches[d].images
-            parts.append(partial(_search_all, find, images, condition.scenes, sides))
-            rows = np.flatnonzero(condition.searches[d].flags == DetectionStatus.detected)
-            detected_share[c, d] = len(rows) / len(condition.scenes)
-            for estimator, estimate in zip(estimating, builds, strict=True):
-                detections = detections_for(
-                    estimator, condition.values, condition.scenes, condition.searches[d],
-                    np.resize(rows, BATCH if len(rows) else 0),
-                )
-                parts.append(partial(_estimate_all, estimate, detections))
+    configurations = _Configurations(
+        [Detector(setting).find for setting in settings], estimating,
+        [build(estimator) for estimator in estimating],
+    )
+
+    def prepared_with(most: int) -> list[_Condition]:
+        chosen = []
+        for indices in conditions:
+            interrupts.check()
+            chosen.append(_prepare(pipeline, indices, most))
+        return chosen
+
+    prepared = prepared_with(TRIAL_SCENES)
+    search_s, estimation_s = configurations.round_s(prepared, interrupts)
+    left_s = limit_s - (time.perf_counter() - started) - (1 + LEAST_ROUNDS) * estimation_s
+    # Beside the rounds, each scene is rendered and searched once.
+    most = max(int(TRIAL_SCENES * left_s / ((3 + LEAST_ROUNDS) * search_s)), 1)
+    if any(len(condition.scenes) == TRIAL_SCENES for condition in prepared) or most == 1:
+        prepared = prepared_with(most)
+    parts, detected_share = configurations.parts(prepared)
+    shape = (len(prepared), len(settings), len(estimating))
     frames = np.array([len(condition.scenes) for condition in prepared])
     visible = np.array([len(condition.searches[0].images) > 0 for condition in prepared])
 
@@ -135,7 +142,57 @@ def measure(
     def ratios(seconds: Floats) -> Floats:
         return costs(seconds).ratio
 
-    return costs(time_in_turns(parts, ratios, limit_s, interrupts))
+    left_s = max(limit_s - (time.perf_counter() - started), 0.1)
+    return costs(time_in_turns(parts, ratios, left_s, interrupts, progress))
+
+
+@dataclass(frozen=True, slots=True)
+class _Configurations:
+    """The detector settings and the estimators, ready to be timed."""
+
+    finders: Sequence[Callable[[Grey, str, int], DetectorOutput]]
+    settings: Sequence[EstimatorSetting]
+    estimators: Sequence[PoseEstimator]
+
+    def parts(
+        self, conditions: Sequence[_Condition]
+    ) -> tuple[list[Callable[[], Any]], Floats]:
+        """Return what is timed, and the (C, D) share of scenes with a detection.
+
+        For each condition and detector setting: the search of all scenes, then each estimator.
+        """
+        parts: list[Callable[[], Any]] = []
+        detected_share = np.zeros((len(conditions), len(self.finders)))
+        for c, condition in enumerate(conditions):
+            sides = condition.scenes.frame.max(axis=1).tolist()
+            for d, find in enumerate(self.finders):
+                images = condition.searches[d].images
+                parts.append(partial(_search_all, find, images, condition.scenes, sides))
+                rows = np.flatnonzero(condition.searches[d].flags == DetectionStatus.detected)
+                detected_share[c, d] = len(rows) / len(condition.scenes)
+                for setting, estimate in zip(self.settings, self.estimators, strict=True):
+                    detections = detections_for(
+                        setting, condition.values, condition.scenes, condition.searches[d],
+                        np.resize(rows, BATCH if len(rows) else 0),
+                    )
+                    parts.append(partial(_estimate_all, estimate, detections))
+        return parts, detected_share
+
+    def round_s(
+        self, conditions: Sequence[_Condition], interrupts: Interrupts
+    ) -> tuple[float, float]:
+        """Return the seconds of all searches, and of all estimates; code is compiled before."""
+        parts, _ = self.parts(conditions)
+        spent = [0.0, 0.0]
+        for number, part in enumerate(parts):
+            interrupts.check()
+            kind = int(number % (1 + len(self.estimators)) > 0)
+            if kind:
+                part()
+            begun = time.perf_counter()
+            part()
+            spent[kind] += time.perf_counter() - begun
+        return max(spent[0], 1e-6), spent[1]
 
 
 def _search_all(
@@ -154,14 +211,20 @@ def _estimate_all(estimator: PoseEstimator, detections: Detections) -> None:
             estimator(detections)
 
 
-def _prepare(pipeline: Pipeline, indices: Sequence[Indices]) -> _Condition:
-    """Render a condition's visible scenes, and search each once with each setting."""
+def _prepare(pipeline: Pipeline, indices: Sequence[Indices], most: int) -> _Condition:
+    """Render a condition's visible scenes, and search each once with each setting.
+
+    Of more than ``most`` scenes, so many are taken from all over the sample.
+    """
     count = len(indices[0]) if indices else 1
     values = scene_values(pipeline, indices)
     scenes = build_scenes(values, count)
     rows = np.flatnonzero(visibility_flags(scenes) == DetectionStatus.not_run)
     if 0 < len(rows) < count:
-        return _prepare(pipeline, [index[rows] for index in indices])
+        return _prepare(pipeline, [index[rows] for index in indices], most)
+    if count > most:
+        chosen = (2 * np.arange(most) + 1) * count // (2 * most)
+        return _prepare(pipeline, [index[chosen] for index in indices], most)
     settings = detector_settings(pipeline)
     wanted = np.full((count, len(settings)), len(rows) > 0)
     full = whole_frames(values, count)

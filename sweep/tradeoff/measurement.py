@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from sweep.analysis import covariance_trust, efficiency, error_statistics, renderer_bias
 from sweep.errors import ArgumentError, StoreError
+from sweep.execution.progress import StageReport
 from sweep.isolation.interrupts import Interrupts
 from sweep.measure.estimators import build
 from sweep.measure.flags import DetectionStatus, EstimateStatus
@@ -36,12 +38,16 @@ from sweep.typing import Floats
 Interval = tuple[Floats, Floats, Floats]
 """Values and the low and high ends of their intervals, arrays of one shape."""
 
+MIN_SHARE = 0.3
+"""Share of the time limit that is left for the costs, however long the accuracy takes."""
+
 REFERENCE = "exact"
 """The renderer with which others are compared if the grid has several."""
 
 
 def measure_trade(
-    url: str, per: Sequence[str] = (), limit_s: float = 60.0
+    url: str, per: Sequence[str] = (), limit_s: float = 60.0,
+    progress: StageReport | None = None,
 ) -> tuple[xr.Dataset, xr.Dataset | None]:
     """Measure the tradeoff of a finished store, and write it to its group ``cost/tradeoff``.
 
@@ -56,7 +62,10 @@ def measure_trade(
     per
         Scene axes; each combination of their values is a condition of its own.
     limit_s
-        Time limit of the measurement in seconds.
+        Time limit of the measurement in seconds, in which the accuracy is read, too, as far as it
+        leaves 30 % of them.
+    progress
+        Called with what is being done, and the share of it that is done.
 
     Returns
     -------
@@ -76,6 +85,7 @@ def measure_trade(
     """
     if not 0 < limit_s < math.inf:
         raise ArgumentError("limit_s", limit_s, "expected a finite number above 0")
+    started = time.perf_counter()
     store = open_store(url, "r+")
     if not store.finished:
         raise StoreError(f"{url}: unfinished; `sweep run` continues it")
@@ -91,16 +101,18 @@ def measure_trade(
     if lines:
         raise StoreError("\n".join([f"{url}: its costs cannot be measured here:", *lines]))
     renderers = None
+    report = progress or (lambda _what, _share: None)
     with locked(store), Interrupts() as interrupts:
         if "renderer" in results.dims:
             names = [str(name) for name in results["renderer"].values.tolist()]
+            report("measuring renderers", 0.0)
             renderers = _renderers(pipeline, results, names, limit_s / 4, interrupts)
             pipeline = dataclasses.replace(
                 pipeline, fixed={**pipeline.fixed, "renderer": REFERENCE},
                 axes=tuple(axis for axis in pipeline.axes if axis.name != "renderer"),
             )
             results = results.sel(renderer=REFERENCE, drop=True)
-        trade = _trade(pipeline, results, per, limit_s, interrupts)
+        trade = _trade(pipeline, results, per, started + limit_s, limit_s, interrupts, report)
         if renderers is not None:
             write_group(store, "cost/renderers", renderers)
         write_group(store, "cost/tradeoff", trade)
@@ -128,9 +140,11 @@ def _check(url: str, pipeline: Pipeline, results: xr.Dataset, per: Sequence[str]
 
 
 def _trade(
-    pipeline: Pipeline, results: xr.Dataset, per: Sequence[str], limit_s: float,
-    interrupts: Interrupts,
+    pipeline: Pipeline, results: xr.Dataset, per: Sequence[str], deadline: float, limit_s: float,
+    interrupts: Interrupts, report: StageReport,
 ) -> xr.Dataset:
+    """Return the trade, measured until a time of `time.perf_counter` of at most ``limit_s``."""
+    report("reading the accuracy", 0.0)
     axes = [*pipeline.axes_of(Stage.detection), *pipeline.axes_of(Stage.estimation)]
     settings = [axis.name for axis in axes]
     kept = [*per, *settings]
@@ -146,17 +160,22 @@ def _trade(
     trade = _flattened(accuracy, axes)
     lengths = [results.sizes[name] for name in per]
     conditions = list(np.ndindex(*lengths))
-    costs = measure(
-        pipeline,
-        [
-            _without_crashed(pipeline, results, [
-                sample_scenes(pipeline, dict(zip(per, condition, strict=True)), len(conditions))
-            ])[0]
-            for condition in conditions
-        ],
-        limit_s, interrupts,
-    )
     configurations = trade.sizes["treatment"]
+    measuring = (
+        f"measuring {configurations:,} configurations under {len(conditions):,} "
+        f"condition{'s' if len(conditions) > 1 else ''}"
+    )
+    report(measuring, 0.0)
+    samples = [
+        _without_crashed(pipeline, results, [
+            sample_scenes(pipeline, dict(zip(per, condition, strict=True)), len(conditions))
+        ])[0]
+        for condition in conditions
+    ]
+    costs = measure(
+        pipeline, samples, max(deadline - time.perf_counter(), MIN_SHARE * limit_s), interrupts,
+        lambda share: report(measuring, share),
+    )
 
     def add(name: str, meaning: str, unit: str, interval: Interval) -> None:
         shaped = [np.asarray(end).reshape(*lengths, configurations) for end in interval]
@@ -176,6 +195,7 @@ def _trade(
         "baseline": str(trade["treatment"].values[0]),
         "rounds": len(total),
         "frames": int(costs.frames.sum()),
+        "sampled": sum(len(sample[0]) if sample else 1 for sample in samples),
         "covariance": "of the solvers with the corners' noise as it was measured in each regime; "
                       "of photometric from its likelihood",
     }

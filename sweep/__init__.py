@@ -103,8 +103,9 @@ def run(
 ) -> xr.Dataset:
     """Run a pipeline into a store and return its results.
 
-    A finished store is opened, an unfinished one is continued. In a script, call it under
-    ``if __name__ == "__main__":``, because the workers are processes that import the script.
+    A finished store is opened, an unfinished one is continued. A script needs no
+    ``if __name__ == "__main__":`` for it: the workers that it starts do not import the script. (A
+    ``LocalCluster`` of your own does.)
 
     Parameters
     ----------

@@ -14,6 +14,13 @@ MAX_LINES = 50
 """Lines of each kind that `sweep status` and `sweep verify` print."""
 
 
+OTHER_FORMATS = {
+    ".jpg", ".jpeg", ".svg", ".pdf", ".gif", ".tif", ".tiff", ".bmp", ".webp", ".html", ".toml",
+    ".zarr", ".csv", ".json",
+}
+"""Suffixes of files that a PNG image would not be taken for."""
+
+
 def say(text: str = "") -> None:
     """Print lines without control characters, whosever names and texts they quote."""
     from sweep.messages import plain  # noqa: PLC0415
@@ -78,11 +85,16 @@ def check_png(output: str) -> None:
 
     Raises
     ------
+    ArgumentError
+        If its name is that of another format.
     StoreError
         If it cannot be.
     """
+    from sweep.errors import ArgumentError  # noqa: PLC0415
     from sweep.report.output_file import check_output_file  # noqa: PLC0415
 
+    if Path(output).suffix.lower() in OTHER_FORMATS:
+        raise ArgumentError("output", output, "expected a file that ends in .png")
     check_output_file(Path(output))
 
 

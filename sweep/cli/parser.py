@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Sequence
+from typing import NoReturn
 
 from sweep.cli.command import Command
 from sweep.cli.output import flushed
@@ -15,6 +17,7 @@ from sweep.cli.show import SHOW
 from sweep.cli.status import STATUS
 from sweep.cli.tradeoff import TRADEOFF
 from sweep.cli.verify import VERIFY
+from sweep.messages import nearest
 from sweep.version import __version__
 
 COMMANDS = (RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, VERIFY, STATUS)
@@ -24,9 +27,48 @@ GUIDES = ("README.md", "sweep/README.md")
 """Pages for all commands: a first answer; architecture, development and the glossary."""
 
 
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors say what may be meant."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the usage and an error with a hint, and exit with status 2."""
+        super().error(message + _hint(message))
+
+
+def _hint(message: str) -> str:
+    """Return what may be meant in place of what argparse refuses; empty if nothing is similar."""
+    if chosen := re.match(r"argument COMMAND: invalid choice: '([^']*)'", message):
+        if chosen[1] == "help":
+            return "; `sweep --help` and `sweep COMMAND --help` print the help"
+        return nearest(chosen[1], [command.name for command in COMMANDS])
+    if unknown := re.match(r"unrecognized arguments: (.*)", message):
+        return "".join(dict.fromkeys(_meant(word) for word in unknown[1].split()))
+    return ""
+
+
+def _meant(word: str) -> str:
+    if word in ("--dry-run", "--dryrun", "-n"):
+        return "; `sweep plan PIPELINE` shows what would run"
+    if word.startswith("-"):
+        flags = {
+            flag for command in COMMANDS for flag in _options(command) if flag.startswith("--")
+        }
+        return nearest(word.partition("=")[0], sorted(flags))
+    if "=" in word:
+        return f"; did you mean --set {word}?"
+    return "; values are set by --set KEY=VALUE, in quotes if there are spaces in it"
+
+
+def _options(command: Command) -> list[str]:
+    """Return the option strings of a command."""
+    parser = argparse.ArgumentParser(add_help=False)
+    command.add_arguments(parser)
+    return list(parser._option_string_actions)  # noqa: SLF001  (argparse offers no other list)
+
+
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of ``sweep``; ``command`` is the chosen :class:`Command`, or None."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="sweep",
         description="How well will I know the pose? Experiments with fiducial markers.",
         epilog="`sweep COMMAND --help` explains a command, with examples.\n"

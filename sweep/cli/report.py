@@ -10,6 +10,12 @@ from sweep.cli.arguments import add_store
 from sweep.cli.command import Command, Example
 from sweep.cli.output import quiet_matplotlib, say, say_next
 
+NO_REPORTS = {
+    ".pdf", ".png", ".svg", ".jpg", ".jpeg", ".docx", ".odt", ".tex", ".ipynb", ".csv", ".json",
+    ".toml", ".zarr",
+}
+"""Suffixes of files that neither HTML nor Markdown would be taken for."""
+
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add_store(parser)
@@ -38,6 +44,9 @@ def _execute(options: argparse.Namespace) -> int:
         value = getattr(options, name)
         if value is not None and not value.strip():
             raise ArgumentError(name, repr(value), "expected a name")
+    suffix = Path(options.output or "").suffix.lower()
+    if suffix in NO_REPORTS:
+        raise ArgumentError("output", options.output, "expected a file that ends in .html or .md")
     form = options.form or ("md" if str(options.output).lower().endswith(".md") else "html")
     output = Path(options.output or f"report.{form}")
     figures = Path(options.figures) if options.figures else None

@@ -104,11 +104,13 @@ def _check(options: argparse.Namespace) -> None:
     import math  # noqa: PLC0415
 
     from sweep.errors import ArgumentError  # noqa: PLC0415
+    from sweep.messages import nearest  # noqa: PLC0415
     from sweep.tradeoff.pareto import CRITERIA  # noqa: PLC0415
 
     if options.criterion not in CRITERIA:
         raise ArgumentError(
-            "criterion", options.criterion, f"expected one of {', '.join(CRITERIA)}")
+            "criterion", options.criterion,
+            f"expected one of {', '.join(CRITERIA)}{nearest(options.criterion, CRITERIA)}")
     if options.budget_ms is not None and not 0 < options.budget_ms < math.inf:
         raise ArgumentError("budget_ms", options.budget_ms, "expected a finite number above 0")
     if not 0 < options.limit_s < math.inf:

@@ -29,7 +29,7 @@ except (ValueError, TypeError, KeyError, AttributeError) as error:
     ) from None
 
 from sweep.evaluation.machine_faults import exception_line
-from sweep.execution.distributed_internals import thread_counts
+from sweep.execution.distributed_internals import main_not_imported, thread_counts
 from sweep.execution.limits import ANSWER_S, NO_WORKERS_TIMEOUT_S, THREAD_COUNT_TIMEOUT_S
 from sweep.execution.scheduler_connection import connect_to_scheduler
 from sweep.execution.thread_limit import check_threads
@@ -121,7 +121,7 @@ def embedded(workers: int) -> Iterator[Client]:
     It listens on the loopback interface only, and has no limits of memory. The user's own
     configuration of Dask (files, environment variables, ``dask.config.set``) does not apply to it.
     """
-    with silenced_dask_loggers(), dask.config.set(own_dask_config()):
+    with silenced_dask_loggers(), main_not_imported(), dask.config.set(own_dask_config()):
         with _ignored_interrupts():
             cluster = _started(workers)
         with cluster, Client(cluster, set_as_default=False) as client:

@@ -7,6 +7,9 @@ that a new version of ``distributed`` can break a run in this module alone.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import multiprocessing.spawn
+from collections.abc import Iterator
 from typing import Any
 
 from distributed import Client
@@ -16,9 +19,36 @@ from distributed.comm.registry import backends, get_backend
 from distributed.core import send_recv
 
 __all__ = [
-    "CommClosedError", "is_known_protocol", "peer_type", "thread_counts", "worker_deaths",
-    "worker_states", "worker_that_failed",
+    "CommClosedError", "is_known_protocol", "main_not_imported", "peer_type", "thread_counts",
+    "worker_deaths", "worker_states", "worker_that_failed",
 ]
+
+
+WORKER_PROCESS = "Dask Worker process"
+"""What the names of the processes begin with that nannies start."""
+
+
+@contextlib.contextmanager
+def main_not_imported() -> Iterator[None]:
+    """Have workers that are started now not import the caller's script, of which they need nothing.
+
+    `multiprocessing` has each new process import the main module. A script that calls
+    `sweep.run` outside ``if __name__ == "__main__":`` would run again in each worker.
+    """
+    prepare = multiprocessing.spawn.get_preparation_data
+
+    def without_main(name: str) -> dict[str, Any]:
+        prepared = dict(prepare(name))
+        if name.startswith(WORKER_PROCESS):
+            for key in ("init_main_from_name", "init_main_from_path"):
+                prepared.pop(key, None)
+        return prepared
+
+    multiprocessing.spawn.get_preparation_data = without_main
+    try:
+        yield
+    finally:
+        multiprocessing.spawn.get_preparation_data = prepare
 
 
 def is_known_protocol(scheme: str) -> bool:

@@ -58,11 +58,11 @@ def stage_display() -> Iterator[StageReport]:
             task = bar.add_task("starting", total=1.0)
             yield lambda what, share: bar.update(task, description=what, completed=share)
         return
-    told: list[str] = []
+    printed: list[str] = []
 
     def report(what: str, _share: float) -> None:
-        if told[-1:] != [what]:
-            told.append(what)
+        if printed[-1:] != [what]:
+            printed.append(what)
             notice(what)
 
     yield report

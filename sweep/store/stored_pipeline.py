@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from sweep.messages import plain, refusal
 from sweep.plan.experiment import Pipeline
 
 
@@ -27,15 +28,17 @@ def read_pipeline(path: str | os.PathLike[str], settings: Sequence[str] = ()) ->
     Raises
     ------
     PipelineError
-        If the file or a setting is invalid.
+        If the file or a setting is invalid, or a folder is no store.
     StoreError
-        If a folder is no store.
+        If the store cannot be read.
     """
     if not names_store(path):
         return Pipeline.from_toml(os.fspath(path), settings)
     from sweep.store.lifecycle import open_store  # noqa: PLC0415  (slow to import)
 
     url = os.fspath(path)
+    if "://" not in url and not (Path(url) / "zarr.json").exists():
+        raise refusal([f"{plain(url)}: a folder that is no store; expected a TOML file or a store"])
     stored = open_store(url).pipeline
     return Pipeline.from_text(
         stored.text, settings, name=stored.name, source=f"{url} (its pipeline)",

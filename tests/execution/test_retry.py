@@ -92,6 +92,7 @@ def test_what_fails_again_stays_as_it_was(pipeline, failed, copied, tmp_path, mo
         assert table.sizes["failure"] == 1
 
 
+@pytest.mark.long
 def test_retry_that_is_stopped_at_any_write_is_continued(pipeline, clean, copied, monkeypatch):
     import zarr.storage._local as local  # noqa: PLC0415
 

@@ -1,0 +1,199 @@
+"""Ordinary mistakes of a new user: each is told in a line that says what to change, or works."""
+
+import json
+import shlex
+import subprocess
+import sys
+
+import pytest
+
+import sweep
+from support.here import calls_here
+from support.stores import by_hand
+from sweep import cli
+from sweep.errors import SweepError
+from sweep.execution.affordability import Demand, FreeDisk, objections
+from sweep.execution.finalize import close
+from sweep.plan.experiment import Pipeline
+
+TEXT = """
+pose = { jitter_px = 0.5 }
+axes = { side_px = [30, 60], solver = ["ippe_square", "iterative"], trial = 2 }
+"""
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("mistakes")
+    (folder / "small.toml").write_text(TEXT)
+    (folder / "pipelines").mkdir()
+    (folder / "pipelines/other.toml").write_text(TEXT)
+    pipeline = Pipeline.from_toml(folder / "small.toml")
+    close(by_hand(str(folder / "runs/small.zarr"), pipeline))
+    by_hand(str(folder / "runs/unfinished.zarr"), pipeline)
+    return folder
+
+
+@pytest.fixture
+def folder(stores, monkeypatch):
+    monkeypatch.chdir(stores)
+    return stores
+
+
+def told(capsys, line):
+    with calls_here():
+        try:
+            code = cli.main(shlex.split(line))
+        except SystemExit as stopped:
+            code = stopped.code
+    return code, *capsys.readouterr()
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize(
+    ("line", "hint"),
+    [
+        ("runn small.toml", "did you mean run?"),
+        ("help", "`sweep COMMAND --help` print the help"),
+        ("run small.toml tilt_deg=3", "did you mean --set tilt_deg=3?"),
+        ("run small.toml --set tilt_deg 3", "values are set by --set KEY=VALUE"),
+        ("run small.toml --dry-run", "`sweep plan PIPELINE` shows what would run"),
+        ("plan small.toml --worker-count 2", "did you mean --workers?"),
+        ("run small", "did you mean small.toml?"),
+        ("run other", "did you mean pipelines/other.toml?"),
+        ("plan other.toml", "did you mean pipelines/other.toml?"),
+        ("run runs", "runs: a folder that is no store; expected a TOML file or a store"),
+        ("run small.toml --set Tilt_Deg=3", "did you mean tilt_deg?"),
+        ("run small.toml --set tilt_deg=0,45", "such as [0, 45]"),
+        ("run small.toml --set cornerRefinementMethod=1", "OpenCV's constant 1 is subpix"),
+        ("show small.toml --at side_px:30", "expected name=value"),
+        ("show small.toml -o cell.jpg", "expected a file that ends in .png"),
+        ("repro runs/small.zarr --at Side_px=30", "did you mean side_px?"),
+        ("repro runs/small.zarr --at side_px=31", "not on the grid; its values are 30.0, 60.0"),
+        ("repro runs/small.zarr --plain", "--plain and --full are for the file of -o"),
+        ("repro runs/small.zarr -o a.png --at trial=0 --at trial=1", "expected one --at beside it"),
+        ("repro small.toml", "`sweep run small.toml` makes its store"),
+        ("status small", "did you mean runs/small.zarr?"),
+        ("report runs/small", "did you mean runs/small.zarr?"),
+        ("report runs/small.zarr -o report.pdf", "expected a file that ends in .html or .md"),
+        ("verify small.toml", "not a sweep store, but a pipeline file"),
+        ("tradeoff runs/small.zarr --criterion rotation_p95", "did you mean rotation_p95_deg?"),
+        ("run small.toml --retry-failed --reuse runs/small.zarr", "expected no retry_failed"),
+        ("run small.toml --set trial=5",
+         "sweep run small.toml --set trial=5 --store runs/small-2.zarr --reuse runs/small.zarr"),
+        ("run small.toml --set 'dictionary=[\"DICT_5X5_50\", \"DICT_4X4_50\"]'",
+         "--store runs/small-2.zarr --reuse runs/small.zarr"),
+        ("run small.toml --set seed=5", "holds another experiment; choose another store"),
+    ],
+)
+def test_a_mistake_is_refused_with_what_to_change(line, hint, capsys):
+    code, out, err = told(capsys, line)
+    assert (code, out) == (2, "")
+    assert hint in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize(
+    ("line", "command"),
+    [
+        ("run small.toml", "sweep report runs/small.zarr"),
+        ("run runs/small.zarr", "sweep report runs/small.zarr"),
+        ("plan small.toml --set trial=1", "sweep run small.toml --set trial=1"),
+        ("show runs/small.zarr", "sweep plan runs/small.zarr"),
+        ("repro runs/small.zarr --at trial=1",
+         "sweep repro runs/small.zarr --at side_px=30.0,solver=ippe_square,trial=1 -o scene.png"),
+        ("status runs/small.zarr", "sweep report runs/small.zarr"),
+        ("status runs/unfinished.zarr", "sweep run runs/unfinished.zarr"),
+        ("verify runs/small.zarr --sample 0", "sweep report runs/small.zarr"),
+        ("verify runs/unfinished.zarr --sample 0", "sweep run runs/unfinished.zarr"),
+        ("report runs/small.zarr", "sweep tradeoff runs/small.zarr"),
+        ("tradeoff runs/small.zarr --seconds 0.1", "sweep report runs/small.zarr"),
+    ],
+)
+def test_every_command_ends_with_what_to_do_next(line, command, capsys):
+    code, out, _ = told(capsys, line)
+    assert code == 0
+    last = out.splitlines()[-1]
+    assert last.partition("  #")[0] == f"next: {command}"
+    assert cli.parser.build_parser().parse_args(shlex.split(command)[1:]).command is not None
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize("line", [
+    "run small.toml --json", "status runs/small.zarr --json",
+    "verify runs/small.zarr --sample 0 --json",
+])
+def test_json_is_one_object_and_nothing_else(line, capsys):
+    code, out, err = told(capsys, line)
+    assert (code, err) == (0, "")
+    assert json.loads(out)
+
+
+def test_repro_writes_no_file_unasked(folder, capsys):
+    before = sorted(folder.rglob("*"))
+    assert told(capsys, "repro runs/small.zarr")[0] == 0
+    assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.usefixtures("folder")
+def test_paths_of_stores_and_pipelines_are_taken_for_what_they_are_in_python():
+    with calls_here(), sweep.run("runs/small.zarr") as results:
+        assert results.sizes["trial"] == 2
+    with pytest.raises(SweepError, match="a folder that is no store"):
+        sweep.run("runs")
+    with pytest.raises(SweepError, match=r"but a pipeline file; `sweep run small.toml` makes"):
+        sweep.open("small.toml")
+    with pytest.raises(SweepError, match=r"did you mean runs/small.zarr\?"):
+        sweep.open("small")
+
+
+def test_a_script_without_a_main_guard_runs_once(tmp_path):
+    (tmp_path / "script.py").write_text(
+        "import sweep\nprint('begun')\n"
+        "results = sweep.run({'axes': {'side_px': [20, 40], 'trial': 2}, 'pose': {'jitter_px': 1}},"
+        " store='s.zarr', workers=2)\nprint(results.sizes['side_px'])\n"
+    )
+    ran = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True,
+                         text=True, check=False)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (0, "begun\n2\n", "")
+
+
+# Runs that have to be confirmed.
+
+DAY = 86_400.0
+
+
+@pytest.mark.parametrize(
+    ("demand", "free", "found"),
+    [
+        (Demand(0.9 * DAY, 2, 10**9, 10), FreeDisk(10**10, 100), []),
+        (Demand(2.5 * DAY, 2, 10**9, 10), FreeDisk(10**10, 100),
+         ["takes about 2.5 days with 2 workers"]),
+        (Demand(5.0, 1, 2 * 10**10, 10), FreeDisk(10**10, 100),
+         ["writes 20 GB before compression, and 10 GB are free"]),
+        (Demand(5.0, 1, 1, 1000), FreeDisk(10**10, 100),
+         ["makes 1,000 files, and the disk has room for 100"]),
+        (Demand(5.0, 1, 1, 1000), FreeDisk(10**10, None), []),
+        (Demand(5.0, 1, 10**15, 1000), None, []),
+    ],
+)
+def test_what_has_to_be_confirmed(demand, free, found):
+    assert objections(demand, free) == found
+
+
+def test_a_run_that_is_too_large_is_refused_in_a_line_unless_it_is_confirmed(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "small.toml").write_text(TEXT)
+    monkeypatch.setattr(
+        "sweep.execution.affordability.free_disk", lambda _url: FreeDisk(100, None))
+    code, out, err = told(capsys, "run small.toml")
+    assert (code, out) == (2, "")
+    assert "before compression, and 100 bytes are free; make it smaller, or confirm it with --yes" \
+        in err.splitlines()[-1]
+    assert not (tmp_path / "runs/small.zarr").exists()
+    with calls_here(), pytest.raises(SweepError, match="yes=True"):
+        sweep.run("small.toml")
+    assert told(capsys, "run small.toml --yes")[0] == 0

@@ -57,12 +57,13 @@ class Rates:
 
 @dataclass(frozen=True, slots=True)
 class Dip:
-    """A range of sides, its place, and the lowest rate in it (mean of the IDs)."""
+    """A range of sides, its place, the lowest rate in it (mean of the IDs), its prominence."""
 
     low_px: float
     high_px: float
     area_px2: float
     lowest: float
+    prominence: float
 
 
 def dips(found: Rates) -> list[Dip]:
@@ -73,11 +74,15 @@ def dips(found: Rates) -> list[Dip]:
         properties["prominences"], properties["left_bases"], properties["right_bases"]))
     index = np.arange(len(loss))
     out = []
-    for peak, height, left, right in zip(peaks, heights, low, high, strict=True):
+    prominences = properties["prominences"]
+    for peak, height, left, right, above in zip(
+        peaks, heights, low, high, prominences, strict=True
+    ):
         within = (index >= left) & (index <= right)
         area = np.average(found.areas_px2[within], weights=loss[within] - height + 1e-9)
         ends = np.interp([left, right], index, found.sides_px)
-        out.append(Dip(float(ends[0]), float(ends[1]), float(area), float(1.0 - loss[peak])))
+        out.append(Dip(
+            float(ends[0]), float(ends[1]), float(area), float(1.0 - loss[peak]), float(above)))
     return out
 
 

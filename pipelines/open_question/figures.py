@@ -11,7 +11,6 @@ import numpy as np
 from dips import Rates
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from sweep.measure.bit_reading import reading_of
 from sweep.measure.detector import DetectorSetting
@@ -37,9 +36,7 @@ FIRST_PX, LAST_PX = 22, 41
 """The first and the last pixel with its centre in that square, in x and in y."""
 
 
-def draw_second_dip(
-    path: Path, truth: Rates, model: Rates, second: frozenset[int]
-) -> None:
+def draw_rates(path: Path, truth: Rates, model: Rates, second: frozenset[int]) -> None:
     """Draw measured and predicted rates of the IDs with (``second``) and without the second dip."""
     has = np.isin(truth.ids, sorted(second))
     with mpl.rc_context(STYLE):
@@ -47,49 +44,45 @@ def draw_second_dip(
         axes = figure.subplots()
         axes.axvspan(350, 450, color=STRIP, zorder=0)
         axes.axvspan(298, 302, color=STRIP, zorder=0)
-        for area, words in ((300, "the paper's first, 300"), (400, "the paper's second, 350-450")):
-            axes.text(area, 101.6, words, ha="center", va="bottom", color=FAINT)
-        axes.plot([361, 441], [100.9, 100.9], color=INK, lw=2.5, solid_capstyle="butt")
-        axes.annotate("closed form, 361-441", (450, 100.9), (5, 0), textcoords="offset points",
-                      va="center")
+        for area, words in ((300, "first, 300"), (400, "second, 350-450")):
+            axes.text(area, 2, f"the paper's\n{words}", ha="center", va="bottom", color=FAINT)
+        axes.axvline((2.1 * 7) ** 2, color=RULE, lw=1)
+        axes.text((2.1 * 7) ** 2, 40, " 2.1 px a module", color=FAINT)
         for who, colour, words in (
             (has, VERMILION, "two or more lone cells in the middle column or row"),
             (~has, BLUE, "at most one"),
         ):
-            axes.plot(truth.sides_px**2, 100 * truth.rates[:, who].mean(axis=1), color=colour,
-                      lw=2, label=f"{who.sum()} IDs with {words}, measured")
-            axes.plot(model.sides_px**2, 100 * model.rates[:, who].mean(axis=1), color=colour,
+            axes.plot(truth.areas_px2, 100 * truth.rates[:, who].mean(axis=1), color=colour,
+                      lw=2, alpha=0.65, label=f"{who.sum()} IDs with {words}, measured")
+            axes.plot(model.areas_px2, 100 * model.rates[:, who].mean(axis=1), color=colour,
                       lw=1.4, ls=(0, (3, 2)), label="predicted")
-        axes.set(xlim=(220, 500), ylim=(72, 103), xlabel="area of the black square, px²",
-                 ylabel="detected, %", yticks=range(75, 101, 5))
+        axes.set(xlim=(70, 484), ylim=(0, 102), xlabel="area of the black square, px²",
+                 ylabel="detected, %")
         axes.grid(axis="y")
-        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.0))
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.14))
         axes.set_title("Detection rate of frontal markers, DICT_5X5_50")
         figure.savefig(path, dpi=DOTS_PER_INCH)
 
 
-def draw_dictionaries(path: Path, shown: Sequence[tuple[str, Rates, Rates]]) -> None:
+def draw_sweeps(path: Path, shown: Sequence[tuple[str, Rates, Rates]]) -> None:
     """Draw measured and predicted rates, mean of the IDs, of (title, measured, predicted) each."""
-    with mpl.rc_context(STYLE):
-        rows = (len(shown) + 1) // 2
-        figure = Figure(figsize=(WIDTH, 2.3 * rows))
-        figure.get_layout_engine().set(h_pad=0.09)
-        panels = figure.subplots(rows, 2, squeeze=False)
+    with mpl.rc_context(STYLE | {"axes.titlesize": 8.5}):
+        rows = (len(shown) + 2) // 3
+        figure = Figure(figsize=(WIDTH, 1.85 * rows))
+        panels = figure.subplots(rows, 3, squeeze=False, sharey=True)
         for axes, (what, truth, model) in zip(panels.flat, shown, strict=False):
-            areas = truth.sides_px**2
-            axes.plot(areas, 100 * truth.rates.mean(axis=1), color=BLUE, lw=2, label="measured")
-            axes.plot(areas, 100 * model.rates.mean(axis=1), color=VERMILION, lw=1.4,
+            axes.plot(truth.areas_px2, 100 * truth.mean, color=BLUE, lw=2, alpha=0.65,
+                      label="measured")
+            axes.plot(model.areas_px2, 100 * model.mean, color=VERMILION, lw=1.4,
                       ls=(0, (3, 2)), label="predicted")
-            lowest = min(truth.rates.mean(axis=1).min(), model.rates.mean(axis=1).min())
-            axes.set(xlim=(areas[0], areas[-1]), ylim=(min(97, 100 * lowest - 1), 100.4),
-                     ylabel="detected, %")
-            axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 5, 10]))
+            axes.set(xlim=(truth.areas_px2[0], truth.areas_px2[-1]), ylim=(0, 102))
             axes.grid(axis="y")
             axes.set_title(what)
-        panels.flat[0].legend(loc="lower right", bbox_to_anchor=(0.92, 0.0))
+        panels[0, 0].legend(loc="lower right")
         for axes in panels[-1]:
-            axes.set_xlabel("area of the black square, px²")
-        figure.align_ylabels()
+            axes.set_xlabel("area, px²")
+        for axes in panels[:, 0]:
+            axes.set_ylabel("detected, %")
         figure.savefig(path, dpi=DOTS_PER_INCH)
 
 

@@ -15,72 +15,35 @@ import dataclasses
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import xarray as xr
-from dips import Rates, dips, half_read, pairs
+from dips import PROMINENCE, Rates, dips, half_read, pairs
+from sweeps import (
+    DEVELOPMENT,
+    HELD_BACK,
+    SECOND,
+    SENSOR_MM,
+    Sweep,
+    every_dictionary,
+    measured,
+    predicted,
+    spread,
+    written_down,
+)
 
 import sweep
 from sweep.analysis import compare
-from sweep.measure.bit_reading import STAYS_LOST, lone_cells, predicted_rate, reading_of
+from sweep.measure.bit_reading import lone_cells, predicted_rates, reading_of
 from sweep.measure.detector import DetectorSetting
 from sweep.measure.flags import DetectionStatus
+from sweep.measure.quadrilaterals import Surround, upright_corners
 from sweep.model.marker import module_count, modules, opencv_dictionary
 
 FOLDER = Path(__file__).parent
 PIPELINES = FOLDER.parent
-SINGLE_READING = 1.0
-"""``stays_lost`` of the model's first version, which knows one quadrilateral only."""
-FIRST_VERSION = "held back from the first version"
-
-
-@dataclass(frozen=True, slots=True)
-class Sweep:
-    """A sweep of second_dip.toml: settings as ``--set`` takes them, and what is said of it."""
-
-    name: str
-    settings: tuple[str, ...] = ()
-    said: str = "held back"
-
-    def pipeline(self, trials: int | None = None) -> sweep.Pipeline:
-        """Return the pipeline, with other trials where they are given."""
-        more = () if trials is None else (f"trial={trials}",)
-        return sweep.Pipeline.from_toml(PIPELINES / "second_dip.toml", (*self.settings, *more))
-
-
-def _sweep(
-    name: str, ids: tuple[int, int], sides: tuple[float, float], trials: int, width_px: int,
-    said: str = "held back",
-) -> Sweep:
-    height_px, focal_mm = {640: (480, 4.0), 1280: (960, 6.0), 1920: (1440, 8.0)}[width_px]
-    return Sweep(f"{name.removeprefix('DICT_').lower()}_{width_px}", (
-        f"dictionary={name}",
-        f"marker_id={{range=[{ids[0]},{ids[1]}]}}",
-        f"side_px={{arange=[{sides[0]},{sides[1]},0.1]}}",
-        f"trial={trials}", f"width_px={width_px}", f"height_px={height_px}",
-        f"focal_length_mm={focal_mm}",
-    ), said)
-
-
-DEVELOPMENT = Sweep("5x5_50_640", said="development")
-HELD_BACK = (
-    _sweep("DICT_5X5_100", (50, 80), (15.7, 21.3), 60, 1920),
-    _sweep("DICT_APRILTAG_25h9", (0, 35), (15.3, 21.5), 100, 1280),
-)
-"""Swept after the model and its predictions were fixed. Dictionary, IDs, sides in px, trials."""
-
-SWEEPS = (
-    DEVELOPMENT,
-    _sweep("DICT_5X5_50", (0, 10), (15.3, 21.5), 100, 1280, "development's markers"),
-    *HELD_BACK,
-    _sweep("DICT_7X7_50", (0, 50), (19.4, 27.4), 100, 1920, FIRST_VERSION),
-    _sweep("DICT_6X6_250", (0, 25), (16.6, 26.6), 40, 640, FIRST_VERSION),
-    _sweep("DICT_4X4_50", (0, 26), (12.4, 30.1), 40, 1280, FIRST_VERSION),
-)
-"""4x4 and 6x6 with half of the IDs and 40 trials: no dip is expected that would need more."""
 
 CHANGES = {
     "perspectiveRemovePixelPerCell": (4, 2, 3, 5, 6, 7, 8, 10, 16),
@@ -99,15 +62,15 @@ CHANGES = {
 }
 """What is changed, one at a time: the default, then others."""
 
-READ_BY_MODEL = (
-    "perspectiveRemovePixelPerCell", "perspectiveRemoveIgnoredMarginPerCell",
-    "errorCorrectionRate", "maxErroneousBitsInBorderRate",
-)
-ONE_QUADRILATERAL = (("adaptiveThreshWinSizeMax", 3), ("minGroupDistance", 0.6))
-"""Settings that take the further quadrilaterals away."""
+NOT_IN_MODEL = ("cornerRefinementMethod", "renderer", "roll_deg", "validBitIdThreshold")
 
 DIPS_PX = ((15.7, 16.5), (16.7, 17.7), (18.9, 21.0))
 """Sides over which the settings' losses are averaged, for each dip."""
+
+SAMPLES = Sweep("DICT_5X5_50", (0, 10), spread(10.0, 14.8, 0.2), 40)
+SAMPLES_A_CELL = (4, 5, 6, 8, 16)
+SAMPLED_PX = (11.0, 12.0, 13.0, 14.0)
+"""Sides below 2.1 px a module at which numbers of samples are compared."""
 
 
 def swept(
@@ -121,34 +84,6 @@ def swept(
     return results.assign(detection=results["detection"].compute())
 
 
-def measured(results: xr.Dataset, dictionary: str) -> Rates:
-    """Return the detection rates of a sweep."""
-    found = (results["detection"] == DetectionStatus.detected).mean("trial")
-    return Rates(
-        results["side_px"].to_numpy().round(1), results["marker_id"].to_numpy(),
-        found.transpose("side_px", "marker_id").to_numpy(), module_count(dictionary),
-    )
-
-
-def predicted(
-    pipeline: sweep.Pipeline, setting: DetectorSetting | None = None,
-    stays_lost: float = STAYS_LOST,
-) -> Rates:
-    """Return the model's rates of a sweep: from the dictionary and the frame's size alone."""
-    [dictionary], [width], [height] = (
-        pipeline.values_of(name) for name in ("dictionary", "width_px", "height_px")
-    )
-    reading = reading_of(dictionary, width, height, setting or DetectorSetting())
-    ids = np.array(pipeline.values_of("marker_id"))
-    sides = np.array(pipeline.values_of("side_px")).round(1)
-    bits = [modules(dictionary, int(marker_id)) for marker_id in ids]
-    rates = [
-        [predicted_rate(each, float(side), reading, stays_lost=stays_lost) for each in bits]
-        for side in sides
-    ]
-    return Rates(sides, ids, np.array(rates), module_count(dictionary))
-
-
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print a Markdown table."""
     for row in (header, ["---"] * len(header), *rows):
@@ -156,53 +91,90 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     print()
 
 
-def title(pipeline: sweep.Pipeline) -> str:
-    """Return what is swept, as rows of tables name it."""
-    [dictionary], [width] = (pipeline.values_of(name) for name in ("dictionary", "width_px"))
-    ids = pipeline.values_of("marker_id")
-    return f"{dictionary.removeprefix('DICT_')}, IDs {ids[0]}-{ids[-1]}, {width} px"
+def dip_rows(what: str, model: Rates, truth: Rates) -> list[list[str]]:
+    """Return rows of the table of dips: areas, lowest rates, and how far they differ."""
+    rows = []
+    for mine, its in pairs(model, truth):
+        both = mine is not None and its is not None
+        rows.append([
+            what if not rows else "",
+            " / ".join("-" if dip is None else f"{dip.area_px2:.0f}" for dip in (mine, its)),
+            f"{100 * (mine.area_px2 / its.area_px2 - 1):+.1f} %" if both else "-",
+            " / ".join("-" if dip is None else f"{dip.lowest:.2f}" for dip in (mine, its)),
+            f"{mine.lowest - its.lowest:+.2f}" if both else "-",
+        ])
+    return rows or [[what, "none / none", "-", "-", "-"]]
 
 
-def dictionaries(trials: int | None, workers: int | None) -> None:
-    """Print the dips of every dictionary, what the model says of them, and the rule of the IDs."""
-    shown, flags, check, first, rule = [], [], [], [], []
-    for one in SWEEPS:
-        pipeline = one.pipeline(trials)
-        [dictionary] = pipeline.values_of("dictionary")
-        name = "second_dip" if one is DEVELOPMENT else f"second_dip_{one.name}"
-        results = swept(name, pipeline, trials, workers)
-        truth, model = measured(results, dictionary), predicted(pipeline)
-        what, count = title(pipeline), len(truth.ids)
-        shown.append((what, truth, model))
-        read = results["detection"].sel(side_px=slice(2.1 * truth.modules - 1e-9, None))
-        counts = {flag: int((read == flag).sum()) for flag in DetectionStatus}
-        flags.append([what, f"{read.size:,}", *(f"{counts[flag]:,}" for flag in (
-            DetectionStatus.rejected, DetectionStatus.no_candidate, DetectionStatus.wrong_id))])
-        found = list(pairs(model, truth))
-        check += [[f"{what}: {one.said}", *pair.cells(count)] for pair in found] or [
-            [f"{what}: {one.said}", "none / none", *["-"] * 5]]
-        if one is DEVELOPMENT or one.said == FIRST_VERSION:
-            once = predicted(pipeline, stays_lost=SINGLE_READING)
-            first += [[what, *pair.cells(count)] for pair in pairs(once, truth)]
-        corrected, named = ruled(dictionary, truth.ids)
-        rule += [[what, str(corrected), str(len(named)), f"{len(dip.ids)} of {count}",
-                  str(len(named ^ dip.ids))]
-                 for dip in dips(truth) if truth.modules == 7 and dip.low_px > 19]
-    print("Lost poses, sides from 2.1 px a module:\n")
-    table(["swept", "poses", "rejected", "no_candidate", "wrong_id"], flags)
-    heads = ["sides, px", "area, px²", "off", "IDs", "IDs that differ", "lowest rate"]
-    print("Dips, predicted / measured:\n")
-    table(["swept", *heads], check)
-    print("The same with the model's first version, without the fitted number:\n")
-    table(["swept", *heads], first)
+def rate_row(what: str, model: Rates, truth: Rates, flags: xr.DataArray) -> list[str]:
+    """Return a row of the table of rates: how far they differ, and how the marker was lost."""
+    off = model.mean - truth.mean
+    counts = [int((flags == flag).sum()) for flag in (
+        DetectionStatus.rejected, DetectionStatus.no_candidate, DetectionStatus.wrong_id)]
+    return [what, f"{flags.size:,}", f"{np.sqrt((off**2).mean()):.3f}",
+            f"{np.abs(off).max():.2f} at {truth.areas_px2[np.abs(off).argmax()]:.0f} px²",
+            *(f"{count:,}" for count in counts)]
+
+
+def small(trials: int | None, workers: int | None) -> None:
+    """Print rates and dips, predicted and measured, from the detection limit on; draw them."""
+    shown, rates, found = [], [], []
+    before = written_down()
+    for one in (DEVELOPMENT, *HELD_BACK):
+        results = swept(f"small_{one.name}", one.pipeline(trials), trials, workers)
+        truth = measured(one, results)
+        model = predicted(one) if one is DEVELOPMENT else one.rates(before[one.title][:, None])
+        what = one.title if one is DEVELOPMENT else f"**{one.title}**"
+        rates.append(rate_row(what, model, truth, results["detection"]))
+        found += dip_rows(what, model, truth)
+        shown.append((one.short_title, truth, model))
+    print("Rates, predicted - measured, and lost poses (bold: held back):\n")
+    table(["swept", "poses", "rms", "worst", "rejected", "no_candidate", "wrong_id"], rates)
+    print(f"Dips of a prominence of {PROMINENCE} or more, predicted / measured:\n")
+    table(["swept", "area, px²", "off", "lowest rate", "off"], found)
+    from figures import draw_rates, draw_sweeps  # noqa: PLC0415  (Matplotlib is slow to import)
+
+    _, truth, model = shown[0]
+    draw_rates(FOLDER / "second_dip.png", truth, model, ruled("DICT_5X5_50", truth.ids)[1])
+    draw_sweeps(FOLDER / "held_back.png", shown[1:])
+
+
+def every(trials: int | None, workers: int | None) -> None:
+    """Print the dips below 2.4 px a module of every predefined dictionary, frontal."""
+    rates = []
+    for one in every_dictionary():
+        results = swept(f"every_{one.name}", one.pipeline(trials), trials, workers)
+        truth, model = measured(one, results), predicted(one)
+        off = model.mean - truth.mean
+        half = float(np.interp(0.5, np.maximum.accumulate(truth.mean), truth.sides_px))
+        n = module_count(one.dictionary)
+        rates.append([
+            one.dictionary.removeprefix("DICT_"), str(n), f"{half / n:.2f}",
+            "; ".join(f"{dip.area_px2:.0f} ({dip.lowest:.2f})" for dip in dips(truth)) or "none",
+            "; ".join(f"{dip.area_px2:.0f} ({dip.lowest:.2f})" for dip in dips(model)) or "none",
+            f"{np.sqrt((off**2).mean()):.3f}", f"{np.abs(off).max():.2f}",
+        ])
+    print("Every dictionary, last ten IDs, frontal; dips as area in px² (lowest rate):\n")
+    table(["dictionary", "n", "half detected from, px a module", "dips measured",
+           "dips predicted", "rms", "worst"], rates)
+
+
+def second(trials: int | None, workers: int | None) -> None:
+    """Print which IDs have the second dip, by the rule of lone cells and as measured."""
+    rule = []
+    for one in SECOND:
+        results = swept(f"second_{one.name}", one.pipeline(trials), trials, workers)
+        truth, model = measured(one, results), predicted(one)
+        corrected, named = ruled(one.dictionary, truth.ids)
+        having = [rates.having(18.9, 21.2) for rates in (truth, model)]
+        rule.append([one.title, str(corrected), str(len(named)),
+                     f"{len(having[0])} of {len(truth.ids)}", str(len(named ^ having[0])),
+                     str(len(having[1])), str(len(having[1] ^ having[0])),
+                     f"{model.mean.min():.3f} / {truth.mean.min():.3f}"])
     print("More lone cells in the middle column or row than are corrected, against the second dip "
           "as measured:\n")
-    table(["swept", "corrected bits", "IDs by the rule", "IDs measured", "differ"], rule)
-    from figures import draw_dictionaries, draw_second_dip  # noqa: PLC0415  (Matplotlib is slow)
-
-    what, truth, model = shown[0]
-    draw_second_dip(FOLDER / "second_dip.png", truth, model, ruled("DICT_5X5_50", truth.ids)[1])
-    draw_dictionaries(FOLDER / "dictionaries.png", shown[1:])
+    table(["swept", "corrected bits", "IDs by the rule", "IDs measured", "differ",
+           "IDs by the model", "differ", "lowest rate, predicted / measured"], rule)
 
 
 def ruled(dictionary: str, ids: np.ndarray) -> tuple[int, frozenset[int]]:
@@ -224,6 +196,22 @@ def closed_form(_trials: int | None, _workers: int | None) -> None:
     table(["n", "cell", "sides, px", "area, px²"], rows)
 
 
+def samples(trials: int | None, workers: int | None) -> None:
+    """Print what other numbers of samples a cell do below 2.1 px a module."""
+    pipeline = sweep.Pipeline.from_toml(PIPELINES / "second_dip_settings.toml", [
+        *SAMPLES.settings(trials), f"perspectiveRemovePixelPerCell={list(SAMPLES_A_CELL)}"])
+    results = swept("small_samples", pipeline, trials, workers)
+    rows = []
+    for count in SAMPLES_A_CELL:
+        truth = measured(SAMPLES, results.sel(perspectiveRemovePixelPerCell=count)).mean
+        model = predicted(SAMPLES, DetectorSetting(perspectiveRemovePixelPerCell=count)).mean
+        at = [SAMPLES.sides_px.index(side) for side in SAMPLED_PX]
+        rows.append([str(count), *(f"{truth[k]:.2f} ({model[k]:.2f})" for k in at),
+                     f"{truth.mean():.2f} ({model.mean():.2f})"])
+    print("Rate by samples a cell (the model's in brackets), 5X5_50, IDs 0-9:\n")
+    table(["samples a cell", *(f"{side**2:.0f} px²" for side in SAMPLED_PX), "10-14.8 px"], rows)
+
+
 def settings(trials: int | None, workers: int | None) -> None:
     """Print what one setting changed at a time does to the three dips, and at which p-value."""
     rows = []
@@ -234,7 +222,7 @@ def settings(trials: int | None, workers: int | None) -> None:
         pipeline = sweep.Pipeline.from_toml(PIPELINES / "second_dip_settings.toml", [
             "perspectiveRemovePixelPerCell=4", f"{name}=[{written}]", *more])
         results = swept(f"second_dip_settings_{name}", pipeline, trials, workers)
-        rows += [setting_row(name, value, values[0], results, pipeline) for value in values]
+        rows += [setting_row(name, value, values[0], results) for value in values]
     print("Loss in % at the three dips and at the other sides of 15.2-21.8 px (the model's in "
           "brackets), poses with a wrong ID, McNemar's p against the default:\n")
     table(["changed", "value", "257 px²", "292 px²", "391 px²", "elsewhere", "wrong ID", "p"],
@@ -242,7 +230,7 @@ def settings(trials: int | None, workers: int | None) -> None:
 
 
 def setting_row(
-    name: str, value: object, default: object, results: xr.Dataset, pipeline: sweep.Pipeline
+    name: str, value: object, default: object, results: xr.Dataset
 ) -> list[str]:
     """Return a row of the table of settings."""
     one = results.sel({name: value})
@@ -250,10 +238,8 @@ def setting_row(
     lost = (one["detection"] != DetectionStatus.detected).mean(["marker_id", "trial"]).to_numpy()
     detecting = name in {field.name for field in dataclasses.fields(DetectorSetting)}
     model = None
-    if name in READ_BY_MODEL:
-        model = predicted(pipeline, DetectorSetting(**{name: value}))
-    elif (name, value) in ONE_QUADRILATERAL:
-        model = predicted(pipeline, stays_lost=SINGLE_READING)
+    if name not in NOT_IN_MODEL:
+        model = losses_of(sides, one["marker_id"].to_numpy(), name, value, detecting)
     rest = np.ones(len(sides), dtype=bool)
     cells = []
     for low, high in DIPS_PX:
@@ -263,7 +249,7 @@ def setting_row(
     cells.append(rest)
     losses = [
         f"{100 * lost[within].mean():.1f}"
-        + ("" if model is None else f" ({100 * (1 - model.rates[within]).mean():.1f})")
+        + ("" if model is None else f" ({100 * model[within].mean():.1f})")
         for within in cells
     ]
     wrong = int((one["detection"] == DetectionStatus.wrong_id).sum())
@@ -272,6 +258,25 @@ def setting_row(
         p = float(compare(results.sel({name: default}), one)["detection_p_value"])
         p_value = f"{p:.2g}" if p >= 1e-6 else "<1e-6"
     return [f"`{name}`", str(value), *losses, f"{wrong:,} of {one['detection'].size:,}", p_value]
+
+
+def losses_of(
+    sides: np.ndarray, ids: np.ndarray, name: str, value: object, detecting: bool
+) -> np.ndarray:
+    """Return the model's losses (S,) with one setting or scene parameter changed."""
+    setting = DetectorSetting(**{name: value}) if detecting else DetectorSetting()
+    surround = Surround(
+        quiet_zone=value if name == "quiet_zone_modules" else 1.0,
+        background=value if name == "background" else 0.0,
+    )
+    tilt_deg = value if name == "tilt_deg" else 0.0
+    reading = reading_of("DICT_5X5_50", 640, 480, setting)
+    bits = np.array([modules("DICT_5X5_50", int(i)) for i in ids])
+    return np.array([
+        1.0 - predicted_rates(
+            bits, upright_corners(side, tilt_deg, 0.0, 4.0 * 640 / SENSOR_MM), reading, surround,
+        ).mean() for side in sides
+    ])
 
 
 def costs(_trials: int | None, _workers: int | None) -> None:
@@ -325,8 +330,8 @@ def worked_example(_trials: int | None, _workers: int | None) -> None:
 
 
 PARTS = {
-    "closed_form": closed_form, "worked_example": worked_example, "dictionaries": dictionaries,
-    "settings": settings, "costs": costs,
+    "closed_form": closed_form, "worked_example": worked_example, "small": small, "every": every,
+    "second": second, "samples": samples, "settings": settings, "costs": costs,
 }
 
 

@@ -13,6 +13,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import xarray as xr
 from dips import Rates
@@ -52,9 +53,14 @@ class Sweep:
     @property
     def title(self) -> str:
         """What is swept, as rows of tables name it."""
-        about = "" if self.tilt_deg == 0 else " about x" if self.azimuth_deg == 0 else " about y"
-        return (f"{self.dictionary.removeprefix('DICT_')}, IDs {self.ids[0]}-{self.ids[1] - 1}, "
-                f"{self.width_px} px, {self.tilt_deg:g}°{about}")
+        dictionary, tilt = self.short_title.split(", ")
+        return f"{dictionary}, IDs {self.ids[0]}-{self.ids[1] - 1}, {self.width_px} px, {tilt}"
+
+    @property
+    def short_title(self) -> str:
+        """Dictionary and tilt."""
+        axis = "" if self.tilt_deg == 0 else " about x" if self.azimuth_deg == 0 else " about y"
+        return f"{self.dictionary.removeprefix('DICT_')}, {self.tilt_deg:g}°{axis}"
 
     def settings(self, trials: int | None = None) -> list[str]:
         """Return the settings as ``--set`` takes them, with other trials where they are given."""
@@ -101,7 +107,7 @@ def held_back(dictionary: str, ids: tuple[int, int], width_px: int) -> tuple[Swe
     )
 
 
-DEVELOPMENT = Sweep("DICT_5X5_50", (0, 50), spread(8.5, 22.0, 0.1), 20)
+DEVELOPMENT = Sweep("DICT_5X5_50", (0, 50), spread(8.5, 22.0, 0.15), 12)
 HELD_BACK = (
     *held_back("DICT_4X4_100", (50, 80), 640),
     *held_back("DICT_6X6_250", (100, 130), 640),
@@ -110,20 +116,24 @@ HELD_BACK = (
 )
 """Swept after the model and its predictions were fixed."""
 SECOND = tuple(
-    Sweep(dictionary, ids, spread(18.8, 21.3, 0.1), 100, width)
-    for dictionary, ids, width in (
-        ("DICT_5X5_50", (0, 50), 640), ("DICT_5X5_100", (50, 80), 1920),
-        ("DICT_APRILTAG_25h9", (0, 35), 1280),
+    Sweep(dictionary, ids, spread(18.8, 21.3, 0.1), trials, width)
+    for dictionary, ids, trials, width in (
+        ("DICT_5X5_50", (0, 50), 100, 640), ("DICT_5X5_100", (50, 80), 60, 1920),
+        ("DICT_APRILTAG_25h9", (0, 35), 100, 1280),
     )
 )
 """The middle column and row at W = 19, ID by ID."""
 
 
 def every_dictionary() -> list[Sweep]:
-    """Return a sweep of every predefined dictionary's last ten IDs, upright and frontal."""
+    """Return a sweep of every predefined dictionary's last ten IDs, upright and frontal.
+
+    OpenCV has two spellings of some names.
+    """
+    names = {getattr(cv2.aruco, name): name for name in dictionary_names()}
     return [
-        Sweep(name, (marker_count(name) - 10, marker_count(name)), small(name, 0.0), 60)
-        for name in dictionary_names()
+        Sweep(name, (marker_count(name) - 10, marker_count(name)), small(name, 0.0, 30), 20)
+        for name in sorted(names.values())
     ]
 
 

@@ -16,8 +16,7 @@ module as OpenCV samples it):
    wrong for black and for white. More wrong bits than are corrected lose the quadrilateral; if
    no quadrilateral can be read, the marker is lost.
 
-Left out: grey pixels between modules, and quadrilaterals from inside the black border, which is
-hollow for the smallest window if it is three pixels wide.
+Left out: grey pixels between modules, and corners that a threshold cuts off.
 
 Sources: OpenCV 5, modules/objdetect/src/aruco/aruco_detector.cpp (_extractCellPixelRatio,
 _getBorderErrors, filterTooCloseCandidates, identifyCandidates) and aruco_dictionary.cpp
@@ -35,10 +34,9 @@ from sweep.measure.detector import DetectorSetting
 from sweep.measure.quadrilaterals import (
     Surround,
     Thresholds,
+    candidates,
     from_unit_square,
-    outlines,
     transformed,
-    tried_outlines,
 )
 from sweep.model.marker import opencv_dictionary
 from sweep.typing import Floats
@@ -150,7 +148,8 @@ def quadrilateral_mixing(
     at = seen / (n * p - 1.0)
     grid = np.column_stack([np.tile(at, len(at)), np.repeat(at, len(at))])
     pixels = np.asarray(np.rint(transformed(from_unit_square(quads), grid)), dtype=np.float64)
-    within = np.floor(n * transformed(np.linalg.inv(from_unit_square(corners)), pixels))
+    back = np.asarray(np.linalg.inv(from_unit_square(corners)), dtype=np.float64)
+    within = np.floor(n * transformed(back, pixels))
     column, row = within[..., 0], within[..., 1]
     inside = (column >= 0) & (column < n) & (row >= 0) & (row < n)
     module = np.where(inside, row * n + column, n * n).astype(np.int64)
@@ -216,9 +215,7 @@ def predicted_rates(
     positions = np.column_stack([i, i * step % count]) / count
     moved = corners + positions[:, None]
     detected = np.zeros((count, len(bits)), dtype=bool)
-    found = outlines(moved, n, reading.thresholds, surround or Surround())
-    tried = tried_outlines(found, n, reading.thresholds)
-    for quads, tries in zip(found, tried, strict=True):
+    for quads, tries in candidates(moved, n, reading.thresholds, surround or Surround()):
         perimeter = np.abs(np.roll(quads, -1, axis=1) - quads).max(axis=2).sum(axis=1)
         rows = np.flatnonzero(tries & (perimeter >= reading.outline_px))
         if len(rows):

@@ -145,7 +145,13 @@ def bounds(
 ) -> Bounds:
     """Return the bounds of visible scenes ``rows`` (n,) with the marker's ``boxes`` (n, 4).
 
-    The bound is that of the exact image in the frame, after its gain, whichever renderer draws it.
+    The bound is that of the exact image, after its gain, whichever renderer draws it: of the pixels
+    in ``boxes`` and of up to :data:`~sweep.measure.likelihood.BACKGROUND_MARGIN_PX` around them, as
+    far as the frame goes, which are those that solver ``photometric`` has. The rest of the frame
+    knows only the background's level: N more pixels add N to that level's diagonal element of
+    the Fisher information (times the noise's variance). With all of a frame of 320 x 240 px the
+    bound would be lower by at most 1.0 %, of markers that the frame cuts by 1.3 %
+    (``tests/measure/test_bound.py``).
     Levels of black, white and background are unknown; with ``unknown_blur`` the point spread is,
     too. From Kay, "Fundamentals of statistical signal processing: estimation theory" (1993),
     section 3.9, with analytic derivatives (:mod:`sweep.model.derivatives`).

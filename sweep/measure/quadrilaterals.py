@@ -1,10 +1,11 @@
-"""The quadrilaterals that the detector sees of a small upright marker, one for each threshold.
+"""The quadrilaterals that the detector sees of a small upright marker at its thresholds.
 
 The adaptive threshold takes a pixel for black if it is darker than the mean of its window by a
 constant. At a corner of the black square that mean depends on the window: one of 3 px holds five
 white pixels of nine, one of 23 px mostly what surrounds the marker. So the grey pixels of the
 square's edge are black for some windows and not for others, and each window has its own whole-pixel
-corners. The detector reads them one after the other, the largest first.
+corners. A border of three pixels or more is hollow for a window of 3 px: one quadrilateral more.
+The detector reads them one after the other, the largest first.
 
 Sources: OpenCV 5, modules/objdetect/src/aruco/aruco_detector.cpp (_threshold,
 _findMarkerContours, filterTooCloseCandidates).
@@ -24,6 +25,15 @@ from sweep.typing import Floats
 WHITE = 255.0
 DATA_WHITE = 0.5
 """Share of white among a marker's data bits; it changes only what large windows see."""
+
+INWARDS = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+"""Directions from the corners TL, TR, BR, BL into the square."""
+
+HOLLOW = np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [1.0, 0.0]])
+"""The hollow border's quadrilateral relative to the square's, in pixels. A border of three pixels
+or more has a middle that a window of 3 px sees no white in, and does not take for black. The
+outline of that hole has its corners cut off by a pixel, and of each cut one end becomes a corner:
+the quadrilateral is turned by a pixel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,23 +186,50 @@ def _slope(edge: Floats, axis: int) -> Floats:
     return np.asarray(edge[:, 1 - axis] / edge[:, axis])
 
 
-def tried_outlines(
-    found: list[Floats], modules: int, thresholds: Thresholds
-) -> list[NDArray[np.bool_]]:
-    """Return for each threshold at which positions (P,) its quadrilateral is tried.
+def candidates(
+    corners: Floats, modules: int, thresholds: Thresholds, surround: Surround
+) -> list[tuple[Floats, NDArray[np.bool_]]]:
+    """Return the quadrilaterals (P, 4, 2) in which bits are read, and where each is tried (P,).
 
-    One is tried if its corners' root mean square distance to those of the one tried before it is
-    above ``group_distance`` modules.
+    The outlines, the largest first, then those of the hollow border. One is tried if its corners'
+    root mean square distance to those of the one tried before it is above ``group_distance``
+    modules. Parameters as of :func:`outlines`.
     """
+    found = outlines(corners, modules, thresholds, surround)
+    existing = [np.ones(len(corners), dtype=bool) for _ in found]
+    found.append(found[0] + HOLLOW)
+    hollow = _is_hollow(found[0], corners, modules, thresholds, surround)
+    existing.append(hollow & (min(thresholds.windows) == 3))
     before = found[0].copy()
-    tried = [np.ones(len(before), dtype=bool)]
-    for quads in found[1:]:
+    out = [(found[0], existing[0])]
+    for quads, exists in zip(found[1:], existing[1:], strict=True):
         distance = np.sqrt(((quads - before) ** 2).sum(axis=2).mean(axis=1))
         sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2).mean(axis=1)
-        new = distance > thresholds.group_distance * sides / modules
-        before[new] = quads[new]
-        tried.append(new)
-    return tried
+        tried = exists & (distance > thresholds.group_distance * sides / modules)
+        before[tried] = quads[tried]
+        out.append((quads, tried))
+    return out
+
+
+def _is_hollow(
+    outline: Floats, corners: Floats, modules: int, thresholds: Thresholds, surround: Surround
+) -> NDArray[np.bool_]:
+    """Return for which squares (P,) the border is three black pixels wide on all of its sides.
+
+    Three grey pixels beside it, of a level three times the threshold's constant, make a window's
+    black centre black for the threshold.
+    """
+    module_px = np.ptp(corners[0], axis=0) / modules
+    ramp = surround.ramp_modules + surround.ramp_px / module_px
+    grey = ramp * max(0.5 - 3.0 * thresholds.constant / WHITE, 0.0)
+    back = np.asarray(np.linalg.inv(from_unit_square(corners)), dtype=np.float64)
+
+    def depth(pixels: Floats) -> Floats:
+        within = modules * transformed(back, pixels)
+        return np.asarray(np.where(INWARDS > 0.0, within, modules - within))
+
+    black = (depth(outline) > grey) & (depth(outline + 2.0 * INWARDS) < 1.0 - grey)
+    return np.asarray(black.all(axis=(1, 2)))
 
 
 def from_unit_square(quads: Floats) -> Floats:

@@ -198,18 +198,18 @@ def _centres(values: Mapping[str, Column], count: int) -> Floats:
     ], axis=1)
 
 
-def _px_to_m(values: Mapping[str, Column], count: int) -> Floats:
-    """Return the metres (count, 2) at the centre's depth that a pixel is along x and y."""
+def _shifts(
+    values: Mapping[str, Column], count: int, names: tuple[str, str] = SHIFTS
+) -> Floats:
+    """Return what the jitter's pixels are at the centre's depth, along x and y, (count, 2) m."""
     focal = intrinsics(
         *(None if values[name].missing else values[name].broadcast(count)
           for name in VIEW_PARAMETERS)
     )[:2]
-    return np.asarray(values["distance_m"].broadcast(count)[:, None] / np.stack(focal, axis=1))
-
-
-def _shifts(values: Mapping[str, Column], count: int) -> Floats:
-    """Return the jitter (count, 2) in metres."""
-    return np.stack(_numbers(values, SHIFTS, count), axis=1) * _px_to_m(values, count)
+    depth, pixels = values["distance_m"].broadcast(count), _numbers(values, names, count)
+    return np.stack(
+        [depth * (pixel / length) for pixel, length in zip(pixels, focal, strict=True)], axis=1
+    )
 
 
 def _from_frame(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
@@ -219,8 +219,9 @@ def _from_frame(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
     size, quiet = _numbers(values, ("size_m", "quiet_zone_modules"), count)
     outline = marker_corners(size * (1 + 2 * quiet / modules))
     depth = values["distance_m"].broadcast(count)
-    facing, jitter = _facing(values, count), values["jitter_px"].broadcast(count)
-    given, shift, pixel = (make(values, count) for make in (_centres, _shifts, _px_to_m))
+    facing, given = _facing(values, count), _centres(values, count)
+    shift = _shifts(values, count)
+    margin = _shifts(values, count, ("jitter_px", "jitter_px"))
     frame = np.stack(_numbers(values, ("width_px", "height_px"), count), axis=1)
     share = np.stack(_numbers(values, SHARES, count, np.nan), axis=1)
     centres = np.empty((count, 2))
@@ -239,7 +240,7 @@ def _from_frame(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
 
         centres[rows] = Framing(
             cameras.take(rows), frame[rows], depth[rows], offsets, share[rows], given[rows],
-            jitter[rows, None] * pixel[rows], shift[rows],
+            margin[rows], shift[rows],
         ).centres()
     return tuple(centres.T)
 

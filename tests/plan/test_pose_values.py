@@ -7,12 +7,17 @@ from scipy.spatial.transform import Rotation
 
 import sweep
 from support.here import calls_here
+from support.lengths import lengths
 from sweep.errors import PipelineError
+from sweep.evaluation.search import visibility_flags
+from sweep.evaluation.variables import GEOMETRY
+from sweep.measure.flags import DetectionStatus
 from sweep.model.scene import build_scenes
-from sweep.plan.alternatives import IN_CAMERA, RIVALS, WORLD
+from sweep.plan.alternatives import CHOICES, IN_CAMERA, RIVALS, WORLD
 from sweep.plan.cell_selection import cell
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes, scene_values
+from sweep.plan.parameters import PARAMETERS
 
 FLIP = np.diag([1.0, -1.0, -1.0])
 ANGLE_DEG = 1e-12
@@ -127,13 +132,14 @@ def projected(scenes, points, distortion):
 
 @pytest.mark.parametrize("distortion", [[], LENS, [0.25, 0.1, 0, 0]])
 @pytest.mark.parametrize("turn", ["tilt_deg", "view_angle_deg", "yaw_deg"])
-def test_share_of_the_frame_never_leaves_it_and_reaches_its_edges(distortion, turn):
-    """No scene may be outside; that 600 leave a tenth empty has a chance below 0.9^600 = 1e-27."""
+@lengths(300, 5000)
+def test_share_of_the_frame_never_leaves_it_and_reaches_its_edges(distortion, turn, count):
+    """No scene may be outside; that 300 leave a tenth empty has a chance below 0.9^300 = 2e-14."""
     values, scenes = made(
         {"frame_x": {"uniform": [0, 1]}, "frame_y": {"uniform": [0, 1]},
          "distance_m": {"uniform": [0.5, 4]}, turn: {"uniform": [-75, 75]},
          "roll_deg": {"uniform": [0, 360]}, "jitter_px": 2},
-        {"trial": 600}, marker={"size_m": 0.1, "quiet_zone_modules": 2},
+        {"trial": count}, marker={"size_m": 0.1, "quiet_zone_modules": 2},
         camera={"fx_px": 500, "distortion": distortion},
     )
     pixels = projected(scenes, outline(scenes, 2, 50), distortion)
@@ -221,6 +227,79 @@ def test_places_in_the_world_are_scipys():
     np.testing.assert_allclose(
         scenes.translation, image.apply(body.inv().apply(marker - camera)), atol=1e-12
     )
+
+
+# Any pose, to the ends of the ranges
+
+LENSES = [[], LENS, [0.3, 0.2, 0, 0], [-1.2, 0.3, 0, 0], [5, 0, 0, 0],
+          [-0.4, 0.2, 0, 0, 0, 0, 0, 0, 0.01, 0, 0.01, 0, 0.1, -0.1]]
+
+
+def any_value(rng, name):
+    declared = PARAMETERS[name].declaration
+    low, high = max(declared.low, -1e12), min(declared.high, 1e12)
+    ends = [1e-9 if declared.open_low else low, high, max(low, 1e-3)]
+    usual = [1e-9, 0.001, 1, 89.9999999, 90, 180]
+    number = [rng.choice(ends), rng.choice(usual), rng.uniform(low, min(high, 1000))]
+    return float(np.clip(number[rng.integers(3)], low, high))
+
+
+def any_document(rng):
+    """Return a document with a pose given in any way, at any value, fixed, as axis or drawn."""
+    if rng.random() < 0.25:
+        names = [str(name) for name in rng.choice(WORLD, rng.integers(1, 12), replace=False)]
+    else:
+        chosen = [ways[rng.integers(len(ways))] for ways in CHOICES]
+        turned = {"yaw_deg", "pitch_deg"} & {name for way in chosen for name in way}
+        without = ("tilt_deg", "view_angle_deg", "azimuth_deg") if turned else ()
+        given = dict.fromkeys(name for way in chosen for name in way)
+        names = [name for name in given if name not in without] + ["roll_deg"]
+    pose, axes = {name: any_value(rng, name) for name in names}, {}
+    if rng.random() < 0.5:
+        pose["jitter_px"] = float(rng.choice([0.5, 50]))
+    for name in names:
+        kind, other = rng.random(), any_value(rng, name)
+        if kind < 0.3 and other != pose[name]:
+            axes[name] = [pose.pop(name), other]
+        elif kind < 0.5 and other > pose[name]:
+            pose[name] = {"uniform": [pose[name], other]}
+    if "jitter_px" in pose or any(isinstance(value, dict) for value in pose.values()):
+        axes["trial"] = 3
+    return {
+        "pose": pose, "axes": axes,
+        "marker": {"size_m": float(rng.choice([0.05, 1e-9, 1e9])),
+                   "quiet_zone_modules": float(rng.choice([0, 1, 100]))},
+        "camera": {"fx_px": float(rng.choice([300, 600, 1e-3, 1e9])),
+                   "width_px": int(rng.choice([640, 1, 100_000])),
+                   "distortion": LENSES[rng.integers(len(LENSES))]},
+    }
+
+
+@lengths(60, 2000)
+def test_any_pose_has_a_truth_and_is_the_same_alone(count):
+    rng = np.random.default_rng(0)
+    for _ in range(count):
+        document = any_document(rng)
+        pipeline = Pipeline.from_dict(document)
+        indices = [index.ravel() for index in np.indices(
+            [len(axis) for axis in scene_axes(pipeline)], dtype=np.intp)]
+        scene_count = len(indices[0]) if indices else 1
+        values = scene_values(pipeline, indices)
+        scenes = build_scenes(values, scene_count)
+        unseen = visibility_flags(scenes) == DetectionStatus.not_visible
+        for name, function in GEOMETRY.items():
+            numbers = function(scenes)
+            if name == "marker_area_px":
+                numbers = numbers[~unseen]
+            assert np.isfinite(numbers).all(), (name, document)
+        if "view_angle_deg" in pipeline.given:
+            given = np.abs(values["view_angle_deg"].broadcast(scene_count))
+            found = GEOMETRY["viewing_angle_deg"](scenes)
+            np.testing.assert_allclose(found, given, atol=1e-10, err_msg=str(document))
+        one = int(rng.integers(scene_count))
+        alone = build_scenes(scene_values(pipeline, [each[one : one + 1] for each in indices]), 1)
+        np.testing.assert_array_equal(alone.translation[0], scenes.translation[one])
+        np.testing.assert_array_equal(alone.rotation[0], scenes.rotation[one])
 
 
 # Draws

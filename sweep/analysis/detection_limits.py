@@ -56,8 +56,8 @@ def detection_limit(
     rate
         The detection rate that is asked for, above 0 and at most 1.
     per
-        Dimensions that are kept; by default the tilt, if it varies. A dimension ``dictionary`` is
-        always kept; the sides and the trials cannot be.
+        Dimensions that are kept; by default the tilt or viewing angle, if it varies. A
+        dimension ``dictionary`` is always kept; the sides and the trials cannot be.
 
     Returns
     -------
@@ -102,7 +102,7 @@ def detection_limit(
     axes = axes_of(results)
     dictionaries = ["dictionary"] if "dictionary" in axes else []
     if per is None:
-        per = [name for name in ("tilt_deg",) if name in axes]
+        per = [name for name in ("tilt_deg", "view_angle_deg") if name in axes]
     kept = kept_dimensions(results, (*as_names(per), *dictionaries))
     for name in (axis, DRAWS):
         if name in kept:

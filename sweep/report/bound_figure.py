@@ -19,7 +19,6 @@ from sweep.report.figure import (
 )
 from sweep.report.grouping import (
     CONFIGURATION,
-    TILT,
     Grouping,
     by_configuration,
     group_labels,
@@ -39,7 +38,7 @@ def _has_bound(data: ReportData) -> bool:
 
 def _render(data: ReportData) -> RenderedFigure:
     grouping = configuration_grouping(data)
-    along = data.size_axis or (TILT if data.tilted else None)
+    along = data.size_axis or data.angle_axis
     sizes = data.along(along, SIZE_COLUMNS) if along else Grouping()
     settings, per = list(grouping.dims), list(sizes.dims)
     ratio = _over_bound(data.analysed(efficiency, grouping + sizes))

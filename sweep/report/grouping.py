@@ -15,7 +15,9 @@ from sweep.tradeoff.labels import configuration_label
 from sweep.typing import Floats
 
 AREA = "marker_area_px"
-TILT = "tilt_deg"
+ANGLES = {"tilt_deg": "tilt", "view_angle_deg": "viewing angle"}
+"""Axes along which the marker is turned away, and their names in sentences."""
+
 IDS = "marker_id"
 CONFIGURATION = "configuration"
 """Dimension of tables that have a row for each configuration."""

@@ -14,7 +14,7 @@ from sweep.analysis.detection_limits import Limit
 from sweep.errors import SweepError
 from sweep.plan.parameters import Stage
 from sweep.report.formatting import coordinate, number
-from sweep.report.grouping import TILT
+from sweep.report.grouping import ANGLES
 from sweep.report.report_data import ReportData
 from sweep.report.table import Table
 from sweep.report.tile import Tile
@@ -58,7 +58,7 @@ def limits_of(data: ReportData) -> Limits:
     settings = ", ".join(
         f"{axis.name} {coordinate(first[axis.name].item())}" for axis in axes if len(axis) > 1
     )
-    per = (TILT,) if data.tilted else ()
+    per = (data.angle_axis,) if data.angle_axis else ()
     try:
         lazy = detection_limit(first, rate=RELIABLE_RATE, per=per)
     except SweepError:  # the side differs within what is pooled, or is not known
@@ -70,7 +70,7 @@ def limits_of(data: ReportData) -> Limits:
         cell = computed.isel(dict(zip(dims, index, strict=True)))
         values = {name: cell[name].item() for name in dims}
         condition = ", ".join(
-            f"tilt {coordinate(value)}\u00b0" if name == TILT else str(value)
+            f"{ANGLES[name]} {coordinate(value)}\u00b0" if name in ANGLES else str(value)
             for name, value in values.items()
         )
         limit = int(cell["limit"])

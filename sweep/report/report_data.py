@@ -17,12 +17,13 @@ from sweep.errors import StoreError, SweepError
 from sweep.execution.summary import outcome_of_finished
 from sweep.measure.flags import DetectionStatus, uncounted_values
 from sweep.model.camera import VIEW_PARAMETERS
+from sweep.plan.alternatives import WORLD
 from sweep.plan.axes import TRIAL
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
 from sweep.report.grouping import (
+    ANGLES,
     AREA,
-    TILT,
     Grouping,
     area_bins,
     axis_label,
@@ -90,9 +91,14 @@ class ReportData:
         return next((name for name in SIZE_AXES if self.length(name) > 1), None)
 
     @property
-    def tilted(self) -> bool:
-        """Whether the tilt is an axis."""
-        return self.length(TILT) > 1
+    def angle_axis(self) -> str | None:
+        """The axis along which the marker is turned away: the tilt, or the viewing angle."""
+        return next((name for name in ANGLES if self.length(name) > 1), None)
+
+    @property
+    def angle(self) -> str:
+        """The name of that axis in sentences; empty without one."""
+        return ANGLES[self.angle_axis] if self.angle_axis else ""
 
     @functools.cached_property
     def area_range(self) -> tuple[float, float]:
@@ -107,12 +113,13 @@ class ReportData:
 
     @property
     def areas_vary(self) -> bool:
-        """Whether areas differ for other reasons than an axis of sizes or tilts."""
-        reasons = {*VIEW_PARAMETERS, *SIZE_AXES, TILT, "size_m"}
+        """Whether areas differ for other reasons than an axis of sizes or angles."""
+        expected = {*SIZE_AXES, *ANGLES}
+        reasons = {*VIEW_PARAMETERS, *expected, *WORLD, "yaw_deg", "pitch_deg", "size_m"}
         drawn = bool(reasons & self.pipeline.distributions.keys())
         axes = {axis.name for axis in self.pipeline.axes if len(axis) > 1}
         together = {name for axis in self.pipeline.axes for name, _ in axis.zipped}
-        if not drawn and not axes & (reasons - {*SIZE_AXES, TILT}) and not together & reasons:
+        if not drawn and not axes & (reasons - expected) and not together & reasons:
             return False
         low, high = self.area_range
         return high > AREA_RATIO * low
@@ -164,9 +171,9 @@ class ReportData:
             return bins_of(name, np.asarray(self.results[name].values, dtype=np.float64), most)
         return chosen_of(name, len(axis), most)
 
-    def by_tilt(self, most: int = 6) -> Grouping:
-        """Return the grouping by tilt, if the tilt is an axis."""
-        return self.along(TILT, most) if self.tilted else Grouping()
+    def by_angle(self, most: int = 6) -> Grouping:
+        """Return the grouping by tilt or viewing angle, if one is an axis."""
+        return self.along(self.angle_axis, most) if self.angle_axis else Grouping()
 
     def pooled(self, *kept: str) -> str:
         """Return a sentence that names the axes pooled over, all but ``kept``."""

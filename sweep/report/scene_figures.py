@@ -1,4 +1,4 @@
-"""Figures of detection, errors and flips by the marker's size and tilt."""
+"""Figures of detection, errors and flips by the marker's size and tilt, or viewing angle."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sweep.report.figure import (
     sentences,
     uncapitalised,
 )
-from sweep.report.grouping import AREA, TILT, Grouping, group_labels
+from sweep.report.grouping import AREA, Grouping, group_labels
 from sweep.report.report_data import ReportData
 from sweep.report.svg import Panel
 from sweep.report.table import table_of
@@ -43,12 +43,12 @@ def _short_name(name: str) -> str:
     return SHORT_NAMES.get(name, name)
 
 
-def _by_tilt(data: ReportData) -> str:
-    return ", by tilt" if data.tilted else ""
+def _by_angle(data: ReportData) -> str:
+    return f", by {data.angle}" if data.angle else ""
 
 
 def _size_axes(data: ReportData) -> list[str]:
-    return [name for name in (data.size_axis, TILT if data.tilted else None) if name]
+    return [name for name in (data.size_axis, data.angle_axis) if name]
 
 
 # Detection against size.
@@ -57,15 +57,15 @@ def _detection(data: ReportData) -> RenderedFigure:
     axis = data.size_axis
     areas = axis is None or data.length(axis) >= MIN_BINNED_SIZES
     along = AREA if areas else str(axis)
-    grouping = data.by_tilt() + data.along(along)
+    grouping = data.by_angle() + data.along(along)
     summary = data.analysed(detection_rate, grouping)
-    lines = lines_of(summary, along, "detection_rate", TILT if data.tilted else None, 100)
+    lines = lines_of(summary, along, "detection_rate", data.angle_axis, 100)
     label = data.label(along)
     return RenderedFigure(
         "detection", f"Detection rate by {_short_name(along)}",
         sentences(
             f"Share of the poses looked for in which the marker is detected, against its "
-            f"{long_name(along)}{_by_tilt(data)}.",
+            f"{long_name(along)}{_by_angle(data)}.",
             interval_sentence(summary, "detection_rate", marks="Bands and bars").replace(
                 "intervals over", "intervals (Wilson's) over"),
             denominators(summary), *grouping.notes, data.pooled(along, *grouping.dims),
@@ -82,9 +82,9 @@ def _detection(data: ReportData) -> RenderedFigure:
 
 def _errors(data: ReportData) -> RenderedFigure:
     along = str(data.size)
-    grouping = data.by_tilt() + data.along(along)
+    grouping = data.by_angle() + data.along(along)
     summary = data.analysed(error_statistics, grouping)
-    by = TILT if data.tilted else None
+    by = data.angle_axis
     label = data.label(along)
 
     def panel(name: str, title: str, unit: str) -> Panel:
@@ -98,7 +98,7 @@ def _errors(data: ReportData) -> RenderedFigure:
         "errors", f"Errors of the pose by {_short_name(along)}",
         sentences(
             f"Error of the estimated pose against the marker's {long_name(along)}"
-            f"{_by_tilt(data)}: median and 95 % quantile (p95) of the rotation error, median of "
+            f"{_by_angle(data)}: median and 95 % quantile (p95) of the rotation error, median of "
             "the range error (depth, relative to the true depth), RMSE of range without flips.",
             "An error of 0 is drawn at the lower edge."
             if (summary["rotation_median_deg"] == 0).any() else "",
@@ -115,23 +115,27 @@ def _errors(data: ReportData) -> RenderedFigure:
     )
 
 
-# Maps over size and tilt.
+# Maps over size and angle.
+
+def _over(data: ReportData) -> str:
+    return f"{_short_name(str(data.size_axis))} and {data.angle}"
+
 
 def _has_map(data: ReportData) -> bool:
-    return data.size_axis is not None and data.tilted
+    return data.size_axis is not None and data.angle_axis is not None
 
 
 def _map_grouping(data: ReportData) -> Grouping:
-    return data.along(TILT, MAP_ROWS) + data.along(str(data.size_axis), MAP_COLUMNS)
+    return data.along(str(data.angle_axis), MAP_ROWS) + data.along(str(data.size_axis), MAP_COLUMNS)
 
 
 def _map_panel(
     data: ReportData, summary: xr.Dataset, name: str, title: str, *, share: bool = False
 ) -> Panel:
-    along = str(data.size_axis)
-    rows, columns = group_labels(summary, TILT), group_labels(summary, along)
-    values = summary[name].transpose(TILT, along).values.astype(np.float64)
-    labels = (data.label(along), data.label(TILT))
+    along, angle = str(data.size_axis), str(data.angle_axis)
+    rows, columns = group_labels(summary, angle), group_labels(summary, along)
+    values = summary[name].transpose(angle, along).values.astype(np.float64)
+    labels = (data.label(along), data.label(angle))
     return Panel(
         title, f"Map of {uncapitalised(title)} over {labels[0]} and {labels[1]}.",
         lambda axes: draw_map(axes, rows, columns, values, labels, share=share),
@@ -143,7 +147,7 @@ def _maps(data: ReportData) -> RenderedFigure:
     grouping = _map_grouping(data)
     summary = data.analysed(error_statistics, grouping)
     return RenderedFigure(
-        "maps", f"Detection and rotation error over {_short_name(str(data.size_axis))} and tilt",
+        "maps", f"Detection and rotation error over {_over(data)}",
         sentences(
             "Detection rate in percent, and 95 % quantile of the rotation error in degrees; "
             "a pose that is not solved counts as an infinite error (\u221e).",
@@ -164,10 +168,11 @@ def _flips(data: ReportData) -> RenderedFigure:
     grouping = _map_grouping(data)
     summary = data.analysed(flip_rate, grouping)
     return RenderedFigure(
-        "flips", f"Flips to the mirrored pose over {_short_name(str(data.size_axis))} and tilt",
+        "flips", f"Flips to the mirrored pose over {_over(data)}",
         sentences(
             "Share of the solved poses that are nearer to the mirror of the truth than to the "
-            "truth, in percent. At a tilt near 0 the mirror hardly differs from the truth.",
+            f"truth, in percent. At a {data.angle} near 0 the mirror hardly differs from the "
+            "truth.",
             denominators(summary, "solved", "solved poses"), *grouping.notes,
             data.pooled(*grouping.dims),
         ),

@@ -384,7 +384,7 @@ def test_bins_are_the_same_whether_a_store_is_loaded_or_read_in_pieces(full, mon
     assert loaded.results["estimate"].chunks is None
     monkeypatch.setattr(report_data, "MAX_LOADED_BYTES", 0)
     assert data.in_memory().results["estimate"].chunks is not None
-    for grouping in (data.by_tilt() + data.along("side_px", 2), data.along("solver")):
+    for grouping in (data.by_angle() + data.along("side_px", 2), data.along("solver")):
         xr.testing.assert_allclose(
             data.analysed(error_statistics, grouping), loaded.analysed(error_statistics, grouping))
 

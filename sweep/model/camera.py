@@ -51,7 +51,12 @@ class Camera:
         unit="degree", low=1e-5, high=179.9,
     )
     vfov_deg: float | None = parameter(
-        None, "vertical field of view: 2 atan(height_px / (2 fy)); as hfov_deg, and not both",
+        None, "vertical field of view: 2 atan(height_px / (2 fy)); as hfov_deg",
+        unit="degree", low=1e-5, high=179.9,
+    )
+    dfov_deg: float | None = parameter(
+        None, "diagonal field of view between the frame's opposite corners, in square pixels: "
+        "2 atan(hypot(width_px, height_px) / (2 fx)); as hfov_deg",
         unit="degree", low=1e-5, high=179.9,
     )
     fx_px: float | None = parameter(
@@ -89,7 +94,7 @@ class Camera:
 
 VIEW_PARAMETERS = (
     "width_px", "height_px", "sensor_width_mm", "sensor_height_mm", "focal_length_mm", "fx_px",
-    "fy_px", "cx_px", "cy_px", "hfov_deg", "vfov_deg", "pixel_size_um",
+    "fy_px", "cx_px", "cy_px", "hfov_deg", "vfov_deg", "pixel_size_um", "dfov_deg",
 )
 """The arguments of :func:`intrinsics`, in order."""
 
@@ -110,6 +115,7 @@ def intrinsics(
     hfov_deg: Any = None,
     vfov_deg: Any = None,
     pixel_size_um: Any = None,
+    dfov_deg: Any = None,
 ) -> tuple[Any, Any, Any, Any]:
     """Return fx, fy, cx, cy in pixels (numbers or arrays, as the arguments of :class:`Camera`)."""
     if fx_px is not None:
@@ -119,6 +125,8 @@ def intrinsics(
         fx = fy = width_px / (2 * np.tan(np.radians(hfov_deg) / 2))
     elif vfov_deg is not None:
         fx = fy = height_px / (2 * np.tan(np.radians(vfov_deg) / 2))
+    elif dfov_deg is not None:
+        fx = fy = np.hypot(width_px, height_px) / (2 * np.tan(np.radians(dfov_deg) / 2))
     elif pixel_size_um is not None:
         fx = fy = 1e3 * focal_length_mm / pixel_size_um
     else:

@@ -9,7 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model.camera import VIEW_PARAMETERS, are_square, field_of_view_deg, intrinsics
+from sweep.model.camera import (
+    VIEW_PARAMETERS,
+    are_square,
+    canonical_distortion,
+    field_of_view_deg,
+    intrinsics,
+)
+from sweep.model.lens import fold_radius
 from sweep.plan.beliefs import belief_notes
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes, scene_values
@@ -175,6 +182,12 @@ def _side_of_cells(pipeline: Pipeline) -> Range | None:
 OFF_CENTRE = 0.15
 """Distance of the principal point from the frame's centre, as a share of its side, that is told."""
 
+WIDE_DEG = 150.0
+"""Horizontal field of view above which it is told; lenses without fisheye reach about 130."""
+
+POLE = 1e-9
+"""Denominator of the radial distortion at a fold below which it is a pole."""
+
 NOT_SQUARE = 0.01
 """Difference of fy/fx from 1 that is told; calibrations of square pixels differ by less."""
 
@@ -183,7 +196,7 @@ def notes(pipeline: Pipeline) -> list[str]:
     """Return a line for each property of the camera, or of beliefs about it, that may surprise."""
     facts = camera_facts(pipeline)
     return [
-        *_focal_notes(pipeline, facts), *_centre_notes(facts),
+        *_focal_notes(pipeline, facts), *_centre_notes(facts), *_fold_notes(pipeline, facts),
         *belief_notes(pipeline.given, pipeline.fixed, pipeline.values_of("believed")),
     ]
 
@@ -194,6 +207,11 @@ def _focal_notes(pipeline: Pipeline, facts: CameraFacts) -> list[str]:
         lines.append(
             f"pixels are not square: fy/fx = {_text(facts.aspect, 4)}; a single side "
             "of the sensor, or fx_px alone, makes them square"
+        )
+    if facts.hfov_deg[1] > WIDE_DEG:
+        lines.append(
+            f"HFOV {_text(facts.hfov_deg, 4)}°: hardly any pinhole camera is as wide; is a focal "
+            "length in another unit?"
         )
     if _varies(pipeline, "width_px") and pipeline.fixed.get("fx_px") is not None:
         lines.append(
@@ -218,6 +236,31 @@ def _centre_notes(facts: CameraFacts) -> list[str]:
                 "of another frame size?"
             )
     return lines
+
+
+def _fold_notes(pipeline: Pipeline, facts: CameraFacts) -> list[str]:
+    """Return a line if the radial distortion of the only lens stops growing within the frame."""
+    lens = canonical_distortion(pipeline.fixed.get("distortion", ()))
+    ends = (facts.width_px, facts.height_px, facts.fx_px, facts.fy_px, facts.cx_px, facts.cy_px)
+    if not lens or any(low != high for low, high in ends) or not math.isfinite(fold_radius(lens)):
+        return []
+    width, height, fx, fy, cx, cy = (low for low, _ in ends)
+    radius = fold_radius(lens)
+    k1, k2, _, _, k3, k4, k5, k6 = (*lens, *[0.0] * 8)[:8]
+    s = radius**2
+    denominator = 1 + s * (k4 + s * (k5 + s * k6))
+    if denominator <= POLE:
+        return []
+    fold = radius * (1 + s * (k1 + s * (k2 + s * k3))) / denominator
+    corner = math.hypot(
+        max(cx + 0.5, width - 0.5 - cx) / fx, max(cy + 0.5, height - 0.5 - cy) / fy
+    )
+    if fold >= corner:
+        return []
+    return [
+        (f"the lens folds {fold * fx:.0f} px from the principal point, and a corner of the frame is "
+        f"{corner * fx:.0f} px from it: poses beyond the fold are not_modelled")
+    ]
 
 
 def _varies(pipeline: Pipeline, name: str) -> bool:

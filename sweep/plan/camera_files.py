@@ -24,7 +24,7 @@ FILE_DEVIATIONS = ("calibration_sd", "calibration_covariance")
 
 OTHER_WAYS = (
     "sensor_width_mm", "sensor_height_mm", "focal_length_mm", "pixel_size_um", "hfov_deg",
-    "vfov_deg",
+    "vfov_deg", "dfov_deg",
 )
 
 

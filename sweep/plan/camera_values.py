@@ -19,7 +19,7 @@ from sweep.plan.toml_text import read_document
 IN_PIXELS = ("fx_px", "fy_px")
 IN_MM = ("sensor_width_mm", "sensor_height_mm", "focal_length_mm", "pixel_size_um")
 SENSOR_SIDES = ("sensor_width_mm", "sensor_height_mm")
-FIELDS_OF_VIEW = ("hfov_deg", "vfov_deg")
+FIELDS_OF_VIEW = ("hfov_deg", "vfov_deg", "dfov_deg")
 
 
 def one_camera(reading: Reading) -> None:
@@ -41,9 +41,10 @@ def one_camera(reading: Reading) -> None:
         if others := in_pixels + in_mm:
             fault(name, "a field of view or focal lengths, not both; delete it or "
                   f"{', '.join(others)}")
-    if "hfov_deg" in given and "vfov_deg" in given:
-        fault("vfov_deg", "hfov_deg or vfov_deg, not both: pixels are square, so that one follows "
-              "from the other; delete one of them (for other pixels, give fx_px and fy_px)")
+    for name in present(FIELDS_OF_VIEW)[1:]:
+        first = present(FIELDS_OF_VIEW)[0]
+        fault(name, f"{first} or {name}, not both: pixels are square, so that one follows from the "
+              "other; delete one of them (for other pixels, give fx_px and fy_px)")
     if "pixel_size_um" in given:
         if sides := present(SENSOR_SIDES):
             fault("pixel_size_um", "the size of a pixel or the sensor's sides, not both; delete it "

@@ -19,7 +19,7 @@ from sweep.plan.toml_text import python_boolean, quoted_if_bare, read_value
 _PX = ("fx_px", "fy_px")
 _SIDES = ("sensor_width_mm", "sensor_height_mm")
 _MM = ("focal_length_mm", *_SIDES, "pixel_size_um")
-_FIELDS = ("hfov_deg", "vfov_deg")
+_FIELDS = ("hfov_deg", "vfov_deg", "dfov_deg")
 
 ALTERNATIVES: dict[str, Collection[str]] = {
     **RIVALS,
@@ -27,8 +27,9 @@ ALTERNATIVES: dict[str, Collection[str]] = {
     "focal_length_mm": (*_PX, *_FIELDS),
     **dict.fromkeys(_SIDES, (*_PX, *_FIELDS, "pixel_size_um")),
     "pixel_size_um": (*_PX, *_FIELDS, *_SIDES),
-    "hfov_deg": (*_PX, *_MM, "vfov_deg"),
-    "vfov_deg": (*_PX, *_MM, "hfov_deg"),
+    **{
+        name: (*_PX, *_MM, *(other for other in _FIELDS if other != name)) for name in _FIELDS
+    },
     "believed_focal_scale": ("believed_fx_px", "believed_fy_px"),
     "believed_fx_px": ("believed_focal_scale",),
     "believed_fy_px": ("believed_focal_scale",),

@@ -197,6 +197,8 @@ def differences(ours: Pipeline, theirs: Pipeline, stored: dict[str, Any]) -> lis
             and name != "camera_file"
             and their_values.get(name) != our_values.get(name)
         ]
+    if any(line.startswith("sensor_") for line in lines):
+        lines.append("pixels are square unless both sides of the sensor are given")
     return lines
 
 

@@ -49,6 +49,16 @@ def test_a_field_of_view_reaches_from_edge_to_edge_of_the_frame(fov, width):
     assert math.degrees(bottom - top) == pytest.approx(fov, rel=1e-10)
 
 
+def test_a_diagonal_field_of_view_reaches_from_corner_to_corner():
+    # A webcam of 78 degrees at 1920 x 1080: 1360 px.
+    fx, fy, cx, cy = view({"width_px": 1920, "height_px": 1080, "dfov_deg": 78.0})
+    assert fx == fy == pytest.approx(math.hypot(960, 540) / math.tan(math.radians(39)), rel=1e-14)
+    rays = [np.array([(u - cx) / fx, (v - cy) / fy, 1]) for u, v in (
+        (-0.5, -0.5), (1919.5, 1079.5))]
+    cosine = rays[0] @ rays[1] / (np.linalg.norm(rays[0]) * np.linalg.norm(rays[1]))
+    assert math.degrees(math.acos(cosine)) == pytest.approx(78, rel=1e-12)
+
+
 def test_a_pixel_size_gives_the_focal_length_in_pixels():
     # 8 mm before pixels of 3.45 um.
     assert view({"pixel_size_um": 3.45, "focal_length_mm": 8.0})[:2] == pytest.approx(
@@ -129,6 +139,8 @@ def test_a_frame_size_on_an_axis_keeps_pixels_square():
 
 @pytest.mark.parametrize(("camera", "lines"), [
     ({"hfov_deg": 60, "vfov_deg": 40}, ["vfov_deg = 40: expected hfov_deg or vfov_deg, not both"]),
+    ({"hfov_deg": 60, "dfov_deg": 70},
+     ["dfov_deg = 70: expected hfov_deg or dfov_deg, not both: pixels are square"]),
     ({"hfov_deg": 60, "fx_px": 500},
      ["hfov_deg = 60: expected a field of view or focal lengths, not both; delete it or fx_px"]),
     ({"vfov_deg": 60, "focal_length_mm": 5, "sensor_width_mm": 6},
@@ -165,6 +177,7 @@ def test_a_camera_given_in_two_ways_is_refused_in_a_line_for_each(camera, lines)
     ({"fx_px": 500, "fy_px": 510}, "hfov_deg=50", {"hfov_deg": 50}),
     ({"focal_length_mm": 8, "sensor_width_mm": 6}, "hfov_deg=50", {"hfov_deg": 50}),
     ({"hfov_deg": 50}, "vfov_deg=40", {"vfov_deg": 40}),
+    ({"hfov_deg": 50}, "dfov_deg=60", {"dfov_deg": 60}),
     ({"hfov_deg": 50}, "fx_px=600", {"fx_px": 600}),
     ({"hfov_deg": 50, "width_px": 1280}, "focal_length_mm=6",
      {"width_px": 1280, "focal_length_mm": 6}),
@@ -253,6 +266,10 @@ def test_run_report_and_dataset_name_the_camera(tmp_path, capsys):
      "cx_px = 320: far from the centre of the frame of 1280 x 720 px; is it that of another frame"),
     ({"camera": {"fx_px": 500}, "axes": {"width_px": [640, 1280]}},
      "fx_px is fixed while width_px varies: HFOV goes from 65.24 to 104°"),
+    ({"camera": {"fx_px": 4.0}}, "HFOV 178.6°: hardly any pinhole camera is as wide; is a focal"),
+    # r(1 - 0.3 r²) grows up to r = 1/sqrt(0.9); (2/3) of it are 421.6 px; the corner: 800 px.
+    ({"camera": {"fx_px": 600, "width_px": 1280, "height_px": 960, "distortion": [-0.3, 0, 0, 0]}},
+     "the lens folds 422 px from the principal point, and a corner of the frame is 800 px from it"),
     ({"camera": {"cx_px": 319.5}, "axes": {"width_px": [640, 1280]}},
      "cx_px = 319.5: far from the centre of the frame of 640 to 1280 x 480 px"),
 ])
@@ -287,7 +304,9 @@ def test_an_old_store_keeps_its_camera_and_is_not_continued_with_another(tmp_pat
     assert (fx, fy) == (4.0 / 4.8 * 128, 4.0 / 3.6 * 72)
     at = cell(store.pipeline, "")
     assert [at.fixed[name] for name in VIEW_PARAMETERS] == [fixed[name] for name in VIEW_PARAMETERS]
-    with pytest.raises(StoreError, match=r"sensor_height_mm: the store has 3\.6, this run None"):
+    with pytest.raises(StoreError, match=(
+        r"sensor_height_mm: the store has 3\.6, this run None(.|\n)*pixels are square unless both"
+    )):
         execute(Pipeline.from_text(WIDE), url)
     stated = WIDE.replace("[pose]", "sensor_width_mm = 4.8\nsensor_height_mm = 3.6\n[pose]")
     with calls_here():

@@ -257,9 +257,9 @@ def _fold_notes(pipeline: Pipeline, facts: CameraFacts) -> list[str]:
     )
     if fold >= corner:
         return []
+    where = f"{fold * fx:.0f} px from the principal point, within the frame"
     return [
-        (f"the lens folds {fold * fx:.0f} px from the principal point, and a corner of the frame is "
-        f"{corner * fx:.0f} px from it: poses beyond the fold are not_modelled")
+        f"the lens folds {where} (corner: {corner * fx:.0f} px): poses beyond are not_modelled"
     ]
 
 

@@ -269,7 +269,7 @@ def test_run_report_and_dataset_name_the_camera(tmp_path, capsys):
     ({"camera": {"fx_px": 4.0}}, "HFOV 178.6°: hardly any pinhole camera is as wide; is a focal"),
     # r(1 - 0.3 r²) grows up to r = 1/sqrt(0.9); (2/3) of it are 421.6 px; the corner: 800 px.
     ({"camera": {"fx_px": 600, "width_px": 1280, "height_px": 960, "distortion": [-0.3, 0, 0, 0]}},
-     "the lens folds 422 px from the principal point, and a corner of the frame is 800 px from it"),
+     "the lens folds 422 px from the principal point, within the frame (corner: 800 px): poses"),
     ({"camera": {"cx_px": 319.5}, "axes": {"width_px": [640, 1280]}},
      "cx_px = 319.5: far from the centre of the frame of 640 to 1280 x 480 px"),
 ])

@@ -1,8 +1,9 @@
-"""The figure of an axis that no other figure shows: rates and errors along it."""
+"""The figure of an axis or a drawn parameter that no other shows: rates and errors along it."""
 
 from __future__ import annotations
 
 from sweep.analysis import error_statistics
+from sweep.plan.parameters import PARAMETERS
 from sweep.report.charts import draw_dots, draw_lines, rows_height
 from sweep.report.error_columns import ERRORS, INFINITE_ERRORS, RATES
 from sweep.report.figure import (
@@ -25,14 +26,16 @@ MAX_BINS, MAX_ROWS = 40, 24
 
 
 def effect_of(name: str) -> FigureKind:
-    """Return the kind of figure that shows the effect of one axis."""
-    return FigureKind(f"effect-{name}", lambda data: data.length(name) > 1,
+    """Return the kind of figure that shows the effect of one axis, or of a drawn parameter."""
+    return FigureKind(f"effect-{name}",
+                      lambda data: data.length(name) > 1 or name in data.drawn_parameters,
                       lambda data: _render(data, name), lambda _: (name,))
 
 
 def _render(data: ReportData, name: str) -> RenderedFigure:
     axis = data.pipeline.axis(name)
-    numeric = axis is not None and is_numeric(axis)
+    meaning = PARAMETERS[name].declaration.meaning if axis is None else axis.meaning
+    numeric = axis is None or is_numeric(axis)
     grouping = data.along(name, MAX_BINS if numeric else MAX_ROWS)
     summary = data.analysed(error_statistics, grouping)
     label = data.label(name)
@@ -53,8 +56,8 @@ def _render(data: ReportData, name: str) -> RenderedFigure:
     return RenderedFigure(
         f"effect-{name}", f"The effect of {name}",
         sentences(
-            f"Detection rate, and median and 95 % quantile of the rotation error, by {name}"
-            + (f" ({axis.meaning})." if axis is not None else "."),
+            f"Detection rate, and median and 95 % quantile of the rotation error, by {name} "
+            f"({meaning}).",
             interval_sentence(summary, "detection_rate", marks="Bars and bands"), INFINITE_ERRORS,
             denominators(summary),
             *grouping.notes, data.pooled(*grouping.dims),

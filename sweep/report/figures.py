@@ -18,16 +18,16 @@ KINDS: tuple[FigureKind, ...] = (
     DETECTION, ERRORS_BY_SIZE, MAPS, FAILURES, FLIPS, RANKING, CONFIGURATIONS, COMPARED, BOUND,
     TRADE,
 )
-"""Add a kind of figure here; an axis that no kind covers gets a figure of its effect."""
+"""Add a kind of figure here; what no kind covers of axes and draws gets a figure of its effect."""
 
 
 def figure_kinds(data: ReportData) -> Iterator[FigureKind]:
-    """Yield the kinds of figures of a store, such that every axis is shown in one of them."""
+    """Yield the kinds of figures of a store, such that one shows each axis and drawn parameter."""
     covered: set[str] = set()
     for kind in KINDS:
         if kind.applies(data):
             covered.update(kind.covers(data))
             yield kind
-    for name in (*data.scene_axes, *data.setting_axes):
+    for name in (*data.scene_axes, *data.setting_axes, *data.drawn_parameters):
         if name not in covered:
             yield effect_of(name)

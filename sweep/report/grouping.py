@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from sweep.plan.axes import Axis
+from sweep.plan.axes import Axis, Distribution
 from sweep.report.formatting import bin_text, coordinates
 from sweep.tradeoff.labels import configuration_label
 from sweep.typing import Floats
@@ -23,6 +23,9 @@ CONFIGURATION = "configuration"
 """Dimension of tables that have a row for each configuration."""
 
 AREA_BINS = 24
+
+DRAWN_BINS = 10
+"""Bins of a drawn parameter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +69,16 @@ def area_bins(low: float, high: float) -> Grouping:
         bins=((AREA, tuple(areas.tolist())),),
         notes=(f"Areas are grouped into {AREA_BINS} bins of equal ratio.",),
     )
+
+
+def drawn_bins(name: str, distribution: Distribution) -> Grouping:
+    """Return the grouping of a drawn parameter by bins of equal probability."""
+    edges = distribution.at(np.arange(1, DRAWN_BINS) / DRAWN_BINS)
+    ends = (-np.inf, np.inf)
+    if distribution.kind == "uniform":
+        ends = (distribution.a, float(np.nextafter(distribution.b, np.inf)))
+    note = f"The draws of {name} are grouped into {DRAWN_BINS} bins of equal probability."
+    return Grouping(bins=((name, (ends[0], *edges.tolist(), ends[1])),), notes=(note,))
 
 
 def bins_of(name: str, values: Floats, most: int) -> Grouping:

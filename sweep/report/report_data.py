@@ -29,6 +29,7 @@ from sweep.report.grouping import (
     axis_label,
     bins_of,
     chosen_of,
+    drawn_bins,
     is_numeric,
 )
 from sweep.store.blocks import committed
@@ -143,6 +144,13 @@ class ReportData:
             if len(axis) > 1 and axis.name != TRIAL
         )
 
+    @property
+    def drawn_parameters(self) -> tuple[str, ...]:
+        """Parameters that are drawn from a distribution, and whose draws the store has."""
+        return tuple(
+            name for name in self.pipeline.distributions if name in self.results.variables
+        )
+
     def label(self, name: str) -> str:
         """Return an axis' name with its unit, as on the axes of charts: ``distance, m``."""
         return axis_label(self.results, name)
@@ -152,8 +160,8 @@ class ReportData:
     def along(self, name: str, most: int = 40, *, binned: bool = True) -> Grouping:
         """Return the grouping by an axis into at most ``most`` groups, or by bins of the area.
 
-        If the axis is longer, its values are binned if they are numeric and ``binned`` is set;
-        otherwise some of them are chosen.
+        The draws of a parameter are binned, too. If an axis is longer, its values are binned if
+        they are numeric and ``binned`` is set; otherwise some of them are chosen.
 
         Raises
         ------
@@ -162,6 +170,8 @@ class ReportData:
         """
         if name == AREA:
             return area_bins(*self.area_range)
+        if name in self.drawn_parameters:
+            return drawn_bins(name, self.pipeline.distributions[name])
         axis = self.pipeline.axis(name)
         if axis is None:
             raise KeyError(name)

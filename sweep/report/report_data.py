@@ -146,9 +146,13 @@ class ReportData:
 
     @property
     def drawn_parameters(self) -> tuple[str, ...]:
-        """Parameters that are drawn from a distribution, and whose draws the store has."""
+        """Parameters that are drawn from a distribution, and whose draws the store has.
+
+        A drawn size of the image is shown by the area.
+        """
         return tuple(
-            name for name in self.pipeline.distributions if name in self.results.variables
+            name for name in self.pipeline.distributions
+            if name in self.results.variables and name not in SIZE_AXES
         )
 
     def label(self, name: str) -> str:

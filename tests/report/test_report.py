@@ -186,7 +186,7 @@ def kinds(url):
 def test_each_figure_applies_where_it_should(full, odd):
     assert kinds(full) == [
         "detection", "errors", "maps", "failures", "flips", "ranking", "configurations", "paired",
-        "bound",
+        "bound", "effect-azimuth_deg",
     ]
     found = {name: kinds(odd(name)) for name in ODD if name != "long axes"}
     assert found == {
@@ -504,7 +504,7 @@ def test_markdown_has_its_figures_beside_it_and_figures_go_where_they_are_asked(
     output, folder = tmp_path / "answer.md", tmp_path / "pictures"
     code, out, err = command("report", full, "-o", output, "--figures", folder)
     assert (code, err) == (0, "")
-    assert out.startswith(f"{output}: 9 figures")
+    assert out.startswith(f"{output}: 10 figures")
     text = output.read_text(encoding="utf-8")
     assert text.startswith('# All &lt;axes&gt; &amp; "kinds" of \\$figures\\$\n')
     linked = re.findall(r"!\[[^\]]*\]\(([^)]*)\)", text)

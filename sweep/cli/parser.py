@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from sweep.cli.command import Command
+from sweep.cli.completion import COMPLETION
 from sweep.cli.output import flushed
 from sweep.cli.plan import PLAN
 from sweep.cli.report import REPORT
@@ -20,7 +21,7 @@ from sweep.cli.verify import VERIFY
 from sweep.messages import nearest
 from sweep.version import __version__
 
-COMMANDS = (RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, VERIFY, STATUS)
+COMMANDS = (RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, VERIFY, STATUS, COMPLETION)
 """Every command, in the order in which the help lists them."""
 
 GUIDES = ("README.md", "sweep/README.md")

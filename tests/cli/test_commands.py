@@ -45,7 +45,7 @@ def test_bare_sweep_prints_the_help(capsys):
     assert out == told(capsys, "--help")[1]
     for command in COMMANDS:
         assert re.search(
-            rf"^    {command.name} +{re.escape(command.summary[:20])}", out, re.MULTILINE)
+            rf"^    {command.name}\s+{re.escape(command.summary[:20])}", out, re.MULTILINE)
 
 
 def test_every_summary_fits_into_a_line_of_a_terminal(capsys, monkeypatch):

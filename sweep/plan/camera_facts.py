@@ -20,6 +20,7 @@ from sweep.model.lens import fold_radius
 from sweep.plan.beliefs import belief_notes
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes, scene_values
+from sweep.typing import Floats
 
 Range = tuple[float, float]
 """The least and the largest value on the grid."""
@@ -104,6 +105,10 @@ def _text(ends: Range, digits: int = 6) -> str:
     return low if low == high else f"{low} to {high}"
 
 
+MAX_ROWS = 10**6
+"""The most rows of axes of parameters that go together whose cameras are computed."""
+
+
 def camera_facts(pipeline: Pipeline) -> CameraFacts:
     """Return what a pipeline's camera is.
 
@@ -112,28 +117,38 @@ def camera_facts(pipeline: Pipeline) -> CameraFacts:
     """
     together = [axis for axis in pipeline.axes
                 if axis.zipped and axis.columns.keys() & set(VIEW_PARAMETERS)]
-    separate = [name for name in VIEW_PARAMETERS
-             if not any(name in axis.columns for axis in together)]
-    chosen: list[list[dict[str, Any]]] = [
-        [{name: end} for end in dict.fromkeys(_ends(pipeline, name) or (None,))]
-        for name in separate
+    lengths = [len(axis) for axis in together]
+    if math.prod(lengths) > MAX_ROWS:
+        together, lengths = [], []  # the ends of each column are bounds
+    rows = [index.ravel() for index in np.indices(lengths)]
+    zipped = {
+        name: np.asarray(column)[index]
+        for axis, index in zip(together, rows, strict=True)
+        for name, column in axis.columns.items() if name in VIEW_PARAMETERS
+    }
+    chosen = [
+        [zipped[name]] if name in zipped else dict.fromkeys(_ends(pipeline, name) or (None,))
+        for name in VIEW_PARAMETERS
     ]
-    chosen += [[axis.at(index) for index in range(len(axis))] for axis in together]
-    rows: dict[str, list[float]] = {}
-    for parts in itertools.product(*chosen):
-        values = {name: value for part in parts for name, value in part.items()}
-        fx, fy, cx, cy = intrinsics(*(values[name] for name in VIEW_PARAMETERS))
-        width, height = values["width_px"], values["height_px"]
-        for name, number in {
+    found: dict[str, list[Floats]] = {}
+    for values in itertools.product(*chosen):
+        fx, fy, cx, cy = intrinsics(*values)
+        width, height = values[:2]
+        for name, numbers in {
             "width_px": width, "height_px": height, "fx_px": fx, "fy_px": fy, "cx_px": cx,
             "cy_px": cy, "hfov_deg": field_of_view_deg(width, fx),
             "vfov_deg": field_of_view_deg(height, fy), "aspect": fy / fx,
             "off_centre_x": (cx - (width - 1) / 2) / width,
             "off_centre_y": (cy - (height - 1) / 2) / height,
         }.items():
-            rows.setdefault(name, []).append(float(number))
-    ranges = {name: (min(column), max(column)) for name, column in rows.items()}
-    square = all(map(are_square, rows["fx_px"], rows["fy_px"]))
+            found.setdefault(name, []).append(np.asarray(numbers, dtype=np.float64))
+    ranges = {
+        name: (float(min(map(np.min, parts))), float(max(map(np.max, parts))))
+        for name, parts in found.items()
+    }
+    square = all(
+        np.all(are_square(fx, fy)) for fx, fy in zip(found["fx_px"], found["fy_px"], strict=True)
+    )
     return CameraFacts(square=square, side_px=_side(pipeline, ranges["fx_px"]), **ranges)
 
 

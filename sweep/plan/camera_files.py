@@ -6,7 +6,7 @@ The values are written into the pipeline's text: a store does not need the file 
 from __future__ import annotations
 
 import hashlib
-import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +28,14 @@ OTHER_WAYS = (
 )
 
 
-def file_and_camera(written: str) -> tuple[str, str]:
+def file_and_camera(written: str, is_file: Callable[[str], bool]) -> tuple[str, str]:
     """Return the path, and the name of the camera in the file or "".
 
-    >>> file_and_camera("chains/camchain.yaml#cam1")
+    >>> file_and_camera("chains/camchain.yaml#cam1", lambda path: "#" not in path)
     ('chains/camchain.yaml', 'cam1')
     """
     path, mark, camera = written.rpartition("#")
-    return (path, camera) if mark else (written, "")
+    return (path, camera) if mark and not is_file(written) else (written, "")
 
 
 def read_camera_file(reading: Reading) -> None:
@@ -52,13 +52,15 @@ def read_camera_file(reading: Reading) -> None:
     if not written.isprintable():
         _fault(reading, "a path without control characters")
         return
-    path, camera = file_and_camera(written)
     known = reading.known_files if reading.known_files is not None else reading.known_cameras
-    if known is not None and path in known and reading.given.issuperset(FILE_VALUES):
-        reading.files[path] = known[path]
-        return
+    if known is not None and reading.given.issuperset(FILE_VALUES):
+        path, _ = file_and_camera(written, known.__contains__)
+        if path in known:
+            reading.files[path] = known[path]
+            return
+    path, camera = file_and_camera(written, lambda path: _within(reading, path).is_file())
     try:
-        content = read_regular(os.path.join(reading.folder, path), MAX_BYTES)  # noqa: PTH118
+        content = read_regular(_within(reading, path), MAX_BYTES)
         calibration = calibration_of(read_tree(content), camera)
     except OSError as error:
         _fault(reading, f"a camera file ({error.strerror or 'unreadable'})")
@@ -68,6 +70,10 @@ def read_camera_file(reading: Reading) -> None:
         return
     reading.files[path] = hashlib.sha256(content).hexdigest()
     _take(reading, path, calibration)
+
+
+def _within(reading: Reading, path: str) -> Path:
+    return Path(reading.folder) / path
 
 
 def _fault(reading: Reading, expected: str) -> None:

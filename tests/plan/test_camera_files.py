@@ -243,6 +243,21 @@ def test_a_camchain_of_kalibr_has_cameras_by_name(tmp_path):
     assert camera(single).fixed["fx_px"] == 458.654
 
 
+def test_names_of_folders_and_files_may_have_the_mark_of_a_camera(tmp_path):
+    (tmp_path / "a#b").mkdir()
+    write(tmp_path / "a#b" / "c#1.yaml", GOOD)
+    write(tmp_path / "a#b" / "chain.yaml", KALIBR)
+    for name, focal in (("c#1.yaml", MATRIX[0][0]), ("chain.yaml#cam1", 457.587)):
+        chosen = Pipeline.from_dict(
+            {"camera": {"camera_file": f"a#b/{name}"}, "pose": {"side_px": 40}}, folder=tmp_path
+        )
+        assert chosen.fixed["fx_px"] == focal
+        again = Pipeline.from_text(chosen.to_toml(), folder="/", files=chosen.files)
+        assert again.files == chosen.files
+    with pytest.raises(PipelineError, match=r"File name too long"):
+        camera(tmp_path / ("a" * 5000))
+
+
 def test_a_sensor_file_of_euroc_is_read(tmp_path):
     path = write(tmp_path / "sensor.yaml", """sensor_type: camera
 comment: VI-Sensor cam0 (MT9M034)

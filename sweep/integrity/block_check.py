@@ -14,11 +14,13 @@ from sweep.integrity.consistency import contradiction
 from sweep.integrity.damage import BlockDamage, Damage, FileDamage
 from sweep.plan.grid import Block
 from sweep.plan.schema import Variable
-from sweep.store.blocks import chunk_key, parsed_receipt, receipt_key, region
+from sweep.store.blocks import parsed_receipt, receipt_key, region
 from sweep.store.checksums import digest
 from sweep.store.layout import RECEIPTS, decoded_chunk
 from sweep.store.receipt import Receipt
+from sweep.store.receipt_text import decoded, is_decodable
 from sweep.store.run_store import RunStore
+from sweep.store.snapshot import BlockKeys
 
 THREADS, WINDOW = 4, 256
 """Blocks that are read and decoded at a time, and that are submitted at a time."""
@@ -34,10 +36,8 @@ class CheckedBlock:
     ----------
     number
         Its number.
-    keys
-        Keys of its receipt and its chunks.
     bytes
-        Their size.
+        Size of its receipt and its chunks.
     receipt
         Its receipt; None if that is damaged.
     damage
@@ -45,7 +45,6 @@ class CheckedBlock:
     """
 
     number: int
-    keys: Sequence[str]
     bytes: int
     receipt: Receipt | None
     damage: Sequence[Damage]
@@ -56,6 +55,7 @@ class BlockCheck:
 
     def __init__(self, store: RunStore) -> None:
         self._store = store
+        self._keys = BlockKeys(store)
 
     def run(self, numbers: Sequence[int]) -> Iterator[CheckedBlock]:
         """Yield the blocks of these numbers in order, checked."""
@@ -68,7 +68,7 @@ class BlockCheck:
         """Check one block; called in any thread."""
         store, block = self._store, self._store.blocks[number]
         key = receipt_key(number)
-        chunks = {variable.name: chunk_key(store, variable, block) for variable in store.variables}
+        chunks = self._keys.of_chunks(number)
         keys = [key, *chunks.values()]
         contents = dict(zip(keys, store.storage.contents(keys), strict=True))
         faults = {
@@ -77,7 +77,7 @@ class BlockCheck:
         }
         receipt = None
         if contents[key] is not None:
-            receipt = self._receipt(number)
+            receipt = self._receipt(number, contents[key])
             if receipt is None:
                 faults[key] = CHANGED
         values: dict[str, NDArray[Any]] = {}
@@ -96,14 +96,18 @@ class BlockCheck:
             if fault:
                 damage.append(BlockDamage(number, str(block), fault))
         return CheckedBlock(
-            number, keys, sum(len(content) for content in contents.values() if content is not None),
+            number, sum(len(content) for content in contents.values() if content is not None),
             receipt, damage,
         )
 
-    def _receipt(self, number: int) -> Receipt | None:
-        """Return a block's receipt; None if it is damaged."""
+    def _receipt(self, number: int, content: bytes | None) -> Receipt | None:
+        """Return a block's receipt from its chunk; None if it is damaged."""
+        array = self._store.array(RECEIPTS)
         try:
-            text = np.asarray(self._store.array(RECEIPTS)[number : number + 1]).tolist()[0]
+            if content is not None and is_decodable(array):
+                text = decoded(content)
+            else:
+                text = np.asarray(array[number : number + 1]).tolist()[0]
             return parsed_receipt(self._store, number, text)
         except Exception:
             # Decoding a damaged chunk may raise anything.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,7 +21,7 @@ from sweep.store.lifecycle import store_of
 from sweep.store.locations import open_storage
 from sweep.store.lock import holder
 from sweep.store.manifest import KEYS, Manifest, parsed, read_manifest
-from sweep.store.snapshot import axis_positions, block_of_chunk
+from sweep.store.snapshot import BlockKeys, axis_positions, block_of_chunk
 from sweep.store.zarr_sync import sync
 
 SAMPLE = 20
@@ -164,19 +164,20 @@ class Verification:
         """
         store = self.store
         done = committed(store)
-        left = sync(self._listed())
-        listed = len(left)
+        numbers: Sequence[int] = range(len(store.blocks)) if store.finished else sorted(done)
+        checked: Container[int] = numbers if store.finished else done
+        listed, left = sync(self._listed(checked))
         files = FileCheck(store, self.manifest, self.planned).run(left)
+        if not files.grid_fits:
+            # The blocks of the pipeline's grid are not those of the arrays.
+            numbers = []
+            listed, left = sync(self._listed(numbers))
         left -= {"zarr.json", *KEYS} | files.keys
         self._damage += files.damage
         size = files.bytes
-        numbers: Sequence[int] = range(len(store.blocks)) if store.finished else sorted(done)
-        if not files.grid_fits:
-            numbers = []  # the blocks of the pipeline's grid are not those of the arrays
         sound: dict[int, str] = {}
         doubtful = []
         for block in BlockCheck(store).run(numbers):
-            left.difference_update(block.keys)
             size += block.bytes
             self._damage += block.damage
             if not block.damage and block.receipt is not None:
@@ -196,8 +197,18 @@ class Verification:
             ),
         )
 
-    async def _listed(self) -> set[str]:
-        return {key async for key in self.storage.list_prefix("")}
+    async def _listed(self, checked: Container[int]) -> tuple[int, set[str]]:
+        """Return how many files there are, and the keys of those that belong to no checked block.
+
+        There may be 25 million files.
+        """
+        count, others, block_keys = 0, set(), BlockKeys(self.store)
+        async for key in self.storage.list_prefix(""):
+            count += 1
+            number = block_keys.number(key)
+            if number is None or number not in checked:
+                others.add(key)
+        return count, others
 
     def _of_unfinished_block(self, key: str, done: set[int]) -> bool:
         """Return whether a key belongs to a block that a run will write again."""

@@ -21,7 +21,6 @@ from zarr.storage import LocalStore
 from sweep.errors import StoreError, StoreReplacedError
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
-from sweep.plan.parameters import Stage
 from sweep.plan.schema import SCHEMA, Variable
 from sweep.store.checksums import DigestingStore
 from sweep.store.durability import DurableStore
@@ -219,9 +218,8 @@ def parsed_receipt(store: RunStore, number: int, text: str) -> Receipt:
         raise ValueError("of another run")
     if receipt.block != (number if store.format >= NAMING_FORMAT else None):
         raise ValueError(f"block {number} has the receipt of block {receipt.block}")
-    settings = store.pipeline.size(Stage.detection)
-    estimates = settings * store.pipeline.size(Stage.estimation)
-    receipt.check(len(store.blocks[number]), settings, estimates)
-    if receipt.digests.keys() != {variable.name for variable in store.variables}:
+    settings, estimators = store.configurations
+    receipt.check(len(store.blocks[number]), settings, settings * estimators)
+    if receipt.digests.keys() != store.variable_names:
         raise ValueError("digests of other variables than the store's")
     return receipt

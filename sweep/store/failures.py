@@ -82,6 +82,8 @@ def recorded(
 
 def failed_cells(store: RunStore, number: int, receipt: Receipt) -> Iterator[FailedCell]:
     """Yield the failures that a block's receipt holds."""
+    if not receipt.failures:
+        return
     block = store.blocks[number]
     for failure in receipt.failures:
         coordinates = _coordinates(store.pipeline, block, failure)

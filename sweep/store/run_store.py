@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, cast
 
 import zarr
@@ -12,6 +13,7 @@ from zarr.buffer import default_buffer_prototype
 
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks
+from sweep.plan.parameters import Stage
 from sweep.plan.schema import Variable, variables_of
 from sweep.store.checksums import DigestingStore
 from sweep.store.durability import DurableStore
@@ -53,10 +55,20 @@ class RunStore:
         """The storage that holds the store's files."""
         return cast("DigestingStore", self.group.store)
 
-    @property
+    @cached_property
     def variables(self) -> tuple[Variable, ...]:
         """The variables of the pipeline in the store's format."""
         return variables_of(self.pipeline, self.format)
+
+    @cached_property
+    def variable_names(self) -> frozenset[str]:
+        """The names of the variables."""
+        return frozenset(variable.name for variable in self.variables)
+
+    @cached_property
+    def configurations(self) -> tuple[int, int]:
+        """How many detector settings there are, and how many estimators for each."""
+        return self.pipeline.size(Stage.detection), self.pipeline.size(Stage.estimation)
 
     @property
     def data_url(self) -> str:

@@ -16,8 +16,9 @@ from zarr.abc.store import ByteRequest, Store
 from zarr.storage import LocalStore, WrapperStore
 
 from sweep.plan.grid import Block, Blocks, scene_axes
-from sweep.store.blocks import committed
+from sweep.store.blocks import committed, receipt_key
 from sweep.store.checksums import may_be_read
+from sweep.store.layout import RECEIPTS
 from sweep.store.run_store import RunStore
 
 AxisPositions = dict[str, tuple[int, ...]]
@@ -49,30 +50,66 @@ def block_of_chunk(key: str, blocks: Blocks, where: AxisPositions) -> int | None
     return blocks.number(Block(starts, starts))
 
 
+class BlockKeys:
+    """The keys of the blocks' chunks and receipts in a store; there may be millions of them.
+
+    Parameters
+    ----------
+    store
+        The store.
+    """
+
+    def __init__(self, store: RunStore) -> None:
+        self._blocks = store.blocks
+        self._positions = axis_positions(store)
+        # Variable -> the key of its chunk, to be filled in with a block's index along each axis.
+        self._templates: dict[str, str] = {}
+        for variable in store.variables:
+            parts = ["0"] * len(variable.dimensions(store.pipeline))
+            for axis, position in enumerate(self._positions[variable.name]):
+                parts[position] = f"{{{axis}}}"
+            self._templates[variable.name] = "/".join([variable.name, "c", *parts])
+
+    def of_chunks(self, number: int) -> dict[str, str]:
+        """Return the keys of a block's chunks by variable."""
+        index = self._index(number)
+        return {name: template.format(*index) for name, template in self._templates.items()}
+
+    def missing(self, store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
+        """Return those of the blocks of which chunks are missing, each with the key of one."""
+        indices = {number: self._index(number) for number in numbers}
+        missing: dict[int, str] = {}
+        for name, template in self._templates.items():
+            keys = {
+                template.format(*index): number
+                for number, index in indices.items() if number not in missing
+            }
+            missing |= {keys[key]: key for key in store.storage.absent(keys, f"{name}/c")}
+        return missing
+
+    def _index(self, number: int) -> tuple[int, ...]:
+        """Return a block's index along each scene axis."""
+        return tuple(map(floordiv, self._blocks[number].starts, self._blocks.extents))
+
+    def number(self, key: str) -> int | None:
+        """Return the number of the block whose receipt or chunk lies under a key, else None."""
+        name, _, rest = key.rpartition("/c/")
+        if name == RECEIPTS:
+            found = int(rest) if rest.isascii() and rest.isdecimal() else None
+            return found if found is not None and receipt_key(found) == key else None
+        found = block_of_chunk(key, self._blocks, self._positions)
+        if found is None or not 0 <= found < len(self._blocks):
+            return None
+        template = self._templates[key.partition("/c")[0]]
+        return found if template.format(*self._index(found)) == key else None
+
+
 def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
     """Return those of the committed blocks of which chunks are missing, each with the key of one.
 
     A copy that was made while the store was written has such blocks, for instance.
     """
-    extents = store.blocks.extents
-    indices = {
-        number: tuple(map(floordiv, store.blocks[number].starts, extents)) for number in numbers
-    }
-    missing: dict[int, str] = {}
-    positions = axis_positions(store)
-    for variable in store.variables:
-        name = variable.name
-        # Formatted, not encoded one by one: there may be millions.
-        parts = ["0"] * len(variable.dimensions(store.pipeline))
-        for axis, position in enumerate(positions[name]):
-            parts[position] = f"{{{axis}}}"
-        template = "/".join([name, "c", *parts])
-        keys = {
-            template.format(*index): number
-            for number, index in indices.items() if number not in missing
-        }
-        missing |= {keys[key]: key for key in store.storage.absent(keys, f"{name}/c")}
-    return missing
+    return BlockKeys(store).missing(store, numbers)
 
 
 class Snapshot(WrapperStore[Store]):

@@ -1,11 +1,12 @@
 """The client, a Dask scheduler and a store under many simulated workers.
 
     python tests/benchmarks/bench_scale.py [--workers 64 256 1000] [--waves 4] [--stored 100000]
-        [--block-s 2.0] [--record]
+        [--chunks] [--block-s 2.0] [--record]
 
 Many `distributed.Worker`s live in two processes; a block's work is replaced by waiting its time,
 after which a real receipt is written. Blocks are as long as a run of this size would have them.
-The second table is of a store of ``--stored`` committed blocks, of which only receipts are made.
+The second table is of stores of ``--stored`` committed blocks, of which only receipts are made;
+with ``--chunks`` also chunks, many names of few files: processor seconds, and most memory in MB.
 Efficiency is the workers' busy share between their first and their last block; start and end count
 in the other figure, so more with few ``--waves`` (blocks a worker).
 ``--record`` appends the figures to ``scale_history.csv``, which later changes are held against.
@@ -14,6 +15,7 @@ in the other figure, so more with few ``--waves`` (blocks a worker).
 import argparse
 import asyncio
 import csv
+import dataclasses
 import importlib.metadata
 import json
 import math
@@ -28,23 +30,31 @@ from functools import lru_cache
 from pathlib import Path
 
 import dask
+import google_crc32c
 import numpy as np
 import psutil
 from distributed import Client, Worker
+from numcodecs.vlen import VLenUTF8
+from numcodecs.zstd import Zstd
 
 import sweep
 from sweep.execution import in_flight
 from sweep.execution.calibration import block_work_s
 from sweep.execution.cluster import QUIET_DASK_CONFIG
-from sweep.execution.limits import TIME_LIMIT_S
+from sweep.execution.finalize import close
 from sweep.execution.status import status
 from sweep.execution.tally import Tally
+from sweep.integrity.verification import verify
 from sweep.isolation.interrupts import Interrupts
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.experiment import Pipeline
-from sweep.store.blocks import committed, receipts
+from sweep.plan.parameters import Stage
+from sweep.store.blocks import chunk_key, committed, receipts, region
+from sweep.store.checksums import digest
 from sweep.store.layout import RECEIPTS
 from sweep.store.lifecycle import create_store, open_store
 from sweep.store.receipt import Receipt
+from sweep.store.snapshot import missing_chunks
 
 HISTORY = Path(__file__).with_name("scale_history.csv")
 PROCESSES = 2
@@ -144,7 +154,7 @@ def simulated(count, waves, block_s, folder):
     """Return the figures of a run of ``waves`` blocks a worker."""
     if block_s is None:
         # As in a run of 100,000 blocks.
-        block_s = block_work_s(1e5 * max(2.0, count / 75), count, TIME_LIMIT_S)
+        block_s = block_work_s(1e5 * max(2.0, count / 75), count)
     store = created(count * waves, f"{folder}/{count}.zarr")
     address = Path(folder) / f"{count}.json"
     paths = [str(Path(__file__).parent), str(Path(sweep.__file__).parents[1])]
@@ -215,26 +225,100 @@ def measured(store, client, block_s, interrupts, scheduler):
     }
 
 
-def stored(count, folder):
-    """Return the seconds that a store of ``count`` receipts takes to list, count and open."""
-    begun = time.perf_counter()
+def encoded(text):
+    """Return the bytes of a receipt's chunk."""
+    body = Zstd(level=0).encode(VLenUTF8().encode(np.array([text], dtype=object)))
+    return body + google_crc32c.value(body).to_bytes(4, "little")
+
+
+def fill(store, chunks):
+    """Write all receipts of a store past Zarr, and with ``chunks`` a chunk for each variable."""
+    root, count = Path(open_store(store.url).storage.below.root), len(store.blocks)
+    contents, digests = {}, {variable.name: 123456789 for variable in store.variables}
+    if chunks:
+        first = store.blocks[0]
+        for variable in store.variables:
+            part = region(variable, store.pipeline, first)
+            array = store.array(variable.name)
+            there = variable.stage is Stage.scene and variable.name != "bound_std"
+            empty = 0.0 if there else variable.fill
+            array[part] = empty if variable.flags is None else SOUND.get(variable.name, 0)
+            key = chunk_key(store, variable, first)
+            contents[variable.name] = (root / key).read_bytes()
+            digests[variable.name] = digest(contents[variable.name])
+    (root / RECEIPTS / "c").mkdir(parents=True, exist_ok=True)
+    for number in range(count):
+        receipt, _ = receipt_text(store, number, 2.0)
+        scenes = receipt.scenes
+        text = dataclasses.replace(
+            receipt, digests=digests, detection=[0] * SOUND["detection"] + [scenes],
+            estimate=[0] * SOUND["estimate"] + [scenes],
+        ).to_json(store.format)
+        (root / RECEIPTS / "c" / str(number)).write_bytes(encoded(text))
+    for name, content in contents.items():
+        variable = next(each for each in store.variables if each.name == name)
+        source = None
+        for links, block in enumerate(store.blocks):
+            path = root / chunk_key(store, variable, block)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if links % MAX_LINKS == 0:
+                path.write_bytes(content)
+                source = path
+            elif path != source:
+                path.unlink(missing_ok=True)
+                os.link(source, path)
+
+
+SOUND = {"detection": DetectionStatus.no_candidate, "estimate": EstimateStatus.no_detection,
+         "flipped": Flipped.no_estimate}
+"""Flags of the chunks that are made: no numbers stand beside them."""
+
+MAX_LINKS = 60_000
+"""Names of one file; a file of its own for each chunk would take hours to make."""
+
+
+def peak_mb():
+    """Return the most memory that this process has used since this was called last."""
+    status_file, control = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+    lines = dict(line.split(":", 1) for line in status_file.read_text().splitlines())
+    control.write_text("5")
+    return int(lines["VmHWM"].split()[0]) * 1024 / 1e6
+
+
+def stored(count, folder, chunks):
+    """Return what a store of ``count`` blocks takes to list, count, open, verify and close.
+
+    Processor seconds, and the most memory in MB; with ``chunks``, also of what looks at them.
+    """
     store = created(count, f"{folder}/stored.zarr")
-    count = len(store.blocks)
-    seconds = {"create": time.perf_counter() - begun}
-    for first in range(0, count, 1000):
-        texts = [receipt_text(store, k, 2.0)[1] for k in range(first, min(first + 1000, count))]
-        store.array(RECEIPTS)[first : first + len(texts)] = np.array(texts, dtype=object)
-    for name, call in (
-        ("open_store", lambda: open_store(store.url)),
-        ("committed", lambda: committed(store)),
-        ("continue", lambda: Tally(store).begin(committed(store))),
-        ("status", lambda: status(store.url)),
-        ("sweep.open", lambda: sweep.open(store.url)),
-    ):
-        begun = time.perf_counter()
+    fill(store, chunks)
+    url = store.url
+    calls = {
+        "open_store": lambda: open_store(url),
+        "committed": lambda: committed(store),
+        "continue": lambda: Tally(store).begin(committed(store)),
+        "status": lambda: status(url),
+        "sweep.open": lambda: sweep.open(url),
+    }
+    if chunks:
+        calls |= {
+            "missing_chunks": lambda: check(missing_chunks(store, committed(store)) == {}),
+            "close": lambda: close(store),
+            "verify": lambda: check(not verify(url, 0).damage),
+        }
+    figures = {"blocks": len(store.blocks)}
+    for name, call in calls.items():
+        peak_mb()
+        spent = time.process_time()
         call()
-        seconds[name] = time.perf_counter() - begun
-    return {name: round(value, 2) for name, value in seconds.items()}
+        figures[name] = [round(time.process_time() - spent, 2), round(peak_mb())]
+    return figures
+
+
+def check(sound):
+    """Raise AssertionError unless what was measured is right."""
+    if not sound:
+        raise AssertionError
 
 
 def record(rows):
@@ -257,7 +341,8 @@ def main():
     parser.add_argument("--workers", type=int, nargs="*", default=[64, 256, 1000])
     parser.add_argument("--waves", type=int, default=4)
     parser.add_argument("--block-s", type=float)
-    parser.add_argument("--stored", type=int, default=0)
+    parser.add_argument("--stored", type=int, nargs="*", default=[])
+    parser.add_argument("--chunks", action="store_true")
     parser.add_argument("--record", action="store_true")
     parser.add_argument("--live", nargs=2)
     options = parser.parse_args()
@@ -275,10 +360,11 @@ def main():
             figures = simulated(count, options.waves, options.block_s, folder)
             print(json.dumps(figures), flush=True)
             rows.append((f"{count} workers", figures))
-        if options.stored:
-            figures = stored(options.stored, folder)
-            print(json.dumps(figures), flush=True)
-            rows.append((f"store of {options.stored} blocks", figures))
+    for count in options.stored:
+        with tempfile.TemporaryDirectory() as folder:
+            figures = stored(count, folder, options.chunks)
+        print(json.dumps(figures), flush=True)
+        rows.append((f"store of {count} blocks{', with chunks' * options.chunks}", figures))
     if options.record:
         record(rows)
 

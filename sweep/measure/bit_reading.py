@@ -71,7 +71,21 @@ class Reading:
 def reading_of(
     dictionary: str, width_px: int, height_px: int, setting: DetectorSetting
 ) -> Reading:
-    """Return how a detector with a setting reads a dictionary's markers in frames of a size."""
+    """Return how a detector with a setting reads a dictionary's markers in frames of a size.
+
+    Raises
+    ------
+    ValueError
+        The setting has another search for candidates, or another border, than the model.
+    """
+    for name, modelled in (
+        ("cornerRefinementMethod", setting.cornerRefinementMethod != "apriltag"),
+        ("useAruco3Detection", not setting.useAruco3Detection),
+        ("detectInvertedMarker", not setting.detectInvertedMarker),
+        ("markerBorderBits", setting.markerBorderBits == 1),
+    ):
+        if not modelled:
+            raise ValueError(f"{name} = {getattr(setting, name)!r} is not modelled: leave it out")
     known = opencv_dictionary(dictionary)
     cell_px = setting.perspectiveRemovePixelPerCell
     return Reading(
@@ -82,7 +96,8 @@ def reading_of(
         border_errors=int(known.markerSize**2 * setting.maxErroneousBitsInBorderRate),
         outline_px=int(setting.minMarkerPerimeterRate * max(width_px, height_px)),
         thresholds=Thresholds(
-            windows=tuple(range(
+            # An even window is a pixel larger.
+            windows=tuple(window | 1 for window in range(
                 setting.adaptiveThreshWinSizeMin, setting.adaptiveThreshWinSizeMax + 1,
                 setting.adaptiveThreshWinSizeStep,
             )),
@@ -216,8 +231,10 @@ def predicted_rates(
     moved = corners + positions[:, None]
     detected = np.zeros((count, len(bits)), dtype=bool)
     for quads, tries in candidates(moved, n, reading.thresholds, surround or Surround()):
-        perimeter = np.abs(np.roll(quads, -1, axis=1) - quads).max(axis=2).sum(axis=1)
-        rows = np.flatnonzero(tries & (perimeter >= reading.outline_px))
+        sides = np.abs(np.roll(quads, -1, axis=1) - quads).max(axis=2)
+        # A square below two pixels has no area in whole pixels.
+        found = (sides.sum(axis=1) >= reading.outline_px) & (sides.min(axis=1) >= 1.0)
+        rows = np.flatnonzero(tries & found)
         if len(rows):
             mixing = quadrilateral_mixing(quads[rows], moved[rows], n, reading)
             detected[rows] |= are_read(bits, mixing, reading)

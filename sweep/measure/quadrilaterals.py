@@ -81,8 +81,13 @@ def upright_corners(
     Raises
     ------
     ValueError
-        The azimuth is another, or a corner lies behind the camera.
+        The side is not above 0, the azimuth is another, the tilt is not below 90 degrees, or a
+        corner lies behind the camera.
     """
+    if not 0.0 < side_px < math.inf:
+        raise ValueError(f"side_px = {side_px}: expected a number above 0")
+    if not 0.0 <= tilt_deg < 90.0:
+        raise ValueError(f"tilt_deg = {tilt_deg}: expected 0 to below 90")
     if azimuth_deg not in (0.0, 90.0):
         raise ValueError(f"azimuth_deg = {azimuth_deg}: expected 0 or 90, an axis of the image")
     x, y = 0.5 * side_px * np.array([[-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0]])

@@ -221,6 +221,33 @@ def test_corners_of_other_azimuths_and_behind_the_camera_are_refused():
         upright_corners(20.0, 45.0, 30.0)
     with pytest.raises(ValueError, match="behind the camera"):
         upright_corners(400.0, 80.0, 0.0, 100.0)
+    for side in (0.0, -3.0, math.nan, math.inf):
+        with pytest.raises(ValueError, match=r"side_px = .*: expected a number above 0"):
+            upright_corners(side)
+    for tilt in (-1.0, 90.0, math.nan):
+        with pytest.raises(ValueError, match=r"tilt_deg = .*: expected 0 to below 90"):
+            upright_corners(20.0, tilt)
+
+
+@pytest.mark.parametrize(("name", "value"), [
+    ("cornerRefinementMethod", "apriltag"), ("useAruco3Detection", True),
+    ("detectInvertedMarker", True), ("markerBorderBits", 2),
+])
+def test_settings_that_the_model_lacks_are_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name} = {value!r} is not modelled"):
+        reading(**{name: value})
+
+
+def test_even_windows_are_a_pixel_larger_as_opencvs_are():
+    windows = reading(adaptiveThreshWinSizeMin=4, adaptiveThreshWinSizeStep=6).thresholds.windows
+    assert windows == (5, 11, 17, 23)
+
+
+def test_squares_of_a_few_pixels_are_never_read():
+    bits = np.array([modules(DICTIONARY, 0)])
+    tiny = reading_of(DICTIONARY, 20, 10, DetectorSetting())
+    for side in (0.3, 1.0, 2.5, 4.0):
+        assert predicted_rates(bits, upright_corners(side), tiny).tolist() == [0.0]
 
 
 def opencv_quadrilateral(image, window, size):

@@ -18,6 +18,7 @@ from dask.typing import Key
 from numpy.typing import NDArray
 
 from sweep.analysis.binning import Binning, Bins, read_bins
+from sweep.analysis.dimensions import is_fixed
 from sweep.analysis.graph import ChunkReader, ReadBlock, TaskLayer, add_pass, array_of_blocks
 from sweep.analysis.layout import Arrays, Layout, Lengths
 from sweep.analysis.replicates import replicate_order, replicated
@@ -82,8 +83,8 @@ def aggregate(
         ), output.attributes())
         for statistic in statistics for output in statistic.outputs()
     }
-    coordinates = {name: value for name, value in results.coords.items()
-                   if set(value.dims) <= set(kept)}
+    coordinates = {name: value.variable for name, value in results.coords.items()
+                   if set(value.dims) <= set(kept) and not is_fixed(value)}
     table = xr.Dataset(variables, coordinates).assign_coords(binning.coordinates(results))
     return table if lazy else table.compute(scheduler="synchronous")
 

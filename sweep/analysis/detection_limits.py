@@ -17,6 +17,7 @@ from sweep.analysis.dimensions import (
     kept_dimensions,
     pipeline_text,
     require_dimension,
+    without_fixed,
 )
 from sweep.analysis.intervals import LEVEL, wilson
 from sweep.analysis.rates import detection_rate
@@ -138,7 +139,7 @@ def detection_limit(
         for name in ("side_px", "side_px_low", "side_px_high")
     }
     if axis == "distance_m":
-        scale = (sides * results["distance_m"]).isel(distance_m=0, drop=True)
+        scale = (sides * without_fixed(results["distance_m"])).isel(distance_m=0, drop=True)
         out["distance_m"] = (scale / limits["side_px"]).assign_attrs(
             long_name="the distance of that side", units="m")
     out["limit"] = limit.astype(np.uint8).assign_attrs(
@@ -201,7 +202,7 @@ def _positive(sides: xr.DataArray) -> xr.DataArray:
     if not (np.isfinite(sides) & (sides > 0)).all():
         raise DatasetError("sides must be finite and above 0 px: see the coordinates of the size, "
                            "the distance and the camera")
-    return sides
+    return without_fixed(sides)
 
 
 def _modules(results: xr.Dataset) -> Any:

@@ -12,6 +12,7 @@ import xarray as xr
 from sweep.analysis.pose_view import REQUIRED_VARIABLES
 from sweep.errors import ArgumentError, DatasetError
 from sweep.plan.camera_values import SQUARE_FORMAT, stored_text
+from sweep.plan.coordinates import FIXED
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS, Stage
 from sweep.plan.schema import LABELS, SCHEMA
 
@@ -37,6 +38,16 @@ def is_grid_axis(name: object, results: xr.Dataset) -> bool:
         each in PARAMETERS and PARAMETERS[each].section in GEOMETRY_SECTIONS
         for each in str(attributes.get("zip", name)).split()
     )
+
+
+def is_fixed(coordinate: xr.DataArray) -> bool:
+    """Return whether a coordinate is a parameter with one value on the whole grid."""
+    return not coordinate.dims and FIXED in coordinate.attrs
+
+
+def without_fixed(array: xr.DataArray) -> xr.DataArray:
+    """Return an array without the coordinates of fixed parameters."""
+    return array.drop_vars([name for name, each in array.coords.items() if is_fixed(each)])
 
 
 def fingerprint_of(results: xr.Dataset) -> Mapping[str, Any]:

@@ -27,6 +27,10 @@ CALIBRATION_SCALE_PX = 1e4
 """Size of a camera's numbers in pixels by which rounding of a calibration's is measured."""
 
 
+FIXED = "fixed"
+"""Attribute of the coordinates of fixed parameters; tables of analyses leave them out."""
+
+
 @dataclass(frozen=True, slots=True)
 class FixedValue:
     """A parameter with one value on the whole grid: a coordinate without dimensions.
@@ -38,7 +42,7 @@ class FixedValue:
     value
         A number, a truth value, or a text (a list of numbers as "0.1, 0").
     attributes
-        ``long_name``, and ``units`` if it has a unit.
+        ``long_name``, :data:`FIXED`, and ``units`` if it has a unit.
     """
 
     name: str
@@ -96,7 +100,7 @@ def _scalar(value: Any) -> float | bool | str | None:
 
 def _attributes(parameter: Parameter) -> dict[str, str]:
     unit = {"units": parameter.unit} if parameter.unit else {}
-    return {"long_name": parameter.declaration.meaning, **unit}
+    return {"long_name": parameter.declaration.meaning, FIXED: "on the whole grid", **unit}
 
 
 def drawn_quantities(pipeline: Pipeline) -> list[DrawnQuantity]:

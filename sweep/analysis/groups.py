@@ -40,3 +40,25 @@ def group_numbers(array: NDArray[Any]) -> Integers:
     """Return the group of each element of (groups, ...)."""
     numbers = np.arange(len(array)).reshape(-1, *[1] * (array.ndim - 1))
     return np.broadcast_to(numbers, array.shape)
+
+
+MAX_SLICES = 8
+"""Settings up to which they are summed one by one: below 8 NumPy adds in the same order."""
+
+
+def sum_of_settings(array: NDArray[Any]) -> NDArray[Any]:
+    """Return the sums over the last axis of (groups, cells, draws, settings), bit for bit.
+
+    NumPy's loop along a short last axis takes three times as long.
+
+    Examples
+    --------
+    >>> sum_of_settings(np.array([[[[True, True], [False, True]]]])).tolist()
+    [[[2, 1]]]
+    """
+    if not 0 < array.shape[3] < MAX_SLICES:
+        return np.asarray(array.sum(axis=3))
+    total = array[..., 0].astype(np.int64 if array.dtype.kind == "b" else array.dtype)
+    for k in range(1, array.shape[3]):
+        total += array[..., k]
+    return total

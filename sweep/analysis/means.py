@@ -9,6 +9,7 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
+from sweep.analysis.groups import sum_of_settings
 from sweep.analysis.mean_intervals import (
     MeanEstimate,
     estimate_mean,
@@ -95,7 +96,7 @@ class Mean(Statistic[DrawnT, MeanState, CentredState, Spread], Generic[DrawnT]):
         values = self.values(poses)
         used = self._used(poses, values)
         moments = Moments.of(np.where(used[..., None], values, np.nan), axis=OVER_ALL)
-        return BlockMeanState(moments, CellDraws.of(used.sum(axis=3)))
+        return BlockMeanState(moments, CellDraws.of(sum_of_settings(used)))
 
     def prepare_second(self, first: MeanState) -> CentredState:
         """Return the moments with the mean of the scores."""
@@ -108,7 +109,7 @@ class Mean(Statistic[DrawnT, MeanState, CentredState, Spread], Generic[DrawnT]):
         with np.errstate(all="ignore"):
             scores = self._scores(values, known.moments)
             centre = known.centre[:, None, None, None]
-            deviations = np.where(used, scores - centre, 0.0).sum(axis=3)
+            deviations = sum_of_settings(np.where(used, scores - centre, 0.0))
         return CellDeviations(Moments.of(np.where(poses.draws, deviations, np.nan), axis=2))
 
     def finish(self, known: CentredState, second: Spread) -> Variables:

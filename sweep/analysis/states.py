@@ -14,7 +14,7 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 
-from sweep.analysis.groups import interleaved, scattered
+from sweep.analysis.groups import interleaved, scattered, sum_of_settings
 from sweep.analysis.moments import Moments
 from sweep.typing import Floats, Integers, Masks
 
@@ -154,7 +154,7 @@ class BlockSample(BlockState[Sample]):
     @classmethod
     def of(cls, used: Masks) -> Self:
         """Return that of the poses that count, (groups, cells, draws, settings)."""
-        settings = used.sum(axis=3)
+        settings = sum_of_settings(used)
         squares = np.square(settings, dtype=np.float64).sum(axis=(1, 2))
         return cls(settings.sum(axis=(1, 2)), squares, CellDraws.of(settings))
 

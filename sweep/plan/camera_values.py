@@ -108,6 +108,15 @@ def stored_text(text: str, store_format: int) -> str:
     stated = given & {"width_px", "height_px", *SENSOR_SIDES}
     if "fx_px" in given or not missing or not stated:
         return text
+    camera, axes = tables
+    if not stated & axes.keys():
+        numbers = [camera.get(name, default) for name, default in (
+            ("width_px", 640), ("height_px", 480),
+            *zip(SENSOR_SIDES, DEFAULT_SENSOR_MM, strict=True),
+        )]
+        positive = all(isinstance(each, (int, float)) and each > 0 for each in numbers)
+        if positive and _default_is_square(*numbers):
+            return text
     return with_values(text, "camera", {
         name: default for name, default in zip(SENSOR_SIDES, DEFAULT_SENSOR_MM, strict=True)
         if name in missing

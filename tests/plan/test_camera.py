@@ -318,6 +318,8 @@ def test_an_old_store_keeps_its_camera_and_is_not_continued_with_another(tmp_pat
 @pytest.mark.parametrize("text", [
     "[pose]\ndistance_m = 1\n",
     "[camera]\nfx_px = 500\nwidth_px = 1280\n[pose]\ndistance_m = 1\n",
+    "[camera]\nwidth_px = 1280\nheight_px = 960\n[pose]\ndistance_m = 1\n",
+    "[camera]\nsensor_width_mm = 4.8\n[pose]\ndistance_m = 1\n",
     "[camera]\nsensor_width_mm = 5\nsensor_height_mm = 3\nwidth_px = 9\n[pose]\ndistance_m = 1\n",
 ])
 def test_old_texts_in_which_nothing_was_left_to_the_default_are_read_as_written(text):

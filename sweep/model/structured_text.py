@@ -14,6 +14,8 @@ from xml.etree import ElementTree as ET
 
 import yaml
 
+from sweep.messages import plain
+
 MAX_BYTES = 4_000_000
 """The largest file that is read; a calibration with all its image points is a tenth of that."""
 
@@ -97,7 +99,7 @@ def _xml_tree(text: str) -> Any:
     except ET.ParseError as error:
         raise ValueError(f"not XML, or cut short: {error}") from None
     if root.tag != "opencv_storage":
-        raise ValueError(f"XML of another kind: <{root.tag}>, not <opencv_storage>")
+        raise ValueError(f"XML of another kind: <{plain(root.tag)}>, not <opencv_storage>")
     return _element(root, 0)
 
 
@@ -109,7 +111,10 @@ def _element(element: ET.Element, depth: int) -> Any:
         return (element.text or "").strip().strip('"')
     if all(child.tag == "_" for child in children):
         return [_element(child, depth + 1) for child in children]
-    return {child.tag: _element(child, depth + 1) for child in children}
+    tree = {child.tag: _element(child, depth + 1) for child in children}
+    if len(tree) < len(children):
+        raise ValueError(f"XML that has an element of <{plain(element.tag)}> twice")
+    return tree
 
 
 def _yaml_tree(text: str) -> Any:
@@ -156,7 +161,7 @@ class _Events:
         if tag.startswith(("tag:", "!")) and tag != "!" and not tag.startswith(_TAGS) and (
             not re.fullmatch("tag:yaml.org,2002:(str|float|int|seq|map|bool|null)", tag)
         ):
-            raise ValueError(f"YAML with the tag {tag}, which no camera file has")
+            raise ValueError(f"YAML with the tag {plain(tag)}, which no camera file has")
         if isinstance(event, yaml.ScalarEvent):
             return str(event.value)
         if isinstance(event, yaml.SequenceStartEvent):
@@ -170,6 +175,6 @@ class _Events:
             if not isinstance(key, str):
                 raise ValueError("YAML with a key that is no text")  # noqa: TRY004
             if key in tree:
-                raise ValueError(f"YAML that has the key {key} twice")
+                raise ValueError(f"YAML that has the key {plain(key)} twice")
             tree[key] = self.node(next(self._events), depth + 1)
         return tree

@@ -369,6 +369,9 @@ REFUSED = {
         ), "YAML with references (*)"),
     "XML bomb": (('<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "aa">]><opencv_storage>&a;'
                  "</opencv_storage>"), "XML with a document type"),
+    "XML twice": ("<opencv_storage><K>1</K><K>2</K></opencv_storage>", "twice"),
+    "a long tag": ("!" * 100_000, "YAML with the tag"),
+    "a long key": ("".join(f"{'k' * 1000}: 1\n" for _ in range(2)), "twice"),
     "web page": ("<html><body>404</body></html>", "XML of another kind: <html>"),
     "cut XML": ("<opencv_storage><camera_matrix>", "not XML, or cut short"),
     "cut JSON": ('{"camera_matrix": [[1, 2', "not JSON, or cut short"),

@@ -144,7 +144,8 @@ def run(
     Returns
     -------
     xarray.Dataset
-        The results, lazily loaded; the variables are described in their attributes.
+        The results, lazily loaded; the variables are described in their attributes. What failed,
+        or that nothing was detected, is told on stderr.
 
     Raises
     ------
@@ -182,6 +183,7 @@ def _run(
     from sweep.execution import BLOCK_TASK  # noqa: PLC0415  (as the docstring says)
     from sweep.execution.progress import progress_report  # noqa: PLC0415
     from sweep.isolation.child_process import Child  # noqa: PLC0415
+    from sweep.messages import notice  # noqa: PLC0415
 
     # The child imports its packages while this process does.
     with Child(BLOCK_TASK) as child, progress_report(progress) as report:
@@ -192,7 +194,12 @@ def _run(
             from sweep.store.stored_pipeline import names_store  # noqa: PLC0415
 
             options["store"] = pipeline if names_store(pipeline) else None
-        return open(execute(read, progress=report, child=child, **options).store)
+        summary = execute(read, progress=report, child=child, **options)
+    for line in summary.warnings:
+        notice(line)
+    if summary.advice:
+        notice(f"look at it: {summary.advice}")
+    return open(summary.store)
 
 
 def _pipeline(given: Pipeline | Mapping[str, Any] | str | os.PathLike[str]) -> Pipeline:

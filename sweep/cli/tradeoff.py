@@ -54,10 +54,14 @@ def _execute(options: argparse.Namespace) -> int:
     if store.lower().endswith(".toml"):
         from sweep.execution.progress import progress_display  # noqa: PLC0415
         from sweep.execution.runner import execute  # noqa: PLC0415
+        from sweep.messages import notice  # noqa: PLC0415
         from sweep.plan.experiment import Pipeline  # noqa: PLC0415
 
         with progress_display() as bar:
-            store = execute(Pipeline.from_toml(store), None, progress=bar).store
+            summary = execute(Pipeline.from_toml(store), None, progress=bar)
+        for line in summary.warnings:
+            notice(line)
+        store = summary.store
     with stage_display() as report:
         trade, renderers = measure_trade(store, options.per, options.limit_s, report)
     budget = [] if options.budget_ms is None else budget_advice(

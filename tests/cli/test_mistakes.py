@@ -148,6 +148,17 @@ def test_paths_of_stores_and_pipelines_are_taken_for_what_they_are_in_python():
         sweep.open("small")
 
 
+def test_python_is_told_that_nothing_was_detected(tmp_path, capsys):
+    url = str(tmp_path / "far.zarr")
+    far = {"pose": {"jitter_px": 0.5}, "axes": {"side_px": [2], "trial": 2}}
+    with calls_here(), sweep.run(far, store=url):
+        pass
+    assert capsys.readouterr().err.splitlines() == [
+        "warning: nothing was detected: 2 no_candidate (No candidate at the marker)",
+        f"look at it: sweep repro {url} --at side_px=2.0,trial=0 -o scene.png",
+    ]
+
+
 def test_a_script_without_a_main_guard_runs_once(tmp_path):
     (tmp_path / "script.py").write_text(
         "import sweep\nprint('begun')\n"

@@ -81,7 +81,8 @@ class EstimatorSetting:
     )
     guarded: bool = parameter(
         True, "true: the solver is called in a frame in which it is stable, checked, and replaced "
-        f"by iterative if it fails; false: the plain cv2.solvePnP call ({_PLAIN} always)",
+        "by iterative (far away by ippe) if it fails; false: the plain cv2.solvePnP call "
+        f"({_PLAIN} always)",
     )
     reprojection_limit: float = parameter(
         0.25, "largest RMS reprojection error of a solution, as a share of the detected side; of a "

@@ -210,7 +210,7 @@ lie far above it. Others are compared with ITERATIVE's."""
 _CREDIBLE_RATIO = 2.0
 """The largest ratio of a solution's reprojection error to that of ITERATIVE."""
 
-_FAR_SHARE = 1e-3
+_FAR_SHARE = 1 / 800
 """Sides below this share of the focal length are compared with IPPE: the perspective across the
 marker, which tells the two planar solutions apart, is below this share of the side, and what all
 solvers but IPPE leave of it is rounding."""

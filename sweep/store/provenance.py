@@ -24,10 +24,10 @@ NUMBERS_VERSION = 4
 """Raised whenever the numbers change; a test with golden digests fails if it is not."""
 
 NEAR_NUMBERS_VERSION = 3
-"""The version where no marker is far: version 4 changed guarded solvers at sides below 1/1000 of
+"""The version where no marker is far: version 4 changed guarded solvers at sides below 1/800 of
 the focal length (`sweep.measure.solver`), and nothing else."""
 
-NEAR_FOCAL_PX = 5000.0
+NEAR_FOCAL_PX = 4000.0
 """Up to this focal length such sides are below 5 px, where no marker is detected."""
 
 

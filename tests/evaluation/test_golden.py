@@ -113,9 +113,9 @@ def test_numbers_change_only_with_their_version():
 
 @pytest.mark.parametrize(("camera", "near"), [
     ("", True),
-    ("fx_px = 5000", True),
-    ("fx_px = 5001", False),
-    ("fx_px = 600\nfy_px = 5001", False),
+    ("fx_px = 4000", True),
+    ("fx_px = 4001", False),
+    ("fx_px = 600\nfy_px = 4001", False),
     ("focal_length_mm = 50", False),  # 6667 px
     ("focal_length_mm = 50\nsensor_width_mm = 36\nsensor_height_mm = 24", True),
     ("hfov_deg = 1", False),
@@ -126,6 +126,6 @@ def test_stores_whose_numbers_did_not_change_keep_their_version(camera, near):
 
 
 def test_the_longest_focal_length_of_the_grid_decides_about_the_version():
-    for values, near in (("[300, 5000, 900]", True), ("[300, 90000, 900]", False)):
+    for values, near in (("[300, 4000, 900]", True), ("[300, 90000, 900]", False)):
         pipeline = Pipeline.from_text(f"[pose]\ndistance_m = 1\n[axes]\nfx_px = {values}")
         assert numbers_version(pipeline) == (NEAR_NUMBERS_VERSION if near else NUMBERS_VERSION)

@@ -118,6 +118,7 @@ class FarView:
         tilt, azimuth, roll = rng.uniform(0, [[steepest], [360], [360]], (3, count))
         # Every tenth is parallel to the image, or turned about an image axis: where IPPE's
         # rotation vector has a norm of pi.
+        side_px[-1], tilt[-1] = 100.0, 0.0
         tilt[::10], azimuth[5::10], roll[5::10] = 0.0, 0.0, 90.0 * rng.integers(0, 4, count // 10)
         along = np.radians(azimuth)
         axis = np.stack([np.cos(along), np.sin(along), 0 * tilt], axis=1)

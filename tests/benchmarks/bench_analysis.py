@@ -68,6 +68,7 @@ lazy = {call}
 called = time.perf_counter()
 table = lazy if lazy is results else lazy.compute()
 done = time.perf_counter()
+assert "looked_for" not in table or table["looked_for"].sum() > 0  # the store was read
 # Not ru_maxrss, which begins at the parent's size.
 status = dict(line.split(":", 1) for line in open("/proc/self/status"))
 print(json.dumps({{"peak": int(status["VmHWM"].split()[0]) * 1024, "call_s": called - begun,

@@ -11,8 +11,7 @@ from sweep.cli.command import Command, Example
 from sweep.cli.output import quiet_matplotlib, say, say_next
 
 NO_REPORTS = {
-    ".pdf", ".png", ".svg", ".jpg", ".jpeg", ".docx", ".odt", ".tex", ".ipynb", ".csv", ".json",
-    ".toml", ".zarr",
+    ".pdf", ".png", ".svg", ".jpg", ".jpeg", ".docx", ".odt", ".tex", ".ipynb", ".csv",
 }
 """Suffixes of files that neither HTML nor Markdown would be taken for."""
 

@@ -6,14 +6,13 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from sweep.execution.outcome import FailureGroup, outcome_of
-from sweep.execution.summary import first_cell
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plan.parameters import Stage
 from sweep.store.blocks import committed, receipts
 from sweep.store.failures import MAX_ROWS, FailedCell, failed_cells
 from sweep.store.lifecycle import open_store
 from sweep.store.lock import holder
+from sweep.store.outcome import FailureGroup, first_cell, outcome_of
 
 RATE_S = 60.0
 """Seconds over which the rate is measured, up to the last block that was written."""

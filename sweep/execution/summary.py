@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from sweep.errors import StoreError
 from sweep.execution.finalize import lost
-from sweep.execution.outcome import FailureGroup, Outcome, outcome_of
 from sweep.execution.retry import Retry
 from sweep.measure.flags import DetectionStatus
-from sweep.plan.cell_selection import selection_text
 from sweep.plan.parameters import Stage
-from sweep.store.blocks import committed, receipts
-from sweep.store.failures import FailedCell, failed_cells
+from sweep.store.blocks import committed
+from sweep.store.outcome import FailureGroup, outcome_of_finished
 from sweep.store.run_store import RunStore
 from sweep.store.snapshot import missing_chunks
 
@@ -125,27 +123,3 @@ def summary_of(
         retried=retry.cells,
         recovered=retry.recovered(store),
     )
-
-
-def outcome_of_finished(store: RunStore) -> Outcome:
-    """Return what became of the cells of a finished store.
-
-    Raises
-    ------
-    StoreError
-        If cells failed, and a receipt that may record them is damaged.
-    """
-    detection, estimate = (store.run_metadata["counts"][name] for name in ("detection", "estimate"))
-    cells = _recorded_failures(store) if any(lost(detection, estimate).values()) else ()
-    return outcome_of(store.url, detection, estimate, cells, first_cell(store))
-
-
-def first_cell(store: RunStore) -> str:
-    """Return the first cell of a store's grid, as ``sweep repro --at`` takes it."""
-    return selection_text({axis.name: axis.values[0] for axis in store.pipeline.axes})
-
-
-def _recorded_failures(store: RunStore) -> Iterator[FailedCell]:
-    """Yield the failed cells that the receipts of a store record."""
-    for number, receipt in receipts(store, committed(store)):
-        yield from failed_cells(store, number, receipt)

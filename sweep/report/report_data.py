@@ -14,7 +14,6 @@ import xarray as xr
 
 from sweep.analysis.detection_limits import SIZE_AXES
 from sweep.errors import StoreError, SweepError
-from sweep.execution.summary import outcome_of_finished
 from sweep.measure.flags import DetectionStatus, uncounted_values
 from sweep.model.camera import VIEW_PARAMETERS
 from sweep.plan.alternatives import WORLD
@@ -34,6 +33,7 @@ from sweep.report.grouping import (
 )
 from sweep.store.blocks import committed
 from sweep.store.lifecycle import open_dataset, open_store
+from sweep.store.outcome import outcome_of_finished
 from sweep.store.snapshot import snapshot
 
 MAX_LOADED_BYTES = 300_000_000

@@ -7,11 +7,11 @@ import pytest
 
 from support.commands import command
 from support.poison import Poison, poisoned
-from sweep.execution.outcome import failure_groups, outcome_of
 from sweep.execution.progress import Progress, ProgressLines, progress_display
 from sweep.execution.status import WrittenBlock, poses_per_second
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.store.failures import FailedCell
+from sweep.store.outcome import failure_groups, outcome_of
 
 TEXT = """
 pose = { jitter_px = 0.5 }

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag
 from sweep.messages import plain
-from sweep.store.failures import FailedCell
+from sweep.plan.cell_selection import selection_text
+from sweep.store.blocks import committed, receipts
+from sweep.store.failures import FailedCell, failed_cells
+from sweep.store.run_store import RunStore
 
 LOUD_SHARE = 0.1
 """Share of the cells that were tried, above which failures are told first."""
@@ -136,6 +139,34 @@ def outcome_of(
         any(stage.nothing_computed for stage in stages), max(stage.share for stage in stages),
         groups, warnings, advice,
     )
+
+
+def outcome_of_finished(store: RunStore) -> Outcome:
+    """Return what became of the cells of a finished store.
+
+    Raises
+    ------
+    StoreError
+        If cells failed, and a receipt that may record them is damaged.
+    """
+    detection, estimate = (store.run_metadata["counts"][name] for name in ("detection", "estimate"))
+    any_lost = any(
+        _Counts("", flags, counts).lost
+        for flags, counts in ((DetectionStatus, detection), (EstimateStatus, estimate))
+    )
+    cells = _recorded_failures(store) if any_lost else ()
+    return outcome_of(store.url, detection, estimate, cells, first_cell(store))
+
+
+def first_cell(store: RunStore) -> str:
+    """Return the first cell of a store's grid, as ``sweep repro --at`` takes it."""
+    return selection_text({axis.name: axis.values[0] for axis in store.pipeline.axes})
+
+
+def _recorded_failures(store: RunStore) -> Iterator[FailedCell]:
+    """Yield the failed cells that the receipts of a store record."""
+    for number, receipt in receipts(store, committed(store)):
+        yield from failed_cells(store, number, receipt)
 
 
 @dataclass(frozen=True, slots=True)

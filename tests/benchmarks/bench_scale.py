@@ -240,7 +240,8 @@ def fill(store, chunks):
         for variable in store.variables:
             part = region(variable, store.pipeline, first)
             array = store.array(variable.name)
-            there = variable.stage is Stage.scene and variable.name != "bound_std"
+            flag = variable.present_when.flag if variable.present_when else ""
+            there = variable.stage is Stage.scene and flag != "bound"
             empty = 0.0 if there else variable.fill
             array[part] = empty if variable.flags is None else SOUND.get(variable.name, 0)
             key = chunk_key(store, variable, first)

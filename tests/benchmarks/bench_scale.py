@@ -209,11 +209,11 @@ def measured(store, client, block_s, interrupts, scheduler):
     )
     running.compute(range(number), Tally(store, report))
     wall = time.perf_counter() - begun
+    after = [process.memory_info().rss for process in (scheduler, client_process)]
     found = [receipt for _, receipt in receipts(store, range(number))]
     busy_s = sum(receipt.wall_s for receipt in found)
     # From the end of a worker's block to the start of its next one, with the writing of receipts.
     idle_s = sum(receipt.seconds["scene"][0] for receipt in found)
-    after = [process.memory_info().rss for process in (scheduler, client_process)]
     return {
         "blocks_a_s": round(number / wall, 1),
         "efficiency": round(busy_s / (busy_s + idle_s), 3),

@@ -190,7 +190,9 @@ def _side_of_cells(pipeline: Pipeline) -> Range | None:
     values = scene_values(pipeline, [index.ravel() for index in np.indices(lengths, dtype=np.intp)])
     fx = intrinsics(*(values[name].values for name in VIEW_PARAMETERS))[0]
     distance = values["distance_m"].broadcast(count)
-    sides = (fx * values["size_m"].broadcast(count) / distance)[distance > 0]
+    before = distance > 0
+    sides = np.broadcast_to(fx, count)[before] * values["size_m"].broadcast(count)[before]
+    sides = sides / distance[before]
     return (float(sides.min()), float(sides.max())) if len(sides) else None
 
 

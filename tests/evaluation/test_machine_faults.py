@@ -58,7 +58,7 @@ def test_fault_keeps_its_words_in_another_process():
     assert "\n" not in str(fault)
 
 
-@pytest.mark.parametrize("place", machine_faults.PLACES)
+@pytest.mark.parametrize("place", [place for place in machine_faults.PLACES if place != "set"])
 @pytest.mark.parametrize("fault", ["disk", "memory", "import", "compiler", "opencv memory"])
 def test_no_scene_is_flagged_failed_by_a_fault_of_the_machine(fault, place):
     machine_faults.inject(fault, place, 0)

@@ -622,7 +622,7 @@ def test_a_report_goes_through_links_and_into_devices(tmp_path):
     assert len(list((behind / "pictures").iterdir())) == 3
     assert all((tmp_path / link).is_symlink() for link in ("r.md", "r_figures"))
     assert command("report", url, "-o", tmp_path / "null") == (
-        0, f"{tmp_path / 'null'}: 1 figures\n", "")
+        0, f"{tmp_path / 'null'}: 1 figures\nnext: look at {tmp_path / 'null'}\n", "")
     for device in ("/dev/null", "/dev/full"):
         code, _, err = command("report", url, "-o", device, "--format", "md")
         assert code == 2

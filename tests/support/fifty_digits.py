@@ -56,8 +56,8 @@ def exact_camera(value):
     width, height = value["width_px"], value["height_px"]
     if value["fx_px"] is None:
         focal = mpf(value["focal_length_mm"])
-        fx = focal / mpf(value["sensor_width_mm"]) * width
-        fy = focal / mpf(value["sensor_height_mm"]) * height
+        # Of the sensor's sides neither is given: it is 4.8 mm wide, and its pixels are square.
+        fx = fy = focal / mpf(4.8) * width
     else:
         fx = mpf(value["fx_px"])
         fy = fx if value["fy_px"] is None else mpf(value["fy_px"])

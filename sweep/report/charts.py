@@ -23,6 +23,7 @@ from sweep.report.scales import (
     clipped_intervals,
     colour_ends,
     colour_scale,
+    grow_by_factors,
     plain_ticks,
     readable_on,
     spans,
@@ -66,7 +67,7 @@ def draw_lines(
         Whether y is a share, drawn from 0 to 100 %.
     """
     x = np.concatenate([line.x for line in series])
-    logarithmic_x = spans(x, 5) and bool((x > 0).all())
+    logarithmic_x = spans(x, 5) and bool((x > 0).all()) and grow_by_factors(x)
     axes.set_xscale("log" if logarithmic_x else "linear")
     axes.set_xlim(*value_limits(x, logarithmic=logarithmic_x, margin=0.05))
     logarithmic_y, (bottom, top) = value_scale(series, share=share)

@@ -36,6 +36,12 @@ def spans(values: Floats, ratio: float) -> bool:
     return bool(positive.size and finite.min() >= 0 and positive.max() > ratio * positive.min())
 
 
+def grow_by_factors(values: Floats) -> bool:
+    """Return whether distinct positive values lie more evenly on a logarithmic scale."""
+    steps, factors = (np.diff(each) for each in (np.unique(values), np.log(np.unique(values))))
+    return bool(np.std(factors) / np.mean(factors) <= np.std(steps) / np.mean(steps))
+
+
 def value_limits(values: Floats, *, logarithmic: bool, margin: float) -> tuple[float, float]:
     """Return the ends of an axis with the finite values on it, and a margin (share of its length).
 

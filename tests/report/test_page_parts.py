@@ -10,11 +10,12 @@ from matplotlib.figure import Figure
 
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.report.answer import Answer
-from sweep.report.charts import OUTCOME_COLOURS, draw_stack
+from sweep.report.charts import OUTCOME_COLOURS, draw_lines, draw_stack
 from sweep.report.figure import RenderedFigure
 from sweep.report.gallery import Scene
 from sweep.report.page import page
 from sweep.report.provenance_facts import Provenance
+from sweep.report.scales import Series
 from sweep.report.scene_selection import FAILURES
 from sweep.report.svg import Panel
 from sweep.report.table import MAX_ROWS, Table
@@ -100,3 +101,15 @@ def test_columns_of_numbers_are_aligned_and_long_words_wrap():
     assert Table("", ["a", "b"], [["x", "1"]]).column_classes == ["", "n"]
     words = Table("", ["a", "b", "c"], [["x", "short", "long " * 9]], words=True)
     assert words.column_classes == ["", "", "text"]
+
+
+@pytest.mark.parametrize(("values", "scale"), [
+    (np.geomspace(0.05, 1, 8), "log"), (np.array([0.5, 1, 2, 4]), "log"),
+    (np.linspace(3, 57, 10), "linear"), (np.linspace(0, 60, 4), "linear"),
+    (np.array([1.0, 10.0]), "log"), (np.array([10.0, 12.0, 14.0]), "linear"),
+], ids=["geom", "doubled", "bins of a tilt", "with 0", "two", "short"])
+def test_values_that_grow_by_factors_are_on_a_logarithmic_axis(values, scale):
+    axes = Figure().subplots()
+    ones = np.ones(len(values))
+    draw_lines(axes, [Series("", values, ones, ones, ones)], ("x", "y"))
+    assert axes.get_xscale() == scale

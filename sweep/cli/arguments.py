@@ -55,8 +55,8 @@ def add_cell(parser: argparse.ArgumentParser, meaning: str, *, several: bool = F
     parser.add_argument(
         "--at", metavar="NAME=VALUE,...",
         help=f"{meaning}; an axis that is not named takes its first value"
-        + ("; may be repeated" if several else ""),
-        **({"action": "append", "default": None} if several else {"default": ""}),
+        + ("; may be repeated" if several else "; may be repeated, with other names"),
+        action="append", default=[],
     )
 
 

@@ -23,7 +23,7 @@ def _execute(options: argparse.Namespace) -> int:
     from sweep.plan.cell_selection import cell, coordinates_text  # noqa: PLC0415
     from sweep.report.scene_drawing import draw_scene  # noqa: PLC0415
 
-    single = cell(pipeline, options.at)
+    single = cell(pipeline, ",".join(options.at))
     scene = inspect_scene(single, whole_frame=options.full)
     image = scene.image if options.plain else draw_scene(scene, coordinates_text(pipeline, single))
     write_png(options.output, image)

@@ -105,11 +105,14 @@ def _cameras(tree: Any) -> dict[str, dict[str, Any]]:
     if not isinstance(tree, dict):
         return {}
     if isinstance(listed := tree.get("calibrations"), list):  # PhotonVision's settings
-        cameras = {}
+        cameras: dict[str, dict[str, Any]] = {}
         for node in listed:
             if isinstance(node, dict) and _has_matrix(node):
                 width, height = _size(_by_name(node))
-                cameras[f"{width}x{height}"] = node
+                name = f"{width}x{height}"
+                if name in cameras and _calibration(cameras[name]) != _calibration(node):
+                    raise ValueError(f"two calibrations of {name} that differ; delete one of them")
+                cameras[name] = node
         return cameras
     if _has_matrix(tree):
         return {"": tree}
@@ -117,7 +120,9 @@ def _cameras(tree: Any) -> dict[str, dict[str, Any]]:
     rest = {}
     for name, value in tree.items():
         match = re.fullmatch(r"(.*?[A-Za-z])_?([0-9]{1,2})", str(name))
-        if match and _normal(match[1]) in (*MATRIX_NAMES, *DISTORTION_NAMES):
+        if match and _normal(match[1]) in (*MATRIX_NAMES, *DISTORTION_NAMES) and (
+            isinstance(value, (list, dict))  # a single number k1 is a lens coefficient
+        ):
             numbered.setdefault(match[2], {})[match[1]] = value
         else:
             rest[name] = value
@@ -141,6 +146,16 @@ def _first(named: dict[str, tuple[str, Any]], names: tuple[str, ...]) -> tuple[s
     return next((named[name] for name in names if name in named), None)
 
 
+def _demand_one(named: dict[str, tuple[str, Any]], names: tuple[str, ...]) -> None:
+    """Refuse a camera that has other numbers under another of its names."""
+    written = [named[name] for name in names if name in named]
+    for name, value in written[1:]:
+        if _numbers(name, value)[0] != _numbers(*written[0])[0]:
+            raise ValueError(
+                f"{plain(written[0][0])} and {plain(name)} differ: delete one of them from the file"
+            )
+
+
 def _calibration(node: dict[str, Any]) -> Calibration:
     named = _by_name(node)
     counts = _check_model(named)
@@ -148,8 +163,10 @@ def _calibration(node: dict[str, Any]) -> Calibration:
     found = _first(named, MATRIX_NAMES)
     if found is None:
         raise AssertionError(sorted(named))
+    _demand_one(named, MATRIX_NAMES)
     fx, fy, cx, cy = _matrix(*found)
     lens = _first(named, DISTORTION_NAMES)
+    _demand_one(named, DISTORTION_NAMES)
     if lens is None and counts != (0,):
         raise ValueError(
             "no distortion coefficients (distortion_coefficients, distCoeffs, D; an empty list "
@@ -203,6 +220,12 @@ def _check_region(named: dict[str, tuple[str, Any]]) -> None:
     if isinstance(region, dict):
         for name in ("x_offset", "y_offset"):
             if _number(name, region.get(name, 0)) != 0:
+                raise ValueError(
+                    f"roi with {name} = {plain(region[name])}: the matrix is that of the whole "
+                    "frame; give the calibration of the frame as it is sent"
+                )
+        for name, whole in zip(("width", "height"), _size(named), strict=True):
+            if _number(name, region.get(name, 0)) not in (0, whole):
                 raise ValueError(
                     f"roi with {name} = {plain(region[name])}: the matrix is that of the whole "
                     "frame; give the calibration of the frame as it is sent"

@@ -6,6 +6,7 @@ a number is decided by who expects one. Tags, anchors and references make no obj
 
 from __future__ import annotations
 
+import codecs
 import json
 import re
 from collections.abc import Iterator
@@ -28,6 +29,8 @@ MAX_DEPTH = 30
 _TAGS = ("tag:yaml.org,2002:opencv-", "tag:yaml.org,2002:python/tuple")
 """Beginnings of the tags that mean a plain mapping or list; other tags may make objects."""
 
+_MATRIX_TAG = "tag:yaml.org,2002:opencv-matrix"
+
 _COMMENT = re.compile(r"^[ \t]*//[^\n]*$", re.MULTILINE)
 
 
@@ -43,10 +46,7 @@ def read_tree(content: bytes) -> Any:
         raise ValueError(f"more than {MAX_BYTES:,} bytes")
     if content.startswith(b"\x1f\x8b"):
         raise ValueError("compressed; unpack it")
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise ValueError("not text") from None
+    text = _decoded(content)
     if "\0" in text:
         raise ValueError("not text")
     if not text.strip():
@@ -60,6 +60,20 @@ def read_tree(content: bytes) -> Any:
         return _yaml_tree(text)
     except RecursionError:
         raise ValueError("nested too deeply") from None
+
+
+def _decoded(content: bytes) -> str:
+    """Return the text of UTF-8, of UTF-16 with its mark, or else of Latin-1.
+
+    Windows' shells redirect in UTF-16. OpenCV's programs write the date in the locale's encoding,
+    and no camera's numbers are outside of ASCII.
+    """
+    try:
+        if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            return content.decode("utf-16")
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
 
 
 def _json_tree(text: str) -> Any:
@@ -161,7 +175,8 @@ class _Events:
         if tag.startswith(("tag:", "!")) and tag != "!" and not tag.startswith(_TAGS) and (
             not re.fullmatch("tag:yaml.org,2002:(str|float|int|seq|map|bool|null)", tag)
         ):
-            raise ValueError(f"YAML with the tag {plain(tag)}, which no camera file has")
+            cut = "; is the file cut short?" if _MATRIX_TAG.startswith(tag) else ""
+            raise ValueError(f"YAML with the tag {plain(tag)}, which no camera file has{cut}")
         if isinstance(event, yaml.ScalarEvent):
             return str(event.value)
         if isinstance(event, yaml.SequenceStartEvent):

@@ -67,6 +67,8 @@ def told(capsys, line):
         ("run small.toml --set tilt_deg=0,45", "such as [0, 45]"),
         ("run small.toml --set cornerRefinementMethod=1", "OpenCV's constant 1 is subpix"),
         ("show small.toml --at side_px:30", "expected name=value"),
+        ("show small.toml --at side_px=30 --at side_px=60", "side_px is given twice"),
+        ("show small.toml --at side_px=-1 --at trial=0", "--at side_px=-1: expected"),
         ("show small.toml -o cell.jpg", "expected a file that ends in .png"),
         ("repro runs/small.zarr --at Side_px=30", "did you mean side_px?"),
         ("repro runs/small.zarr --at side_px=31", "not on the grid; its values are 30.0, 60.0"),

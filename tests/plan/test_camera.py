@@ -221,6 +221,14 @@ def test_plan_names_focal_lengths_fields_of_view_and_sides(tmp_path, capsys):
     ) in capsys.readouterr().out
 
 
+def test_a_marker_at_the_camera_s_depth_has_no_side_and_no_warning():
+    world = Pipeline.from_dict({
+        "pose": {"camera_x_m": 0}, "marker": {"size_m": 0.1}, "camera": {"fx_px": 600},
+        "axes": {"marker_x_m": [0, 2]},
+    })
+    assert camera_facts(world).side_px == pytest.approx((30, 30))
+
+
 def test_sides_of_poses_in_the_world_are_named():
     # The camera looks along x; fx = 600.
     world = Pipeline.from_dict({

@@ -310,6 +310,19 @@ def test_a_calibration_of_limelight_is_read(tmp_path):
     assert_camera(camera(path))
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16"])
+def test_dates_and_shells_of_other_countries_are_read(tmp_path, encoding):
+    path = tmp_path / "c.yml"
+    text = 'calibration_time: "20 févr. 2026"\r\n' + ros_text().replace("\n", "\r\n")
+    path.write_bytes(text.encode(encoding))
+    assert_camera(camera(path))
+
+
+def test_a_camera_info_of_a_whole_region_or_with_equal_names_is_read(tmp_path):
+    text = ros_text() + "roi: {x_offset: 0, y_offset: 0, width: 640, height: 480}\n"
+    assert_camera(camera(write(tmp_path / "c.yml", text + f"D: {LENS}\n")))
+
+
 # 2. What is refused, in one line each.
 
 def damaged(text, old, new):
@@ -386,6 +399,17 @@ REFUSED = {
     "deviations below 0": (GOOD + f"std_deviations_intrinsics: {[-1] * 9}\n", "below 0"),
     "too few deviations": (GOOD + "std_deviations_intrinsics: [1, 1, 1, 1, 1]\n", "expected 9"),
     "odd covariance": (GOOD + f"covariance_intrinsics: {[1] * 80}\n", "expected 9 x 9"),
+    "two matrices": (GOOD + "K: [600, 0, 320, 0, 600, 240, 0, 0, 1]\n",
+                     "camera_matrix and K differ: delete one of them"),
+    "two lenses": (GOOD + "D: [0.1, 0, 0, 0]\n", "distortion_coefficients and D differ"),
+    "a region of the frame": (GOOD + "roi: {x_offset: 0, width: 320, height: 240}\n",
+                              "roi with width = 320: the matrix is that of the whole frame"),
+    "numbers on their own": ("fx: 800\nfy: 801\nk1: 0.1\nwidth: 640\nheight: 480\n",
+                             "it has no camera matrix"),
+    "cut in a tag": ("%YAML:1.0\n---\ncamera_matrix: !!open", "is the file cut short?"),
+    "two calibrations of a size": (
+        json.dumps({"calibrations": [photonvision(), photonvision(distCoeffs=[0.1] * 5)]}),
+        "two calibrations of 1280x720 that differ"),
     "focal length out of range": (damaged(GOOD, repr(MATRIX[0][0]), "1e12"),
                                   "fx_px = 1000000000000.0: expected a number from 0.001"),
 }

@@ -8,8 +8,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from sweep.errors import ArgumentError
+
 UNKNOWN = "unknown"
 """Label of a value that the attributes do not name."""
+
+UNNAMED = 255
+"""Where a table of labels has :data:`UNKNOWN`: flags are stored as uint8, and none has so many."""
 
 Labelled = TypeVar("Labelled", xr.Dataset, xr.DataArray)
 
@@ -26,7 +31,13 @@ def decode_flags(results: Labelled) -> Labelled:
     Returns
     -------
     The same, lazy where it was. Flags are strings; cells without a value (NaN, as after ``where``)
-    are ``not_run``, the meaning of the fill value 0.
+    are ``not_run``, the meaning of the fill value 0; what is no flag's value, such as a mean of
+    flags, is ``unknown``.
+
+    Raises
+    ------
+    ArgumentError
+        For what is no dataset and no variable of one.
 
     Examples
     --------
@@ -37,8 +48,13 @@ def decode_flags(results: Labelled) -> Labelled:
     """
     if isinstance(results, xr.DataArray):
         return _decoded(results)
-    return results.assign({
-        name: _decoded(variable) for name, variable in results.data_vars.items()
+    if not isinstance(results, xr.Dataset):
+        raise ArgumentError(
+            "results", type(results).__name__,
+            "expected a dataset, as sweep.open returns it, or a variable of one",
+        )
+    return results.assign({  # without its coordinates, which are those of the results
+        name: _decoded(variable).variable for name, variable in results.data_vars.items()
     })
 
 
@@ -52,8 +68,9 @@ def _decoded(variable: xr.DataArray) -> xr.DataArray:
     labels[values.astype(np.intp)] = meanings
 
     def look_up(flags: NDArray[Any]) -> NDArray[Any]:
-        known = np.nan_to_num(flags, nan=0.0).astype(np.intp) if flags.dtype.kind == "f" else flags
-        return labels[np.asarray(known).astype(np.uint8)]
+        known = np.nan_to_num(flags, nan=0.0) if flags.dtype.kind == "f" else np.asarray(flags)
+        index = np.clip(known, 0, UNNAMED).astype(np.uint8)
+        return labels[np.where(index == known, index, UNNAMED)]
 
     words: xr.DataArray = xr.apply_ufunc(
         look_up, variable, dask="parallelized", output_dtypes=[labels.dtype]

@@ -10,6 +10,7 @@ import xarray as xr
 import sweep
 from support.stores import by_hand
 from sweep.analysis import detection_rate
+from sweep.errors import ArgumentError
 from sweep.execution.finalize import close
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.experiment import Pipeline
@@ -122,6 +123,30 @@ def test_labels_are_lazy_and_those_of_any_part(results):
 def test_a_value_of_a_later_version_is_unknown(results):
     later = results.detection.copy(data=np.full(results.detection.shape, 77, dtype="u1"))
     assert (sweep.decode_flags(later) == "unknown").all()
+
+
+def test_what_is_no_flag_is_unknown_not_another_flag(results):
+    meaned = results.detection.copy(data=results.detection.astype(float) + 0.5)
+    assert (sweep.decode_flags(meaned) == "unknown").all()
+    for value in (-1, 256, 257):  # 257 is 1 in eight bits, as "detected" is
+        other = results.detection.astype(np.int64) * 0 + value
+        other.attrs = results.detection.attrs
+        assert (sweep.decode_flags(other) == "unknown").all(), value
+
+
+def test_flags_of_stacked_results_are_decoded_without_a_warning(results):
+    stacked = results.stack(pose=["dictionary", "trial"])
+    told = sweep.decode_flags(stacked)
+    assert told.detection.dims == stacked.detection.dims
+    assert told.indexes["pose"].equals(stacked.indexes["pose"])
+    assert (told.detection == sweep.decode_flags(stacked.detection)).all()
+
+
+@pytest.mark.parametrize("given", ["runs/smoke.zarr", None, np.ones(3, dtype="u1")])
+def test_what_has_no_flags_to_decode_is_refused_in_a_line(given):
+    with pytest.raises(ArgumentError, match="expected a dataset") as error:
+        sweep.decode_flags(given)
+    assert "\n" not in str(error.value)
 
 
 def test_cf_xarray_reads_the_flags(results):

@@ -33,6 +33,20 @@ class Retry:
         return self.cells - sum(_lost(receipt) for _, receipt in receipts(store, self.blocks))
 
 
+def failed_blocks(store: RunStore) -> dict[int, int]:
+    """Return the committed blocks in which cells failed or crashed, and how many did.
+
+    Raises
+    ------
+    StoreError
+        If a receipt is damaged.
+    """
+    return {
+        number: count for number, receipt in receipts(store, committed(store))
+        if (count := _lost(receipt))
+    }
+
+
 def drop_failed(store: RunStore) -> tuple[RunStore, Retry]:
     """Drop the committed blocks in which cells failed or crashed, so that a run computes them.
 
@@ -49,10 +63,7 @@ def drop_failed(store: RunStore) -> tuple[RunStore, Retry]:
         If a receipt is damaged, another process writes the store, or it cannot be written.
     """
     with locked(store):
-        failed = {
-            number: count for number, receipt in receipts(store, committed(store))
-            if (count := _lost(receipt))
-        }
+        failed = failed_blocks(store)
         if failed:
             if store.finished:
                 reopen(store)

@@ -37,7 +37,7 @@ from sweep.execution.limits import (
     TIME_LIMIT_S,
 )
 from sweep.execution.progress import ProgressReport
-from sweep.execution.retry import Retry, drop_failed
+from sweep.execution.retry import Retry, drop_failed, failed_blocks
 from sweep.execution.reuse import is_reusable, match
 from sweep.execution.small_run import BlocksInChild
 from sweep.execution.summary import Summary, summary_of, summary_of_complete
@@ -141,17 +141,15 @@ def execute(
     if retry_failed and reuse:
         raise ArgumentError("reuse", os.fspath(reuse[0]), "expected no retry_failed beside it")
     unfinished = _store_to_continue(url, pipeline, overwrite)
-    retry = Retry()
-    if retry_failed and unfinished is not None:
-        unfinished, retry = drop_failed(unfinished)
-    if unfinished is not None and unfinished.finished:
+    again = set(failed_blocks(unfinished)) if retry_failed and unfinished is not None else set()
+    if unfinished is not None and unfinished.finished and not again:
         return summary_of_complete(unfinished, started)
     for line in notes(pipeline):
         notice(line)
     if durable and is_remote(url):
         notice(f"{url}: nothing to flush: an object store answers once it keeps what was written")
     sources = _matching_sources(url, pipeline, reuse)
-    done = set() if unfinished is None else committed(unfinished)
+    done = set() if unfinished is None else committed(unfinished) - again
     if unfinished is None:
         check_writable(url)
 
@@ -174,8 +172,8 @@ def execute(
             from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
 
             # Measured while the workers' processes start.
-            again = not done and not (calibration is not None and calibration.over)
-            future = measuring(CALIBRATION_S) if again else None
+            better = not done and not (calibration is not None and calibration.over)
+            future = measuring(CALIBRATION_S) if better else None
             connection = stack.enter_context(
                 connected(pipeline, workers=workers, scheduler=scheduler, client=client)
             )
@@ -190,6 +188,9 @@ def execute(
             )
         elif not (yes or sources):
             check_affordable(url, demand_left(unfinished, done, calibration, connection))
+        retry = Retry()
+        if again:  # once nothing refuses the run
+            unfinished, retry = drop_failed(unfinished)
         if durable:
             unfinished = open_store(url, "r+", durable=True)
         limit_s = block_time_limit_s(time_limit_s, block_s_of(unfinished, done, calibration))

@@ -8,7 +8,9 @@ import xarray as xr
 from support.here import calls_here
 from support.poison import Poison, poisoned
 from support.stores import by_hand, same
-from sweep.errors import ArgumentError
+from sweep.cli import main
+from sweep.errors import ArgumentError, StoreError
+from sweep.execution.affordability import FreeDisk
 from sweep.execution.block_task import compute_block
 from sweep.execution.finalize import close
 from sweep.execution.retry import drop_failed
@@ -90,6 +92,21 @@ def test_what_fails_again_stays_as_it_was(pipeline, failed, copied, tmp_path, mo
     assert not same(copied, failed)
     with xr.open_zarr(copied, group="failures") as table:
         assert table.sizes["failure"] == 1
+
+
+def test_retry_that_is_refused_leaves_the_store_as_it_was(pipeline, failed, copied, monkeypatch):
+    free = FreeDisk(bytes=1, files=None)
+    monkeypatch.setattr("sweep.execution.affordability.free_disk", lambda _: free)
+    with calls_here(), pytest.raises(StoreError, match="confirm it with --yes"):
+        execute(pipeline, copied, retry_failed=True)
+    assert open_store(copied).finished
+    assert same(copied, failed)
+    assert len(status(copied).failures) == 2
+
+
+def test_command_says_that_there_is_nothing_to_try_again(clean, capsys):
+    assert main(["run", clean, "--retry-failed"]) == 0
+    assert "no cell failed or crashed; nothing is tried again" in capsys.readouterr().out
 
 
 @pytest.mark.long

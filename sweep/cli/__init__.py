@@ -6,6 +6,7 @@ Ctrl-C. Heavy packages are imported inside each command, so that ``sweep --help`
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Sequence
 
@@ -30,6 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     accept_any_text()
     parser = build_parser()
+    options = argparse.Namespace()
     try:
         options = parse(parser, arguments)
         if options.command is None:
@@ -42,8 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ImportError as error:
         return print_import_error(error)
     except KeyboardInterrupt:
-        without = " without --overwrite" if getattr(options, "overwrite", False) else ""
-        print(f"stopped; the same command{without} continues", file=sys.stderr)
+        print(getattr(options, "stopped", "stopped"), file=sys.stderr)
         return 130
     except BrokenPipeError:
         sys.stderr.close()

@@ -6,6 +6,9 @@ import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 
+CONTINUES = "stopped; the same command continues"
+"""Told after Ctrl-C where it does; a command sets ``options.stopped`` to it."""
+
 
 @dataclass(frozen=True, slots=True)
 class Example:

@@ -10,7 +10,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from sweep.cli.arguments import add_json, add_pipeline, add_workers, read_pipeline
-from sweep.cli.command import Command, Example
+from sweep.cli.command import CONTINUES, Command, Example
 from sweep.cli.output import print_json, say, say_next
 
 if TYPE_CHECKING:
@@ -70,11 +70,14 @@ def _execute_beside(child: Child, options: argparse.Namespace) -> int:
 
     announce_compilation(pipeline)
     store = options.store or (options.pipeline if names_store(options.pipeline) else None)
+    options.stopped = "stopped before anything was computed" if options.overwrite else CONTINUES
     camera = [] if options.json else [f"camera: {camera_facts(pipeline).line()}"]
 
     watched = sys.stdout is not None and sys.stdout.isatty()
 
     def report(progress: Progress) -> None:
+        if options.overwrite:  # there is a new store
+            options.stopped = CONTINUES.replace("command", "command without --overwrite")
         while camera and watched:  # once the run is not refused; a pipe gets it with the results
             say(camera.pop())
         display(progress)
@@ -102,6 +105,8 @@ def _execute_beside(child: Child, options: argparse.Namespace) -> int:
         say(line)
     if summary.retried:
         say(f"{summary.retried:,} failed cells tried again, {summary.recovered:,} computed now")
+    elif options.retry_failed and summary.computed_blocks == 0:
+        say(f"{summary.store}: no cell failed or crashed; nothing is tried again")
     elif summary.computed_blocks == 0:
         failed = " and --retry-failed what failed" if summary.failures else ""
         say(f"{summary.store} is already finished; --overwrite recomputes it{failed}")

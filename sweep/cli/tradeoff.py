@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 
 from sweep.cli.arguments import add_json
-from sweep.cli.command import Command, Example
+from sweep.cli.command import CONTINUES, Command, Example
 from sweep.cli.output import print_json, quiet_matplotlib, say, say_next
 
 FIGURE_SUFFIXES = (".png", ".svg")
@@ -57,6 +57,7 @@ def _execute(options: argparse.Namespace) -> int:
         from sweep.messages import notice  # noqa: PLC0415
         from sweep.plan.experiment import Pipeline  # noqa: PLC0415
 
+        options.stopped = CONTINUES
         with progress_display() as bar:
             summary = execute(Pipeline.from_toml(store), None, progress=bar)
         for line in summary.warnings:

@@ -6,7 +6,7 @@ import argparse
 import shlex
 
 from sweep.cli.arguments import add_json, add_store, add_workers
-from sweep.cli.command import Command, Example
+from sweep.cli.command import CONTINUES, Command, Example
 from sweep.cli.output import MAX_LINES, print_json, say, say_next
 
 
@@ -27,6 +27,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _execute(options: argparse.Namespace) -> int:
     if options.repair:
+        options.stopped = CONTINUES
         from sweep.integrity.repair import repair  # noqa: PLC0415
 
         report = repair(options.store, options.sample, workers=options.workers)
@@ -66,8 +67,18 @@ def _execute(options: argparse.Namespace) -> int:
     elif report.damage:
         say_next(f"sweep run {store} --overwrite", "computes all of it again")
     else:
-        say_next(f"sweep report {store}" if report.finished else f"sweep run {store}")
+        say_next(f"sweep {_following(options.store, finished=report.finished)} {store}")
     return 1 if report.damage else 0
+
+
+def _following(url: str, *, finished: bool) -> str:
+    """Return the command to go on with after a sound store."""
+    if finished:
+        return "report"
+    from sweep.store.lifecycle import open_store  # noqa: PLC0415
+    from sweep.store.lock import holder  # noqa: PLC0415
+
+    return "run" if holder(open_store(url).storage) is None else "status"
 
 
 VERIFY = Command(

@@ -162,8 +162,8 @@ def _trade(
     conditions = list(np.ndindex(*lengths))
     configurations = trade.sizes["treatment"]
     measuring = (
-        f"measuring {configurations:,} configurations under {len(conditions):,} "
-        f"condition{'s' if len(conditions) > 1 else ''}"
+        f"measuring {configurations:,} configuration{'s' if configurations > 1 else ''} under "
+        f"{len(conditions):,} condition{'s' if len(conditions) > 1 else ''}"
     )
     report(measuring, 0.0)
     samples = [
@@ -196,8 +196,8 @@ def _trade(
         "rounds": len(total),
         "frames": int(costs.frames.sum()),
         "sampled": sum(len(sample[0]) if sample else 1 for sample in samples),
-        "covariance": "of the solvers with the corners' noise as it was measured in each regime; "
-                      "of photometric from its likelihood",
+        "covariance": "of the solvers with the corners' noise as it was measured under each "
+                      "condition; of photometric from its likelihood",
     }
     return trade
 

@@ -14,10 +14,12 @@ from pathlib import Path
 import pytest
 
 import sweep
+from support.here import calls_here
 from sweep import cli, installation
 from sweep.cli.errors import flag_of, print_error
 from sweep.cli.parser import COMMANDS, GUIDES, build_parser
 from sweep.errors import ArgumentError, PipelineError, RunError, StoreError
+from sweep.execution.progress import Progress
 
 TOP = Path(__file__).parents[2]
 HEAVY = ("numpy", "dask", "xarray", "numba", "cv2", "zarr", "matplotlib", "jinja2", "rich")
@@ -35,6 +37,36 @@ def told(capsys, *arguments):
     except SystemExit as stopped:
         code = stopped.code
     return code, *capsys.readouterr()
+
+
+# Ctrl-C.
+
+@pytest.mark.parametrize(("flags", "begun", "line"), [
+    ([], False, "stopped; the same command continues"),
+    (["--overwrite"], False, "stopped before anything was computed"),
+    (["--overwrite"], True, "stopped; the same command without --overwrite continues"),
+])
+def test_stopped_run_says_what_is_left_of_it(flags, begun, line, tmp_path, monkeypatch, capsys):
+    def execute(*_, progress, **__):
+        if begun:
+            progress(Progress(0, 1, 0))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sweep.execution.runner.execute", execute)
+    pipeline = tmp_path / "one.toml"
+    pipeline.write_text("pose = { side_px = 40 }\n")
+    with calls_here():
+        code, out, err = told(capsys, "run", str(pipeline), *flags)
+    assert (code, out) == (130, "")
+    assert err.splitlines()[-1] == line
+
+
+def test_stopped_command_that_does_not_continue_does_not_say_so(monkeypatch, capsys):
+    def stopped(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sweep.execution.status.status", stopped)
+    assert told(capsys, "status", "any.zarr") == (130, "", "stopped\n")
 
 
 # Help and version.

@@ -155,6 +155,10 @@ def belief_notes(
         for own, other in (("fx", "fy"), ("fy", "fx"))
         if f"believed_{own}_px" in given and f"believed_{other}_px" not in given
     ]
+    lines += [
+        f"{name} has no effect: no estimator has believed = calibration" for name in STATED
+        if name in given and "calibration" not in believed and fixed.get("camera_file") is None
+    ]
     if "calibration" in believed and fixed["calibration_sd"]:
         lines.append(
             "the calibration's numbers are drawn independently of each other; those of most "

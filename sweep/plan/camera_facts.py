@@ -17,7 +17,9 @@ from sweep.model.camera import (
     intrinsics,
 )
 from sweep.model.lens import fold_radius
+from sweep.model.marker import module_count
 from sweep.plan.beliefs import belief_notes
+from sweep.plan.camera_values import FIELDS_OF_VIEW
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes, scene_values
 from sweep.typing import Floats
@@ -202,6 +204,9 @@ OFF_CENTRE = 0.15
 WIDE_DEG = 150.0
 """Horizontal field of view above which it is told; lenses without fisheye reach about 130."""
 
+RADIANS = (0.2, math.pi)
+"""Fields of view between these look like radians: of 12 to 180 degrees."""
+
 POLE = 1e-9
 """Denominator of the radial distortion at a fold below which it is a pole."""
 
@@ -213,7 +218,8 @@ def notes(pipeline: Pipeline) -> list[str]:
     """Return a line for each property of the camera, or of beliefs about it, that may surprise."""
     facts = camera_facts(pipeline)
     return [
-        *_focal_notes(pipeline, facts), *_centre_notes(facts), *_fold_notes(pipeline, facts),
+        *_focal_notes(pipeline, facts), *_angle_notes(pipeline), *_centre_notes(facts),
+        *_fold_notes(pipeline, facts), *_side_notes(pipeline, facts),
         *belief_notes(pipeline.given, pipeline.fixed, pipeline.values_of("believed")),
     ]
 
@@ -236,6 +242,34 @@ def _focal_notes(pipeline: Pipeline, facts: CameraFacts) -> list[str]:
             f"{_text(facts.hfov_deg, 4)}°; hfov_deg in place of fx_px keeps it"
         )
     return lines
+
+
+def _angle_notes(pipeline: Pipeline) -> list[str]:
+    """Return a line for a field of view that looks like radians."""
+    return [
+        f"{name} = {_text(ends)}: in degrees; {ends[1]:g} radians would be "
+        f"{math.degrees(ends[1]):.4g}"
+        for name in FIELDS_OF_VIEW
+        if (ends := _ends(pipeline, name)) and ends[0] > RADIANS[0] and ends[1] < RADIANS[1]
+    ]
+
+
+def _side_notes(pipeline: Pipeline, facts: CameraFacts) -> list[str]:
+    """Return a line if no marker of the grid is of a size that can be detected."""
+    if facts.side_px is None:
+        return []
+    far, near = facts.side_px
+    units = (
+        "" if "side_px" in pipeline.given
+        else "; are size_m and the distances in metres?" if "size_m" in pipeline.given
+        else f"; size_m is not given: {pipeline.fixed['size_m']:g} m"
+    )
+    line = ""
+    if near < min(map(module_count, pipeline.values_of("dictionary"))):
+        line = f"at most {near:.4g} px, less than a pixel a module: too small to be read"
+    elif far > max(facts.width_px[1], facts.height_px[1]):
+        line = f"at least {far:.4g} px, more than the frame's"
+    return [f"the marker's side is {line}{units}"] if line else []
 
 
 def _centre_notes(facts: CameraFacts) -> list[str]:

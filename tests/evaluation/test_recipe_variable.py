@@ -11,12 +11,14 @@ from pathlib import Path
 
 import pytest
 
+import sweep
 from sweep.evaluation import variables
 from sweep.evaluation.variables import check_complete
 from sweep.plan.parameters import Stage
 from sweep.store.layout import FORMAT
 
-TOP = Path(__file__).parents[2]
+TESTS = Path(__file__).parents[1]
+TOP = TESTS.parent
 
 PIPELINE = """
 seed = 5
@@ -69,10 +71,11 @@ SCRIPT = """
 import sys
 import numpy as np
 import sweep
+from support.here import calls_here
 from sweep.cli import main
 from sweep.plan.reference import TABLES
 
-if __name__ == "__main__":
+with calls_here():
     pipeline, old, new = sys.argv[1:]
     results = sweep.run(pipeline, store=new)
     solved = results["estimate"].values == 1
@@ -95,6 +98,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.usefixtures("no_child")
 def test_a_record_and_a_function_make_a_variable(tmp_path):
     overlay = tmp_path / "overlay"
     overlay.mkdir()
@@ -108,14 +112,13 @@ def test_a_record_and_a_function_make_a_variable(tmp_path):
     pipeline.write_text(PIPELINE)
     (tmp_path / "script.py").write_text(SCRIPT)
     old, new = tmp_path / "old.zarr", tmp_path / "new.zarr"
-    run = [sys.executable, "-m", "sweep", "run", str(pipeline), "--store", str(old)]
-    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(overlay), str(TOP)])}
-    script = [sys.executable, str(tmp_path / "script.py"), str(pipeline), str(old), str(new)]
-    for command, environment in ((run, None), (script, env)):
-        done = subprocess.run(
-            command, cwd=TOP, env=environment, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
+    sweep.run(str(pipeline), store=old)
+    done = subprocess.run(
+        [sys.executable, str(tmp_path / "script.py"), str(pipeline), str(old), str(new)], cwd=TOP,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(overlay), str(TOP), str(TESTS)])},
+        capture_output=True, text=True, check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_a_variable_without_a_function_and_a_function_without_a_variable_are_refused():

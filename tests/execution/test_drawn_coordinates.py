@@ -144,6 +144,7 @@ def test_blocks_that_were_not_computed_have_no_draws(tmp_path):
         )
 
 
+@pytest.mark.long
 def test_cells_of_an_older_format_are_reused_and_their_draws_recomputed(tmp_path, monkeypatch):
     pipeline = sweep.Pipeline.from_dict(PIPELINE)
     old, new = str(tmp_path / "old.zarr"), str(tmp_path / "new.zarr")

@@ -7,6 +7,7 @@ import pytest
 
 from support.commands import command
 from support.poison import Poison, poisoned
+from sweep.cli import main
 from sweep.execution.progress import Progress, ProgressLines, progress_display
 from sweep.execution.status import WrittenBlock, poses_per_second
 from sweep.measure.flags import DetectionStatus, EstimateStatus
@@ -102,7 +103,7 @@ def test_few_reasons_are_listed_and_the_others_counted():
     assert found.advice.count("--at") == 5
 
 
-def test_solver_that_raises_on_every_scene_ends_with_status_1_and_one_command(tmp_path):
+def test_solver_that_raises_on_every_scene_ends_with_status_1_and_one_command(tmp_path, capsys):
     path, url = tmp_path / "bad.toml", str(tmp_path / "bad.zarr")
     path.write_text(TEXT.replace('["ippe_square", "iterative"]', '["iterative"]'))
     poisons = [Poison(cell, "estimation", "raise") for cell in range(4)]
@@ -115,14 +116,14 @@ def test_solver_that_raises_on_every_scene_ends_with_status_1_and_one_command(tm
         (4, "RuntimeError: poisoned")]
     assert told["warnings"][0] == "nothing computed: all 4 estimates failed"
     assert told["advice"].startswith(f"sweep repro {url} --at side_px=30.0,solver=iterative,trial=")
-    again = command("run", path, "--store", url)  # a finished store tells it as well
-    assert again.returncode == 1
-    assert again.stdout.splitlines()[-3:] == [*told["warnings"], f"next: {told['advice']}"]
-    status = command("status", url)
-    assert (status.returncode, status.stdout.splitlines()[-3:]) == (
-        0, [*told["warnings"], f"next: {told['advice']}"])
-    report = command("report", url, "-o", tmp_path / "report.html")
-    assert report.stdout.splitlines()[1:3] == told["warnings"]
+    assert main(["run", str(path), "--store", url]) == 1  # a finished store tells it as well
+    assert capsys.readouterr().out.splitlines()[-3:] == [
+        *told["warnings"], f"next: {told['advice']}"]
+    assert main(["status", url]) == 0
+    assert capsys.readouterr().out.splitlines()[-3:] == [
+        *told["warnings"], f"next: {told['advice']}"]
+    assert main(["report", url, "-o", str(tmp_path / "report.html")]) == 0
+    assert capsys.readouterr().out.splitlines()[1:3] == told["warnings"]
     assert "Nothing computed: all 4 estimates failed" in (tmp_path / "report.html").read_text()
 
 

@@ -268,6 +268,7 @@ def test_the_group_holds_what_was_printed_and_the_store_is_as_before(store, trad
     assert execute(Pipeline.from_text(TRADE, name="trade"), store, workers=1).computed_blocks == 0
 
 
+@pytest.mark.long
 def test_text_markdown_and_figures_name_every_treatment(store, tmp_path):
     text = told(store, "--seconds", "0.1", "-o", tmp_path / "trade.png")
     markdown = told(store, "--seconds", "0.1", "--markdown", "-o", tmp_path / "trade.SVG",
@@ -410,6 +411,7 @@ def test_what_is_not_to_be_seen_has_no_error_and_no_advice(unseen_store):
 
 # A pose that failed in the run.
 
+@pytest.mark.long
 def test_a_detector_that_raises_has_a_cost_all_the_same(tmp_path):
     text = CAMERA + """
 side_px = 40

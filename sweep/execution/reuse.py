@@ -1,7 +1,8 @@
 """Finished cells of other stores, copied into a new one: grids grow, halves are joined.
 
-A cell is reusable if the fingerprint and all its parameter values agree. Which cells an old store
-has finished follows from its receipts and flags; the old store is only read.
+A cell is reusable if the fingerprint and all its parameter values agree, and nothing of it failed
+or crashed. Which cells an old store has finished follows from its receipts and flags; the old store
+is only read.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from sweep.execution.grid_match import (
     groups,
     rows_in,
 )
+from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.scene import build_scenes
 from sweep.plan.axes import TRIAL
 from sweep.plan.experiment import Pipeline
@@ -36,6 +38,12 @@ from sweep.plan.schema import VARIABLES, Variable, variables_of
 from sweep.store.blocks import committed
 from sweep.store.provenance import changes, fingerprint
 from sweep.store.run_store import RunStore
+
+LOST = {
+    "detection": (DetectionStatus.failed, DetectionStatus.crashed),
+    "estimate": (EstimateStatus.failed, EstimateStatus.crashed),
+}
+"""Flags of cells that are not reused."""
 
 PINNED = ""
 """In place of the name of an old dimension of which one index is read."""
@@ -248,11 +256,12 @@ def _read_from(
         pipeline, [v for v in variables if v.name not in present], cuts, positions,
         np.isfinite(old["true_tvec_m"]).all(axis=-1),
     )
-    # A cell is finished if its block is committed and its flag says that it was run.
-    estimate = VARIABLES["estimate"]
-    names = [name for name in estimate.dimensions(pipeline) if name in positions]
-    flags = np.transpose(old["estimate"], [names.index(name) for name in order])
-    fresh = ready & (flags != 0) & ~available[np.ix_(*(positions[name] for name in order))]
+    # A cell is finished if its block is committed and its flags say that it was run. What failed is
+    # computed, so that the new store has the reasons of all its failures.
+    fresh = ready & (_along(order, pipeline, "estimate", old) != 0)
+    for name, flags in LOST.items():
+        fresh &= ~np.isin(_along(order, pipeline, name, old), flags)
+    fresh &= ~available[np.ix_(*(positions[name] for name in order))]
     if not fresh.any():
         return
     available[np.ix_(*(positions[name] for name in order))] |= fresh
@@ -268,6 +277,16 @@ def _read_from(
         part = target[grid]
         part[chosen] = old[variable.name][chosen]
         target[grid] = part
+
+
+def _along(
+    order: Sequence[str], pipeline: Pipeline, name: str, values: dict[str, NDArray[Any]]
+) -> NDArray[Any]:
+    """Return a variable's values along the axes ``order``, of length 1 along those it lacks."""
+    names = [axis for axis in VARIABLES[name].dimensions(pipeline) if axis in order]
+    kept = [axis for axis in order if axis in names]
+    moved = np.transpose(values[name], [names.index(axis) for axis in kept])
+    return moved[tuple(slice(None) if axis in names else None for axis in order)]
 
 
 def _follows(variable: Variable) -> bool:

@@ -104,6 +104,16 @@ def test_retry_that_is_refused_leaves_the_store_as_it_was(pipeline, failed, copi
     assert len(status(copied).failures) == 2
 
 
+def test_cells_that_failed_are_not_reused(pipeline, clean, failed, tmp_path):
+    url = str(tmp_path / "grown.zarr")
+    with calls_here():
+        summary = execute(pipeline, url, reuse=[failed])
+    assert (summary.failed, summary.crashed, summary.warnings) == (0, 0, [])
+    # One estimate raised; a detection ended its process, and both its solvers went without.
+    assert (summary.computed_scenes, summary.computed_estimates) == (2, 3)
+    assert same(url, clean)
+
+
 def test_command_says_that_there_is_nothing_to_try_again(clean, capsys):
     assert main(["run", clean, "--retry-failed"]) == 0
     assert "no cell failed or crashed; nothing is tried again" in capsys.readouterr().out

@@ -215,6 +215,13 @@ def _read_axis(reading: Reading, key: str, value: Any, quota: int, table: str = 
             return parse_trial(value)
         if key == TRIAL:
             reading.fault(path, value, "it as an axis of its own: every cell has the same trials")
+        elif key not in PARAMETERS and isinstance(value, dict) and (
+            not value.keys().isdisjoint(("zip", *PARAMETERS))
+        ):
+            reading.fault(
+                path, value, "parameters that go together as "
+                "{ zip = { fx_px = [600, 800], fy_px = [600, 805] } }, with nothing beside zip",
+            )
         elif key not in PARAMETERS:
             reading.unknown(path, "unknown parameter", key, [*PARAMETERS, TRIAL])
         elif key in reading.given:

@@ -93,6 +93,6 @@ def check_affordable(url: str, demand: Demand) -> None:
     found = objections(demand, free_disk(url))
     if found:
         raise StoreError(
-            f"{url}: the run {' and '.join(found)}; make it smaller, or confirm it with --yes "
-            "(in Python, yes=True)"
+            f"{url}: the run {' and '.join(found)}; make it smaller, or confirm it with "
+            "`sweep run --yes` (in Python, yes=True)"
         )

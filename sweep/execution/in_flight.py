@@ -21,11 +21,13 @@ from sweep.errors import RunError, StoreReplacedError
 from sweep.evaluation.machine_faults import machine_fault
 from sweep.execution.block_task import compute_block
 from sweep.execution.cluster import thread_count
+from sweep.execution.distributed_internals import worker_deaths
 from sweep.execution.limits import (
     BLOCKS_PER_THREAD,
     MAX_DEATHS,
     NO_WORKERS_TIMEOUT_S,
     THREAD_COUNT_INTERVAL_S,
+    THREAD_COUNT_TIMEOUT_S,
     TIME_LIMIT_S,
 )
 from sweep.execution.stall import StallWatch
@@ -60,9 +62,19 @@ class InFlightLimit:
             if threads:
                 self._blocks, self._last_worker = BLOCKS_PER_THREAD * threads, self._asked
         if time.monotonic() > self._last_worker + NO_WORKERS_TIMEOUT_S:
-            advice = deaths_reason(self._kills) if memory_ran_out(self._kills) else "start some"
-            raise RunError(f"there have been no workers for {NO_WORKERS_TIMEOUT_S:.0f} s; {advice}")
+            raise RunError(
+                f"there have been no workers for {NO_WORKERS_TIMEOUT_S:.0f} s{self._reason()}"
+            )
         return self._blocks
+
+    def _reason(self) -> str:
+        """Return why there are no workers, as far as that is known, and what to do."""
+        died = 0
+        with contextlib.suppress(OSError, TimeoutError):
+            died = worker_deaths(self._client, THREAD_COUNT_TIMEOUT_S)
+        if died or memory_ran_out(self._kills):
+            return f": they died; {deaths_reason(self._kills)}"
+        return "; start some"
 
 
 class BlocksInFlight:

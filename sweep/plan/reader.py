@@ -152,6 +152,8 @@ def _read_header(reading: Reading) -> None:
     else:
         reading.seed = seed
     sampling = reading.document.get("sampling", SAMPLINGS[0])
+    if isinstance(sampling, str):
+        sampling = sampling.strip().lower()
     if sampling not in SAMPLINGS:
         reading.fault("sampling", sampling, f"one of {', '.join(SAMPLINGS)}")
     else:

@@ -15,7 +15,7 @@ from distributed import Client, LocalCluster
 import sweep
 from sweep.errors import ArgumentError, RunError
 from sweep.execution import cluster as clusters
-from sweep.execution import stall
+from sweep.execution import in_flight, stall
 from sweep.execution.cluster import borrowed, embedded
 from sweep.execution.distributed_internals import worker_states
 from sweep.execution.in_flight import BlocksInFlight
@@ -266,6 +266,18 @@ def test_run_whose_workers_die_again_and_again_ends_in_a_line(monkeypatch):
         watch = stall.StallWatch(Identity("running", "running", dying=True), 600.0)
         with pytest.raises(RunError, match=f"workers died [0-9]+ times meanwhile; {reason}"):
             check_until(watch, time.monotonic() + 10)
+
+
+@pytest.mark.parametrize(("dying", "line"), [
+    (False, "there have been no workers for 0 s; start some"),
+    (True, "there have been no workers for 0 s: they died; if by SIGKILL, as where memory runs"),
+])
+def test_run_that_has_lost_its_workers_says_whether_they_died(dying, line, monkeypatch):
+    monkeypatch.setattr(in_flight, "NO_WORKERS_TIMEOUT_S", -1.0)
+    monkeypatch.setattr(in_flight, "thread_count", lambda _: 0)
+    with pytest.raises(RunError) as raised:
+        in_flight.InFlightLimit(Identity(dying=dying)).blocks()
+    assert str(raised.value).replace("-1 s", "0 s").startswith(line)
 
 
 def test_run_whose_workers_are_all_paused_ends_in_a_line(monkeypatch, tmp_path):

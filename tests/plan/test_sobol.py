@@ -152,6 +152,7 @@ def test_sampling_is_part_of_what_stores_must_share():
     grid = pipeline()
     assert sweep.Pipeline.from_text(grid.to_toml()) == grid
     assert fingerprint(grid)["sampling"] == "sobol"
+    assert fingerprint(pipeline("sampling='Sobol'"))["sampling"] == "sobol"
     plain = pipeline("sampling=independent")
     assert "sampling" not in fingerprint(plain)
     index = np.zeros(3, dtype=int), np.arange(3)

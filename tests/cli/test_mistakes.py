@@ -15,6 +15,8 @@ from sweep.errors import SweepError
 from sweep.execution.affordability import Demand, FreeDisk, objections
 from sweep.execution.finalize import close
 from sweep.plan.experiment import Pipeline
+from sweep.store.lifecycle import open_store
+from sweep.store.lock import locked
 
 TEXT = """
 pose = { jitter_px = 0.5 }
@@ -136,6 +138,14 @@ def test_repro_writes_no_file_unasked(folder, capsys):
     before = sorted(folder.rglob("*"))
     assert told(capsys, "repro runs/small.zarr")[0] == 0
     assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.usefixtures("folder")
+def test_verify_of_a_store_that_is_being_written_points_to_its_status(capsys):
+    url = "runs/unfinished.zarr"
+    with locked(open_store(url, "r+")):
+        _, out, _ = told(capsys, f"verify {url} --sample 0")
+    assert out.splitlines()[-1] == f"next: sweep status {url}"
 
 
 @pytest.mark.usefixtures("folder")

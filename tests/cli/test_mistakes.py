@@ -166,6 +166,7 @@ def test_python_is_told_that_nothing_was_detected(tmp_path, capsys):
     with calls_here(), sweep.run(far, store=url):
         pass
     assert capsys.readouterr().err.splitlines() == [
+        "the marker's side is at most 2 px, less than a pixel a module: too small to be read",
         "warning: nothing was detected: 2 no_candidate (No candidate at the marker)",
         f"look at it: sweep repro {url} --at side_px=2.0,trial=0 -o scene.png",
     ]

@@ -400,6 +400,7 @@ def test_kill_between_any_two_writes_of_closing_leaves_no_half_finished_store(
         whole(url, pipeline, reference)
 
 
+@pytest.mark.long
 @lengths(3, ALL)
 def test_kill_between_any_two_writes_of_a_new_store_leaves_all_or_none(
     count, small, tmp_path

@@ -102,6 +102,7 @@ def test_workers_that_are_threads_of_the_caller_are_refused():
         assert "its workers are threads of this process" in refusal(cluster)
 
 
+@pytest.mark.long
 def test_run_that_is_stopped_takes_its_blocks_back_from_the_callers_client(tmp_path):
     def stop(progress):
         if progress.done:

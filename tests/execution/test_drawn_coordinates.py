@@ -121,6 +121,7 @@ def test_analyses_bin_by_what_was_drawn(results):
     assert pair.compared.sum() == 2 * 40
 
 
+@pytest.mark.long
 def test_blocks_that_were_not_computed_have_no_draws(tmp_path):
     pipeline = sweep.Pipeline.from_dict(PIPELINE)
     url = str(tmp_path / "half.zarr")

@@ -539,6 +539,7 @@ def test_background_axis_of_levels_and_images(tmp_path):
         compute_block(other.url, other.run_id, next(iter(other.blocks)))
 
 
+@pytest.mark.long
 def test_progress_is_shown_on_a_terminal(tmp_path):
     path = tmp_path / "small.toml"
     path.write_text(TEXT)

@@ -66,6 +66,7 @@ def test_small_run_and_small_repair_start_no_cluster(pipeline, undisturbed, tmp_
     assert same(url, undisturbed)
 
 
+@pytest.mark.long
 def test_what_takes_longer_than_it_was_measured_goes_to_a_cluster(
     pipeline, undisturbed, client, tmp_path, monkeypatch
 ):

@@ -107,6 +107,7 @@ def test_worker_whose_machine_is_at_fault_is_used_no_more(
     assert same(tmp_path / "none.zarr", undisturbed)
 
 
+@pytest.mark.long
 def test_worker_that_cannot_write_the_store_is_used_no_more(
     tmp_path, undisturbed, two_workers, capfd
 ):

@@ -217,6 +217,7 @@ def test_all_failures_that_status_lists_are_seen_again(finished, tmp_path, capsy
         assert re.search(rf"^ +(detection|estimate) +{kind}$", ran.stdout, re.MULTILINE)
 
 
+@pytest.mark.long
 def test_scene_that_crashed_and_no_longer_does_differs(finished, tmp_path, capsys):
     out = tmp_path / "scene.png"
     assert main(["repro", str(finished), "--at", FAR, "-o", str(out)]) == 1

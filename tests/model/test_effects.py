@@ -442,6 +442,7 @@ def test_motion_blur_is_the_mean_of_256_exact_frames(count, kind, path_px):
     row(f"motion, {kind}, {path_px} px", "mean of 256 exact frames", count, worst, MOTION_TOLERANCE)
 
 
+@pytest.mark.long
 @lengths(1, 10)
 def test_motion_across_the_whole_frame_is_the_mean_of_2048_exact_frames(count):
     worst = max(
@@ -477,6 +478,7 @@ def test_motion_with_blur_is_the_mean_of_256_blurred_frames(count):
     row("motion and blur", "mean of 256 blurred frames", 2 * count, worst, MOTION_TOLERANCE)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("turns", [0.25, 1, 8, 32, 64, 1000])
 def test_marker_that_spins_is_the_mean_of_its_frames_however_fast(turns):
     # Over whole turns the mean does not depend on how many. 720 frames a turn: a corner at 21 px
@@ -510,6 +512,7 @@ def test_rolling_shutter_is_each_row_of_its_own_exact_frame(count, kind):
     row(f"rolling shutter, {kind}", "rows of exact frames", count, worst, 1e-9)
 
 
+@pytest.mark.long
 @lengths(1, 5)
 def test_rolling_shutter_with_exposure_is_each_row_of_its_own_mean(count):
     worst = max(

@@ -84,6 +84,7 @@ def test_the_report_is_right_wide_and_narrow_light_and_dark(scheme, tmp_path):
     check(page, tmp_path, [scheme])
 
 
+@pytest.mark.long
 def test_a_page_that_asked_for_something_would_be_told(tmp_path):
     page = tmp_path / "report.html"
     assert command("report", made(

@@ -148,6 +148,7 @@ def test_without_it_a_power_failure_does_harm(recorded, tmp_path):
     assert harmed > 50
 
 
+@pytest.mark.long
 def test_durable_run_gives_the_same_store(recorded, pipeline, tmp_path, monkeypatch):
     url = tmp_path / "power.zarr"
     disk = Recorded(tmp_path)

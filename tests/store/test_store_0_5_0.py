@@ -132,6 +132,7 @@ def test_damage_to_an_old_store_is_named(finished):
     }
 
 
+@pytest.mark.long
 @same_versions
 def test_old_store_is_repaired_and_keeps_its_format(unpacked, finished, monkeypatch):
     def recompute(store, numbers, **_):

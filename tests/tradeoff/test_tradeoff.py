@@ -246,6 +246,7 @@ def test_costs_are_in_order(trade):
     assert values(trade, "cost_ms") == pytest.approx(total, rel=0.2)
 
 
+@pytest.mark.long
 def test_the_group_holds_what_was_printed_and_the_store_is_as_before(store, trade):
     with xr.open_zarr(store) as before, xr.open_zarr(store, group="cost") as cost:
         results, spent = before.load(), cost.load()
@@ -315,6 +316,7 @@ def test_cheaper_images_differ_from_exact_ones_and_exact_ones_do_not(renderers, 
     assert values(content, "render_ms")[eight] > 2 * values(content, "render_ms")[two]
 
 
+@pytest.mark.long
 def test_renderers_are_told_beside_the_table(renderer_store):
     out = told(renderer_store, "--seconds", "0.1")
     for name in ("warp", "exact", "supersample-2", "supersample-8"):
@@ -568,6 +570,7 @@ def test_the_medians_interval_covers_in_a_simulation(count):
 
 # Time limit and budget.
 
+@pytest.mark.long
 def test_a_short_time_limit_measures_fewer_scenes_and_says_so(store):
     text = told(store, "--per", "side_px", "--seconds", "0.05")
     assert re.search(r"costs are those of \d+ of 8 sampled images; more --seconds", text)

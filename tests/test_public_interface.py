@@ -163,6 +163,7 @@ sweep.run(3)
 """
 
 
+@pytest.mark.long
 def test_mypy_sees_the_types_of_the_installed_package_in_a_users_script(tmp_path):
     pytest.importorskip("mypy")
     # An environment of its own, in which the package lies as pip would install it.

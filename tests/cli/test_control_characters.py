@@ -41,6 +41,7 @@ def folder(tmp_path_factory):
 LONG = {"plan", "repro", "report", "show", "tradeoff"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", [
     pytest.param(name, marks=pytest.mark.long if name in LONG else ())
     for name in ("status", "verify", "run", "damaged", "none", *sorted(LONG))

@@ -134,6 +134,7 @@ def test_json_is_one_object_and_nothing_else(line, capsys):
     assert json.loads(out)
 
 
+@pytest.mark.long
 def test_repro_writes_no_file_unasked(folder, capsys):
     before = sorted(folder.rglob("*"))
     assert told(capsys, "repro runs/small.zarr")[0] == 0

@@ -138,6 +138,7 @@ def test_window_finds_what_the_frame_of_1920_by_1080_holds(count, refinement):
     compare(count, 1920, 1080, refinement)
 
 
+@pytest.mark.long
 @lengths(4, 500)
 @pytest.mark.parametrize("refinement", REFINEMENTS)
 def test_window_finds_what_the_frame_of_4000_by_3000_holds(count, refinement):

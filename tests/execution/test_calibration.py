@@ -109,6 +109,7 @@ def test_plan_answers_whatever_a_scene_costs(tmp_path, monkeypatch):
     assert "grey noise        on   noise_grey is 3; cost not measured, poses take too long" in out
 
 
+@pytest.mark.long
 def test_plan_measures_each_effect_within_its_share():
     pipeline = Pipeline.from_text(
         "[scene]\nnoise_grey = 3\n[axes]\nside_px = [20, 40]\ntrial = 9")

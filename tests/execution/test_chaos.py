@@ -340,7 +340,7 @@ def small(tmp_path_factory):
     return prepared(tmp_path_factory.mktemp("small"), SMALL, "small")
 
 
-@lengths(3, ALL)
+@lengths(2, ALL)
 def test_kill_between_any_two_writes_of_a_block_loses_that_block_alone(
     count, small, tmp_path
 ):
@@ -401,7 +401,7 @@ def test_kill_between_any_two_writes_of_closing_leaves_no_half_finished_store(
 
 
 @pytest.mark.long
-@lengths(3, ALL)
+@lengths(2, ALL)
 def test_kill_between_any_two_writes_of_a_new_store_leaves_all_or_none(
     count, small, tmp_path
 ):

@@ -89,6 +89,7 @@ def test_every_parameter_is_a_coordinate_whether_fixed_an_axis_or_drawn(results,
         assert not DRAWN & set(opened.data_vars)
 
 
+@pytest.mark.long
 def test_a_store_with_draws_is_sound_and_its_cells_are_reproduced(url):
     assert verify(url, 2).damage == []
     again = reproduce(url, "azimuth_deg=30,trial=7")

@@ -83,6 +83,7 @@ def test_retry_computes_what_failed_and_nothing_else(pipeline, clean, copied):
     assert (again.retried, again.computed_blocks) == (0, 0)
 
 
+@pytest.mark.long
 def test_what_fails_again_stays_as_it_was(pipeline, failed, copied, tmp_path, monkeypatch):
     poisons = [Poison(1, "estimation", "raise", (), (("solver", "iterative"),))]
     for name, value in poisoned(poisons, tmp_path / "notes").items():

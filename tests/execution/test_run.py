@@ -390,6 +390,7 @@ def test_interrupted_run_says_how_to_go_on_and_goes_on(workers, tmp_path, capsys
     assert state["blocks_done"] == done
 
 
+@pytest.mark.long
 def test_running_scheduler_with_two_workers_gives_the_same(
     pipeline, undisturbed, cluster, tmp_path
 ):

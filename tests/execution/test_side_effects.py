@@ -116,6 +116,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", [
     "client of the caller", pytest.param("all of the caller's", marks=pytest.mark.long),
     pytest.param("embedded", marks=pytest.mark.long)])

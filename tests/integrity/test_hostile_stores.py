@@ -183,6 +183,7 @@ SCHEMAS = {
     "type", "huge shape", "no chunks", "no checksum", "bytes the other way round",
     "separator of keys", "a list",
 }))
+@pytest.mark.long
 def test_array_of_another_schema_is_refused_though_every_checksum_fits(change, copied, capsys):
     edit_json(copied / "translation_error_m/zarr.json", change)
     reseal(copied)
@@ -329,6 +330,7 @@ def test_pipeline_of_something_else_is_refused(text, copied, capsys):
 VALUES = (None, 5, "x", [], {}, [[]], {"a": None}, True, -1.5)
 
 
+@pytest.mark.long
 @lengths(1, len(VALUES))
 @pytest.mark.parametrize(
     "key",
@@ -449,6 +451,7 @@ FAILURE = {"scene": 0, "kind": "failed", "stage": "detection", "setting": 0, "es
            "text": "Error: x"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "wrong",
     [{"scene": 10**9}, {"scene": "0"}, {"kind": "odd"}, {"kind": []}, {"setting": 7},

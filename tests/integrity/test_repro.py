@@ -131,6 +131,7 @@ def test_scene_gives_what_the_store_holds_and_its_image(finished, tmp_path, caps
     np.testing.assert_array_equal(image, cv2.imread(str(shown), cv2.IMREAD_UNCHANGED))
 
 
+@pytest.mark.long
 def test_number_that_was_changed_is_named(copied, tmp_path, capsys):
     array = zarr.open_array(f"{copied}/normal_error_deg", mode="r+")
     assert array.shape == (2, 2, 2, 2, 3)
@@ -168,6 +169,7 @@ def test_unwritable_image_is_told_in_a_line(output, finished, tmp_path, capsys):
     assert str(tmp_path / output) in told
 
 
+@pytest.mark.long
 def test_block_that_is_not_there_yet_is_said(pipeline, tmp_path, capsys):
     url = str(tmp_path / "begun.zarr")
     store = create_store(url, pipeline, EXTENTS)

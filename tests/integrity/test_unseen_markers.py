@@ -13,10 +13,12 @@ from sweep.measure.flags import DetectionStatus
 
 @pytest.mark.parametrize(
     ("pose", "axes"),
-    [({}, {"distance_m": [0.01, 0.3], "tilt_deg": [0, 80, 180]}),
+    [pytest.param({}, {"distance_m": [0.01, 0.3], "tilt_deg": [0, 80, 180]},
+                  marks=pytest.mark.long),
      ({"camera_yaw_deg": 180}, {"marker_x_m": [-0.3, 0, 0.3]}),
-     ({"marker_yaw_deg": 180, "jitter_px": 1},
-      {"camera_x_m": [0, 0.3, 0.6], "marker_x_m": [0.3], "trial": 2})],
+     pytest.param({"marker_yaw_deg": 180, "jitter_px": 1},
+                  {"camera_x_m": [0, 0.3, 0.6], "marker_x_m": [0.3], "trial": 2},
+                  marks=pytest.mark.long)],
     ids=["a corner behind", "the marker behind", "at the camera's centre"],
 )
 def test_a_store_with_markers_behind_the_camera_is_sound(pose, axes, tmp_path):

@@ -348,6 +348,7 @@ def test_a_letter_of_the_manifest_that_changes_no_meaning_is_damage(copied):
         (copied / key).write_text(text)
 
 
+@pytest.mark.long
 def test_sound_chunks_in_wrong_places_and_edited_ones_are_named(sound, copied, here, tmp_path):
     wanted = set()
     # Two exchanged.
@@ -675,6 +676,7 @@ def test_stores_of_all_pipelines_are_sound(path, tmp_path):
     assert found.files == len(files(url))
 
 
+@pytest.mark.long
 @lengths(8, 80)
 def test_random_damages_are_all_found_and_all_mended(count, sound, tmp_path, here):
     seed = int(os.environ.get("SWEEP_SEED", random.SystemRandom().randrange(1 << 32)

@@ -295,6 +295,7 @@ MANY = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "poisons", [pytest.param(FEW, id="few"), pytest.param(MANY, id="many", marks=pytest.mark.long)]
 )

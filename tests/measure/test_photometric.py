@@ -250,6 +250,7 @@ def test_predicted_deviations_are_the_bound_s(regular):
         assert np.median(ratio, axis=0) == pytest.approx(1.0, abs=0.03)
 
 
+@pytest.mark.long
 def test_the_bound_is_attained_through_a_lens():
     lens = "distortion=[-0.3, 0.1, 0.001, -0.002]"
     cells = [

@@ -364,6 +364,7 @@ def both_searches(count, setting):
     return scenes, windowed, framed
 
 
+@pytest.mark.long
 @lengths(25, 400)
 @pytest.mark.parametrize("refinement", REFINEMENTS)
 def test_window_finds_what_the_frame_holds_under_noise(count, refinement):

@@ -96,6 +96,7 @@ def test_text_of_a_pipeline_reads_back_to_an_equal_one(document):
     assert dataclasses.replace(file, text=pipeline.text) == pipeline
 
 
+@pytest.mark.long
 @settings(max_examples=150, deadline=None)
 @given(documents(), st.data())
 def test_faults_are_those_of_a_file(document, data):

@@ -412,6 +412,7 @@ def test_scenes_are_those_with_the_smallest_and_largest_errors(full, monkeypatch
                 title.startswith(flag.name.replace("_", " ")) for title in chosen)
 
 
+@pytest.mark.long
 def test_scenes_looked_at_again_are_what_the_store_holds(full):
     scenes = list(scenes_of(opened(full)))
     assert len(scenes) >= 4
@@ -440,6 +441,7 @@ def test_a_scene_that_differs_from_the_store_is_reported(full):
     assert any("Differs from the store: rotation_error_deg " in problem for problem in problems)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "message"),
     [(1e-6, ""), (1e-2, ", outside the tolerance for another processor or version.")])
@@ -458,6 +460,7 @@ def test_a_scene_of_another_processor_may_differ_within_the_tolerance(
         assert bool(problem) == bool(message)
 
 
+@pytest.mark.long
 def test_a_crashed_scene_is_not_rendered_and_a_lost_background_is_told(full, tmp_path):
     data = opened(full)
     results = data.results.load()
@@ -500,6 +503,7 @@ def test_a_trade_is_shown_where_the_store_has_one(odd, tmp_path):
     assert [row[0] for row in rows[1:3]] == small_trade()["treatment"].values.tolist()
 
 
+@pytest.mark.long
 def test_markdown_has_its_figures_beside_it_and_figures_go_where_they_are_asked(full, tmp_path):
     output, folder = tmp_path / "answer.md", tmp_path / "pictures"
     code, out, err = command("report", full, "-o", output, "--figures", folder)
@@ -584,6 +588,7 @@ def test_what_cannot_be_reported_is_told_in_one_line(full, tmp_path):
     assert file.read_text() == "mine"
 
 
+@pytest.mark.long
 def test_a_report_is_never_written_into_a_store(tmp_path):
     url = made(tmp_path, ODD["single pose"], "one")
     other = made(tmp_path, ODD["single pose"], "other")
@@ -647,6 +652,7 @@ def test_poses_that_are_missing_are_told(odd, tmp_path):
     assert not output.exists()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("loaded", [pytest.param(200_000_000, marks=pytest.mark.long), 0])
 def test_a_damaged_store_is_told_in_one_line(loaded, odd, tmp_path, monkeypatch):
     monkeypatch.setattr(report_data, "MAX_LOADED_BYTES", loaded)

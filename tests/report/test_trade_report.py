@@ -294,6 +294,7 @@ def test_json_holds_everything(trade):
         )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("trade", "suffix", "start"),
     [(synthetic(), "png", b"\x89PNG"), (synthetic([20], treatments=1), "svg", b"<?xml"),

@@ -101,6 +101,7 @@ def test_opencv_that_contradicts_its_metadata_is_refused_by_library_and_workers(
     assert not (tmp_path / "new.zarr").exists()
 
 
+@pytest.mark.long
 def test_several_distributions_of_opencv_are_refused_by_the_library(monkeypatch, tmp_path):
     monkeypatch.setattr(provenance, "builds", builds.__wrapped__)
     version = installation.distribution(installation.OPENCV)

@@ -186,6 +186,7 @@ def test_costs_are_measured_into_an_old_store(finished, capsys):
     assert root_attributes(finished)["sweep"]["format"] == 2
 
 
+@pytest.mark.long
 @same_versions
 def test_old_store_is_reused(unpacked, tmp_path):
     text = (unpacked / "old.toml").read_text()

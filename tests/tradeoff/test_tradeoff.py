@@ -292,6 +292,7 @@ def renderers(renderer_store):
     return json.loads(told(renderer_store, "--seconds", "0.4", "--json"))
 
 
+@pytest.mark.long
 def test_cheaper_images_differ_from_exact_ones_and_exact_ones_do_not(renderers, renderer_store):
     content = renderers["renderers"]
     order = content["coords"]["renderer"]["data"]
@@ -406,6 +407,7 @@ def test_where_nothing_is_to_be_seen_nothing_has_a_cost(unseen_store):
         assert np.isnan(value[1]).all()
 
 
+@pytest.mark.long
 def test_what_is_not_to_be_seen_has_no_error_and_no_advice(unseen_store):
     out = told(unseen_store, "--per", "tilt_deg", "--seconds", "0.1")
     assert "tilt_deg = 180: no configuration has a finite rotation_p95_deg" in out

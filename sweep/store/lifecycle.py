@@ -185,8 +185,9 @@ def create_store(
                 building.rename(Path(url).resolve())
                 if durable:
                     flush(building.parent)
-            finally:
+            except BaseException:
                 _remove_unfinished(building)
+                raise
     return open_store(url, "r+", durable=durable)
 
 
@@ -195,9 +196,12 @@ def _remove_unfinished(folder: Path) -> None:
 
     After the first write that fails, Zarr's others go on for a moment and may add files again.
     """
+    absent = 0
     for _ in range(50):
-        shutil.rmtree(folder, ignore_errors=True)
-        if not folder.exists():
+        if folder.exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            absent = 0
+        elif (absent := absent + 1) == 3:
             return
         time.sleep(0.02)
 

@@ -13,20 +13,17 @@ from sweep.analysis.dimensions import (
     DRAWS,
     as_names,
     axes_of,
-    fingerprint_of,
     kept_dimensions,
-    pipeline_text,
     require_dimension,
     without_fixed,
 )
 from sweep.analysis.intervals import LEVEL, wilson
 from sweep.analysis.rates import detection_rate
-from sweep.errors import ArgumentError, DatasetError, SweepError
+from sweep.analysis.stored_parameters import parameter_value
+from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import Flag, flag
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.model.marker import module_count
-from sweep.plan.experiment import Pipeline
-from sweep.plan.parameters import PARAMETERS
 from sweep.plan.schema import cf_attributes
 from sweep.typing import Floats, Integers, Masks
 
@@ -192,7 +189,7 @@ def _sides(results: xr.Dataset, axis: str) -> xr.DataArray:
         raise DatasetError(f"{axis}: has no coordinate, which the sides are computed from")
     if axis == "side_px":
         return _positive(results["side_px"].astype(np.float64))
-    values = {name: _value(results, name) for name in (*VIEW_PARAMETERS, "size_m")}
+    values = {name: parameter_value(results, name) for name in (*VIEW_PARAMETERS, "size_m")}
     fx = xr.DataArray(intrinsics(*(values[name] for name in VIEW_PARAMETERS))[0])
     sides: xr.DataArray = fx * values["size_m"] / results["distance_m"]
     return _positive(sides.astype(np.float64))
@@ -207,26 +204,8 @@ def _positive(sides: xr.DataArray) -> xr.DataArray:
 
 def _modules(results: xr.Dataset) -> Any:
     """Return the modules along the black square's side, by dictionary."""
-    names = _value(results, "dictionary")
+    names = parameter_value(results, "dictionary")
     if isinstance(names, xr.DataArray):
         counts = [module_count(str(name)) for name in np.atleast_1d(names.values)]
         return xr.DataArray(np.reshape(counts, names.shape), names.coords, names.dims)
     return module_count(names)
-
-
-def _value(results: xr.Dataset, name: str) -> Any:
-    """Return a parameter's value, or its values over the dimensions that it has."""
-    if name in results.coords:
-        return results[name].reset_coords(drop=True)
-    try:
-        files = fingerprint_of(results).get("files", {})
-        pipeline = Pipeline.from_text(pipeline_text(results), files=files)
-    except (KeyError, SweepError):
-        raise DatasetError(f"{name}: not a coordinate, and the attributes hold no pipeline "
-                           "that has it") from None
-    if pipeline.axis(name) is not None:
-        raise DatasetError(f"{name}: varies in this store, but the dataset lacks its coordinate")
-    value = pipeline.fixed.get(name, PARAMETERS[name].default)
-    if value is not None and not isinstance(value, (int, float, str)):
-        raise DatasetError(f"{name}: is drawn, so that the side is not a number of the grid")
-    return value

@@ -7,6 +7,7 @@ each.
 
 from __future__ import annotations
 
+from sweep.analysis.ambiguities import ambiguity
 from sweep.analysis.bound_ratios import efficiency
 from sweep.analysis.comparisons import compare
 from sweep.analysis.covariances import covariance_trust
@@ -17,6 +18,6 @@ from sweep.analysis.rates import detection_rate, failure_composition, flip_rate
 from sweep.analysis.renderers import renderer_bias
 
 __all__ = [
-    "compare", "covariance_trust", "detection_limit", "detection_rate", "efficiency",
+    "ambiguity", "compare", "covariance_trust", "detection_limit", "detection_rate", "efficiency",
     "error_statistics", "failure_composition", "flip_rate", "marker_ranking", "renderer_bias",
 ]

@@ -8,7 +8,7 @@ from typing import Generic
 
 import numpy as np
 
-from sweep.analysis.intervals import LEVEL, jeffreys, wilson
+from sweep.analysis.intervals import LEVEL, clopper_pearson, jeffreys, wilson
 from sweep.analysis.states import BlockSample, BlockState, Sample, State
 from sweep.analysis.statistic import (
     OVER_ALL,
@@ -110,7 +110,9 @@ class BlockRateState(BlockState[RateState]):
 
 @dataclass(frozen=True)
 class Rate(SinglePass[ViewT, RateState], Generic[ViewT]):
-    """The share of ``used`` that are ``successes``, with Wilson's interval of a level.
+    """The share of ``used`` that are ``successes``, with an interval of a level.
+
+    It is Wilson's, or Clopper and Pearson's if it is to be ``exact``.
 
     Pooled settings see the same draws: n of the interval is the number of draws, `Sample.draws`,
     and the successes are rounded outwards to whole draws. It is a little wide if the cells' rates
@@ -125,10 +127,12 @@ class Rate(SinglePass[ViewT, RateState], Generic[ViewT]):
     counts: Sequence[tuple[str, str]] = ()
     """Names and meanings for the numbers of ``used`` and of ``successes``, if they are wanted."""
     with_jeffreys: bool = False
+    exact: bool = False
+    draws_name: str = "draws"
 
     def outputs(self) -> Sequence[Output]:
         """Return the rate, its interval, and the counts that are asked for."""
-        draws = Output("draws", "random draws that the interval is of", "1", "i8")
+        draws = Output(self.draws_name, "random draws that the interval is of", "1", "i8")
         return [
             *(Output(name, meaning, "1", "i8") for name, meaning in self.counts),
             *([draws] if self.counts else []),
@@ -155,8 +159,10 @@ class Rate(SinglePass[ViewT, RateState], Generic[ViewT]):
             values: Variables = {self.name: hits / n}
         if self.counts:
             names = (name for name, _ in self.counts)
-            values |= dict(zip(names, (n, hits), strict=False)) | {"draws": draws}
-        kinds = {"": wilson} | ({"_jeffreys": jeffreys} if self.with_jeffreys else {})
+            values |= dict(zip(names, (n, hits), strict=False)) | {self.draws_name: draws}
+        kinds = {"": clopper_pearson if self.exact else wilson}
+        if self.with_jeffreys:
+            kinds["_jeffreys"] = jeffreys
         for ending, interval in kinds.items():
             low, high = interval(fewest, draws, self.level)[0], interval(most, draws, self.level)[1]
             values[f"{self.name}{ending}_low"] = np.where(state.sample.drawn, low, np.nan)

@@ -28,6 +28,12 @@ def axes_of(results: xr.Dataset, *stages: Stage) -> list[str]:
     return [dim for dim in dict.fromkeys(dims) if dim not in LABELS]
 
 
+def configuration_axes(results: xr.Dataset) -> list[str]:
+    """Return the axes of the detector's and the estimator's settings."""
+    scene = axes_of(results, Stage.scene)
+    return [name for name in axes_of(results) if name not in scene]
+
+
 def is_grid_axis(name: object, results: xr.Dataset) -> bool:
     """Return whether a dimension is of the camera, the marker or the pose: it makes cells.
 

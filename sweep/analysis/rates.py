@@ -45,6 +45,7 @@ class PoseRate:
 
 LOOKED_FOR = ("looked_for", "poses that were run, visible and modelled")
 SOLVED = ("solved", "solved poses")
+FLIPPED = ("flipped", "solved poses that are nearer to the mirror of the truth")
 
 DETECTION_RATE = PoseRate(
     Rate("detection_rate", "detected of looked_for", lambda poses: poses.detected,
@@ -59,8 +60,7 @@ SOLVED_RATE = PoseRate(
 FLIP_RATE = PoseRate(
     Rate("flip_rate", "nearer to the mirror of the truth, of solved",
          lambda poses: poses.flipped, lambda poses: poses.solved),
-    (SOLVED, ("flipped", "solved poses that are nearer to the mirror of the truth")),
-    ESTIMATE_INPUTS,
+    (SOLVED, FLIPPED), ESTIMATE_INPUTS,
 )
 
 

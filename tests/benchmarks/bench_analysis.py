@@ -50,6 +50,7 @@ CALLS = {
     "error_statistics": "error_statistics(results, ('solver', 'tilt_deg', 'side_px'))",
     "error_statistics, bins":
         "error_statistics(results, ('solver',), {'marker_area_px': AREAS})",
+    "ambiguity": "ambiguity(results, ('tilt_deg', 'side_px'))",
     "marker_ranking": "marker_ranking(results)",
     "compare": "compare(results.isel(solver=0), results.isel(solver=1), ('tilt_deg',))",
     "detection_limit": "detection_limit(results, 0.9)",
@@ -59,7 +60,7 @@ CHILD = """
 import json, sys, time
 import numpy as np
 import sweep
-from sweep.analysis import (compare, detection_limit, detection_rate, error_statistics,
+from sweep.analysis import (ambiguity, compare, detection_limit, detection_rate, error_statistics,
                             failure_composition, flip_rate, marker_ranking)
 AREAS = np.geomspace(100, 40_000, 13)
 begun = time.perf_counter()
@@ -118,6 +119,9 @@ def chunk(rng, pipeline, block):
             solved, Flipped.not_flipped, Flipped.no_estimate)),
         "rotation_error_rad": rotation, "translation_error_m": position,
         "rotation_error_deg": angle,
+        "reprojection_error_px": np.where(solved, 0.1, np.nan).astype("f4"),
+        "alternative_reprojection_error_px": np.where(
+            solved, rng.uniform(0.1, 1.0, (*scene, solvers)), np.nan).astype("f4"),
     }
     return {
         "true_tvec_m": np.stack([0 * depth, 0 * depth, depth], axis=-1),

@@ -48,6 +48,10 @@ def example_results():
                 [flipped, solved], [Flipped.flipped, Flipped.not_flipped], Flipped.no_estimate)),
             "rotation_error_rad": ((*estimate, "xyz"), np.radians(0.3 * pattern)),
             "translation_error_m": ((*estimate, "xyz"), 0.001 * pattern),
+            "reprojection_error_px": (estimate, np.where(solved, 0.1, np.nan)),
+            "alternative_reprojection_error_px": (estimate, np.where(
+                solved & (np.array(SOLVERS) == "ippe"), np.array([[[0.1]], [[0.2]], [[0.5]]]),
+                np.nan)),
             "nees": (estimate, nees),
         },
         {"side_px": SIDES, "trial": range(TRIALS), "solver": SOLVERS, "xyz": list(XYZ),

@@ -1,0 +1,313 @@
+"""What a threshold on the ambiguity of planar poses keeps: of the poses, and of the flips.
+
+The ratio of a pose is its reprojection error over that of the other planar solution: the
+"ambiguity" that users compare with a fixed number such as 0.2.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from sweep.analysis.aggregate import aggregate
+from sweep.analysis.binning import Bins
+from sweep.analysis.counts import Count, Rate, scaled_to_draws
+from sweep.analysis.dimensions import as_names, configuration_axes, kept_dimensions
+from sweep.analysis.intervals import TAIL, clopper_pearson
+from sweep.analysis.pose_view import ESTIMATE_INPUTS, Poses, pose_arrays
+from sweep.analysis.rates import FLIPPED, SOLVED
+from sweep.analysis.statistic import Statistic
+from sweep.errors import ArgumentError
+from sweep.measure.flags import Flag, flag
+from sweep.plan.schema import cf_attributes
+from sweep.typing import Floats, Integers, Masks
+
+THRESHOLDS = (
+    0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, np.inf)
+"""Thresholds that are tried by default; the infinite one keeps all poses."""
+
+MAX_THRESHOLDS = 200
+
+RATIO_INPUTS = (
+    *ESTIMATE_INPUTS, "reprojection_error_px", "alternative_reprojection_error_px")
+
+
+class ThresholdChoice(Flag):
+    """Whether a threshold keeps the wanted flip rate."""
+
+    not_run = flag(0, "No pose was solved.", counted=False)
+    found = flag(1, "A threshold keeps the wanted flip rate.", present=True)
+    not_needed = flag(2, "All poses together have the wanted flip rate.", present=True)
+    too_few_draws = flag(3, "The draws show neither that a threshold keeps it nor that none does.")
+    none = flag(4, "No threshold keeps it: at each the flip rate is shown to be higher.")
+    nothing_drawn = flag(5, "No cell has two draws: nothing can be shown.")
+
+
+def ambiguity_ratio(reprojection_px: ArrayLike, alternative_px: ArrayLike) -> Floats:
+    """Return the ratio (...) of reprojection errors, that of the pose over that of the other.
+
+    0 if there is no other solution (NaN), so that every threshold keeps the pose; 1 if both are 0,
+    since nothing tells them apart; infinite if only the other's is 0. Above 1 the solver did not
+    return the solution with the smaller error.
+
+    Parameters
+    ----------
+    reprojection_px, alternative_px
+        RMS reprojection errors (...) in pixels.
+
+    Examples
+    --------
+    >>> ambiguity_ratio([0.1, 0.1, 0.0, 0.1], [0.4, np.nan, 0.0, 0.0]).tolist()
+    [0.25, 0.0, 1.0, inf]
+    """
+    error = np.asarray(reprojection_px, dtype=np.float64)
+    other = np.asarray(alternative_px, dtype=np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = error / other
+    ratio = np.where((error == 0) & (other == 0), 1.0, ratio)
+    return np.where(np.isnan(other), 0.0, ratio)
+
+
+class AmbiguousPoses(Poses):
+    """Poses of a block with the ratios of their reprojection errors."""
+
+    @cached_property
+    def ratio(self) -> Floats:
+        """Ratios (groups, cells, draws, settings), as `ambiguity_ratio` defines them."""
+        return ambiguity_ratio(
+            self["reprojection_error_px"], self["alternative_reprojection_error_px"])
+
+    @cached_property
+    def single(self) -> Masks:
+        """Solved poses without another solution."""
+        return np.asarray(self.solved & np.isnan(self["alternative_reprojection_error_px"]))
+
+    def kept(self, threshold: float) -> Masks:
+        """Return the solved poses whose ratio is at most a threshold."""
+        return np.asarray(self.solved & (self.ratio <= threshold))
+
+
+def ambiguity(
+    results: xr.Dataset, per: Sequence[str] = (), bins: Bins | None = None, *,
+    thresholds: Iterable[float] = THRESHOLDS, flip_rate: float = 0.01, min_kept: float = 0.05,
+) -> xr.Dataset:
+    """Return what thresholds on the ratio of both reprojection errors keep, and which one to take.
+
+    A threshold keeps the solved poses with ``reprojection_error_px /
+    alternative_reprojection_error_px`` of at most itself. A pose without another solution is
+    always kept, one with two solutions of error 0 has the ratio 1 (`ambiguity_ratio`).
+
+    Parameters
+    ----------
+    results, bins
+        As in `sweep.analysis.detection_rate`.
+    per
+        Dimensions that are kept beside those of the detector and the estimator: configurations
+        are never pooled.
+    thresholds
+        What to try, numbers of at least 0; infinity, which keeps all, is always among them.
+    flip_rate
+        The wanted share of flips among the kept poses, above 0 and below 1.
+    min_kept
+        Smallest share of the solved poses, 0 to 1, that a threshold must keep to be of use.
+
+    Returns
+    -------
+    xr.Dataset
+        Dimensions (*per, *configuration, *bins); lazy if ``results`` is. Intervals are in
+        ``x_low`` and ``x_high``.
+
+        - ``solved``, ``flipped``, ``without_alternative``: solved poses, those of them that are
+          nearer to the mirror of the truth, and those without another solution.
+        - Along ``threshold``, increasing: ``kept`` and ``kept_flipped`` poses; ``kept_rate``, of
+          the solved; ``kept_flip_rate``, flips of the kept; ``flips_kept_rate``, kept of the
+          flips; ``right_rejected_rate``, rejected of the poses that are not flipped;
+          ``rejected_right_rate``, not flipped of the rejected.
+        - ``choice``: whether any threshold keeps the wanted flip rate (`ThresholdChoice`), and
+          ``chosen_threshold``, the largest that is shown to; NaN if none is, infinite if none is
+          needed. At it: ``chosen_kept_rate``, ``chosen_flip_rate``,
+          ``chosen_right_rejected_rate``, and ``chosen_flip_rate_bound``, which the flip rate
+          exceeds with a probability of 2.5 % at most, the choice included.
+
+    Raises
+    ------
+    ArgumentError, DatasetError
+        As in `sweep.analysis.detection_rate`; also for thresholds and rates that cannot be.
+
+    Notes
+    -----
+    Each interval has 95 % for itself, over the random draws, conditional on the grid: Clopper and
+    Pearson's (`sweep.analysis.intervals.clopper_pearson`), NaN if no cell has two draws. A
+    threshold that was chosen because few flips were seen below it would look better than it is:
+    it is therefore chosen by the upper ends of all thresholds together (Bonferroni: a tail of
+    2.5 % over their number), so that a choice whose true flip rate is above the wanted one has a
+    probability of 2.5 % at most, whatever the dependence between thresholds. Fewer ``thresholds``
+    need fewer draws. ``none`` is said if at every threshold of use the lower end of the interval
+    lies above the wanted rate; that all of them do by chance is no likelier than that one does.
+
+    Flips mean nothing for frontal markers, whose mirrored pose is the pose itself.
+
+    Examples
+    --------
+    >>> table = ambiguity(results, thresholds=[0.2, 0.5], flip_rate=0.4)
+    >>> table["solver"].values.tolist(), table["kept"].values.tolist()
+    (['ippe', 'iterative'], [[8, 13, 13], [13, 13, 13]])
+    >>> [ThresholdChoice(choice).name for choice in table["choice"].values]
+    ['not_needed', 'too_few_draws']
+    """
+    tried = _checked_thresholds(thresholds)
+    if not (_is_number(flip_rate) and 0.0 < flip_rate < 1.0):
+        raise ArgumentError(
+            "flip_rate", flip_rate, "expected a number above 0 and below 1, such as 0.01")
+    if not (_is_number(min_kept) and 0.0 <= min_kept <= 1.0):
+        raise ArgumentError("min_kept", min_kept, "expected a number from 0 to 1, such as 0.05")
+    kept = kept_dimensions(results, (*as_names(per), *configuration_axes(results)))
+    statistics: list[Statistic[AmbiguousPoses, Any, Any, Any]] = [
+        Count(*SOLVED, lambda poses: poses.solved),
+        Count(*FLIPPED, lambda poses: poses.flipped),
+        Count("without_alternative", "solved poses without another solution",
+              lambda poses: poses.single),
+        *(rate for threshold in tried for rate in _rates(threshold)),
+    ]
+    table = aggregate(
+        results, pose_arrays(results, RATIO_INPUTS), kept, statistics, AmbiguousPoses, bins)
+    return _with_choice(_along_thresholds(table, tried), flip_rate, min_kept)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float, np.number))
+
+
+def _checked_thresholds(thresholds: Iterable[float]) -> list[float]:
+    """Return the thresholds, increasing, each once, and infinity; ArgumentError if any is bad."""
+    words = f"expected numbers of at least 0, {MAX_THRESHOLDS} at most, such as 0.2, 0.4"
+    try:
+        numbers = np.array([] if isinstance(thresholds, str) else list(thresholds), dtype="f8")
+    except (TypeError, ValueError):
+        raise ArgumentError("thresholds", thresholds, words) from None
+    if numbers.ndim != 1 or not 0 < numbers.size <= MAX_THRESHOLDS or not (numbers >= 0).all():
+        raise ArgumentError("thresholds", thresholds, words)
+    return sorted({*numbers.tolist(), np.inf})
+
+
+Masked = Callable[[AmbiguousPoses], Masks]
+
+RATES = {
+    "kept_rate": "kept of the solved poses",
+    "kept_flip_rate": "flips of the kept poses",
+    "flips_kept_rate": "kept of the flips",
+    "right_rejected_rate": "rejected of the poses that are not flipped",
+    "rejected_right_rate": "not flipped of the rejected poses",
+}
+"""Rates at a threshold, and what they are."""
+
+
+def _rates(threshold: float) -> list[Rate[AmbiguousPoses]]:
+    """Return the rates at a threshold; the threshold stands behind their names."""
+    def kept(poses: AmbiguousPoses) -> Masks:
+        return poses.kept(threshold)
+
+    def rejected(poses: AmbiguousPoses) -> Masks:
+        return np.asarray(poses.solved & ~poses.kept(threshold))
+
+    of: dict[str, tuple[Masked, Masked]] = {
+        "kept_rate": (kept, lambda poses: poses.solved),
+        "kept_flip_rate": (lambda poses: poses.flipped, kept),
+        "flips_kept_rate": (kept, lambda poses: poses.flipped),
+        "right_rejected_rate": (rejected, lambda poses: poses.unflipped),
+        "rejected_right_rate": (lambda poses: poses.unflipped, rejected),
+    }
+    return [
+        Rate(_at(name, threshold), RATES[name], successes, used, exact=True,
+             counts=((_at(f"{name} n", threshold), ""), (_at(f"{name} hits", threshold), "")),
+             draws_name=_at(f"{name} draws", threshold))
+        for name, (successes, used) in of.items()
+    ]
+
+
+def _at(name: str, threshold: float, end: str = "") -> str:
+    """Return the name of a variable at one threshold."""
+    return f"{name} {threshold!r}{end}"
+
+
+def _along_thresholds(table: xr.Dataset, tried: Sequence[float]) -> xr.Dataset:
+    """Return a table of variables at single thresholds as one of variables along them."""
+    def along(name: str, end: str = "") -> xr.DataArray:
+        parts = [table[_at(name, threshold, end)] for threshold in tried]
+        joined = xr.concat(parts, dim="threshold").transpose(..., "threshold")
+        return joined.chunk({"threshold": -1}) if joined.chunks is not None else joined
+
+    variables = {name: table[name] for name in ("solved", "flipped", "without_alternative")}
+    for name, source, meaning in (
+        ("kept", "kept_flip_rate n", "poses that the threshold keeps"),
+        ("kept_flipped", "kept_flip_rate hits", "flips that the threshold keeps"),
+        ("draws", "kept_flip_rate draws", "random draws that the kept poses are worth"),
+    ):
+        variables[name] = along(source).assign_attrs(cf_attributes(meaning, "1"))
+    for name, meaning in RATES.items():
+        for end, words in (("", ""), ("_low", "lower end of the 95 % interval: "),
+                           ("_high", "upper end of the 95 % interval: ")):
+            variables[f"{name}{end}"] = along(name, end).assign_attrs(
+                cf_attributes(words + meaning, "1"))
+    coordinates = {"threshold": ("threshold", list(tried), cf_attributes(
+        "largest ratio of both reprojection errors that is kept", "1"))}
+    return xr.Dataset(variables, table.coords).assign_coords(coordinates)
+
+
+CHOSEN = {
+    "chosen_threshold": "largest threshold that is shown to keep the wanted flip rate",
+    "chosen_kept_rate": "kept of the solved poses, at the chosen threshold",
+    "chosen_flip_rate": "flips of the kept poses, at the chosen threshold",
+    "chosen_flip_rate_bound": "upper bound of the flip rate at the chosen threshold",
+    "chosen_right_rejected_rate": "rejected of the poses not flipped, at the chosen threshold",
+}
+
+
+def _with_choice(table: xr.Dataset, flip_rate: float, min_kept: float) -> xr.Dataset:
+    """Return the table with the chosen threshold of each group."""
+    inputs = [table[name] for name in (
+        "threshold", "kept", "kept_flipped", "draws", "kept_rate", "kept_flip_rate",
+        "kept_flip_rate_low", "right_rejected_rate")]
+    choice, *values = xr.apply_ufunc(
+        functools.partial(_choose, flip_rate=flip_rate, min_kept=min_kept), *inputs,
+        input_core_dims=[["threshold"]] * len(inputs), dask="parallelized",
+        output_core_dims=[[]] * (1 + len(CHOSEN)),
+        output_dtypes=[np.uint8, *[np.float64] * len(CHOSEN)],
+    )
+    chosen = {name: value.assign_attrs(cf_attributes(meaning, "1"))
+              for (name, meaning), value in zip(CHOSEN.items(), values, strict=True)}
+    chosen["choice"] = choice.assign_attrs(
+        cf_attributes("whether a threshold keeps the wanted flip rate", flags=ThresholdChoice))
+    return table.assign(chosen).assign_attrs(flip_rate=flip_rate, min_kept=min_kept)
+
+
+def _choose(
+    thresholds: Floats, n: Integers, hits: Integers, draws: Integers, share: Floats, rate: Floats,
+    low: Floats, right_rejected: Floats, flip_rate: float, min_kept: float,
+) -> tuple[Any, ...]:
+    """Return the flag and the values of `CHOSEN`; arrays are (..., thresholds)."""
+    _, most = scaled_to_draws(hits, n, draws)
+    bound = clopper_pearson(most, draws, 1.0 - 2.0 * TAIL / len(thresholds))[1]
+    useful = (share >= min_kept) | np.isinf(thresholds)
+    meets = useful & ~np.isnan(low) & (bound <= flip_rate)
+    last = len(thresholds) - 1
+    at = np.where(meets.any(axis=-1), last - np.argmax(meets[..., ::-1], axis=-1), last)
+    none = ((low > flip_rate) | ~useful).all(axis=-1)
+    choice = np.select(
+        [n[..., -1] == 0, np.isnan(low[..., -1]), meets[..., -1], meets.any(axis=-1), none],
+        [ThresholdChoice.not_run, ThresholdChoice.nothing_drawn, ThresholdChoice.not_needed,
+         ThresholdChoice.found, ThresholdChoice.none], ThresholdChoice.too_few_draws)
+    exists = meets.any(axis=-1)
+
+    def chosen(values: Floats) -> Floats:
+        picked = np.take_along_axis(np.broadcast_to(values, n.shape), at[..., None], axis=-1)
+        return np.where(exists, picked[..., 0], np.nan)
+
+    return (choice.astype(np.uint8), chosen(thresholds), chosen(share), chosen(rate),
+            chosen(bound), chosen(right_rejected))

@@ -121,3 +121,7 @@ class MachineFaultError(RunError):
     def __reduce__(self) -> tuple[type[MachineFaultError], tuple[str, str]]:
         """Return how to make it again in another process."""
         return MachineFaultError, (self.fault, self.machine)
+
+
+class PluginError(SweepError):
+    """A plug-in that cannot be used, or that returned what it must not; one line."""

@@ -13,8 +13,10 @@ from sweep.analysis.pose_view import REQUIRED_VARIABLES
 from sweep.errors import ArgumentError, DatasetError
 from sweep.plan.camera_values import SQUARE_FORMAT, stored_text
 from sweep.plan.coordinates import FIXED
+from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS, Stage
 from sweep.plan.schema import LABELS, SCHEMA
+from sweep.plugins.declared import recorded_plugins
 
 DRAWS = "trial"
 """The dimension of random draws."""
@@ -67,6 +69,21 @@ def pipeline_text(results: xr.Dataset) -> str:
     store_format = _run_metadata(results).get("format")
     return stored_text(
         results.attrs["pipeline"], SQUARE_FORMAT if store_format is None else store_format
+    )
+
+
+def stored_pipeline(results: xr.Dataset) -> Pipeline:
+    """Return the pipeline in a dataset's attributes, without its files and plug-ins.
+
+    Raises
+    ------
+    KeyError, SweepError
+        If they have none.
+    """
+    metadata = _run_metadata(results)
+    return Pipeline.from_text(
+        pipeline_text(results), files=fingerprint_of(results).get("files", {}),
+        plugins=recorded_plugins(metadata),
     )
 
 

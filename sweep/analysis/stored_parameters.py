@@ -6,10 +6,8 @@ from typing import Any
 
 import xarray as xr
 
-from sweep.analysis.dimensions import fingerprint_of, pipeline_text
+from sweep.analysis.dimensions import stored_pipeline
 from sweep.errors import DatasetError, SweepError
-from sweep.plan.experiment import Pipeline
-from sweep.plan.parameters import PARAMETERS
 
 
 def parameter_value(results: xr.Dataset, name: str) -> Any:
@@ -24,14 +22,13 @@ def parameter_value(results: xr.Dataset, name: str) -> Any:
     if name in results.coords:
         return results[name].reset_coords(drop=True)
     try:
-        files = fingerprint_of(results).get("files", {})
-        pipeline = Pipeline.from_text(pipeline_text(results), files=files)
+        pipeline = stored_pipeline(results)
     except (KeyError, SweepError):
         raise DatasetError(f"{name}: not a coordinate, and the attributes hold no pipeline "
                            "that has it") from None
     if pipeline.axis(name) is not None:
         raise DatasetError(f"{name}: varies in this store, but the dataset lacks its coordinate")
-    value = pipeline.fixed.get(name, PARAMETERS[name].default)
+    value = pipeline.fixed.get(name, pipeline.parameters[name].default)
     if value is not None and not isinstance(value, (int, float, str)):
         raise DatasetError(f"{name}: is drawn, so that the side is not a number of the grid")
     return value

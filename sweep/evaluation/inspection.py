@@ -13,7 +13,7 @@ from sweep.evaluation.cells import run_cells
 from sweep.evaluation.estimation import assumed_cameras
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search_windows, visibility_flags, whole_frames
-from sweep.measure.detector import Detector
+from sweep.measure.detectors import make_detector
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.columns import Column
 from sweep.model.extent import marker_boxes
@@ -126,7 +126,7 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
     full = whole_frames(values, 1) | rendered.invisible
     searched = search_windows(scenes, rendered.boxes, setting, full)
     x0, y0, x1, y1 = searched[0].tolist()
-    quads, ids, rejected = Detector(setting).find(
+    quads, ids, rejected = make_detector(setting)(
         image[y0 - top : y1 - top, x0 - left : x1 - left],
         scenes.dictionary[0],
         int(scenes.frame[0].max()),

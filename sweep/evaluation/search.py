@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,15 +12,14 @@ from numpy.typing import NDArray
 from sweep.evaluation.machine_faults import raise_machine_fault
 from sweep.evaluation.results import Failure, exception_text
 from sweep.measure.classify import classify
-from sweep.measure.detector import (
-    NOISE_MARGIN_PX,
-    UNEVEN_LIGHT_CONSTANT,
-    Detector,
-    DetectorOutput,
-    DetectorSetting,
+from sweep.measure.detector import NOISE_MARGIN_PX, DetectorOutput, windows
+from sweep.measure.detectors import (
+    AnyDetectorSetting,
+    FindFunction,
     full_frame_reason,
+    make_detector,
     margin_px,
-    windows,
+    uneven_light_needs_frame,
 )
 from sweep.measure.flags import DetectionStatus
 from sweep.model.columns import Column, map_columns
@@ -76,7 +75,7 @@ def visibility_flags(scenes: Scenes) -> NDArray[np.uint8]:
 
 
 def search_windows(
-    scenes: Scenes, boxes: Integers, setting: DetectorSetting, full: Masks
+    scenes: Scenes, boxes: Integers, setting: AnyDetectorSetting, full: Masks
 ) -> Integers:
     """Return the windows that a setting searches: a function of scene and setting alone.
 
@@ -99,7 +98,7 @@ def search_windows(
     margin = margin_px(setting) + NOISE_MARGIN_PX * scenes.noisy[:, None].astype(np.int64)
     cut = windows(boxes, scenes.frame, margin)
     whole = full | (full_frame_reason(setting) is not None)
-    whole |= setting.adaptiveThreshConstant < UNEVEN_LIGHT_CONSTANT * scenes.uneven_gain
+    whole |= uneven_light_needs_frame(setting, scenes.uneven_gain)
     frame = np.concatenate([np.zeros_like(scenes.frame), scenes.frame], axis=1)
     return np.where(whole[:, None], frame, cut)
 
@@ -107,7 +106,7 @@ def search_windows(
 def search(
     scenes: Scenes,
     wanted: Masks,
-    settings: Sequence[DetectorSetting],
+    settings: Sequence[AnyDetectorSetting],
     full: Masks,
     failures: list[Failure],
     *,
@@ -153,7 +152,7 @@ def search(
         None if (window == widest).all() else (window - np.tile(widest[:, :2], 2)).tolist()
         for window in cut
     ]
-    passes = [_Pass(Detector(setting).find) for setting in settings]
+    passes = [_Pass(make_detector(setting)) for setting in settings]
     dictionary, sides = scenes.dictionary, scenes.frame.max(axis=1).tolist()
     render_s = 0.0
     row_s = [0.0] * len(scenes)
@@ -214,7 +213,7 @@ def search(
 class _Pass:
     """The search with one setting: its candidates by row, and the rows for which it raised."""
 
-    find: Callable[[Grey, str, int], DetectorOutput]
+    find: FindFunction
     candidates: list[tuple[int, *DetectorOutput]] = field(default_factory=list)
     images: dict[int, Grey] = field(default_factory=dict)
     failed: list[int] = field(default_factory=list)

@@ -70,6 +70,8 @@ def _opened(url: str, run_id: str, durable: bool = False) -> RunStore:
         )
     # What a camera file says is in the pipeline's text.
     images = store.pipeline.values_of("background")
+    for plugin in store.pipeline.plugins:
+        plugin.record(store.pipeline.folder)
     for path, digest in store.fingerprint["files"].items():
         if path in images and file_digest(Path(store.pipeline.folder) / path) != digest:
             raise StoreError(

@@ -32,7 +32,7 @@ from sweep.model.scene import build_scenes
 from sweep.plan.axes import TRIAL
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes, scene_values
-from sweep.plan.parameters import PARAMETERS, Stage
+from sweep.plan.parameters import Stage
 from sweep.plan.same_meaning import alike
 from sweep.plan.schema import VARIABLES, Variable, variables_of
 from sweep.store.blocks import committed
@@ -90,9 +90,10 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
     old = store.pipeline
     mine, theirs = fingerprint(pipeline), store.fingerprint
     # A file that only one of them refers to is a value that only one of them has.
-    shared = mine["files"].keys() & theirs["files"].keys()
-    for stamp in (mine, theirs):
-        stamp["files"] = {path: stamp["files"][path] for path in sorted(shared)}
+    for key in ("files", "plugins"):  # as of a plug-in
+        shared = mine.get(key, {}).keys() & theirs.get(key, {}).keys()
+        for stamp in (mine, theirs):
+            stamp[key] = {name: stamp[key][name] for name in sorted(shared)}
     faults = [
         f"{key}: the store has {json.dumps(old_value)}, this run {json.dumps(value)}"
         for key, old_value, value in changes(theirs, mine)
@@ -104,7 +105,7 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
         if variable.name not in present and not _follows(variable)
     ]
     pipeline, old = alike(pipeline, old)
-    for name in (*PARAMETERS, TRIAL):
+    for name in dict.fromkeys((*pipeline.parameters, *old.parameters, TRIAL)):
         if pipeline.distributions.get(name) != old.distributions.get(name):
             faults.append(f"{name}: not drawn from the same distribution in both")
         elif (

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
+from sweep.declaration import parameter
 from sweep.measure.flags import BoundStatus
 from sweep.measure.likelihood import (
     BACKGROUND_MARGIN_PX,
@@ -31,7 +32,6 @@ from sweep.measure.likelihood import (
 )
 from sweep.measure.positive_definite import pose_covariance
 from sweep.model import coverage
-from sweep.model.declaration import parameter
 from sweep.model.derivatives import POSE, work_space
 from sweep.model.effects import IN_BOUND, NEUTRAL
 from sweep.model.projection import Projection

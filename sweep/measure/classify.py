@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +57,7 @@ def classify(
 
 
 def _in_frame(
-    quads: Sequence[tuple[int, Sequence[NDArray[np.float32]]]], origin: Floats
+    quads: Sequence[tuple[int, Sequence[NDArray[np.floating[Any]]]]], origin: Floats
 ) -> tuple[NDArray[np.intp], Floats]:
     """Return the rows (M,) and the corners (M, 4, 2) in the frame of quadrilaterals in windows."""
     rows = np.array([row for row, _ in quads], dtype=np.intp)

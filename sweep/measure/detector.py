@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.model.declaration import parameter
+from sweep.declaration import parameter
 from sweep.model.marker import opencv_dictionary
 
 REFINEMENTS = {
@@ -219,17 +219,18 @@ def windows(
 
 
 DetectorOutput = tuple[
-    Sequence[NDArray[np.float32]], NDArray[np.int32] | None, Sequence[NDArray[np.float32]]
+    Sequence[NDArray[np.floating[Any]]], NDArray[np.integer[Any]] | None,
+    Sequence[NDArray[np.floating[Any]]],
 ]
-"""Corners (1, 4, 2) each of n decoded markers; their IDs, (n,) in OpenCV 5 and (n, 1) in 4, None if
-n is 0; and corners of the rejected candidates."""
+"""Corners (1, 4, 2) each of n decoded markers; their IDs, (n,) or as in OpenCV 4 (n, 1), None if n
+is 0; and corners of the rejected candidates."""
 
 
 SearchFunction = Callable[[NDArray[np.uint8]], DetectorOutput]
 
 
 class Detector:
-    """One detector setting in this process; OpenCV's objects cannot be pickled."""
+    """One setting of OpenCV's detector in this process; OpenCV's objects cannot be pickled."""
 
     def __init__(self, setting: DetectorSetting) -> None:
         self._setting = setting

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
+from sweep.declaration import parameter
 from sweep.measure.estimation import PoseEstimator
 from sweep.measure.photometric import Photometric
 from sweep.measure.solver import OPENCV_SOLVERS, CornerSolver, OpenCVSolver
-from sweep.model.declaration import parameter
 from sweep.model.lens import COUNTS
 
 

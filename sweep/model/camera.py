@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
+from sweep.declaration import parameter
 from sweep.model import lens
-from sweep.model.declaration import parameter
 from sweep.model.projection import Optics
 
 BELIEF_COUNTS = tuple(4 + count for count in lens.COUNTS)

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sweep.model.declaration import parameter
+from sweep.declaration import parameter
 from sweep.model.sensor import standard_normals
 from sweep.typing import Floats
 
@@ -76,7 +76,7 @@ class Effect:
         that falls on the pixels; "signal": on the pixels' signal, with its noise and gain, before
         quantisation; "readout": on quantisation.
     parameters
-        Its parameters by name, as :func:`sweep.model.declaration.parameter` declares them. The
+        Its parameters by name, as :func:`sweep.declaration.parameter` declares them. The
         first is its switch: the effect is active if that has another value than its default.
     needs
         Parameter -> parameters of which one must be given beside it.

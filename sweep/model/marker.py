@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.declaration import parameter
 from sweep.model.coverage import MarkerEdges
-from sweep.model.declaration import parameter
 
 OUTSIDE, BLACK, WHITE, OCCLUDER = 0, 1, 2, 3
 """Codes of the areas beside an edge."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from sweep.compilation import compiled
-from sweep.model.declaration import parameter
+from sweep.declaration import parameter
 from sweep.typing import Floats
 
 

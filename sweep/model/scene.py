@@ -10,10 +10,10 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.declaration import parameter
 from sweep.model import lens as lens_model
 from sweep.model.camera import VIEW_PARAMETERS, Camera, Cameras, intrinsics
 from sweep.model.columns import Column, map_columns
-from sweep.model.declaration import parameter
 from sweep.model.effects import EFFECTS, NEUTRAL, SWITCHES, VELOCITIES, is_active
 from sweep.model.marker import MarkerKey, marker_corners, module_count
 from sweep.model.pose import rotation_of_angles, transform_points

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model.declaration import parameter
+from sweep.declaration import parameter
 from sweep.model.rotations import axis_rotation
 from sweep.typing import Floats
 

@@ -5,18 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 
-from sweep.measure.detector import (
-    NOISE_MARGIN_PX,
-    UNEVEN_LIGHT_CONSTANT,
-    full_frame_reason,
-    margin_px,
-)
+from sweep.measure.detector import NOISE_MARGIN_PX
+from sweep.measure.detectors import full_frame_reason, margin_px, uneven_light_needs_frame
 from sweep.measure.estimators import SOLVERS
 from sweep.model.camera import canonical_distortion
 from sweep.model.effects import EFFECTS, RANDOM, SWITCHES, is_on
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings
 from sweep.plan.parameters import PARAMETERS
+from sweep.plugins.declared import DeclaredPlugin
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +52,12 @@ def _effect(pipeline: Pipeline, name: str, switch: str) -> Part:
     return Part(name, True, f"{switch} is {extent}", switch)
 
 
+def _described(plugin: DeclaredPlugin) -> str:
+    """Return a plug-in in words: kind, name, versions."""
+    versions = ", ".join(f"{name} {version}" for name, version in plugin.versions)
+    return f"{plugin.kind} {plugin.name}" + (f" ({versions})" if versions else "")
+
+
 def parts(pipeline: Pipeline) -> list[Part]:
     """Return every optional part, active or not."""
     lens = pipeline.any_value("distortion", lambda value: len(canonical_distortion(value)) > 0)
@@ -78,7 +81,7 @@ def parts(pipeline: Pipeline) -> list[Part]:
         or effect.switch in pipeline.distributions
         for effect in EFFECTS if effect.widens == "uneven light"
     )
-    if uneven and any(s.adaptiveThreshConstant < UNEVEN_LIGHT_CONSTANT * gain for s in settings):
+    if uneven and any(uneven_light_needs_frame(setting, gain) for setting in settings):
         whole.append("adaptiveThreshConstant is low for uneven light")
     if image:
         whole.append("the background is an image: clutter near the marker may change the detection")
@@ -86,7 +89,8 @@ def parts(pipeline: Pipeline) -> list[Part]:
         whole.append('window = "full"')
     noisy = any(effect.switch in draws for effect in EFFECTS if effect.widens == "noise")
     noise = f", and {NOISE_MARGIN_PX} more for noise" if noisy else ""
-    margins = sorted({margin_px(setting) for setting in settings})
+    margins = sorted({margin_px(s) for s in settings if full_frame_reason(s) is None})
+    windowed = bool(margins) and not (asked or image)
     guarded = pipeline.any_value("guarded", bool)
     assumptions = [
         name for name in PARAMETERS
@@ -105,9 +109,13 @@ def parts(pipeline: Pipeline) -> list[Part]:
         ),
         Part("background image", image, "background names a file" if image else "a level"),
         Part(
-            "window", not (asked or image),
+            "window", windowed,
             f"{', '.join(str(m) for m in margins)} px around the marker's pixels{noise}"
-            if not (asked or image) else "the full frame",
+            if windowed else "the full frame",
+        ),
+        Part(
+            "plug-ins", bool(pipeline.plugins),
+            ", ".join(_described(plugin) for plugin in pipeline.plugins) or "none is named",
         ),
         Part("full frame", bool(whole), "; ".join(whole) if whole else "no setting needs it"),
         Part("renderer", True, ", ".join(renderers)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -36,14 +37,21 @@ class Axis:
         Its values, without repeats; labels if parameters go together.
     zipped
         The parameters that go together, each with its values; empty for an axis of one parameter.
+    plugged
+        Those of its parameters that plug-ins declare.
     """
 
     name: str
     values: Sequence[Any]
     zipped: tuple[tuple[str, Sequence[Any]], ...] = ()
+    plugged: tuple[Parameter, ...] = ()
 
     def __len__(self) -> int:
         return len(self.values)
+
+    def parameter(self, name: str) -> Parameter:
+        """Return one of its parameters; not of ``trial``."""
+        return next((each for each in self.plugged if each.name == name), None) or PARAMETERS[name]
 
     @property
     def columns(self) -> dict[str, Sequence[Any]]:
@@ -69,8 +77,8 @@ class Axis:
         """Return the axis with one value in place of all those of a parameter."""
         same = (value,) * len(self)
         if not self.zipped:
-            return Axis(self.name, same)
-        return Axis(self.name, self.values, tuple(
+            return dataclasses.replace(self, values=same)
+        return dataclasses.replace(self, zipped=tuple(
             (other, same if other == name else values) for other, values in self.zipped
         ))
 
@@ -78,12 +86,12 @@ class Axis:
     def stage(self) -> Stage:
         """The first stage that the axis touches."""
         first = next(iter(self.columns))
-        return Stage.scene if first == TRIAL else PARAMETERS[first].stage
+        return Stage.scene if first == TRIAL else self.parameter(first).stage
 
     @property
     def unit(self) -> str:
         """The unit of its values; empty if they have none."""
-        return "" if self.zipped or self.name == TRIAL else PARAMETERS[self.name].unit
+        return "" if self.zipped or self.name == TRIAL else self.parameter(self.name).unit
 
     @property
     def meaning(self) -> str:
@@ -91,7 +99,7 @@ class Axis:
         if self.zipped:
             return f"{', '.join(self.columns)}, which go together"
         return "number of the draw" if self.name == TRIAL else (
-            PARAMETERS[self.name].declaration.meaning
+            self.parameter(self.name).declaration.meaning
         )
 
     @property
@@ -239,7 +247,7 @@ def parse_axis(
         if parameter.types == (int,):
             for end in (values[0], values[-1]):
                 parameter.check(end)
-            return Axis(parameter.name, values)
+            return Axis(parameter.name, values, plugged=_plugged(parameter))
         values = [float(value) for value in _bounded(values, quota)]
     if form != "values" and float in parameter.types:
         # All are numbers: if the least and the largest are admitted, all are.
@@ -254,11 +262,19 @@ def parse_axis(
             if value in seen:
                 raise ValueError(f"each value once ({shown(value)} is repeated)")
             seen.add(value)
-    return Axis(parameter.name, tuple(checked))
+    return Axis(parameter.name, tuple(checked), plugged=_plugged(parameter))
 
 
-def zipped_axis(name: str, columns: Mapping[str, Sequence[Any]]) -> Axis:
-    """Return the axis along which parameters go together.
+def _plugged(*parameters: Parameter) -> tuple[Parameter, ...]:
+    """Return those of parameters that plug-ins declare."""
+    return tuple(each for each in parameters if each.name not in PARAMETERS)
+
+
+def zipped_axis(
+    name: str, columns: Mapping[str, Sequence[Any]],
+    parameters: Mapping[str, Parameter] = PARAMETERS,
+) -> Axis:
+    """Return the axis along which parameters go together, of ``parameters`` by their names.
 
     Raises
     ------
@@ -275,7 +291,7 @@ def zipped_axis(name: str, columns: Mapping[str, Sequence[Any]]) -> Axis:
     if len(set(lengths.values())) > 1:
         counts = ", ".join(f"{parameter} has {length:,}" for parameter, length in lengths.items())
         raise ValueError(f"equally many values of each parameter: {counts}")
-    stages = {parameter: PARAMETERS[parameter].stage.name for parameter in columns}
+    stages = {parameter: parameters[parameter].stage.name for parameter in columns}
     if len(set(stages.values())) > 1:
         listed = ", ".join(f"{parameter} is of the {stage}" for parameter, stage in stages.items())
         raise ValueError(f"parameters of one stage: {listed}")
@@ -287,7 +303,10 @@ def zipped_axis(name: str, columns: Mapping[str, Sequence[Any]]) -> Axis:
         raise ValueError(f"each combination once ({plain(labels[repeated])} is repeated)")
     if len(set(labels)) < len(labels):
         labels = tuple(f"{k}: {text}" for k, text in enumerate(labels))
-    return Axis(name, labels, tuple((key, tuple(values)) for key, values in columns.items()))
+    return Axis(
+        name, labels, tuple((key, tuple(values)) for key, values in columns.items()),
+        _plugged(*(parameters[key] for key in columns)),
+    )
 
 
 def _short(value: Any) -> str:

@@ -11,7 +11,7 @@ from sweep.messages import MAX_FAULTS, label, nearest, plain, refusal
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.experiment import Pipeline
 from sweep.plan.overrides import displaced_by
-from sweep.plan.parameters import PARAMETERS
+from sweep.plan.parameters import PARAMETERS, Parameter
 from sweep.plan.toml_text import python_boolean, read_value
 
 _PART = re.compile(r"""(?:\[[^\]]*\]?|"[^"]*"?|[^,\["])+""")
@@ -67,6 +67,7 @@ def parse_selection(at: str, pipeline: Pipeline | None = None) -> dict[str, Any]
     faults: list[str] = []
     named: dict[str, Any] = {}
     axes = () if pipeline is None else pipeline.axes
+    parameters = PARAMETERS if pipeline is None else pipeline.parameters
     together = {axis.name: axis for axis in axes if axis.zipped}
     for part in map(str, _PART.findall(at)):
         name, equals, written = (piece.strip() for piece in part.partition("="))
@@ -82,15 +83,15 @@ def parse_selection(at: str, pipeline: Pipeline | None = None) -> dict[str, Any]
                 f"--at {plain(part)}: {other} is given twice" for other in row if other in named
             ]
             named |= row
-        elif name != TRIAL and name not in PARAMETERS:
-            known = [*PARAMETERS, TRIAL, *together]
+        elif name != TRIAL and name not in parameters:
+            known = [*parameters, TRIAL, *together]
             hint = nearest(name, known) if len(faults) < MAX_FAULTS else ""
             faults.append(f"--at {plain(part)}: unknown parameter{hint}")
         elif name in named:
             faults.append(f"--at {plain(part)}: {name} is given twice")
         else:
             try:
-                named[name] = _value(name, written)
+                named[name] = _value(parameters.get(name), written)
             except ValueError as error:
                 faults.append(f"--at {plain(part)}: expected {error}")
     if faults:
@@ -111,13 +112,13 @@ def _row(axis: Axis, written: str) -> int:
     raise ValueError(f'a number from 0 to {len(axis) - 1}, or a label such as "{axis.values[0]}"')
 
 
-def _value(name: str, written: str) -> Any:
+def _value(parameter: Parameter | None, written: str) -> Any:
     try:
         value = read_value(python_boolean(written))
     except ValueError:
         value = written
-    if name != TRIAL:
-        return PARAMETERS[name].check(value)
+    if parameter is not None:
+        return parameter.check(value)
     if isinstance(value, int) and 0 <= value < 2**62:
         return value
     raise ValueError("a whole number, at least 0")

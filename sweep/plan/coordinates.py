@@ -87,7 +87,7 @@ def fixed_values(pipeline: Pipeline) -> list[FixedValue]:
     without = superseded(pipeline.given)
     return [
         FixedValue(parameter.name, value, _attributes(parameter))
-        for parameter in PARAMETERS.values()
+        for parameter in pipeline.parameters.values()
         if parameter.section in ALWAYS_GIVEN or parameter.name in pipeline.given
         if parameter.name not in without
         if (value := _scalar(pipeline.fixed.get(parameter.name))) is not None
@@ -114,7 +114,7 @@ def drawn_quantities(pipeline: Pipeline) -> list[DrawnQuantity]:
     ['side_px', 'distance_m']
     """
     quantities = [
-        _of_parameter(PARAMETERS[name], _scale(distribution))
+        _of_parameter(pipeline.parameters[name], _scale(distribution))
         for name, distribution in pipeline.distributions.items()
     ]
     if "side_px" in pipeline.distributions:

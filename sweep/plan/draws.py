@@ -86,7 +86,7 @@ def geometry_keys(
         if name not in distributions and name in values and not values[name].missing:
             columns[name] = _texts(name, values[name], PARAMETERS[name].default)
     for name, distribution in distributions.items():
-        if PARAMETERS[name].section in GEOMETRY_SECTIONS:
+        if name in PARAMETERS and PARAMETERS[name].section in GEOMETRY_SECTIONS:
             columns[name] = Column.of(f"{name}={distribution}")
     used = [columns[name] for name in sorted(columns) if columns[name].differs_from("")]
     joined = map_columns(lambda *texts: "|".join(filter(None, texts)), used)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,10 +17,12 @@ from sweep.plan.axes import Axis, Distribution
 from sweep.plan.camera_files import read_camera_file
 from sweep.plan.camera_values import resolve_sensor, with_values
 from sweep.plan.overrides import apply_settings, fix_values, parse_settings
-from sweep.plan.parameters import Stage
+from sweep.plan.parameters import Parameter, Stage
+from sweep.plan.plugins import NAMED_BY, parameters_with, read_plugins
 from sweep.plan.reader import read_keys
 from sweep.plan.rules import check_rules
 from sweep.plan.toml_text import MAX_BYTES, document_text, read_document
+from sweep.plugins.declared import DeclaredPlugin
 
 MAX_SHOWN_PATH_LENGTH = 400
 
@@ -51,6 +54,8 @@ class Pipeline:
         Path as written -> SHA-256 of every file that the pipeline refers to.
     folder
         Where relative paths start.
+    plugins
+        The plug-ins that it names.
 
     Examples
     --------
@@ -73,6 +78,16 @@ class Pipeline:
     text: str
     files: Mapping[str, str]
     folder: str
+    plugins: tuple[DeclaredPlugin, ...] = ()
+
+    @property
+    def parameters(self) -> Mapping[str, Parameter]:
+        """Every parameter by its name: our own, and the settings of its plug-ins."""
+        return parameters_with(self.plugins)
+
+    def plugin(self, kind: str, name: str) -> DeclaredPlugin | None:
+        """Return the plug-in of a kind by its name; None if it is not one of the pipeline's."""
+        return next((p for p in self.plugins if (p.kind, p.name) == (kind, name)), None)
 
     @property
     def heading(self) -> str:
@@ -123,6 +138,7 @@ class Pipeline:
         folder: str | Path = ".",
         files: Mapping[str, str] | None = None,
         camera_files: Mapping[str, str] | None = None,
+        plugins: Sequence[DeclaredPlugin] | None = None,
     ) -> Pipeline:
         """Read a pipeline from TOML text.
 
@@ -143,6 +159,8 @@ class Pipeline:
             as for a store whose files may have moved.
         camera_files
             The same of camera files alone: a store's text has their values.
+        plugins
+            The plug-ins that a store has recorded, used instead of importing them.
 
         Raises
         ------
@@ -151,15 +169,18 @@ class Pipeline:
         """
         document = _document(text, source)
         if settings:
-            chosen = parse_settings(settings)
-            apply_settings(document, chosen)
+            parameters = _parameters(document, settings, folder, plugins)
+            chosen = parse_settings(settings, parameters)
+            apply_settings(document, chosen, parameters)
             # Checked before tomlkit, which keeps the comments, reads it again: tomlkit is slow.
-            _checked(document, text, name, source, Path(folder), files, camera_files)
+            _checked(
+                document, text, name, source, Path(folder), files, camera_files, plugins
+            )
             written = tomlkit.parse(text)
-            apply_settings(written, chosen)
+            apply_settings(written, chosen, parameters)
             text = tomlkit.dumps(written)
             document = _document(text, source)
-        return _checked(document, text, name, source, Path(folder), files, camera_files)
+        return _checked(document, text, name, source, Path(folder), files, camera_files, plugins)
 
     @staticmethod
     def from_dict(
@@ -220,9 +241,11 @@ class Pipeline:
             One line for each fault, beginning with ``source``.
         """
         document = _document(self.text, source)
-        fix_values(document, chosen)
+        fix_values(document, chosen, self.parameters)
         text = tomlkit.dumps(document)
-        return _checked(document, text, self.name, source, Path(self.folder), None, self.files)
+        return _checked(
+            document, text, self.name, source, Path(self.folder), None, self.files, self.plugins
+        )
 
     def axis(self, name: str) -> Axis | None:
         """Return an axis by name."""
@@ -282,12 +305,29 @@ def _document(text: str, source: str) -> dict[str, Any]:
         raise refusal([f"{source}: {error}"]) from None
 
 
+def _parameters(
+    document: Mapping[str, Any], settings: Sequence[str], folder: str | Path,
+    known: Sequence[DeclaredPlugin] | None,
+) -> Mapping[str, Parameter]:
+    """Return the parameters of a document once the settings that name plug-ins are applied."""
+    naming = {parameter for _, parameter in NAMED_BY.values()}
+    chosen = parse_settings(
+        [each for each in settings
+         if each.partition("=")[0].strip().rpartition(".")[2] in naming]
+    )
+    changed = copy.deepcopy(dict(document))
+    apply_settings(changed, chosen)
+    plugins, _ = read_plugins(changed, str(folder), known)  # faults are told when it is checked
+    return parameters_with(tuple(plugins))
+
+
 def _checked(
     document: Mapping[str, Any], text: str, name: str, source: str, folder: Path,
     files: Mapping[str, str] | None, camera_files: Mapping[str, str] | None,
+    plugins: Sequence[DeclaredPlugin] | None,
 ) -> Pipeline:
     """Return the pipeline of a document; PipelineError with all its faults."""
-    reading = read_keys(document, source, folder, files, camera_files)
+    reading = read_keys(document, source, folder, files, camera_files, plugins)
     read_camera_file(reading)
     resolve_sensor(reading)
     check_rules(reading)
@@ -300,5 +340,5 @@ def _checked(
         fixed=reading.fixed,
         given=frozenset(reading.given), distributions=reading.distributions,
         axes=tuple(reading.axes.values()), text=text, files=reading.files,
-        folder=str(folder.resolve()),
+        folder=str(folder.resolve()), plugins=reading.plugins,
     )

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.measure.detector import DetectorSetting
+from sweep.measure.detectors import AnyDetectorSetting, PluginSetting
 from sweep.measure.estimators import EstimatorSetting
 from sweep.model.camera import canonical_distortion
 from sweep.model.columns import Column
@@ -22,7 +24,7 @@ from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.beliefs import CALIBRATED, believed_calibration, calibrated_columns
 from sweep.plan.draws import bits, even_uniform, geometry_keys, jointly_drawn, uniform
 from sweep.plan.experiment import Pipeline
-from sweep.plan.parameters import PARAMETERS, Stage
+from sweep.plan.parameters import Stage
 from sweep.plan.pose_values import resolve_pose
 from sweep.typing import Floats
 
@@ -126,11 +128,11 @@ def scene_values(
     Random ones are drawn (those of later stages too), the pose is resolved, lenses are
     canonical, images are absolute paths, and ``shift_u_px``, ``shift_v_px`` are the jitter.
     """
-    axes = scene_axes(pipeline)
+    axes, parameters = scene_axes(pipeline), pipeline.parameters
     count = len(indices[0]) if axes else 1
     values = {
         name: Column(value, constant=True)
-        for name, value in pipeline.fixed.items() if PARAMETERS[name].stage is Stage.scene
+        for name, value in pipeline.fixed.items() if parameters[name].stage is Stage.scene
     }
     for axis, index in zip(axes, indices, strict=True):
         for name, along in axis.columns.items():
@@ -193,23 +195,37 @@ def combinations(axes: Sequence[Axis]) -> list[dict[str, Any]]:
     ]
 
 
-def _setting(pipeline: Pipeline, section: str, chosen: dict[str, Any]) -> dict[str, Any]:
-    names = [p.name for p in PARAMETERS.values() if p.section == section]
-    given = {name: pipeline.fixed.get(name, PARAMETERS[name].default) for name in names}
-    return {**given, **chosen}
+def _fixed(pipeline: Pipeline, section: str) -> dict[str, Any]:
+    """Return the fixed values of a section, and the defaults of its parameters that are not."""
+    return {
+        p.name: pipeline.fixed.get(p.name, p.default)
+        for p in pipeline.parameters.values() if p.section == section
+    }
 
 
-def detector_settings(pipeline: Pipeline) -> list[DetectorSetting]:
+def detector_settings(pipeline: Pipeline) -> list[AnyDetectorSetting]:
     """Return the detector settings of the grid, in the order of its detection axes."""
     return [
-        DetectorSetting(**_setting(pipeline, "detector", chosen))
+        _detector_setting(pipeline, {**_fixed(pipeline, "detector"), **chosen})
         for chosen in combinations(pipeline.axes_of(Stage.detection))
     ]
+
+
+def _detector_setting(pipeline: Pipeline, values: Mapping[str, Any]) -> AnyDetectorSetting:
+    """Return the setting of a detector that has these values; it takes those that are its own."""
+    plugin = pipeline.plugin("detector", values["detector"])
+    if plugin is None:
+        return DetectorSetting(**{name: values[name] for name in OPENCV_FIELDS})
+    own = tuple((setting.name, values[setting.name]) for setting in plugin.settings)
+    return PluginSetting(plugin, own, pipeline.folder)
+
+
+OPENCV_FIELDS = tuple(field.name for field in dataclasses.fields(DetectorSetting))
 
 
 def estimators(pipeline: Pipeline) -> list[EstimatorSetting]:
     """Return the estimators of the grid, in the order of its estimation axes."""
     return [
-        EstimatorSetting(**_setting(pipeline, "estimator", chosen))
+        EstimatorSetting(**{**_fixed(pipeline, "estimator"), **chosen})
         for chosen in combinations(pipeline.axes_of(Stage.estimation))
     ]

@@ -12,7 +12,7 @@ from sweep.messages import MAX_FAULTS, nearest, plain, refusal
 from sweep.plan.alternatives import RIVALS
 from sweep.plan.axes import DISTRIBUTION_FORMS, TRIAL
 from sweep.plan.camera_files import FILE_DEVIATIONS, FILE_VALUES, OTHER_WAYS
-from sweep.plan.parameters import PARAMETERS
+from sweep.plan.parameters import PARAMETERS, Parameter
 from sweep.plan.reader import HEADER, is_zip, section_of
 from sweep.plan.toml_text import python_boolean, quoted_if_bare, read_value
 
@@ -38,10 +38,13 @@ ALTERNATIVES: dict[str, Collection[str]] = {
 """Parameter -> those that say the same in another way: choosing it drops them."""
 
 
-def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
+def parse_settings(
+    settings: Sequence[str], parameters: Mapping[str, Parameter] = PARAMETERS
+) -> dict[str, Any]:
     """Return the values that "key=value" settings give, by parameter or header key.
 
-    A parameter's name needs no section, and a bare word counts as a string.
+    A parameter's name needs no section, and a bare word counts as a string. ``parameters`` are
+    those that the pipeline has, plug-ins' included.
 
     Raises
     ------
@@ -67,9 +70,9 @@ def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
         except ValueError:
             faults.append(f"{start}expected a TOML value, such as [0, 45] or 'text'")
             continue
-        home = section_of(name)
+        home = section_of(name, parameters)
         if not home and name not in HEADER and not is_zip(value):
-            known = [*PARAMETERS, TRIAL, *HEADER]
+            known = [*parameters, TRIAL, *HEADER]
             hint = nearest(name, known) if len(faults) < MAX_FAULTS else ""
             faults.append(f"{start}unknown parameter{hint}")
         elif is_zip(value) and section in ("", "axes"):
@@ -101,7 +104,9 @@ def _delete(document: Any, names: Collection[str]) -> None:
                 del table[name]
 
 
-def apply_settings(document: Any, chosen: Mapping[str, Any]) -> None:
+def apply_settings(
+    document: Any, chosen: Mapping[str, Any], parameters: Mapping[str, Parameter] = PARAMETERS
+) -> None:
     """Write chosen values into a document, of plain tables or of tomlkit's.
 
     A list or a table of values makes (or replaces) an axis; a single value or a distribution
@@ -112,8 +117,11 @@ def apply_settings(document: Any, chosen: Mapping[str, Any]) -> None:
     for name, value in chosen.items():
         if name in HEADER:
             document[name] = value
-        elif all(isinstance(document.get(table, {}), dict) for table in (section_of(name), "axes")):
-            _write(document, name, value)
+        elif all(
+            isinstance(document.get(table, {}), dict)
+            for table in (section_of(name, parameters), "axes")
+        ):
+            _write(document, name, value, parameters)
         # Otherwise a section is no table, which reading the document reports.
 
 
@@ -126,7 +134,9 @@ def _leave_camera_file(document: Any, chosen: Collection[str]) -> None:
         del camera["camera_file"]
 
 
-def fix_values(document: Any, chosen: Mapping[str, Any]) -> None:
+def fix_values(
+    document: Any, chosen: Mapping[str, Any], parameters: Mapping[str, Parameter] = PARAMETERS
+) -> None:
     """Fix parameters of a document at chosen values.
 
     The axis ``trial`` goes, axes of parameters that go together, each of which must be chosen, and
@@ -139,13 +149,17 @@ def fix_values(document: Any, chosen: Mapping[str, Any]) -> None:
         TRIAL, *displaced_by(chosen), *(name for name, value in axes.items() if is_zip(value)),
     })
     for name, value in chosen.items():
-        _write(document, name, list(value) if isinstance(value, tuple) else value)
+        written = list(value) if isinstance(value, tuple) else value
+        _write(document, name, written, parameters)
 
 
-def _write(document: Any, name: str, value: Any) -> None:
+def _write(
+    document: Any, name: str, value: Any, parameters: Mapping[str, Parameter]
+) -> None:
     """Write a parameter under its section or under the axes, and delete it from the other."""
-    section = PARAMETERS[name].section if name in PARAMETERS else "axes"
-    home, other = ("axes", section) if name == TRIAL or _is_axis(name, value) else (section, "axes")
+    section = parameters[name].section if name in parameters else "axes"
+    is_axis = name == TRIAL or _is_axis(name, value, parameters)
+    home, other = ("axes", section) if is_axis else (section, "axes")
     if other != home and name in document.get(other, {}):
         del document[other][name]
     if home not in document:
@@ -160,14 +174,14 @@ def _inline(table: dict[str, Any]) -> tomlkit.items.InlineTable:
     return inline
 
 
-def _is_axis(name: str, value: Any) -> bool:
+def _is_axis(name: str, value: Any, parameters: Mapping[str, Parameter]) -> bool:
     """Return whether a value of ``--set`` makes an axis."""
-    if name not in PARAMETERS:
+    if name not in parameters:
         return True
     if isinstance(value, dict):
         return not DISTRIBUTION_FORMS.keys() & value.keys()
     if not isinstance(value, list):
         return False
-    if tuple in PARAMETERS[name].types:
+    if tuple in parameters[name].types:
         return bool(value) and all(isinstance(item, list) for item in value)
     return True

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import types
 import typing
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
+from sweep.declaration import Declaration, plain_types
 from sweep.measure.bound import BoundSetting
 from sweep.measure.detector import DetectorSetting
+from sweep.measure.detectors import DetectorChoice, detector_name
 from sweep.measure.estimators import EstimatorSetting
 from sweep.messages import nearest
 from sweep.model.camera import Camera
-from sweep.model.declaration import Declaration
 from sweep.model.effects import Effects
 from sweep.model.marker import Marker
 from sweep.model.pose import Pose
@@ -37,7 +37,7 @@ SECTIONS: dict[str, tuple[tuple[type, ...], Stage]] = {
     "marker": ((Marker,), Stage.scene),
     "pose": ((Pose, WorldPose), Stage.scene),
     "scene": ((Scene, Effects, BoundSetting), Stage.scene),
-    "detector": ((DetectorSetting,), Stage.detection),
+    "detector": ((DetectorChoice, DetectorSetting), Stage.detection),
     "estimator": ((EstimatorSetting,), Stage.estimation),
 }
 """Section of a pipeline file -> the dataclasses that declare its parameters, and its stage."""
@@ -94,6 +94,8 @@ class Parameter:
                 if fault is None:
                     return value.strip().lower()
                 raise ValueError(fault)
+            if self.name == "detector":
+                return detector_name(value)
             if self.declaration.choices:
                 choice = self.declaration.choice(value)
                 if choice is not None:
@@ -126,18 +128,10 @@ def _gather() -> dict[str, Parameter]:
             if field.name in gathered:
                 raise TypeError(f"parameter {field.name} is declared twice")
             gathered[field.name] = Parameter(
-                field.name, section, stage, _types(hints[field.name]), field.default,
+                field.name, section, stage, plain_types(hints[field.name]), field.default,
                 field.metadata["declaration"],
             )
     return gathered
-
-
-def _types(hint: Any) -> tuple[type, ...]:
-    """Return the plain types of an annotation: ``float | None`` -> (float,)."""
-    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
-        kinds = [_types(part) for part in typing.get_args(hint) if part is not type(None)]
-        return tuple(kind for group in kinds for kind in group)
-    return (typing.get_origin(hint) or hint,)
 
 
 PARAMETERS: dict[str, Parameter] = _gather()

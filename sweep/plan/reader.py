@@ -19,7 +19,9 @@ from sweep.plan.axes import (
     zipped_axis,
 )
 from sweep.plan.draws import SAMPLINGS
-from sweep.plan.parameters import PARAMETERS, SECTIONS
+from sweep.plan.parameters import PARAMETERS, SECTIONS, Parameter
+from sweep.plan.plugins import NAMED_BY, parameters_with, read_plugins
+from sweep.plugins.declared import DeclaredPlugin
 
 MAX_TITLE_LENGTH = 200
 
@@ -43,10 +45,16 @@ class Reading:
         Path as written -> SHA-256, used instead of reading the files; None to read them.
     known_cameras
         The same of camera files alone, whose values the document has.
+    known_plugins
+        The plug-ins that a store has recorded, used instead of importing them; None to import.
     title, seed, sampling, fixed, distributions, axes, files
         As :class:`sweep.plan.experiment.Pipeline` has them; ``axes`` by name.
     given
         Names of the parameters that the document has, even with a value that cannot be.
+    plugins, parameters
+        The plug-ins that the document names, and every parameter by its name, theirs included.
+    unread
+        Sections of plug-ins that cannot be used: any key may be theirs.
     stated
         Values that a camera file has, by parameter: they are written into the document's text.
     faults
@@ -58,6 +66,7 @@ class Reading:
     folder: Path
     known_files: Mapping[str, str] | None
     known_cameras: Mapping[str, str] | None = None
+    known_plugins: Sequence[DeclaredPlugin] | None = None
     title: str = ""
     seed: int = 0
     sampling: str = SAMPLINGS[0]
@@ -67,6 +76,9 @@ class Reading:
     files: dict[str, str] = field(default_factory=dict)
     given: set[str] = field(default_factory=set)
     stated: dict[str, Any] = field(default_factory=dict)
+    plugins: tuple[DeclaredPlugin, ...] = ()
+    parameters: Mapping[str, Parameter] = field(default_factory=lambda: PARAMETERS)
+    unread: set[str] = field(default_factory=set)
     faults: list[str] = field(default_factory=list)
 
     def fault(self, key: str, value: Any, expected: str) -> None:
@@ -114,10 +126,12 @@ class Reading:
 def read_keys(
     document: Mapping[str, Any], source: str, folder: Path,
     known_files: Mapping[str, str] | None = None, known_cameras: Mapping[str, str] | None = None,
+    known_plugins: Sequence[DeclaredPlugin] | None = None,
 ) -> Reading:
     """Return what the keys of a document say, each checked on its own (as :class:`Reading`)."""
-    reading = Reading(document, source, folder, known_files, known_cameras)
+    reading = Reading(document, source, folder, known_files, known_cameras, known_plugins)
     _read_header(reading)
+    _read_plugins(reading)
     known = [*HEADER, *SECTIONS, "axes"]
     for key, value in document.items():
         if key in HEADER:
@@ -125,15 +139,15 @@ def read_keys(
         if key == "axes" or key in SECTIONS:
             if not isinstance(value, dict):
                 reading.fault(key, value, f"a table: [{key}]")
-        elif key in PARAMETERS:
-            reading.fault(key, value, f"it under [{PARAMETERS[key].section}]")
+        elif key in reading.parameters:
+            reading.fault(key, value, f"it under [{reading.parameters[key].section}]")
         else:
             kind = "a section" if isinstance(value, dict) else "a key"
             reading.unknown(key, f"unknown; expected {kind} of {', '.join(known)}", key, known)
     for section in SECTIONS:
         _read_section(reading, section)
     _read_axes(reading)
-    for parameter in PARAMETERS.values():
+    for parameter in reading.parameters.values():
         if parameter.name not in reading.given:
             reading.fixed[parameter.name] = parameter.default
     return reading
@@ -160,19 +174,33 @@ def _read_header(reading: Reading) -> None:
         reading.sampling = sampling
 
 
+def _read_plugins(reading: Reading) -> None:
+    """Note the plug-ins that the document names, their files' digests, and their parameters."""
+    plugins, faults = read_plugins(
+        reading.document, str(reading.folder), reading.known_plugins
+    )
+    for kind, key, name, expected in faults:
+        reading.fault(key, name, expected)
+        reading.unread.add(NAMED_BY[kind][0])
+    reading.plugins, reading.parameters = tuple(plugins), parameters_with(tuple(plugins))
+    reading.files.update({each.file: each.digest for each in plugins if each.file})
+
+
 def _read_section(reading: Reading, section: str) -> None:
     table = reading.document.get(section, {})
     if not isinstance(table, dict):
         return
-    names = [p.name for p in PARAMETERS.values() if p.section == section]
+    names = [p.name for p in reading.parameters.values() if p.section == section]
     for key, value in table.items():
         path = f"{section}.{key}"
         if key not in names:
-            home = section_of(key)
+            home = section_of(key, reading.parameters)
+            if section in reading.unread and not home:
+                continue
             hint = f"; it belongs under [{home}]" if home else ""
             reading.unknown(path, f"unknown key{hint}", "" if home else key, names)
             continue
-        parameter = PARAMETERS[key]
+        parameter = reading.parameters[key]
         reading.given.add(key)
         try:
             if isinstance(value, dict):
@@ -183,11 +211,11 @@ def _read_section(reading: Reading, section: str) -> None:
             reading.fault(path, value, str(error))
 
 
-def section_of(name: str) -> str:
+def section_of(name: str, parameters: Mapping[str, Parameter] = PARAMETERS) -> str:
     """Return the section that a parameter belongs under; empty for an unknown name."""
     if name == TRIAL:
         return "axes"
-    return PARAMETERS[name].section if name in PARAMETERS else ""
+    return parameters[name].section if name in parameters else ""
 
 
 def _read_axes(reading: Reading) -> None:
@@ -196,7 +224,7 @@ def _read_axes(reading: Reading) -> None:
         return
     quota = MAX_LISTED
     for key, value in table.items():
-        if key not in PARAMETERS and key != TRIAL and is_zip(value):
+        if key not in reading.parameters and key != TRIAL and is_zip(value):
             axis = _read_zip(reading, key, value["zip"], quota)
         else:
             axis = _read_axis(reading, key, value, quota)
@@ -217,21 +245,22 @@ def _read_axis(reading: Reading, key: str, value: Any, quota: int, table: str = 
             return parse_trial(value)
         if key == TRIAL:
             reading.fault(path, value, "it as an axis of its own: every cell has the same trials")
-        elif key not in PARAMETERS and isinstance(value, dict) and (
-            not value.keys().isdisjoint(("zip", *PARAMETERS))
+        elif key not in reading.parameters and isinstance(value, dict) and (
+            not value.keys().isdisjoint(("zip", *reading.parameters))
         ):
             reading.fault(
                 path, value, "parameters that go together as "
                 "{ zip = { fx_px = [600, 800], fy_px = [600, 805] } }, with nothing beside zip",
             )
-        elif key not in PARAMETERS:
-            reading.unknown(path, "unknown parameter", key, [*PARAMETERS, TRIAL])
+        elif key not in reading.parameters:
+            if not reading.unread:
+                reading.unknown(path, "unknown parameter", key, [*reading.parameters, TRIAL])
         elif key in reading.given:
             other = _other_path(reading, key, path)
             reading.fault(path, value, f"it once: {other} is given too; delete one of them")
         else:
             reading.given.add(key)
-            return parse_axis(PARAMETERS[key], value, quota, repeats=bool(table))
+            return parse_axis(reading.parameters[key], value, quota, repeats=bool(table))
     except ValueError as error:
         reading.fault(path, value, str(error))
     return None
@@ -239,7 +268,7 @@ def _read_axis(reading: Reading, key: str, value: Any, quota: int, table: str = 
 
 def _other_path(reading: Reading, name: str, path: str) -> str:
     """Return where else than at ``path`` a document gives a parameter, for messages."""
-    section = PARAMETERS[name].section
+    section = reading.parameters[name].section
     tables = {section: reading.document.get(section), "axes": reading.document.get("axes")}
     tables |= {
         f"axes.{key}": value["zip"]
@@ -276,7 +305,7 @@ def _read_zip(reading: Reading, key: str, members: dict[str, Any], quota: int) -
     if len(columns) < max(len(members), 2):
         return None
     try:
-        return zipped_axis(key, columns)
+        return zipped_axis(key, columns, reading.parameters)
     except ValueError as error:
         reading.faults.append(f"{reading.source}: {path}: expected {error}")
         return None

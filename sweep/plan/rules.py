@@ -112,6 +112,30 @@ def fields_of_the_installed_opencv(reading: Reading) -> None:
         )
 
 
+def dictionaries_of_detectors(reading: Reading) -> None:
+    """Demand dictionaries that each plug-in's detector has."""
+    for plugin in reading.plugins:
+        if plugin.kind != "detector" or not plugin.dictionaries:
+            continue
+        for dictionary in reading.values("dictionary"):
+            if dictionary not in plugin.dictionaries:
+                reading.fault(
+                    "dictionary", dictionary,
+                    f"one that the detector {plugin.name} has: {', '.join(plugin.dictionaries)}",
+                )
+
+
+def names_of_settings(reading: Reading) -> None:
+    """Demand names that nothing else of the dataset has for settings of plug-ins."""
+    for plugin in reading.plugins:
+        reading.faults += [
+            f"{reading.source}: {plugin.name}: expected another name for its setting "
+            f"{setting.name}: the dataset or its analyses have this one"
+            for setting in plugin.settings
+            if setting.name in RESERVED or setting.name.startswith("_")
+        ]
+
+
 def something_random_to_repeat(reading: Reading) -> None:
     """Demand a random quantity if there is more than one trial."""
     trials = len(reading.axes[TRIAL]) if TRIAL in reading.axes else 1
@@ -219,6 +243,8 @@ RULES: tuple[Callable[[Reading], None], ...] = (
     threshold_windows_in_order,
     check_backgrounds,
     fields_of_the_installed_opencv,
+    dictionaries_of_detectors,
+    names_of_settings,
     something_random_to_repeat,
     trials_fill_replicates,
     names_of_axes,

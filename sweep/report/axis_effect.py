@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from sweep.analysis import error_statistics
-from sweep.plan.parameters import PARAMETERS
 from sweep.report.charts import draw_dots, draw_lines, rows_height
 from sweep.report.error_columns import ERRORS, INFINITE_ERRORS, RATES
 from sweep.report.figure import (
@@ -34,7 +33,7 @@ def effect_of(name: str) -> FigureKind:
 
 def _render(data: ReportData, name: str) -> RenderedFigure:
     axis = data.pipeline.axis(name)
-    meaning = PARAMETERS[name].declaration.meaning if axis is None else axis.meaning
+    meaning = data.pipeline.parameters[name].declaration.meaning if axis is None else axis.meaning
     numeric = axis is None or is_numeric(axis)
     grouping = data.along(name, MAX_BINS if numeric else MAX_ROWS)
     summary = data.analysed(error_statistics, grouping)

@@ -13,7 +13,6 @@ from typing import Any
 from sweep.messages import label
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.camera_facts import camera_facts, notes
-from sweep.plan.parameters import PARAMETERS
 from sweep.report.formatting import coordinates
 from sweep.report.gallery import pipeline_file
 from sweep.report.report_data import ReportData
@@ -117,7 +116,7 @@ def _axes(data: ReportData) -> Table | None:
 def _section(axis: Axis) -> str:
     """Return the sections of an axis' parameters."""
     names = [name for name in axis.columns if name != TRIAL]
-    return ", ".join(dict.fromkeys(PARAMETERS[name].section for name in names)) or "draws"
+    return ", ".join(dict.fromkeys(axis.parameter(name).section for name in names)) or "draws"
 
 
 def _meaning(axis: Axis) -> str:

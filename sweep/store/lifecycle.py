@@ -27,6 +27,7 @@ from sweep.plan.camera_values import stored_text
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.schema import SCHEMA
+from sweep.plugins.declared import RECORDED, recorded_plugins
 from sweep.store.checksums import DigestingStore
 from sweep.store.direct_reading import read_directly
 from sweep.store.durability import DurableStore, flush, flush_tree
@@ -118,7 +119,7 @@ def store_of(
         pipeline = Pipeline.from_text(
             stored_text(str(attributes["pipeline"]), metadata["format"]), name=metadata["name"],
             source=f"{url} (its pipeline)", folder=metadata["folder"],
-            files=metadata["fingerprint"]["files"],
+            files=metadata["fingerprint"]["files"], plugins=recorded_plugins(metadata),
         )
         lengths, extents = tuple(len(a) for a in scene_axes(pipeline)), tuple(metadata["block"])
         if len(extents) != len(lengths) or not all(
@@ -229,6 +230,10 @@ def _lay_out(to: Store, pipeline: Pipeline, extents: tuple[int, ...], run_id: st
             "block": list(extents),
             "fingerprint": fingerprint(pipeline),
             "environment": environment(),
+            **(
+                {RECORDED: [plugin.to_json() for plugin in pipeline.plugins]}
+                if pipeline.plugins else {}
+            ),
             "created": utc_now(),
             "finished": False,
         },

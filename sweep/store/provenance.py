@@ -96,7 +96,13 @@ def fingerprint(pipeline: Pipeline) -> dict[str, Any]:
         "seed": pipeline.seed,
         **({} if pipeline.sampling == SAMPLINGS[0] else {"sampling": pipeline.sampling}),
         "files": dict(sorted(pipeline.files.items())),
+        **({"plugins": versions_used} if (versions_used := plugin_versions(pipeline)) else {}),
     }
+
+
+def plugin_versions(pipeline: Pipeline) -> dict[str, dict[str, str]]:
+    """Return the versions of distributions that plug-ins depend on; a file is in ``files``."""
+    return {each.name: dict(each.versions) for each in pipeline.plugins if each.versions}
 
 
 def numbers_version(pipeline: Pipeline) -> int:

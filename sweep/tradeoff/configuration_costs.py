@@ -21,7 +21,7 @@ from sweep.evaluation.estimation import detections_for
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import SearchResult, search, visibility_flags, whole_frames
 from sweep.isolation.interrupts import Interrupts
-from sweep.measure.detector import Detector, DetectorOutput
+from sweep.measure.detectors import FindFunction, make_detector
 from sweep.measure.estimation import Detections, PoseEstimator
 from sweep.measure.estimators import EstimatorSetting, build
 from sweep.measure.flags import DetectionStatus
@@ -106,7 +106,7 @@ def measure(
     started = time.perf_counter()
     settings, estimating = detector_settings(pipeline), estimators(pipeline)
     configurations = _Configurations(
-        [Detector(setting).find for setting in settings], estimating,
+        [make_detector(setting) for setting in settings], estimating,
         [build(estimator) for estimator in estimating],
     )
 
@@ -150,7 +150,7 @@ def measure(
 class _Configurations:
     """The detector settings and the estimators, ready to be timed."""
 
-    finders: Sequence[Callable[[Grey, str, int], DetectorOutput]]
+    finders: Sequence[FindFunction]
     settings: Sequence[EstimatorSetting]
     estimators: Sequence[PoseEstimator]
 
@@ -196,7 +196,7 @@ class _Configurations:
 
 
 def _search_all(
-    find: Callable[[Grey, str, int], DetectorOutput], images: Mapping[int, Grey], scenes: Scenes,
+    find: FindFunction, images: Mapping[int, Grey], scenes: Scenes,
     sides: Sequence[int],
 ) -> None:
     for row, image in images.items():

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.measure.detector import full_frame_reason
+from sweep.measure.detectors import full_frame_reason
 from sweep.plan.axes import TRIAL
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings, scene_axes

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import types
+import typing
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,3 +76,15 @@ def parameter(default: Any, meaning: str, **declared: Any) -> Any:
     """Return a dataclass field that carries its :class:`Declaration` (keywords as its fields)."""
     declaration = Declaration(meaning, **declared)
     return dataclasses.field(default=default, metadata={"declaration": declaration})
+
+
+def plain_types(hint: Any) -> tuple[type, ...]:
+    """Return the plain types of an annotation, without None.
+
+    >>> plain_types(float | None), plain_types(tuple[float, ...])
+    ((<class 'float'>,), (<class 'tuple'>,))
+    """
+    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
+        kinds = [plain_types(part) for part in typing.get_args(hint) if part is not type(None)]
+        return tuple(kind for group in kinds for kind in group)
+    return (typing.get_origin(hint) or hint,)

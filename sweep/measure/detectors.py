@@ -1,0 +1,132 @@
+"""The detectors: OpenCV's and those of plug-ins, each made from its setting."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.declaration import parameter
+from sweep.errors import PluginError
+from sweep.measure import detector as opencv
+from sweep.measure.detector import UNEVEN_LIGHT_CONSTANT, Detector, DetectorOutput, DetectorSetting
+from sweep.measure.plugged_detector import PluggedDetector
+from sweep.plugins import DetectorPlugin
+from sweep.plugins.declared import DeclaredPlugin
+
+OPENCV = "opencv"
+"""The detector that is no plug-in, ``cv2.aruco.ArucoDetector``."""
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorChoice:
+    """Which detector searches the images."""
+
+    detector: str = parameter(
+        OPENCV, "opencv: cv2.aruco.ArucoDetector, which has the settings below; or a plug-in: the "
+        "name of an installed one, or module:name in a file beside the pipeline",
+    )
+
+
+def detector_name(written: str) -> str:
+    """Return a detector's name as pipelines write it: OpenCV's in any case of letters."""
+    name = written.strip()
+    return OPENCV if name.casefold() == OPENCV else name
+
+
+@dataclass(frozen=True, slots=True)
+class PluginSetting:
+    """One setting of a plug-in's detector.
+
+    Attributes
+    ----------
+    plugin
+        The plug-in.
+    values
+        Name and value of each of its settings.
+    folder
+        Where its file is.
+    """
+
+    plugin: DeclaredPlugin
+    values: tuple[tuple[str, Any], ...]
+    folder: str
+
+    def record(self) -> DetectorPlugin:
+        """Return the plug-in's record; PluginError if it is not the one that was declared."""
+        return cast("DetectorPlugin", self.plugin.record(self.folder))
+
+    def instance(self) -> Any:
+        """Return its settings as an instance of the plug-in's own dataclass; None without."""
+        settings = self.record().settings
+        return None if settings is None else settings(**dict(self.values))
+
+
+AnyDetectorSetting = DetectorSetting | PluginSetting
+"""A setting of any detector."""
+
+FindFunction = Callable[[NDArray[np.uint8], str, int], DetectorOutput]
+"""A search of an image (h, w): a window of a frame whose larger side is the last argument, for
+markers of a dictionary."""
+
+
+def make_detector(setting: AnyDetectorSetting) -> FindFunction:
+    """Return the search that a setting describes; those of plug-ins are kept by the process.
+
+    Raises
+    ------
+    PluginError
+        If a plug-in cannot be used.
+    """
+    if isinstance(setting, DetectorSetting):
+        return Detector(setting).find
+    return _kept_plugin(setting).find
+
+
+@lru_cache(maxsize=1024)
+def _kept_plugin(setting: PluginSetting) -> PluggedDetector:
+    return PluggedDetector(setting.plugin.name, setting.record(), setting.instance())
+
+
+def full_frame_reason(setting: AnyDetectorSetting) -> str | None:
+    """Return why a setting must search the whole frame; None if it can search a window."""
+    if isinstance(setting, DetectorSetting):
+        return opencv.full_frame_reason(setting)
+    if _margin_px(setting) is None:
+        return f"{setting.plugin.name} declares no margin_px"
+    return None
+
+
+def margin_px(setting: AnyDetectorSetting) -> int:
+    """Return the width of the border around the marker whose pixels can change the detection."""
+    if isinstance(setting, DetectorSetting):
+        return opencv.margin_px(setting)
+    return _margin_px(setting) or 0
+
+
+def uneven_light_needs_frame(setting: AnyDetectorSetting, gain: Any) -> Any:
+    """Return whether uneven light, amplified by ``gain`` (...; 0: even), needs whole frames."""
+    if isinstance(setting, DetectorSetting):
+        return setting.adaptiveThreshConstant < UNEVEN_LIGHT_CONSTANT * gain
+    return np.zeros(np.shape(gain), dtype=bool)
+
+
+@lru_cache(maxsize=1024)
+def _margin_px(setting: PluginSetting) -> int | None:
+    margin = setting.record().margin_px
+    if callable(margin):
+        try:
+            margin = margin(setting.instance())
+        except Exception as error:
+            raise PluginError(f"{setting.plugin.name}: margin_px raises {error!r}") from error
+    if margin is None:
+        return None
+    if not isinstance(margin, int) or not 0 <= margin < 1 << 31:
+        raise PluginError(
+            f"{setting.plugin.name}: margin_px = {margin!r}: expected a whole number, at least 0"
+        )
+    return margin

@@ -1,0 +1,190 @@
+"""A plug-in as pipelines and stores know it: all that can be said of it without importing it."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from sweep.declaration import Declaration, plain_types
+from sweep.errors import PluginError
+from sweep.plugins import DetectorPlugin, Plugin
+from sweep.plugins.loading import file_of, load, read_source, versions_of
+
+TYPES: dict[str, type] = {"float": float, "int": int, "bool": bool, "str": str}
+"""Types that a setting may have."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One setting of a plug-in: name, types, default and declaration."""
+
+    name: str
+    types: tuple[type, ...]
+    default: Any
+    declaration: Declaration
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as a store records it."""
+        declared = {
+            field.name: value for field in dataclasses.fields(Declaration)
+            if (value := getattr(self.declaration, field.name)) != field.default
+            and not (isinstance(value, float) and math.isinf(value))
+        }
+        return {"name": self.name, "types": [kind.__name__ for kind in self.types],
+                "default": self.default, **declared}
+
+    @staticmethod
+    def from_json(record: Mapping[str, Any]) -> Setting:
+        """Return the setting of a record; KeyError, TypeError or ValueError if it is none."""
+        declared: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value
+            for key, value in record.items() if key not in ("name", "types", "default")
+        }
+        name, kinds = record["name"], tuple(TYPES[kind] for kind in record["types"])
+        if not isinstance(name, str) or not name.isidentifier():
+            raise ValueError(name)
+        return Setting(name, kinds, record["default"], Declaration(**declared))
+
+
+@dataclass(frozen=True, slots=True)
+class DeclaredPlugin:
+    """A plug-in that a pipeline names.
+
+    Attributes
+    ----------
+    kind, name
+        What it is ("detector"), and its name in the pipeline.
+    meaning
+        One line.
+    versions
+        Distributions that its results depend on, with their versions.
+    file, digest
+        The file that has it, relative to the pipeline, and its SHA-256; empty for installed ones.
+    settings
+        Its settings.
+    dictionaries
+        Those that a detector knows; empty for all.
+    threads
+        Threads that it uses.
+    """
+
+    kind: str
+    name: str
+    meaning: str = ""
+    versions: tuple[tuple[str, str], ...] = ()
+    file: str = ""
+    digest: str = ""
+    settings: tuple[Setting, ...] = ()
+    dictionaries: tuple[str, ...] = ()
+    threads: int = 1
+
+    def record(self, folder: str) -> Plugin:
+        """Return the plug-in's record, imported; ``folder`` is that of the pipeline.
+
+        Raises
+        ------
+        PluginError
+            If it is not the plug-in that was declared; in one line.
+        """
+        try:
+            record = load(self.kind, self.name, folder, self.digest)
+            versions = versions_of(self.kind, self.name, record)
+        except PluginError as error:
+            raise PluginError(f"{self.kind} {self.name}: expected {error}") from error
+        if versions != self.versions:
+            raise PluginError(
+                f"{self.kind} {self.name}: expected {_listed(self.versions)}, "
+                f"not {_listed(versions)}"
+            )
+        return record
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as a store records it."""
+        return {
+            "kind": self.kind, "name": self.name, "meaning": self.meaning,
+            "versions": dict(self.versions), "file": self.file, "digest": self.digest,
+            "settings": [setting.to_json() for setting in self.settings],
+            "dictionaries": list(self.dictionaries), "threads": self.threads,
+        }
+
+    @staticmethod
+    def from_json(record: Mapping[str, Any]) -> DeclaredPlugin:
+        """Return the plug-in of a record; KeyError, TypeError or ValueError if it is none."""
+        texts = {key: record[key] for key in ("kind", "name", "meaning", "file", "digest")}
+        versions = tuple(sorted(record["versions"].items()))
+        dictionaries, threads = tuple(record["dictionaries"]), record["threads"]
+        words = [*texts.values(), *dictionaries, *(word for pair in versions for word in pair)]
+        if not all(isinstance(word, str) for word in words) or not isinstance(threads, int):
+            raise TypeError(record["name"])
+        return DeclaredPlugin(
+            **texts, versions=versions, dictionaries=dictionaries, threads=threads,
+            settings=tuple(Setting.from_json(setting) for setting in record["settings"]),
+        )
+
+
+def recorded_plugins(metadata: Mapping[str, Any]) -> tuple[DeclaredPlugin, ...]:
+    """Return the plug-ins that a store's metadata record; none for stores without plug-ins.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError, AttributeError
+        If they are not what :meth:`DeclaredPlugin.to_json` returns.
+    """
+    return tuple(DeclaredPlugin.from_json(record) for record in metadata.get(RECORDED, ()))
+
+
+RECORDED = "plugins"
+"""Key of the plug-ins in a store's metadata."""
+
+
+def _listed(versions: tuple[tuple[str, str], ...]) -> str:
+    return ", ".join(f"{name} {version}" for name, version in versions) or "none"
+
+
+def declare(kind: str, name: str, folder: str) -> DeclaredPlugin:
+    """Import a plug-in and return what it declares.
+
+    Raises
+    ------
+    PluginError
+        In one line, what was expected instead.
+    """
+    file = file_of(name)
+    record = load(kind, name, folder)
+    digest = "" if file is None else hashlib.sha256(read_source(file, folder)).hexdigest()
+    dictionaries: tuple[str, ...] = ()
+    if isinstance(record, DetectorPlugin) and record.families is not None:
+        dictionaries = tuple(record.families)
+    return DeclaredPlugin(
+        kind, name, record.meaning, versions_of(kind, name, record), file or "", digest,
+        tuple(_settings(record)), dictionaries, getattr(record, "threads", 1),
+    )
+
+
+def _settings(record: Plugin) -> Iterator[Setting]:
+    """Yield the settings that a plug-in's dataclass declares."""
+    if record.settings is None:
+        return
+    if not dataclasses.is_dataclass(record.settings):
+        raise PluginError("settings that are a dataclass")
+    try:
+        hints = typing.get_type_hints(record.settings)
+    except Exception as error:
+        raise PluginError(f"settings whose annotations can be read: {error}") from None
+    for field in dataclasses.fields(record.settings):
+        declaration = field.metadata.get("declaration")
+        kinds = plain_types(hints[field.name])
+        if not isinstance(declaration, Declaration) or not set(kinds) <= set(TYPES.values()):
+            raise PluginError(
+                f"the setting {field.name} as `name: type = parameter(default, meaning)` with "
+                f"one of the types {', '.join(TYPES)}"
+            )
+        default = field.default
+        if default is not None and type(default) is int and kinds == (float,):
+            default = float(default)
+        yield Setting(field.name, kinds, default, declaration)

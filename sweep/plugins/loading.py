@@ -1,0 +1,209 @@
+"""Plug-ins by name: entry points, whose names are read without importing, and files.
+
+A file is executed from the bytes whose digest is taken. It is a module of its own: others beside
+it are not importable, so that the digest says all of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.metadata
+import importlib.util
+import sys
+import traceback
+from collections.abc import Iterator
+from functools import lru_cache
+from importlib.metadata import EntryPoint, PackageNotFoundError
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from sweep.errors import PluginError
+from sweep.messages import nearest, plain
+from sweep.plugins import RECORDS, Plugin
+
+OWN_DISTRIBUTION = "fiducial-sweep"
+"""Its adapters' results change with the version of the numbers, which is recorded in any case."""
+
+MAX_SOURCE_BYTES = 1 << 20
+
+
+def group_of(kind: str) -> str:
+    """Return the group of entry points of a kind of plug-in."""
+    return f"sweep.{kind}s"
+
+
+def installed_names(kind: str) -> list[str]:
+    """Return the names of the installed plug-ins of a kind, in order; none is imported."""
+    return sorted({entry.name for entry in importlib.metadata.entry_points(group=group_of(kind))})
+
+
+def file_of(name: str) -> str | None:
+    """Return the file that ``module:attribute`` names, relative to the pipeline; None for others.
+
+    >>> file_of("mine:Detector"), file_of("own/mine.py:Detector"), file_of("pyapriltags")
+    ('mine.py', 'own/mine.py', None)
+    """
+    module, colon, _ = name.rpartition(":")
+    if not colon:
+        return None
+    return module if module.endswith(".py") else f"{module.replace('.', '/')}.py"
+
+
+def load(kind: str, name: str, folder: str, digest: str = "") -> Plugin:
+    """Return a plug-in's record.
+
+    Parameters
+    ----------
+    kind
+        A key of :data:`sweep.plugins.RECORDS`.
+    name
+        Of an entry point, or ``module:attribute``.
+    folder
+        Where files are.
+    digest
+        The SHA-256 that the file must have; empty for any.
+
+    Raises
+    ------
+    PluginError
+        In one line, what was expected instead.
+    """
+    file = file_of(name)
+    if file is None:
+        return _of_entry_point(kind, name)
+    source = read_source(file, folder)
+    found = hashlib.sha256(source).hexdigest()
+    if digest and found != digest:
+        raise PluginError(f"{file} as it was when the run began: it was changed in {folder}")
+    return _of_file(kind, name, str(Path(folder) / file), found, source)
+
+
+def read_source(file: str, folder: str) -> bytes:
+    """Return the content of a plug-in's file; PluginError if it cannot be read."""
+    try:
+        path = Path(folder) / file
+        if path.stat().st_size > MAX_SOURCE_BYTES:
+            raise PluginError(f"a file of at most {MAX_SOURCE_BYTES:,} bytes ({file})")
+        return path.read_bytes()
+    except (OSError, ValueError) as error:
+        reason = (error.strerror if isinstance(error, OSError) else None) or error
+        raise PluginError(
+            f"the file {plain(file)} in {plain(folder)} ({reason}); packages offer plug-ins by "
+            "entry points"
+        ) from None
+
+
+def entry_point(kind: str, name: str) -> EntryPoint:
+    """Return the entry point of an installed plug-in.
+
+    Raises
+    ------
+    PluginError
+        If there is none, or several distributions offer the name.
+    """
+    offered = {
+        (entry.value, entry.dist.name if entry.dist else ""): entry
+        for entry in importlib.metadata.entry_points(group=group_of(kind), name=name)
+    }
+    if not offered:
+        names = installed_names(kind)
+        hint = nearest(name, names) or f"; installed: {', '.join(names) or 'none'}"
+        raise PluginError(f"an installed {kind} plug-in, or file:name beside the pipeline{hint}")
+    if len(offered) > 1:
+        owners = " and ".join(sorted(owner for _, owner in offered))
+        raise PluginError(f"a name that one distribution offers: {owners} both have it")
+    return next(iter(offered.values()))
+
+
+@lru_cache(maxsize=256)
+def _of_entry_point(kind: str, name: str) -> Plugin:
+    entry = entry_point(kind, name)
+    with _import_faults(), contextlib.redirect_stdout(sys.stderr):
+        found = entry.load()
+    return _record(kind, found)
+
+
+@lru_cache(maxsize=256)
+def _of_file(kind: str, name: str, path: str, digest: str, source: bytes) -> Plugin:
+    module = _module(path, digest, source)
+    attribute = name.rpartition(":")[2]
+    if not hasattr(module, attribute):
+        known = [each for each in vars(module) if not each.startswith("_")]
+        raise PluginError(f"a name in {Path(path).name}{nearest(attribute, known)}")
+    return _record(kind, getattr(module, attribute))
+
+
+@lru_cache(maxsize=256)
+def _module(path: str, digest: str, source: bytes) -> ModuleType:
+    """Execute a file once in each process."""
+    name = f"sweep_plugin_{digest[:12]}_{Path(path).stem}"
+    module = ModuleType(name)
+    module.__file__ = path
+    sys.modules[name] = module  # dataclasses find their annotations there
+    with _import_faults(path), contextlib.redirect_stdout(sys.stderr):
+        exec(compile(source, path, "exec"), module.__dict__)  # noqa: S102  (the user's own file)
+    return module
+
+
+@contextlib.contextmanager
+def _import_faults(path: str = "") -> Iterator[None]:
+    """Raise PluginError for whatever importing a plug-in raises, also for an attempt to exit."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        lines = [line for file, line, *_ in traceback.extract_tb(error.__traceback__)
+                 if file == path]
+        if isinstance(error, SyntaxError):
+            lines = [error.lineno or 0]
+        where = f" (line {lines[-1]} of {Path(path).name})" if path and lines else ""
+        raise PluginError(
+            f"a plug-in that can be imported: {exception_line(error)}{where}"
+        ) from error
+
+
+def exception_line(error: BaseException) -> str:
+    """Return an exception as one line: its type, and the first line of its message."""
+    text = str(error).strip().partition("\n")[0]
+    return plain(f"{type(error).__name__}: {text}" if text else type(error).__name__)
+
+
+def _record(kind: str, found: Any) -> Plugin:
+    """Return the record that a name leads to; a class or function is a detector's factory."""
+    wanted: Any = RECORDS[kind]
+    if isinstance(found, Plugin) and isinstance(found, wanted):
+        return found
+    if isinstance(found, Plugin) or not callable(found):
+        raise PluginError(f"a {wanted.__name__}, not a {type(found).__name__}")
+    try:
+        made: Plugin = wanted(make=found)
+    except TypeError:
+        raise PluginError(f"a {wanted.__name__}, not a {type(found).__name__}") from None
+    return made
+
+
+def versions_of(kind: str, name: str, record: Plugin) -> tuple[tuple[str, str], ...]:
+    """Return the distributions that a plug-in's results depend on, with their versions.
+
+    Raises
+    ------
+    PluginError
+        If one is not installed.
+    """
+    versions = {}
+    for distribution in record.distributions:
+        try:
+            versions[distribution] = importlib.metadata.version(distribution)
+        except PackageNotFoundError:
+            command = record.install or f"pip install {distribution}"
+            raise PluginError(
+                f"the distribution {distribution}, which is not installed: `{command}`"
+            ) from None
+    if file_of(name) is None:
+        owner = entry_point(kind, name).dist
+        if owner is not None and owner.name != OWN_DISTRIBUTION:
+            versions[owner.name] = owner.version
+    return tuple(sorted(versions.items()))

@@ -13,11 +13,14 @@ from sweep.analysis.comparisons import compare
 from sweep.analysis.covariances import covariance_trust
 from sweep.analysis.detection_limits import detection_limit
 from sweep.analysis.error_summaries import error_statistics
+from sweep.analysis.farthest import farthest_met
 from sweep.analysis.ranking import marker_ranking
 from sweep.analysis.rates import detection_rate, failure_composition, flip_rate
 from sweep.analysis.renderers import renderer_bias
+from sweep.analysis.requirements import check_requirements
 
 __all__ = [
-    "ambiguity", "compare", "covariance_trust", "detection_limit", "detection_rate", "efficiency",
-    "error_statistics", "failure_composition", "flip_rate", "marker_ranking", "renderer_bias",
+    "ambiguity", "check_requirements", "compare", "covariance_trust", "detection_limit",
+    "detection_rate", "efficiency", "error_statistics", "failure_composition", "farthest_met",
+    "flip_rate", "marker_ranking", "renderer_bias",
 ]

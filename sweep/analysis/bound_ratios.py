@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
@@ -13,6 +14,7 @@ from sweep.analysis.dimensions import kept_dimensions
 from sweep.analysis.means import RootMeanSquare
 from sweep.analysis.pose_view import DEPTH, ERROR_INPUTS, Poses, norm_squared, pose_arrays, relative
 from sweep.analysis.quantities import QUANTITIES, Quantity
+from sweep.analysis.statistic import Output
 from sweep.plan.schema import XYZ
 from sweep.typing import Floats, Masks
 
@@ -64,48 +66,75 @@ def efficiency(
     [0.544, 0.27]
     """
     kept = kept_dimensions(results, per)
-    labels = [f"rotation_{axis}" for axis in XYZ]
-    bound = results.get("bound_std", xr.DataArray(
-        np.full(4, np.nan), {"pose_parameter": [*labels, "translation_z"]}, "pose_parameter"
-    ))
-    inputs = pose_arrays(results, ERROR_INPUTS) | {
-        "rotation_bound": bound.sel(pose_parameter=labels),
-        "depth_bound": bound.sel(pose_parameter="translation_z", drop=True),
-    }
-    rotation, depth = QUANTITIES[:2]
-    bounds: dict[Quantity, Callable[[Poses], Floats]] = {
-        rotation: lambda poses: norm_squared(np.degrees(poses["rotation_bound"])),
-        depth: lambda poses: (100.0 * relative(poses["depth_bound"], poses[DEPTH])) ** 2,
-    }
-    statistics = [statistic for quantity, bound_squared in bounds.items()
-                  for statistic in _bound_and_error(quantity, bound_squared)]
+    inputs = pose_arrays(results, ERROR_INPUTS) | bound_arrays(results)
+    statistics = [statistic for ratio in RATIOS for statistic in ratio.statistics()]
     table = aggregate(results, inputs, kept, statistics, Poses, bins)
     variables: dict[str, xr.DataArray] = {}
-    for quantity in bounds:
-        least, meaning = table[quantity.named("bound")], f"RMS bound over RMS {quantity.words}"
-        name, error = f"{quantity.name}_efficiency", quantity.named("rmse")
+    for ratio in RATIOS:
+        bound, error = (statistic.name for statistic in ratio.statistics())
         for ending, other, words in (
             ("", "", ""), ("_low", "_high", "lower end of the 95 % interval: "),
             ("_high", "_low", "upper end of the 95 % interval: "),
         ):
-            ratio = least / table[f"{error}{other}"]
-            variables[f"{name}{ending}"] = ratio.assign_attrs(
-                long_name=f"{words}{meaning}, solved and not flipped", units="1")
+            variables[f"{ratio.output.name}{ending}"] = (
+                table[bound] / table[f"{error}{other}"]).assign_attrs(
+                    long_name=f"{words}{ratio.output.meaning}", units="1")
     return xr.Dataset(variables, dict(table.coords))
 
 
-def _bound_and_error(
-    quantity: Quantity, bound_squared: Callable[[Poses], Floats]
-) -> list[RootMeanSquare[Poses]]:
-    """Return the RMS bound and the RMS error of the poses that have both."""
-    def used(poses: Poses) -> Masks:
-        return poses.unflipped & np.isfinite(bound_squared(poses))
+def bound_arrays(results: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Return the bounds by the names that `BoundRatio` reads; NaN without ``bound_std``."""
+    labels = [f"rotation_{axis}" for axis in XYZ]
+    bound = results.get("bound_std", xr.DataArray(
+        np.full(4, np.nan), {"pose_parameter": [*labels, "translation_z"]}, "pose_parameter"
+    ))
+    return {
+        "rotation_bound": bound.sel(pose_parameter=labels),
+        "depth_bound": bound.sel(pose_parameter="translation_z", drop=True),
+    }
 
-    return [
-        RootMeanSquare(
-            quantity.named("bound"), f"RMS bound of the {quantity.words}", quantity.units,
-            lambda poses: bound_squared(poses)[..., None], used),
-        RootMeanSquare(
-            quantity.named("rmse"), f"RMS {quantity.words} of poses with a bound",
-            quantity.units, quantity.squares, used),
-    ]
+
+@dataclass(frozen=True)
+class BoundRatio:
+    """The RMS bound over the RMS error of a kind of error.
+
+    Attributes
+    ----------
+    quantity
+        The kind of error.
+    bound_squared
+        The squared bounds (...) of poses.
+    """
+
+    quantity: Quantity
+    bound_squared: Callable[[Poses], Floats]
+
+    @property
+    def output(self) -> Output:
+        """The ratio's name and meaning."""
+        words = f"RMS bound over RMS {self.quantity.words}, solved and not flipped"
+        return Output(f"{self.quantity.name}_efficiency", words, "1")
+
+    def statistics(self) -> tuple[RootMeanSquare[Poses], RootMeanSquare[Poses]]:
+        """Return the RMS bound and the RMS error of the poses that have both."""
+        quantity = self.quantity
+        return (
+            RootMeanSquare(
+                quantity.named("bound"), f"RMS bound of the {quantity.words}", quantity.units,
+                lambda poses: self.bound_squared(poses)[..., None], self.used),
+            RootMeanSquare(
+                quantity.named("rmse"), f"RMS {quantity.words} of poses with a bound",
+                quantity.units, quantity.squares, self.used),
+        )
+
+    def used(self, poses: Poses) -> Masks:
+        """Return the poses that have a bound and are solved and not flipped."""
+        return poses.unflipped & np.isfinite(self.bound_squared(poses))
+
+
+RATIOS = (
+    BoundRatio(QUANTITIES[0], lambda poses: norm_squared(np.degrees(poses["rotation_bound"]))),
+    BoundRatio(QUANTITIES[1],
+               lambda poses: (100.0 * relative(poses["depth_bound"], poses[DEPTH])) ** 2),
+)
+"""Of the rotation and of the depth."""

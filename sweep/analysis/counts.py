@@ -72,12 +72,14 @@ class CountOfDraws(SinglePass[ViewT, Sample], Generic[ViewT]):
     name: str
     meaning: str
     of: Callable[[ViewT], Masks]
+    draws: str = "draws"
+    drawn: str = "drawn"
 
     def outputs(self) -> Sequence[Output]:
         """Return the three variables."""
         return [Output(self.name, self.meaning, "1", "i8"),
-                Output("draws", "random draws that the intervals are of", "1", "i8"),
-                Output("drawn", "whether any cell has two draws", "1", "?")]
+                Output(self.draws, "random draws that the intervals are of", "1", "i8"),
+                Output(self.drawn, "whether any cell has two draws", "1", "?")]
 
     def first_pass(self, poses: ViewT) -> BlockSample:
         """Count."""
@@ -85,7 +87,7 @@ class CountOfDraws(SinglePass[ViewT, Sample], Generic[ViewT]):
 
     def result(self, state: Sample) -> Variables:
         """Return the counts."""
-        return {self.name: state.n, "draws": state.draws, "drawn": state.drawn}
+        return {self.name: state.n, self.draws: state.draws, self.drawn: state.drawn}
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from sweep.analysis.dimensions import axes_of, kept_dimensions
 from sweep.analysis.intervals import LEVEL
 from sweep.analysis.means import PositiveMean
 from sweep.analysis.pose_view import ESTIMATE_INPUTS, Poses, pose_arrays
+from sweep.analysis.registry import PoseStatistic
 from sweep.analysis.statistic import Statistic
 from sweep.errors import ArgumentError
 from sweep.plan.schema import POSE_PARAMETERS
@@ -25,6 +26,21 @@ TOLERANCE = 0.02
 
 MIN_DRAWS = 50
 """Draws from which on a covariance can be trusted."""
+
+
+def _nees(poses: Poses) -> Floats:
+    return poses["nees"].astype(np.float64)
+
+
+def _with_nees(poses: Poses) -> Masks:
+    return poses.solved & ~np.isnan(_nees(poses))
+
+
+NEES_MEAN = PoseStatistic(
+    PositiveMean("nees_mean", "mean normalised estimation error squared, expected 6", "1",
+                 lambda poses: _nees(poses)[..., None], _with_nees),
+    (*ESTIMATE_INPUTS, "nees"))
+"""The mean of ``nees``."""
 
 
 def covariance_trust(
@@ -140,24 +156,15 @@ def _nees_statistics(limits: Sequence[float]) -> list[Statistic[Poses, Any, Any,
     """
     joint = 1.0 - (1.0 - LEVEL) / len(limits)
 
-    def values(poses: Poses) -> Floats:
-        return poses["nees"].astype(np.float64)
-
-    def used(poses: Poses) -> Masks:
-        return poses.solved & ~np.isnan(values(poses))
-
-    statistics: list[Statistic[Poses, Any, Any, Any]] = [
-        PositiveMean("nees_mean", "mean normalised estimation error squared, expected 6", "1",
-                     lambda poses: values(poses)[..., None], used),
-    ]
+    statistics: list[Statistic[Poses, Any, Any, Any]] = [NEES_MEAN.statistic]
     for at, limit in enumerate(limits):
         def within(poses: Poses, most: float = limit) -> Masks:
-            return np.asarray(values(poses) <= most)
+            return np.asarray(_nees(poses) <= most)
 
         statistics += [
-            Rate(f"coverage {at}", "within the region of used", within, used,
+            Rate(f"coverage {at}", "within the region of used", within, _with_nees,
                  counts=(("nees_count", "estimates with a normalised estimation error squared"),
                          (f"hits {at}", ""))),
-            Rate(f"joint {at}", "within the region of used", within, used, joint),
+            Rate(f"joint {at}", "within the region of used", within, _with_nees, joint),
         ]
     return statistics

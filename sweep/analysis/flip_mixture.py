@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sweep.analysis.counts import BlockRateState, Rate, RateState, scaled_to_draws
-from sweep.analysis.intervals import clopper_pearson
+from sweep.analysis.intervals import LEVEL, clopper_pearson
 from sweep.analysis.means import BlockMeanState, CentredState, MeanState, RootMeanSquare
 from sweep.analysis.pose_view import Poses
 from sweep.analysis.states import BlockState, CellDeviations, Spread, State
@@ -105,13 +105,14 @@ class FlipMixture(Statistic[Poses, MixtureState, CentredMixture, MixtureSpread])
     """The largest error that exists, in the unit of the errors."""
     flips: Rate[Poses] = FLIPS
     """The share of flips, p."""
+    level: float = LEVEL
 
     def outputs(self) -> Sequence[Output]:
         """Return the root mean square and its interval."""
         return with_interval(self.name, self.meaning, self.units)
 
     def _of(self, used: Callable[[Poses], Masks]) -> RootMeanSquare[Poses]:
-        return RootMeanSquare("rms", "", self.units, self.squares, used)
+        return RootMeanSquare("rms", "", self.units, self.squares, used, self.level)
 
     @property
     def _unflipped(self) -> RootMeanSquare[Poses]:
@@ -153,7 +154,7 @@ class FlipMixture(Statistic[Poses, MixtureState, CentredMixture, MixtureSpread])
         largest = self.bound**2
         lows = _first_known(u_low, v_low), _first_known(v_low, u_low)
         highs = [np.fmin(high, largest) for high in (u_high, v_high)]
-        shares = _shares(self.flips.draws_of(known.flips), known.flips)
+        shares = _shares(self.flips.draws_of(known.flips), known.flips, self.level)
         low = np.minimum(*((1 - share) * lows[0] + share * lows[1] for share in shares))
         high = np.maximum(*((1 - share) * highs[0] + share * highs[1] for share in shares))
         # What is computed is rounded: the value lies in its interval.
@@ -169,7 +170,7 @@ def _first_known(*values: Floats) -> Floats:
     return np.nan_to_num(np.where(np.isnan(first), second, first), nan=0.0)
 
 
-def _shares(draws: Integers, flips: RateState) -> tuple[Floats, Floats]:
+def _shares(draws: Integers, flips: RateState, level: float) -> tuple[Floats, Floats]:
     """Return the ends of the share of flips, counted in draws."""
     fewest, most = scaled_to_draws(flips.hits, flips.sample.n, draws)
-    return clopper_pearson(fewest, draws)[0], clopper_pearson(most, draws)[1]
+    return clopper_pearson(fewest, draws, level)[0], clopper_pearson(most, draws, level)[1]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
-from sweep.analysis.intervals import LEVEL, TAIL
+from sweep.analysis.intervals import LEVEL
 from sweep.analysis.states import Spread
 from sweep.typing import Floats, Integers
 
@@ -43,29 +43,32 @@ def estimate_mean(mean: Floats, n: Integers, freedom: Integers, spread: Spread) 
     return MeanEstimate(np.where(n > 0, mean, np.nan), error, degrees)
 
 
-def half_width(estimate: MeanEstimate) -> Floats:
+def half_width(estimate: MeanEstimate, level: float = LEVEL) -> Floats:
     """Return half the width of Student's interval."""
-    return np.asarray(estimate.error * special.stdtrit(estimate.freedom, 1.0 - TAIL))
+    upper = 1.0 - (1.0 - level) / 2.0
+    return np.asarray(estimate.error * special.stdtrit(estimate.freedom, upper))
 
 
-def symmetric(estimate: MeanEstimate) -> tuple[Floats, Floats, Floats]:
+def symmetric(estimate: MeanEstimate, level: float = LEVEL) -> tuple[Floats, Floats, Floats]:
     """Return Student's interval of means: value, low, high."""
-    half = half_width(estimate)
+    half = half_width(estimate, level)
     return estimate.mean, estimate.mean - half, estimate.mean + half
 
 
-def exponential(estimate: MeanEstimate) -> tuple[Floats, Floats, Floats]:
+def exponential(estimate: MeanEstimate, level: float = LEVEL) -> tuple[Floats, Floats, Floats]:
     """Return the interval of positive means: Student's of the logarithm, by the delta method."""
     mean, error, freedom = estimate
     with np.errstate(all="ignore"):
-        factor = np.exp(error / mean * special.stdtrit(freedom, 1.0 - TAIL))
+        factor = np.exp(error / mean * special.stdtrit(freedom, 1.0 - (1.0 - level) / 2.0))
         positive = mean / factor, mean * factor
-    plain = symmetric(estimate)
+    plain = symmetric(estimate, level)
     low, high = (np.where(mean == 0.0, a, b) for a, b in zip(plain[1:], positive, strict=True))
     return mean, low, high
 
 
-def length_interval(estimate: MeanEstimate, components: int) -> tuple[Floats, Floats, Floats]:
+def length_interval(
+    estimate: MeanEstimate, components: int, level: float = LEVEL
+) -> tuple[Floats, Floats, Floats]:
     """Return the interval of the length of a mean vector, at least 0.
 
     Along its own direction the mean vector is a plain mean, and the upper end is Student's. The
@@ -75,10 +78,10 @@ def length_interval(estimate: MeanEstimate, components: int) -> tuple[Floats, Fl
     at least. With 50 normal errors of 3 components it covers 0.97 (a large bias) to 0.995 (a bias
     of its error).
     """
-    length, low, high = symmetric(estimate)
+    length, low, high = symmetric(estimate, level)
     rest = estimate.freedom - (components - 1)
     with np.errstate(invalid="ignore", divide="ignore"):
         reach = np.sqrt(
-            components * estimate.freedom / rest * special.fdtri(components, rest, LEVEL))
+            components * estimate.freedom / rest * special.fdtri(components, rest, level))
         low = np.where(rest > 0.0, np.fmax(0.0, length - reach * estimate.error), 0.0)
     return length, np.where(np.isnan(estimate.error), np.nan, low), high

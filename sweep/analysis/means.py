@@ -10,6 +10,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from sweep.analysis.groups import sum_of_settings
+from sweep.analysis.intervals import LEVEL
 from sweep.analysis.mean_intervals import (
     MeanEstimate,
     estimate_mean,
@@ -86,6 +87,7 @@ class Mean(Statistic[DrawnT, MeanState, CentredState, Spread], Generic[DrawnT]):
     units: str
     values: Callable[[DrawnT], Floats]
     used: Callable[[DrawnT], Masks]
+    level: float = LEVEL
 
     def outputs(self) -> Sequence[Output]:
         """Return the mean and its interval."""
@@ -131,7 +133,7 @@ class Mean(Statistic[DrawnT, MeanState, CentredState, Spread], Generic[DrawnT]):
         self, estimate: MeanEstimate, moments: Moments,  # noqa: ARG002
     ) -> tuple[Floats, Floats, Floats]:
         """Return value, low and high, from the mean of the scores."""
-        return symmetric(estimate)
+        return symmetric(estimate, self.level)
 
 
 def missing(values: Floats) -> Masks:
@@ -146,7 +148,7 @@ class PositiveMean(Mean[DrawnT]):
     def _interval(
         self, estimate: MeanEstimate, moments: Moments,  # noqa: ARG002
     ) -> tuple[Floats, Floats, Floats]:
-        return exponential(estimate)
+        return exponential(estimate, self.level)
 
 
 class RootMeanSquare(PositiveMean[DrawnT]):
@@ -160,7 +162,7 @@ class RootMeanSquare(PositiveMean[DrawnT]):
     def _interval(
         self, estimate: MeanEstimate, moments: Moments,  # noqa: ARG002
     ) -> tuple[Floats, Floats, Floats]:
-        mean, low, high = (np.sqrt(each) for each in exponential(estimate))
+        mean, low, high = (np.sqrt(each) for each in exponential(estimate, self.level))
         return mean, low, high
 
 
@@ -192,7 +194,7 @@ class MeanLength(Mean[DrawnT]):
     def _interval(
         self, estimate: MeanEstimate, moments: Moments
     ) -> tuple[Floats, Floats, Floats]:
-        return length_interval(estimate, moments.mean.shape[1])
+        return length_interval(estimate, moments.mean.shape[1], self.level)
 
 
 class RootMeanSquareRatio(Mean[DrawnT]):
@@ -211,7 +213,7 @@ class RootMeanSquareRatio(Mean[DrawnT]):
     def _interval(
         self, estimate: MeanEstimate, moments: Moments
     ) -> tuple[Floats, Floats, Floats]:
-        half = half_width(estimate) / 2.0
+        half = half_width(estimate, self.level) / 2.0
         with np.errstate(all="ignore"):
             ratio = np.sqrt(moments.mean[:, 1] / moments.mean[:, 0])
             return ratio, ratio * np.exp(-half), ratio * np.exp(half)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import special
 
 from sweep.analysis.groups import group_numbers
-from sweep.analysis.intervals import TAIL
+from sweep.analysis.intervals import LEVEL
 from sweep.analysis.radix_histogram import LowerTally, UpperTally
 from sweep.analysis.states import BlockSample, BlockState, Sample, State
 from sweep.analysis.statistic import (
@@ -99,6 +99,7 @@ class Quantiles(Statistic[ViewT, QuantileState, WantedRanks, LowerState], Generi
     solved: Callable[[ViewT], Masks]
     used: Callable[[ViewT], Masks]
     with_reason: bool = False
+    level: float = LEVEL
 
     def outputs(self) -> Sequence[Output]:
         """Return the quantiles and their intervals."""
@@ -126,7 +127,7 @@ class Quantiles(Statistic[ViewT, QuantileState, WantedRanks, LowerState], Generi
             ranks[:, at, 0] = -(-n * percent // 100)
             for count in np.unique(draws[drawn]).tolist():
                 same = (draws == count) & drawn
-                low, high = interval_ranks(count, percent)
+                low, high = interval_ranks(count, percent, self.level)
                 ranks[same, at, 1] = low * n[same] // count
                 # One beyond the last if there is no such draw.
                 ranks[same, at, 2] = -(-high * n[same] // count) if high <= count else n[same] + 1
@@ -162,10 +163,11 @@ class Quantiles(Statistic[ViewT, QuantileState, WantedRanks, LowerState], Generi
 
 
 @functools.lru_cache(maxsize=4096)
-def interval_ranks(n: int, percent: int) -> tuple[int, int]:
-    """Return the ranks, from 1, between which the quantile lies, beyond each with 2.5 % at most.
+def interval_ranks(n: int, percent: int, level: float = LEVEL) -> tuple[int, int]:
+    """Return the ranks, from 1, between which the quantile lies.
 
-    0 and n + 1 stand for ends that the sample does not have.
+    It lies beyond each with (1 - level) / 2 at most. 0 and n + 1 stand for ends that the sample
+    does not have.
 
     Examples
     --------
@@ -176,6 +178,7 @@ def interval_ranks(n: int, percent: int) -> tuple[int, int]:
     reach = 10.0 * np.sqrt(n * p * (1.0 - p)) + 10.0
     below = np.arange(max(0, int(n * p - reach)), min(n, int(n * p + reach)) + 1)
     chance = special.bdtr(below, n, p)
-    first = below[np.searchsorted(chance, TAIL)]
-    last = below[np.searchsorted(chance, 1.0 - TAIL)] + 1
+    tail = (1.0 - level) / 2.0
+    first = below[np.searchsorted(chance, tail)]
+    last = below[np.searchsorted(chance, 1.0 - tail)] + 1
     return int(first), int(last)

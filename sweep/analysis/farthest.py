@@ -1,0 +1,260 @@
+"""How far requirements are met along an axis: "up to 2.25 m (2.0 to 2.5)"."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from sweep.analysis.dimensions import DRAWS, as_names, axes_of
+from sweep.analysis.requirements import (
+    Decision,
+    Requirement,
+    check_requirements,
+    configuration_axes,
+    parse_requirements,
+)
+from sweep.errors import ArgumentError, DatasetError
+from sweep.measure.flags import Flag, flag
+from sweep.plan.schema import cf_attributes
+
+HARDER_WHEN_SMALLER = (
+    "side_px", "size_m", "fx_px", "fy_px", "focal_length_mm", "width_px", "height_px",
+    "white", "contrast",
+)
+"""Axes along which a marker is harder to find the smaller the value is."""
+
+
+class Reach(Flag):
+    """How far the requirements are met along the axis."""
+
+    not_run = flag(0, "Nothing could be judged.", counted=False)
+    found = flag(1, "They are met up to a value within the grid.", present=True)
+    never = flag(2, "They are not met at the easiest value.")
+    always = flag(3, "They are met at all values: the limit may lie beyond.", present=True)
+
+
+def farthest_met(
+    results: xr.Dataset, requirements: Iterable[Requirement | str], along: str,
+    per: Sequence[str] = (), at_all: Sequence[str] = (),
+) -> xr.Dataset:
+    """Return how far along an axis all requirements are met.
+
+    Parameters
+    ----------
+    results, requirements
+        As in `sweep.analysis.check_requirements`.
+    along
+        An axis of the scene with numbers, such as ``distance_m``. It goes from easy to hard: sides
+        and focal lengths downwards, all others upwards.
+    per
+        Dimensions that are kept: a limit for each of their values.
+    at_all
+        Dimensions at all of whose values the requirements must hold for a value of ``along`` to
+        count, such as ``tilt_deg`` for "up to 2.25 m at tilts up to 45 degrees".
+
+    Returns
+    -------
+    xr.Dataset
+        Dimensions (*configuration, *per), computed.
+
+        - ``value``: the last value of the axis up to which, without a gap, the values of all
+          requirements keep their limits; NaN for never.
+        - ``low``, ``high``: ends of its interval, in the axis' unit. Up to the end nearer to the
+          easy values they are decided to be met, beyond the other end a requirement is decided not
+          to be met. -inf or inf: the limit may lie beyond the grid's end.
+        - ``reach`` (`Reach`).
+        - ``limited_by``: the requirement that first fails beyond ``value``, "" for none;
+          ``fails_at`` the value of the axis there; ``fails_where``: the values of ``at_all`` at
+          which it fails worst, as text "tilt_deg = 45"; ``failing_value``: the quantity's value
+          there.
+        - ``met_beyond``: at how many values beyond ``fails_at`` all requirements keep their limits
+          again; ``farthest_beyond`` the farthest of them, NaN for none. Detection is not
+          monotonic: above 0 there is a dip, which ends ``value``.
+
+        With the dimension ``along``, for each of its values: ``decision`` (`Decision`) of all
+        requirements together, and ``keeps``: whether all values keep their limits.
+
+    Raises
+    ------
+    ArgumentError, DatasetError
+        As in `sweep.analysis.check_requirements`; also for an axis without an order.
+
+    Notes
+    -----
+    ``low`` (of a limit upwards) is too large with the error probability of one decision: only the
+    first value at which a requirement fails could make it so. ``high`` is too small if any value
+    up to the limit is falsely decided as not met: these decisions are at the error probability of
+    all of them together.
+
+    Examples
+    --------
+    >>> reach = farthest_met(results.sel(solver=["ippe"]), ["detection >= 0.6"], along="side_px")
+    >>> reach["value"].item(), reach["limited_by"].item(), reach["fails_at"].item()
+    (20.0, 'detection_rate >= 0.6', 10.0)
+    """
+    required = tuple(parse_requirements([
+        each.text if isinstance(each, Requirement) else each
+        for each in ([requirements] if isinstance(requirements, str | Requirement)
+                     else requirements)]))
+    values = axis_values(results, along)
+    together = [name for name in as_names(at_all) if name != along]
+    names = [name for name in as_names(per) if name != along]
+    overlap = [name for name in together if name in names]
+    if overlap:
+        raise ArgumentError("at_all", ", ".join(overlap), "is in per, too; name it in one of them")
+    table = check_requirements(results, required, per=[*names, *together, along])
+    upwards = not harder_when_smaller(results, along)
+    order = np.argsort(values if upwards else -values, kind="stable")
+    table = table.isel({along: order})
+    values = values[order]
+    inner = [*together, "requirement"]
+    keeps = xr.concat([
+        each.holds(table["value"].isel(requirement=number))
+        for number, each in enumerate(required)], dim="requirement").transpose(
+            *table["value"].dims)
+    applicable = table["decision"] != Decision.not_applicable
+    judged = applicable.any(inner)
+    all_keep = (keeps | ~applicable).all(inner) & judged
+    decision = combined_decision(table["decision"], inner)
+    kept = [dim for dim in decision.dims if dim != along]
+    shape = decision.transpose(*kept, along)
+    out: dict[str, Any] = {name: np.full(shape.shape[:-1], np.nan) for name in (
+        "value", "low", "high", "fails_at", "failing_value", "met_beyond", "farthest_beyond")}
+    out["reach"] = np.zeros(shape.shape[:-1], np.uint8)
+    texts = {name: np.full(shape.shape[:-1], "", dtype=object) for name in (
+        "limited_by", "fails_where")}
+    for index in np.ndindex(*shape.shape[:-1]):
+        at = dict(zip(kept, index, strict=True))
+        one = {"keeps": all_keep.isel(at).values, "judged": judged.isel(at).values,
+               "decision": decision.isel(at).values}
+        numbers, failing = _limit(values, upwards, **one)
+        for name, number in numbers.items():
+            out[name][index] = number
+        if failing is not None:
+            cell = table.isel({**at, along: failing})
+            words = _cause(cell, keeps.isel({**at, along: failing}), together)
+            texts["limited_by"][index], texts["fails_where"][index] = words[:2]
+            out["failing_value"][index] = words[2]
+    units = str(results[along].attrs.get("units", ""))
+    meanings = {
+        "value": f"{along} up to which all requirements are met",
+        "low": f"lower end of the interval: {along} up to which all are met",
+        "high": f"upper end of the interval: {along} up to which all are met",
+        "fails_at": f"first {along} at which one is not",
+        "farthest_beyond": f"farthest {along} beyond it at which all are met again",
+        "failing_value": "value of the requirement that fails there",
+        "met_beyond": "values beyond it at which all are met again",
+    }
+    variables: dict[str, Any] = {
+        name: (kept, out[name], {"long_name": meaning, "units": {
+            "failing_value": "", "met_beyond": "1"}.get(name, units)})
+        for name, meaning in meanings.items()}
+    variables["reach"] = (kept, out["reach"], cf_attributes(
+        "how far the requirements are met", flags=Reach))
+    variables["limited_by"] = (kept, texts["limited_by"].astype(str),
+                               {"long_name": "requirement that first fails"})
+    variables["fails_where"] = (kept, texts["fails_where"].astype(str),
+                                {"long_name": "where it fails"})
+    variables["decision"] = decision.transpose(*kept, along)
+    variables["keeps"] = all_keep.transpose(*kept, along).assign_attrs(
+        long_name="whether all values keep their limits", units="1")
+    coordinates = {name: value for name, value in table.coords.items()
+                   if set(value.dims) <= {*kept, along}}
+    found = xr.Dataset(variables, coordinates).isel({along: np.argsort(order)})
+    return found.assign_attrs(
+        along=along, harder="upwards" if upwards else "downwards",
+        configuration_dims=[name for name in configuration_axes(results) if name in kept])
+
+
+def axis_values(results: xr.Dataset, along: str) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Return the values of an axis of the scene that has an order.
+
+    Raises
+    ------
+    ArgumentError
+        If there is no such axis, or its values are no numbers, or it is one of configurations.
+    """
+    axes = [name for name in axes_of(results)
+            if name != DRAWS and name not in configuration_axes(results)
+            and name in results.coords and results[name].dtype.kind in "fiu"]
+    if along not in axes:
+        raise ArgumentError("along", along, "expected an axis of the scene with numbers; there "
+                            f"are {', '.join(axes) or 'none'}")
+    values = results[along].to_numpy().astype(np.float64)
+    if len(set(values.tolist())) < len(values) or not np.isfinite(values).all():
+        raise DatasetError(f"{along}: has values that repeat or are not finite")
+    return values
+
+
+def harder_when_smaller(results: xr.Dataset, along: str) -> bool:  # noqa: ARG001
+    """Return whether small values of an axis are the hard ones."""
+    return along in HARDER_WHEN_SMALLER
+
+
+def combined_decision(decision: xr.DataArray, dims: Sequence[str]) -> xr.DataArray:
+    """Return the decision of all requirements and conditions over some dimensions together.
+
+    Not met if any is, met if all are; what is not applicable does not count.
+    """
+    applicable = decision != Decision.not_applicable
+    all_met = ((decision == Decision.met) | ~applicable).all(dims)
+    combined = (xr.full_like(all_met, Decision.undecided, dtype=np.float64)
+                .where(~all_met, Decision.met)
+                .where(~(decision == Decision.not_met).any(dims), Decision.not_met)
+                .where(applicable.any(dims), Decision.not_applicable))
+    return combined.astype(np.uint8).assign_attrs(
+        cf_attributes("whether all requirements are met", flags=Decision))
+
+
+def _limit(
+    values: np.ndarray[Any, Any], upwards: bool, *, keeps: np.ndarray[Any, Any],
+    judged: np.ndarray[Any, Any], decision: np.ndarray[Any, Any],
+) -> tuple[dict[str, float], int | None]:
+    """Return the limit along the axis, from easy to hard, and the index of the first failure."""
+    if not judged.any():
+        return {"reach": Reach.not_run}, None
+    none, beyond = (-np.inf, np.inf) if upwards else (np.inf, -np.inf)
+    failing = np.nonzero(~keeps & judged)[0]
+    unsure = np.nonzero((decision != Decision.met) & judged)[0]
+    failed = np.nonzero(decision == Decision.not_met)[0]
+
+    def before(indices: np.ndarray[Any, Any], all_of_them: float) -> float:
+        """Return the last judged value before the first of some indices."""
+        if not len(indices):
+            return all_of_them
+        earlier = np.nonzero(judged[: indices[0]])[0]
+        return float(values[earlier[-1]]) if len(earlier) else none
+
+    last = float(values[np.nonzero(judged)[0][-1]])
+    value = before(failing, last)
+    ends = sorted((before(unsure, last), before(failed, beyond)))
+    numbers = {"value": value if np.isfinite(value) else np.nan, "low": ends[0], "high": ends[1],
+               "met_beyond": 0.0}
+    if not len(failing):
+        return {**numbers, "reach": Reach.always}, None
+    first = int(failing[0])
+    again = np.nonzero(keeps & judged)[0]
+    again = again[again > first]
+    numbers |= {"fails_at": float(values[first]), "met_beyond": float(len(again)),
+                "farthest_beyond": float(values[again[-1]]) if len(again) else np.nan,
+                "reach": Reach.found if np.isfinite(value) else Reach.never}
+    return numbers, first
+
+
+def _cause(
+    cell: xr.Dataset, keeps: xr.DataArray, together: Sequence[str]
+) -> tuple[str, str, float]:
+    """Return which requirement fails worst, where among ``together``, and its value there."""
+    failing = ~keeps & (cell["decision"] != Decision.not_applicable)
+    ratio = cell["value"] / cell["limit"]
+    at_least = cell["relation"].isin([">=", ">"])
+    excess = (1.0 - ratio).where(at_least, 1.0 - 1.0 / ratio).fillna(np.inf).where(failing)
+    flat = excess.stack(all_dims=excess.dims)
+    worst = flat.isel(all_dims=int(flat.argmax("all_dims")))
+    at = {name: worst[name].item() for name in excess.dims}
+    where = ", ".join(f"{name} = {at[name]:g}" if isinstance(at[name], float) else
+                      f"{name} = {at[name]}" for name in together)
+    return str(at["requirement"]), where, float(cell["value"].sel(at))

@@ -9,6 +9,7 @@ from typing import NoReturn
 
 from sweep.cli.command import Command
 from sweep.cli.completion import COMPLETION
+from sweep.cli.export import EXPORT
 from sweep.cli.output import flushed
 from sweep.cli.plan import PLAN
 from sweep.cli.report import REPORT
@@ -21,7 +22,7 @@ from sweep.cli.verify import VERIFY
 from sweep.messages import nearest
 from sweep.version import __version__
 
-COMMANDS = (RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, VERIFY, STATUS, COMPLETION)
+COMMANDS = (RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, VERIFY, STATUS, EXPORT, COMPLETION)
 """Every command, in the order in which the help lists them."""
 
 GUIDES = ("README.md", "sweep/README.md")

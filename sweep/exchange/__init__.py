@@ -1,0 +1,1 @@
+"""Images for other programs, and their answers: ``sweep export`` and ``sweep score``."""

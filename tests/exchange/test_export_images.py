@@ -1,0 +1,266 @@
+"""``sweep export``: images as a run searches them, their truth, and camera files."""
+
+import csv
+import json
+import shutil
+import subprocess
+
+import cv2
+import numpy as np
+import pytest
+import xarray as xr
+
+from sweep import cli
+from sweep.errors import ArgumentError, StoreError
+from sweep.evaluation.cells import run_cells
+from sweep.exchange import export as exporting
+from sweep.exchange.export import export
+from sweep.exchange.image_set import scene_indices
+from sweep.plan.cell_selection import cell
+from sweep.plan.experiment import Pipeline
+from sweep.plan.image_keys import image_keys
+
+TEXT = """
+title = "Exported"
+seed = 5
+[camera]
+width_px = 160
+height_px = 120
+fx_px = 150
+distortion = [0.01, 0.002, 0.001, -0.001]
+[marker]
+size_m = 0.05
+[pose]
+jitter_px = 0.5
+azimuth_deg = { uniform = [0, 360] }
+[scene]
+background = 128
+noise_grey = 2
+[detector]
+cornerRefinementMethod = "subpix"
+[axes]
+tilt_deg = [0, 50]
+distance_m = [0.1, 0.2, -0.2]
+trial = 3
+"""
+
+
+@pytest.fixture(scope="module")
+def pipeline():
+    text = TEXT.replace("-0.2]", "0.3]")
+    return Pipeline.from_text(text, name="exported")
+
+
+@pytest.fixture(scope="module")
+def exported(pipeline, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("export") / "images"
+    return folder, export(pipeline, folder)
+
+
+def truth(folder):
+    with (folder / "truth.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def corners_of(row):
+    return np.array([float(row[f"{axis}{k}"]) for k in range(4) for axis in "xy"]).reshape(4, 2)
+
+
+def matrix_of(path):
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    return (file.getNode("camera_matrix").mat(), file.getNode("distortion_coefficients").mat(),
+            file.getNode("image_width").real(), file.getNode("image_height").real())
+
+
+def test_truth_is_what_opencv_projects_with_the_camera_file(exported):
+    folder, result = exported
+    rows = truth(folder)
+    assert result.images == len(rows) == 18
+    assert {path.name for path in (folder / "images").iterdir()} == {row["image"] for row in rows}
+    for row in rows:
+        matrix, lens, width, height = matrix_of(folder / f"cameras/{row['camera']}.opencv.yml")
+        half = float(row["size_m"]) / 2
+        square = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
+        rvec, tvec = ([float(row[f"{kind}{axis}"]) for axis in "xyz"] for kind in "rt")
+        projected, _ = cv2.projectPoints(square, np.array(rvec), np.array(tvec), matrix, lens)
+        np.testing.assert_allclose(corners_of(row), projected[:, 0], atol=1e-9)
+        image = cv2.imread(str(folder / "images" / row["image"]), cv2.IMREAD_UNCHANGED)
+        assert image.shape == (height, width) == (120, 160)
+        assert (float(row["fx_px"]), float(row["cx_px"])) == (matrix[0, 0], matrix[0, 2])
+
+
+def test_images_are_those_of_a_run_to_the_last_bit(exported, pipeline):
+    folder, _ = exported
+    whole = Pipeline.from_text(pipeline.text, ['window="full"'])
+    run = run_cells(whole, scene_indices(whole, np.arange(18))).columns
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50)
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    detector = cv2.aruco.ArucoDetector(dictionary, parameters)
+    for k, row in enumerate(truth(folder)):
+        image = cv2.imread(str(folder / "images" / row["image"]), cv2.IMREAD_UNCHANGED)
+        quads, ids, _ = detector.detectMarkers(image)
+        assert (ids is not None) == (run["detection"][0][k] == 1)
+        if ids is not None:
+            assert (quads[0][0] - corners_of(row) == run["corner_error_px"][0][k]).all()
+    assert (run["detection"][0] == 1).sum() > 5
+
+
+def test_windows_are_parts_of_the_frames_and_their_truth_is_shifted(exported, pipeline, tmp_path):
+    folder, _ = exported
+    export(pipeline, tmp_path / "windows", windowed=True)
+    for whole, part in zip(truth(folder), truth(tmp_path / "windows"), strict=True):
+        x0, y0, width, height = (
+            int(part[name]) for name in ("origin_x_px", "origin_y_px", "width_px", "height_px"))
+        frame = cv2.imread(str(folder / "images" / whole["image"]), cv2.IMREAD_UNCHANGED)
+        window = cv2.imread(
+            str(tmp_path / "windows/images" / part["image"]), cv2.IMREAD_UNCHANGED)
+        assert (window == frame[y0 : y0 + height, x0 : x0 + width]).all()
+        np.testing.assert_allclose(corners_of(part), corners_of(whole) - (x0, y0), atol=1e-12)
+        assert float(part["cx_px"]) == float(whole["cx_px"]) - x0
+    assert any(int(row["origin_x_px"]) for row in truth(tmp_path / "windows"))
+
+
+def test_tables_agree_and_netcdf_has_the_axes(exported, pipeline):
+    folder, _ = exported
+    rows = truth(folder)
+    coco = json.loads((folder / "truth_coco.json").read_text())
+    assert [image["file_name"] for image in coco["images"]] == [
+        f"images/{row['image']}" for row in rows]
+    for row, annotation in zip(rows, coco["annotations"], strict=True):
+        points = np.reshape(annotation["keypoints"], (4, 3))
+        assert (points[:, :2] == corners_of(row)).all()
+        assert annotation["bbox"][:2] == corners_of(row).min(axis=0).tolist()
+    with xr.open_dataset(folder / "truth.nc", engine="scipy") as dataset:
+        assert dataset["true_tvec_m"].dims == ("tilt_deg", "distance_m", "trial", "xyz")
+        assert dataset["image"].values.ravel().tolist() == [row["image"] for row in rows]
+        at = dataset.sel(tilt_deg=50, distance_m=0.2, trial=2)
+        row = next(row for row in rows if row["image"] == str(at["image"].values))
+        assert (row["tilt_deg"], row["distance_m"], row["trial"]) == ("50.0", "0.2", "2")
+        assert at["azimuth_deg"].item() == float(row["azimuth_deg"])
+        assert (at["true_corners_px"].values == corners_of(row)).all()
+        assert dataset.attrs["pipeline"] == pipeline.text
+
+
+def test_camera_files_are_read_as_the_same_camera(exported, pipeline):
+    folder, _ = exported
+    for name in ("camera-0.opencv.yml", "camera-0.ros.yaml"):
+        other = Pipeline.from_dict({
+            "camera": {"camera_file": str(folder / "cameras" / name)}, "pose": {"distance_m": 1},
+        })
+        assert other.fixed["distortion"][:4] == pipeline.fixed["distortion"]
+        assert [other.fixed[key] for key in ("width_px", "fx_px", "cx_px", "cy_px")] == [
+            160, 150, 79.5, 59.5]
+
+
+def test_an_interrupted_export_continues_and_damage_is_repaired(exported, pipeline, tmp_path):
+    whole, _ = exported
+    folder = tmp_path / "again"
+    shutil.copytree(whole, folder)
+    names = sorted(path.name for path in (folder / "images").iterdir())
+    (folder / "images" / names[3]).unlink()
+    (folder / "images" / names[4]).write_bytes(b"half a file")
+    lines = (folder / "images.sha256").read_text().splitlines(keepends=True)
+    (folder / "images.sha256").write_text("".join(lines[:10]) + lines[10][:30])
+    (folder / "truth.csv").unlink()
+    again = export(pipeline, folder)
+    assert (again.kept, again.written, again.damaged) == (8, 10, 2)
+    assert files_of(folder) == files_of(whole)
+    assert export(pipeline, folder).kept == 18
+
+
+def files_of(folder):
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*") if path.is_file()
+    }
+
+
+def test_several_processes_write_the_same_files(exported, pipeline, tmp_path, monkeypatch):
+    monkeypatch.setattr(exporting, "BATCH", 5)
+    class InThisProcess:
+        def __init__(self, *_, **__):
+            pass
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def submit(self, function, *arguments):
+            future = exporting.Future()
+            future.set_result(function(*arguments))
+            return future
+
+    monkeypatch.setattr(exporting, "ProcessPoolExecutor", InThisProcess)
+    assert export(pipeline, tmp_path / "shared", workers=2).written == 18
+    assert files_of(tmp_path / "shared") == files_of(exported[0])
+
+
+@pytest.mark.long
+def test_a_pool_of_processes_writes_the_same_files(exported, pipeline, tmp_path, monkeypatch):
+    monkeypatch.setattr(exporting, "BATCH", 5)
+    assert export(pipeline, tmp_path / "pool", workers=2).written == 18
+    assert files_of(tmp_path / "pool") == files_of(exported[0])
+
+
+def test_checksums_are_those_of_sha256sum(exported):
+    folder, _ = exported
+    if shutil.which("sha256sum") is None:
+        pytest.skip("sha256sum is not installed")
+    subprocess.run(["sha256sum", "-c", "--quiet", "images.sha256"], cwd=folder, check=True)
+
+
+def test_scenes_without_a_visible_marker_have_no_image_and_are_counted(tmp_path, capsys):
+    (tmp_path / "p.toml").write_text(
+        TEXT.replace("tilt_deg = [0, 50]", "bearing_x_deg = [0, 80]")
+        .replace("distance_m = [0.1, 0.2, -0.2]\ntrial = 3", "distance_m = [0.2]"))
+    assert cli.main(["export", str(tmp_path / "p.toml"), str(tmp_path / "out")]) == 0
+    assert "1 images" in capsys.readouterr().out
+    assert len(truth(tmp_path / "out")) == 1
+    assert "1 scenes more have no image" in (tmp_path / "out/README.md").read_text()
+
+
+def test_folders_of_others_are_refused_in_a_line(exported, pipeline, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(StoreError, match=r"holds notes\.txt, and no export"):
+        export(pipeline, tmp_path)
+    with pytest.raises(StoreError, match="a file; choose a new folder"):
+        export(pipeline, tmp_path / "notes.txt")
+    other = Pipeline.from_text(pipeline.text.replace("seed = 5", "seed = 6"), name="exported")
+    with pytest.raises(StoreError, match="holds another export") as error:
+        export(other, exported[0])
+    assert "pipeline: the folder has" in str(error.value)
+    with pytest.raises(StoreError, match="images: the folder has whole frames"):
+        export(pipeline, exported[0], windowed=True)
+    with pytest.raises(ArgumentError, match="workers"):
+        export(pipeline, tmp_path / "new", workers=0)
+    assert not (tmp_path / "new").exists()
+
+
+def test_what_is_large_has_to_be_confirmed(pipeline, tmp_path, monkeypatch):
+    monkeypatch.setattr(exporting, "MAX_BYTES", 1000)
+    with pytest.raises(StoreError, match=r"takes about .*confirm it with --yes"):
+        export(pipeline, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    assert export(pipeline, tmp_path / "out", yes=True).images == 18
+    huge = Pipeline.from_text(pipeline.text.replace("trial = 3", "trial = 1000000"), name="huge")
+    with pytest.raises(StoreError, match="6,000,000 scenes; at most 1,000,000"):
+        export(huge, tmp_path / "huge", yes=True)
+
+
+def test_keys_are_those_of_the_scene_whatever_its_grid(pipeline):
+    keys = image_keys(pipeline, scene_indices(pipeline, np.arange(18)))
+    assert len(set(keys.tolist())) == 18
+    single = cell(pipeline, "tilt_deg=50,distance_m=0.2,trial=2")
+    assert image_keys(single, [np.zeros(1, dtype=np.intp)]) == keys[14]
+    larger = Pipeline.from_text(
+        pipeline.text, ["distance_m=[0.05, 0.2]", "trial=9", 'window="full"', "solver=ippe",
+                        "cornerRefinementMethod=none"])
+    among = image_keys(larger, scene_indices(larger, np.arange(36)))
+    assert set(among.tolist()) & set(keys.tolist()) == set(keys[[3, 4, 5, 12, 13, 14]].tolist())
+    for other in ("seed=6", "noise_grey=3", "size_m=0.06", "background=100", "fx_px=151"):
+        changed = Pipeline.from_text(pipeline.text, [other])
+        among = image_keys(changed, scene_indices(changed, np.arange(18)))
+        assert not set(among.tolist()) & set(keys.tolist()), other

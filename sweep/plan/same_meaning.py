@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion, intrinsics
+from sweep.plan.axes import Axis
 from sweep.plan.beliefs import STATED
 from sweep.plan.experiment import Pipeline
 
@@ -32,6 +34,37 @@ def alike(first: Pipeline, second: Pipeline) -> tuple[Pipeline, Pipeline]:
     return _with(first, truth, ignored), _with(second, truth, ignored)
 
 
+def wrong_beliefs(pipeline: Pipeline, axis: Axis) -> tuple[bool, ...]:
+    """Return for each value of an axis whether it makes the estimator believe what is not true.
+
+    A belief whose truth varies over the grid is right somewhere, and counts as not wrong.
+
+    Examples
+    --------
+    >>> pipeline = Pipeline.from_text(
+    ...     "seed = 1\\n[pose]\\nside_px = 40\\n[axes]\\nbelieved_focal_scale = [0.99, 1.0]\\n")
+    >>> wrong_beliefs(pipeline, pipeline.axes[0])
+    (True, False)
+    """
+    view = _view(pipeline)
+    truths = _truth(pipeline, view or (None,) * 4) | {"believed": "truth"}
+    return tuple(
+        any(_differs(axis.at(k)[name], truths[name]) for name in axis.columns if name in truths)
+        for k in range(len(axis))
+    )
+
+
+def _differs(believed: Any, truth: Any) -> bool:
+    """Return whether a belief is known to differ from the truth, beyond rounding."""
+    if believed is None or truth is None:
+        return False
+    if isinstance(believed, tuple):
+        return bool(canonical_distortion(believed) != truth)
+    if isinstance(believed, str):
+        return bool(believed != truth)
+    return not math.isclose(believed, truth, rel_tol=1e-9)
+
+
 def _with(pipeline: Pipeline, truth: dict[str, Any], ignored: dict[str, Any]) -> Pipeline:
     fixed = {name: ignored.get(name, value) for name, value in pipeline.fixed.items()}
     for name in ("distortion", "believed_distortion"):
@@ -51,7 +84,7 @@ def _view(pipeline: Pipeline) -> tuple[float, ...] | None:
     return tuple(float(number) for number in numbers)
 
 
-def _truth(pipeline: Pipeline, view: tuple[float, ...]) -> dict[str, Any]:
+def _truth(pipeline: Pipeline, view: tuple[float | None, ...]) -> dict[str, Any]:
     """Return the true value of each belief, None where it varies."""
     fixed = pipeline.fixed
     names = ("believed_fx_px", "believed_fy_px", "believed_cx_px", "believed_cy_px")

@@ -12,7 +12,7 @@ from sweep.analysis import detection_rate, error_statistics
 from sweep.analysis.quantiles import IntervalOf
 from sweep.analysis.registry import error_headings
 from sweep.plan.parameters import Stage
-from sweep.report.configuration_figures import configuration_grouping
+from sweep.report.configurations import configurations
 from sweep.report.figure import sentences, values_with_ends
 from sweep.report.formatting import degrees, interval_text, number
 from sweep.report.grouping import by_configuration
@@ -118,7 +118,7 @@ def _rates_sentence(data: ReportData, rates: xr.Dataset, errors: xr.Dataset) -> 
 
 def _best_sentence(data: ReportData) -> str:
     """Return which configuration has the smallest median rotation error, as a sentence."""
-    grouping = configuration_grouping(data)
+    grouping = configurations(data).settings.grouping
     if not grouping.dims:
         return ""
     names, summary = by_configuration(data.analysed(error_statistics, grouping), grouping.dims)

@@ -9,7 +9,8 @@ import xarray as xr
 from sweep.analysis import efficiency
 from sweep.measure.flags import BoundStatus, present_values
 from sweep.report.charts import draw_map, rows_height
-from sweep.report.configuration_figures import SIZE_COLUMNS, configuration_grouping
+from sweep.report.configuration_figures import SIZE_COLUMNS
+from sweep.report.configurations import configurations
 from sweep.report.figure import (
     FigureKind,
     RenderedFigure,
@@ -37,15 +38,12 @@ def _has_bound(data: ReportData) -> bool:
 
 
 def _render(data: ReportData) -> RenderedFigure:
-    grouping = configuration_grouping(data)
+    grouping = configurations(data).settings.grouping
     along = data.size_axis or data.angle_axis
     sizes = data.along(along, SIZE_COLUMNS) if along else Grouping()
     settings, per = list(grouping.dims), list(sizes.dims)
     ratio = _over_bound(data.analysed(efficiency, grouping + sizes))
-    if settings:
-        names, summary = by_configuration(ratio, settings)
-    else:
-        names, summary = ["all"], ratio.expand_dims(CONFIGURATION)
+    names, summary = by_configuration(ratio, settings)
     columns = group_labels(summary, along) if along else ["all"]
     label = data.label(along) if along else ""
 

@@ -54,6 +54,7 @@ MAX_OWN_TICKS = 7
 
 def draw_lines(
     axes: Axes, series: Sequence[Series], labels: tuple[str, str], *, share: bool = False,
+    level: float | None = None,
 ) -> None:
     """Draw lines with their intervals; infinite values stand at the upper edge.
 
@@ -65,12 +66,14 @@ def draw_lines(
         Of the x and the y axis.
     share
         Whether y is a share, drawn from 0 to 100 %.
+    level
+        y of a dashed line, such as the 0 of signed errors.
     """
     x = np.concatenate([line.x for line in series])
     logarithmic_x = spans(x, 5) and bool((x > 0).all()) and grow_by_factors(x)
     axes.set_xscale("log" if logarithmic_x else "linear")
     axes.set_xlim(*value_limits(x, logarithmic=logarithmic_x, margin=0.05))
-    logarithmic_y, (bottom, top) = value_scale(series, share=share)
+    logarithmic_y, (bottom, top) = value_scale(series, share=share, level=level)
     axes.set_yscale("log" if logarithmic_y else "linear")
     axes.set_ylim(bottom, top)
     plain_ticks(axes.yaxis, logarithmic=logarithmic_y, share=share)
@@ -104,6 +107,8 @@ def draw_lines(
             transform=dodged, clip_on=False,
             markerfacecolor=PAPER, markersize=3 if many else 5, zorder=4,
         )
+    if level is not None:
+        axes.axhline(level, color=INK, linewidth=0.9, linestyle=REFERENCE_DASHES, zorder=1.5)
     plain_ticks(axes.xaxis, logarithmic=logarithmic_x)
     values = np.unique(x)
     if 0 < values.size <= MAX_OWN_TICKS:

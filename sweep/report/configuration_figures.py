@@ -8,6 +8,7 @@ import xarray as xr
 
 from sweep.analysis import compare, error_statistics
 from sweep.report.charts import draw_dots, draw_map, rows_height
+from sweep.report.configurations import configurations
 from sweep.report.error_columns import ERRORS, LOOKED_FOR
 from sweep.report.figure import (
     FigureKind,
@@ -18,36 +19,21 @@ from sweep.report.figure import (
     sentences,
     uncapitalised,
 )
-from sweep.report.grouping import CONFIGURATION, Grouping, by_configuration, group_labels
+from sweep.report.grouping import (
+    CONFIGURATION,
+    Grouping,
+    by_configuration,
+    group_labels,
+    is_numeric,
+)
 from sweep.report.report_data import ReportData
 from sweep.report.svg import Panel
 from sweep.report.table import Table, cells
 
-MAX_CONFIGURATIONS = 30
 SIZE_COLUMNS = 12
+MIN_DRAWN = 3
+"""From this many values on, an axis of numbers has a figure along it, too."""
 
-
-def configuration_grouping(data: ReportData) -> Grouping:
-    """Return the grouping by configuration, of at most :data:`MAX_CONFIGURATIONS` groups.
-
-    If there are more, the settings with the most values are pooled.
-    """
-    kept: list[str] = []
-    count = 1
-    for name in sorted(data.setting_axes, key=data.length):
-        if count * data.length(name) > MAX_CONFIGURATIONS and kept:
-            break
-        kept.append(name)
-        count *= data.length(name)
-    grouping = Grouping()
-    pooled = [name for name in data.setting_axes if name not in kept]
-    if pooled:
-        note = f"There are too many configurations to show each: pooled over {', '.join(pooled)}."
-        grouping = Grouping(notes=(note,))
-    for name in data.setting_axes:
-        if name in kept:
-            grouping += data.along(name, MAX_CONFIGURATIONS, binned=False)
-    return grouping
 
 
 def _dot_panel(
@@ -64,8 +50,8 @@ def _dot_panel(
 
 
 def _configurations(data: ReportData) -> RenderedFigure:
-    grouping = configuration_grouping(data)
-    names, summary = by_configuration(data.analysed(error_statistics, grouping), grouping.dims)
+    known = configurations(data)
+    grouping, names, summary = known.settings.grouping, known.names, known.summary
     panels = [
         _dot_panel(summary, names, "solved_rate", "Solved", "%", scale=100, share=True),
         _dot_panel(summary, names, "rotation_median_deg", "Rotation error, median", "deg"),
@@ -86,7 +72,7 @@ def _configurations(data: ReportData) -> RenderedFigure:
             "configuration on the same images; a pose that is not solved counts as an infinite "
             "error (right edge, \u221e).",
             interval_sentence(summary, "solved_rate"), denominators(summary), *notes,
-            data.pooled(*grouping.dims),
+            data.pooled(*data.setting_axes),
         ),
         _table("Configurations, with 95 % intervals", names, summary,
                LOOKED_FOR | ERRORS | {"flipped, %": ("flip_rate", 100.0)}),
@@ -141,7 +127,7 @@ PAIRED = {
 
 
 def _paired(data: ReportData) -> RenderedFigure:
-    grouping = configuration_grouping(data)
+    grouping = configurations(data).settings.grouping
     results = data.results.isel({name: list(some) for name, some in grouping.chosen})
     summary = data.once("paired", lambda: compare(
         _with_first_configuration(results, grouping.dims), results, grouping.dims))
@@ -156,7 +142,7 @@ def _paired(data: ReportData) -> RenderedFigure:
             "smaller errors).",
             interval_sentence(others, "detection_difference"),
             denominators(others, "compared", "pairs"), *grouping.notes,
-            data.pooled(*grouping.dims),
+            data.pooled(*data.setting_axes),
         ),
         _table(f"Against {names[0]}, with 95 % intervals", names[1:], others, PAIRED),
         [_dot_panel(others, names[1:], "detection_difference", "Detection, difference",
@@ -180,7 +166,11 @@ def _with_first_configuration(results: xr.Dataset, settings: Sequence[str]) -> x
 
 
 def _covered(data: ReportData) -> tuple[str, ...]:
-    return configuration_grouping(data).dims
+    """Return the axes that need no figure of their own: those of words, and switches."""
+    axes = {axis.name: axis for axis in data.pipeline.axes}
+    return tuple(name for name in data.setting_axes
+                 if len(configurations(data).settings.axes[name]) == data.length(name)
+                 and (not is_numeric(axes[name]) or data.length(name) < MIN_DRAWN))
 
 
 CONFIGURATIONS = FigureKind(

@@ -92,6 +92,15 @@ def bin_text(low: float, high: float) -> str:
         f"{end:.3g}" if abs(end) < 1000 else f"{end:.0f}" for end in (low, high))
 
 
+def plural(count: int, noun: str, plural_noun: str = "") -> str:
+    """Return a count with its noun.
+
+    >>> plural(1, "pose"), plural(2000, "pose"), plural(2, "axis", "axes")
+    ('1 pose', '2,000 poses', '2 axes')
+    """
+    return f"{count:,} {noun if count == 1 else plural_noun or f'{noun}s'}"
+
+
 def shortened(text: str, most: int) -> str:
     """Return text with at most ``most`` characters, the last an ellipsis if it was cut.
 

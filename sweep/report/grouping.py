@@ -81,6 +81,14 @@ def drawn_bins(name: str, distribution: Distribution) -> Grouping:
     return Grouping(bins=((name, (ends[0], *edges.tolist(), ends[1])),), notes=(note,))
 
 
+def equal_bins(name: str, low: float, high: float, width: float) -> Grouping:
+    """Return the grouping by bins of equal width between multiples of it, around two values."""
+    first, last = np.floor(low / width), max(np.ceil(high / width), np.floor(low / width) + 1)
+    edges = width * np.arange(first, last + 1)
+    edges[-1] = max(edges[-1], np.nextafter(high, np.inf))
+    return Grouping(bins=((name, tuple(edges.tolist())),))
+
+
 def bins_of(name: str, values: Floats, most: int) -> Grouping:
     """Return the grouping of an axis' values (n,) into ``most`` bins of about as many each."""
     groups = np.array_split(np.sort(values), most)
@@ -126,12 +134,15 @@ def group_labels(table: xr.Dataset, name: str) -> list[str]:
 def by_configuration(table: xr.Dataset, dims: Sequence[str]) -> tuple[list[str], xr.Dataset]:
     """Return the labels of all combinations of the settings ``dims``, and the table by them.
 
-    In the table the dimension ``configuration`` stands in place of ``dims``.
+    In the table the dimension ``configuration`` stands in place of ``dims``; without any it has
+    one row.
     """
     values = [table[dim].values.tolist() for dim in dims]
     labels = [
         configuration_label(dict(zip(dims, chosen, strict=True)))
         for chosen in itertools.product(*values)
     ]
-    stacked = table.stack({CONFIGURATION: list(dims)}, create_index=False)
-    return labels, stacked.drop_vars([*dims], errors="ignore")
+    stacked = table.stack({CONFIGURATION: list(dims)}, create_index=False) if dims else (
+        table.expand_dims(CONFIGURATION))
+    stacked = stacked.drop_vars([*dims], errors="ignore").assign_coords({CONFIGURATION: labels})
+    return labels, stacked.transpose(CONFIGURATION, ...)

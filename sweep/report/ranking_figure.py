@@ -7,6 +7,7 @@ import xarray as xr
 
 from sweep.analysis import marker_ranking
 from sweep.report.charts import draw_dots, draw_lines, rows_height
+from sweep.report.configurations import first_detector
 from sweep.report.figure import (
     FigureKind,
     RenderedFigure,
@@ -26,7 +27,8 @@ WEAKEST = 24
 
 
 def _render(data: ReportData) -> RenderedFigure:
-    summary = data.once("marker_ranking", lambda: marker_ranking(data.results))
+    first, whose = first_detector(data)
+    summary = data.once("marker_ranking", lambda: marker_ranking(data.results.isel(first)))
     dims = [name for name in ("dictionary", IDS) if name in summary["detection_rate"].dims]
     ranked = _weakest_first(summary, dims)
     names = [
@@ -34,7 +36,7 @@ def _render(data: ReportData) -> RenderedFigure:
     ]
     count = int(ranked["weak"].sum())
     return RenderedFigure(
-        "ranking", "Marker IDs, the weakest first",
+        "ranking", "Marker IDs, the weakest first" + (f": {whose}" if whose else ""),
         sentences(
             f"Detection rate of each ID{' of each dictionary' if len(dims) > 1 else ''}; the small "
             "upright line is the rate expected from its scenes if all IDs were alike.",
@@ -42,7 +44,7 @@ def _render(data: ReportData) -> RenderedFigure:
             "with an adjusted p-value under 0.05." if count else
             f"None of {len(names):,} IDs is weak (adjusted p-value under 0.05).",
             interval_sentence(summary, "detection_rate"), denominators(summary),
-            data.pooled(*dims),
+            data.pooled(*dims, *first),
         ),
         Table(
             "IDs by detection rate, with 95 % intervals",

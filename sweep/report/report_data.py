@@ -7,7 +7,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -44,6 +44,7 @@ AREA_RATIO = 2.0
 """Areas vary if the largest exceeds the smallest by this factor."""
 
 Analysis = Callable[..., xr.Dataset]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +74,7 @@ class ReportData:
     trade: xr.Dataset | None = None
     warnings: tuple[str, ...] = ()
     _analyses: dict[Any, xr.Dataset] = field(default_factory=dict, repr=False)
+    _remembered: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         """Give a single pose, which has no axes, the one draw that it is."""
@@ -185,9 +187,11 @@ class ReportData:
             return bins_of(name, np.asarray(self.results[name].values, dtype=np.float64), most)
         return chosen_of(name, len(axis), most)
 
-    def by_angle(self, most: int = 6) -> Grouping:
+    def by_angle(self, most: int = 6, *, binned: bool = True) -> Grouping:
         """Return the grouping by tilt or viewing angle, if one is an axis."""
-        return self.along(self.angle_axis, most) if self.angle_axis else Grouping()
+        if not self.angle_axis:
+            return Grouping()
+        return self.along(self.angle_axis, most, binned=binned)
 
     def pooled(self, *kept: str) -> str:
         """Return a sentence that names the axes pooled over, all but ``kept``."""
@@ -228,6 +232,13 @@ class ReportData:
 
         key = (analysis.__name__, grouping.per, grouping.bins, grouping.chosen)
         return self.once(key, compute).transpose(*grouping.dims, ...)
+
+    def remembered(self, key: str, make: Callable[[], T]) -> T:
+        """Return what ``make`` returns; it is called once for each key."""
+        if key not in self._remembered:
+            self._remembered[key] = make()
+        value: T = self._remembered[key]
+        return value
 
     def once(self, key: Any, compute: Callable[[], xr.Dataset]) -> xr.Dataset:
         """Return what ``compute`` returns, loaded; it is called once for each key."""

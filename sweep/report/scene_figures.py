@@ -2,35 +2,51 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import xarray as xr
 
 from sweep.analysis import detection_rate, error_statistics, flip_rate
-from sweep.report.charts import draw_lines, draw_map
-from sweep.report.error_columns import ERRORS, INFINITE_ERRORS, LOOKED_FOR, RATES
+from sweep.analysis.binning import Bins
+from sweep.plan.parameters import Stage
+from sweep.report.charts import draw_map
+from sweep.report.configurations import BOTH, settings_of, shown_lines, shown_note
+from sweep.report.curves import WIDE_FROM, curves_of
+from sweep.report.error_columns import (
+    DETECTED,
+    ERROR_CURVES,
+    ERRORS,
+    INFINITE_ERRORS,
+    LOOKED_FOR,
+    RATES,
+    SIGNED,
+    SIGNED_CURVES,
+    SIGNED_GROUPS,
+)
 from sweep.report.figure import (
     FigureKind,
     RenderedFigure,
     denominators,
     interval_sentence,
-    lines_of,
     sentences,
     uncapitalised,
 )
-from sweep.report.grouping import AREA, Grouping, group_labels
-from sweep.report.report_data import ReportData
+from sweep.report.grouping import AREA, CONFIGURATION, Grouping, by_configuration, group_labels
+from sweep.report.report_data import Analysis, ReportData
 from sweep.report.svg import Panel
-from sweep.report.table import table_of
+from sweep.report.table import Table, table_of
 
 MIN_BINNED_SIZES = 20
 """From this many sizes on, the detection rate is drawn against bins of the area."""
 
 MAP_COLUMNS, MAP_ROWS = 24, 20
-WIDE_FROM = 8
-"""Panels with more groups take the whole width."""
+MAX_MAPPED = 3
+"""Configurations that have maps of their own."""
 
-SHORT_NAMES = {AREA: "area", "side_px": "size", "distance_m": "distance"}
-LONG_NAMES = {AREA: "area in the image", "side_px": "side in the image", "distance_m": "distance"}
+SHORT_NAMES = {AREA: "area", "side_px": "size", "distance_m": "distance", "size_m": "marker size"}
+LONG_NAMES = {AREA: "area in the image", "side_px": "side in the image",
+              "distance_m": "distance", "size_m": "size"}
 """Names of the measures of size, in titles and in sentences."""
 
 
@@ -57,24 +73,18 @@ def _detection(data: ReportData) -> RenderedFigure:
     axis = data.size_axis
     areas = axis is None or data.length(axis) >= MIN_BINNED_SIZES
     along = AREA if areas else str(axis)
-    grouping = data.by_angle() + data.along(along)
-    summary = data.analysed(detection_rate, grouping)
-    lines = lines_of(summary, along, "detection_rate", data.angle_axis, 100)
-    label = data.label(along)
+    curves = curves_of(data, detection_rate, along, (Stage.detection,))
     return RenderedFigure(
         "detection", f"Detection rate by {_short_name(along)}",
         sentences(
             f"Share of the poses looked for in which the marker is detected, against its "
             f"{long_name(along)}{_by_angle(data)}.",
-            interval_sentence(summary, "detection_rate", marks="Bands and bars").replace(
+            interval_sentence(curves.summary, "detection_rate", marks="Bands and bars").replace(
                 "intervals over", "intervals (Wilson's) over"),
-            denominators(summary), *grouping.notes, data.pooled(along, *grouping.dims),
+            curves.remarks(),
         ),
-        table_of(summary, "Detection rate, with 95 % intervals", grouping.dims,
-                 RATES | {"draws": ("draws", 1)}, data.results),
-        [Panel("Detected", f"Lines of the detection rate in percent against {label}.",
-               lambda axes: draw_lines(axes, lines, (label, "detected, %"), share=True),
-               wide=max((len(line.x) for line in lines), default=0) > WIDE_FROM)],
+        curves.table("Detection rate, with 95 % intervals", RATES | {"draws": ("draws", 1)}),
+        curves.panels([DETECTED]),
     )
 
 
@@ -82,36 +92,52 @@ def _detection(data: ReportData) -> RenderedFigure:
 
 def _errors(data: ReportData) -> RenderedFigure:
     along = str(data.size)
-    grouping = data.by_angle() + data.along(along)
-    summary = data.analysed(error_statistics, grouping)
-    by = data.angle_axis
-    label = data.label(along)
-
-    def panel(name: str, title: str, unit: str) -> Panel:
-        lines = lines_of(summary, along, name, by)
-        return Panel(
-            title, f"Lines of {uncapitalised(title)} in {unit} against {label}.",
-            lambda axes: draw_lines(axes, lines, (label, f"{uncapitalised(title)}, {unit}")),
-        )
-
+    curves = curves_of(data, error_statistics, along)
     return RenderedFigure(
         "errors", f"Errors of the pose by {_short_name(along)}",
         sentences(
             f"Error of the estimated pose against the marker's {long_name(along)}"
-            f"{_by_angle(data)}: median and 95 % quantile (p95) of the rotation error, median of "
-            "the range error (depth, relative to the true depth), RMSE of range without flips.",
+            f"{_by_angle(data)}: median and 95 % quantile (p95) of the rotation error and of the "
+            "range error (depth, relative to the true depth).",
             "An error of 0 is drawn at the lower edge."
-            if (summary["rotation_median_deg"] == 0).any() else "",
-            interval_sentence(summary, "rotation_median_deg", "range_rmse_unflipped_percent",
-                              marks="Bars and bands"), INFINITE_ERRORS,
-            denominators(summary), *grouping.notes, data.pooled(along, *grouping.dims),
+            if (curves.summary["rotation_median_deg"] == 0).any() else "",
+            interval_sentence(curves.summary, "rotation_median_deg", "range_p95_percent",
+                              marks="Bars and bands"), INFINITE_ERRORS, curves.remarks(),
         ),
-        table_of(summary, "Errors, with 95 % intervals", grouping.dims, LOOKED_FOR | ERRORS,
-                 data.results),
-        [panel("rotation_median_deg", "Rotation error, median", "deg"),
-         panel("rotation_p95_deg", "Rotation error, p95", "deg"),
-         panel("range_median_percent", "Range error, median", "%"),
-         panel("range_rmse_unflipped_percent", "Range RMSE without flips", "%")],
+        curves.table("Errors, with 95 % intervals", LOOKED_FOR | ERRORS),
+        curves.panels(ERROR_CURVES),
+    )
+
+
+# Bias along the axes.
+
+def signed_error_statistics(
+    results: xr.Dataset, per: Sequence[str], bins: Bins
+) -> xr.Dataset:
+    """Return bias and spread of the range, of x, y and z in the camera's frame, and of angles."""
+    return error_statistics(results, per, bins, SIGNED_GROUPS)
+
+
+def signed_axis(data: ReportData) -> str | None:
+    """Return the axis along which bias is shown: the size, or the angle; None without either."""
+    return data.size or data.angle_axis
+
+
+def _signed(data: ReportData) -> RenderedFigure:
+    along = str(signed_axis(data))
+    curves = curves_of(data, signed_error_statistics, along, angles=False)
+    return RenderedFigure(
+        "bias", f"Bias by {_short_name(along)}",
+        sentences(
+            f"Mean error of the solved poses that are not flipped, estimated minus true, against "
+            f"the {long_name(along)}: the range in percent of the true depth; x (right), y (down) "
+            "and z (forward) of the marker's position in the camera's frame; yaw. The table also "
+            "has the standard deviations, and pitch and roll.",
+            interval_sentence(curves.summary, "z_bias_m", "yaw_bias_deg", marks="Bars and bands"),
+            curves.remarks("solved", "solved poses"),
+        ),
+        curves.table("Bias and standard deviation, with 95 % intervals", SIGNED),
+        curves.panels(SIGNED_CURVES),
     )
 
 
@@ -125,38 +151,65 @@ def _has_map(data: ReportData) -> bool:
     return data.size_axis is not None and data.angle_axis is not None
 
 
-def _map_grouping(data: ReportData) -> Grouping:
-    return data.along(str(data.angle_axis), MAP_ROWS) + data.along(str(data.size_axis), MAP_COLUMNS)
+class _Maps:
+    """An analysis over size and angle, by configuration."""
 
+    def __init__(
+        self, data: ReportData, analysis: Analysis, stages: Sequence[Stage] = BOTH
+    ) -> None:
+        self.data = data
+        self.along, self.angle = str(data.size_axis), str(data.angle_axis)
+        settings = settings_of(data, stages)
+        grouping: Grouping = settings.grouping + data.along(self.angle, MAP_ROWS) + data.along(
+            self.along, MAP_COLUMNS)
+        self.names, self.summary = by_configuration(
+            data.analysed(analysis, grouping), settings.grouping.dims)
+        self.several = len(self.names) > 1
+        self.shown = shown_lines(data, settings, MAX_MAPPED)
+        self.notes = (shown_note(self.shown, len(self.names)), *grouping.notes,
+                      data.pooled(self.along, self.angle, *settings.axes))
 
-def _map_panel(
-    data: ReportData, summary: xr.Dataset, name: str, title: str, *, share: bool = False
-) -> Panel:
-    along, angle = str(data.size_axis), str(data.angle_axis)
-    rows, columns = group_labels(summary, angle), group_labels(summary, along)
-    values = summary[name].transpose(angle, along).values.astype(np.float64)
-    labels = (data.label(along), data.label(angle))
-    return Panel(
-        title, f"Map of {uncapitalised(title)} over {labels[0]} and {labels[1]}.",
-        lambda axes: draw_map(axes, rows, columns, values, labels, share=share),
-        wide=len(columns) > WIDE_FROM, height=max(2.6, 1.3 + 0.22 * len(rows)),
-    )
+    def panels(self, name: str, title: str, *, share: bool = False) -> list[Panel]:
+        """Return a map of a variable for each configuration that is shown."""
+        return [self._panel(k, name, title, share=share) for k in self.shown]
+
+    def _panel(self, k: int, name: str, title: str, *, share: bool) -> Panel:
+        part = self.summary.isel({CONFIGURATION: k})
+        rows, columns = group_labels(part, self.angle), group_labels(part, self.along)
+        values = part[name].transpose(self.angle, self.along).values.astype(np.float64)
+        labels = (self.data.label(self.along), self.data.label(self.angle))
+        whose = f", {self.names[k]}" if self.several else ""
+        return Panel(
+            title + whose,
+            f"Map of {uncapitalised(title)}{whose} over {labels[0]} and {labels[1]}.",
+            lambda axes: draw_map(axes, rows, columns, values, labels, share=share),
+            wide=len(columns) > WIDE_FROM, height=max(2.6, 1.3 + 0.22 * len(rows)),
+        )
+
+    def table(self, caption: str, columns: dict[str, tuple[str, float]]) -> Table:
+        """Return the table of all configurations."""
+        dims = [self.angle, self.along]
+        if self.several:
+            return table_of(
+                self.summary, caption, [CONFIGURATION, *dims], columns, self.data.results)
+        return table_of(
+            self.summary.isel({CONFIGURATION: 0}), caption, dims, columns, self.data.results)
 
 
 def _maps(data: ReportData) -> RenderedFigure:
-    grouping = _map_grouping(data)
-    summary = data.analysed(error_statistics, grouping)
+    maps = _Maps(data, error_statistics)
+    detected = maps if not maps.several else _Maps(data, detection_rate, (Stage.detection,))
     return RenderedFigure(
         "maps", f"Detection and rotation error over {_over(data)}",
         sentences(
             "Detection rate in percent, and 95 % quantile of the rotation error in degrees; "
             "a pose that is not solved counts as an infinite error (\u221e).",
-            denominators(summary), *grouping.notes, data.pooled(*grouping.dims),
+            denominators(maps.summary), *maps.notes,
         ),
-        table_of(summary, "Detection rate and rotation error, with 95 % intervals", grouping.dims,
-                 RATES | {"rotation p95, deg": ("rotation_p95_deg", 1.0)}, data.results),
-        [_map_panel(data, summary, "detection_rate", "Detected, %", share=True),
-         _map_panel(data, summary, "rotation_p95_deg", "Rotation error, p95, deg")],
+        maps.table("Detection rate and rotation error, with 95 % intervals",
+                   RATES | {"rotation p95, deg": ("rotation_p95_deg", 1.0)}),
+        [*detected.panels("detection_rate", "Detected, %", share=True),
+         *maps.panels("rotation_p95_deg", "Rotation error, p95, deg")],
     )
 
 
@@ -165,24 +218,23 @@ def _has_flips(data: ReportData) -> bool:
 
 
 def _flips(data: ReportData) -> RenderedFigure:
-    grouping = _map_grouping(data)
-    summary = data.analysed(flip_rate, grouping)
+    maps = _Maps(data, flip_rate)
     return RenderedFigure(
         "flips", f"Flips to the mirrored pose over {_over(data)}",
         sentences(
             "Share of the solved poses that are nearer to the mirror of the truth than to the "
             f"truth, in percent. At a {data.angle} near 0 the mirror hardly differs from the "
             "truth.",
-            denominators(summary, "solved", "solved poses"), *grouping.notes,
-            data.pooled(*grouping.dims),
+            denominators(maps.summary, "solved", "solved poses"), *maps.notes,
         ),
-        table_of(summary, "Flip rate, with 95 % intervals", grouping.dims,
-                 {"solved": ("solved", 1.0), "flipped, %": ("flip_rate", 100.0)}, data.results),
-        [_map_panel(data, summary, "flip_rate", "Flipped, % of the solved", share=True)],
+        maps.table("Flip rate, with 95 % intervals",
+                   {"solved": ("solved", 1.0), "flipped, %": ("flip_rate", 100.0)}),
+        maps.panels("flip_rate", "Flipped, % of the solved", share=True),
     )
 
 
 DETECTION = FigureKind("detection", lambda data: data.size is not None, _detection, _size_axes)
 ERRORS_BY_SIZE = FigureKind("errors", lambda data: data.size is not None, _errors, _size_axes)
+BIAS = FigureKind("bias", lambda data: signed_axis(data) is not None, _signed)
 MAPS = FigureKind("maps", _has_map, _maps)
 FLIPS = FigureKind("flips", _has_flips, _flips)

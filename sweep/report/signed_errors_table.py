@@ -9,7 +9,7 @@ import xarray as xr
 from sweep.analysis import error_statistics
 from sweep.analysis.binning import Bins
 from sweep.analysis.quantities import SIGNED
-from sweep.report.configuration_figures import configuration_grouping
+from sweep.report.configurations import configurations
 from sweep.report.grouping import CONFIGURATION, by_configuration
 from sweep.report.report_data import ReportData
 from sweep.report.table import Table, cells
@@ -20,11 +20,10 @@ CAPTION = "Bias and spread of the solved poses without flips, with 95 % interval
 
 def signed_errors_table(data: ReportData) -> Table:
     """Return the table, with rows for each configuration."""
-    grouping = configuration_grouping(data)
-    names: list[str] = []
-    summary = data.analysed(_signed_error_statistics, grouping)
-    if grouping.dims:
-        names, summary = by_configuration(summary, grouping.dims)
+    grouping = configurations(data).settings.grouping
+    labels, summary = by_configuration(
+        data.analysed(_signed_error_statistics, grouping), grouping.dims)
+    names = labels if grouping.dims else []
     rows = []
     for quantity in (each for group in GROUPS for each in SIGNED[group]):
         columns = [cells(summary, quantity.named(statistic)) for statistic in ("bias", "sd")]

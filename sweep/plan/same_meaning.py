@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion, intrinsics
@@ -35,14 +37,14 @@ def alike(first: Pipeline, second: Pipeline) -> tuple[Pipeline, Pipeline]:
 
 
 def wrong_beliefs(pipeline: Pipeline, axis: Axis) -> tuple[bool, ...]:
-    """Return for each value of an axis whether it makes the estimator believe what is not true.
+    r"""Return for each value of an axis whether it makes the estimator believe what is not true.
 
     A belief whose truth varies over the grid is right somewhere, and counts as not wrong.
 
     Examples
     --------
     >>> pipeline = Pipeline.from_text(
-    ...     "seed = 1\\n[pose]\\nside_px = 40\\n[axes]\\nbelieved_focal_scale = [0.99, 1.0]\\n")
+    ...     "seed = 1\n[pose]\nside_px = 40\n[axes]\nbelieved_focal_scale = [0.99, 1.0]\n")
     >>> wrong_beliefs(pipeline, pipeline.axes[0])
     (True, False)
     """
@@ -52,6 +54,16 @@ def wrong_beliefs(pipeline: Pipeline, axis: Axis) -> tuple[bool, ...]:
         any(_differs(axis.at(k)[name], truths[name]) for name in axis.columns if name in truths)
         for k in range(len(axis))
     )
+
+
+def wrong_configurations(pipeline: Pipeline, axes: Sequence[Axis]) -> list[bool]:
+    """Return for each combination of axes' values, the last fastest, whether a belief is wrong.
+
+    Nowhere, if that is so for all of them: then none is the true one that others differ from.
+    """
+    wrong = [any(flags) for flags in itertools.product(
+        *(wrong_beliefs(pipeline, axis) for axis in axes))]
+    return [False] * len(wrong) if all(wrong) else wrong
 
 
 def _differs(believed: Any, truth: Any) -> bool:

@@ -72,7 +72,7 @@ def _configurations(data: ReportData) -> RenderedFigure:
             "configuration on the same images; a pose that is not solved counts as an infinite "
             "error (right edge, \u221e).",
             interval_sentence(summary, "solved_rate"), denominators(summary), *notes,
-            data.pooled(*data.setting_axes),
+            data.pooled(),
         ),
         _table("Configurations, with 95 % intervals", names, summary,
                LOOKED_FOR | ERRORS | {"flipped, %": ("flip_rate", 100.0)}),
@@ -142,7 +142,7 @@ def _paired(data: ReportData) -> RenderedFigure:
             "smaller errors).",
             interval_sentence(others, "detection_difference"),
             denominators(others, "compared", "pairs"), *grouping.notes,
-            data.pooled(*data.setting_axes),
+            data.pooled(),
         ),
         _table(f"Against {names[0]}, with 95 % intervals", names[1:], others, PAIRED),
         [_dot_panel(others, names[1:], "detection_difference", "Detection, difference",

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from sweep.analysis import error_statistics
 from sweep.plan.parameters import Stage
-from sweep.plan.same_meaning import wrong_beliefs
+from sweep.plan.same_meaning import wrong_configurations
 from sweep.report.formatting import plural
 from sweep.report.grouping import Grouping, by_configuration
 from sweep.report.report_data import ReportData
-from sweep.tradeoff.labels import configuration_label
+from sweep.tradeoff.labels import WRONG, configuration_label
 
 MAX_CONFIGURATIONS = 30
 """Configurations that a table or a figure of all of them compares."""
@@ -123,24 +123,15 @@ def _configurations(data: ReportData) -> Configurations:
     settings = settings_of(data)
     names, summary = by_configuration(
         data.analysed(error_statistics, settings.grouping), settings.grouping.dims)
-    wrong = wrong_of(data, settings)
-    if wrong.all():
-        wrong = np.zeros_like(wrong)
+    axes = [axis for axis in data.pipeline.axes_of(*BOTH) if axis.name in settings.axes]
+    flags = np.array(wrong_configurations(data.pipeline, axes)).reshape(
+        [len(axis) for axis in axes])
+    wrong = flags[np.ix_(*settings.axes.values())].reshape(-1) if axes else flags.reshape(-1)
+    names = [name + WRONG * bool(flag) for name, flag in zip(names, wrong, strict=True)]
     median = summary["rotation_median_deg"].values.astype(np.float64)
     solved = np.nan_to_num(summary["solved_rate"].values.astype(np.float64))
     order = np.lexsort((-solved, np.where(np.isnan(median), np.inf, median), wrong))
     return Configurations(settings, names, wrong, summary, tuple(order.tolist()))
-
-
-def wrong_of(data: ReportData, settings: Settings) -> NDArray[np.bool_]:
-    """Return (n,) which combinations hold a belief that is known not to be true."""
-    wrong = {
-        axis.name: wrong_beliefs(data.pipeline, axis) for axis in data.pipeline.axes
-        if axis.name in settings.axes
-    }
-    return np.array([
-        any(wrong[name][index] for name, index in each.items()) for each in settings.combinations
-    ], dtype=bool)
 
 
 def shown_lines(data: ReportData, settings: Settings, most: int = MAX_LINES) -> list[int]:

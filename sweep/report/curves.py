@@ -33,7 +33,7 @@ from sweep.report.table import Table, table_of
 MAX_BINS, MAX_ROWS = 40, 24
 """Groups of a numeric axis, and of any other."""
 
-MAX_ANGLES, MAX_ANGLE_PANELS = 6, 3
+MAX_ANGLES, MAX_ANGLE_PANELS = 6, 2
 """Angles that are lines of one configuration, and panels of several."""
 
 WIDE_FROM = 8
@@ -147,7 +147,7 @@ class Curves:
         note = shown_note(shown_lines(self.data, self.settings), count)
         return sentences(
             denominators(self.summary, counted, what), note, *self.notes,
-            self.data.pooled(self.along, *self.dims, *self.settings.axes))
+            self.data.pooled(self.along, *self.dims))
 
 
 def curves_of(

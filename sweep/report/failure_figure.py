@@ -72,7 +72,7 @@ class _Outcomes:
         self.counts = summary["count"].sum([name for name in summary["count"].dims
                                             if name != "outcome"])
         self.notes = (shown_note(self.shown, len(self.names)), *settings.grouping.notes,
-                      *groups.notes, data.pooled(*groups.dims, *settings.axes))
+                      *groups.notes, data.pooled(*groups.dims))
 
     @property
     def happened(self) -> list[str]:

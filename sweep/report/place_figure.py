@@ -94,7 +94,7 @@ def _render(data: ReportData) -> RenderedFigure:
         sentences(
             "Detection rate by the place of the marker's centre in the frame; a dash: no pose was "
             "looked for there.", denominators(summary), shown_note(shown, len(names)),
-            data.pooled(*settings.axes),
+            data.pooled(),
         ),
         table_of(summary if several else summary.isel({CONFIGURATION: 0}),
                  "Detection rate by place, with 95 % intervals", dims, RATES),

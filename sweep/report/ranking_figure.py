@@ -44,7 +44,7 @@ def _render(data: ReportData) -> RenderedFigure:
             "with an adjusted p-value under 0.05." if count else
             f"None of {len(names):,} IDs is weak (adjusted p-value under 0.05).",
             interval_sentence(summary, "detection_rate"), denominators(summary),
-            data.pooled(*dims, *first),
+            data.pooled(*dims),
         ),
         Table(
             "IDs by detection rate, with 95 % intervals",

@@ -31,10 +31,10 @@ from sweep.report.grouping import (
     drawn_bins,
     is_numeric,
 )
-from sweep.store.blocks import committed
 from sweep.store.lifecycle import open_dataset, open_store
 from sweep.store.outcome import outcome_of_finished
 from sweep.store.snapshot import snapshot
+from sweep.store.unfinished import unfinished_line
 
 MAX_LOADED_BYTES = 300_000_000
 """Results up to this size are loaded at once: many figures read the same values, and many small
@@ -194,9 +194,10 @@ class ReportData:
         return self.along(self.angle_axis, most, binned=binned)
 
     def pooled(self, *kept: str) -> str:
-        """Return a sentence that names the axes pooled over, all but ``kept``."""
+        """Return a sentence that names the axes of the scene pooled over, all but ``kept``."""
         names = [
-            axis.name for axis in self.pipeline.axes if len(axis) > 1 and axis.name not in kept
+            axis.name for axis in self.pipeline.axes_of(Stage.scene)
+            if len(axis) > 1 and axis.name not in kept
         ]
         return f"Pooled over {', '.join(names)}." if names else ""
 
@@ -272,10 +273,7 @@ def read_report_data(url: str) -> ReportData:
     """
     store = open_store(url)
     if not store.finished:
-        done, blocks = len(committed(store)), len(store.blocks)
-        raise StoreError(
-            f"{store.url}: unfinished: {done:,} of {blocks:,} blocks; `sweep run` continues it"
-        )
+        raise StoreError(unfinished_line(store))
     trade = None
     with store_errors(store.url):
         if "cost/tradeoff" in store.group:

@@ -167,7 +167,7 @@ class _Maps:
         self.several = len(self.names) > 1
         self.shown = shown_lines(data, settings, MAX_MAPPED)
         self.notes = (shown_note(self.shown, len(self.names)), *grouping.notes,
-                      data.pooled(self.along, self.angle, *settings.axes))
+                      data.pooled(self.along, self.angle))
 
     def panels(self, name: str, title: str, *, share: bool = False) -> list[Panel]:
         """Return a map of a variable for each configuration that is shown."""

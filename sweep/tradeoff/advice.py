@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from sweep.tradeoff.labels import digits, unit_of
-from sweep.tradeoff.pareto import by_condition, interval, pareto_front
+from sweep.tradeoff.pareto import by_condition, choices, interval, pareto_front
 from sweep.typing import Floats
 
 MISSES_COUNT = {"median": 50, "p95": 5, "p99": 1}
@@ -41,7 +41,7 @@ def advice(trade: xr.Dataset, criterion: str) -> list[str]:
     """
     return [
         f"{label}: {sentence}" if label else sentence
-        for label, condition in by_condition(trade, criterion)
+        for label, condition in by_condition(choices(trade), criterion)
         for sentence in [_sentence(condition, criterion)]
     ]
 
@@ -60,7 +60,7 @@ def budget_advice(trade: xr.Dataset, criterion: str, budget_ms: float) -> list[s
     """
     return [
         f"{label}: {sentence}" if label else sentence
-        for label, condition in by_condition(trade, criterion)
+        for label, condition in by_condition(choices(trade), criterion)
         for sentence in [_budget_sentence(condition, criterion, budget_ms)]
     ]
 

@@ -7,6 +7,9 @@ from typing import Any
 
 import numpy as np
 
+WRONG = " (wrong)"
+"""Behind the label of a configuration whose estimator believes what is not true."""
+
 NO_SETTINGS = "as set"
 """Label of the only configuration of a pipeline without axes of settings."""
 

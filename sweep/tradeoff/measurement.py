@@ -24,13 +24,16 @@ from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import estimators
 from sweep.plan.parameters import Stage
+from sweep.plan.same_meaning import wrong_configurations
 from sweep.store.closing import write_group
 from sweep.store.lifecycle import open_dataset, open_store
 from sweep.store.lock import locked
 from sweep.store.provenance import differences
+from sweep.store.unfinished import unfinished_line
 from sweep.tradeoff.configuration_costs import measure
-from sweep.tradeoff.labels import configuration_label
+from sweep.tradeoff.labels import WRONG, configuration_label
 from sweep.tradeoff.paired_timing import any_process_interval, median_interval
+from sweep.tradeoff.pareto import WRONG_BELIEF
 from sweep.tradeoff.renderer_costs import measure_renderers
 from sweep.tradeoff.scene_sample import Indices, sample_scenes, whole_frames_of
 from sweep.typing import Floats
@@ -88,7 +91,7 @@ def measure_trade(
     started = time.perf_counter()
     store = open_store(url, "r+")
     if not store.finished:
-        raise StoreError(f"{url}: unfinished; `sweep run` continues it")
+        raise StoreError(unfinished_line(store))
     stored, results = store.pipeline, open_dataset(url)
     per = list(dict.fromkeys(per))
     _check(url, stored, results, per)
@@ -157,7 +160,7 @@ def _trade(
         ],
         compat="no_conflicts", join="exact",
     ).compute()
-    trade = _flattened(accuracy, axes)
+    trade = _flattened(accuracy, axes, wrong_configurations(pipeline, axes))
     lengths = [results.sizes[name] for name in per]
     conditions = list(np.ndindex(*lengths))
     configurations = trade.sizes["treatment"]
@@ -245,17 +248,25 @@ def _add(
         table[name + ending] = (dims, values, {"long_name": meaning + words, "units": unit})
 
 
-def _flattened(accuracy: xr.Dataset, axes: Sequence[Axis]) -> xr.Dataset:
-    """Return a dataset with one dimension ``treatment``, by label, for the settings' axes."""
+def _flattened(
+    accuracy: xr.Dataset, axes: Sequence[Axis], wrong: Sequence[bool]
+) -> xr.Dataset:
+    """Return a dataset with one dimension ``treatment``, by label, for the settings' axes.
+
+    Those with a wrong belief are marked: they show what an error costs, and are no choices.
+    """
     names = [axis.name for axis in axes]
     labels = [
-        configuration_label(dict(zip(names, chosen, strict=True)))
-        for chosen in itertools.product(*(axis.values for axis in axes))
+        configuration_label(dict(zip(names, chosen, strict=True))) + WRONG * believed_wrongly
+        for chosen, believed_wrongly in zip(
+            itertools.product(*(axis.values for axis in axes)), wrong, strict=True)
     ]
     if not axes:
         return accuracy.expand_dims(treatment=labels)
     flat = accuracy.stack(treatment=names, create_index=False)
-    return flat.assign_coords(treatment=("treatment", labels))
+    flat = flat.assign_coords(treatment=("treatment", labels))
+    marks = {WRONG_BELIEF: ("treatment", np.array(wrong))} if any(wrong) else {}
+    return flat.assign_coords(marks)
 
 
 def _bound(results: xr.Dataset, per: Sequence[str]) -> xr.Dataset:

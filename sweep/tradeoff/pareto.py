@@ -17,6 +17,9 @@ from sweep.typing import Floats
 
 Booleans = NDArray[np.bool_]
 
+WRONG_BELIEF = "wrong_belief"
+"""Coordinate of a trade: whether a configuration believes what is known not to be true."""
+
 UNITS = {"rotation": "deg", "range": "percent"}
 CRITERIA = tuple(
     f"{quantity}_{statistic}_{unit}"
@@ -67,6 +70,8 @@ def pareto_front(cost: ArrayLike, error: ArrayLike) -> Booleans:
 def mark_front(trade: xr.Dataset, criterion: str) -> xr.Dataset:
     """Return ``trade`` with the variable ``on_front``: the Pareto front of each condition.
 
+    A configuration with a wrong belief is never on it, and dominates no other.
+
     Parameters
     ----------
     trade
@@ -74,11 +79,24 @@ def mark_front(trade: xr.Dataset, criterion: str) -> xr.Dataset:
     criterion
         One of `CRITERIA`.
     """
+    error = trade[criterion]
+    if WRONG_BELIEF in trade.coords:
+        error = error.where(~trade[WRONG_BELIEF])
     on_front = xr.apply_ufunc(
-        pareto_front, trade["cost_ms"], trade[criterion], vectorize=True, output_dtypes=[bool],
+        pareto_front, trade["cost_ms"], error, vectorize=True, output_dtypes=[bool],
         input_core_dims=[["treatment"], ["treatment"]], output_core_dims=[["treatment"]],
     )
     return trade.assign(on_front=on_front)
+
+
+def choices(trade: xr.Dataset) -> xr.Dataset:
+    """Return ``trade`` without the configurations that believe what is known not to be true.
+
+    A wrong belief is an error of the user's, whose cost a trade shows, and no choice.
+    """
+    if WRONG_BELIEF not in trade.coords:
+        return trade
+    return trade.isel(treatment=np.flatnonzero(~trade[WRONG_BELIEF].values))
 
 
 def by_condition(trade: xr.Dataset, criterion: str) -> Iterator[tuple[str, xr.Dataset]]:

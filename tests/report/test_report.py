@@ -185,21 +185,22 @@ def kinds(url):
 
 def test_each_figure_applies_where_it_should(full, odd):
     assert kinds(full) == [
-        "detection", "errors", "maps", "failures", "flips", "ranking", "configurations", "paired",
-        "bound", "effect-azimuth_deg",
+        "detection", "errors", "bias", "configurations", "paired", "maps", "flips", "failures",
+        "ranking", "bound", "effect-azimuth_deg",
     ]
     found = {name: kinds(odd(name)) for name in ODD if name != "long axes"}
     assert found == {
         "single pose": ["failures"],
         "one axis of one value": ["failures"],
         "only trial": ["failures"],
-        "nothing detected": ["detection", "errors", "maps", "failures"],
-        "nothing visible": ["detection", "errors", "failures"],
-        "no draws": ["detection", "errors", "maps", "failures", "flips", "configurations",
-                     "paired"],
-        "lists and words": ["failures", "configurations", "paired", "effect-distortion",
+        "nothing detected": ["detection", "errors", "bias", "maps", "failures"],
+        "nothing visible": ["detection", "errors", "bias", "failures"],
+        "no draws": ["detection", "errors", "bias", "configurations", "paired", "maps", "flips",
+                     "failures"],
+        "lists and words": ["configurations", "paired", "failures", "effect-distortion",
                             "effect-renderer"],
-        "distances drawn": ["detection", "errors", "failures", "ranking", "effect-dictionary"],
+        "distances drawn": ["detection", "errors", "bias", "failures", "ranking",
+                            "effect-dictionary"],
     }
 
 
@@ -210,7 +211,8 @@ def test_an_axis_of_too_many_configurations_has_a_figure_of_its_own(tmp_path):
             "polygonalApproxAccuracyRate = [0.01, 0.02, 0.03, 0.04, 0.05]\n")
     url = made(tmp_path, text, "many")
     assert kinds(url) == [
-        "failures", "configurations", "paired", "effect-polygonalApproxAccuracyRate"]
+        "configurations", "paired", "failures", "effect-errorCorrectionRate",
+        "effect-polygonalApproxAccuracyRate"]
     assert command("report", url, "-o", tmp_path / "report.html")[::2] == (0, "")
 
 
@@ -232,28 +234,36 @@ def test_odd_stores_have_a_report_without_a_warning(name, odd, tmp_path):
 def test_numbers_of_the_tables_are_those_of_the_analysis(full, page):
     tables = Page(page).tables
     results = open_dataset(full)
-    errors = error_statistics(results, per=("tilt_deg", "side_px")).compute()
+    per = ("cornerRefinementMethod", "solver", "tilt_deg", "side_px")
+    errors = error_statistics(results, per).compute()
     rows = tables["Errors, with 95 % intervals"]
     assert len(rows) == 1 + errors["looked_for"].size
     column = rows[0].index("rotation median, deg")
     for row in rows[1:]:
-        one = errors.sel(tilt_deg=float(row[0]), side_px=float(row[1]))
+        one = errors.sel(dict(zip(
+            per, [*row[0].split(" \u00b7 "), float(row[1]), float(row[2])], strict=True)))
         low, value, high = (
             float(one[f"rotation_median_deg{end}"]) for end in ("_low", "", "_high"))
-        assert row[2] == f"{int(one.looked_for):,}"
+        assert row[3] == f"{int(one.looked_for):,}"
         between = "" if math.isnan(low) and math.isnan(high) else (
             f" ({number(low)} to {number(high)})")
         assert row[column] == number(value) + between
-    rates = detection_rate(results, per=("marker_id",)).compute()
+    first = re.search("the weakest first: (\\w+)", page)[1]
+    rates = detection_rate(
+        results.sel(cornerRefinementMethod=first), per=("marker_id",)).compute()
     rows = tables["IDs by detection rate, with 95 % intervals"]
     for row in rows[1:]:
         rate = 100 * float(rates["detection_rate"].sel(marker_id=int(row[0])))
         assert row[2].split(" (")[0] == number(rate)
-    shares = failure_composition(results, per=("side_px",)).compute()
+    shares = failure_composition(
+        results.sel(cornerRefinementMethod="none", solver="photometric"), per=("side_px",)
+    ).compute()
     rows = tables["Shares in percent, with 95 % intervals"]
     column = rows[0].index("solved, %")
     for row in rows[1:]:
-        share = 100 * float(shares["share"].sel(side_px=float(row[0]), outcome="solved"))
+        if row[0] != "none \u00b7 photometric":
+            continue
+        share = 100 * float(shares["share"].sel(side_px=float(row[1]), outcome="solved"))
         assert row[column].split(" (")[0] == number(share)
 
 

@@ -380,7 +380,7 @@ def test_what_is_no_finished_store_is_told_in_one_line(renderer_store, tmp_path)
         ("missing.toml", "cannot be read: No such file or directory"),
         ("text.zarr", "not a sweep store; choose another path"),
         ("empty", "not a sweep store; choose another path"),
-        ("unfinished.zarr", "unfinished; `sweep run` continues it"),
+        ("unfinished.zarr", "unfinished: 0 of 1 blocks; `sweep run` continues it"),
     ):
         assert command(tmp_path / place) == (2, "", f"{tmp_path / place}: {message}\n")
     code, _, err = command(renderer_store, "--per", "renderer")

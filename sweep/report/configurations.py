@@ -139,14 +139,14 @@ def shown_lines(data: ReportData, settings: Settings, most: int = MAX_LINES) -> 
     known = configurations(data)
     all_of_them = known.settings.combinations
 
-    def place(each: dict[str, int]) -> int:
+    def rank_of(each: dict[str, int]) -> int:
         return next((
             rank for rank, k in enumerate(known.order)
             if all(all_of_them[k].get(name, index) == index for name, index in each.items())
         ), len(known.order))
 
-    places = [place(each) for each in settings.combinations]
-    return sorted(sorted(range(len(places)), key=lambda k: (places[k], k))[:most])
+    ranks = [rank_of(each) for each in settings.combinations]
+    return sorted(sorted(range(len(ranks)), key=lambda k: (ranks[k], k))[:most])
 
 
 def shown_note(shown: Sequence[int], count: int) -> str:

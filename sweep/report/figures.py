@@ -9,14 +9,14 @@ from sweep.report.bound_figure import BOUND
 from sweep.report.configuration_figures import COMPARED, CONFIGURATIONS
 from sweep.report.failure_figure import FAILURES
 from sweep.report.figure import FigureKind
-from sweep.report.place_figure import PLACE
+from sweep.report.frame_figure import FRAME
 from sweep.report.ranking_figure import RANKING
 from sweep.report.report_data import ReportData
 from sweep.report.scene_figures import BIAS, DETECTION, ERRORS_BY_SIZE, FLIPS, MAPS
 from sweep.report.tradeoff_figure import TRADE
 
 KINDS: tuple[FigureKind, ...] = (
-    DETECTION, ERRORS_BY_SIZE, BIAS, CONFIGURATIONS, COMPARED, TRADE, MAPS, FLIPS, FAILURES, PLACE,
+    DETECTION, ERRORS_BY_SIZE, BIAS, CONFIGURATIONS, COMPARED, TRADE, MAPS, FLIPS, FAILURES, FRAME,
     RANKING, BOUND,
 )
 """Add a kind of figure here; what no kind covers of axes and draws gets a figure of its effect."""

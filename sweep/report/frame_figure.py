@@ -29,7 +29,7 @@ MIN_RANGE_PERCENT = 10.0
 TRUE = "true_tvec_m"
 
 
-def _places(results: xr.Dataset, view: Sequence[float]) -> xr.Dataset:
+def _in_frame(results: xr.Dataset, view: Sequence[float]) -> xr.Dataset:
     """Return where the marker's centre is, in percent of the frame from its top left corner."""
     fx, fy, cx, cy, width, height = view
     x, y, z = (results[TRUE].isel(xyz=k, drop=True) for k in range(3))
@@ -53,9 +53,9 @@ def _applies(data: ReportData) -> bool:
     view = _view(data)
     if view is None or TRUE not in data.results:
         return False
-    places = _places(data.results, view)
-    ranges = data.once("ranges of places", lambda: xr.Dataset(
-        {name: places[name].max() - places[name].min() for name in (ACROSS, DOWN)}))
+    shares = _in_frame(data.results, view)
+    ranges = data.once("ranges in the frame", lambda: xr.Dataset(
+        {name: shares[name].max() - shares[name].min() for name in (ACROSS, DOWN)}))
     return max(float(ranges[name]) for name in (ACROSS, DOWN)) >= MIN_RANGE_PERCENT
 
 
@@ -70,11 +70,11 @@ def _render(data: ReportData) -> RenderedFigure:
         each[-1] = np.nextafter(100, 101)
     bins = Grouping(bins=tuple((name, tuple(each.tolist())) for name, each in edges.items()))
 
-    def by_place(results: xr.Dataset, per: Sequence[str], bins: Bins) -> xr.Dataset:
-        return detection_rate(results.assign(_places(results, view).data_vars), per, bins)
+    def over_frame(results: xr.Dataset, per: Sequence[str], bins: Bins) -> xr.Dataset:
+        return detection_rate(results.assign(_in_frame(results, view).data_vars), per, bins)
 
     names, summary = by_configuration(
-        data.analysed(by_place, settings.grouping + bins), settings.grouping.dims)
+        data.analysed(over_frame, settings.grouping + bins), settings.grouping.dims)
     shown = shown_lines(data, settings, MAX_MAPPED)
     several = len(names) > 1
     columns, rows = group_labels(summary, ACROSS), group_labels(summary, DOWN)[::-1]
@@ -90,7 +90,7 @@ def _render(data: ReportData) -> RenderedFigure:
 
     dims = [*([CONFIGURATION] if several else []), DOWN, ACROSS]
     return RenderedFigure(
-        "place", "Detection by place in the frame",
+        "frame", "Detection by place in the frame",
         sentences(
             "Detection rate by the place of the marker's centre in the frame; a dash: no pose was "
             "looked for there.", denominators(summary), shown_note(shown, len(names)),
@@ -102,4 +102,4 @@ def _render(data: ReportData) -> RenderedFigure:
     )
 
 
-PLACE = FigureKind("place", _applies, _render)
+FRAME = FigureKind("frame", _applies, _render)

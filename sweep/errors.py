@@ -54,6 +54,10 @@ class ArgumentError(SweepError, ValueError):
         return ArgumentError, (self.argument, self.value, self.problem)
 
 
+class MissingPackageError(SweepError):
+    """An optional package that was asked for is not installed."""
+
+
 class StoreError(SweepError):
     """A store that cannot be written, read or continued as asked."""
 

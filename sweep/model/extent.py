@@ -34,7 +34,7 @@ def _square(low: Floats, high: Floats, per_side: int) -> Floats:
 def _outline(scenes: Scenes, rows: NDArray[np.intp], quiet: bool, per_side: int) -> Floats:
     """Return points (n, 4 · per_side, 2) along the images of the outline or the black square."""
     modules = scenes.modules[rows]
-    margin = scenes.quiet_zone[rows] if quiet else np.zeros(len(rows))
+    margin = scenes.margin[rows] if quiet else np.zeros(len(rows))
     square = _square(-margin, modules + margin, per_side)
     flat = np.concatenate([square, np.ones_like(square[..., :1])], axis=2)
     return scenes.cameras.take(rows).project(
@@ -84,7 +84,7 @@ def _warp_extent(scenes: Scenes, rows: NDArray[np.intp]) -> tuple[Floats, Floats
         if not np.isfinite(corners).all():
             continue
         n = scenes.modules[row]
-        margin = scenes.quiet_zone[row] + 0.5 / WARP_PX_PER_MODULE
+        margin = scenes.margin[row] + 0.5 / WARP_PX_PER_MODULE
         square = np.array([[0, 0], [n, 0], [n, n], [0, n]], dtype=np.float32)
         transform = cv2.getPerspectiveTransform(square, corners.astype(np.float32))
         outline = square + np.sign(square - n / 2) * margin
@@ -106,9 +106,9 @@ _COARSE_TURN = math.pi / 8
 
 def outline_modules(scenes: Scenes, row: int) -> Floats:
     """Return points (M, 2) of a marker's outline in modules: its corners, or more under a lens."""
-    quiet = scenes.quiet_zone[row : row + 1]
+    margin = scenes.margin[row : row + 1]
     per_side = CHORDS_PER_SIDE if scenes.cameras.distorted[row] else 1
-    return np.asarray(_square(-quiet, scenes.modules[row : row + 1] + quiet, per_side)[0])
+    return np.asarray(_square(-margin, scenes.modules[row : row + 1] + margin, per_side)[0])
 
 
 def moving_marker(scenes: Scenes, row: int, velocity: Floats) -> MovingMarker:
@@ -192,8 +192,8 @@ def spread_px(scenes: Scenes, row: int, inverse_depth: Floats) -> Floats:
 
 def corner_depths(scenes: Scenes, row: int) -> Floats:
     """Return the depths (4,) in metres of the quiet zone's corners."""
-    quiet = scenes.quiet_zone[row : row + 1]
-    (corners,) = _square(-quiet, scenes.modules[row : row + 1] + quiet, 1)
+    margin = scenes.margin[row : row + 1]
+    (corners,) = _square(-margin, scenes.modules[row : row + 1] + margin, 1)
     depth = scenes.plane[row][2]
     return np.asarray(corners @ depth[:2] + depth[2])
 
@@ -307,7 +307,7 @@ def not_modelled(scenes: Scenes) -> NDArray[np.bool_]:
             folded[row] = not np.isfinite(_exposed_extent(scenes, row, low, high)).all()
     rows = np.flatnonzero(scenes.cameras.distorted & np.isfinite(scenes.outline_px).all((1, 2)))
     if len(rows):
-        widened = 1 + 2 * scenes.quiet_zone[rows] / scenes.modules[rows]
+        widened = 1 + 2 * scenes.margin[rows] / scenes.modules[rows]
         outline = marker_corners(scenes.size_m[rows] * widened)
         points = transform_points(outline, scenes.rotation[rows], scenes.translation[rows])
         folded[rows] |= lens_model.folds(

@@ -17,7 +17,7 @@ from sweep.model.effects import POINTWISE, Patch, apply_pointwise
 from sweep.model.exposure import marker_exposure
 from sweep.model.extent import WARP_PX_PER_MODULE
 from sweep.model.image_file import decode_grey
-from sweep.model.marker import edge_table, edges, modules
+from sweep.model.marker import edge_table, edges, modules, overhang
 from sweep.model.scene import Box, Scenes
 from sweep.model.sensor import Light, Readout, add_noise, digitise, illuminate, read_out
 from sweep.model.supersampling import SampledMarker, supersample
@@ -208,9 +208,13 @@ def marker_levels(
         match = SUPERSAMPLE.fullmatch(renderer)
         if match is None:
             raise ValueError(f"renderer = {renderer!r}: expected {renderer_fault(renderer)}")
+        beyond = overhang(scenes.dictionary[row])
+        inverse = np.linalg.inv(scenes.plane[row])
+        inverse[:2] += beyond * inverse[2]
         marker = SampledMarker(
-            modules(scenes.dictionary[row], scenes.marker_id[row]), float(scenes.quiet_zone[row]),
-            scenes.levels[row], np.linalg.inv(scenes.plane[row]), scenes.cameras.optics(row),
+            modules(scenes.dictionary[row], scenes.marker_id[row]),
+            float(scenes.margin[row] - beyond), scenes.levels[row], inverse,
+            scenes.cameras.optics(row),
         )
         supersample(
             mean, share, marker, int(match[1]), match[2] is not None, box[0], box[1]
@@ -223,7 +227,7 @@ def _cover(
 ) -> NDArray[np.float64]:
     """Return the accumulated edges of a scene's marker, (height, width + 2) of ``box``."""
     cover = np.zeros((box[3] - box[1], box[2] - box[0] + 2))
-    outlines = edges(scenes.dictionary[row], scenes.marker_id[row], float(scenes.quiet_zone[row]))
+    outlines = edges(scenes.dictionary[row], scenes.marker_id[row], float(scenes.margin[row]))
     coverage.accumulate(
         cover, outlines, levels, scenes.projection(row), box[0], box[1], 0.0
     )
@@ -232,30 +236,32 @@ def _cover(
 
 @lru_cache(maxsize=1024)
 def _bitmap(
-    dictionary: str, marker_id: int, quiet_zone: float, black: float, white: float
+    dictionary: str, marker_id: int, margin: float, black: float, white: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return a marker's bitmap (side, side) at 10 px a module, and its black square's corners.
+    """Return a marker's bitmap (side, side) at 10 px a module, and its square's corners.
 
     The corners (4, 2) are TL, TR, BR, BL in pixels of the bitmap, whose pixels' edges lie at
     halves.
     """
-    pad = round(WARP_PX_PER_MODULE * quiet_zone)
-    square = np.kron(
+    beyond = overhang(dictionary)
+    pad = round(WARP_PX_PER_MODULE * (margin - beyond))
+    cells = np.kron(
         modules(dictionary, marker_id),
         np.ones((WARP_PX_PER_MODULE, WARP_PX_PER_MODULE), dtype=bool),
     )
-    bitmap = np.where(np.pad(square, pad, constant_values=True), white, black)
-    near, far = pad - 0.5, pad + len(square) - 0.5
+    bitmap = np.where(np.pad(cells, pad, constant_values=True), white, black)
+    near = pad + WARP_PX_PER_MODULE * beyond - 0.5
+    far = len(bitmap) - 1 - near
     corners = np.array([[near, near], [far, near], [far, far], [near, far]], dtype=np.float32)
     return bitmap.astype(np.float32), corners
 
 
 @lru_cache(maxsize=1024)
 def _grey_bitmap(
-    dictionary: str, marker_id: int, quiet_zone: float, black: float, white: float
+    dictionary: str, marker_id: int, margin: float, black: float, white: float
 ) -> tuple[Grey, NDArray[np.float32]]:
     """As :func:`_bitmap`, in 8 bits."""
-    bitmap, corners = _bitmap(dictionary, marker_id, quiet_zone, black, white)
+    bitmap, corners = _bitmap(dictionary, marker_id, margin, black, white)
     return quantise(bitmap.astype(np.float64)), corners
 
 
@@ -271,7 +277,7 @@ def _warp_grey(scenes: Scenes, row: int, box: Box, view: Grey) -> None:
     """Take the paper's steps 5-8: only the corners are projected, and OpenCV warps the bitmap."""
     background, black, white = scenes.levels[row].tolist()
     bitmap, corners = _grey_bitmap(
-        scenes.dictionary[row], scenes.marker_id[row], float(scenes.quiet_zone[row]), black, white
+        scenes.dictionary[row], scenes.marker_id[row], float(scenes.margin[row]), black, white
     )
     transform = _perspective(scenes, row, box, corners)
     size = (box[2] - box[0], box[3] - box[1])
@@ -286,7 +292,7 @@ def _warp_levels(
 ) -> None:
     """As :func:`_warp_grey`, not quantised, with the marker's share as the warp of ones."""
     bitmap, corners = _bitmap(
-        scenes.dictionary[row], scenes.marker_id[row], scenes.quiet_zone[row],
+        scenes.dictionary[row], scenes.marker_id[row], float(scenes.margin[row]),
         *scenes.levels[row, 1:].tolist(),
     )
     transform = _perspective(scenes, row, box, corners)

@@ -15,7 +15,7 @@ from sweep.model import lens as lens_model
 from sweep.model.camera import VIEW_PARAMETERS, Camera, Cameras, intrinsics
 from sweep.model.columns import Column, map_columns
 from sweep.model.effects import EFFECTS, NEUTRAL, SWITCHES, VELOCITIES, is_active
-from sweep.model.marker import MarkerKey, marker_corners, module_count
+from sweep.model.marker import MarkerKey, marker_corners, module_count, overhang
 from sweep.model.pose import rotation_of_angles, transform_points
 from sweep.model.projection import Projection
 from sweep.typing import Floats
@@ -60,10 +60,11 @@ class Scenes:
     ----------
     frame
         (N, 2) width and height in pixels.
-    dictionary, marker_id, quiet_zone, renderer, background
-        One value for each scene; the quiet zone is 0 if the background has its level.
+    dictionary, marker_id, margin, renderer, background
+        One value for each scene. The margin is how far the marker extends beyond the square, in
+        modules: data outside it, and the quiet zone unless the background has its level.
     markers, marker
-        The distinct markers (dictionary, ID, quiet zone), and (N,) the index of each scene's.
+        The distinct markers (dictionary, ID, margin), and (N,) the index of each scene's.
     modules
         (N,) modules along the black square's side.
     size_m
@@ -87,7 +88,7 @@ class Scenes:
     frame: NDArray[np.int64]
     dictionary: Sequence[str]
     marker_id: Sequence[int]
-    quiet_zone: Floats
+    margin: Floats
     markers: tuple[MarkerKey, ...]
     marker: NDArray[np.int64]
     modules: Floats
@@ -215,13 +216,14 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
     keys = mapped(
         lambda dictionary, marker_id, width, white, background, occlusion: (
             dictionary, int(marker_id),
-            0.0 if background == white and occlusion == 0 else float(width),
+            overhang(dictionary)
+            + (0.0 if background == white and occlusion == 0 else float(width)),
         ),
         "dictionary", "marker_id", "quiet_zone_modules", "white", "background", "occlusion",
     )
     markers, marker = distinct(keys)
     modules = np.array([module_count(key[0]) for key in markers], dtype=np.float64)[marker]
-    quiet = np.array([key[2] for key in markers])[marker]
+    margin = np.array([key[2] for key in markers])[marker]
     half, module = size / 2, size / modules
     plane = np.empty((count, 3, 3))
     plane[:, :, 0] = rotation[:, :, 0] * module[:, None]
@@ -229,7 +231,7 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
     plane[:, :, 2] = (
         translation - (rotation[:, :, 0] - rotation[:, :, 1]) * half[:, None]
     )
-    outline_size = size * (1 + 2 * quiet / modules)
+    outline_size = size * (1 + 2 * margin / modules)
     corners_px, outline_px = (
         cameras.project(transform_points(marker_corners(side), rotation, translation))
         for side in (size, outline_size)
@@ -257,7 +259,7 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
         frame=np.stack([numbers("width_px"), numbers("height_px")], axis=1).astype(np.int64),
         dictionary=[key[0] for key in keys],
         marker_id=[key[1] for key in keys],
-        quiet_zone=quiet,
+        margin=margin,
         markers=markers,
         marker=marker,
         modules=modules,

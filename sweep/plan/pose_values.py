@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.model.columns import Column
-from sweep.model.marker import marker_corners, module_count
+from sweep.model.marker import marker_corners, module_count, overhang
 from sweep.model.placement import PER_SIDE, Framing
 from sweep.model.pose import rotation_of_angles, transform_points
 from sweep.model.rotations import (
@@ -217,7 +217,8 @@ def _from_frame(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
     cameras = build_cameras(values, count)
     modules = values["dictionary"].map(module_count).broadcast(count)
     size, quiet = _numbers(values, ("size_m", "quiet_zone_modules"), count)
-    outline = marker_corners(size * (1 + 2 * quiet / modules))
+    margin = quiet + values["dictionary"].map(overhang).broadcast(count)
+    outline = marker_corners(size * (1 + 2 * margin / modules))
     depth = values["distance_m"].broadcast(count)
     facing, given = _facing(values, count), _centres(values, count)
     shift = _shifts(values, count)

@@ -12,7 +12,7 @@ from sweep.measure.detector import DetectorSetting
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.model.effects import GEOMETRIC, NEEDS, RANDOM, is_on
 from sweep.model.image_file import MAX_PIXELS
-from sweep.model.marker import marker_count
+from sweep.model.marker import has_circles, marker_count, missing_package
 from sweep.plan.alternatives import IN_CAMERA, WORLD, contradictions
 from sweep.plan.axes import TRIAL
 from sweep.plan.background_files import check_backgrounds
@@ -63,6 +63,24 @@ def ids_in_dictionary(reading: Reading) -> None:
             "marker_id", reading.written("marker_id"),
             f"IDs from 0 to {count - 1}, which is what {dictionary} has",
         )
+
+
+def dictionaries_can_be_drawn(reading: Reading) -> None:
+    """Demand the packages that have the codes of a dictionary, and a renderer for its circles.
+
+    A store's pipeline can be read without them.
+    """
+    for dictionary in reading.values("dictionary"):
+        missing = missing_package(dictionary)
+        if missing is not None and reading.known_files is None:
+            reading.fault("marker.dictionary", dictionary, missing)
+    for dictionaries, renderers in reading.together("dictionary", "renderer"):
+        if any(map(has_circles, dictionaries)) and any(name != "exact" for name in renderers):
+            reading.fault(
+                "scene.renderer", reading.written("renderer"),
+                "exact for STag's markers, which have circles",
+            )
+            break
 
 
 def is_active(reading: Reading, switch: str) -> bool:
@@ -238,6 +256,7 @@ RULES: tuple[Callable[[Reading], None], ...] = (
     one_camera,
     beliefs_in_one_way,
     ids_in_dictionary,
+    dictionaries_can_be_drawn,
     effects_need_partners,
     effects_need_the_exact_renderer,
     threshold_windows_in_order,

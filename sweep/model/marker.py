@@ -36,13 +36,15 @@ class Marker:
     """A marker's parameters."""
 
     dictionary: str = parameter(
-        "DICT_5X5_50", "the marker's dictionary, by OpenCV's name, or by AprilTag's; STAG_* are STag's libraries",
+        "DICT_5X5_50", "the marker's dictionary, by OpenCV's name; tag*: AprilTag's families that "
+        "OpenCV lacks; STAG_*: STag's libraries",
         choices=dictionary_names(), prefix="DICT_",
         numbers=tuple((name, getattr(cv2.aruco, name)) for name in opencv_dictionary_names()),
     )
     marker_id: int = parameter(0, "the marker's ID in its dictionary", low=0, high=10**6)
     size_m: float = parameter(
-        0.01, "side of the square whose corners are detected: the black one, or tag*'s white one", unit="m", low=1e-9, high=1e9
+        0.01, "side of the black square (of tag* the white one, whose corners are detected)",
+        unit="m", low=1e-9, high=1e9,
     )
     quiet_zone_modules: float = parameter(
         1.0, "width of the white surround, in modules", unit="module", low=0, high=100

@@ -63,7 +63,7 @@ DOTS_RADIUS = 0.35 * STAG_MODULES
 DOT_RADIUS = 0.062482177287080 * 2 * DOTS_RADIUS
 """In modules: the white circle, the circle that encloses the dots, and a dot."""
 
-DOT_PLACES = (
+DOT_POSITIONS = (
     (0.088363142525988, math.pi / 4),
     (0.206935928182607, 0.459275804122858), (0.206935928182607, math.pi / 2 - 0.459275804122858),
     (0.313672146827381, 0.200579720495241), (0.327493143484516, 0.591687617505840),
@@ -146,9 +146,9 @@ def _circle(centre: Floats, radius: float, sides: int) -> Floats:
 @lru_cache(maxsize=1)
 def dot_centres() -> Floats:
     """Return the centres (48, 2) of the dots in modules, from the square's top left corner."""
-    places = np.array(DOT_PLACES)
-    radius = np.tile(places[:, 0], 4) * 2 * DOTS_RADIUS
-    angle = (places[:, 1] + np.arange(4)[:, None] * math.pi / 2).ravel()
+    positions = np.array(DOT_POSITIONS)
+    radius = np.tile(positions[:, 0], 4) * 2 * DOTS_RADIUS
+    angle = (positions[:, 1] + np.arange(4)[:, None] * math.pi / 2).ravel()
     half = STAG_MODULES / 2
     return np.stack([half + radius * np.cos(angle), half - radius * np.sin(angle)], axis=1)
 

@@ -33,7 +33,7 @@ class TagFamily:
     count
         IDs.
     sha256
-        Digest of codes and places of bits: a library with others is refused.
+        Digest of codes and positions of bits: a library with others is refused.
     """
 
     modules: int
@@ -100,9 +100,9 @@ def missing_library() -> str | None:
 
 @lru_cache(maxsize=8)
 def _codes(name: str) -> tuple[NDArray[np.uint64], NDArray[np.int32]]:
-    """Return a family's codes (count,), and the places (bits, 2) of its bits: column, row.
+    """Return a family's codes (count,), and the positions (bits, 2) of its bits: column, row.
 
-    Bits count from the code's highest; places from the first module inside the square.
+    Bits count from the code's highest; positions from the first module inside the square.
     """
     path = library_path()
     if path is None:
@@ -111,15 +111,15 @@ def _codes(name: str) -> tuple[NDArray[np.uint64], NDArray[np.int32]]:
     create.restype = ctypes.POINTER(_Family)
     family = create().contents  # the library keeps it; it is read once in a process
     codes = np.array(family.codes[: family.ncodes], dtype=np.uint64)
-    places = np.array(
+    positions = np.array(
         [family.bit_x[: family.nbits], family.bit_y[: family.nbits]], dtype=np.int32
     ).T
-    digest = hashlib.sha256(codes.astype("<u8").tobytes() + places.astype("<i4").tobytes())
+    digest = hashlib.sha256(codes.astype("<u8").tobytes() + positions.astype("<i4").tobytes())
     if digest.hexdigest() != TAG_FAMILIES[name].sha256:
         raise MissingPackageError(
             f"{name}: the codes in {path} are not AprilTag's; install another pyapriltags"
         )
-    return codes, places
+    return codes, positions
 
 
 def tag_cells(name: str, marker_id: int) -> NDArray[np.bool_]:
@@ -134,13 +134,13 @@ def tag_cells(name: str, marker_id: int) -> NDArray[np.bool_]:
         No package with an AprilTag library is installed.
     """
     family = TAG_FAMILIES[name]
-    codes, places = _codes(name)
+    codes, positions = _codes(name)
     n, start = family.modules, family.overhang
     white = np.ones((n + 2 * start, n + 2 * start), dtype=np.bool_)
     ring = np.s_[start - 1 : start + n + 1]
     white[ring, ring] = False
     white[start : start + n, start : start + n] = True
-    shift = np.arange(len(places) - 1, -1, -1, dtype=np.uint64)
-    column, row = (places + start).T
+    shift = np.arange(len(positions) - 1, -1, -1, dtype=np.uint64)
+    column, row = (positions + start).T
     white[row, column] = (codes[marker_id] >> shift & np.uint64(1)).astype(np.bool_)
     return white

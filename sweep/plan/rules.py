@@ -5,14 +5,21 @@ A parameter whose own value is at fault is passed over: its fault is known alrea
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 
 from sweep.measure.detector import DetectorSetting
+from sweep.measure.detectors import OPENCV
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.model.effects import GEOMETRIC, NEEDS, RANDOM, is_on
 from sweep.model.image_file import MAX_PIXELS
-from sweep.model.marker import has_circles, marker_count, missing_package
+from sweep.model.marker import (
+    has_circles,
+    marker_count,
+    missing_package,
+    opencv_dictionary_names,
+)
 from sweep.plan.alternatives import IN_CAMERA, WORLD, contradictions
 from sweep.plan.axes import TRIAL
 from sweep.plan.background_files import check_backgrounds
@@ -73,7 +80,7 @@ def dictionaries_can_be_drawn(reading: Reading) -> None:
     for dictionary in reading.values("dictionary"):
         missing = missing_package(dictionary)
         if missing is not None and reading.known_files is None:
-            reading.fault("marker.dictionary", dictionary, missing)
+            reading.fault("dictionary", dictionary, missing)
     for dictionaries, renderers in reading.together("dictionary", "renderer"):
         if any(map(has_circles, dictionaries)) and any(name != "exact" for name in renderers):
             reading.fault(
@@ -131,16 +138,24 @@ def fields_of_the_installed_opencv(reading: Reading) -> None:
 
 
 def dictionaries_of_detectors(reading: Reading) -> None:
-    """Demand dictionaries that each plug-in's detector has."""
-    for plugin in reading.plugins:
-        if plugin.kind != "detector" or not plugin.dictionaries:
-            continue
-        for dictionary in reading.values("dictionary"):
-            if dictionary not in plugin.dictionaries:
-                reading.fault(
-                    "dictionary", dictionary,
-                    f"one that the detector {plugin.name} has: {', '.join(plugin.dictionaries)}",
-                )
+    """Demand dictionaries that each detector has."""
+    known: dict[str, tuple[str, ...]] = {
+        OPENCV: opencv_dictionary_names(),
+        **{plugin.name: plugin.dictionaries for plugin in reading.plugins
+           if plugin.kind == "detector" and plugin.dictionaries},
+    }
+    pairs = dict.fromkeys(
+        pair for some in reading.together("detector", "dictionary")
+        for pair in itertools.product(*some)
+    )
+    for detector, dictionary in pairs:
+        if dictionary not in known.get(detector, (dictionary,)):
+            expected = (
+                "one of OpenCV's for its detector; give another detector"
+                if detector == OPENCV
+                else f"one that the detector {detector} has: {', '.join(known[detector])}"
+            )
+            reading.fault("dictionary", dictionary, expected)
 
 
 def names_of_settings(reading: Reading) -> None:

@@ -28,14 +28,21 @@ side_px = 90
 tilt_deg = 25
 azimuth_deg = 70
 roll_deg = 140
+[detector]
+detector = "{detector}"
 [scene]
 background = 90
 """
 
 
+def text_of(dictionary, marker_id, extra=""):
+    detector = "stag-python" if dictionary.startswith("STAG") else "pyapriltags"
+    return TEXT.format(dictionary=dictionary, marker_id=marker_id, detector=detector) + extra
+
+
 def image(dictionary, marker_id, extra=""):
-    text = TEXT.format(dictionary=dictionary, marker_id=marker_id) + extra
-    return np.ascontiguousarray(scene_image(Pipeline.from_text(text), whole_frame=True))
+    pipeline = Pipeline.from_text(text_of(dictionary, marker_id, extra))
+    return np.ascontiguousarray(scene_image(pipeline, whole_frame=True))
 
 
 class AprilTagImage(ctypes.Structure):
@@ -54,10 +61,10 @@ def test_modules_of_tag_families_are_those_that_apriltag_draws(family):
     library.apriltag_to_image.restype = ctypes.POINTER(AprilTagImage)
     library.apriltag_to_image.argtypes = (ctypes.c_void_p, ctypes.c_uint32)
     made = create()
-    _, places = tag_families._codes(family)
+    _, positions = tag_families._codes(family)
     start, size = overhang(family), module_count(family) + 2 * overhang(family)
     used = np.zeros((size, size), dtype=bool)
-    used[tuple((places + start).T[::-1])] = True
+    used[tuple((positions + start).T[::-1])] = True
     used[start - 1 : -start + 1, start - 1 : -start + 1] |= np.pad(
         np.zeros((size - 2 * start - 2, size - 2 * start - 2), dtype=bool), 2, constant_values=True
     )
@@ -102,7 +109,8 @@ def test_codes_of_stag_are_as_far_apart_as_their_name_says():
 def test_circles_of_stag_have_their_areas():
     pytest.importorskip("stag")
     circle, dots = stag.stag_circles("STAG_HD21", 3)
-    for polygon, radius in ((circle, stag.CIRCLE_RADIUS), *[(dot, stag.DOT_RADIUS) for dot in dots]):
+    circles = ((circle, stag.CIRCLE_RADIUS), *[(dot, stag.DOT_RADIUS) for dot in dots])
+    for polygon, radius in circles:
         x0, y0, x1, y1 = polygon.T
         assert abs((x0 * y1 - x1 * y0).sum() / 2 / (np.pi * radius**2) - 1) < 1e-12
         centre = polygon[:, :2].mean(axis=0)
@@ -114,7 +122,7 @@ def test_circles_of_stag_have_their_areas():
 def test_stag_image_is_that_of_many_samples():
     pytest.importorskip("stag")
     dictionary, marker_id = "STAG_HD19", 7
-    text = TEXT.format(dictionary=dictionary, marker_id=marker_id).replace(
+    text = text_of(dictionary, marker_id).replace(
         "tilt_deg = 25", "tilt_deg = 0").replace("roll_deg = 140", "roll_deg = 0")
     drawn = scene_image(Pipeline.from_text(text), whole_frame=True).astype(float)
     # 20 samples along a side of a pixel, each black or white by the distances to the circles.
@@ -153,23 +161,29 @@ def test_renderers_agree_on_families_with_data_outside(renderer):
     assert difference.mean() < (0.1 if renderer == "supersample-16" else 2)
 
 
+def faults_of(dictionary, marker_id, extra=""):
+    with pytest.raises(PipelineError) as refused:
+        Pipeline.from_text(text_of(dictionary, marker_id, extra))
+    return "\n".join(refused.value.faults)
+
+
 def test_a_dictionary_whose_package_is_missing_is_refused_with_what_to_install(monkeypatch):
     monkeypatch.setattr(tag_families, "library_path", lambda: None)
     monkeypatch.setattr(stag, "library_file", lambda: None)
     for dictionary, extra in (("tagStandard41h12", "pyapriltags"), ("STAG_HD21", "stag-python")):
-        with pytest.raises(PipelineError) as refused:
-            Pipeline.from_text(TEXT.format(dictionary=dictionary, marker_id=1))
-        (line,) = refused.value.faults
-        assert f"pip install 'fiducial-sweep[{extra}]'" in line
+        assert f"for its codes: pip install 'fiducial-sweep[{extra}]'" in faults_of(dictionary, 1)
 
 
 def test_an_id_beyond_a_family_is_refused():
-    with pytest.raises(PipelineError, match="IDs from 0 to 37, which is what tagCircle21h7 has"):
-        Pipeline.from_text(TEXT.format(dictionary="tagCircle21h7", marker_id=38))
+    faults = faults_of("tagCircle21h7", 38)
+    assert "IDs from 0 to 37, which is what tagCircle21h7 has" in faults
 
 
 def test_circles_need_the_exact_renderer():
-    with pytest.raises(PipelineError, match="exact for STag's markers"):
-        Pipeline.from_text(
-            TEXT.format(dictionary="STAG_HD21", marker_id=1) + 'renderer = "warp"\n'
-        )
+    assert "exact for STag's markers" in faults_of("STAG_HD21", 1, 'renderer = "warp"\n')
+
+
+def test_opencv_has_only_its_own_dictionaries():
+    text = text_of("tagCircle21h7", 1).replace('detector = "pyapriltags"', "")
+    with pytest.raises(PipelineError, match="one of OpenCV's for its detector"):
+        Pipeline.from_text(text)

@@ -207,15 +207,21 @@ def _pipeline(given: Pipeline | Mapping[str, Any] | str | os.PathLike[str]) -> P
     from sweep.store.stored_pipeline import read_pipeline  # noqa: PLC0415
 
     if isinstance(given, Pipeline):
-        return given
-    if isinstance(given, Mapping):
-        return Pipeline.from_dict(given)
-    if isinstance(given, (str, os.PathLike)):
-        return read_pipeline(given)
-    raise ArgumentError(
-        "pipeline", given,
-        "expected a Pipeline, the path of a TOML file or of a store, or a mapping",
-    )
+        pipeline = given
+    elif isinstance(given, Mapping):
+        pipeline = Pipeline.from_dict(given)
+    elif isinstance(given, (str, os.PathLike)):
+        pipeline = read_pipeline(given)
+    else:
+        raise ArgumentError(
+            "pipeline", given,
+            "expected a Pipeline, the path of a TOML file or of a store, or a mapping",
+        )
+    if pipeline.requirements:
+        from sweep.analysis.required_pipeline import check_required  # noqa: PLC0415
+
+        check_required(pipeline.requirements, "pipeline")
+    return pipeline
 
 
 def open(store: str | os.PathLike[str]) -> xr.Dataset:  # noqa: A001  (as xarray and zarr have it)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from sweep.analysis.aggregate import aggregate
 from sweep.analysis.binning import Bins
 from sweep.analysis.counts import Count, CountOfDraws
 from sweep.analysis.dimensions import kept_dimensions
+from sweep.analysis.intervals import LEVEL
 from sweep.analysis.means import Mean, RootMeanSquareRatio
 from sweep.analysis.paired_rates import newcombe_and_mcnemar
 from sweep.analysis.pose_pairs import TRUTH, Pair, paired_arrays, require_pairs
@@ -85,11 +86,28 @@ def compare(
     """
     kept = kept_dimensions(first, per)
     kept_dimensions(second, per)
+    table = paired_table(first, second, kept, bins)
+    return table.drop_vars([
+        "drawn", *(quantity.named("first") for quantity in QUANTITIES),
+        *(f"{quantity.named('first')}{end}" for quantity in QUANTITIES
+          for end in ("_low", "_high"))])
+
+
+def paired_table(
+    first: xr.Dataset, second: xr.Dataset, kept: Sequence[str], bins: Bins | None,
+    quantities: Sequence[Quantity] = QUANTITIES, level: float = LEVEL,
+) -> xr.Dataset:
+    """Return the table of `compare` of some kinds of error.
+
+    Beside it there is the first's mean absolute error of the poses that both solved, and whether
+    any cell has two draws, ``drawn``. ``level`` is that of the intervals of errors.
+    """
     require_pairs(first, second)
     own = [name for name, value in first.coords.items() if not value.dims
            and not (name in second.coords and value.equals(second.coords[name]))]
     first = first.drop_vars(own)  # such as the name of its solver
-    inputs = paired_arrays(_errors_and_truth(first), _errors_and_truth(second))
+    names = dict.fromkeys(name for quantity in quantities for name in quantity.inputs)
+    inputs = paired_arrays(*(_errors_and_truth(side, names) for side in (first, second)))
     statistics: list[PairStatistic] = [
         *_agreement("detected", lambda poses: poses.detected),
         *_agreement("solved", lambda poses: poses.solved),
@@ -98,14 +116,15 @@ def compare(
                      lambda pair: pair.compared),
         Count("different_scenes", "compared poses whose truth differs, so that they are no pairs",
               lambda pair: pair.compared & pair.differing),
-        *(statistic for quantity in QUANTITIES for statistic in _differences(quantity)),
+        *(statistic for quantity in quantities for statistic in _differences(quantity, level)),
     ]
     table = aggregate(first, inputs, kept, statistics, Pair, bins)
-    return table.assign(_tested(table)).drop_vars("drawn")
+    return table.assign(_tested(table))
 
 
-def _errors_and_truth(results: xr.Dataset) -> dict[str, xr.DataArray]:
-    return pose_arrays(results, (*ERROR_INPUTS, *(name for name in TRUTH if name in results)))
+def _errors_and_truth(results: xr.Dataset, names: Iterable[str]) -> dict[str, xr.DataArray]:
+    truth = (name for name in TRUTH if name in results)
+    return pose_arrays(results, (*ERROR_INPUTS, *names, *truth))
 
 
 def _agreement(ending: str, reached: Callable[[Poses], Masks]) -> list[PairStatistic]:
@@ -133,7 +152,7 @@ def _flipped_in_one() -> list[PairStatistic]:
     ]
 
 
-def _differences(quantity: Quantity) -> list[PairStatistic]:
+def _differences(quantity: Quantity, level: float) -> list[PairStatistic]:
     def both_squares(pair: Pair) -> Floats:
         sides = (pair.first, pair.second)
         return np.stack([norm_squared(quantity.vector(side)) for side in sides], axis=-1)
@@ -144,7 +163,9 @@ def _differences(quantity: Quantity) -> list[PairStatistic]:
     words = quantity.words
     differences: list[PairStatistic] = [
         Mean(quantity.named("difference"), f"mean difference of the absolute {words}",
-             quantity.units, lambda pair: np.diff(np.sqrt(both_squares(pair))), solved),
+             quantity.units, lambda pair: np.diff(np.sqrt(both_squares(pair))), solved, level),
+        Mean(quantity.named("first"), f"first mean absolute {words}", quantity.units,
+             lambda pair: np.sqrt(both_squares(pair)[..., :1]), solved),
         RootMeanSquareRatio(f"{quantity.name}_rmse_ratio", f"second RMS {words} over the first",
                             "1", both_squares, solved),
     ]

@@ -116,16 +116,7 @@ def parse_requirements(texts: str | Iterable[str]) -> tuple[Requirement, ...]:
     ['detection_rate >= 0.99', 'yaw_bias_deg < 0.1']
     """
     given = [texts] if isinstance(texts, str) else list(texts)
-    requirements, faults = [], []
-    for text in given:
-        try:
-            requirement = _parsed(text)
-        except ValueError as error:
-            faults.append((text, str(error)))
-        else:
-            requirements.append(requirement)
-    faults += contradictions([
-        Side(each.text, each.variable, each.at_least, each.limit) for each in requirements])
+    requirements, faults = read_requirements(given)
     if not given:
         faults.append(("[]", "expected at least one, such as 'detection >= 0.95'"))
     if faults:
@@ -138,6 +129,23 @@ def parse_requirements(texts: str | Iterable[str]) -> tuple[Requirement, ...]:
 def parse_requirement(text: str) -> Requirement:
     """Return the requirement of a text; ArgumentError as `parse_requirements`."""
     return parse_requirements([text])[0]
+
+
+def read_requirements(
+    texts: Iterable[str]
+) -> tuple[list[Requirement], list[tuple[str, str]]]:
+    """Return the requirements of some texts, and their faults: texts and what is wrong."""
+    requirements, faults = [], []
+    for text in texts:
+        try:
+            requirement = _parsed(text)
+        except ValueError as error:
+            faults.append((text, str(error)))
+        else:
+            requirements.append(requirement)
+    faults += contradictions([
+        Side(each.text, each.variable, each.at_least, each.limit) for each in requirements])
+    return requirements, faults
 
 
 def _parsed(text: str) -> Requirement:
@@ -225,7 +233,8 @@ def check_requirements(
           for statistic in each.requirable.computed(prefix, level)),
     ]
     table = aggregate(results, inputs, kept, statistics, Poses, bins).compute()
-    replicated = is_replicated(results) and DRAWS not in kept
+    _require_numbers(table, required)
+    replicated = is_replicated(results)
     judged = [_judged(table, number, each, replicated) for number, each in enumerate(required)]
     index = xr.DataArray([each.text for each in required], dims="requirement", attrs={
         "long_name": "what is required"})
@@ -264,6 +273,16 @@ def require_draws(results: xr.Dataset, kept: Sequence[str]) -> None:
             "trial: this store has a single draw of each pose, so that nothing tells how far its "
             "numbers are chance; give the pipeline something drawn (jitter_px = 0.5, noise_grey) "
             "and trial = 100 under [axes], and run it again")
+
+
+def _require_numbers(table: xr.Dataset, required: Sequence[Requirement]) -> None:
+    """Raise if poses were solved and what is required has no number at all."""
+    lacking = [each.variable for number, each in enumerate(required)
+               if not table[f"{number} one used"].any() and table["solved"].any()]
+    if lacking:
+        raise DatasetError("\n".join(
+            f"{name}: no pose of this store has such a number; require something else, or give the "
+            "pipeline what computes it" for name in lacking))
 
 
 def _judged(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from sweep.messages import plain
+
 if TYPE_CHECKING:
     from sweep.plan.experiment import Pipeline
 
@@ -32,9 +34,24 @@ def read_pipeline(options: argparse.Namespace) -> Pipeline:
     StoreError
         If it is given as a folder that is no store.
     """
+    from sweep.errors import PipelineError  # noqa: PLC0415
     from sweep.store.stored_pipeline import read_pipeline as read  # noqa: PLC0415
+    from sweep.store.stored_pipeline import texts_required  # noqa: PLC0415
 
-    return read(options.pipeline, options.settings)
+    source = plain(options.pipeline)
+    try:
+        pipeline = read(options.pipeline, options.settings)
+    except PipelineError as error:
+        if texts := texts_required(options.pipeline, options.settings):
+            from sweep.analysis.required_pipeline import check_required  # noqa: PLC0415
+
+            check_required(texts, source, error)
+        raise
+    if pipeline.requirements:
+        from sweep.analysis.required_pipeline import check_required  # noqa: PLC0415
+
+        check_required(pipeline.requirements, source)
+    return pipeline
 
 
 def add_store(parser: argparse.ArgumentParser) -> None:

@@ -49,7 +49,8 @@ def completions(commands: Sequence[Command]) -> list[Completion]:
             choices = " ".join(map(str, action.choices or ()))
             if not action.option_strings:
                 metavar = str(action.metavar)
-                positional = choices or ("toml" if "PIPELINE" in metavar else "zarr")
+                positional = positional or choices or (
+                    "toml" if "PIPELINE" in metavar else "zarr")
                 continue
             if action.nargs == 0:
                 follows = ""

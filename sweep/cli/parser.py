@@ -14,6 +14,7 @@ from sweep.cli.output import flushed
 from sweep.cli.plan import PLAN
 from sweep.cli.report import REPORT
 from sweep.cli.repro import REPRO
+from sweep.cli.require import REQUIRE
 from sweep.cli.run import RUN
 from sweep.cli.show import SHOW
 from sweep.cli.status import STATUS
@@ -22,7 +23,7 @@ from sweep.cli.verify import VERIFY
 from sweep.messages import nearest
 from sweep.version import __version__
 
-COMMANDS = (RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, VERIFY, STATUS, EXPORT, COMPLETION)
+COMMANDS = (RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, VERIFY, STATUS, EXPORT, COMPLETION)
 """Every command, in the order in which the help lists them."""
 
 GUIDES = ("README.md", "sweep/README.md")

@@ -40,6 +40,9 @@ def _execute(options: argparse.Namespace) -> int:
                 "notes": [*notes(pipeline), *pose_notes(pipeline, views)],
                 "views": views.ranges(),
                 "dimensions": {axis.name: len(axis) for axis in pipeline.axes},
+                "require": {
+                    "all": list(pipeline.requirements), "per": list(pipeline.require_per),
+                },
                 **dataclasses.asdict(expected),
                 "parts": [
                     {**dataclasses.asdict(part), "pose_s": costs.get(part.switch)}
@@ -61,6 +64,12 @@ def _execute(options: argparse.Namespace) -> int:
         stage = axis.stage.name
         values = f"{axis.values[0]} ... {axis.values[-1]}" if len(axis) > 1 else axis.values[0]
         say(f"  {axis.name:{width}}  {len(axis):>11,}  {stage:10}  {values} {axis.unit}".rstrip())
+    if pipeline.requirements:
+        say("\nRequired")
+        for text in pipeline.requirements:
+            say(f"  {text}")
+        names = [name for name in pipeline.require_per if pipeline.axis(name) is not None]
+        say(f"  at each {', '.join(names)}" if names else "  pooled over all axes of the scene")
     say("\nParts")
     for part in listed:
         cost = ""

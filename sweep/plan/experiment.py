@@ -20,6 +20,7 @@ from sweep.plan.overrides import apply_settings, fix_values, parse_settings
 from sweep.plan.parameters import Parameter, Stage
 from sweep.plan.plugins import NAMED_BY, parameters_with, read_plugins
 from sweep.plan.reader import read_keys
+from sweep.plan.required import read_required
 from sweep.plan.rules import check_rules
 from sweep.plan.toml_text import MAX_BYTES, document_text, read_document
 from sweep.plugins.declared import DeclaredPlugin
@@ -56,6 +57,9 @@ class Pipeline:
         Where relative paths start.
     plugins
         The plug-ins that it names.
+    requirements, require_per
+        What is required of the results, as texts, and the axes whose values are conditions: the
+        section [require]. No part of an experiment's identity.
 
     Examples
     --------
@@ -79,6 +83,8 @@ class Pipeline:
     files: Mapping[str, str]
     folder: str
     plugins: tuple[DeclaredPlugin, ...] = ()
+    requirements: tuple[str, ...] = ()
+    require_per: tuple[str, ...] = ()
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
@@ -331,6 +337,7 @@ def _checked(
     read_camera_file(reading)
     resolve_sensor(reading)
     check_rules(reading)
+    read_required(reading)
     if reading.faults:
         raise refusal(reading.faults)
     if reading.stated:
@@ -341,4 +348,5 @@ def _checked(
         given=frozenset(reading.given), distributions=reading.distributions,
         axes=tuple(reading.axes.values()), text=text, files=reading.files,
         folder=str(folder.resolve()), plugins=reading.plugins,
+        requirements=reading.requirements, require_per=reading.require_per,
     )

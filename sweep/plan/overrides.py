@@ -13,7 +13,8 @@ from sweep.plan.alternatives import RIVALS
 from sweep.plan.axes import DISTRIBUTION_FORMS, TRIAL
 from sweep.plan.camera_files import FILE_DEVIATIONS, FILE_VALUES, OTHER_WAYS
 from sweep.plan.parameters import PARAMETERS, Parameter
-from sweep.plan.reader import HEADER, is_zip, section_of
+from sweep.plan.reader import HEADER, REQUIRE, is_zip, section_of
+from sweep.plan.required import KEYS
 from sweep.plan.toml_text import python_boolean, quoted_if_bare, read_value
 
 _PX = ("fx_px", "fy_px")
@@ -71,7 +72,9 @@ def parse_settings(
             faults.append(f"{start}expected a TOML value, such as [0, 45] or 'text'")
             continue
         home = section_of(name, parameters)
-        if not home and name not in HEADER and not is_zip(value):
+        if section == REQUIRE and name in KEYS:
+            chosen[f"{REQUIRE}.{name}"] = value
+        elif not home and name not in HEADER and not is_zip(value):
             known = [*parameters, TRIAL, *HEADER]
             hint = nearest(name, known) if len(faults) < MAX_FAULTS else ""
             faults.append(f"{start}unknown parameter{hint}")
@@ -117,6 +120,9 @@ def apply_settings(
     for name, value in chosen.items():
         if name in HEADER:
             document[name] = value
+        elif name.startswith(f"{REQUIRE}."):
+            if isinstance(document.setdefault(REQUIRE, {}), dict):
+                document[REQUIRE][name.partition(".")[2]] = value
         elif all(
             isinstance(document.get(table, {}), dict)
             for table in (section_of(name, parameters), "axes")
@@ -144,6 +150,7 @@ def fix_values(
     another value is chosen for one of them.
     """
     axes = document.get("axes", {})
+    document.pop(REQUIRE, None)  # one pose fulfils or fails nothing
     _leave_camera_file(document, chosen)
     _delete(document, {
         TRIAL, *displaced_by(chosen), *(name for name, value in axes.items() if is_zip(value)),

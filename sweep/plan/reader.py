@@ -28,6 +28,9 @@ MAX_TITLE_LENGTH = 200
 HEADER = ("title", "seed", "sampling")
 """Keys that stand above the sections."""
 
+REQUIRE = "require"
+"""The section of what the results must fulfil (`sweep.plan.required`)."""
+
 
 @dataclass(slots=True)
 class Reading:
@@ -51,6 +54,8 @@ class Reading:
         As :class:`sweep.plan.experiment.Pipeline` has them; ``axes`` by name.
     given
         Names of the parameters that the document has, even with a value that cannot be.
+    requirements, require_per
+        As :class:`sweep.plan.experiment.Pipeline` has them.
     plugins, parameters
         The plug-ins that the document names, and every parameter by its name, theirs included.
     unread
@@ -75,6 +80,8 @@ class Reading:
     axes: dict[str, Axis] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)
     given: set[str] = field(default_factory=set)
+    requirements: tuple[str, ...] = ()
+    require_per: tuple[str, ...] = ()
     stated: dict[str, Any] = field(default_factory=dict)
     plugins: tuple[DeclaredPlugin, ...] = ()
     parameters: Mapping[str, Parameter] = field(default_factory=lambda: PARAMETERS)
@@ -132,9 +139,9 @@ def read_keys(
     reading = Reading(document, source, folder, known_files, known_cameras, known_plugins)
     _read_header(reading)
     _read_plugins(reading)
-    known = [*HEADER, *SECTIONS, "axes"]
+    known = [*HEADER, *SECTIONS, "axes", REQUIRE]
     for key, value in document.items():
-        if key in HEADER:
+        if key in HEADER or key == REQUIRE:
             continue
         if key == "axes" or key in SECTIONS:
             if not isinstance(value, dict):

@@ -6,8 +6,12 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from sweep.errors import PipelineError
 from sweep.messages import plain, refusal
 from sweep.plan.experiment import Pipeline
+from sweep.plan.overrides import apply_settings, parse_settings
+from sweep.plan.required import texts_in
+from sweep.plan.toml_text import read_document
 
 
 def names_store(path: str | os.PathLike[str]) -> bool:
@@ -44,3 +48,13 @@ def read_pipeline(path: str | os.PathLike[str], settings: Sequence[str] = ()) ->
         stored.text, settings, name=stored.name, source=f"{url} (its pipeline)",
         folder=stored.folder, camera_files=stored.files,
     )
+
+
+def texts_required(path: str | os.PathLike[str], settings: Sequence[str] = ()) -> list[str]:
+    """Return what a TOML file that has faults requires; nothing if it is no file of TOML."""
+    try:
+        document = read_document(Path(path).read_text(encoding="utf-8"))
+        apply_settings(document, parse_settings(settings))
+    except (OSError, ValueError, PipelineError):
+        return []
+    return texts_in(document)

@@ -47,7 +47,7 @@ def test_each_script_is_one_of_its_shell(shell, check, capsys, tmp_path):
 @pytest.mark.parametrize(
     ("line", "offered"),
     [
-        ("sweep r", ["run", "repro", "report"]),
+        ("sweep r", ["run", "repro", "report", "require"]),
         ("sweep plan sm", ["small.toml"]),
         ("sweep plan ", ["runs", "small.toml"]),
         ("sweep report runs/", ["runs/small.zarr"]),

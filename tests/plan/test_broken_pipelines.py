@@ -16,7 +16,7 @@ BROKEN = {
     "unknown section, nearest named": (
         "[pose]\ndistance_m = 1\n[camra]\nwidth_px = 640",
         ("camra: unknown; expected a section of title, seed, sampling, camera, marker, pose, "
-        "scene, detector, estimator, axes; did you mean camera?"),
+        "scene, detector, estimator, axes, require; did you mean camera?"),
     ),
     "a key without its section": (
         "tilt_deg = 3\n[pose]\ndistance_m = 1", "tilt_deg = 3: expected it under [pose]",
@@ -183,6 +183,38 @@ BROKEN = {
     "a section that is no table, beside others": (
         "pose = 3\n[axes]\ndistance_m = [1]\nfy_px = [1]\ntrial = 4",
         "pose = 3: expected a table: [pose]",
+    ),
+    "a requirement without a relation": (
+        '[pose]\ndistance_m = 1\n[require]\nall = ["detection"]',
+        'require.all = "detection": expected NAME >= NUMBER',
+    ),
+    "a requirement of what does not exist": (
+        '[pose]\ndistance_m = 1\n[require]\nall = ["detektion >= 0.5"]',
+        ('require.all = "detektion >= 0.5": detektion: nothing of this name has an interval; '
+         "did you mean detection_rate?"),
+    ),
+    "a requirement in a wrong unit, beside another fault": (
+        '[pose]\ndistance = 1\n[require]\nall = ["range_error_p95_m <= 0.1"]',
+        'require.all = "range_error_p95_m <= 0.1": its unit is %: write range_p95_percent',
+    ),
+    "requirements that contradict each other": (
+        '[pose]\ndistance_m = 1\n[require]\nall = ["detection >= 0.9", "detection <= 0.5"]',
+        'require.all = "detection_rate >= 0.9": contradicts detection_rate <= 0.5',
+    ),
+    "a condition that is no axis": (
+        '[pose]\ndistance_m = 1\n[require]\nall = ["detection >= 0.9"]\nper = ["dist_m"]',
+        "require.per: dist_m: no such axis; did you mean distance_m?",
+    ),
+    "a condition that is a configuration": (
+        '[pose]\ndistance_m = 1\n[require]\nall = ["detection >= 0.9"]\nper = ["solver"]',
+        "require.per: solver: configurations are always told apart",
+    ),
+    "conditions of nothing": (
+        '[pose]\ndistance_m = 1\n[require]\nper = ["distance_m"]', "what is required, too",
+    ),
+    "an unknown key of what is required": (
+        '[pose]\ndistance_m = 1\n[require]\nany = ["detection >= 0.9"]',
+        "require.any: unknown key; expected all or per",
     ),
     "a negative seed": (
         "seed = -1\n[pose]\ndistance_m = 1", "seed = -1: expected a whole number from 0",

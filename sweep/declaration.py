@@ -16,7 +16,7 @@ class Declaration:
 
     ``low`` and ``high`` are inclusive unless ``open_low`` excludes the lower end. ``drawable``
     parameters may be drawn from a distribution per trial. ``lengths`` are those that a list of
-    numbers may have.
+    numbers may have. ``plugin`` is the kind of plug-in that may be named in place of a choice.
     """
 
     meaning: str
@@ -29,6 +29,7 @@ class Declaration:
     numbers: tuple[tuple[str, int], ...] = ()
     drawable: bool = False
     lengths: tuple[int, ...] = ()
+    plugin: str = ""
 
     def range_text(self) -> str:
         """Return the allowed values in words, as error messages and the reference print them."""

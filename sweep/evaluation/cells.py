@@ -43,6 +43,7 @@ from sweep.model.extent import marker_boxes
 from sweep.model.scene import Scenes, build_scenes
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings, estimators, scene_values
+from sweep.plan.scene_plugins import scene_plugins
 from sweep.plan.schema import drawn_variables, variables_of
 from sweep.typing import Masks
 
@@ -118,7 +119,7 @@ def _run_batch(
     failures: list[Failure] = []
     start = time.perf_counter()
     values = scene_values(pipeline, indices)
-    scenes = build_scenes(values, count)
+    scenes = build_scenes(values, count, scene_plugins(pipeline))
     visibility = visibility_flags(scenes)
     to_search = searched & (visibility == DetectionStatus.not_run)[:, None]
     geometry_s = time.perf_counter() - start

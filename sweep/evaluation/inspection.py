@@ -23,6 +23,7 @@ from sweep.model.scene import Scenes, build_scenes
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings, estimators, scene_values
 from sweep.plan.parameters import Stage
+from sweep.plan.scene_plugins import scene_plugins
 from sweep.plan.schema import SCHEMA, variables_of
 from sweep.typing import Floats, Grey, Integers, Masks
 
@@ -81,7 +82,7 @@ class _Rendered:
 def _rendered(pipeline: Pipeline, *, whole_frame: bool) -> _Rendered:
     indices = [np.zeros(1, dtype=np.intp) for _ in pipeline.axes_of(Stage.scene)]
     values = scene_values(pipeline, indices)
-    scenes = build_scenes(values, 1)
+    scenes = build_scenes(values, 1, scene_plugins(pipeline))
     boxes = marker_boxes(scenes)
     full = whole_frames(values, 1) | whole_frame
     invisible = visibility_flags(scenes) != DetectionStatus.not_run

@@ -23,13 +23,18 @@ MAX_ERROR_RAD = 0.2
 def warm_up(pipeline: Pipeline) -> None:
     """Load the compiled code that a pipeline needs by computing a scene of known pose with it.
 
-    Its renderers, bounds and solvers are used, but none of its scenes, which may end the process.
+    Its renderers, bounds and solvers are used, without plug-ins, but none of its scenes, which may
+    end the process.
 
     Raises
     ------
     MachineFaultError
         If the scene cannot be computed, or the marker's pose is not what it is known to be.
     """
+    renderers = sorted(
+        name for name in set(pipeline.values_of("renderer"))
+        if pipeline.plugin("renderer", name) is None
+    )
     solvers = [name for name in SOLVERS if name in pipeline.values_of("solver")]
     standard = Pipeline.from_dict({
         "title": TITLE,
@@ -37,7 +42,7 @@ def warm_up(pipeline: Pipeline) -> None:
         "pose": {"side_px": 60, "tilt_deg": 45},
         "scene": {"noise_grey": 1.0},
         "axes": {
-            "renderer": sorted(set(pipeline.values_of("renderer"))),
+            "renderer": renderers or ["exact"],
             "bound": sorted(set(pipeline.values_of("bound"))),
             "solver": solvers or [SOLVERS[0]],
         },

@@ -30,10 +30,10 @@ from sweep.execution.limits import (
 )
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
 from sweep.isolation.watchdog import compilation_s
-from sweep.model.effects import SWITCHES
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.parameters import Stage
+from sweep.plan.scene_plugins import effects_of
 from sweep.plan.schema import bytes_per_block
 
 EFFECT_SCENES = 24
@@ -132,7 +132,7 @@ def effect_cost(
 
 def _without(pipeline: Pipeline, switch: str) -> Pipeline:
     """Return the pipeline with an effect switched off everywhere, on the same grid."""
-    off = SWITCHES[switch]
+    off = next(each.off for each in effects_of(pipeline.plugins) if each.switch == switch)
     return dataclasses.replace(
         pipeline,
         fixed={**pipeline.fixed, switch: off},

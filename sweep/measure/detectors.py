@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from sweep.measure import detector as opencv
 from sweep.measure.detector import UNEVEN_LIGHT_CONSTANT, Detector, DetectorOutput, DetectorSetting
 from sweep.measure.plugged_detector import PluggedDetector
 from sweep.plugins import DetectorPlugin
-from sweep.plugins.declared import DeclaredPlugin
+from sweep.plugins.declared import PluginSetting
 
 OPENCV = "opencv"
 """The detector that is no plug-in, ``cv2.aruco.ArucoDetector``."""
@@ -28,42 +28,9 @@ class DetectorChoice:
 
     detector: str = parameter(
         OPENCV, "opencv: cv2.aruco.ArucoDetector, which has the settings below; or a plug-in: the "
-        "name of an installed one, or module:name in a file beside the pipeline",
+        "name of an installed one, or file:name beside the pipeline", choices=(OPENCV,),
+        plugin="detector",
     )
-
-
-def detector_name(written: str) -> str:
-    """Return a detector's name as pipelines write it: OpenCV's in any case of letters."""
-    name = written.strip()
-    return OPENCV if name.casefold() == OPENCV else name
-
-
-@dataclass(frozen=True, slots=True)
-class PluginSetting:
-    """One setting of a plug-in's detector.
-
-    Attributes
-    ----------
-    plugin
-        The plug-in.
-    values
-        Name and value of each of its settings.
-    folder
-        Where its file is.
-    """
-
-    plugin: DeclaredPlugin
-    values: tuple[tuple[str, Any], ...]
-    folder: str
-
-    def record(self) -> DetectorPlugin:
-        """Return the plug-in's record; PluginError if it is not the one that was declared."""
-        return cast("DetectorPlugin", self.plugin.record(self.folder))
-
-    def instance(self) -> Any:
-        """Return its settings as an instance of the plug-in's own dataclass; None without."""
-        settings = self.record().settings
-        return None if settings is None else settings(**dict(self.values))
 
 
 AnyDetectorSetting = DetectorSetting | PluginSetting
@@ -89,7 +56,8 @@ def make_detector(setting: AnyDetectorSetting) -> FindFunction:
 
 @lru_cache(maxsize=1024)
 def _kept_plugin(setting: PluginSetting) -> PluggedDetector:
-    return PluggedDetector(setting.plugin.name, setting.record(), setting.instance())
+    record: DetectorPlugin = setting.record()
+    return PluggedDetector(setting.plugin.name, record, setting.instance())
 
 
 def full_frame_reason(setting: AnyDetectorSetting) -> str | None:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 
 from sweep.declaration import parameter
 from sweep.measure.estimation import PoseEstimator
 from sweep.measure.photometric import Photometric
+from sweep.measure.plugged_estimator import PluggedEstimator
 from sweep.measure.solver import OPENCV_SOLVERS, CornerSolver, OpenCVSolver
 from sweep.model.lens import COUNTS
+from sweep.plugins.declared import PluginSetting
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +80,7 @@ class EstimatorSetting:
         "ippe_square", "; ".join(f"{name}: {each.meaning}" for name, each in SOLVERS.items()),
         choices=tuple(SOLVERS), prefix="SOLVEPNP_",
         numbers=tuple((name, each.method) for name, each in OPENCV_SOLVERS.items()),
+        plugin="estimator",
     )
     guarded: bool = parameter(
         True, "true: the solver is called in a frame in which it is stable, checked, and replaced "
@@ -137,6 +140,29 @@ class EstimatorSetting:
     )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PluggedEstimatorSetting(EstimatorSetting):
+    """The setting of a plug-in's solver: ours, and ``own``."""
+
+    own: PluginSetting
+
+
 def build(setting: EstimatorSetting) -> PoseEstimator:
-    """Return the estimator that a setting describes."""
+    """Return the estimator that a setting describes; those of plug-ins are kept by the process.
+
+    Raises
+    ------
+    PluginError
+        If a plug-in cannot be used.
+    """
+    if isinstance(setting, PluggedEstimatorSetting):
+        return _kept_plugin(setting)
     return SOLVERS[setting.solver].build(setting)
+
+
+@lru_cache(maxsize=1024)
+def _kept_plugin(setting: PluggedEstimatorSetting) -> PluggedEstimator:
+    return PluggedEstimator(
+        setting.solver, setting.own.record(), setting.own.instance(), setting.reprojection_limit,
+        setting.corner_noise_px,
+    )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +11,7 @@ from numpy.typing import NDArray
 from sweep.errors import PluginError
 from sweep.measure.detector import DetectorOutput
 from sweep.plugins import DetectorPlugin
-from sweep.plugins.loading import exception_line
+from sweep.plugins.calls import call
 from sweep.typing import Floats
 
 MAX_MARKERS = 1000
@@ -51,8 +49,7 @@ class PluggedDetector:
         """
         search = self._searches.get(dictionary) or self.make(dictionary)
         own = np.array(image, order="C")  # what it does to its image reaches nobody else
-        with contextlib.redirect_stdout(sys.stderr):
-            returned = self._called(search, own)
+        returned = call(self._name, search, own)
         if not np.array_equal(own, image):
             raise PluginError(f"{self._name}: changed the image that it was given; copy it first")
         return self._checked(returned)
@@ -71,8 +68,7 @@ class PluggedDetector:
                 f"{self._name}: no dictionary {dictionary}; it has {', '.join(families)}"
             )
         family = dictionary if families is None else families[dictionary]
-        with contextlib.redirect_stdout(sys.stderr):
-            search = self._called(self._record.make, self._settings, family)
+        search = call(self._name, self._record.make, self._settings, family)
         if not callable(search):
             raise PluginError(
                 f"{self._name}: make returns a {type(search).__name__}, not a function"
@@ -80,15 +76,6 @@ class PluggedDetector:
         made: Callable[[NDArray[np.uint8]], Any] = search
         self._searches[dictionary] = made
         return made
-
-    def _called(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a function of the plug-in; PluginError for whatever it raises, exits included."""
-        try:
-            return function(*arguments)
-        except (KeyboardInterrupt, MemoryError):
-            raise
-        except BaseException as error:
-            raise PluginError(f"{self._name}: raises {exception_line(error)}") from error
 
     def _checked(self, returned: Any) -> DetectorOutput:
         """Return what a plug-in returned in our conventions."""

@@ -8,7 +8,7 @@ checks, the list of active parts, random draws, the bound and the windows follow
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
 from typing import Any, Literal
@@ -113,6 +113,18 @@ class Effect:
     def off(self) -> Any:
         """The value of its switch at which it is absent."""
         return self.parameters[self.switch].default
+
+    def is_on(self, value: Any) -> bool:
+        """Return whether its switch has another value than its neutral one."""
+        return bool(value != self.off)
+
+    def is_active(self, strength: Any) -> Any:
+        """Return whether it is on: numbers (...) as scenes hold them, NaN if not given."""
+        return ~np.isnan(strength) if self.off is None else strength != self.off
+
+    def applying(self, apply: Callable[[Floats, Patch], Floats]) -> Effect:
+        """Return it as a pointwise effect."""
+        return dataclasses.replace(self, apply=apply)
 
 
 EFFECTS: tuple[Effect, ...] = (
@@ -326,20 +338,12 @@ POINTWISE = tuple(effect for effect in EFFECTS if effect.apply is not None)
 """Effects that are applied by a function of their own."""
 
 
-def is_on(name: str, value: Any) -> bool:
-    """Return whether a switch has another value than its neutral one."""
-    return bool(value != SWITCHES[name])
-
-
-def is_active(name: str, strength: Any) -> Any:
-    """Return whether a switch is on: numbers (...) as scenes hold them, NaN if not given."""
-    return ~np.isnan(strength) if SWITCHES[name] is None else strength != SWITCHES[name]
-
-
-def apply_pointwise(step: str, levels: Floats, patch: Patch) -> Floats:
-    """Return levels (h, w) after the active pointwise effects of a step."""
-    for effect in POINTWISE:
-        if effect.step == step and is_active(effect.switch, patch.values[effect.switch]):
+def apply_pointwise(
+    effects: Sequence[Effect], step: str, levels: Floats, patch: Patch
+) -> Floats:
+    """Return levels (h, w) after the active ones of pointwise effects, those of a step."""
+    for effect in effects:
+        if effect.step == step and effect.is_active(patch.values[effect.switch]):
             assert effect.apply is not None  # noqa: S101  (for the type checker)
             levels = effect.apply(levels, patch)
     return levels

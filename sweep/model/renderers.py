@@ -18,6 +18,7 @@ from sweep.model.exposure import marker_exposure
 from sweep.model.extent import WARP_PX_PER_MODULE
 from sweep.model.image_file import decode_grey
 from sweep.model.marker import edge_table, edges, modules, overhang
+from sweep.model.plugged_scene import MarkerView
 from sweep.model.scene import Box, Scenes
 from sweep.model.sensor import Light, Readout, add_noise, digitise, illuminate, read_out
 from sweep.model.supersampling import SampledMarker, supersample
@@ -132,19 +133,21 @@ def _sensed(scenes: Scenes, row: int, levels: NDArray[np.float64], left: int, to
             effect["vignetting"],
         )
         illuminate(levels, left, top, light, scenes.cameras.view[row])
-    if POINTWISE:
+    pointwise = (*POINTWISE, *scenes.plugins.effects)
+    if pointwise:
         patch = Patch(
             effect, left, top, (width, height), scenes.cameras.view[row], scenes.noise_key[row]
         )
-        levels = apply_pointwise("light", levels, patch)
+        levels = apply_pointwise(pointwise, "light", levels, patch)
     image = np.empty(levels.shape, dtype=np.uint8)
     readout = Readout(
         scenes.noise_key[row], effect["full_well_e"], effect["read_noise_e"], effect["gain"],
         effect["noise_grey"], int(effect["bit_depth"]),
     )
-    if any(each.step == "signal" for each in POINTWISE):
+    if any(each.step == "signal" for each in pointwise):
         add_noise(levels, left, top, readout)
-        digitise(apply_pointwise("signal", levels, patch), readout.bits, image)
+        levels = apply_pointwise(pointwise, "signal", levels, patch)
+        digitise(levels, readout.bits, image)
     else:
         read_out(levels, left, top, readout, image)
     return image
@@ -197,6 +200,8 @@ def marker_levels(
     """
     renderer = scenes.renderer[row]
     height, width = box[3] - box[1], box[2] - box[0]
+    if renderer in scenes.plugins.renderers:
+        return scenes.plugins.renderers[renderer](_marker_view(scenes, row, box))
     mean, share = np.empty((height, width)), np.empty((height, width))
     if renderer == "exact":
         levels = np.array([0.0, scenes.levels[row, 1], scenes.levels[row, 2]])
@@ -220,6 +225,20 @@ def marker_levels(
             mean, share, marker, int(match[1]), match[2] is not None, box[0], box[1]
         )
     return mean, share
+
+
+def _marker_view(scenes: Scenes, row: int, box: Box) -> MarkerView:
+    """Return the marker of a scene as renderers of plug-ins get it."""
+    _, black, white = scenes.levels[row].tolist()
+    distorted = bool(scenes.cameras.distorted[row])
+    beyond = overhang(scenes.dictionary[row])
+    from_whole = np.array([[1.0, 0.0, -beyond], [0.0, 1.0, -beyond], [0.0, 0.0, 1.0]])
+    return MarkerView(
+        np.array(modules(scenes.dictionary[row], scenes.marker_id[row])),
+        float(scenes.margin[row]) - beyond, black, white, scenes.plane[row] @ from_whole,
+        scenes.cameras.matrix(row), scenes.cameras.lenses[row, :14].copy() if distorted else None,
+        box, {name: float(scenes.plugin_values[name][row]) for name in scenes.plugins.settings},
+    )
 
 
 def _cover(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,8 +14,9 @@ from sweep.declaration import parameter
 from sweep.model import lens as lens_model
 from sweep.model.camera import VIEW_PARAMETERS, Camera, Cameras, intrinsics
 from sweep.model.columns import Column, map_columns
-from sweep.model.effects import EFFECTS, NEUTRAL, SWITCHES, VELOCITIES, is_active
+from sweep.model.effects import NEUTRAL, VELOCITIES
 from sweep.model.marker import MarkerKey, marker_corners, module_count, overhang
+from sweep.model.plugged_scene import NO_PLUGINS, ScenePlugins
 from sweep.model.pose import rotation_of_angles, transform_points
 from sweep.model.projection import Projection
 from sweep.typing import Floats
@@ -31,7 +32,9 @@ class Scene:
     renderer: str = parameter(
         "exact",
         "exact: area coverage; warp: the paper's, 10 px a module, INTER_LINEAR; supersample-N: "
-        "N x N regular samples a pixel; supersample-N-jittered: at random within their cells",
+        "N x N regular samples a pixel; supersample-N-jittered: at random within their cells; or a "
+        "plug-in: the name of an installed one, or file:name beside the pipeline",
+        plugin="renderer",
     )
     window: str = parameter(
         "auto",
@@ -80,6 +83,8 @@ class Scenes:
     effects, affected, noise_key
         (N,) each: every parameter of the effects, NaN if not given (``effects`` is None if no
         effect is active in any of the scenes), whether one is active, and the key of the noise.
+    plugins, plugin_values
+        The plug-ins' effects and renderers, and (N,) each setting of the renderers.
     corners_px, outline_px
         (N, 4, 2) images of the black square's and of the quiet zone's corners; NaN at z <= 0.
     """
@@ -105,6 +110,8 @@ class Scenes:
     effects: Mapping[str, Floats] | None
     affected: NDArray[np.bool_]
     noise_key: NDArray[np.uint64]
+    plugins: ScenePlugins = NO_PLUGINS
+    plugin_values: Mapping[str, Floats] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -125,9 +132,9 @@ class Scenes:
     def _any_active(self, widens: str) -> NDArray[np.bool_]:
         """Return whether an effect that widens the windows in this way is active, (N,)."""
         active = np.zeros(len(self), dtype=bool)
-        for effect in EFFECTS:
+        for effect in self.plugins.all_effects:
             if effect.widens == widens and self.effects is not None:
-                active |= is_active(effect.switch, self.effects[effect.switch])
+                active |= effect.is_active(self.effects[effect.switch])
         return active
 
     def projection(self, row: int) -> Projection:
@@ -145,7 +152,9 @@ class Scenes:
         if not self.affected[row]:
             return []
         effect = self.effect(row)
-        return [name for name in SWITCHES if is_active(name, effect[name])]
+        return [
+            each.switch for each in self.plugins.all_effects if each.is_active(effect[each.switch])
+        ]
 
     def motion(self, row: int) -> tuple[float, float, Floats] | None:
         """Return exposure and row time in s and the velocity (6,), m/s and rad/s; None at rest."""
@@ -163,14 +172,16 @@ _DEFAULT_CAMERA = {
 }
 
 
-def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
+def build_scenes(
+    values: Mapping[str, Any], count: int, plugins: ScenePlugins = NO_PLUGINS
+) -> Scenes:
     """Return ``count`` scenes from parameter values.
 
     ``values`` has every parameter of camera, marker and scene (``distortion`` canonical);
     ``distance_m``, and ``x_m``, ``y_m`` or, without these, the bearings; ``tilt_deg``,
     ``azimuth_deg``, ``roll_deg``, instead of which ``resolved_tilt_deg`` and so on count if they
     are there; and ``shift_u_px``, ``shift_v_px``: the drawn jitter. Each is a :class:`Column`, or
-    a value that :meth:`Column.of` takes.
+    a value that :meth:`Column.of` takes. ``plugins`` are needed if the scenes are to be rendered.
     """
     values = {
         **_NEUTRAL_COLUMNS, **_DEFAULT_CAMERA, "noise_key": 0, "x_m": None, "y_m": None, **values,
@@ -246,10 +257,12 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
         axis=1,
     )
     effects, affected = None, np.zeros(count, dtype=bool)
-    if any(column(name).differs_from(off) for name, off in SWITCHES.items()):
-        effects = {name: numbers(name) for name in NEUTRAL}
-        for name in SWITCHES:
-            affected |= is_active(name, effects[name])
+    every = plugins.all_effects
+    if any(column(each.switch).differs_from(each.off) for each in every):
+        own = [name for each in plugins.effects for name in each.parameters]
+        effects = {name: numbers(name) for name in (*NEUTRAL, *own)}
+        for each in every:
+            affected |= each.is_active(effects[each.switch])
     plain = np.array(
         mapped(lambda name, level: name == "exact" and not isinstance(level, str),
                "renderer", "background"), dtype=bool,
@@ -276,6 +289,8 @@ def build_scenes(values: Mapping[str, Any], count: int) -> Scenes:
         effects=effects,
         affected=affected,
         noise_key=column("noise_key").broadcast(count, np.uint64),
+        plugins=plugins,
+        plugin_values={name: numbers(name) for name in plugins.settings},
     )
 
 

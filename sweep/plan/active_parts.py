@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 from sweep.measure.detector import NOISE_MARGIN_PX
 from sweep.measure.detectors import full_frame_reason, margin_px, uneven_light_needs_frame
 from sweep.measure.estimators import SOLVERS
 from sweep.model.camera import canonical_distortion
-from sweep.model.effects import EFFECTS, RANDOM, SWITCHES, is_on
+from sweep.model.effects import Effect
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings
 from sweep.plan.parameters import PARAMETERS
+from sweep.plan.scene_plugins import effects_of
 from sweep.plugins.declared import DeclaredPlugin
 
 
@@ -36,20 +36,22 @@ class Part:
     switch: str = ""
 
 
-EFFECT_LABELS = {effect.switch: effect.label for effect in EFFECTS}
-"""Switch of an effect -> its name, in physical order."""
-
-
-def _effect(pipeline: Pipeline, name: str, switch: str) -> Part:
-    off = "not given" if SWITCHES[switch] is None else f"{SWITCHES[switch]:g}"
+def _effect(pipeline: Pipeline, effect: Effect) -> Part:
+    name, switch = effect.label, effect.switch
+    off = "not given" if effect.off is None else f"{effect.off:g}"
     if switch in pipeline.distributions:
         return Part(name, True, f"{switch} is drawn: {pipeline.distributions[switch]}", switch)
-    values = [value for value in pipeline.values_of(switch) if is_on(switch, value)]
+    values = [value for value in pipeline.values_of(switch) if effect.is_on(value)]
     if not values:
         return Part(name, False, f"{switch} is {off}", switch)
     low, high = min(values), max(values)
     extent = f"{low:g}" if low == high else f"{low:g} to {high:g}"
     return Part(name, True, f"{switch} is {extent}", switch)
+
+
+def _needs_images(pipeline: Pipeline, solver: str) -> bool:
+    plugin = pipeline.plugin("estimator", solver)
+    return SOLVERS[solver].needs_images if plugin is None else plugin.needs_images
 
 
 def _described(plugin: DeclaredPlugin) -> str:
@@ -60,13 +62,15 @@ def _described(plugin: DeclaredPlugin) -> str:
 
 def parts(pipeline: Pipeline) -> list[Part]:
     """Return every optional part, active or not."""
+    effects = effects_of(pipeline.plugins)
     lens = pipeline.any_value("distortion", lambda value: len(canonical_distortion(value)) > 0)
     draws = [*pipeline.distributions]
     if pipeline.any_value("jitter_px", lambda value: value > 0):
         draws.append("jitter_px")
     draws += [
-        name for name in RANDOM
-        if name not in draws and pipeline.any_value(name, partial(is_on, name))
+        each.switch for each in effects
+        if each.random and each.switch not in draws
+        and pipeline.any_value(each.switch, each.is_on)
     ]
     if pipeline.any_value("believed", lambda value: value == "calibration"):
         draws.append("the believed calibration")
@@ -77,9 +81,9 @@ def parts(pipeline: Pipeline) -> list[Part]:
     whole = sorted({reason for s in settings if (reason := full_frame_reason(s)) is not None})
     gain = max([1.0, *(value for value in pipeline.values_of("gain"))])
     uneven = any(
-        pipeline.any_value(effect.switch, partial(is_on, effect.switch))
+        pipeline.any_value(effect.switch, effect.is_on)
         or effect.switch in pipeline.distributions
-        for effect in EFFECTS if effect.widens == "uneven light"
+        for effect in effects if effect.widens == "uneven light"
     )
     if uneven and any(uneven_light_needs_frame(setting, gain) for setting in settings):
         whole.append("adaptiveThreshConstant is low for uneven light")
@@ -87,7 +91,7 @@ def parts(pipeline: Pipeline) -> list[Part]:
         whole.append("the background is an image: clutter near the marker may change the detection")
     if asked:
         whole.append('window = "full"')
-    noisy = any(effect.switch in draws for effect in EFFECTS if effect.widens == "noise")
+    noisy = any(effect.switch in draws for effect in effects if effect.widens == "noise")
     noise = f", and {NOISE_MARGIN_PX} more for noise" if noisy else ""
     margins = sorted({margin_px(s) for s in settings if full_frame_reason(s) is None})
     windowed = bool(margins) and not (asked or image)
@@ -99,7 +103,7 @@ def parts(pipeline: Pipeline) -> list[Part]:
     if pipeline.any_value("believed", lambda value: value == "calibration"):
         assumptions.append("believed: calibration")
     bounds = sorted(set(pipeline.values_of("bound")) - {"none"})
-    pixels = [name for name in pipeline.values_of("solver") if SOLVERS[name].needs_images]
+    pixels = [name for name in pipeline.values_of("solver") if _needs_images(pipeline, name)]
     return [
         Part("lens distortion", lens, "distortion is given" if lens else "distortion is empty"),
         Part(
@@ -119,7 +123,7 @@ def parts(pipeline: Pipeline) -> list[Part]:
         ),
         Part("full frame", bool(whole), "; ".join(whole) if whole else "no setting needs it"),
         Part("renderer", True, ", ".join(renderers)),
-        *(_effect(pipeline, name, switch) for switch, name in EFFECT_LABELS.items()),
+        *(_effect(pipeline, effect) for effect in effects),
         Part(
             "solver guard", guarded,
             "guarded = true" if guarded else "guarded = false: plain cv2.solvePnP",

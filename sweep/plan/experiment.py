@@ -18,7 +18,7 @@ from sweep.plan.camera_files import read_camera_file
 from sweep.plan.camera_values import resolve_sensor, with_values
 from sweep.plan.overrides import apply_settings, fix_values, parse_settings
 from sweep.plan.parameters import Parameter, Stage
-from sweep.plan.plugins import NAMED_BY, parameters_with, read_plugins
+from sweep.plan.plugins import EFFECTS_KEY, NAMED_BY, parameters_with, read_plugins
 from sweep.plan.reader import read_keys
 from sweep.plan.required import read_required
 from sweep.plan.rules import check_rules
@@ -316,7 +316,7 @@ def _parameters(
     known: Sequence[DeclaredPlugin] | None,
 ) -> Mapping[str, Parameter]:
     """Return the parameters of a document once the settings that name plug-ins are applied."""
-    naming = {parameter for _, parameter in NAMED_BY.values()}
+    naming = {EFFECTS_KEY, *(parameter.name for parameter in NAMED_BY.values())}
     chosen = parse_settings(
         [each for each in settings
          if each.partition("=")[0].strip().rpartition(".")[2] in naming]

@@ -15,17 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.measure.detector import DetectorSetting
-from sweep.measure.detectors import AnyDetectorSetting, PluginSetting
-from sweep.measure.estimators import EstimatorSetting
+from sweep.measure.detectors import AnyDetectorSetting
+from sweep.measure.estimators import EstimatorSetting, PluggedEstimatorSetting
 from sweep.model.camera import canonical_distortion
 from sweep.model.columns import Column
-from sweep.model.effects import RANDOM, SWITCHES
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.beliefs import CALIBRATED, believed_calibration, calibrated_columns
 from sweep.plan.draws import bits, even_uniform, geometry_keys, jointly_drawn, uniform
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
 from sweep.plan.pose_values import resolve_pose
+from sweep.plan.scene_plugins import effects_of
+from sweep.plugins.declared import DeclaredPlugin, PluginSetting
 from sweep.typing import Floats
 
 
@@ -144,7 +145,10 @@ def scene_values(
         values["background"] = values["background"].map(partial(_absolute, pipeline.folder))
     jitter = np.asarray(values["jitter_px"].values, dtype=np.float64)
     values["shift_u_px"] = values["shift_v_px"] = Column.of(0.0)
-    noisy = any(name in drawn or values[name].differs_from(SWITCHES[name]) for name in RANDOM)
+    noisy = any(
+        effect.switch in drawn or values[effect.switch].differs_from(effect.off)
+        for effect in effects_of(pipeline.plugins) if effect.random
+    )
     calibration = believed_calibration(pipeline.fixed, pipeline.values_of("believed"))
     if not drawn and not noisy and not (jitter > 0).any() and calibration is None:
         resolve_pose(values)
@@ -216,6 +220,12 @@ def _detector_setting(pipeline: Pipeline, values: Mapping[str, Any]) -> AnyDetec
     plugin = pipeline.plugin("detector", values["detector"])
     if plugin is None:
         return DetectorSetting(**{name: values[name] for name in OPENCV_FIELDS})
+    return _plugin_setting(pipeline, plugin, values)
+
+
+def _plugin_setting(
+    pipeline: Pipeline, plugin: DeclaredPlugin, values: Mapping[str, Any]
+) -> PluginSetting:
     own = tuple((setting.name, values[setting.name]) for setting in plugin.settings)
     return PluginSetting(plugin, own, pipeline.folder)
 
@@ -226,6 +236,18 @@ OPENCV_FIELDS = tuple(field.name for field in dataclasses.fields(DetectorSetting
 def estimators(pipeline: Pipeline) -> list[EstimatorSetting]:
     """Return the estimators of the grid, in the order of its estimation axes."""
     return [
-        EstimatorSetting(**{**_fixed(pipeline, "estimator"), **chosen})
+        _estimator_setting(pipeline, {**_fixed(pipeline, "estimator"), **chosen})
         for chosen in combinations(pipeline.axes_of(Stage.estimation))
     ]
+
+
+def _estimator_setting(pipeline: Pipeline, values: Mapping[str, Any]) -> EstimatorSetting:
+    """Return the setting of an estimator that has these values; a plug-in takes its own, too."""
+    common = {name: values[name] for name in ESTIMATOR_FIELDS}
+    plugin = pipeline.plugin("estimator", values["solver"])
+    if plugin is None:
+        return EstimatorSetting(**common)
+    return PluggedEstimatorSetting(**common, own=_plugin_setting(pipeline, plugin, values))
+
+
+ESTIMATOR_FIELDS = tuple(field.name for field in dataclasses.fields(EstimatorSetting))

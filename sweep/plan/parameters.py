@@ -12,7 +12,7 @@ from typing import Any
 from sweep.declaration import Declaration, plain_types
 from sweep.measure.bound import BoundSetting
 from sweep.measure.detector import DetectorSetting
-from sweep.measure.detectors import DetectorChoice, detector_name
+from sweep.measure.detectors import DetectorChoice
 from sweep.measure.estimators import EstimatorSetting
 from sweep.messages import nearest
 from sweep.model.camera import Camera
@@ -89,13 +89,11 @@ class Parameter:
             if abs(value) < 1e300 and self.declaration.admits(float(value)):
                 return float(value)
         elif str in self.types and isinstance(value, str):
-            if self.name == "renderer":
+            if self.name == "renderer" and value not in self.declaration.choices:
                 fault = renderer_fault(value.strip().lower())
                 if fault is None:
                     return value.strip().lower()
                 raise ValueError(fault)
-            if self.name == "detector":
-                return detector_name(value)
             if self.declaration.choices:
                 choice = self.declaration.choice(value)
                 if choice is not None:

@@ -2,34 +2,59 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from typing import Any
 
 from sweep.errors import PluginError
-from sweep.measure.detectors import OPENCV, detector_name
 from sweep.plan.parameters import PARAMETERS, SECTIONS, Parameter
 from sweep.plugins.declared import DeclaredPlugin, declare
+from sweep.plugins.loading import installed_names
 
-NAMED_BY: dict[str, tuple[str, str]] = {"detector": ("detector", "detector")}
-"""Kind of plug-in -> the section of its settings, and the parameter whose values name it."""
+NAMED_BY: dict[str, Parameter] = {
+    each.declaration.plugin: each for each in PARAMETERS.values() if each.declaration.plugin
+}
+"""Kind of plug-in -> the parameter whose values name it."""
 
-OWN: dict[str, tuple[str, ...]] = {"detector": (OPENCV,)}
-"""Kind of plug-in -> names that are not of plug-ins."""
+EFFECTS_KEY = "effects"
+"""The key above the sections that names effects."""
+
+
+def section_of_settings(kind: str) -> str:
+    """Return the section that the settings of a kind of plug-in belong under."""
+    return NAMED_BY[kind].section if kind in NAMED_BY else "scene"
 
 
 def named(document: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
     """Yield kind, name and key of each plug-in that a document names, in its order, once."""
     seen = set()
-    for kind, (section, parameter) in NAMED_BY.items():
-        for key, value in _values(document, section, parameter):
+    for kind, parameter in NAMED_BY.items():
+        for key, value in _values(document, parameter.section, parameter.name):
             for name in value if isinstance(value, list) else [value]:
-                if not isinstance(name, str) or not name.strip():
-                    continue
-                name = detector_name(name)  # noqa: PLW2901
-                if name not in OWN[kind] and (kind, name) not in seen:
+                if (
+                    isinstance(name, str) and (kind, name) not in seen
+                    and is_plugin(parameter, name)
+                ):
                     seen.add((kind, name))
                     yield kind, name, key
+    effects = document.get(EFFECTS_KEY)
+    for name in effects if isinstance(effects, list) else ():
+        if isinstance(name, str) and ("effect", name) not in seen:
+            seen.add(("effect", name))
+            yield "effect", name, EFFECTS_KEY
+
+
+def is_plugin(parameter: Parameter, name: str) -> bool:
+    """Return whether a value names a plug-in, or is meant to: it is none of the choices."""
+    try:
+        parameter.check(name)
+    except ValueError:
+        kind = parameter.declaration.plugin
+        # Where there are several choices, a misspelt one is more likely.
+        few = len(parameter.declaration.choices) == 1
+        return few or ":" in name or name in installed_names(kind)
+    return False
 
 
 def _values(document: Mapping[str, Any], section: str, parameter: str) -> Iterator[tuple[str, Any]]:
@@ -78,7 +103,7 @@ def read_plugins(
 
 @lru_cache(maxsize=64)
 def parameters_with(plugins: tuple[DeclaredPlugin, ...]) -> Mapping[str, Parameter]:
-    """Return every parameter by its name: our own, and the settings of plug-ins.
+    """Return every parameter by its name: our own, which may name them, and their settings.
 
     Raises
     ------
@@ -88,7 +113,12 @@ def parameters_with(plugins: tuple[DeclaredPlugin, ...]) -> Mapping[str, Paramet
     gathered: dict[str, Parameter] = {}
     owners: dict[str, str] = {}
     for plugin in plugins:
-        section, _ = NAMED_BY[plugin.kind]
+        section = section_of_settings(plugin.kind)
+        if plugin.kind in NAMED_BY:
+            by = gathered.get(NAMED_BY[plugin.kind].name, NAMED_BY[plugin.kind])
+            gathered[by.name] = dataclasses.replace(by, declaration=dataclasses.replace(
+                by.declaration, choices=(*by.declaration.choices, plugin.name)
+            ))
         for setting in plugin.settings:
             name = setting.name
             parameter = Parameter(

@@ -20,12 +20,18 @@ from sweep.plan.axes import (
 )
 from sweep.plan.draws import SAMPLINGS
 from sweep.plan.parameters import PARAMETERS, SECTIONS, Parameter
-from sweep.plan.plugins import NAMED_BY, parameters_with, read_plugins
+from sweep.plan.plugins import (
+    EFFECTS_KEY,
+    NAMED_BY,
+    parameters_with,
+    read_plugins,
+    section_of_settings,
+)
 from sweep.plugins.declared import DeclaredPlugin
 
 MAX_TITLE_LENGTH = 200
 
-HEADER = ("title", "seed", "sampling")
+HEADER = ("title", "seed", "sampling", EFFECTS_KEY)
 """Keys that stand above the sections."""
 
 REQUIRE = "require"
@@ -59,7 +65,8 @@ class Reading:
     plugins, parameters
         The plug-ins that the document names, and every parameter by its name, theirs included.
     unread
-        Sections of plug-ins that cannot be used: any key may be theirs.
+        Parameters that name plug-ins that cannot be used, and the sections of their settings: any
+        key may be theirs.
     stated
         Values that a camera file has, by parameter: they are written into the document's text.
     faults
@@ -179,6 +186,12 @@ def _read_header(reading: Reading) -> None:
         reading.fault("sampling", sampling, f"one of {', '.join(SAMPLINGS)}")
     else:
         reading.sampling = sampling
+    effects = reading.document.get(EFFECTS_KEY, [])
+    if (
+        not isinstance(effects, list) or len({*map(str, effects)}) < len(effects)
+        or not all(isinstance(name, str) and name for name in effects)
+    ):
+        reading.fault(EFFECTS_KEY, effects, 'a list of plug-ins, each once, such as ["haze"]')
 
 
 def _read_plugins(reading: Reading) -> None:
@@ -188,7 +201,9 @@ def _read_plugins(reading: Reading) -> None:
     )
     for kind, key, name, expected in faults:
         reading.fault(key, name, expected)
-        reading.unread.add(NAMED_BY[kind][0])
+        reading.unread |= {section_of_settings(kind), *(
+            [NAMED_BY[kind].name] if kind in NAMED_BY else []
+        )}
     reading.plugins, reading.parameters = tuple(plugins), parameters_with(tuple(plugins))
     reading.files.update({each.file: each.digest for each in plugins if each.file})
 
@@ -215,7 +230,8 @@ def _read_section(reading: Reading, section: str) -> None:
             else:
                 reading.fixed[key] = parameter.check(value)
         except ValueError as error:
-            reading.fault(path, value, str(error))
+            if key not in reading.unread:
+                reading.fault(path, value, str(error))
 
 
 def section_of(name: str, parameters: Mapping[str, Parameter] = PARAMETERS) -> str:
@@ -269,7 +285,8 @@ def _read_axis(reading: Reading, key: str, value: Any, quota: int, table: str = 
             reading.given.add(key)
             return parse_axis(reading.parameters[key], value, quota, repeats=bool(table))
     except ValueError as error:
-        reading.fault(path, value, str(error))
+        if key not in reading.unread:
+            reading.fault(path, value, str(error))
     return None
 
 

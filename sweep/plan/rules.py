@@ -12,7 +12,7 @@ from collections.abc import Callable
 from sweep.measure.detector import DetectorSetting
 from sweep.measure.detectors import OPENCV
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
-from sweep.model.effects import GEOMETRIC, NEEDS, RANDOM, is_on
+from sweep.model.effects import GEOMETRIC, NEEDS, RANDOM
 from sweep.model.image_file import MAX_PIXELS
 from sweep.model.marker import (
     has_circles,
@@ -95,7 +95,8 @@ def is_active(reading: Reading, switch: str) -> bool:
     values = reading.values(switch)
     if not values:
         return switch in reading.given
-    return any(is_on(switch, value) for value in values)
+    off = reading.parameters[switch].default
+    return any(value != off for value in values)
 
 
 def effects_need_partners(reading: Reading) -> None:
@@ -174,6 +175,10 @@ def something_random_to_repeat(reading: Reading) -> None:
     trials = len(reading.axes[TRIAL]) if TRIAL in reading.axes else 1
     jitter = reading.values("jitter_px")
     noisy = any(is_active(reading, name) for name in RANDOM)
+    noisy = noisy or any(
+        is_active(reading, plugin.settings[0].name)
+        for plugin in reading.plugins if plugin.kind == "effect" and plugin.random
+    )
     noisy = noisy or "calibration" in reading.values("believed")
     if trials > 1 and not reading.distributions and jitter and max(jitter) == 0 and not noisy:
         reading.fault(

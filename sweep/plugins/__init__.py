@@ -13,7 +13,10 @@ from typing import Any, ClassVar, NamedTuple
 
 from sweep.declaration import parameter
 
-__all__ = ["DetectorPlugin", "Markers", "Plugin", "parameter"]
+__all__ = [
+    "DetectorPlugin", "EffectPlugin", "EstimatorPlugin", "Markers", "Plugin", "Poses",
+    "RendererPlugin", "parameter",
+]
 
 
 class Markers(NamedTuple):
@@ -32,6 +35,29 @@ class Markers(NamedTuple):
     corners: Any
     ids: Any
     rejected: Any = ()
+
+
+class Poses(NamedTuple):
+    """What a solver returns of N detections; a plain tuple of the first two does as well.
+
+    NaN where there is no solution. Poses are those of the marker in the camera's frame: OpenCV's
+    axes, metres.
+
+    Attributes
+    ----------
+    rotation, translation
+        (N, 3, 3) and (N, 3).
+    covariance
+        (N, 6, 6) as :class:`sweep.measure.estimation.Estimates` has it; None for none.
+    alternative_rotation, alternative_translation
+        The other planar solution; None for none.
+    """
+
+    rotation: Any
+    translation: Any
+    covariance: Any = None
+    alternative_rotation: Any = None
+    alternative_translation: Any = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,5 +138,96 @@ class DetectorPlugin(Plugin):
             raise TypeError("make: expected a class or function of settings and family")
 
 
-RECORDS: dict[str, type[Plugin]] = {record.kind: record for record in (DetectorPlugin,)}
+@dataclass(frozen=True, kw_only=True)
+class EstimatorPlugin(Plugin):
+    """A solver: from detections to poses.
+
+    Attributes
+    ----------
+    make
+        Called once for each setting and process, and never pickled: ``make(settings)`` with an
+        instance of `settings` (None without). Returns a function of
+        :class:`sweep.measure.estimation.Detections`, N of them, that returns :class:`Poses`.
+    needs_images
+        Whether it uses the pixels: the detections' images are kept for it.
+    """
+
+    kind: ClassVar[str] = "estimator"
+    make: Callable[[Any], Callable[[Any], Any]]
+    needs_images: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be called."""
+        if not callable(self.make):
+            raise TypeError("make: expected a class or function of settings")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectPlugin(Plugin):
+    """A pointwise effect of the camera or its surroundings on the image.
+
+    Its settings are numbers. The first is its switch: the effect is absent where that has its
+    default.
+
+    Attributes
+    ----------
+    apply
+        ``apply(levels, patch)`` with levels (h, w) and their :class:`sweep.model.effects.Patch`
+        returns the levels after it. The result must not depend on the window.
+    step
+        "light": on the light that falls on the pixels; "signal": on their signal, with its noise
+        and gain, before quantisation. After the built-in effects of the step.
+    random
+        Whether it draws random numbers (``patch.normals``).
+    widens
+        Whether more than the usual window must be searched: "noise" or "uneven light".
+    """
+
+    kind: ClassVar[str] = "effect"
+    apply: Callable[[Any, Any], Any]
+    step: str = "light"
+    random: bool = False
+    widens: str = "nothing"
+
+    def __post_init__(self) -> None:
+        """Refuse what no effect has."""
+        for name, choices in (
+            ("step", ("light", "signal")), ("widens", ("nothing", "noise", "uneven light")),
+        ):
+            if getattr(self, name) not in choices:
+                raise ValueError(
+                    f"{name} = {getattr(self, name)!r}: expected one of {', '.join(choices)}"
+                )
+        if self.settings is None or not callable(self.apply):
+            raise TypeError("expected settings, of which the first is the switch, and apply")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RendererPlugin(Plugin):
+    """A renderer of the marker. Its settings are numbers.
+
+    Attributes
+    ----------
+    render
+        A function of a :class:`sweep.model.plugged_scene.MarkerView` that returns two arrays
+        (h, w) of the view's box: the marker's levels before quantisation, where the part of a pixel
+        that the marker does not cover counts as 0, and the marker's share of each pixel.
+    """
+
+    kind: ClassVar[str] = "renderer"
+    render: Callable[[Any], Any]
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be called."""
+        if not callable(self.render):
+            raise TypeError("render: expected a function of a view")
+
+
+FACTORY = {"detector": "make", "estimator": "make", "renderer": "render"}
+"""Kind of plug-in -> the field that a class or function may stand for, in place of a record."""
+
+RECORDS: dict[str, type[Plugin]] = {
+    record.kind: record
+    for record in (DetectorPlugin, EstimatorPlugin, EffectPlugin, RendererPlugin)
+}
 """Kind of plug-in -> its record."""

@@ -12,7 +12,7 @@ from typing import Any
 
 from sweep.declaration import Declaration, plain_types
 from sweep.errors import PluginError
-from sweep.plugins import DetectorPlugin, Plugin
+from sweep.plugins import RECORDS, DetectorPlugin, Plugin
 from sweep.plugins.loading import file_of, load, read_source, versions_of
 
 TYPES: dict[str, type] = {"float": float, "int": int, "bool": bool, "str": str}
@@ -71,6 +71,8 @@ class DeclaredPlugin:
         Those that a detector knows; empty for all.
     threads
         Threads that it uses.
+    needs_images, random, widens, step
+        As :class:`sweep.plugins.EstimatorPlugin` and :class:`sweep.plugins.EffectPlugin` have them.
     """
 
     kind: str
@@ -82,6 +84,10 @@ class DeclaredPlugin:
     settings: tuple[Setting, ...] = ()
     dictionaries: tuple[str, ...] = ()
     threads: int = 1
+    needs_images: bool = False
+    random: bool = False
+    widens: str = "nothing"
+    step: str = "light"
 
     def record(self, folder: str) -> Plugin:
         """Return the plug-in's record, imported; ``folder`` is that of the pipeline.
@@ -109,7 +115,9 @@ class DeclaredPlugin:
             "kind": self.kind, "name": self.name, "meaning": self.meaning,
             "versions": dict(self.versions), "file": self.file, "digest": self.digest,
             "settings": [setting.to_json() for setting in self.settings],
-            "dictionaries": list(self.dictionaries), "threads": self.threads,
+            "dictionaries": list(self.dictionaries),
+            **{name: value for name, kind in TRAITS.items()
+               if (value := getattr(self, name)) != kind()},
         }
 
     @staticmethod
@@ -117,14 +125,43 @@ class DeclaredPlugin:
         """Return the plug-in of a record; KeyError, TypeError or ValueError if it is none."""
         texts = {key: record[key] for key in ("kind", "name", "meaning", "file", "digest")}
         versions = tuple(sorted(record["versions"].items()))
-        dictionaries, threads = tuple(record["dictionaries"]), record["threads"]
+        dictionaries = tuple(record["dictionaries"])
+        traits = {name: kind(record[name]) for name, kind in TRAITS.items() if name in record}
         words = [*texts.values(), *dictionaries, *(word for pair in versions for word in pair)]
-        if not all(isinstance(word, str) for word in words) or not isinstance(threads, int):
+        if not all(isinstance(word, str) for word in words) or texts["kind"] not in RECORDS:
             raise TypeError(record["name"])
         return DeclaredPlugin(
-            **texts, versions=versions, dictionaries=dictionaries, threads=threads,
+            **texts, **traits, versions=versions, dictionaries=dictionaries,
             settings=tuple(Setting.from_json(setting) for setting in record["settings"]),
         )
+
+
+@dataclass(frozen=True, slots=True)
+class PluginSetting:
+    """One setting of a plug-in, as a value: the plug-in itself is imported where it is used.
+
+    Attributes
+    ----------
+    plugin
+        The plug-in.
+    values
+        Name and value of each of its settings.
+    folder
+        Where its file is.
+    """
+
+    plugin: DeclaredPlugin
+    values: tuple[tuple[str, Any], ...]
+    folder: str
+
+    def record(self) -> Any:
+        """Return the plug-in's record; PluginError if it is not the one that was declared."""
+        return self.plugin.record(self.folder)
+
+    def instance(self) -> Any:
+        """Return its settings as an instance of the plug-in's own dataclass; None without."""
+        settings = self.record().settings
+        return None if settings is None else settings(**dict(self.values))
 
 
 def recorded_plugins(metadata: Mapping[str, Any]) -> tuple[DeclaredPlugin, ...]:
@@ -162,8 +199,15 @@ def declare(kind: str, name: str, folder: str) -> DeclaredPlugin:
         dictionaries = tuple(record.families)
     return DeclaredPlugin(
         kind, name, record.meaning, versions_of(kind, name, record), file or "", digest,
-        tuple(_settings(record)), dictionaries, getattr(record, "threads", 1),
+        tuple(_settings(record)), dictionaries,
+        **{name: getattr(record, name) for name in TRAITS if hasattr(record, name)},
     )
+
+
+TRAITS: dict[str, type] = {
+    "threads": int, "needs_images": bool, "random": bool, "widens": str, "step": str,
+}
+"""Fields of records that are known without importing them."""
 
 
 def _settings(record: Plugin) -> Iterator[Setting]:
@@ -176,6 +220,8 @@ def _settings(record: Plugin) -> Iterator[Setting]:
         hints = typing.get_type_hints(record.settings)
     except Exception as error:
         raise PluginError(f"settings whose annotations can be read: {error}") from None
+    if record.kind == "effect" and not dataclasses.fields(record.settings):
+        raise PluginError("settings, of which the first switches the effect on")
     for field in dataclasses.fields(record.settings):
         declaration = field.metadata.get("declaration")
         kinds = plain_types(hints[field.name])
@@ -184,7 +230,11 @@ def _settings(record: Plugin) -> Iterator[Setting]:
                 f"the setting {field.name} as `name: type = parameter(default, meaning)` with "
                 f"one of the types {', '.join(TYPES)}"
             )
+        if record.kind in ("effect", "renderer") and str in kinds:
+            raise PluginError(f"numbers as settings of {record.kind}s; {field.name} is a text")
         default = field.default
+        if default is dataclasses.MISSING:
+            raise PluginError(f"a default of the setting {field.name}")
         if default is not None and type(default) is int and kinds == (float,):
             default = float(default)
         yield Setting(field.name, kinds, default, declaration)

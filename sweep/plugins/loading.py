@@ -21,7 +21,7 @@ from typing import Any
 
 from sweep.errors import PluginError
 from sweep.messages import nearest, plain
-from sweep.plugins import RECORDS, Plugin
+from sweep.plugins import FACTORY, RECORDS, Plugin
 
 OWN_DISTRIBUTION = "fiducial-sweep"
 """Its adapters' results change with the version of the numbers, which is recorded in any case."""
@@ -172,16 +172,13 @@ def exception_line(error: BaseException) -> str:
 
 
 def _record(kind: str, found: Any) -> Plugin:
-    """Return the record that a name leads to; a class or function is a detector's factory."""
+    """Return the record that a name leads to; a class or function is its factory."""
     wanted: Any = RECORDS[kind]
     if isinstance(found, Plugin) and isinstance(found, wanted):
         return found
-    if isinstance(found, Plugin) or not callable(found):
+    if isinstance(found, Plugin) or not callable(found) or kind not in FACTORY:
         raise PluginError(f"a {wanted.__name__}, not a {type(found).__name__}")
-    try:
-        made: Plugin = wanted(make=found)
-    except TypeError:
-        raise PluginError(f"a {wanted.__name__}, not a {type(found).__name__}") from None
+    made: Plugin = wanted(**{FACTORY[kind]: found})
     return made
 
 

@@ -29,6 +29,7 @@ from sweep.model.renderers import Grey
 from sweep.model.scene import Scenes, build_scenes
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings, estimators, scene_values
+from sweep.plan.scene_plugins import scene_plugins
 from sweep.tradeoff.paired_timing import LEAST_ROUNDS, time_in_turns
 from sweep.tradeoff.scene_sample import Indices
 from sweep.typing import Floats
@@ -218,7 +219,7 @@ def _prepare(pipeline: Pipeline, indices: Sequence[Indices], most: int) -> _Cond
     """
     count = len(indices[0]) if indices else 1
     values = scene_values(pipeline, indices)
-    scenes = build_scenes(values, count)
+    scenes = build_scenes(values, count, scene_plugins(pipeline))
     rows = np.flatnonzero(visibility_flags(scenes) == DetectionStatus.not_run)
     if 0 < len(rows) < count:
         return _prepare(pipeline, [index[rows] for index in indices], most)

@@ -17,6 +17,7 @@ from sweep.model.renderers import render_all
 from sweep.model.scene import build_scenes
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_values
+from sweep.plan.scene_plugins import scene_plugins
 from sweep.tradeoff.paired_timing import time_in_turns
 from sweep.tradeoff.scene_sample import Indices
 from sweep.typing import Floats
@@ -61,7 +62,10 @@ def measure_renderers(
         Checked between two measurements.
     """
     count = len(samples[0][0])
-    scenes = [build_scenes(scene_values(pipeline, indices), count) for indices in samples]
+    plugins = scene_plugins(pipeline)
+    scenes = [
+        build_scenes(scene_values(pipeline, indices), count, plugins) for indices in samples
+    ]
     rows = np.flatnonzero(visibility_flags(scenes[reference]) == DetectionStatus.not_run)
     boxes = [marker_boxes(each)[rows] for each in scenes]
     windows = np.concatenate(

@@ -1,0 +1,133 @@
+"""The guide's plug-ins: each is one short file, and does what plain NumPy or a closed form says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sweep.evaluation.cells import run_cells
+from sweep.evaluation.inspection import scene_image
+from sweep.measure.estimation import Detections
+from sweep.measure.estimators import build
+from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.model.marker import modules
+from sweep.model.scene import build_scenes
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import estimators, scene_values
+
+FOLDER = Path(__file__).parents[2] / "pipelines" / "plugins"
+
+SCENE = """
+[camera]
+width_px = 160
+height_px = 120
+fx_px = 200
+fy_px = 200
+[marker]
+size_m = 0.05
+marker_id = 3
+[pose]
+distance_m = 0.2
+tilt_deg = 35
+azimuth_deg = 20
+roll_deg = 12
+"""
+
+
+def pipeline_of(text, **options):
+    return Pipeline.from_text(text, folder=FOLDER, **options)
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.py")), ids=lambda path: path.stem)
+def test_each_is_short(path):
+    assert len(path.read_text().splitlines()) <= 25
+
+
+def test_the_pipeline_runs_with_all_four():
+    pipeline = Pipeline.from_toml(FOLDER / "plugins.toml", ["trial=2", "side_px=60"])
+    assert {plugin.kind for plugin in pipeline.plugins} == {
+        "detector", "estimator", "effect", "renderer",
+    }
+    cells = run_cells(pipeline, [index.ravel() for index in np.indices((2, 2, 2))])
+    assert not cells.failures
+    assert (np.array(cells.columns["detection"]) == DetectionStatus.detected).all()
+    assert (np.array(cells.columns["estimate"]) == EstimateStatus.solved).all()
+
+
+def test_the_renderer_samples_each_pixel_at_its_centre():
+    image = scene_image(
+        pipeline_of(SCENE + '[scene]\nrenderer = "sampled:RENDERER"\nbackground = 90\n'),
+        whole_frame=True,
+    )
+    tilt, azimuth, roll = np.radians([35, 20, 12])
+    axis = np.array([np.cos(azimuth), np.sin(azimuth), 0])
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    turn = np.eye(3) + np.sin(tilt) * cross + (1 - np.cos(tilt)) * cross @ cross
+    about_z = np.array(
+        [[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]]
+    )
+    rotation = turn @ about_z @ np.diag([1.0, -1.0, -1.0])
+    v, u = np.mgrid[:120, :160]
+    rays = np.stack([(u - 79.5) / 200, (v - 59.5) / 200, np.ones(u.shape)], axis=-1)
+    # The ray meets the marker's plane, whose normal is the third column, at depth 0.2 of its centre
+    normal = rotation[:, 2]
+    points = rays * (0.2 * normal[2] / (rays @ normal))[..., None] - [0, 0, 0.2]
+    x, y = points @ rotation[:, 0], points @ rotation[:, 1]
+    bits = modules("DICT_5X5_50", 3)
+    module = 0.05 / len(bits)
+    column, row = (x + 0.025) / module, (0.025 - y) / module
+    count = len(bits)
+    off_centre = np.maximum(abs(column - count / 2), abs(row - count / 2))
+    inside = (np.clip(row, 0, count - 1).astype(int), np.clip(column, 0, count - 1).astype(int))
+    expected = np.where(bits[inside], 255, 0)
+    expected = np.where(off_centre < count / 2, expected, 255)
+    expected = np.where(off_centre <= count / 2 + 1, expected, 90)
+    np.testing.assert_array_equal(image, expected)
+
+
+def test_the_effect_is_that_of_plain_numpy():
+    lit = SCENE + "[scene]\nbackground = 120\nwhite = 180\nflicker_rows = 40\n"
+    plain, bands = (
+        scene_image(
+            pipeline_of('effects = ["flicker:EFFECT"]\n' + lit, settings=[f"flicker={strength}"]),
+            whole_frame=True,
+        )
+        for strength in (0, 0.25)
+    )
+    wave = 1 + 0.25 * np.sin(2 * np.pi * np.arange(120) / 40)[:, None]
+    # Where the neighbours are equal the plain image is not rounded.
+    flat = cv2.dilate(plain, np.ones((3, 3))) == cv2.erode(plain, np.ones((3, 3)))
+    assert flat.mean() > 0.8
+    expected = np.clip(np.floor(plain * wave + 0.5 + 1e-9), 0, 255)
+    np.testing.assert_array_equal(bands[flat], expected[flat])
+    assert abs(bands - plain * wave).max() <= 0.5 + 0.5 * 1.25
+
+
+def test_the_solver_finds_the_pose_of_perfect_corners():
+    text = SCENE + '[estimator]\nsolver = "homography:SOLVER"\n[axes]\nroll_deg = [0, 40, 200]\n'
+    pipeline = pipeline_of(text.replace("roll_deg = 12\n", ""))
+    scenes = build_scenes(scene_values(pipeline, [np.arange(3)]), 3)
+    found = build(estimators(pipeline)[0])(Detections(
+        scenes.corners_px, scenes.cameras, scenes.size_m, np.zeros(3), np.zeros(3),
+        [scenes.markers[0]] * 3, [], np.zeros((3, 2), dtype=np.int64),
+    ))
+    np.testing.assert_allclose(found.rotation, scenes.rotation, atol=1e-6)
+    np.testing.assert_allclose(found.translation, scenes.translation, atol=1e-7)
+    assert found.reprojection_px.max() < 1e-4
+
+
+def test_the_detector_has_no_offset():
+    grid = SCENE.replace("tilt_deg = 35\n", "").replace("azimuth_deg = 20\n", "")
+    pipeline = pipeline_of(grid.replace("roll_deg = 12\n", "jitter_px = 0.5\n") + """
+[detector]
+detector = "enlarged:DETECTOR"
+[axes]
+trial = 32
+""")
+    errors = run_cells(pipeline, [np.arange(32)]).columns["corner_error_px"][0]
+    # The four corners' errors are opposite to each other; their mean is the centre's error.
+    # Drawn from the seed: no chance is in it.
+    assert abs(errors.mean(axis=(0, 1))).max() < 0.05

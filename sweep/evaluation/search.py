@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.evaluation.machine_faults import raise_machine_fault
+from sweep.evaluation.machine_faults import local_fault, raise_machine_fault
 from sweep.evaluation.results import Failure, exception_text
 from sweep.measure.classify import classify
 from sweep.measure.detector import NOISE_MARGIN_PX, DetectorOutput, windows
@@ -22,6 +22,7 @@ from sweep.measure.detectors import (
     uneven_light_needs_frame,
 )
 from sweep.measure.flags import DetectionStatus
+from sweep.measure.foreign_detector import ForeignDetector, detector_output
 from sweep.model.columns import Column, map_columns
 from sweep.model.extent import hidden, marker_boxes, not_modelled, outside_frame
 from sweep.model.renderers import render_all
@@ -168,6 +169,18 @@ def search(
         for k, (setting_pass, crop, ask) in enumerate(zip(passes, crops, asked, strict=True)):
             find, note = setting_pass.find, setting_pass.candidates.append
             begun = now = clock()
+            if isinstance(find, ForeignDetector):
+                chosen = [
+                    (row, image if image is None or crop is None else cropped(image, crop[row]))
+                    for row, image in zip(rows.tolist(), images, strict=True) if ask[row]
+                ]
+                setting_pass.search_elsewhere(find, k, chosen, dictionary, sides, row_s, failures)
+                if keep:
+                    setting_pass.images.update(
+                        (row, image) for row, image in chosen if image is not None
+                    )
+                setting_pass.seconds += clock() - begun
+                continue
             for row, image in zip(rows.tolist(), images, strict=True):
                 if not ask[row]:
                     continue
@@ -177,8 +190,7 @@ def search(
                     continue
                 searched = image
                 if crop is not None:
-                    x0, y0, x1, y1 = crop[row]
-                    searched = image[y0:y1, x0:x1]
+                    searched = cropped(image, crop[row])
                 if keep:
                     setting_pass.images[row] = searched
                 try:
@@ -200,6 +212,7 @@ def search(
             window[:, :2].astype(np.float64),
         )
         flags[setting_pass.failed] = DetectionStatus.failed
+        flags[setting_pass.crashed] = DetectionStatus.crashed
         results.append(
             SearchResult(
                 flags, corners, setting_pass.seconds + clock() - start, setting_pass.images,
@@ -217,7 +230,38 @@ class _Pass:
     candidates: list[tuple[int, *DetectorOutput]] = field(default_factory=list)
     images: dict[int, Grey] = field(default_factory=dict)
     failed: list[int] = field(default_factory=list)
+    crashed: list[int] = field(default_factory=list)
     seconds: float = 0.0
+
+    def search_elsewhere(
+        self, find: ForeignDetector, setting: int, chosen: Sequence[tuple[int, Grey | None]],
+        dictionary: Sequence[str], sides: Sequence[int], row_s: list[float],
+        failures: list[Failure],
+    ) -> None:
+        """Search the images (h, w) of rows together in the process of another environment."""
+        self.failed += [row for row, image in chosen if image is None]
+        rendered = [(row, image) for row, image in chosen if image is not None]
+        answers = find.search_all(
+            [image for _, image in rendered], [dictionary[row] for row, _ in rendered],
+            [sides[row] for row, _ in rendered],
+        )
+        for (row, _), answer in zip(rendered, answers, strict=True):
+            row_s[row] += answer.seconds
+            if answer.of_the_machine:
+                raise local_fault(answer.error)
+            if answer.error:
+                failures.append(
+                    Failure(row, "detection", answer.error, setting, crashed=answer.died)
+                )
+                (self.crashed if answer.died else self.failed).append(row)
+            else:
+                self.candidates.append((row, *detector_output(answer)))
+
+
+def cropped(image: Grey, window: Sequence[int]) -> Grey:
+    """Return the part of an image (h, w) within left, top, right, bottom."""
+    x0, y0, x1, y1 = window
+    return image[y0:y1, x0:x1]
 
 
 GROUP_PX = 1 << 24

@@ -34,9 +34,9 @@ from sweep.execution.limits import ANSWER_S, NO_WORKERS_TIMEOUT_S, THREAD_COUNT_
 from sweep.execution.scheduler_connection import connect_to_scheduler
 from sweep.execution.thread_limit import check_threads
 from sweep.execution.worker_versions import check_workers
-from sweep.isolation.child_process import SINGLE_THREADED
 from sweep.isolation.interrupts import in_main_thread
 from sweep.plan.experiment import Pipeline
+from sweep.processes import SINGLE_THREADED
 
 WORKER_ENVIRONMENT = {
     **SINGLE_THREADED,

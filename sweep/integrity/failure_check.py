@@ -15,7 +15,6 @@ from sweep.errors import SweepError
 from sweep.execution.limits import TIME_LIMIT_S
 from sweep.integrity.damage import BlockDamage, Damage
 from sweep.integrity.stored_values import computable
-from sweep.isolation.child_process import OUTSIDE_SIGNALS
 from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plan.cell_selection import selection_text
@@ -23,6 +22,7 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices, scene_axes
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import Variable
+from sweep.processes import OUTSIDE_SIGNALS
 from sweep.store.blocks import receipts, region
 from sweep.store.receipt import Receipt
 from sweep.store.run_store import RunStore

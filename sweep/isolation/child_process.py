@@ -11,7 +11,6 @@ import importlib
 import json
 import os
 import pickle
-import signal
 import struct
 import subprocess
 import sys
@@ -24,21 +23,10 @@ from typing import IO, Any, Self
 from sweep.errors import SweepError
 from sweep.evaluation.machine_faults import machine_fault
 from sweep.isolation.machine_memory import be_killed_before_others
-
-SINGLE_THREADED = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "OPENCV_FOR_THREADS_NUM": "1",
-}
-"""Parallelism is over blocks: a process computes on one thread."""
+from sweep.processes import OUTSIDE_SIGNALS, SINGLE_THREADED, ending
 
 GRACE_S = 30.0
 """How long after its limit a child that did not end itself is killed."""
-
-OUTSIDE_SIGNALS = ("SIGKILL", "SIGTERM", "SIGBUS", "SIGHUP", "SIGINT", "SIGXCPU")
-"""Signals that the system or its users send, too little memory or space among their reasons: what
-a scene's data may cause is SIGSEGV, SIGABRT, SIGFPE, SIGILL, an exit status."""
 
 _LENGTH = struct.Struct("<Q")
 
@@ -161,10 +149,7 @@ class Child:
         # The child ends itself with status 1 (`watchdog.ending_after`).
         if self._killed_late or (code == 1 and took_s >= limit_s):
             return ChildDiedError(f"time limit of {limit_s:.3g} s", timed_out=True)
-        if code < 0:
-            with contextlib.suppress(ValueError):
-                return ChildDiedError(signal.Signals(-code).name)
-        return ChildDiedError(f"exit status {code}")
+        return ChildDiedError(ending(code))
 
     def close(self) -> None:
         """End the child."""

@@ -229,6 +229,18 @@ is 0; and corners of the rejected candidates."""
 SearchFunction = Callable[[NDArray[np.uint8]], DetectorOutput]
 
 
+def perimeter_rates(setting: DetectorSetting, side: int, frame_side: int) -> tuple[float, float]:
+    """Return the perimeter limits for an image of larger side ``side``, a window of a frame.
+
+    OpenCV takes them relative to the image that it is given and turns them into whole pixels: they
+    are passed so that they give the same numbers as on the frame.
+    """
+    low, high = setting.minMarkerPerimeterRate, setting.maxMarkerPerimeterRate
+    if side == frame_side:
+        return low, high
+    return (int(low * frame_side) + 0.5) / side, (int(high * frame_side) + 0.5) / side
+
+
 class Detector:
     """One setting of OpenCV's detector in this process; OpenCV's objects cannot be pickled."""
 
@@ -251,15 +263,8 @@ class Detector:
         return (self._searches.get(key) or self._search(*key))(image)
 
     def _search(self, dictionary: str, side: int, frame_side: int) -> SearchFunction:
-        """Return OpenCV's search for images of larger side ``side``; one for each size is kept.
-
-        The perimeter limits, which OpenCV takes relative to the image that it is given and turns
-        into whole pixels, are passed so that they give the same numbers as on the frame.
-        """
-        low, high = self._setting.minMarkerPerimeterRate, self._setting.maxMarkerPerimeterRate
-        if side != frame_side:
-            low = (int(low * frame_side) + 0.5) / side
-            high = (int(high * frame_side) + 0.5) / side
+        """Return OpenCV's search for images of larger side ``side``; one for each size is kept."""
+        low, high = perimeter_rates(self._setting, side, frame_side)
         parameters = self._parameters
         parameters.minMarkerPerimeterRate, parameters.maxMarkerPerimeterRate = low, high
         detector = cv2.aruco.ArucoDetector(opencv_dictionary(dictionary), parameters)

@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.declaration import parameter
+from sweep.environments.interpreters import INSTALLED
 from sweep.errors import PluginError
 from sweep.measure import detector as opencv
 from sweep.measure.detector import UNEVEN_LIGHT_CONSTANT, Detector, DetectorOutput, DetectorSetting
+from sweep.measure.foreign_detector import ForeignDetector, ForeignSetting
 from sweep.measure.plugged_detector import PluggedDetector
 from sweep.plugins import DetectorPlugin
 from sweep.plugins.declared import PluginSetting
@@ -31,9 +33,13 @@ class DetectorChoice:
         "name of an installed one, or file:name beside the pipeline", choices=(OPENCV,),
         plugin="detector",
     )
+    environment: str = parameter(
+        INSTALLED, "the Python whose OpenCV searches: installed, the one that runs this; a name of "
+        "`sweep environments list`; or the path of a Python or of a virtual environment",
+    )
 
 
-AnyDetectorSetting = DetectorSetting | PluginSetting
+AnyDetectorSetting = DetectorSetting | PluginSetting | ForeignSetting
 """A setting of any detector."""
 
 FindFunction = Callable[[NDArray[np.uint8], str, int], DetectorOutput]
@@ -48,9 +54,13 @@ def make_detector(setting: AnyDetectorSetting) -> FindFunction:
     ------
     PluginError
         If a plug-in cannot be used.
+    EnvironmentFaultError
+        If an environment cannot be used.
     """
     if isinstance(setting, DetectorSetting):
         return Detector(setting).find
+    if isinstance(setting, ForeignSetting):
+        return ForeignDetector(setting)
     return _kept_plugin(setting).find
 
 
@@ -60,8 +70,14 @@ def _kept_plugin(setting: PluginSetting) -> PluggedDetector:
     return PluggedDetector(setting.plugin.name, record, setting.instance())
 
 
+def _of_opencv(setting: AnyDetectorSetting) -> DetectorSetting | PluginSetting:
+    """Return the setting of OpenCV's detector, in whichever environment; a plug-in's as it is."""
+    return setting.setting if isinstance(setting, ForeignSetting) else setting
+
+
 def full_frame_reason(setting: AnyDetectorSetting) -> str | None:
     """Return why a setting must search the whole frame; None if it can search a window."""
+    setting = _of_opencv(setting)
     if isinstance(setting, DetectorSetting):
         return opencv.full_frame_reason(setting)
     if _margin_px(setting) is None:
@@ -71,6 +87,7 @@ def full_frame_reason(setting: AnyDetectorSetting) -> str | None:
 
 def margin_px(setting: AnyDetectorSetting) -> int:
     """Return the width of the border around the marker whose pixels can change the detection."""
+    setting = _of_opencv(setting)
     if isinstance(setting, DetectorSetting):
         return opencv.margin_px(setting)
     return _margin_px(setting) or 0
@@ -78,6 +95,7 @@ def margin_px(setting: AnyDetectorSetting) -> int:
 
 def uneven_light_needs_frame(setting: AnyDetectorSetting, gain: Any) -> Any:
     """Return whether uneven light, amplified by ``gain`` (...; 0: even), needs whole frames."""
+    setting = _of_opencv(setting)
     if isinstance(setting, DetectorSetting):
         return setting.adaptiveThreshConstant < UNEVEN_LIGHT_CONSTANT * gain
     return np.zeros(np.shape(gain), dtype=bool)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.declaration import parameter
+from sweep.environments import child
 from sweep.model.coverage import MarkerEdges
 from sweep.model.stag import STAG_LIBRARIES, STAG_MODULES, missing_stag, stag_circles
 from sweep.model.tag_families import TAG_FAMILIES, missing_library, tag_cells
@@ -71,6 +72,11 @@ def marker_count(dictionary: str) -> int:
     if dictionary in STAG_LIBRARIES:
         return STAG_LIBRARIES[dictionary].count
     return len(opencv_dictionary(dictionary).bytesList)
+
+
+def markers_digest(dictionary: str) -> str:
+    """Return a digest of a dictionary's upright markers: the bits, not how many are corrected."""
+    return child.markers_digest(opencv_dictionary(dictionary))
 
 
 def module_count(dictionary: str) -> int:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
-from sweep.measure.detector import NOISE_MARGIN_PX
+from sweep.environments.identity import identify
+from sweep.environments.interpreters import INSTALLED
+from sweep.errors import EnvironmentFaultError
+from sweep.measure.detector import NOISE_MARGIN_PX, DetectorSetting
 from sweep.measure.detectors import full_frame_reason, margin_px, uneven_light_needs_frame
 from sweep.measure.estimators import SOLVERS
+from sweep.measure.foreign_detector import own_defaults
 from sweep.model.camera import canonical_distortion
 from sweep.model.effects import Effect
 from sweep.plan.experiment import Pipeline
@@ -104,6 +109,10 @@ def parts(pipeline: Pipeline) -> list[Part]:
         assumptions.append("believed: calibration")
     bounds = sorted(set(pipeline.values_of("bound")) - {"none"})
     pixels = [name for name in pipeline.values_of("solver") if _needs_images(pipeline, name)]
+    others = [
+        _environment(pipeline, name) for name in pipeline.values_of("environment")
+        if name != INSTALLED
+    ]
     return [
         Part("lens distortion", lens, "distortion is given" if lens else "distortion is empty"),
         Part(
@@ -121,6 +130,7 @@ def parts(pipeline: Pipeline) -> list[Part]:
             "plug-ins", bool(pipeline.plugins),
             ", ".join(_described(plugin) for plugin in pipeline.plugins) or "none is named",
         ),
+        Part("environments", bool(others), "; ".join(others) or "OpenCV of this Python alone"),
         Part("full frame", bool(whole), "; ".join(whole) if whole else "no setting needs it"),
         Part("renderer", True, ", ".join(renderers)),
         *(_effect(pipeline, effect) for effect in effects),
@@ -141,3 +151,21 @@ def parts(pipeline: Pipeline) -> list[Part]:
             ", ".join(assumptions) or "the estimator knows the true camera and size",
         ),
     ]
+
+
+def _environment(pipeline: Pipeline, name: str) -> str:
+    """Return what another environment's OpenCV is, and what it has otherwise than this one."""
+    try:
+        identity = identify(name, pipeline.folder)
+    except EnvironmentFaultError as error:
+        return f"{name} ({error})"
+    own = own_defaults(identity, pipeline.given)
+    declared = {field.name for field in dataclasses.fields(DetectorSetting)}
+    lacks = sorted(declared - identity.fields.keys())
+    facts = [f"OpenCV {identity.opencv}"]
+    if own:
+        listed = ", ".join(f"{field} {value:g}" for field, value in own.items())
+        facts.append(f"by its own defaults {listed}")
+    if lacks:
+        facts.append(f"without {', '.join(lacks)}")
+    return f"{name} ({', '.join(facts)})"

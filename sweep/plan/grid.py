@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.environments.interpreters import INSTALLED
 from sweep.measure.detector import DetectorSetting
 from sweep.measure.detectors import AnyDetectorSetting
 from sweep.measure.estimators import EstimatorSetting, PluggedEstimatorSetting
+from sweep.measure.foreign_detector import ForeignSetting
 from sweep.model.camera import canonical_distortion
 from sweep.model.columns import Column
 from sweep.plan.axes import TRIAL, Axis
@@ -219,7 +221,11 @@ def _detector_setting(pipeline: Pipeline, values: Mapping[str, Any]) -> AnyDetec
     """Return the setting of a detector that has these values; it takes those that are its own."""
     plugin = pipeline.plugin("detector", values["detector"])
     if plugin is None:
-        return DetectorSetting(**{name: values[name] for name in OPENCV_FIELDS})
+        setting = DetectorSetting(**{name: values[name] for name in OPENCV_FIELDS})
+        if values["environment"] == INSTALLED:
+            return setting
+        given = pipeline.given.intersection(OPENCV_FIELDS)
+        return ForeignSetting(values["environment"], pipeline.folder, setting, given)
     return _plugin_setting(pipeline, plugin, values)
 
 

@@ -5,10 +5,15 @@ A parameter whose own value is at fault is passed over: its fault is known alrea
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
+from sweep.environments.identity import identify
+from sweep.environments.interpreters import INSTALLED
+from sweep.errors import EnvironmentFaultError
 from sweep.measure.detector import DetectorSetting
 from sweep.measure.detectors import OPENCV
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
@@ -17,6 +22,7 @@ from sweep.model.image_file import MAX_PIXELS
 from sweep.model.marker import (
     has_circles,
     marker_count,
+    markers_digest,
     missing_package,
     opencv_dictionary_names,
 )
@@ -159,6 +165,52 @@ def dictionaries_of_detectors(reading: Reading) -> None:
             reading.fault("dictionary", dictionary, expected)
 
 
+OPENCV_FIELDS = {field.name for field in dataclasses.fields(DetectorSetting)}
+
+
+def environments_of_detectors(reading: Reading) -> None:
+    """Demand environments that can be used, with the fields and the markers of the pipeline.
+
+    What a store has recorded is not looked for.
+    """
+    if reading.known_plugins is not None:
+        return
+    defaults = DetectorSetting()
+    for environment in dict.fromkeys(reading.values("environment")):
+        if environment == INSTALLED:
+            continue
+
+        def beside(name: str, environment: str = environment) -> Iterator[Any]:
+            return (value for environments, values in reading.together("environment", name)
+                    if environment in environments for value in values)
+
+        if any(value != OPENCV for value in beside("detector")):
+            reading.fault(
+                "detector.environment", environment,
+                f"{INSTALLED} for detectors other than {OPENCV}; let both axes go together by zip",
+            )
+        try:
+            identity = identify(environment, str(reading.folder))
+        except EnvironmentFaultError as error:
+            reading.fault(
+                "detector.environment", environment, f"an environment for a detector: {error}"
+            )
+            continue
+        own = f"OpenCV {identity.opencv} of environment {environment}"
+        for name in sorted(OPENCV_FIELDS & reading.given - identity.fields.keys()):
+            if any(value != getattr(defaults, name) for value in beside(name)):
+                reading.fault(
+                    f"detector.{name}", reading.written(name), f"a field that {own} has"
+                )
+        for dictionary in dict.fromkeys(beside("dictionary")):
+            if dictionary not in identity.dictionaries:
+                reading.fault("dictionary", dictionary, f"one that {own} has")
+            elif identity.dictionaries[dictionary] != markers_digest(dictionary):
+                reading.fault(
+                    "dictionary", dictionary, f"one with the same markers in {own}: these differ"
+                )
+
+
 def names_of_settings(reading: Reading) -> None:
     """Demand names that nothing else of the dataset has for settings of plug-ins."""
     for plugin in reading.plugins:
@@ -283,6 +335,7 @@ RULES: tuple[Callable[[Reading], None], ...] = (
     check_backgrounds,
     fields_of_the_installed_opencv,
     dictionaries_of_detectors,
+    environments_of_detectors,
     names_of_settings,
     something_random_to_repeat,
     trials_fill_replicates,

@@ -14,7 +14,11 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from sweep.environments.identity import identify
+from sweep.environments.interpreters import INSTALLED
+from sweep.errors import EnvironmentFaultError
 from sweep.installation import check_installation, check_loaded_opencv
+from sweep.measure.foreign_detector import provenance
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.plan.draws import SAMPLINGS
 from sweep.plan.experiment import Pipeline
@@ -97,7 +101,20 @@ def fingerprint(pipeline: Pipeline) -> dict[str, Any]:
         **({} if pipeline.sampling == SAMPLINGS[0] else {"sampling": pipeline.sampling}),
         "files": dict(sorted(pipeline.files.items())),
         **({"plugins": versions_used} if (versions_used := plugin_versions(pipeline)) else {}),
+        **({"environments": others} if (others := environment_versions(pipeline)) else {}),
     }
+
+
+def environment_versions(pipeline: Pipeline) -> dict[str, str]:
+    """Return what the results of each of a pipeline's environments depend on, or why it is none."""
+    versions_of = {}
+    for name in pipeline.values_of("environment"):
+        if name != INSTALLED:
+            try:
+                versions_of[name] = provenance(identify(name, pipeline.folder), pipeline.given)
+            except EnvironmentFaultError as error:
+                versions_of[name] = f"none ({error})"
+    return versions_of
 
 
 def plugin_versions(pipeline: Pipeline) -> dict[str, dict[str, str]]:
@@ -137,6 +154,14 @@ def changes(stored: dict[str, Any], own: dict[str, Any]) -> Iterator[tuple[str, 
             yield from (
                 (f"{key}.{name}", theirs.get(name), mine.get(name))
                 for name in sorted({*theirs, *mine}) if theirs.get(name) != mine.get(name)
+            )
+        elif key == "environments":
+            # Cells of an environment that only one of them has are not compared.
+            stored_ones, own_ones = theirs or {}, mine or {}
+            yield from (
+                (f"{key}.{name}", stored_ones[name], own_ones[name])
+                for name in sorted(stored_ones.keys() & own_ones.keys())
+                if stored_ones[name] != own_ones[name]
             )
         elif key == "files" and _contents(theirs) == _contents(mine):
             continue

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from sweep.report.ambiguity_figure import AMBIGUITY
 from sweep.report.axis_effect import effect_of
 from sweep.report.bound_figure import BOUND
 from sweep.report.configuration_figures import COMPARED, CONFIGURATIONS
@@ -16,8 +17,8 @@ from sweep.report.scene_figures import BIAS, DETECTION, ERRORS_BY_SIZE, FLIPS, M
 from sweep.report.tradeoff_figure import TRADE
 
 KINDS: tuple[FigureKind, ...] = (
-    DETECTION, ERRORS_BY_SIZE, BIAS, CONFIGURATIONS, COMPARED, TRADE, MAPS, FLIPS, FAILURES, FRAME,
-    RANKING, BOUND,
+    DETECTION, ERRORS_BY_SIZE, BIAS, CONFIGURATIONS, COMPARED, TRADE, MAPS, FLIPS, AMBIGUITY,
+    FAILURES, FRAME, RANKING, BOUND,
 )
 """Add a kind of figure here; what no kind covers of axes and draws gets a figure of its effect."""
 

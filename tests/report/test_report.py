@@ -185,8 +185,8 @@ def kinds(url):
 
 def test_each_figure_applies_where_it_should(full, odd):
     assert kinds(full) == [
-        "detection", "errors", "bias", "configurations", "paired", "maps", "flips", "failures",
-        "ranking", "bound", "effect-azimuth_deg",
+        "detection", "errors", "bias", "configurations", "paired", "maps", "flips", "ambiguity",
+        "failures", "ranking", "bound", "effect-azimuth_deg",
     ]
     found = {name: kinds(odd(name)) for name in ODD if name != "long axes"}
     assert found == {
@@ -265,6 +265,31 @@ def test_numbers_of_the_tables_are_those_of_the_analysis(full, page):
             continue
         share = 100 * float(shares["share"].sel(side_px=float(row[1]), outcome="solved"))
         assert row[column].split(" (")[0] == number(share)
+
+
+def test_the_table_of_thresholds_is_that_of_plain_counting(full, page):
+    results = open_dataset(full).load()
+    rows = Page(page).tables[
+        "Thresholds on the ambiguity, with 95 % intervals; wanted: 1 % flips"]
+    for row in rows[1:]:
+        refinement, solver = row[0].split(" \u00b7 ")
+        one = results.sel(
+            cornerRefinementMethod=refinement, solver=solver, side_px=float(row[1]))
+        solved = (one["estimate"] == EstimateStatus.solved).values
+        flipped = solved & (one["flipped"] == 2).values
+        error, other = (one[name].values for name in (
+            "reprojection_error_px", "alternative_reprojection_error_px"))
+        same = (error == 0) & (other == 0)  # nothing tells the two solutions apart
+        kept = solved & ~same & ~(error > np.float64(0.2) * other)  # NaN: no other solution
+        assert row[2:4] == [f"{solved.sum():,}", f"{flipped.sum():,}"]
+        share = 100 * kept.sum() / solved.sum() if solved.any() else math.nan
+        assert row[4].split(" (")[0] == number(share)
+        assert row[5] == f"{(kept & flipped).sum():,}"
+        rejected = solved & ~kept
+        right = 100 * (rejected & ~flipped).sum() / rejected.sum() if rejected.any() else math.nan
+        assert row[6].split(" (")[0] == number(right)
+    assert sum(int(row[2]) for row in rows[1:]) == (
+        results["estimate"] == EstimateStatus.solved).sum()
 
 
 def test_each_configuration_is_paired_with_the_first(full, page):

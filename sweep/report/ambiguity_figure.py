@@ -141,8 +141,8 @@ def _draw_curves(axes: Axes, names: list[str], table: xr.Dataset) -> None:
         for at, shape, size, face in (
             (USUAL, "o", 11, "none"), (float(one["chosen_threshold"]), "*", 13, colour),
         ):
-            here = np.flatnonzero(thresholds == at)
-            axes.plot(kept[here], flips[here], shape, markersize=size, color=colour,
+            index = np.flatnonzero(thresholds == at)
+            axes.plot(kept[index], flips[index], shape, markersize=size, color=colour,
                       markerfacecolor=face, markeredgecolor=INK if shape == "*" else colour,
                       markeredgewidth=0.7 if shape == "*" else 1.6, zorder=4)
     axes.plot([], [], "o", markersize=9, markerfacecolor="none", markeredgecolor=INK,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import bisect
+import functools
 import math
 from typing import TYPE_CHECKING
 
@@ -11,7 +13,6 @@ import xarray as xr
 from sweep.analysis.intervals import clopper_pearson
 from sweep.analysis.quantiles import interval_ranks
 from sweep.analysis.requirable import MIN_DRAWS, Requirable
-from sweep.typing import Floats
 
 if TYPE_CHECKING:
     from sweep.analysis.requirements import Requirement
@@ -22,9 +23,11 @@ MAX_DRAWS = 1e9
 
 def draws_needed(
     requirement: Requirement, value: xr.DataArray, low: xr.DataArray, high: xr.DataArray,
-    draws: xr.DataArray,
+    draws: xr.DataArray, undecided: xr.DataArray,
 ) -> xr.DataArray:
     """Return about how many draws would decide a requirement, infinite if no number would.
+
+    NaN where it is not ``undecided``, and without a value.
 
     For a rate it is the least n at which Clopper and Pearson's end for n times the rate reaches
     the limit. Other intervals narrow with the root of the number of draws; a quantile needs as
@@ -33,20 +36,20 @@ def draws_needed(
     what = requirement.requirable
     needed: xr.DataArray = xr.apply_ufunc(
         np.vectorize(lambda *numbers: _needed(what, requirement, *numbers), otypes=[float]),
-        value, low, high, draws.astype(np.float64))
+        value.where(undecided), low, high, draws.astype(np.float64))
     return needed
 
 
 def _needed(
     what: Requirable, requirement: Requirement, value: float, low: float, high: float, draws: float
 ) -> float:
+    if math.isnan(value):
+        return math.nan
     if what.is_rate:
         return _of_rate(value, requirement.limit, what.level)
     least = float(MIN_DRAWS)
     if what.percent is not None:
         least = float(_of_quantile(what.percent, what.level))
-    if math.isnan(value):
-        return math.nan
     good = value >= requirement.limit if requirement.at_least else value <= requirement.limit
     # The end that has to pass the limit.
     end = low if good == requirement.at_least else high
@@ -59,18 +62,22 @@ def _needed(
 
 
 def _of_rate(rate: float, limit: float, level: float) -> float:
-    """Return the least power of about 1.1 at which the interval of a rate leaves the limit."""
-    if math.isnan(rate) or rate == limit:
-        return math.nan if math.isnan(rate) else math.inf
-    counts: Floats = np.unique(np.ceil(1.1 ** np.arange(1, 218)))
-    hits = np.rint(rate * counts)
-    low, high = clopper_pearson(hits, counts, level)
-    decided = (low > limit) if rate > limit else (high < limit)
-    if not decided.any():
+    """Return the least power of about 1.1 at which the interval excludes the limit."""
+    if rate == limit:
         return math.inf
-    return _rounded(float(counts[np.argmax(decided)]))
+    counts = np.unique(np.ceil(1.1 ** np.arange(1, 218)))
+
+    def is_decided(n: float) -> bool:
+        # Whole hits, rounded towards the limit.
+        hits = math.floor(rate * n) if rate > limit else math.ceil(rate * n)
+        low, high = clopper_pearson(hits, n, level)
+        return bool(low > limit) if rate > limit else bool(high < limit)
+
+    first = bisect.bisect_left(counts, True, key=is_decided)
+    return _rounded(float(counts[first])) if first < len(counts) else math.inf
 
 
+@functools.cache
 def _of_quantile(percent: int, level: float) -> int:
     """Return the least number of draws at which a quantile's interval has an upper end.
 

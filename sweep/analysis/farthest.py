@@ -111,10 +111,9 @@ def farthest_met(
     table = table.isel({along: order})
     values = values[order]
     inner = [*together, "requirement"]
-    keeps = xr.concat([
-        each.holds(table["value"].isel(requirement=number))
-        for number, each in enumerate(required)], dim="requirement").transpose(
-            *table["value"].dims)
+    keeps = xr.zeros_like(table["value"], dtype=bool)
+    for k, each in enumerate(required):
+        keeps[{"requirement": k}] = each.holds(table["value"].isel(requirement=k))
     applicable = table["decision"] != Decision.not_applicable
     judged = applicable.any(inner)
     all_keep = (keeps | ~applicable).all(inner) & judged

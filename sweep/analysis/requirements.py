@@ -238,7 +238,8 @@ def check_requirements(
     judged = [_judged(table, number, each, replicated) for number, each in enumerate(required)]
     index = xr.DataArray([each.text for each in required], dims="requirement", attrs={
         "long_name": "what is required"})
-    out = xr.concat(judged, dim="requirement").assign_coords(
+    out = xr.concat(
+        judged, "requirement", coords="minimal", compat="override").assign_coords(
         requirement=index,
         variable=("requirement", [each.variable for each in required]),
         relation=("requirement", [each.relation for each in required]),
@@ -303,8 +304,8 @@ def _judged(
         (table["looked_for"] == 0) | (table["solved"] > 0))
     decision = (xr.full_like(value, Decision.undecided).where(~not_met, Decision.not_met)
                 .where(~met, Decision.met).where(~no_number, Decision.not_applicable))
-    needed = draws_needed(requirement, value, low, high, draws).where(
-        decision == Decision.undecided)
+    needed = draws_needed(
+        requirement, value, low, high, draws, decision == Decision.undecided)
     words = {
         "value": (value, "value"),
         "low": (low, "lower end of the interval by which it is decided"),

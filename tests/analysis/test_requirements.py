@@ -1,0 +1,305 @@
+"""Decisions on requirements are those of plain NumPy and SciPy, condition by condition."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from support.small_datasets import (
+    coordinates_of,
+    degrees,
+    is_detected,
+    is_solved,
+    length,
+    looked_for,
+    mixed,
+    percent,
+    perfect,
+    poses,
+)
+from sweep.analysis.farthest import Reach, farthest_met
+from sweep.analysis.requirements import Decision, check_requirements, parse_requirements
+from sweep.analysis.verdicts import combined, verdicts
+from sweep.errors import ArgumentError, DatasetError
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+
+SIZES = {"tilt_deg": 2, "side_px": 3, "trial": 80, "solver": 2}
+PER = ["tilt_deg", "side_px"]
+MEANS, EXACT = 0.99, 0.95
+
+
+def clopper_pearson(hits, n, level):
+    tail = (1.0 - level) / 2.0
+    low = stats.beta.ppf(tail, hits, n - hits + 1) if hits else 0.0
+    high = stats.beta.ppf(1.0 - tail, hits + 1, n - hits) if hits < n else 1.0
+    return hits / n, low, high
+
+
+def order_statistics(errors, percent_of, level):
+    """Return a quantile and the order statistics around it; NaN for an end beyond the sample."""
+    n, tail, share = len(errors), (1.0 - level) / 2.0, percent_of / 100.0
+    ordered = np.sort(np.float32(errors))
+    low = int(stats.binom.ppf(tail, n, share))
+    high = int(stats.binom.ppf(1.0 - tail, n, share)) + 1
+    value = ordered[math.ceil(n * percent_of / 100) - 1]
+    return (value, ordered[low - 1] if low else math.nan,
+            ordered[high - 1] if high <= n else math.nan)
+
+
+def student(values, drawn, level, *, root=False):
+    """Return a mean with Student's interval, or the root of one with that of its logarithm."""
+    mean = np.mean(values)
+    error = math.sqrt(drawn / (drawn - 1.0) * np.sum((values - mean) ** 2)) / len(values)
+    reach = stats.t.ppf(1.0 - (1.0 - level) / 2.0, len(values) - 1) * error
+    if root:
+        factor = math.exp(reach / mean)
+        return tuple(math.sqrt(each) for each in (mean, mean / factor, mean * factor))
+    return mean, mean - reach, mean + reach
+
+
+def absolute(interval):
+    value, low, high = interval
+    nearest = 0.0 if low <= 0.0 <= high else min(abs(low), abs(high))
+    return abs(value), nearest, max(abs(low), abs(high))
+
+
+def unflipped(pose):
+    return is_solved(pose) and pose["flipped"] != Flipped.flipped
+
+
+def errors_of(found, error):
+    return [length(error(pose)) if is_solved(pose) else math.inf for pose in found
+            if looked_for(pose)]
+
+
+def interval_of(variable, found, level):
+    """Return value, low, high and draws of a quantity of some poses."""
+    seen, solved = [p for p in found if looked_for(p)], [p for p in found if is_solved(p)]
+    good = [p for p in found if unflipped(p)]
+    run = sum(p["detection"] != DetectionStatus.not_run for p in found)
+    match variable:
+        case "detection_rate":
+            return *clopper_pearson(sum(map(is_detected, seen)), len(seen), level), len(seen)
+        case "solved_rate":
+            return *clopper_pearson(len(solved), len(seen), level), len(seen)
+        case "flip_rate":
+            return *clopper_pearson(len(solved) - len(good), len(solved), level), len(solved)
+        case "range_median_percent":
+            return *order_statistics(errors_of(found, percent), 50, level), len(seen)
+        case "rotation_p95_deg":
+            return *order_statistics(errors_of(found, degrees), 95, level), len(seen)
+        case "range_rmse_percent":
+            values = np.array([percent(p)[0] ** 2 for p in solved])
+            return *student(values, run, level, root=True), len(solved)
+        case "range_bias_percent":
+            values = np.array([percent(p)[0] for p in good])
+            return *absolute(student(values, run, level)), len(good)
+        case "x_bias_m":
+            values = np.array([float(p["translation_error_m"][0]) for p in good])
+            return *absolute(student(values, run, level)), len(good)
+    raise ValueError(variable)
+
+
+LEVELS = {"detection_rate": EXACT, "solved_rate": EXACT, "flip_rate": EXACT,
+          "range_median_percent": EXACT, "rotation_p95_deg": EXACT, "range_rmse_percent": MEANS,
+          "range_bias_percent": MEANS, "x_bias_m": MEANS}
+
+
+def decision_of(variable, relation, limit, found, count):
+    """Return the decision by the interval's end of one condition, and of ``count`` together."""
+    level = LEVELS[variable]
+    _, low, high, draws = interval_of(variable, found, level)
+    _, all_low, all_high, _ = interval_of(variable, found, 1.0 - (1.0 - level) / count)
+    if level == MEANS and draws < 50:
+        return Decision.undecided
+    if relation == ">=":
+        met, failed = low >= limit, all_high < limit
+    else:
+        met, failed = high <= limit, all_low > limit
+    return Decision.met if met else Decision.not_met if failed else Decision.undecided
+
+
+def is_that_of_the_reference(seed, sizes):
+    rng = np.random.default_rng(seed)
+    results = mixed(sizes, seed=seed, good=rng.uniform(0.85, 0.99))
+    per = [name for name in PER if name in sizes]
+    by_condition = poses(results, "estimate", ["solver", *per])
+    texts = []
+    for variable in sorted(LEVELS):
+        # A limit near what there is, so that all decisions occur.
+        middle = interval_of(variable, next(iter(by_condition.values())), 0.5)
+        limit = float(np.clip(middle[0] * rng.uniform(0.7, 1.3), 1e-6, 1e6))
+        if "rate" in variable or not math.isfinite(middle[0]):
+            limit = rng.uniform(0.6, 0.95) if "rate" in variable else 3.0
+        texts.append(f"{variable} {rng.choice(['>=', '<='])} {limit:.12g}")
+    # Implied contradictions are refused: judged one by one.
+    seen = set()
+    for text in texts:
+        table = check_requirements(results, [text], per=per)
+        (requirement,) = parse_requirements([text])
+        for index, found in by_condition.items():
+            at = dict(zip(["solver", *per], index, strict=True))
+            expected = decision_of(requirement.variable, requirement.relation,
+                                   requirement.limit, found,
+                                   count=math.prod(sizes[name] for name in per))
+            cell = table.isel(at).isel(requirement=0)
+            assert Decision(int(cell["decision"])) == expected, (seed, text, at)
+            seen.add(expected)
+    return seen
+
+
+def test_decisions_are_those_of_plain_numpy():
+    sizes = {"side_px": 2, "trial": 80, "solver": 1}
+    seen = set().union(*(is_that_of_the_reference(seed, sizes) for seed in range(5)))
+    assert seen == {Decision.met, Decision.not_met, Decision.undecided}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(50))
+def test_decisions_of_fifty_stores_are_those_of_plain_numpy(seed):
+    is_that_of_the_reference(seed, SIZES)
+
+
+def with_detected(share_by_distance, trials=100, tilts=None):
+    """Return a dataset of which that share of the draws is detected at each distance."""
+    sizes = {"distance_m": len(share_by_distance), **({"tilt_deg": len(tilts)} if tilts else {}),
+             "trial": trials, "solver": 1}
+    results = perfect(np.random.default_rng(4), sizes)
+    results = results.assign_coords(coordinates_of(sizes))
+    results["distance_m"] = np.arange(1.0, len(share_by_distance) + 1.0)
+    shares = np.array(share_by_distance, dtype=float)
+    if tilts:
+        shares = np.minimum(shares[:, None], np.array(tilts)[None])
+    missed = np.arange(trials) >= np.rint(shares[..., None] * trials)
+    results["detection"].values[missed] = DetectionStatus.no_candidate
+    results["estimate"].values[missed] = EstimateStatus.no_detection
+    results["flipped"].values[missed] = Flipped.no_estimate
+    for name in ("rotation_error_rad", "translation_error_m"):
+        results[name].values[missed] = np.nan
+    return results
+
+
+def test_the_limit_along_distance_has_an_interval_and_a_cause():
+    results = with_detected([1.0, 1.0, 0.97, 0.85, 0.2])
+    reach = farthest_met(results, ["detection >= 0.9", "rotation_median_deg <= 90"], "distance_m")
+    one = reach.isel(solver=0)
+    assert [float(one[name]) for name in ("low", "value", "high")] == [3.0, 3.0, 4.0]
+    assert one["limited_by"].item() == "detection_rate >= 0.9"
+    assert float(one["fails_at"]), float(one["failing_value"]) == (4.0, 0.85)
+    assert Reach(int(one["reach"])) is Reach.found
+    assert float(one["met_beyond"]) == 0.0
+
+
+def test_a_dip_ends_the_limit_and_is_told():
+    one = farthest_met(with_detected([1.0, 0.3, 1.0, 1.0]), ["detection >= 0.9"],
+                       "distance_m").isel(solver=0)
+    assert [float(one[name]) for name in ("low", "value", "high")] == [1.0, 1.0, 1.0]
+    assert (float(one["met_beyond"]), float(one["farthest_beyond"])) == (2.0, 4.0)
+    assert one["keeps"].values.tolist() == [True, False, True, True]
+
+
+def test_requirements_hold_at_all_tilts_together():
+    results = with_detected([1.0, 1.0, 1.0], tilts=[1.0, 0.5])
+    apart = farthest_met(results, ["detection >= 0.9"], "distance_m", per=["tilt_deg"])
+    assert [Reach(int(each)).name for each in apart["reach"].isel(solver=0)] == ["always", "never"]
+    together = farthest_met(results, ["detection >= 0.9"], "distance_m", at_all=["tilt_deg"])
+    assert Reach(int(together["reach"].isel(solver=0))) is Reach.never
+    assert together["fails_where"].item() == "tilt_deg = 30"
+
+
+def test_sides_go_from_large_to_small():
+    results = perfect(np.random.default_rng(1), {"side_px": 3, "trial": 100, "solver": 1})
+    results["detection"].values[0] = DetectionStatus.no_candidate
+    results["estimate"].values[0] = EstimateStatus.no_detection
+    one = farthest_met(results, ["detection >= 0.9"], "side_px").isel(solver=0)
+    assert [float(one[name]) for name in ("low", "value", "high")] == [20.0, 20.0, 20.0]
+    assert one["side_px"].values.tolist() == [12.0, 20.0, 35.0]
+
+
+def test_verdicts_are_of_the_worst_condition():
+    table = check_requirements(with_detected([1.0, 0.97, 0.2]), ["detection >= 0.9"],
+                               per=["distance_m"])
+    (verdict,) = verdicts(table)
+    assert verdict.decision is Decision.not_met is combined([verdict])
+    assert verdict.condition == {"distance_m": 3.0}
+    assert verdict.value == pytest.approx(0.2)
+    assert verdict.counts == {Decision.met: 2, Decision.not_met: 1}
+
+
+def test_about_as_many_draws_as_are_said_decide():
+    few = check_requirements(with_detected([0.97], trials=100), ["detection >= 0.95"])
+    assert Decision(int(few["decision"].item())) is Decision.undecided
+    needed = int(few["draws_needed"].item())
+    assert needed > 100
+    many = check_requirements(with_detected([0.97], trials=needed), ["detection >= 0.95"])
+    assert Decision(int(many["decision"].item())) is Decision.met
+
+
+def test_poses_that_cannot_be_seen_are_no_condition():
+    results = with_detected([1.0, 1.0])
+    results["detection"].values[1] = DetectionStatus.not_visible
+    results["estimate"].values[1] = EstimateStatus.no_detection
+    table = check_requirements(results, ["detection >= 0.9"], per=["distance_m"])
+    assert [Decision(each).name for each in table["decision"].values.ravel()] == [
+        "met", "not_applicable"]
+    assert verdicts(table)[0].decision is Decision.met
+
+
+@pytest.mark.parametrize(("texts", "problem"), [
+    (["detection"], "expected NAME >= NUMBER"),
+    (["detection >= 99 %"], "write 0.99"),
+    (["detection >= 95"], "write 0.95 for 95 %"),
+    (["detection >= 1.2"], "a share is from 0 to 1"),
+    (["detection >= 1"], "no number of draws can show a rate of 1"),
+    (["flip_rate <= 0"], "no number of draws can show 0"),
+    (["detection >= 0"], "holds always"),
+    (["detection == 1"], "no relation"),
+    (["detection >= nan"], "expected NAME >= NUMBER"),
+    (["detection >= 1e999"], "finite"),
+    (["detektion >= 0.9"], "did you mean detection_rate?"),
+    (["range_error_p95_m <= 1"], "its unit is %: write range_p95_percent"),
+    (["rotation_p95_rad <= 1"], "its unit is degrees: write rotation_p95_deg"),
+    (["rotation_p95 <= 1"], "write rotation_p95_deg"),
+    (["rotation_p95_deg <= 0.01 rad"], "the number alone, in degrees"),
+    (["range_p95_percent <= -1"], "never negative"),
+    (["yaw_bias_deg >= -1"], "the absolute value is required"),
+    (["rotation_p95_deg >= 200"], "never above 180"),
+    (["looked_for >= 100"], "is a count"),
+    (["detection >= 0.99", "detection <= 0.5"], "contradicts detection_rate <= 0.5"),
+    (["detection >= 0.9", "detection >= 0.8"], "another such limit"),
+    (["range_p95_percent >= 5", "range_p99_percent <= 4"], "contradicts"),
+    (["solved >= 0.9", "detection <= 0.8"], "contradicts"),
+    (["range_p95_percent <= 4", "detection <= 0.8"], "contradicts"),
+    ([], "expected at least one"),
+], ids=str)
+def test_a_requirement_that_cannot_be_is_refused(texts, problem):
+    with pytest.raises(ArgumentError, match=problem.replace("?", r"\?")) as error:
+        parse_requirements(texts)
+    assert len(str(error.value).splitlines()) == 1
+
+
+def test_all_faults_are_told_at_once():
+    with pytest.raises(ArgumentError) as error:
+        parse_requirements(["detection", "foo_deg >= 1", "range_p95_m <= 1"])
+    assert len(str(error.value).splitlines()) == 3
+
+
+@pytest.mark.parametrize(("change", "text", "problem"), [
+    (lambda r: r.isel(trial=slice(1)), "detection >= 0.5", "a single draw of each pose"),
+    (lambda r: r.isel(trial=0), "detection >= 0.5", "a single draw of each pose"),
+    (lambda r: r, "nees <= 7", "lacks nees"),
+    (lambda r: r, "rotation_efficiency >= 0.5", "lacks bound_std"),
+    (lambda r: r.drop_vars("true_rvec"), "yaw_bias_deg <= 1", "lacks true_rvec"),
+])
+def test_a_store_that_cannot_answer_says_so(change, text, problem):
+    results = change(perfect(np.random.default_rng(1), {"side_px": 2, "trial": 60, "solver": 1}))
+    with pytest.raises(DatasetError, match=problem):
+        check_requirements(results, [text])
+
+
+def test_configurations_are_never_pooled():
+    results = mixed({"side_px": 2, "trial": 60, "cornerRefinementMethod": 2, "solver": 2})
+    table = check_requirements(results, ["detection >= 0.5"])
+    assert table["decision"].dims == ("cornerRefinementMethod", "solver", "requirement")
+    assert table.attrs["configuration_dims"] == ["cornerRefinementMethod", "solver"]

@@ -1,0 +1,124 @@
+"""How often a requirement is falsely met, or not met, if the true value is exactly the limit.
+
+2,000 simulations each: configurations of one dataset, which are never pooled. Each test fails by
+chance with a probability below 1e-6: counts are compared with the binomial quantile of the rate
+that is promised. `pytest -m long -s` prints the shares.
+"""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from support.small_datasets import perfect
+from sweep.analysis.requirements import ERROR_PROBABILITY, Decision, check_requirements
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+
+pytestmark = pytest.mark.long
+
+SIMULATIONS = 2000
+CHANCE = 1e-6
+
+
+def at_most(probability, n=SIMULATIONS):
+    """Return the most cases that a probability gives, but for a chance of 1e-6."""
+    return stats.binom.isf(CHANCE, n, probability)
+
+
+def simulated(draws, conditions=1, simulations=SIMULATIONS, **errors):
+    """Return a dataset whose solver axis are simulations."""
+    sizes = {"side_px": conditions, "trial": draws, "solver": simulations}
+    return perfect(np.random.default_rng(draws), sizes, **errors)
+
+
+def count_of(decision, results, text, name):
+    table = check_requirements(results, [text], per=["side_px"])
+    found = (table["decision"] == decision).any("side_px")
+    print(f"{name}: {decision.name} in {int(found.sum())} of {found.size}")
+    return int(found.sum())
+
+
+def lose(results, missed):
+    """Mark poses as not solved."""
+    results["estimate"].values[missed] = EstimateStatus.solver_failed
+    results["flipped"].values[missed] = Flipped.no_estimate
+    for name in ("rotation_error_rad", "translation_error_m"):
+        results[name].values[missed] = np.nan
+    assert (results["detection"] == DetectionStatus.detected).all()
+    return results
+
+
+@pytest.mark.parametrize("rate", [0.9, 0.95, 0.99, 0.995])
+@pytest.mark.parametrize("draws", [20, 50, 100, 400, 1000])
+def test_a_rate_at_the_limit_is_rarely_met(rate, draws):
+    results = simulated(draws)
+    rng = np.random.default_rng(7)
+    results = lose(results, rng.random(results["estimate"].shape) >= rate)
+    for relation, limit, name in ((">=", rate, "met"), ("<=", rate, "at most")):
+        count = count_of(Decision.met, results, f"solved {relation} {limit}",
+                         f"rate {rate}, {draws} draws, {name}")
+        assert count <= at_most(0.025)
+        assert count < ERROR_PROBABILITY * SIMULATIONS
+
+
+@pytest.mark.parametrize("draws", [50, 80, 100, 200, 1000])
+def test_a_quantile_at_the_limit_is_rarely_met(draws):
+    rng = np.random.default_rng(8)
+    errors = np.zeros((1, draws, SIMULATIONS, 3))
+    errors[..., 0] = rng.exponential(size=errors.shape[:-1])
+    limit = np.degrees(0.01 * stats.expon.ppf(0.95))
+    results = simulated(draws, rotation=0.01 * errors)
+    count = count_of(Decision.met, results, f"rotation_p95_deg <= {limit:.12g}",
+                     f"p95, {draws} draws")
+    assert count <= at_most(0.025)
+    assert count < ERROR_PROBABILITY * SIMULATIONS
+
+
+ERRORS = {"normal": (stats.norm(), (50, 100, 400)), "Laplace": (stats.laplace(), (100, 400)),
+          "uniform": (stats.uniform(-1, 2), (50, 400))}
+
+
+@pytest.mark.parametrize(("name", "draws"), [
+    (name, draws) for name, (_, counts) in ERRORS.items() for draws in counts])
+def test_a_root_mean_square_at_the_limit_is_rarely_met(name, draws):
+    distribution = ERRORS[name][0]
+    position = np.zeros((1, draws, SIMULATIONS, 3))
+    position[..., 0] = distribution.rvs(size=position.shape[:-1], random_state=9)
+    results = simulated(draws, position=position)
+    limit = distribution.std()
+    for text in (f"position_rmse_m <= {limit:.12g}", f"x_sd_m <= {limit:.12g}"):
+        count = count_of(Decision.met, results, text, f"{text}, {name} errors, {draws} draws")
+        assert count <= at_most(ERROR_PROBABILITY)
+        assert count < ERROR_PROBABILITY * SIMULATIONS
+
+
+@pytest.mark.parametrize(("name", "draws"), [
+    (name, draws) for name, (_, counts) in ERRORS.items() for draws in counts])
+def test_a_bias_at_the_limit_is_rarely_met(name, draws):
+    distribution = ERRORS[name][0]
+    position = np.zeros((1, draws, SIMULATIONS, 3))
+    position[..., 0] = 0.5 + distribution.rvs(size=position.shape[:-1], random_state=10)
+    results = simulated(draws, position=position)
+    for text in ("x_bias_m <= 0.5", "position_bias_m <= 0.5"):
+        count = count_of(Decision.met, results, text, f"{text}, {name} errors, {draws} draws")
+        assert count <= at_most(0.025)
+        assert count < ERROR_PROBABILITY * SIMULATIONS
+
+
+@pytest.mark.parametrize(("text", "rate"), [("solved >= 0.9", 0.9), ("solved >= 0.99", 0.99)])
+def test_not_met_at_any_of_many_conditions_is_rarely_false(text, rate):
+    results = simulated(100, conditions=6, simulations=1000)
+    rng = np.random.default_rng(11)
+    results = lose(results, rng.random(results["estimate"].shape) >= rate)
+    count = count_of(Decision.not_met, results, text, f"{text} at 6 conditions")
+    assert count <= at_most(ERROR_PROBABILITY, 1000)
+    assert count < ERROR_PROBABILITY * 1000
+
+
+def test_an_interval_without_guarantee_would_be_falsely_decided():
+    """Wilson's ends are why Clopper and Pearson's decide: two misses in 50 exclude 0.99."""
+    n, z = 50, stats.norm.ppf(0.975)
+    hits = np.arange(n + 1)
+    rate = hits / n
+    high = (rate + z**2 / (2 * n) + z * np.sqrt(rate * (1 - rate) / n + z**2 / (4 * n**2))) / (
+        1 + z**2 / n)
+    assert stats.binom.pmf(hits, n, 0.99)[high < 0.99].sum() > 0.08

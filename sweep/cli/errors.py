@@ -6,7 +6,7 @@ import argparse
 import errno
 import sys
 
-from sweep.errors import ArgumentError, PipelineError, StoreError, SweepError
+from sweep.errors import ArgumentError, PipelineError, PluginError, StoreError, SweepError
 from sweep.messages import plain
 
 MAX_LINE_LENGTH = 2000
@@ -27,7 +27,7 @@ OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 NO_THREAD = "can't start new thread"
 """What Python says in a RuntimeError where the system allows no more threads."""
 
-REFUSALS = (ArgumentError, PipelineError, StoreError)
+REFUSALS = (ArgumentError, PipelineError, PluginError, StoreError)
 """Errors of what was asked for (exit status 2); others occur while a command runs (1)."""
 
 

@@ -27,6 +27,7 @@ from sweep.plan.background_files import file_digest
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices
 from sweep.plan.parameters import Stage
+from sweep.plan.plugins import lacking_plugins
 from sweep.plan.schema import Variable
 from sweep.store.blocks import begin_block, withdraw_block, write_block
 from sweep.store.failures import MAX_ROWS, recorded
@@ -70,8 +71,8 @@ def _opened(url: str, run_id: str, durable: bool = False) -> RunStore:
         )
     # What a camera file says is in the pipeline's text.
     images = store.pipeline.values_of("background")
-    for plugin in store.pipeline.plugins:
-        plugin.record(store.pipeline.folder)
+    if lacking := lacking_plugins(store.pipeline.plugins, store.pipeline.folder):
+        raise StoreError(f"a worker lacks what the run began with: {lacking[0]}")
     for path, digest in store.fingerprint["files"].items():
         if path in images and file_digest(Path(store.pipeline.folder) / path) != digest:
             raise StoreError(

@@ -45,6 +45,7 @@ from sweep.execution.tally import Tally
 from sweep.execution.work_left import block_s_of, demand_left, demand_of, thread_count_of, work_s
 from sweep.isolation.child_process import Child
 from sweep.isolation.interrupts import Interrupts
+from sweep.isolation.plugin_check import check_plugins
 from sweep.messages import notice
 from sweep.plan.experiment import Pipeline
 from sweep.plan.notes import notes
@@ -158,6 +159,8 @@ def execute(
         thread = stack.enter_context(ThreadPoolExecutor(1))
         child = child or Child(BLOCK_TASK)
         stack.callback(child.close)  # the thread waits for it
+        if pipeline.plugins:
+            interrupts.await_result(thread.submit(check_plugins, child, pipeline))
 
         def measuring(budget_s: float) -> Future[Calibration]:
             limit_s = CALIBRATION_SHARE * (time_limit_s or TIME_LIMIT_S)

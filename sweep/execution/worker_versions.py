@@ -12,6 +12,7 @@ from distributed import Client
 from sweep.errors import ArgumentError
 from sweep.execution.limits import ANSWER_S, VERSIONS_S
 from sweep.plan.experiment import Pipeline
+from sweep.plan.plugins import lacking_plugins
 from sweep.store.provenance import changes, fingerprint
 
 
@@ -36,7 +37,7 @@ def check_workers(client: Client, pipeline: Pipeline, argument: str, value: str)
         If a worker has other versions, cannot import this package, or is a thread of this process;
         if none answers, or the scheduler went away.
     """
-    own_versions, own_process = _worker_identity(pipeline)
+    own_versions, own_process, _ = _worker_identity(pipeline)
     try:
         identities = client.sync(_worker_identities, client, pipeline)
     except TimeoutError:
@@ -49,7 +50,7 @@ def check_workers(client: Client, pipeline: Pipeline, argument: str, value: str)
         raise ArgumentError(
             argument, value, f"its workers cannot run sweep: {error}; install it there"
         ) from None
-    if any(process == own_process for _, process in identities.values()):
+    if any(process == own_process for _, process, _ in identities.values()):
         raise ArgumentError(
             argument, value,
             "its workers are threads of this process, which a scene may end; "
@@ -57,8 +58,11 @@ def check_workers(client: Client, pipeline: Pipeline, argument: str, value: str)
         )
     lines = sorted(
         f"  {worker}: {key} {theirs}, here {own}"
-        for worker, (versions, _) in identities.items()
+        for worker, (versions, _, _) in identities.items()
         for key, theirs, own in changes({"builds": {}, **versions}, own_versions)
+    )
+    lines += sorted(
+        f"  {worker}: {line}" for worker, (_, _, lacking) in identities.items() for line in lacking
     )
     if lines:
         raise ArgumentError(
@@ -67,14 +71,15 @@ def check_workers(client: Client, pipeline: Pipeline, argument: str, value: str)
         )
 
 
-def _worker_identity(pipeline: Pipeline) -> tuple[dict[str, Any], tuple[str, int]]:
-    """Return the versions that numbers depend on in this process, and which process it is."""
-    return fingerprint(pipeline), (socket.gethostname(), os.getpid())
+def _worker_identity(pipeline: Pipeline) -> tuple[dict[str, Any], tuple[str, int], list[str]]:
+    """Return the versions that numbers depend on here, the process, and plug-ins that lack."""
+    lacking = lacking_plugins(pipeline.plugins, pipeline.folder)
+    return fingerprint(pipeline), (socket.gethostname(), os.getpid()), lacking
 
 
 async def _worker_identities(
     client: Client, pipeline: Pipeline
-) -> dict[str, tuple[dict[str, Any], tuple[str, int]]]:
+) -> dict[str, tuple[dict[str, Any], tuple[str, int], list[str]]]:
     """Return :func:`_worker_identity` of each worker by address; not of those that are stalled."""
     questions = [
         asyncio.ensure_future(client.run(_worker_identity, pipeline, workers=[worker]))

@@ -79,18 +79,19 @@ def read_plugins(
 ) -> tuple[list[DeclaredPlugin], list[tuple[str, str, str, str]]]:
     """Return a document's plug-ins, and faults: kind, key, name and what was expected.
 
-    ``known`` are those of a store, taken instead of importing them.
+    ``known`` are those of a store, or of the pipeline that the document is a cell of: they are
+    taken instead of importing them, also those that the document does not name.
     """
-    plugins: list[DeclaredPlugin] = []
+    if known is not None:
+        plugins = list(known)
+        recorded = {(plugin.kind, plugin.name) for plugin in plugins}
+        return plugins, [
+            (kind, key, name, "a plug-in that the store has recorded")
+            for kind, name, key in named(document) if (kind, name) not in recorded
+        ]
+    plugins = []
     faults = []
-    recorded = None if known is None else {(each.kind, each.name): each for each in known}
     for kind, name, key in named(document):
-        if recorded is not None:
-            if (kind, name) in recorded:
-                plugins.append(recorded[kind, name])
-            else:
-                faults.append((kind, key, name, "a plug-in that the store has recorded"))
-            continue
         try:
             plugin = declare(kind, name, folder)
             parameters_with((*plugins, plugin))
@@ -99,6 +100,17 @@ def read_plugins(
         else:
             plugins.append(plugin)
     return plugins, faults
+
+
+def lacking_plugins(plugins: Iterable[DeclaredPlugin], folder: str) -> list[str]:
+    """Return a line for each plug-in that is not in this process as it was declared."""
+    lines = []
+    for plugin in plugins:
+        try:
+            plugin.record(folder)
+        except PluginError as error:
+            lines.append(str(error))
+    return lines
 
 
 @lru_cache(maxsize=64)

@@ -25,7 +25,7 @@ _LONG_KEY = re.compile(
     rf"(?<![A-Za-z0-9_\\-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MAX_PARTS}}}"
 )
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
-_BARE = re.compile(r"[A-Za-z][A-Za-z0-9_.+-]*(/[A-Za-z0-9_.+-]+)*")
+_BARE = re.compile(r"[A-Za-z][A-Za-z0-9_.+-]*(/[A-Za-z0-9_.+-]+)*(:[A-Za-z_][A-Za-z0-9_]*)?")
 
 
 def read_document(text: str) -> dict[str, Any]:

@@ -1,0 +1,276 @@
+"""Plug-ins at fault: a line each, and what others computed is not lost."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sweep.errors import PipelineError, PluginError
+from sweep.evaluation.cells import run_cells
+from sweep.isolation.child_process import Child
+from sweep.isolation.plugin_check import check_plugins, use
+from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.plan.experiment import Pipeline
+from tests.support.here import Here
+
+DETECTORS = '''
+import os
+import numpy as np
+
+class At:
+    """Misbehaves where there is a marker."""
+    def __init__(self, settings, family):
+        pass
+    def __call__(self, image):
+        return self.returned(image) if image.max() > 200 else ([], [])
+
+def at(function):
+    return type("At", (At,), {"returned": lambda self, image: function(image)})
+
+ONE = np.zeros((1, 4, 2))
+nan = at(lambda image: (ONE * np.nan, [0]))
+shape = at(lambda image: (ONE[0], [0]))
+many = at(lambda image: (np.zeros((10000, 4, 2)), np.zeros(10000, int)))
+words = at(lambda image: ([["a"]], [0]))
+ids_float = at(lambda image: (ONE, [0.0]))
+ids_negative = at(lambda image: (ONE, [-1]))
+ids_missing = at(lambda image: (ONE, None))
+ids_many = at(lambda image: (ONE, [0, 1]))
+nothing = at(lambda image: None)
+changes = at(lambda image: (image.fill(0), ([], []))[1])
+raises = at(lambda image: open("model.onnx"))
+exits = at(lambda image: os.sys.exit(3))
+
+def forking(image):
+    if os.fork() == 0:
+        os._exit(0)
+    os.wait()
+    return [], []
+
+def talking(image):
+    print("found nothing")
+    return [], []
+
+forks = at(forking)
+prints = at(talking)
+never_made = lambda settings, family: 1 / 0
+no_function = lambda settings, family: 3
+dies = lambda settings, family: os.abort()
+sleeps = lambda settings, family: __import__("time").sleep(1000)
+number = 3
+'''
+
+GRID = """
+[camera]
+width_px = 128
+height_px = 96
+[marker]
+size_m = 0.05
+[pose]
+side_px = 48
+[axes]
+detector = ["opencv", "bad:{name}"]
+"""
+
+
+@pytest.fixture
+def pipeline(tmp_path):
+    (tmp_path / "bad.py").write_text(DETECTORS)
+    return lambda name: Pipeline.from_text(GRID.format(name=name), folder=tmp_path)
+
+
+@pytest.mark.parametrize(("name", "told"), [
+    ("nan", "returned corners that are not finite"),
+    ("shape", "returned corners of shape (4, 2); expected (n, 4, 2)"),
+    ("many", "returned 10,000 corners for one image; expected at most 1,000"),
+    ("words", "returned corners that are no array of numbers"),
+    ("ids_float", "returned ids of type float64; expected whole numbers"),
+    ("ids_negative", "returned the ID -1; expected at least 0"),
+    ("ids_missing", "returned ids of shape (); expected (1,), one of each marker"),
+    ("ids_many", "returned ids of shape (2,); expected (1,), one of each marker"),
+    ("nothing", "returned a NoneType; expected a tuple (corners, ids)"),
+    ("changes", "changed the image that it was given; copy it first"),
+    ("raises", "raises FileNotFoundError"),
+    ("exits", "raises SystemExit: 3"),
+    ("forks", "forks the process that it runs in"),
+])
+def test_an_image_at_which_a_detector_is_at_fault_is_flagged(pipeline, name, told):
+    bad = pipeline(name)
+    use(bad, "detector", f"bad:{name}")  # on a blank frame nothing is wrong
+    cells = run_cells(bad, [])
+    assert [flags.tolist() for flags in cells.columns["detection"]] == [
+        [DetectionStatus.detected], [DetectionStatus.failed],
+    ]
+    (failure,) = cells.failures
+    assert (failure.stage, failure.setting) == ("detection", 1)
+    assert f"PluginError: bad:{name}: {told}" in failure.text.splitlines()[-1]
+
+
+def test_what_a_plug_in_prints_does_not_mix_with_results(pipeline, capfd):
+    cells = run_cells(pipeline("prints"), [])
+    assert not cells.failures
+    assert capfd.readouterr() == ("", "found nothing\n")
+
+
+@pytest.mark.parametrize(("name", "told"), [
+    ("never_made", "raises ZeroDivisionError: division by zero"),
+    ("no_function", "make returns a int, not a function"),
+])
+def test_a_detector_that_cannot_be_made_refuses_the_run(pipeline, name, told):
+    with pytest.raises(PluginError) as refused:
+        check_plugins(Here(), pipeline(name))
+    assert str(refused.value) == f"bad:{name}: {told}"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "told"), [
+    ("dies", "SIGABRT"), ("sleeps", "time limit of 2 s"),
+])
+def test_a_detector_that_ends_its_process_or_never_returns_refuses_the_run(pipeline, name, told):
+    with Child() as child:
+        with pytest.raises(PluginError) as refused:
+            check_plugins(child, pipeline(name), limit_s=2)
+        assert str(refused.value) == (
+            f"detector bad:{name}: ends its process before the first pose: {told}"
+        )
+        assert child.call(pow, 2, 10, limit_s=60) == 1024  # it was started again
+
+
+@pytest.mark.parametrize(("source", "told"), [
+    ("import missing_library", "cannot be imported" ),
+    ("x =", "SyntaxError"),
+    ("raise SystemExit(2)", "SystemExit: 2 (line 1 of mine.py)"),
+    ("D = 3", "a DetectorPlugin, not a int"),
+    ("", "a name in mine.py"),
+    ("from sweep.plugins import DetectorPlugin\nD = DetectorPlugin(make=1)",
+     "TypeError: make: expected a class or function of settings and family (line 2 of mine.py)"),
+    ("from sweep.plugins import *\nD = DetectorPlugin(make=print, corner_order=(0, 1, 2, 2))",
+     "corner_order = (0, 1, 2, 2): expected the numbers 0 to 3, each once"),
+    ("from sweep.plugins import *\nD = DetectorPlugin(make=print, distribution='not-there-9')",
+     "the distribution not-there-9, which is not installed: `pip install not-there-9`"),
+    ("from sweep.plugins import *\nD = EstimatorPlugin(make=print)",
+     "a DetectorPlugin, not a EstimatorPlugin"),
+    ("""
+from dataclasses import dataclass
+from sweep.plugins import DetectorPlugin, parameter
+@dataclass
+class Settings:
+    tilt_deg: float = parameter(0.0, "ours")
+D = DetectorPlugin(make=print, settings=Settings)
+""", "another name for its setting tilt_deg: the pipeline has this one"),
+    ("""
+from dataclasses import dataclass
+from sweep.plugins import DetectorPlugin
+@dataclass
+class Settings:
+    plain: float = 1.0
+D = DetectorPlugin(make=print, settings=Settings)
+""", "the setting plain as `name: type = parameter(default, meaning)`"),
+    ("""
+from dataclasses import dataclass
+from sweep.plugins import DetectorPlugin, parameter
+@dataclass
+class Settings:
+    strength: int = parameter(7, "outside", low=0, high=5)
+D = DetectorPlugin(make=print, settings=Settings)
+""", "a default of its setting strength that is allowed: a whole number from 0 to 5"),
+])
+def test_a_plug_in_that_cannot_be_used_is_one_line(tmp_path, source, told):
+    (tmp_path / "mine.py").write_text(source)
+    with pytest.raises(PipelineError) as refused:
+        Pipeline.from_text(
+            '[pose]\nside_px = 24\n[detector]\ndetector = "mine:D"\nits_setting = 3\n',
+            folder=tmp_path,
+        )
+    (line,) = refused.value.faults
+    assert line.startswith('pipeline: detector.detector = "mine:D": expected ')
+    assert told in line or (told == "cannot be imported" and "missing_library" in line)
+
+
+def test_names_of_plug_ins_that_are_not_there(tmp_path):
+    for key, value, told in (
+        ("detector.detector", "nowhere:D", "expected the file nowhere.py in"),
+        ("detector.detector", "apriltagg", "expected an installed detector plug-in"),
+        ("estimator.solver", "nowhere:S", "expected the file nowhere.py in"),
+        ("scene.renderer", "nowhere:R", "expected the file nowhere.py in"),
+    ):
+        section, name = key.split(".")
+        with pytest.raises(PipelineError) as refused:
+            Pipeline.from_text(
+                f'[pose]\nside_px = 24\n[{section}]\n{name} = "{value}"\n', folder=tmp_path
+            )
+        (line,) = refused.value.faults
+        assert line.startswith(f'pipeline: {key} = "{value}": {told}')
+    with pytest.raises(PipelineError, match=r"did you mean ippe\?"):
+        Pipeline.from_text('[pose]\nside_px = 24\n[estimator]\nsolver = "ippee"\n')
+    with pytest.raises(PipelineError, match=r'effects = \["fog"\]|expected an installed effect'):
+        Pipeline.from_text('effects = ["fog"]\n[pose]\nside_px = 24\n')
+    with pytest.raises(PipelineError, match="expected a list of plug-ins, each once"):
+        Pipeline.from_text('effects = "fog"\n[pose]\nside_px = 24\n')
+
+
+SOLVERS = """
+import numpy as np
+
+def returning(function):
+    return lambda settings: lambda detections: function(len(detections.corners))
+
+EYE = np.diag([1.0, -1.0, -1.0])
+
+def poses(count, rotation=EYE, depth=0.4):
+    return np.tile(rotation, (count, 1, 1)), np.tile([0, 0, depth], (count, 1))
+
+nan = returning(lambda n: (poses(n)[0] * np.nan, poses(n)[1]))
+behind = returning(lambda n: poses(n, depth=-0.4))
+wrong = returning(lambda n: poses(n, depth=4.0))
+mirrored = returning(lambda n: poses(n, np.eye(3) * [1, 1, -1]))
+scaled = returning(lambda n: poses(n, 2 * EYE))
+few = returning(lambda n: poses(n + 1))
+nothing = returning(lambda n: None)
+half = returning(lambda n: (*poses(n), None, poses(n)[0]))
+"""
+
+
+@pytest.mark.parametrize(("name", "status", "told"), [
+    ("nan", EstimateStatus.solver_failed, None),
+    ("behind", EstimateStatus.solver_failed, None),
+    ("wrong", EstimateStatus.solver_failed, None),
+    ("mirrored", EstimateStatus.failed, "returned a rotation that is no rotation matrix"),
+    ("scaled", EstimateStatus.failed, "returned a rotation that is no rotation matrix"),
+    ("few", EstimateStatus.failed, "returned a rotation of shape (2, 3, 3); expected (1, 3, 3)"),
+    ("nothing", EstimateStatus.failed, "returned a NoneType; expected a tuple"),
+    ("half", EstimateStatus.failed, "returned half an alternative"),
+])
+def test_a_solver_s_faults_never_pass_as_solved(tmp_path, name, status, told):
+    (tmp_path / "bad.py").write_text(SOLVERS)
+    text = f'[pose]\nside_px = 60\n[axes]\nsolver = ["ippe", "bad:{name}"]\n'
+    cells = run_cells(Pipeline.from_text(text, folder=tmp_path), [])
+    assert [flags[0] for flags in cells.columns["estimate"]] == [EstimateStatus.solved, status]
+    assert np.isnan(cells.columns["rotation_error_rad"][1]).all()
+    lines = [failure.text.splitlines()[-1] for failure in cells.failures]
+    assert len(lines) == (told is not None)
+    assert all(f"PluginError: bad:{name}: {told}" in line for line in lines)
+
+
+@pytest.mark.parametrize(("result", "told"), [
+    ("light * float('nan')", "returned levels that are not finite"),
+    ("light[1:]", "returned levels of shape"),
+    ("None", "returned levels of shape ()"),
+    ("1 / 0", "raises ZeroDivisionError"),
+])
+def test_an_effect_s_faults_are_its_scene_s(tmp_path, result, told):
+    (tmp_path / "bad.py").write_text(f"""
+from dataclasses import dataclass
+from sweep.plugins import EffectPlugin, parameter
+@dataclass
+class Settings:
+    fog: float = parameter(0.0, "strength", low=0, high=1)
+E = EffectPlugin(apply=lambda light, patch: {result}, settings=Settings)
+""")
+    text = 'effects = ["bad:E"]\n[pose]\nside_px = 60\n[axes]\nfog = [0, 0.5]\n'
+    cells = run_cells(Pipeline.from_text(text, folder=tmp_path), [np.arange(2)])
+    assert cells.columns["detection"][0].tolist() == [
+        DetectionStatus.detected, DetectionStatus.failed,
+    ]
+    (failure,) = cells.failures
+    assert told in failure.text.splitlines()[-1]

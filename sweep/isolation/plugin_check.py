@@ -10,12 +10,12 @@ import numpy as np
 from sweep.errors import PluginError
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
-from sweep.measure.detector import DetectorSetting
 from sweep.measure.detectors import make_detector
 from sweep.measure.estimators import PluggedEstimatorSetting, build
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings, estimators
 from sweep.plan.scene_plugins import scene_plugins
+from sweep.plugins.declared import PluginSetting
 
 LIMIT_S = 60.0
 """Seconds that a plug-in may take to be made, and to search one blank frame."""
@@ -58,7 +58,7 @@ def use(pipeline: Pipeline, kind: str, name: str) -> None:
         blank = np.full((height, width), 128, dtype=np.uint8)
         settings = [
             setting for setting in detector_settings(pipeline)
-            if not isinstance(setting, DetectorSetting) and setting.plugin.name == name
+            if isinstance(setting, PluginSetting) and setting.plugin.name == name
         ]
         for setting in _first(settings):
             search = make_detector(setting)

@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from typing import NoReturn
 
+from sweep.cli.check_detector import CHECK_DETECTOR
 from sweep.cli.command import Command
 from sweep.cli.completion import COMPLETION
 from sweep.cli.export import EXPORT
@@ -23,7 +24,10 @@ from sweep.cli.verify import VERIFY
 from sweep.messages import nearest
 from sweep.version import __version__
 
-COMMANDS = (RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, VERIFY, STATUS, EXPORT, COMPLETION)
+COMMANDS = (
+    RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, VERIFY, STATUS, EXPORT, CHECK_DETECTOR,
+    COMPLETION,
+)
 """Every command, in the order in which the help lists them."""
 
 GUIDES = ("README.md", "sweep/README.md")

@@ -15,10 +15,12 @@ from sweep.conformance.conventions import Conventions, conventions, offset_fault
 from sweep.conformance.scenes import SCENES, trial_pipeline
 from sweep.errors import ArgumentError, MachineFaultError, PipelineError, SweepError
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
-from sweep.measure.detectors import OPENCV, PluginSetting, detector_name
+from sweep.measure.detectors import OPENCV
 from sweep.model.marker import marker_count, missing_package
 from sweep.plan.grid import detector_settings
+from sweep.plan.parameters import PARAMETERS
 from sweep.plugins import DetectorPlugin
+from sweep.plugins.declared import PluginSetting
 
 DEFAULT_CALLS = 400
 TIME_LIMIT_S = 60.0
@@ -122,7 +124,7 @@ def check_detector(
         raise ArgumentError("calls", calls, "expected at least 0")
     if not 0 < time_limit_s < float("inf"):
         raise ArgumentError("time_limit_s", time_limit_s, "expected seconds above 0")
-    name = detector_name(detector)
+    name = PARAMETERS["detector"].declaration.choice(detector) or detector.strip()
     chosen, known = _dictionary(name, dictionary, folder)
     pipeline = trial_pipeline(name, chosen, settings, folder)
     setting = detector_settings(pipeline)[0]

@@ -2,32 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from sweep.analysis.binning import Bins
 from sweep.analysis.counts import scaled_to_draws
 from sweep.analysis.dimensions import (
     DRAWS,
     as_names,
     axes_of,
     kept_dimensions,
-    require_dimension,
-    without_fixed,
+    require_poses,
 )
+from sweep.analysis.image_sides import image_sides, parameters_along, require_size_axes
 from sweep.analysis.intervals import LEVEL, wilson
 from sweep.analysis.rates import detection_rate
 from sweep.analysis.stored_parameters import parameter_value
-from sweep.errors import ArgumentError, DatasetError
+from sweep.errors import ArgumentError
 from sweep.measure.flags import Flag, flag
-from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.model.marker import module_count
 from sweep.plan.schema import cf_attributes
 from sweep.typing import Floats, Integers, Masks
 
 SIZE_AXES = ("side_px", "distance_m")
+"""The usual axes along which the size in the image changes."""
+
+SAME_SIDE = 1e-9
+"""Sides that differ by less, relatively, are equal."""
 
 
 class Limit(Flag):
@@ -41,21 +46,27 @@ class Limit(Flag):
 
 
 def detection_limit(
-    results: xr.Dataset, rate: float = 0.9, per: Sequence[str] | None = None
+    results: xr.Dataset, rate: float = 0.9, per: Sequence[str] | None = None,
+    bins: Bins | None = None,
 ) -> xr.Dataset:
     """Return the smallest side of the black square from which on the marker is detected.
 
     Parameters
     ----------
     results
-        The dataset of a run with a dimension ``side_px`` or ``distance_m``. Parameters of the
-        camera and the marker's size that are no dimension or coordinate are read from the pipeline
-        in its attributes.
+        The dataset of a run with a dimension that changes the size in the image: ``side_px``,
+        ``distance_m``, ``size_m``, a focal length or field of view, the resolution, parameters
+        that go together, or several of these. What is no dimension or coordinate is read from the
+        pipeline in its attributes.
     rate
         The detection rate that is asked for, above 0 and at most 1.
     per
         Dimensions that are kept; by default the tilt or viewing angle, if it varies. A
-        dimension ``dictionary`` is always kept; the sides and the trials cannot be.
+        dimension ``dictionary`` is always kept; all dimensions of the sides and the trials cannot
+        be. Others are pooled: of the dimensions that change the side, what has the same side.
+    bins
+        Edges of bins of drawn parameters that change the side, such as ``distance_m``: a bin has
+        the side of its middle.
 
     Returns
     -------
@@ -68,16 +79,19 @@ def detection_limit(
           ``side_px_high``; ``side_px_below`` is the grid's next smaller side, at which the rate is
           not reached.
         - ``side_px_per_module``: the same per module of the marker, with its interval.
-        - ``distance_m``: the distance of that side, if that is the grid's axis.
+        - ``distance_m``, ``size_m`` and whatever else changes the side along the axis, if it is
+          one axis: its value of that side, with its interval in ``distance_m_low`` and
+          ``distance_m_high``. 0 or infinite: beyond the grid.
         - ``limit``: whether the rate is reached within the grid (`Limit`).
 
     Raises
     ------
     ArgumentError
-        For a rate outside (0, 1], and for ``per`` that names a dimension that cannot be kept, or
-        misses one over which the sides differ.
+        For a rate outside (0, 1], for ``per`` that names a dimension that cannot be kept, and for
+        bins that cannot be.
     DatasetError
-        If the dataset has no sides, lacks variables of results, or has no poses.
+        If no axis changes the side, or it is drawn and not in bins; if the dataset lacks variables
+        of results, or has no poses.
 
     Notes
     -----
@@ -96,28 +110,28 @@ def detection_limit(
     """
     if not 0.0 < rate <= 1.0:
         raise ArgumentError("rate", rate, "expected a number above 0 and at most 1, such as 0.9")
-    axis = require_dimension(results, *SIZE_AXES)
     axes = axes_of(results)
+    require_poses(results)
     dictionaries = ["dictionary"] if "dictionary" in axes else []
     if per is None:
         per = [name for name in ("tilt_deg", "view_angle_deg") if name in axes]
     kept = kept_dimensions(results, (*as_names(per), *dictionaries))
-    for name in (axis, DRAWS):
-        if name in kept:
-            raise ArgumentError("per", name, "the limit is over this dimension; it cannot be kept")
-    sides = _sides(results, axis)
-    varied = [str(dim) for dim in sides.dims if dim not in (*kept, axis)]
-    if varied:
-        raise ArgumentError("per", ", ".join(kept) or "()",
-                            f"the sides differ over {', '.join(varied)}; add it")
-    table = detection_rate(results, (*kept, axis))
+    bins = bins or {}
+    sides = image_sides(results, bins)
+    require_size_axes(results, sides)
+    along = [str(dim) for dim in sides.dims if dim not in kept]
+    if DRAWS in kept or not along:
+        name = DRAWS if DRAWS in kept else ", ".join(map(str, sides.dims))
+        raise ArgumentError("per", name, "the limit is over this dimension; it cannot be kept")
+    table = detection_rate(results, (*kept, *(name for name in along if name not in bins)), bins)
     n, draws, hits = (table[name] for name in ("looked_for", "draws", "detected"))
     drawn = table["detection_rate_low"].notnull()
-    counts = [array.chunk({axis: -1}) if array.chunks else array
+    counts = [array.chunk(dict.fromkeys(along, -1)) if array.chunks else array
               for array in (hits, n, draws, drawn)]
     *values, limit = xr.apply_ufunc(
-        _limit, sides, *counts, kwargs={"rate": rate}, dask="parallelized",
-        input_core_dims=[[axis]] * 5, output_core_dims=[[]] * 5, output_dtypes=[np.float64] * 5,
+        _limit, sides, *counts, dask="parallelized",
+        kwargs={"rate": rate, "dims": len(along), "count": _distinct(sides, along)},
+        input_core_dims=[along] * 5, output_core_dims=[[]] * 5, output_dtypes=[np.float64] * 5,
     )
     limits = dict(zip(("side_px", "side_px_low", "side_px_high", "side_px_below"), values,
                       strict=True))
@@ -135,30 +149,47 @@ def detection_limit(
             long_name=f"{words[name]}, per module", units="px")
         for name in ("side_px", "side_px_low", "side_px_high")
     }
-    if axis == "distance_m":
-        scale = (sides * without_fixed(results["distance_m"])).isel(distance_m=0, drop=True)
-        out["distance_m"] = (scale / limits["side_px"]).assign_attrs(
-            long_name="the distance of that side", units="m")
+    if len(along) == 1:
+        out |= _in_units_of_the_axis(results, sides, along[0], bins, limits)
     out["limit"] = limit.astype(np.uint8).assign_attrs(
         cf_attributes("whether the rate is reached within the grid", flags=Limit))
     return xr.Dataset({name: array.transpose(*kept) for name, array in out.items()})
 
 
+def _distinct(sides: xr.DataArray, along: Sequence[str]) -> int:
+    """Return the largest number of distinct sides of a condition."""
+    rows = sides.transpose(..., *along).values.reshape(
+        -1, math.prod(sides.sizes[name] for name in along))
+    return max(int(_is_next(np.sort(row)[::-1]).sum()) for row in rows)
+
+
+def _is_next(sides: Floats) -> Masks:
+    """Return which of some sides, from large to small, are not those before them."""
+    return np.concatenate([[True], sides[1:] < sides[:-1] * (1.0 - SAME_SIDE)])
+
+
 def _limit(
-    sides: Floats, hits: Integers, n: Integers, draws: Integers, drawn: Masks, rate: float
+    sides: Floats, hits: Integers, n: Integers, draws: Integers, drawn: Masks, *, rate: float,
+    dims: int, count: int,
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Return side, low, high, next smaller side and flag; all arrays are (..., sides)."""
-    sides = np.broadcast_to(sides, n.shape)
+    """Return side, low, high, next smaller side and flag; arrays are (..., *sides), ``dims`` these.
+
+    Poses of the same side are pooled; ``count`` is the largest number of distinct sides.
+    """
+    shape = (*n.shape[: n.ndim - dims], math.prod(n.shape[n.ndim - dims :]))
+    sides = np.broadcast_to(sides, n.shape).reshape(shape)
     order = np.argsort(-sides, axis=-1, kind="stable")  # the largest first
-    sides = np.take_along_axis(sides, order, axis=-1)
-    hits, n, draws = (np.take_along_axis(each, order, axis=-1) for each in (hits, n, draws))
-    drawn = np.take_along_axis(drawn, order, axis=-1)
+    sides, hits, n, draws, drawn = (
+        np.take_along_axis(each.reshape(shape), order, axis=-1)
+        for each in (sides, hits, n, draws, drawn))
+    pooled = _pooled(sides, hits, n, draws, drawn.astype(np.int64))
+    hits, n, draws, drawn = (*pooled[:3], pooled[3] > 0)
     exists = n > 0
     with np.errstate(divide="ignore", invalid="ignore"):
         reached = hits / n >= rate
     # Of draws, rounded outwards, as in `Rate`.
     fewest, most = scaled_to_draws(hits, n, draws)
-    joint = 1.0 - (1.0 - LEVEL) / sides.shape[-1]
+    joint = 1.0 - (1.0 - LEVEL) / count
     surely = wilson(fewest, draws)[0] >= rate
     possibly = wilson(most, draws, joint)[1] >= rate
 
@@ -183,23 +214,52 @@ def _limit(
             flag.astype(np.float64))
 
 
-def _sides(results: xr.Dataset, axis: str) -> xr.DataArray:
-    """Return the sides in pixels, over the axis and whatever else they depend on."""
-    if axis not in results.coords:
-        raise DatasetError(f"{axis}: has no coordinate, which the sides are computed from")
-    if axis == "side_px":
-        return _positive(results["side_px"].astype(np.float64))
-    values = {name: parameter_value(results, name) for name in (*VIEW_PARAMETERS, "size_m")}
-    fx = xr.DataArray(intrinsics(*(values[name] for name in VIEW_PARAMETERS))[0])
-    sides: xr.DataArray = fx * values["size_m"] / results["distance_m"]
-    return _positive(sides.astype(np.float64))
+def _pooled(sides: Floats, *counts: Integers) -> list[Integers]:
+    """Return the counts with those of equal sides at the first of these, 0 at the others."""
+    pooled = [np.zeros_like(each) for each in counts]
+    for row in np.ndindex(*sides.shape[:-1]):
+        first = np.nonzero(_is_next(sides[row]))[0]
+        for sums, each in zip(pooled, counts, strict=True):
+            sums[(*row, first)] = np.add.reduceat(each[row], first)
+    return pooled
 
 
-def _positive(sides: xr.DataArray) -> xr.DataArray:
-    if not (np.isfinite(sides) & (sides > 0)).all():
-        raise DatasetError("sides must be finite and above 0 px: see the coordinates of the size, "
-                           "the distance and the camera")
-    return without_fixed(sides)
+def _in_units_of_the_axis(
+    results: xr.Dataset, sides: xr.DataArray, axis: str, bins: Bins,
+    limits: Mapping[str, xr.DataArray],
+) -> dict[str, xr.DataArray]:
+    """Return the limit and its interval as values of the parameters along the axis."""
+    out = {}
+    for name in parameters_along(results, axis, bins):
+        if name == "side_px":
+            continue
+        values = sides[axis].values if axis in bins else results[name].values
+        order = np.argsort(values)
+        ends = sides.isel({axis: order[[0, -1]]})
+        smaller = bool((ends.isel({axis: 1}) < ends.isel({axis: 0})).all())
+        low, high = ("high", "low") if smaller else ("low", "high")
+        for ending, source, words in (
+            ("", "side_px", "value of that side"),
+            ("_low", f"side_px_{low}", "lower end of the 95 % interval: value of that side"),
+            ("_high", f"side_px_{high}", "upper end of the 95 % interval: value of that side"),
+        ):
+            out[f"{name}{ending}"] = xr.apply_ufunc(
+                _value_of_side, limits[source], sides.drop_vars(axis, errors="ignore"),
+                kwargs={"values": values.astype(np.float64), "smaller": smaller},
+                input_core_dims=[[], [axis]], dask="parallelized", output_dtypes=[np.float64],
+            ).assign_attrs(long_name=f"{name}: {words}",
+                           units=str(results[name].attrs.get("units", "1")))
+    return out
+
+
+def _value_of_side(
+    side: Floats, sides: Floats, values: Floats, *, smaller: bool
+) -> Floats:
+    """Return the values (...) at which sides (..., n) are those of (...); 0 or inf beyond all."""
+    nearest = np.argmin(np.abs(sides - np.where(np.isfinite(side), side, 0.0)[..., None]), axis=-1)
+    found = np.where(np.isnan(side), np.nan, values[nearest])
+    found = np.where(side == 0.0, np.inf if smaller else 0.0, found)
+    return np.where(np.isinf(side), 0.0 if smaller else np.inf, found)
 
 
 def _modules(results: xr.Dataset) -> Any:

@@ -1,0 +1,149 @@
+"""The limit of detection along any axes that change the size in the image, by plain loops."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from support.comparisons import with_detected
+from support.small_datasets import perfect
+from sweep.analysis import detection_limit
+from sweep.analysis.detection_limits import Limit
+from sweep.errors import ArgumentError, DatasetError
+
+TEXT = """
+[camera]
+width_px = 640
+height_px = 480
+{camera}
+[marker]
+dictionary = "DICT_4X4_50"
+{marker}
+[pose]
+jitter_px = 0.5
+{pose}
+[axes]
+trial = 40
+"""
+FX, SIZE_M, DISTANCE_M, TRIALS = 600.0, 0.06, 1.0, 40
+HFOV = [20.0, 40.0, 60.0, 80.0]
+
+
+def dataset(coordinates, rates, camera="fx_px = 600", marker="size_m = 0.06",
+            pose="distance_m = 1.0"):
+    """Return a dataset with these axes, whose rate at each cell (...) is exactly this."""
+    rates = np.asarray(rates)
+    sizes = {name: len(values) for name, values in coordinates.items()} | {"trial": TRIALS}
+    results = perfect(np.random.default_rng(3), sizes).assign_coords(coordinates)
+    results.attrs["pipeline"] = TEXT.format(camera=camera, marker=marker, pose=pose)
+    return with_detected(results, np.round(rates * TRIALS)[..., None] > np.arange(TRIALS))
+
+
+def limit_by_hand(sides, rates, wanted):
+    """Return the smallest side down to which all rates are reached; those of one side pooled."""
+    ladder = sorted(set(sides), reverse=True)
+    pooled = [np.mean([rate for other, rate in zip(sides, rates, strict=True) if other == side])
+              for side in ladder]
+    good = list(itertools.takewhile(lambda step: step[1] >= wanted,
+                                    zip(ladder, pooled, strict=True)))
+    return good[-1][0] if good else math.inf
+
+
+AXES = {
+    "size_m": ([0.02, 0.04, 0.08, 0.16], lambda v: FX * v / DISTANCE_M, {"marker": ""}),
+    "fx_px": ([200.0, 400.0, 800.0, 1600.0], lambda v: v * SIZE_M / DISTANCE_M, {"camera": ""}),
+    "focal_length_mm": (
+        [2.0, 4.0, 8.0, 16.0], lambda v: v / 4.8 * 640 * SIZE_M / DISTANCE_M,
+        {"camera": "sensor_width_mm = 4.8\nsensor_height_mm = 3.6"}),
+    "hfov_deg": (HFOV, lambda v: 320 / math.tan(math.radians(v) / 2) * SIZE_M / DISTANCE_M,
+                 {"camera": ""}),
+    "pixel_size_um": ([2.0, 4.0, 8.0, 16.0], lambda v: 4e3 / v * SIZE_M / DISTANCE_M,
+                      {"camera": "focal_length_mm = 4"}),
+    "distance_m": ([0.5, 1.0, 2.0, 4.0], lambda v: FX * SIZE_M / v, {}),
+}
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_the_limit_is_found_along_any_axis_that_changes_the_size(name):
+    values, side_of, texts = AXES[name]
+    sides = [side_of(value) for value in values]
+    rates = [1.0 if side > sorted(sides)[1] * 1.01 else 0.5 for side in sides]
+    answer = detection_limit(dataset({name: values}, rates, **texts), rate=0.9)
+    expected = limit_by_hand(sides, rates, 0.9)
+    assert answer["side_px"].item() == pytest.approx(expected, rel=1e-9)
+    assert Limit(answer["limit"].item()) is Limit.found
+    value = values[sides.index(expected)]
+    assert answer[name].item() == value
+    assert answer[f"{name}_low"].item() <= value <= answer[f"{name}_high"].item()
+    inner = {answer[f"{name}_low"].item(), answer[f"{name}_high"].item()}
+    assert inner <= {0.0, math.inf, *values}
+    assert len(answer.dims) == 0
+
+
+def test_a_higher_resolution_makes_the_marker_larger():
+    results = dataset({"width_px": [320.0, 640.0, 1280.0]}, [0.1, 0.95, 1.0],
+                      camera="hfov_deg = 60")
+    results.attrs["pipeline"] = results.attrs["pipeline"].replace("width_px = 640\n", "")
+    answer = detection_limit(results, rate=0.9)
+    side = 320 / math.tan(math.radians(30)) * SIZE_M / DISTANCE_M
+    assert answer["side_px"].item() == pytest.approx(side)
+    assert answer["width_px"].item() == 640
+
+
+def test_several_axes_pool_what_has_the_same_side():
+    distances, sizes = [1.0, 2.0, 4.0], [0.06, 0.12]
+    rates = np.array([[0.9, 1.0], [0.5, 0.95], [0.0, 0.5]])
+    results = dataset({"distance_m": distances, "size_m": sizes}, rates, marker="")
+    answer = detection_limit(results, rate=0.7)
+    sides = [FX * size / distance for distance in distances for size in sizes]
+    # 36 px at 1 and at 2 m are pooled: 0.925; 18 px at 2 and at 4 m are 0.5
+    assert answer["side_px"].item() == pytest.approx(limit_by_hand(sides, rates.ravel(), 0.7))
+    assert "distance_m" not in answer
+    by_size = detection_limit(results, rate=0.7, per=["size_m"])
+    assert by_size["distance_m"].values.tolist() == [1.0, 2.0]
+
+
+def test_parameters_that_go_together_are_one_axis():
+    results = dataset({"camera": ["a", "b", "c"]}, [0.0, 1.0, 1.0], camera="")
+    results = results.assign_coords(
+        fx_px=("camera", [300.0, 600.0, 900.0], {"units": "px"}),
+        fy_px=("camera", [300.0, 600.0, 900.0], {"units": "px"}))
+    answer = detection_limit(results, rate=0.9)
+    assert (answer["side_px"].item(), answer["fx_px"].item()) == (36.0, 600.0)
+    assert answer["fx_px"].attrs["units"] == "px"
+
+
+def test_drawn_distances_are_taken_by_bins():
+    rng = np.random.default_rng(5)
+    results = dataset({"tilt_deg": [0.0]}, [1.0], pose="distance_m = { uniform = [1, 5] }")
+    drawn = rng.uniform(1.0, 5.0, (1, TRIALS))
+    results = results.assign_coords(distance_m=(("tilt_deg", "trial"), drawn, {"units": "m"}))
+    missed = drawn > 3.0
+    results["detection"].values[missed] = 4
+    with pytest.raises(DatasetError, match=r"is drawn.*give bins"):
+        detection_limit(results, per=[])
+    answer = detection_limit(results, per=[], bins={"distance_m": [1, 2, 3, 4, 5]})
+    assert answer["side_px"].item() == pytest.approx(FX * SIZE_M / 2.5)
+    assert answer["distance_m"].item() == 2.5
+
+
+@pytest.mark.parametrize(("results", "per", "error", "problem"), [
+    (dataset({"tilt_deg": [0.0, 10.0]}, [1.0, 1.0]), None, DatasetError, "no axis changes"),
+    (dataset({"distance_m": [1.0, 2.0]}, [1.0, 1.0]), ["distance_m"], ArgumentError,
+     "cannot be kept"),
+])
+def test_a_limit_that_cannot_be_is_refused(results, per, error, problem):
+    with pytest.raises(error, match=problem) as refused:
+        detection_limit(results, per=per)
+    assert "\n" not in str(refused.value)
+
+
+def test_the_interval_in_metres_is_that_in_pixels():
+    results = dataset({"distance_m": [0.5, 1.0, 2.0, 4.0]}, [1.0, 1.0, 0.9, 0.2])
+    answer = detection_limit(results, rate=0.9)
+    for end, other in (("low", "high"), ("high", "low")):
+        assert answer[f"distance_m_{end}"].item() == pytest.approx(
+            FX * SIZE_M / answer[f"side_px_{other}"].item())
+    assert isinstance(answer, xr.Dataset)

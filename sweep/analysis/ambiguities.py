@@ -25,6 +25,7 @@ from sweep.analysis.rates import FLIPPED, SOLVED
 from sweep.analysis.statistic import Statistic
 from sweep.errors import ArgumentError
 from sweep.measure.flags import Flag, flag
+from sweep.plan.attributes import describes
 from sweep.plan.schema import cf_attributes
 from sweep.typing import Floats, Integers, Masks
 
@@ -93,6 +94,7 @@ class AmbiguousPoses(Poses):
         return np.asarray(self.solved & (self.ratio <= threshold))
 
 
+@describes
 def ambiguity(
     results: xr.Dataset, per: Sequence[str] = (), bins: Bins | None = None, *,
     thresholds: Iterable[float] = THRESHOLDS, flip_rate: float = 0.01, min_kept: float = 0.05,

@@ -15,10 +15,12 @@ from sweep.analysis.means import RootMeanSquare
 from sweep.analysis.pose_view import DEPTH, ERROR_INPUTS, Poses, norm_squared, pose_arrays, relative
 from sweep.analysis.quantities import QUANTITIES, Quantity
 from sweep.analysis.statistic import Output
+from sweep.plan.attributes import describes
 from sweep.plan.schema import XYZ
 from sweep.typing import Floats, Masks
 
 
+@describes
 def efficiency(
     results: xr.Dataset, per: Sequence[str] = (), bins: Bins | None = None
 ) -> xr.Dataset:

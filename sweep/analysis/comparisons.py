@@ -19,6 +19,7 @@ from sweep.analysis.pose_pairs import TRUTH, Pair, paired_arrays, require_pairs
 from sweep.analysis.pose_view import ERROR_INPUTS, Poses, norm_squared, pose_arrays
 from sweep.analysis.quantities import QUANTITIES, Quantity
 from sweep.analysis.statistic import Statistic
+from sweep.plan.attributes import describes
 from sweep.typing import Floats, Masks
 
 PairStatistic = Statistic[Pair, Any, Any, Any]
@@ -26,6 +27,7 @@ PairStatistic = Statistic[Pair, Any, Any, Any]
 ROTATION = QUANTITIES[0]
 
 
+@describes
 def compare(
     first: xr.Dataset, second: xr.Dataset, per: Sequence[str] = (), bins: Bins | None = None
 ) -> xr.Dataset:

@@ -18,6 +18,7 @@ from sweep.analysis.pose_view import ESTIMATE_INPUTS, Poses, pose_arrays
 from sweep.analysis.registry import PoseStatistic
 from sweep.analysis.statistic import Statistic
 from sweep.errors import ArgumentError
+from sweep.plan.attributes import describes
 from sweep.plan.schema import POSE_PARAMETERS
 from sweep.typing import Floats, Masks
 
@@ -43,6 +44,7 @@ NEES_MEAN = PoseStatistic(
 """The mean of ``nees``."""
 
 
+@describes
 def covariance_trust(
     results: xr.Dataset,
     per: Sequence[str] = (),

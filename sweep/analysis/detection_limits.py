@@ -25,6 +25,7 @@ from sweep.analysis.stored_parameters import parameter_value
 from sweep.errors import ArgumentError
 from sweep.measure.flags import Flag, flag
 from sweep.model.marker import module_count
+from sweep.plan.attributes import describes
 from sweep.plan.schema import cf_attributes
 from sweep.typing import Floats, Integers, Masks
 
@@ -45,6 +46,7 @@ class Limit(Flag):
         3, "The rate is reached at the smallest side: the limit may lie below it.", present=True)
 
 
+@describes
 def detection_limit(
     results: xr.Dataset, rate: float = 0.9, per: Sequence[str] | None = None,
     bins: Bins | None = None,

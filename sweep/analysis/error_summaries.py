@@ -12,8 +12,10 @@ from sweep.analysis.binning import Bins
 from sweep.analysis.dimensions import kept_dimensions
 from sweep.analysis.pose_view import Poses, pose_arrays
 from sweep.analysis.quantities import chosen_quantities
+from sweep.plan.attributes import describes
 
 
+@describes
 def error_statistics(
     results: xr.Dataset, per: Sequence[str] = (), bins: Bins | None = None,
     quantities: Sequence[str] | None = None,

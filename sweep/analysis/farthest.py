@@ -18,6 +18,7 @@ from sweep.analysis.requirements import (
 )
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import Flag, flag
+from sweep.plan.attributes import describes
 from sweep.plan.schema import cf_attributes
 
 HARDER_WHEN_SMALLER = (
@@ -36,6 +37,7 @@ class Reach(Flag):
     always = flag(3, "They are met at all values: the limit may lie beyond.", present=True)
 
 
+@describes
 def farthest_met(
     results: xr.Dataset, requirements: Iterable[Requirement | str], along: str,
     per: Sequence[str] = (), at_all: Sequence[str] = (),

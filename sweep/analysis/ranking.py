@@ -19,6 +19,7 @@ from sweep.analysis.dimensions import (
 from sweep.analysis.rates import detection_rate
 from sweep.analysis.replicates import is_replicated
 from sweep.errors import ArgumentError
+from sweep.plan.attributes import describes
 from sweep.typing import Floats
 
 SIGNIFICANCE = 0.05
@@ -28,6 +29,7 @@ MIN_SKEWNESS = 1e-6
 """Below it the gamma distribution is normal to 1e-6, and its functions lose digits."""
 
 
+@describes
 def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     """Return how each marker ID compares with the others.
 

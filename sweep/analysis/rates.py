@@ -15,6 +15,7 @@ from sweep.analysis.counts import Rate
 from sweep.analysis.dimensions import kept_dimensions
 from sweep.analysis.pose_view import DETECTION_INPUTS, ESTIMATE_INPUTS, Poses, pose_arrays
 from sweep.measure.flags import DetectionStatus, EstimateStatus, outcomes
+from sweep.plan.attributes import describes
 from sweep.typing import Masks
 
 
@@ -64,6 +65,7 @@ FLIP_RATE = PoseRate(
 )
 
 
+@describes
 def detection_rate(
     results: xr.Dataset, per: Sequence[str] = (), bins: Bins | None = None
 ) -> xr.Dataset:
@@ -117,6 +119,7 @@ def detection_rate(
     return DETECTION_RATE.table(results, per, bins)
 
 
+@describes
 def flip_rate(
     results: xr.Dataset, per: Sequence[str] = (), bins: Bins | None = None
 ) -> xr.Dataset:
@@ -182,6 +185,7 @@ def _share_of(outcome: str) -> Rate[Poses]:
         counts=((f"of {outcome}", ""), (f"count {outcome}", "")))
 
 
+@describes
 def failure_composition(
     results: xr.Dataset, per: Sequence[str] = (), bins: Bins | None = None
 ) -> xr.Dataset:

@@ -13,6 +13,7 @@ from sweep.analysis.pose_pairs import Pair, paired_arrays
 from sweep.analysis.pose_view import DETECTION_INPUTS, ERROR_INPUTS, norm_squared, pose_arrays
 from sweep.analysis.quantities import QUANTITIES
 from sweep.errors import ArgumentError
+from sweep.plan.attributes import describes
 from sweep.plan.parameters import Stage
 from sweep.typing import Floats
 
@@ -20,6 +21,7 @@ CORNERS = "corner_error_px"
 ROTATION = "rotation_error_rad"
 
 
+@describes
 def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
     """Return what each renderer changes against ``reference``, paired scene by scene.
 

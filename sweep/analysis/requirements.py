@@ -33,6 +33,7 @@ from sweep.analysis.requirable import MIN_DRAWS, Requirable, requirable_arrays, 
 from sweep.analysis.requirement_faults import Side, contradictions, fault_of, named
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import Flag, flag
+from sweep.plan.attributes import describes
 from sweep.plan.parameters import Stage
 from sweep.plan.requirement_text import read_requirement
 from sweep.plan.schema import cf_attributes
@@ -158,6 +159,7 @@ def _parsed(text: str) -> Requirement:
         f"{what.name} {parts.relation} {parts.limit:.12g}", what.name, parts.relation, parts.limit)
 
 
+@describes
 def check_requirements(
     results: xr.Dataset, requirements: Iterable[Requirement | str], per: Sequence[str] = (),
     bins: Bins | None = None,

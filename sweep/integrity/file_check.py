@@ -9,6 +9,7 @@ import numpy as np
 from zarr.buffer import default_buffer_prototype
 
 from sweep.integrity.damage import ArrayDamage, Damage, FileDamage
+from sweep.plan.attributes import with_description
 from sweep.store.layout import FORMAT, RECEIPTS, PlannedArray, documents
 from sweep.store.manifest import Manifest, parsed
 from sweep.store.provenance import environment
@@ -146,7 +147,8 @@ class FileCheck:
         # Another version of sweep may word the attributes otherwise.
         recorded = self._store.run_metadata["environment"].get("sweep")
         same_version = self._store.format == FORMAT and recorded == environment()["sweep"]
-        if same_version and dict(array.attrs) != planned.attributes:
+        attributes = with_description(planned.path, array.attrs)
+        if same_version and attributes != planned.attributes:
             return "its attributes differ from the schema's"
         try:
             for part, values in planned.pieces():

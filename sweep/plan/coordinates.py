@@ -42,7 +42,7 @@ class FixedValue:
     value
         A number, a truth value, or a text (a list of numbers as "0.1, 0").
     attributes
-        ``long_name``, :data:`FIXED`, and ``units`` if it has a unit.
+        Meaning as ``long_name``, :data:`FIXED`, and ``units`` if it has a unit.
     """
 
     name: str
@@ -61,7 +61,7 @@ class DrawnQuantity:
     column
         Its name among the scene's values (:func:`sweep.plan.grid.scene_values`).
     meaning, unit
-        Its ``long_name`` and ``units``.
+        What it means, and its ``units``.
     scale
         The largest numbers that it is added up from, by which rounding is measured; 0 if it is
         a product.

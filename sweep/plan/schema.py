@@ -35,7 +35,10 @@ LABELS: dict[str, tuple[str, ...]] = {
 def cf_attributes(
     meaning: str, units: str = "", flags: type[IntEnum] | None = None
 ) -> dict[str, Any]:
-    """Return the attributes of a variable, after the CF conventions."""
+    """Return the attributes of a variable, after the CF conventions.
+
+    `sweep.plan.attributes.with_description` gives it a short ``long_name`` for readers.
+    """
     attributes: dict[str, Any] = {"long_name": meaning}
     if units:
         attributes["units"] = units
@@ -121,7 +124,7 @@ class Variable:
     dtype
         NumPy's type string, as stored.
     meaning, units
-        Its ``long_name`` and ``units``.
+        What it means (``description``), and its ``units``.
     inner
         Names of its dimensions beside the axes: keys of :data:`LABELS`.
     flags

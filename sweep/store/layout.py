@@ -18,6 +18,7 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.dtype import parse_dtype
 from zarr.storage import MemoryStore
 
+from sweep.plan.attributes import with_description
 from sweep.plan.axes import Axis
 from sweep.plan.coordinates import FixedValue, fixed_values
 from sweep.plan.experiment import Pipeline
@@ -205,6 +206,8 @@ def planned_arrays(
     if store_format >= DRAWN_FORMAT:
         planned += [_fixed(each) for each in fixed_values(pipeline) if each.name not in VARIABLES]
     planned += [_variable(variable, pipeline, scene_extent) for variable in variables]
+    planned = [dataclasses.replace(each, attributes=with_description(each.path, each.attributes))
+               for each in planned]
     lengths = tuple(len(axis) for axis in scene_axes(pipeline))
     planned.append(
         PlannedArray(RECEIPTS, (len(Blocks(lengths, extents)),), (1,), "string", ("block",))

@@ -22,6 +22,7 @@ from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
 from sweep.errors import StoreError
+from sweep.plan.attributes import with_descriptions
 from sweep.plan.camera_facts import camera_facts, notes
 from sweep.plan.camera_values import stored_text
 from sweep.plan.experiment import Pipeline
@@ -325,4 +326,4 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
     # Text, as netCDF needs it.
     dataset.attrs["sweep"] = json.dumps(dataset.attrs["sweep"])
     ordered = [variable.name for variable in SCHEMA if variable.name in dataset]
-    return dataset.assign_coords(texts)[ordered]
+    return with_descriptions(dataset.assign_coords(texts)[ordered])

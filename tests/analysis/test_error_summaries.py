@@ -199,13 +199,15 @@ def test_every_value_lies_in_its_interval_and_is_described(mixed):
     for table in tables:
         for name, array in table.data_vars.items():
             assert array.attrs["long_name"]
+            assert array.attrs["description"]
             assert array.attrs.get("units") or "flag_values" in array.attrs
             if f"{name}_low" in table:
                 assert not (table[f"{name}_low"] > array).any(), name
                 assert not (table[f"{name}_high"] < array).any(), name
                 assert table[f"{name}_low"].attrs["units"] == array.attrs["units"]
     assert tables[0]["distance_m"].values.tolist() == [0.0, 10.0]
-    assert tables[0]["range_p95_percent_low"].attrs["long_name"].startswith("lower end of the 95 %")
+    low = tables[0]["range_p95_percent_low"]
+    assert low.attrs["description"].startswith("lower end of the 95 %")
 
 
 def test_lazy_arrays_give_the_same(mixed):

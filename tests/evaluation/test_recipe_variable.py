@@ -82,7 +82,7 @@ with calls_here():
     error = results["range_error"]
     assert error.dims == results["nees"].dims and error.dtype == "f4"
     assert (np.isfinite(error.values) == solved).all() and solved.any() and not solved.all()
-    assert error.attrs["long_name"].startswith("estimated over true")
+    assert error.attrs["description"].startswith("estimated over true")
     truth = results["true_tvec_m"]
     estimated = truth + results["translation_error_m"]
     expected = (estimated**2).sum("xyz") ** 0.5 / (truth**2).sum("xyz") ** 0.5 - 1

@@ -1,0 +1,100 @@
+"""Short names for the axes of charts, and whole meanings beside them."""
+
+import matplotlib as mpl
+import pytest
+import xarray as xr
+from matplotlib.figure import Figure
+
+import sweep.analysis
+from support.example_results import example_results
+from sweep.plan.attributes import short_name, with_descriptions
+from sweep.plan.experiment import Pipeline
+from sweep.plan.parameters import PARAMETERS
+from sweep.plan.schema import SCHEMA
+from sweep.store.layout import FORMATS, RECEIPTS, planned_arrays
+
+MAX_LINE = 30
+"""Characters after which xarray breaks a label; three lines fit beside a chart."""
+
+EVERYTHING = {
+    "pose": {"side_px": {"uniform": [20, 40]}, "jitter_px": 0.5, "azimuth_deg": {
+        "uniform": [0, 360]}},
+    "scene": {"noise_grey": 2, "bound": "known_blur"},
+    "axes": {"tilt_deg": [0, 30], "cornerRefinementMethod": ["none", "subpix"],
+             "adaptiveThreshWinSizeMax": [13, 23], "trial": 2},
+}
+
+
+@pytest.mark.parametrize("store_format", FORMATS)
+def test_every_array_of_a_store_has_a_short_name_and_its_meaning(store_format):
+    pipeline = Pipeline.from_dict(EVERYTHING)
+    for array in planned_arrays(pipeline, (1, 2), store_format):
+        if array.path != RECEIPTS and array.attributes:
+            assert len(array.attributes["long_name"]) <= MAX_LINE + 2, array.path
+            assert array.attributes["description"], array.path
+
+
+def test_names_of_variables_and_parameters_are_short_and_distinct():
+    names = {variable.name: variable.units for variable in SCHEMA} | {
+        name: parameter.unit for name, parameter in PARAMETERS.items()}
+    short = {name: short_name(name, units) for name, units in names.items()}
+    assert max(map(len, short.values())) <= 40
+    labels = [f"{short[name]} [{units}]" for name, units in names.items()]
+    assert len(set(labels)) == len(labels)
+
+
+CALLS = {
+    name: getattr(sweep.analysis, name) for name in (
+        "covariance_trust", "detection_limit", "detection_rate",
+        "error_statistics", "failure_composition", "flip_rate")
+} | {"ambiguity": lambda results: sweep.analysis.ambiguity(results, thresholds=[0.2]),
+     "compare": lambda results: sweep.analysis.compare(
+    results.isel(solver=0), results.isel(solver=1))}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_results_of_analyses_have_them_too(name):
+    results = example_results()
+    table = CALLS[name](results)
+    for each, variable in table.data_vars.items():
+        assert len(variable.attrs["long_name"]) <= 42, each
+        assert variable.attrs["description"], each
+    assert "description" not in results["marker_area_px"].attrs
+
+
+def test_an_older_store_s_words_become_descriptions_and_nothing_else_changes():
+    old = xr.Dataset({"tilt_deg": ("x", [1.0], {"long_name": "to the image", "units": "degree"}),
+                      "other": ("x", [2.0]),
+                      "own": ("x", [3.0], {"long_name": "kept", "description": "as it is"})})
+    new = with_descriptions(old)
+    assert new["tilt_deg"].attrs == {
+        "long_name": "tilt", "description": "to the image", "units": "degree"}
+    assert new["other"].attrs == {}
+    assert new["own"].attrs == old["own"].attrs
+    assert old["tilt_deg"].attrs["long_name"] == "to the image"
+    xr.testing.assert_equal(old, new)
+
+
+def test_xarray_s_own_plots_have_labels_that_fit():
+    results = with_descriptions(xr.Dataset(
+        {name: (("tilt_deg", "distance_m"), [[1.0, 2.0], [3.0, 4.0]], variable.attributes())
+         for name, variable in ((each.name, each) for each in SCHEMA) if not variable.inner},
+        {"tilt_deg": ("tilt_deg", [0, 30], {"long_name": PARAMETERS[
+            "tilt_deg"].declaration.meaning, "units": "degree"}),
+         "distance_m": ("distance_m", [1, 2], {"long_name": PARAMETERS[
+             "distance_m"].declaration.meaning, "units": "m"})}))
+    with mpl.rc_context({"font.size": 10}):
+        longest = sorted(results.data_vars, key=lambda name: -len(results[name].attrs["long_name"]))
+        for name in longest[:4]:
+            figure = Figure((6.4, 4.8))
+            axes = figure.add_subplot()
+            results[name].isel(distance_m=0, drop=True).plot.line(ax=axes)
+            figure.draw_without_rendering()
+            renderer = figure._get_renderer()
+            for label in (axes.xaxis.label, axes.yaxis.label, axes.title):
+                box = label.get_window_extent(renderer)
+                assert figure.bbox.x0 <= box.x0, name
+                assert box.x1 <= figure.bbox.x1, name
+                assert figure.bbox.y0 <= box.y0, name
+                assert box.y1 <= figure.bbox.y1, name
+            assert axes.get_xlabel() == "tilt [degree]"

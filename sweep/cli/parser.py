@@ -17,6 +17,7 @@ from sweep.cli.report import REPORT
 from sweep.cli.repro import REPRO
 from sweep.cli.require import REQUIRE
 from sweep.cli.run import RUN
+from sweep.cli.score import SCORE
 from sweep.cli.show import SHOW
 from sweep.cli.status import STATUS
 from sweep.cli.tradeoff import TRADEOFF
@@ -25,8 +26,8 @@ from sweep.messages import nearest
 from sweep.version import __version__
 
 COMMANDS = (
-    RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, VERIFY, STATUS, EXPORT, CHECK_DETECTOR,
-    COMPLETION,
+    RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, VERIFY, STATUS, EXPORT, SCORE,
+    CHECK_DETECTOR, COMPLETION,
 )
 """Every command, in the order in which the help lists them."""
 

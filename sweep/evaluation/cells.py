@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from sweep.evaluation.estimation import detections_for, estimate_poses
 from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.evaluation.opencv_threads import single_threaded
+from sweep.evaluation.recorded_search import any_recorded
 from sweep.evaluation.results import CellsResult, Failure, concatenate
 from sweep.evaluation.search import search, visibility_flags, whole_frames
 from sweep.evaluation.variables import (
@@ -43,6 +44,7 @@ from sweep.model.extent import marker_boxes
 from sweep.model.scene import Scenes, build_scenes
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings, estimators, scene_values
+from sweep.plan.image_keys import image_keys
 from sweep.plan.scene_plugins import scene_plugins
 from sweep.plan.schema import drawn_variables, variables_of
 from sweep.typing import Masks
@@ -127,7 +129,8 @@ def _run_batch(
     builds = [build(estimator) for estimator in estimating]
     keep = any(each.needs_images for each in builds)
     results, render_s, row_s = search(
-        scenes, to_search, settings, whole_frames(values, count), failures, keep=keep
+        scenes, to_search, settings, whole_frames(values, count), failures, keep=keep,
+        keys=image_keys(pipeline, indices) if any_recorded(settings) else None,
     )
     columns: dict[str, list[NDArray[Any]]] = {
         variable.name: [] for variable in variables_of(pipeline)

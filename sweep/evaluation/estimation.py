@@ -81,6 +81,10 @@ def detections_for(
         [scenes.markers[k] for k in scenes.marker[rows]],
         [result.images[row] for row in rows.tolist()] if result.images else [],
         result.origins[rows],
+        *(
+            (None, None) if result.poses is None
+            else (result.poses.rotation[rows], result.poses.translation[rows])
+        ),
     )
 
 

@@ -12,6 +12,7 @@ from sweep.errors import RunError
 from sweep.evaluation.cells import run_cells
 from sweep.evaluation.estimation import assumed_cameras
 from sweep.evaluation.opencv_threads import single_threaded
+from sweep.evaluation.recorded_search import recorded_candidates, recording_of
 from sweep.evaluation.search import search_windows, visibility_flags, whole_frames
 from sweep.measure.detectors import make_detector
 from sweep.measure.flags import DetectionStatus, EstimateStatus
@@ -22,6 +23,7 @@ from sweep.model.renderers import render
 from sweep.model.scene import Scenes, build_scenes
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings, estimators, scene_values
+from sweep.plan.image_keys import image_keys
 from sweep.plan.parameters import Stage
 from sweep.plan.scene_plugins import scene_plugins
 from sweep.plan.schema import SCHEMA, variables_of
@@ -127,12 +129,20 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
     full = whole_frames(values, 1) | rendered.invisible
     searched = search_windows(scenes, rendered.boxes, setting, full)
     x0, y0, x1, y1 = searched[0].tolist()
-    quads, ids, rejected = make_detector(setting)(
-        image[y0 - top : y1 - top, x0 - left : x1 - left],
-        scenes.dictionary[0],
-        int(scenes.frame[0].max()),
-    )
-    origin = np.array([x0, y0], dtype=np.float64)
+    recording = recording_of(setting)
+    if recording is None:
+        quads, ids, rejected = make_detector(setting)(
+            image[y0 - top : y1 - top, x0 - left : x1 - left],
+            scenes.dictionary[0],
+            int(scenes.frame[0].max()),
+        )
+        origin = np.array([x0, y0], dtype=np.float64)
+    else:
+        found, _ = recorded_candidates(
+            recording, scenes, np.zeros(1, dtype=np.intp), image_keys(pipeline, indices), [], 0
+        )
+        quads, ids, rejected = found[0][1:] if found else ((), None, ())
+        origin = np.zeros(2)
     columns = {name: parts[0][0] for name, parts in result.columns.items()}
     corners = scenes.corners_px[0] + columns["corner_error_px"]
     axes_px = np.full((4, 2), np.nan)

@@ -10,6 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.evaluation.machine_faults import local_fault, raise_machine_fault
+from sweep.evaluation.recorded_search import (
+    RecordedPoses,
+    recorded_candidates,
+    recorded_poses,
+    recording_of,
+)
 from sweep.evaluation.results import Failure, exception_text
 from sweep.measure.classify import classify
 from sweep.measure.detector import NOISE_MARGIN_PX, DetectorOutput, windows
@@ -46,6 +52,8 @@ class SearchResult:
         Row -> the image that was searched, if images were to be kept.
     origins
         (N, 2) the first pixel of each searched image in the frame.
+    poses
+        Those that recorded detections have; None where images are searched.
     """
 
     flags: NDArray[np.uint8]
@@ -53,6 +61,7 @@ class SearchResult:
     seconds: float
     images: dict[int, Grey]
     origins: Integers
+    poses: RecordedPoses | None = None
 
 
 def whole_frames(values: Mapping[str, Column], count: int) -> Masks:
@@ -112,6 +121,7 @@ def search(
     failures: list[Failure],
     *,
     keep: bool = False,
+    keys: NDArray[np.uint64] | None = None,
 ) -> tuple[list[SearchResult], float, Floats]:
     """Render each scene once and search it with detector settings.
 
@@ -129,6 +139,8 @@ def search(
         The exceptions of single scenes are appended.
     keep
         Whether the results keep the images.
+    keys
+        (N,) keys of the images, by which recorded detections are found.
 
     Returns
     -------
@@ -153,13 +165,15 @@ def search(
         None if (window == widest).all() else (window - np.tile(widest[:, :2], 2)).tolist()
         for window in cut
     ]
+    recordings = [recording_of(setting) for setting in settings]
     passes = [_Pass(make_detector(setting)) for setting in settings]
+    imaged = wanted if keep else wanted & np.array([each is None for each in recordings])
     dictionary, sides = scenes.dictionary, scenes.frame.max(axis=1).tolist()
     render_s = 0.0
     row_s = [0.0] * len(scenes)
     clock = time.perf_counter
-    asked = wanted.T.tolist()
-    for rows in _groups(np.flatnonzero(wanted.any(axis=1)), widest, scenes.plain):
+    asked = imaged.T.tolist()
+    for rows in _groups(np.flatnonzero(imaged.any(axis=1)), widest, scenes.plain):
         begun = clock()
         images = _rendered(scenes, rows, boxes, widest, failures)
         now = clock()
@@ -193,6 +207,8 @@ def search(
                     searched = cropped(image, crop[row])
                 if keep:
                     setting_pass.images[row] = searched
+                if recordings[k] is not None:
+                    continue
                 try:
                     note((row, *find(searched, dictionary[row], sides[row])))
                 except Exception as error:
@@ -205,18 +221,31 @@ def search(
 
     results = []
     marker_id = np.array(scenes.marker_id, dtype=np.int64)
-    for setting_pass, window in zip(passes, cut, strict=True):
+    for k, (setting_pass, recording, window) in enumerate(
+        zip(passes, recordings, cut, strict=True)
+    ):
         start = clock()
-        flags, corners = classify(
-            scenes.corners_px, marker_id, setting_pass.candidates,
-            window[:, :2].astype(np.float64),
-        )
+        origin = window[:, :2].astype(np.float64)
+        if recording is not None:
+            if keys is None:
+                raise TypeError("recorded detections need keys")
+            rows = np.setdiff1d(np.flatnonzero(wanted[:, k]), setting_pass.failed)
+            setting_pass.candidates, unknown = recorded_candidates(
+                recording, scenes, rows, keys, failures, k
+            )
+            setting_pass.failed += unknown
+            origin = np.zeros_like(origin)  # they are in pixels of the frame
+        flags, corners = classify(scenes.corners_px, marker_id, setting_pass.candidates, origin)
         flags[setting_pass.failed] = DetectionStatus.failed
         flags[setting_pass.crashed] = DetectionStatus.crashed
+        poses = None
+        if recording is not None and keys is not None:
+            rows = np.flatnonzero(flags == DetectionStatus.detected)
+            poses = recorded_poses(recording, scenes, rows, keys, corners)
         results.append(
             SearchResult(
                 flags, corners, setting_pass.seconds + clock() - start, setting_pass.images,
-                window[:, :2],
+                window[:, :2], poses,
             )
         )
     return results, render_s, np.array(row_s)

@@ -254,25 +254,24 @@ def _rendered_parts(
 ) -> Iterator[_Part]:
     """Yield the parts of an export, in this process or from several, few of them in flight."""
     count = scene_count(pipeline)
-    starts = range(0, count, BATCH)
-    if workers is None or workers == 1 or len(starts) == 1:
-        for start in starts:
-            yield write_images(pipeline, folder, windowed, start, known)
+    parts = [range(start, min(start + BATCH, count)) for start in range(0, count, BATCH)]
+    if workers is None or workers == 1 or len(parts) == 1:
+        for numbers in parts:
+            yield write_images(pipeline, folder, windowed, numbers, known)
         return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        waiting = iter(starts)
+        waiting = iter(parts)
         flying: set[Future[_Part]] = set()
         try:
             while True:
-                for start in waiting:
-                    numbers = range(start, min(start + BATCH, count))
+                for numbers in waiting:
                     digests = {
                         name: digest for name, digest in known.items()
-                        if int(name[7:].partition("-")[0]) in numbers
-                    } if known else {}
+                        if _number(name) in numbers
+                    }
                     flying.add(
-                        pool.submit(write_images, pipeline, folder, windowed, start, digests)
+                        pool.submit(write_images, pipeline, folder, windowed, numbers, digests)
                     )
                     if len(flying) >= 2 * workers:
                         break
@@ -286,18 +285,23 @@ def _rendered_parts(
             raise
 
 
+def _number(name: str) -> int:
+    """Return the number of the scene of an image's path; -1 if it has none."""
+    written = name.removeprefix("images/").partition("-")[0]
+    return int(written) if written.isdecimal() else -1
+
+
 def write_images(
-    pipeline: Pipeline, folder: Path, windowed: bool, start: int, known: dict[str, str]
+    pipeline: Pipeline, folder: Path, windowed: bool, numbers: range, known: dict[str, str]
 ) -> _Part:
-    """Write the images of a batch of scenes that are missing, or differ from their digests.
+    """Write the images of scenes by their numbers that are missing, or differ from their digests.
 
     Raises
     ------
     RunError
         If an image cannot be rendered.
     """
-    stop = min(start + BATCH, scene_count(pipeline))
-    batch = image_batch(pipeline, np.arange(start, stop, dtype=np.intp), windowed=windowed)
+    batch = image_batch(pipeline, np.array(numbers, dtype=np.intp), windowed=windowed)
     names = batch.names
     lines: list[str] = []
     written = kept = damaged = size = 0
@@ -320,7 +324,7 @@ def write_images(
             lines.append(f"{new}  {path}\n")
         written += 1
         size += len(content)
-    return _Part(lines, stop - start, written, kept, damaged, size)
+    return _Part(lines, len(numbers), written, kept, damaged, size)
 
 
 def encoded_image(batch: ImageBatch, row: int) -> bytes:

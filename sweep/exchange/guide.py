@@ -72,8 +72,9 @@ with open("truth.csv") as images, open("detections.csv", "w", newline="") as fil
             dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
             detectors[name] = cv2.aruco.ArucoDetector(dictionary, cv2.aruco.DetectorParameters())
         grey = cv2.imread(f"images/{image['image']}", cv2.IMREAD_GRAYSCALE)
-        corners, ids, _ = detectors[name].detectMarkers(grey)
-        for quad, marker_id in zip(corners, [] if ids is None else ids.ravel()):
+        corners, ids, rejected = detectors[name].detectMarkers(grey)
+        ids = [-1] * len(rejected) if ids is None else [*ids.ravel(), *[-1] * len(rejected)]
+        for quad, marker_id in zip([*corners, *rejected], ids):
             rows.writerow([image["image"], int(marker_id), *map(float, quad.ravel())])
 """
 

@@ -17,6 +17,7 @@ from sweep.model.scene import Scenes, build_scenes
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings, scene_axes, scene_values
 from sweep.plan.image_keys import image_keys
+from sweep.plan.scene_plugins import scene_plugins
 from sweep.typing import Integers, Masks
 
 BATCH = 256
@@ -92,7 +93,7 @@ def image_batch(
     indices = scene_indices(pipeline, numbers)
     count = len(numbers)
     values = scene_values(pipeline, indices)
-    scenes = build_scenes(values, count)
+    scenes = build_scenes(values, count, scene_plugins(pipeline))
     visible = visibility_flags(scenes) == DetectionStatus.not_run
     boxes = marker_boxes(scenes)
     frames = np.concatenate([np.zeros_like(scenes.frame), scenes.frame], axis=1)

@@ -19,6 +19,7 @@ from sweep.measure.foreign_detector import ForeignDetector, ForeignSetting
 from sweep.measure.plugged_detector import PluggedDetector
 from sweep.plugins import DetectorPlugin
 from sweep.plugins.declared import PluginSetting
+from sweep.plugins.recording import is_recording
 
 OPENCV = "opencv"
 """The detector that is no plug-in, ``cv2.aruco.ArucoDetector``."""
@@ -30,7 +31,8 @@ class DetectorChoice:
 
     detector: str = parameter(
         OPENCV, "opencv: cv2.aruco.ArucoDetector, which has the settings below; or a plug-in: the "
-        "name of an installed one, or file:name beside the pipeline", choices=(OPENCV,),
+        "name of an installed one, or file:name beside the pipeline; or the .npz file of "
+        "detections that `sweep score` recorded", choices=(OPENCV,),
         plugin="detector",
     )
     environment: str = parameter(
@@ -61,7 +63,16 @@ def make_detector(setting: AnyDetectorSetting) -> FindFunction:
         return Detector(setting).find
     if isinstance(setting, ForeignSetting):
         return ForeignDetector(setting)
+    if is_recording(setting.plugin.name):
+        return _find_nothing
     return _kept_plugin(setting).find
+
+
+def _find_nothing(
+    image: NDArray[np.uint8], dictionary: str, frame_side: int  # noqa: ARG001
+) -> DetectorOutput:
+    """Return no marker: recorded detections are read, whatever the image."""
+    return [], None, []
 
 
 @lru_cache(maxsize=1024)

@@ -32,6 +32,9 @@ class Detections:
     images, origins
         The windows that were searched, and (N, 2) their first pixels in the frame; no images for
         estimators that do not need them.
+    recorded_rotation, recorded_translation
+        (N, 3, 3) and (N, 3) in metres: poses that came with recorded detections, NaN where none
+        did; None where images were searched.
     """
 
     corners: Floats
@@ -42,6 +45,8 @@ class Detections:
     markers: Sequence[MarkerKey]
     images: Sequence[NDArray[np.uint8]]
     origins: NDArray[np.int64]
+    recorded_rotation: Floats | None = None
+    recorded_translation: Floats | None = None
 
     def take(self, rows: NDArray[np.intp]) -> Detections:
         """Return the detections of the given rows."""
@@ -49,6 +54,8 @@ class Detections:
             self.corners[rows], self.cameras.take(rows), self.size_m[rows], self.noise_grey[rows],
             self.blur_px[rows], [self.markers[row] for row in rows],
             [self.images[row] for row in rows] if len(self.images) else [], self.origins[rows],
+            None if self.recorded_rotation is None else self.recorded_rotation[rows],
+            None if self.recorded_translation is None else self.recorded_translation[rows],
         )
 
 

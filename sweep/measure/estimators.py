@@ -10,6 +10,7 @@ from sweep.declaration import parameter
 from sweep.measure.estimation import PoseEstimator
 from sweep.measure.photometric import Photometric
 from sweep.measure.plugged_estimator import PluggedEstimator
+from sweep.measure.recorded_pose import RecordedPose
 from sweep.measure.solver import OPENCV_SOLVERS, CornerSolver, OpenCVSolver
 from sweep.model.lens import COUNTS
 from sweep.plugins.declared import PluginSetting
@@ -32,6 +33,8 @@ class Solver:
         Whether the setting ``guarded`` applies to it.
     planar_only
         Whether it works for coplanar points alone.
+    recorded
+        Whether it estimates nothing, and takes poses of recorded detections.
     """
 
     meaning: str
@@ -39,6 +42,7 @@ class Solver:
     needs_images: bool = False
     guarded: bool = False
     planar_only: bool = False
+    recorded: bool = False
 
 
 def _corner_solver(name: str, setting: EstimatorSetting) -> PoseEstimator:
@@ -61,11 +65,16 @@ SOLVERS: dict[str, Solver] = {
         lambda setting: Photometric(setting.refined_starts, setting.estimate_blur),
         needs_images=True, planar_only=True,
     ),
+    "recorded": Solver(
+        "the poses that came with the detections which `sweep score` recorded",
+        lambda setting: RecordedPose(setting.reprojection_limit), recorded=True,
+    ),
 }
 """Name in pipeline files -> the solver; choices, messages and reference follow from it."""
 
 _PLAIN = ", ".join(
-    name for name, each in SOLVERS.items() if not (each.guarded or each.needs_images)
+    name for name, each in SOLVERS.items()
+    if not (each.guarded or each.needs_images or each.recorded)
 )
 _PIXELS = ", ".join(name for name, each in SOLVERS.items() if each.needs_images)
 

@@ -23,7 +23,7 @@ from sweep.plan.axes import TRIAL
 from sweep.plan.draws import bits
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
-from sweep.plan.parameters import PARAMETERS, Stage
+from sweep.plan.parameters import Stage
 
 NOT_IN_IMAGE = {
     "window", "camera_file", "calibration_sd", "calibration_covariance",
@@ -34,11 +34,11 @@ NOT_IN_IMAGE = {
 
 def image_keys(pipeline: Pipeline, indices: Sequence[NDArray[np.intp]]) -> NDArray[np.uint64]:
     """Return the keys (N,) of the images of scenes at ``indices`` (N,) along each scene axis."""
-    axes = scene_axes(pipeline)
+    axes, parameters = scene_axes(pipeline), pipeline.parameters
     count = len(indices[0]) if axes else 1
     values = {
         name: Column(value, constant=True) for name, value in pipeline.fixed.items()
-        if PARAMETERS[name].stage is Stage.scene
+        if parameters[name].stage is Stage.scene
     }
     for axis, index in zip(axes, indices, strict=True):
         for name, along in axis.columns.items():
@@ -51,7 +51,7 @@ def image_keys(pipeline: Pipeline, indices: Sequence[NDArray[np.intp]]) -> NDArr
     texts += [
         Column.of(f"{name}={distribution}")
         for name, distribution in sorted(pipeline.distributions.items())
-        if PARAMETERS[name].stage is Stage.scene
+        if parameters[name].stage is Stage.scene
     ]
     used = [column for column in texts if column.differs_from("")]
     joined = map_columns(lambda *each: "|".join(filter(None, each)), used) if used \
@@ -62,7 +62,7 @@ def image_keys(pipeline: Pipeline, indices: Sequence[NDArray[np.intp]]) -> NDArr
 
 def _texts(pipeline: Pipeline, name: str, column: Column) -> Column:
     """Return "name=value" of each value, empty where it is the default."""
-    default = PARAMETERS[name].default
+    default = pipeline.parameters[name].default
 
     @cache
     def text(value: Any) -> str:

@@ -128,7 +128,8 @@ def solver_table() -> str:
     return markdown_table(
         ["solver", "meaning", "from", "guarded"],
         [
-            [f"`{name}`", solver.meaning, "pixels" if solver.needs_images else "corners",
+            [f"`{name}`", solver.meaning,
+             "a file" if solver.recorded else "pixels" if solver.needs_images else "corners",
              "yes" if solver.guarded else "no"]
             for name, solver in SOLVERS.items()
         ],

@@ -14,6 +14,7 @@ from sweep.declaration import Declaration, plain_types
 from sweep.errors import PluginError
 from sweep.plugins import RECORDS, DetectorPlugin, Plugin
 from sweep.plugins.loading import file_of, load, read_source, versions_of
+from sweep.plugins.recording import RecordedDetector
 
 TYPES: dict[str, type] = {"float": float, "int": int, "bool": bool, "str": str}
 """Types that a setting may have."""
@@ -193,7 +194,11 @@ def declare(kind: str, name: str, folder: str) -> DeclaredPlugin:
     """
     file = file_of(name)
     record = load(kind, name, folder)
-    digest = "" if file is None else hashlib.sha256(read_source(file, folder)).hexdigest()
+    digest = ""
+    if isinstance(record, RecordedDetector):
+        digest = record.digest
+    elif file is not None:
+        digest = hashlib.sha256(read_source(file, folder)).hexdigest()
     dictionaries: tuple[str, ...] = ()
     if isinstance(record, DetectorPlugin) and record.families is not None:
         dictionaries = tuple(record.families)

@@ -22,6 +22,7 @@ from typing import Any
 from sweep.errors import PluginError
 from sweep.messages import nearest, plain
 from sweep.plugins import FACTORY, RECORDS, Plugin
+from sweep.plugins.recording import is_recording, recorded_detector
 
 OWN_DISTRIBUTION = "fiducial-sweep"
 """Its adapters' results change with the version of the numbers, which is recorded in any case."""
@@ -44,8 +45,15 @@ def file_of(name: str) -> str | None:
 
     >>> file_of("mine:Detector"), file_of("own/mine.py:Detector"), file_of("pyapriltags")
     ('mine.py', 'own/mine.py', None)
+
+    A file of recorded detections is its own name.
+
+    >>> file_of("mine.npz")
+    'mine.npz'
     """
     module, colon, _ = name.rpartition(":")
+    if is_recording(name):
+        return name
     if not colon:
         return None
     return module if module.endswith(".py") else f"{module.replace('.', '/')}.py"
@@ -73,6 +81,11 @@ def load(kind: str, name: str, folder: str, digest: str = "") -> Plugin:
     file = file_of(name)
     if file is None:
         return _of_entry_point(kind, name)
+    if is_recording(name):
+        recorded = recorded_detector(name, folder)
+        if digest and recorded.digest != digest:
+            raise PluginError(f"{file} as it was when the run began: it was changed in {folder}")
+        return recorded
     source = read_source(file, folder)
     found = hashlib.sha256(source).hexdigest()
     if digest and found != digest:

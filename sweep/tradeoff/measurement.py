@@ -25,6 +25,7 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import estimators
 from sweep.plan.parameters import Stage
 from sweep.plan.same_meaning import wrong_configurations
+from sweep.plugins.recording import is_recording
 from sweep.store.closing import write_group
 from sweep.store.lifecycle import open_dataset, open_store
 from sweep.store.lock import locked
@@ -93,6 +94,12 @@ def measure_trade(
     if not store.finished:
         raise StoreError(unfinished_line(store))
     stored, results = store.pipeline, open_dataset(url)
+    for plugin in stored.plugins:
+        if is_recording(plugin.name):
+            raise StoreError(
+                f"{url}: the detections of {plugin.name} were recorded: there is no search whose "
+                "time could be measured"
+            )
     per = list(dict.fromkeys(per))
     _check(url, stored, results, per)
     # The same versions and files must be measured as were run.

@@ -1,0 +1,242 @@
+"""Scoring of others' answers: the experiment of an export with recorded detections as detector."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+
+from sweep.errors import ArgumentError, StoreError
+from sweep.exchange.answers import Answers, read_answers
+from sweep.exchange.conventions import Conventions
+from sweep.exchange.export import EXPERIMENT, read_mark
+from sweep.exchange.files import write_errors, write_whole
+from sweep.exchange.hints import hints
+from sweep.exchange.image_set import image_batches
+from sweep.messages import plain
+from sweep.plan.experiment import Pipeline
+from sweep.plan.parameters import Stage
+from sweep.plugins.recording import REJECTED, SUFFIX, Recording
+from sweep.typing import Integers
+
+DOUBLED = ("refuse", "nearest")
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,79}")
+
+
+@dataclass(frozen=True, slots=True)
+class Scored:
+    """Answers that are ready to be scored.
+
+    Attributes
+    ----------
+    pipeline
+        The experiment, with the answers as its detectors.
+    name
+        What its store is named after.
+    lines
+        What the answers hold, and what may be wrong with their conventions, in lines.
+    """
+
+    pipeline: Pipeline
+    name: str
+    lines: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class _Images:
+    """The images of an export: their names with an index, and keys and origins by that index."""
+
+    pipeline: Pipeline
+    index: dict[str, int]
+    numbers: Integers
+    keys: np.ndarray[Any, np.dtype[np.uint64]]
+    origins: Integers
+
+
+def prepare(
+    folder: str | Path,
+    files: Sequence[str | Path],
+    *,
+    names: Sequence[str] = (),
+    conventions: Conventions | None = None,
+    doubled: str = "refuse",
+    beside: bool = False,
+    settings: Sequence[str] = (),
+) -> Scored:
+    """Read answers, record them beside the export's pipeline, and return what scores them.
+
+    Parameters
+    ----------
+    folder
+        An export.
+    files
+        CSV or JSON Lines files, one a program.
+    names
+        A name for each program (default: those of the files).
+    conventions
+        Theirs (default: those of the export).
+    doubled
+        "refuse" where an image has an ID twice, or "nearest".
+    beside
+        Whether the experiment's own detector searches the same images beside them.
+    settings
+        "key=value" for the experiment: solvers, beliefs, bounds.
+
+    Raises
+    ------
+    ArgumentError, PipelineError
+        If the files cannot be read as answers; a line for each fault.
+    StoreError
+        If there is no export, or the recordings cannot be written.
+    """
+    target = Path(folder)
+    mark = read_mark(target)
+    if mark is None:
+        raise StoreError(
+            f"{plain(target, 300)}: not an export; make one with `sweep export PIPELINE "
+            f"{plain(target, 300)}`"
+        )
+    labels = _labels(files, names)
+    if doubled not in DOUBLED:
+        raise ArgumentError("doubled", doubled, f"expected one of {', '.join(DOUBLED)}")
+    images = _images(target, windowed=mark.get("images") == "windows")
+    home = target / EXPERIMENT
+    recordings, lines = [], []
+    poses = True
+    corners = False
+    for path, label in zip(files, labels, strict=True):
+        source = Path(path)
+        answers = read_answers(source, images.index, conventions or Conventions(), doubled)
+        with_pose = bool(np.isfinite(answers.translation).any())
+        poses &= with_pose
+        corners |= bool(np.isfinite(answers.corners).any())
+        lines += _summary(label, answers, len(images.index), with_pose)
+        lines += [
+            f"{label}: {line}"
+            for line in hints(images.pipeline, answers, images.numbers, images.origins,
+                              conventions or Conventions())
+        ]
+        recordings.append((home / f"{label}{SUFFIX}", _recording(answers, images).content()))
+    for path, content in recordings:
+        _write_recording(path, content)
+    detectors = [f"{label}{SUFFIX}" for label in labels]
+    solver = "recorded" if poses and not beside else ""
+    pipeline = _pipeline(home, labels[0], detectors, beside, solver, settings)
+    if poses and corners and not any("solver" in each for each in settings):
+        lines.append(
+            "the poses are scored; --set solver=ippe_square scores those of the corners, "
+            "--set 'solver=[\"recorded\", \"ippe_square\"]' both"
+        )
+    return Scored(pipeline, "-".join(labels), lines)
+
+
+def _labels(files: Sequence[str | Path], names: Sequence[str]) -> list[str]:
+    """Return a name for each file; ArgumentError if two are the same, or one cannot be."""
+    if not files:
+        raise ArgumentError("files", "none", "expected at least one")
+    if names and len(names) != len(files):
+        raise ArgumentError(
+            "name", ", ".join(names), f"expected one for each of the {len(files)} files"
+        )
+    labels = list(names) or [
+        re.sub(r"[^A-Za-z0-9._+-]", "-", Path(path).stem).lstrip("-._") or "answers"
+        for path in files
+    ]
+    for label in labels:
+        if not _NAME.fullmatch(label):
+            raise ArgumentError(
+                "name", repr(label), "expected letters, digits, and . _ + - between them"
+            )
+    if len(set(labels)) < len(labels):
+        raise ArgumentError("name", ", ".join(labels), "expected another name for each file")
+    return labels
+
+
+def _images(folder: Path, *, windowed: bool) -> _Images:
+    """Return the images of an export, from its pipeline."""
+    pipeline = Pipeline.from_toml(folder / EXPERIMENT / "pipeline.toml")
+    index: dict[str, int] = {}
+    numbers, keys, origins = [], [], []
+    for batch in image_batches(pipeline, windowed=windowed):
+        names = batch.names
+        for row in np.flatnonzero(batch.visible).tolist():
+            index[names[row]] = len(index)
+        numbers.append(batch.numbers[batch.visible])
+        keys.append(batch.keys[batch.visible])
+        origins.append(batch.windows[batch.visible, :2])
+    return _Images(
+        pipeline, index, np.concatenate(numbers), np.concatenate(keys), np.concatenate(origins)
+    )
+
+
+def _recording(answers: Answers, images: _Images) -> Recording:
+    """Return answers as recorded detections: sorted by image, in pixels of the frame."""
+    order = np.argsort(images.keys[answers.image], kind="stable")
+    image = answers.image[order]
+    return Recording(
+        np.unique(images.keys), images.keys[image], answers.marker_id[order],
+        answers.corners[order] + images.origins[image][:, None], answers.rotation[order],
+        answers.translation[order],
+    )
+
+
+def _write_recording(path: Path, content: bytes) -> None:
+    """Write a recording; StoreError if other detections have its name, which a store may use."""
+    with write_errors(path.parent):
+        if path.exists() and path.read_bytes() != content:
+            raise StoreError(
+                f"{plain(path, 300)}: holds other detections, which a store may refer to; choose "
+                "another --name, or delete it"
+            )
+        write_whole(path, content)
+
+
+def _summary(label: str, answers: Answers, images: int, with_pose: bool) -> list[str]:
+    """Return what answers hold, in lines."""
+    decoded = int((answers.marker_id != REJECTED).sum())
+    if not decoded:
+        return [f"{label}: no marker: each of {images:,} images counts as searched in vain"]
+    rejected = len(answers.marker_id) - decoded
+    more = f", {rejected:,} candidates not decoded" if rejected else ""
+    found = len(np.unique(answers.image[answers.marker_id != REJECTED]))
+    poses = ", with poses" if with_pose else ""
+    return [f"{label}: {decoded:,} markers{poses} in {found:,} of {images:,} images{more}"]
+
+
+def _pipeline(
+    home: Path, name: str, detectors: Sequence[str], beside: bool, solver: str,
+    settings: Sequence[str],
+) -> Pipeline:
+    """Return the export's pipeline with recorded detections in the place of its detector."""
+    path = home / "pipeline.toml"
+    exported = Pipeline.from_toml(path)
+    document = tomlkit.parse(exported.text)
+    axes: Any = document.get("axes", {})
+    values: list[str] = list(detectors)
+    if beside:
+        values = [*map(str, exported.values_of("detector")), *values]
+    else:
+        document.pop("detector", None)
+        for axis in exported.axes_of(Stage.detection):
+            axes.pop(axis.name, None)
+    for table in ("detector", "axes"):
+        if table in document:
+            document[table].pop("detector", None)
+    if len(values) == 1:
+        document.setdefault("detector", tomlkit.table())["detector"] = values[0]
+    else:
+        document.setdefault("axes", tomlkit.table())["detector"] = values
+    if solver:
+        document.setdefault("estimator", tomlkit.table())["solver"] = solver
+        along = exported.axis_of("solver")
+        if along is not None:
+            axes.pop(along.name, None)
+    return Pipeline.from_text(
+        tomlkit.dumps(document), settings, name=name, source=str(path), folder=home
+    )

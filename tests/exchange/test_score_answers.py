@@ -1,0 +1,417 @@
+"""``sweep score``: answers of programs that know nothing of us equal a run; bad files are told."""
+
+import codecs
+import csv
+import json
+import re
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+import sweep
+from support.here import calls_here
+from support.stores import by_hand
+from sweep import cli
+from sweep.errors import ArgumentError, PipelineError, StoreError
+from sweep.evaluation.cells import run_cells
+from sweep.evaluation.inspection import inspect_scene
+from sweep.exchange.conventions import Conventions, frame_axes, right_handed_frames
+from sweep.exchange.export import export
+from sweep.exchange.image_set import scene_indices
+from sweep.exchange.score import prepare
+from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.plan.cell_selection import cell
+from sweep.plan.experiment import Pipeline
+from sweep.store.lifecycle import open_store
+
+TEXT = """
+title = "Scored"
+seed = 11
+[camera]
+width_px = 200
+height_px = 160
+fx_px = 180
+distortion = [0.05, -0.02, 0.001, 0.001]
+[marker]
+size_m = 0.05
+[pose]
+jitter_px = 0.5
+[scene]
+background = 128
+noise_grey = 4
+window = "full"
+[estimator]
+solver = "ippe"
+[axes]
+dictionary = ["DICT_4X4_50", "DICT_APRILTAG_36h11"]
+tilt_deg = [0, 50]
+distance_m = [0.1, 0.25]
+trial = 3
+"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_child():
+    with calls_here():
+        yield
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """An export with the detections of the program that its README shows."""
+    folder = tmp_path_factory.mktemp("score") / "export"
+    export(Pipeline.from_text(TEXT, name="scored"), folder)
+    script = re.search(r"```python\n(.*?)```", (folder / "README.md").read_text(), re.DOTALL)[1]
+    assert "sweep" not in script
+    subprocess.run([sys.executable, "-c", script], cwd=folder, check=True)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory):
+    store = tmp_path_factory.mktemp("ran") / "run.zarr"
+    return results_of(Pipeline.from_text(TEXT, name="scored"), store)
+
+
+@pytest.fixture(scope="module")
+def scored(exported, tmp_path_factory):
+    store = tmp_path_factory.mktemp("scored") / "mine.zarr"
+    arguments = ["score", str(exported), str(exported / "detections.csv"), "--name", "mine"]
+    assert cli.main([*arguments, "--store", str(store)]) == 0
+    return store
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def write(path, rows):
+    with path.open("w", newline="") as file:
+        table = csv.DictWriter(file, list(rows[0]))
+        table.writeheader()
+        table.writerows(rows)
+    return path
+
+
+def assert_equal(one, other, names=None):
+    for name in names or one.data_vars:
+        np.testing.assert_array_equal(one[name].values, other[name].values, err_msg=name)
+
+
+def results_of(pipeline, store):
+    by_hand(str(store), pipeline)
+    return sweep.open(store)
+
+
+def run_answers(exported, path, store, *options):
+    conventions = Conventions.of(*(dict(zip(options[::2], options[1::2], strict=True)).get(*each)
+                                   for each in (("--pixel-center", "0"),
+                                                ("--corner-order", "TL TR BR BL"),
+                                                ("--frame", "right up out"))))
+    ready = prepare(exported, [path], conventions=conventions)
+    return results_of(ready.pipeline, store), ready.lines
+
+
+def test_export_then_a_plain_opencv_script_then_score_equals_run(ran, scored):
+    results = sweep.open(scored)
+    assert set(ran.data_vars) == set(results.data_vars)
+    assert_equal(ran, results)
+    assert (results.detection == DetectionStatus.detected).sum() > 10
+    assert str(results["detector"].values) == "mine.npz"
+
+
+def test_a_scored_store_is_a_store(scored, capsys):
+    for command in ("verify", "status", "run"):
+        arguments = ["--store", str(scored)] if command == "run" else []
+        assert cli.main([command, str(scored), *arguments]) == 0, command
+    assert re.search(r"sound: .* \d+ scenes recomputed", capsys.readouterr().out)
+    assert cli.main(["tradeoff", str(scored)]) == 2
+    assert "the detections of mine.npz were recorded" in capsys.readouterr().err
+    scene = inspect_scene(cell(open_store(str(scored)).pipeline, "tilt_deg=50,trial=2"))
+    assert scene.detection is DetectionStatus.detected
+    assert [marker for marker, _ in scene.decoded] == [0]
+    assert (scene.decoded[0][1] == scene.corners).all()
+
+
+@pytest.mark.long
+def test_a_scored_store_is_reported_and_its_cells_reproduced(scored, tmp_path, capsys):
+    assert cli.main(["repro", str(scored), "--at", "tilt_deg=50"]) == 0
+    assert "agrees with the store bit for bit" in capsys.readouterr().out
+    page = tmp_path / "report.html"
+    assert cli.main(["report", str(scored), "-o", str(page)]) == 0
+    assert "Cannot be drawn" not in page.read_text()
+
+
+def test_verify_names_recorded_detections_that_were_changed_or_deleted(exported, tmp_path, capsys):
+    ready = prepare(exported, [exported / "detections.csv"], names=["gone"])
+    results_of(ready.pipeline, tmp_path / "gone.zarr")
+    (exported / "experiment/gone.npz").unlink()
+    assert cli.main(["verify", str(tmp_path / "gone.zarr")]) == 0
+    assert re.search(r"not recomputed|gone\.npz", capsys.readouterr().out)
+    assert sweep.open(tmp_path / "gone.zarr").detection.sum() > 0
+    (exported / "experiment/gone.npz").write_bytes(b"PK no archive")
+    with pytest.raises(PipelineError, match=r"gone\.npz"):
+        Pipeline.from_text(ready.pipeline.text, folder=exported / "experiment")
+
+
+def test_others_conventions_are_turned_into_ours(exported, ran, tmp_path):
+    rows = [row for row in rows_of(exported / "detections.csv") if row["id"] != "-1"]
+    theirs = []
+    order = [1, 0, 3, 2]  # TR TL BL BR
+    for row in rows:
+        other = {"image": f"C:\\images\\{row['image'][:-4]}.jpg", "tag_id": f"{row['id']}.0"}
+        for k, j in enumerate(order):
+            other |= {f"{axis}_{k}": repr(float(row[f"{axis}{j}"]) + 0.5) for axis in "xy"}
+        theirs.append(other)
+    path = write(tmp_path / "theirs.csv", theirs)
+    results, lines = run_answers(
+        exported, path, tmp_path / "theirs.zarr", "--pixel-center", "0.5",
+        "--corner-order", "TR TL BL BR")
+    assert_equal(ran, results, ["corner_error_px", "estimate", "translation_error_m", "flipped"])
+    assert len(lines) == 1
+    wrong = prepare(exported, [path], names=["wrong"]).lines
+    assert any('pass --corner-order "TR TL BL BR"' in line for line in wrong)
+    assert any("pass --pixel-center 0.5" in line for line in wrong)
+
+
+@pytest.mark.parametrize("form", ["rvec", "quaternion", "jsonl"])
+def test_poses_alone_are_scored_as_they_are(form, exported, tmp_path):
+    generator = np.random.default_rng(3)
+    rows, wanted = [], {}
+    for truth in rows_of(exported / "truth.csv"):
+        rvec = np.array([float(truth[f"r{axis}"]) for axis in "xyz"])
+        tvec = np.array([float(truth[f"t{axis}"]) for axis in "xyz"])
+        turn, _ = cv2.Rodrigues(generator.normal(0, 0.01, 3))
+        rotation = turn @ cv2.Rodrigues(rvec)[0]
+        shift = generator.normal(0, 1e-4, 3)
+        wanted[truth["image"]] = shift, np.linalg.norm(cv2.Rodrigues(turn)[0])
+        # Their marker frame: x right, y down, z into the marker.
+        theirs = rotation @ np.diag([1.0, -1.0, -1.0])
+        numbers = cv2.Rodrigues(theirs)[0].ravel()
+        angle = np.linalg.norm(numbers)
+        quaternion = -np.array([np.cos(angle / 2), *(np.sin(angle / 2) * numbers / angle)])
+        row = {"image": truth["image"], "id": int(truth["id"])}
+        if form == "jsonl":
+            row |= {"rvec": numbers.tolist(), "tvec": (tvec + shift).tolist()}
+        else:
+            names = ("rx", "ry", "rz") if form == "rvec" else ("qw", "qx", "qy", "qz")
+            values = numbers if form == "rvec" else quaternion
+            row |= dict(zip(names, map(repr, values.tolist()), strict=True))
+            row |= dict(zip(("tx", "ty", "tz"), map(repr, (tvec + shift).tolist()), strict=True))
+        rows.append(row)
+    if form == "jsonl":
+        path = tmp_path / "poses.jsonl"
+        path.write_text("\n".join(json.dumps(row) for row in rows))
+    else:
+        path = write(tmp_path / "poses.csv", rows)
+    ready = prepare(exported, [path], names=[f"poses-{form}"],
+                    conventions=Conventions.of("0", "TL TR BR BL", "right,down,in"))
+    results = results_of(ready.pipeline, tmp_path / "poses.zarr")
+    assert ready.pipeline.fixed["solver"] == "recorded"
+    assert (results.estimate == EstimateStatus.solved).all()
+    shifts = np.array([each for each, _ in wanted.values()]).reshape(2, 2, 2, 3, 3)
+    angles = np.array([each for _, each in wanted.values()]).reshape(2, 2, 2, 3)
+    np.testing.assert_allclose(results.translation_error_m.values, shifts, atol=1e-9)
+    np.testing.assert_allclose(np.radians(results.rotation_error_deg), angles, atol=1e-7)
+    told = prepare(exported, [path], names=[f"wrong-{form}"]).lines
+    assert any('pass --frame "right down in"' in line for line in told)
+
+
+def test_poses_behind_the_camera_or_far_from_their_corners_are_never_solved(exported, tmp_path):
+    rows = [row for row in rows_of(exported / "detections.csv") if row["id"] != "-1"]
+    for number, row in enumerate(rows):
+        row |= {"rx": 0, "ry": 0, "rz": 0, "tx": 0, "ty": 0, "tz": (-0.2, 0.2)[number % 2]}
+        if number % 2:
+            row["rx"] = 0.3  # seen from behind
+    ready = prepare(exported, [write(tmp_path / "bad.csv", rows)], names=["bad-poses"])
+    results = results_of(ready.pipeline, tmp_path / "bad.zarr")
+    detected = results.detection == DetectionStatus.detected
+    assert (results.estimate.where(detected, 3) == EstimateStatus.solver_failed).sum() > 5
+    assert not (results.estimate == EstimateStatus.solved).any()
+    assert np.isnan(results.translation_error_m).all()
+
+
+def test_several_programs_and_our_own_detector_are_paired_on_one_axis(exported, ran, tmp_path):
+    empty = tmp_path / "nothing.csv"
+    empty.write_text("")
+    ready = prepare(exported, [exported / "detections.csv", empty], beside=True)
+    results = results_of(ready.pipeline, tmp_path / "paired.zarr")
+    assert results["detector"].values.tolist() == ["opencv", "detections.npz", "nothing.npz"]
+    for name in ("opencv", "detections.npz"):
+        assert_equal(ran, results.sel(detector=name).drop_vars("detector"), ["corner_error_px"])
+    assert not (results.detection.sel(detector="nothing.npz") == DetectionStatus.detected).any()
+    assert any("no marker: each of 24 images counts as searched in vain" in line
+               for line in ready.lines)
+
+
+def test_windows_are_scored_as_whole_frames_are(exported, ran, tmp_path):
+    pipeline = Pipeline.from_text(TEXT.replace('window = "full"', ""), name="scored")
+    export(pipeline, tmp_path / "windows", windowed=True)
+    rows = [row for row in rows_of(exported / "detections.csv") if row["id"] != "-1"]
+    origins = {row["image"]: row for row in rows_of(tmp_path / "windows/truth.csv")}
+    for row in rows:
+        for axis, k in ((axis, k) for axis in "xy" for k in range(4)):
+            origin = float(origins[row["image"]][f"origin_{axis}_px"])
+            row[f"{axis}{k}"] = repr(float(row[f"{axis}{k}"]) - origin)
+    path = write(tmp_path / "windows.csv", rows)
+    results, _ = run_answers(tmp_path / "windows", path, tmp_path / "windows.zarr")
+    assert_equal(ran, results, ["corner_error_px", "estimate", "translation_error_m"])
+
+
+def test_scenes_that_were_not_exported_are_failed_and_said(exported):
+    whole = prepare(exported, [exported / "detections.csv"]).pipeline
+    known = run_cells(whole, scene_indices(whole, np.arange(24)))
+    assert not known.failures
+    # On another grid, the cells that it shares with the export have the same detections.
+    grown = prepare(exported, [exported / "detections.csv"],
+                    settings=["trial=4", "distance_m=[0.25, 0.1]"]).pipeline
+    found = run_cells(grown, scene_indices(grown, np.arange(32)))
+    assert {failure.scene % 4 for failure in found.failures} == {3}
+    assert "not among those that were exported" in found.failures[0].text
+    flags, corners = (found.columns[name][0].reshape(2, 2, 2, 4, *rest)
+                      for name, rest in (("detection", ()), ("corner_error_px", (4, 2))))
+    assert (flags[..., 3] == DetectionStatus.failed).all()
+    np.testing.assert_array_equal(
+        corners[:, :, ::-1, :3], known.columns["corner_error_px"][0].reshape(2, 2, 2, 3, 4, 2))
+
+
+GOOD = "image,id,x0,y0,x1,y1,x2,y2,x3,y3\n{0},0,1,2,3,4,5,6,7,8\n"
+
+BAD = {
+    "an unknown image": (GOOD.replace("{0}", "frame1.png"), ("line 2: image frame1.png is not "
+                         "among those that were exported; expected a name such as 000000-")),
+    "another export": (GOOD.replace("{0}", "000001-00000000.png"), "it is of another export"),
+    "a doubled row": (GOOD + "{0},0,1,2,3,4,5,6,7,9\n", ("line 3: image {0} has ID 0 twice, here "
+                      "and in line 2")),
+    "a missing column": (GOOD.replace("y3", "yy3"), "line 1: no column y3; the header has "),
+    "no header": ("{0},0,1,2,3,4,5,6,7,8\n", "line 1: no column image, id, x0"),
+    "NaN": (GOOD.replace(",8", ",nan"), "line 2: y3 = nan: expected a finite number"),
+    "infinity": (GOOD.replace(",8", ",-inf"), "y3 = -inf: expected a finite number"),
+    "overflow": (GOOD.replace(",8", ",1e999"), "line 2: corners beyond 1e"),
+    "text": (GOOD.replace(",8", ",eight"), "line 2: y3 = eight: expected a finite number"),
+    "a missing number": (GOOD.replace(",8", ","), "line 2: no y3; expected all numbers of the "),
+    "too few values": (GOOD.replace(",8", ""), "line 2: 9 values; expected 10, as the header"),
+    "five corners": (GOOD.replace("y3", "y3,x4,y4").replace(",8", ",8,9,9"), "more than four"),
+    "a column twice": (GOOD.replace("y3", "x3"), "line 1: the column x3 is there twice"),
+    "an ID with a fraction": (GOOD.replace(",0,1", ",0.5,1"), "line 2: id 0.5: expected a whole"),
+    "a negative ID": (GOOD.replace(",0,1", ",-2,1"), "line 2: id -2: expected a whole number"),
+    "no ID": (GOOD.replace(",0,1", ",,1"), "line 2: id : expected a whole number"),
+    "half a pose": ("image,id,rx,ry,rz\n{0},0,1,2,3\n", "line 1: no column tx, ty, tz"),
+    "a quaternion of length 2": (
+        "image,id,qw,qx,qy,qz,tx,ty,tz\n{0},0,2,0,0,0,0,0,1\n", "a quaternion of length 2"),
+    "a JSON line that is none": ('{"image": "{0}"\n', "line 1: not JSON; expected one object"),
+    "three corners": ('{"image": "{0}", "id": 0, "corners": [[1, 2], [3, 4], [5, 6]]}',
+                      "expected 4 pairs of finite numbers"),
+    "NaN in JSON": ('{"image": "{0}", "id": 0, "rvec": [NaN, 0, 0], "tvec": [0, 0, 1]}',
+                    "rvec = [nan, 0, 0]: expected 3 finite numbers"),
+    "a position without a rotation": ('{"image": "{0}", "id": 0, "tvec": [0, 0, 1]}',
+                                      "half a pose; expected tvec, and rvec or quaternion"),
+    "a number as a line": ("[1]", "expected an object such as"),
+    "binary data": ("\0\1", "not text: a zero byte"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_a_bad_file_is_told_in_a_line_and_nothing_is_written(kind, exported, tmp_path, capsys):
+    content, expected = BAD[kind]
+    name = rows_of(exported / "truth.csv")[0]["image"]
+    path = tmp_path / "bad.csv"
+    path.write_text(content.replace("{0}", name))
+    before = sorted((exported / "experiment").iterdir())
+    assert cli.main(["score", str(exported), str(path), "--store", str(tmp_path / "x.zarr")]) == 2
+    out, err = capsys.readouterr()
+    assert not out
+    assert len(err.splitlines()) == 1
+    assert expected.replace("{0}", name) in err
+    assert sorted((exported / "experiment").iterdir()) == before
+    assert not (tmp_path / "x.zarr").exists()
+
+
+def test_many_faults_are_counted(exported, tmp_path):
+    path = tmp_path / "many.csv"
+    path.write_text(GOOD.splitlines()[0] + "\n" + "none.png,0,1,2,3,4,5,6,7,8\n" * 100)
+    with pytest.raises(PipelineError) as error:
+        prepare(exported, [path])
+    assert len(error.value.faults) == 21
+    assert error.value.faults[-1] == "... and 80 faults more"
+
+
+def spelled_otherwise():
+    """Yield the name of a spelling and what it does to the file's text."""
+    yield "BOM and CRLF", lambda text: codecs.BOM_UTF8 + text.replace("\n", "\r\n").encode()
+    yield "UTF-16", lambda text: text.encode("utf-16")
+    yield "semicolons, decimal commas", lambda text: "\n".join(
+        line if k == 0 else line.replace(",", ";").replace(".png", "#png").replace(".", ",")
+        .replace("#png", ".png")
+        for k, line in enumerate(text.replace(text.splitlines()[0],
+                                              text.splitlines()[0].replace(",", ";")).splitlines())
+    ).encode()
+    yield "tabs, comments, empty lines", lambda text: (
+        "# made by\n\n" + text.replace(",", "\t") + "\n\n").encode()
+    yield "quotes and old line ends", lambda text: "\r".join(
+        ",".join(f'"{cell}"' for cell in line.split(",")) for line in text.splitlines()).encode()
+
+
+@pytest.mark.parametrize(("name", "spell"), [*spelled_otherwise()])
+def test_whatever_wrote_the_csv_its_numbers_are_the_same(name, spell, exported, tmp_path):
+    del name
+    path = tmp_path / "detections.csv"
+    path.write_bytes(spell((exported / "detections.csv").read_text()))
+    prepare(exported, [path])  # writes detections.npz: of the same bytes, or it would be refused
+    prepare(exported, [exported / "detections.csv"])
+
+
+def test_an_image_that_is_named_without_a_marker_counts_as_searched(exported, tmp_path):
+    names = [row["image"] for row in rows_of(exported / "truth.csv")]
+    path = tmp_path / "none.csv"
+    path.write_text("image,id,x0,y0,x1,y1,x2,y2,x3,y3\n" + f"{names[0]},,,,,,,,,\n")
+    assert prepare(exported, [path], names=["nothing-found"]).lines == [
+        "nothing-found: no marker: each of 24 images counts as searched in vain"]
+
+
+def test_of_doubled_rows_the_nearest_counts_if_asked_for(exported, ran, tmp_path):
+    rows = [row for row in rows_of(exported / "detections.csv") if row["id"] != "-1"]
+    far = [{**row, "x0": repr(float(row["x0"]) + 3)} for row in rows]
+    path = write(tmp_path / "doubled.csv", [*far, *rows])
+    with pytest.raises(PipelineError, match="twice"):
+        prepare(exported, [path])
+    ready = prepare(exported, [path], doubled="nearest")
+    results = results_of(ready.pipeline, tmp_path / "doubled.zarr")
+    assert_equal(ran, results, ["corner_error_px", "translation_error_m"])
+
+
+def test_what_cannot_be_scored_is_refused_in_a_line(exported, tmp_path):
+    good = exported / "detections.csv"
+    with pytest.raises(StoreError, match="not an export; make one with `sweep export"):
+        prepare(tmp_path, [good])
+    with pytest.raises(StoreError, match="cannot be read: No such file"):
+        prepare(exported, [tmp_path / "missing.csv"])
+    with pytest.raises(ArgumentError, match="another name for each file"):
+        prepare(exported, [good, good])
+    with pytest.raises(ArgumentError, match="one for each of the 1 files"):
+        prepare(exported, [good], names=["a", "b"])
+    with pytest.raises(ArgumentError, match="letters, digits"):
+        prepare(exported, [good], names=["../a"])
+    with pytest.raises(ArgumentError, match="one of refuse, nearest"):
+        prepare(exported, [good], doubled="first")
+    prepare(exported, [good], names=["held"])
+    other = write(tmp_path / "other.csv", rows_of(good)[:3])
+    with pytest.raises(StoreError, match="holds other detections, which a store may refer to"):
+        prepare(exported, [other], names=["held"])
+    for wrong in (("one", "TL TR BR BL", "right up out"), ("2", "TL TR BR BL", "right up out"),
+                  ("0", "TL TR BR", "right up out"), ("0", "TL TL BR BL", "right up out"),
+                  ("0", "TL TR BR BL", "right up in"), ("0", "TL TR BR BL", "right up front")):
+        with pytest.raises(ArgumentError, match="expected"):
+            Conventions.of(*wrong)
+
+
+def test_frames_are_rotations():
+    assert len(right_handed_frames()) == 24
+    for words in right_handed_frames():
+        axes = frame_axes(words)
+        assert np.linalg.det(axes) == pytest.approx(1)
+        assert (axes @ axes.T == np.eye(3)).all()

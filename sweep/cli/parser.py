@@ -13,6 +13,7 @@ from sweep.cli.completion import COMPLETION
 from sweep.cli.export import EXPORT
 from sweep.cli.output import flushed
 from sweep.cli.plan import PLAN
+from sweep.cli.plugins import PLUGINS
 from sweep.cli.report import REPORT
 from sweep.cli.repro import REPRO
 from sweep.cli.require import REQUIRE
@@ -27,7 +28,7 @@ from sweep.version import __version__
 
 COMMANDS = (
     RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, VERIFY, STATUS, EXPORT, SCORE,
-    CHECK_DETECTOR, COMPLETION,
+    CHECK_DETECTOR, PLUGINS, COMPLETION,
 )
 """Every command, in the order in which the help lists them."""
 

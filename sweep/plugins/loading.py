@@ -1,7 +1,7 @@
 """Plug-ins by name: entry points, whose names are read without importing, and files.
 
-A file is executed from the bytes whose digest is taken. It is a module of its own: others beside
-it are not importable, so that the digest says all of it.
+A file is executed from the bytes whose digest is taken. It is a module of its own: one that imports
+others beside it is refused, so that the digest says all of it.
 """
 
 from __future__ import annotations
@@ -155,8 +155,18 @@ def _module(path: str, digest: str, source: bytes) -> ModuleType:
     module = ModuleType(name)
     module.__file__ = path
     sys.modules[name] = module  # dataclasses find their annotations there
+    known = set(sys.modules)
     with _import_faults(path), contextlib.redirect_stdout(sys.stderr):
         exec(compile(source, path, "exec"), module.__dict__)  # noqa: S102  (the user's own file)
+    folder = Path(path).parent.resolve()
+    for other in set(sys.modules) - known:
+        file = getattr(sys.modules.get(other), "__file__", None)
+        if file is not None and Path(file).resolve().parent == folder:
+            del sys.modules[other]
+            raise PluginError(
+                f"a plug-in in one file, whose digest is recorded: {Path(path).name} imports "
+                f"{Path(file).name} beside it; put both into one, or make a package of them"
+            )
     return module
 
 

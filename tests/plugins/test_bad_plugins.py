@@ -187,6 +187,17 @@ def test_a_plug_in_that_cannot_be_used_is_one_line(tmp_path, source, told):
     assert told in line or (told == "cannot be imported" and "missing_library" in line)
 
 
+def test_a_plug_in_is_one_file(tmp_path, monkeypatch):
+    (tmp_path / "beside_it.py").write_text("value = 3\n")
+    (tmp_path / "mine.py").write_text("import beside_it\nD = print\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    for _ in range(2):
+        with pytest.raises(PipelineError, match=r"imports beside_it\.py beside it; put both"):
+            Pipeline.from_text(
+                '[pose]\nside_px = 24\n[detector]\ndetector = "mine:D"\n', folder=tmp_path
+            )
+
+
 def test_names_of_plug_ins_that_are_not_there(tmp_path):
     for key, value, told in (
         ("detector.detector", "nowhere:D", "expected the file nowhere.py in"),

@@ -20,6 +20,8 @@ from sweep.plan.grid import estimators, scene_values
 
 FOLDER = Path(__file__).parents[2] / "pipelines" / "plugins"
 
+GUIDE = (FOLDER / "README.md").read_text()
+
 SCENE = """
 [camera]
 width_px = 160
@@ -44,6 +46,12 @@ def pipeline_of(text, **options):
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.py")), ids=lambda path: path.stem)
 def test_each_is_short(path):
     assert len(path.read_text().splitlines()) <= 25
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.[pt]*")), ids=lambda path: path.name)
+def test_the_guide_shows_it(path):
+    assert f"<!-- file: {path.name} -->\n" in GUIDE
+    assert path.read_text() + "```\n" in GUIDE
 
 
 def test_the_pipeline_runs_with_all_four():

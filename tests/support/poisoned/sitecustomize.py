@@ -93,7 +93,9 @@ class _Poison:
         self._real = {name: getattr(home, name) for name, home in homes.items()}
         for name, home in homes.items():
             setattr(home, name, getattr(self, name))
-        search.Detector = self._detector(search.Detector)
+        from sweep.measure import detectors  # noqa: PLC0415
+
+        detectors.Detector = self._detector(detectors.Detector)
 
     def note(self, event, **what):
         line = {"event": event, "kind": _kind(), "pid": os.getpid(), "time": time.time(), **what}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis.detection_limits import SIZE_AXES
+from sweep.analysis.requirements import parse_requirements
 from sweep.errors import StoreError, SweepError
 from sweep.measure.flags import DetectionStatus, uncounted_values
 from sweep.model.camera import VIEW_PARAMETERS
@@ -65,6 +66,10 @@ class ReportData:
         The store's group ``cost/tradeoff``, or None.
     warnings
         Lines on cells that failed, or a run in which nothing was detected.
+    require, per
+        What is required, as `sweep.analysis.check_requirements` takes it, and the conditions.
+    command
+        The command line that asked for the report; empty if none did.
     """
 
     store: str
@@ -73,6 +78,9 @@ class ReportData:
     run_metadata: Mapping[str, Any]
     trade: xr.Dataset | None = None
     warnings: tuple[str, ...] = ()
+    require: tuple[str, ...] = ()
+    per: tuple[str, ...] = ()
+    command: str = ""
     _analyses: dict[Any, xr.Dataset] = field(default_factory=dict, repr=False)
     _remembered: dict[str, Any] = field(default_factory=dict, repr=False)
 
@@ -263,11 +271,25 @@ def store_errors(store: str) -> Iterator[None]:
         raise StoreError(f"{store}: cannot be read: {reason}") from None
 
 
-def read_report_data(url: str) -> ReportData:
+def read_report_data(
+    url: str, require: Sequence[str] = (), per: Sequence[str] = (), command: str = ""
+) -> ReportData:
     """Open a finished store for its report.
+
+    Parameters
+    ----------
+    url
+        Path or URL of the store.
+    require, per
+        What is required, and the dimensions whose values are conditions; by default what the
+        pipeline requires.
+    command
+        The command line that asked for the report.
 
     Raises
     ------
+    ArgumentError
+        For what cannot be required.
     StoreError
         If there is no store, it is not finished, or it cannot be read.
     """
@@ -284,4 +306,6 @@ def read_report_data(url: str) -> ReportData:
     return ReportData(
         store.url, results, store.pipeline, store.run_metadata, trade,
         tuple(outcome_of_finished(store).warnings),
+        tuple(each.text for each in parse_requirements(require)) if require else (), tuple(per),
+        command,
     )

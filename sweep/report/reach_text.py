@@ -1,0 +1,118 @@
+"""How far requirements are met, in words and as a table."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from sweep.report.figure import sentences
+from sweep.report.formatting import coordinate, number
+from sweep.report.grouping import ANGLES, CONFIGURATION
+from sweep.report.reach import Limit, Reaches
+from sweep.report.report_data import ReportData
+from sweep.report.table import Table
+
+SIZES = {
+    "distance_m": ("up to {}", "at no distance", "at all distances, up to {}"),
+    "side_px": ("down to a side of {}", "at no size", "at all sizes, down to a side of {}"),
+    "size_m": ("with markers of {} and larger", "with no size of the marker",
+               "with all markers, from {} on"),
+}
+"""Axis -> words for a limit along it, for none, and for one that may lie beyond the grid."""
+
+
+def quantity(data: ReportData, name: str, value: float) -> str:
+    """Return a value of an axis with its unit: ``2.25 m``, ``45°``."""
+    unit = str(data.results[name].attrs.get("units", "")) if name in data.results.variables else ""
+    unit = {"degree": "\u00b0", "px2": "px²", "1": ""}.get(unit, unit)
+    return f"{coordinate(float(value))}{'' if unit in ('', '°') else ' '}{unit}"
+
+
+def _words(reach: Reaches) -> tuple[str, str, str]:
+    known = SIZES.get(reach.along)
+    if known is not None:
+        return known
+    if reach.along in ANGLES:
+        name = ANGLES[reach.along]
+        return f"up to a {name} of {{}}", f"at no {name}", f"at every {name}, up to {{}}"
+    bound = "up to" if reach.upwards else "down to"
+    return (f"{bound} {reach.along} {{}}", f"at no {reach.along}",
+            f"at every {reach.along}, {bound} {{}}")
+
+
+def limit_text(data: ReportData, reach: Reaches, limit: Limit) -> str:
+    """Return a limit with its interval: ``up to 2.25 m (2 m to 2.5 m)``."""
+    to, none, everywhere = _words(reach)
+    if not limit.judged:
+        return "nothing was looked for"
+    if limit.rank < 0:
+        return none
+    text = everywhere if limit.rank == len(reach.values) - 1 else to
+    return text.format(quantity(data, reach.along, limit.value)) + interval_of(data, reach, limit)
+
+
+def interval_of(data: ReportData, reach: Reaches, limit: Limit) -> str:
+    """Return the interval of a limit in brackets, or nothing without one."""
+    near, far = (limit.low, limit.high) if reach.upwards else (limit.high, limit.low)
+    if math.isnan(near) or (near == far and near == limit.value):
+        return ""
+    ends = [quantity(data, reach.along, end) if math.isfinite(end) else "" for end in (near, far)]
+    if not ends[0]:
+        return f" (at most {ends[1]})" if ends[1] and reach.upwards else (
+            f" (not below {ends[1]})" if ends[1] else " (too few draws for an interval)")
+    return f" ({ends[0]} to {ends[1]})" if ends[1] else f" ({ends[0]} or beyond the grid)"
+
+
+def angle_text(data: ReportData, angle: str | None, limit: Limit) -> str:
+    """Return up to which angle a limit holds: ``at tilts up to 45°``."""
+    if angle is None or limit.angle is None:
+        return ""
+    return f"at {ANGLES[angle]}s up to {quantity(data, angle, limit.angle)}"
+
+
+def limiting_text(data: ReportData, reach: Reaches, angle: str | None, limit: Limit) -> str:
+    """Return what limits the reach: which requirement fails first, at which condition."""
+    if not limit.limited_by:
+        return ""
+    where = [f"at {quantity(data, reach.along, limit.fails_at)}" if reach.along in SIZES else
+             f"at {reach.along} {quantity(data, reach.along, limit.fails_at)}"]
+    if angle is not None and limit.fails_at_angle is not None:
+        where.append(f"a {ANGLES[angle]} of {quantity(data, angle, limit.fails_at_angle)}")
+    if limit.fails_where:
+        where.append(limit.fails_where)
+    again = "" if not limit.met_beyond else (
+        f"Beyond, at {quantity(data, reach.along, limit.farthest_beyond)}"
+        + (f" and {limit.met_beyond - 1:,} nearer" if limit.met_beyond > 1 else "")
+        + ", all are met again: the limit is that of the first dip.")
+    value = "" if math.isnan(limit.failing_value) else f", which is {number(limit.failing_value)}"
+    return sentences(f"It is limited by {limit.limited_by}{value} {' and '.join(where)}.", again)
+
+
+def reach_table(
+    data: ReportData, reach: Reaches, angle: str | None, order: Sequence[int], caption: str
+) -> Table:
+    """Return how far requirements are met: a row for each configuration, a column for each angle.
+
+    A star stands behind what too few draws were made for.
+    """
+    first = reach.limits[0]
+    headings = [f"{ANGLES[angle]}s up to {quantity(data, angle, limit.angle)}"
+                if angle and limit.angle is not None else "limit" for limit in first]
+    rows = [[reach.names[k], *(short_limit(data, reach, limit) for limit in reach.limits[k]),
+             limiting_text(data, reach, angle, reach.limits[k][-1])
+             .removeprefix("It is limited by ").rstrip(".")]
+            for k in order]
+    return Table(caption, [CONFIGURATION, *headings, "limited by"], rows, words=True)
+
+
+def short_limit(data: ReportData, reach: Reaches, limit: Limit) -> str:
+    """Return a limit as a cell of a table."""
+    if not limit.judged:
+        return "\u2013"
+    star = "" if reach.decided(limit) else " *"
+    if limit.rank < 0:
+        return f"none{star}"
+    beyond = ("\u2265 " if reach.upwards else "\u2264 ") if (
+        limit.rank == len(reach.values) - 1) else ""
+    return beyond + quantity(data, reach.along, limit.value) + interval_of(
+        data, reach, limit) + star

@@ -34,6 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = argparse.Namespace()
     try:
         options = parse(parser, arguments)
+        options.given = list(sys.argv[1:] if arguments is None else arguments)
         if options.command is None:
             print(parser.format_help(), end="")
             return flushed(0)

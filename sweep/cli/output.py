@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
 import io
 import json
 import logging
 import os
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -32,6 +34,13 @@ def say(text: str = "") -> None:
 def say_next(command: str, meaning: str = "") -> None:
     """Print the last line of a command: what to do next."""
     say(f"next: {command}" + (f"  # {meaning}" if meaning else ""))
+
+
+def command_line(options: argparse.Namespace) -> str:
+    """Return the command line as it was given, quoted for a shell, with how sweep was called."""
+    program = Path(sys.argv[0]).name if sys.argv else ""
+    called = "python -m sweep" if program == "__main__.py" else "sweep"
+    return shlex.join([*called.split(), *options.given])
 
 
 def accept_any_text() -> None:

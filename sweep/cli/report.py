@@ -6,9 +6,9 @@ import argparse
 import shlex
 from pathlib import Path
 
-from sweep.cli.arguments import add_store
+from sweep.cli.arguments import add_json, add_store
 from sweep.cli.command import Command, Example
-from sweep.cli.output import quiet_matplotlib, say, say_next
+from sweep.cli.output import command_line, print_json, quiet_matplotlib, say, say_next
 
 NO_REPORTS = {
     ".pdf", ".png", ".svg", ".jpg", ".jpeg", ".docx", ".odt", ".tex", ".ipynb", ".csv",
@@ -29,12 +29,25 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--figures", metavar="DIR", help="also write each figure into DIR, as SVG and PNG"
     )
+    parser.add_argument(
+        "--require", action="append", default=[], metavar="REQUIREMENT", dest="requirements",
+        help="what is required, in quotes: 'detection >= 0.99', 'range_error_p95_percent <= 1'; "
+        "the report begins with whether it is met; may be repeated (default: the section "
+        "[require] of the store's pipeline)",
+    )
+    parser.add_argument(
+        "--per", action="append", default=[], metavar="AXES",
+        help="axes whose values are conditions, such as distance_m,tilt_deg (default: those of "
+        "[require], else the axes of size and angle)",
+    )
+    add_json(parser)
 
 
 def _execute(options: argparse.Namespace) -> int:
     quiet_matplotlib()
     from sweep.errors import ArgumentError  # noqa: PLC0415
     from sweep.messages import byte_count  # noqa: PLC0415
+    from sweep.report.formatting import plural  # noqa: PLC0415
     from sweep.report.output_file import is_standard_stream  # noqa: PLC0415
     from sweep.report.report_data import read_report_data  # noqa: PLC0415
     from sweep.report.write_report import write_report  # noqa: PLC0415
@@ -49,12 +62,20 @@ def _execute(options: argparse.Namespace) -> int:
     form = options.form or ("md" if str(options.output).lower().endswith(".md") else "html")
     output = Path(options.output or f"report.{form}")
     figures = Path(options.figures) if options.figures else None
-    data = read_report_data(options.store)
-    count = write_report(data, output, form, figures)
+    per = [name for part in options.per for each in part.split(",") if (name := each.strip())]
+    data = read_report_data(options.store, options.requirements, per, command_line(options))
+    if options.json and is_standard_stream(output):
+        raise ArgumentError("json", "", "and the report both go to standard output; choose -o FILE")
+    count, found = write_report(data, output, form, figures)
     if is_standard_stream(output):
         return 0  # a line more would not be HTML
+    if options.json:
+        print_json({"report": str(output), "figures": count, "store": data.store,
+                    "required": list(data.require), "per": list(data.per)} | found.as_json())
+        return 0
     size = f", {byte_count(output.stat().st_size)}" if output.is_file() else ""
-    say(f"{output}: {count} figures{size}")
+    say(f"{output}: {plural(count, 'figure')}{size}")
+    say(found.headline)
     for line in data.warnings:
         say(line)
     if data.trade is None and data.setting_axes:
@@ -68,7 +89,10 @@ REPORT = Command(
     "report", "write a report of a store: the answer, figures, example scenes",
     "sweep/analysis/README.md",
     (
-        Example("sweep report runs/smoke.zarr", "writes report.html, one self-contained page"),
+        Example(
+            "sweep report runs/smoke.zarr --require 'detection >= 0.9'",
+            "writes report.html, which begins with how far that is met",
+        ),
         Example(
             "sweep report runs/smoke.zarr -o answer.md --figures figures",
             "writes Markdown, and each figure as SVG and PNG",

@@ -25,7 +25,7 @@ def write_figure(figure: RenderedFigure, folder: Path) -> None:
 
 def markdown(
     title: str, answer: Answer, provenance: Provenance, figures: Sequence[RenderedFigure],
-    scenes: Iterable[Scene], folder: Path, link_folder: str,
+    scenes: Iterable[Scene], folder: Path, link_folder: str, require: Sequence[str] = (),
 ) -> str:
     """Return the report as Markdown; pictures of scenes are written into ``folder``.
 
@@ -33,23 +33,17 @@ def markdown(
     """
     base = quote(link_folder)
     parts = [
-        f"# {markdown_text(title)}", markdown_text(answer.paragraph),
+        f"# {markdown_text(title)}", f"**{markdown_text(answer.headline)}**",
+        *([f"Required: {markdown_text('; '.join(require))}."] if require else []),
+        markdown_text(answer.paragraph),
+        *(table.markdown() for table in answer.tables),
+        *([f"With {markdown_text(answer.of)}, over the whole grid:"] if answer.of else []),
         "\n".join(
             f"- {markdown_text(tile.heading)}: **{markdown_text(tile.value)}**"
             + (f" ({markdown_text(tile.detail)})" if tile.detail else "")
             for tile in answer.tiles
         ),
-        "## Origin of the numbers",
-        "\n".join(f"- {name}: {markdown_text(text)}" for name, text in provenance.facts.items()),
-        "Commands that reproduce the store and this report:",
-        _code("\n".join(provenance.commands), "sh"),
-        _folded(f"The pipeline, {provenance.file}", _code(provenance.pipeline, "toml")),
     ]
-    if provenance.axes is not None:
-        parts.append(provenance.axes.markdown())
-    if provenance.drawn:
-        parts.append(f"Drawn in each trial: {markdown_text(provenance.drawn)}.")
-    parts += [table.markdown() for table in answer.tables]
     parts.append("## Figures")
     for figure in figures:
         parts += [
@@ -70,7 +64,25 @@ def markdown(
             markdown_text(text) for text in (scene.result, scene.coordinates, scene.problem) if text
         ]
         parts.append(_code(scene.command, "sh"))
+    parts += ["## More numbers", *(table.markdown() for table in answer.details)]
+    parts += _origin(provenance)
     return "\n\n".join(parts) + "\n"
+
+
+def _origin(provenance: Provenance) -> list[str]:
+    """Return the origin of the numbers, and the commands that make them again."""
+    parts = [
+        "## Origin of the numbers",
+        "\n".join(f"- {name}: {markdown_text(text)}" for name, text in provenance.facts.items()),
+        "Commands that reproduce the store and this report:",
+        _code("\n".join(provenance.commands), "sh"),
+        _folded(f"The pipeline, {provenance.file}", _code(provenance.pipeline, "toml")),
+    ]
+    if provenance.axes is not None:
+        parts.append(provenance.axes.markdown())
+    if provenance.drawn:
+        parts.append(f"Drawn in each trial: {markdown_text(provenance.drawn)}.")
+    return parts
 
 
 def _code(text: str, language: str) -> str:

@@ -21,12 +21,12 @@ POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 def page(
     title: str, answer: Answer, provenance: Provenance, figures: Sequence[RenderedFigure],
-    scenes: Iterable[Scene],
+    scenes: Iterable[Scene], require: Sequence[str] = (),
 ) -> str:
     """Return the report as HTML, from the templates beside this module; all text is escaped."""
     return _environment().get_template("page.html").render(
         policy=POLICY, title=title, answer=answer, provenance=provenance, figures=figures,
-        scenes=list(scenes),
+        scenes=list(scenes), require=require,
         legend=[(text, css_colour(colour)) for text, colour in LEGEND],
     )
 

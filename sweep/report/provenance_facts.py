@@ -75,7 +75,7 @@ def provenance(data: ReportData, output: str) -> Provenance:
     return Provenance(
         facts,
         (f"sweep run {pipeline_file(data.pipeline)} --store {store}", *trade,
-         f"sweep report {store} -o {shlex.quote(output)}"),
+         data.command or f"sweep report {store} -o {shlex.quote(output)}"),
         _axes(data),
         "; ".join(f"{name} {distribution}"
                   for name, distribution in data.pipeline.distributions.items()),

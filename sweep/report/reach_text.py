@@ -48,19 +48,21 @@ def limit_text(data: ReportData, reach: Reaches, limit: Limit) -> str:
     if limit.rank < 0:
         return none
     text = everywhere if limit.rank == len(reach.values) - 1 else to
-    return text.format(quantity(data, reach.along, limit.value)) + interval_of(data, reach, limit)
+    return text.format(quantity(data, reach.along, limit.value)) + interval_of(reach, limit)
 
 
-def interval_of(data: ReportData, reach: Reaches, limit: Limit) -> str:
+def interval_of(reach: Reaches, limit: Limit) -> str:
     """Return the interval of a limit in brackets, or nothing without one."""
     near, far = (limit.low, limit.high) if reach.upwards else (limit.high, limit.low)
     if math.isnan(near) or (near == far and near == limit.value):
         return ""
-    ends = [quantity(data, reach.along, end) if math.isfinite(end) else "" for end in (near, far)]
-    if not ends[0]:
-        return f" (at most {ends[1]})" if ends[1] and reach.upwards else (
-            f" (not below {ends[1]})" if ends[1] else " (too few draws for an interval)")
-    return f" ({ends[0]} to {ends[1]})" if ends[1] else f" ({ends[0]} or beyond the grid)"
+    low, high = (coordinate(end) if math.isfinite(end) else "" for end in (near, far))
+    if low and high:
+        return f" ({low} to {high})"
+    more = "more" if reach.upwards else "less"
+    if low:
+        return f" ({low} or {more})"
+    return f" (at {'most' if reach.upwards else 'least'} {high})" if high else ""
 
 
 def angle_text(data: ReportData, angle: str | None, limit: Limit) -> str:
@@ -99,10 +101,22 @@ def reach_table(
     headings = [f"{ANGLES[angle]}s up to {quantity(data, angle, limit.angle)}"
                 if angle and limit.angle is not None else "limit" for limit in first]
     rows = [[reach.names[k], *(short_limit(data, reach, limit) for limit in reach.limits[k]),
-             limiting_text(data, reach, angle, reach.limits[k][-1])
-             .removeprefix("It is limited by ").rstrip(".")]
+             _short_cause(data, reach, angle, reach.limits[k][-1])]
             for k in order]
     return Table(caption, [CONFIGURATION, *headings, "limited by"], rows, words=True)
+
+
+def _short_cause(data: ReportData, reach: Reaches, angle: str | None, limit: Limit) -> str:
+    """Return what limits the reach as a cell of a table: ``detection_rate 0.75 at 3 m, 60°``."""
+    if not limit.limited_by:
+        return ""
+    where = [quantity(data, reach.along, limit.fails_at)]
+    if angle is not None and limit.fails_at_angle is not None:
+        where.append(quantity(data, angle, limit.fails_at_angle))
+    if limit.fails_where:
+        where.append(limit.fails_where)
+    return (f"{limit.limited_by.split()[0]} {number(limit.failing_value)} at "
+            f"{', '.join(where)}")
 
 
 def short_limit(data: ReportData, reach: Reaches, limit: Limit) -> str:
@@ -115,4 +129,4 @@ def short_limit(data: ReportData, reach: Reaches, limit: Limit) -> str:
     beyond = ("\u2265 " if reach.upwards else "\u2264 ") if (
         limit.rank == len(reach.values) - 1) else ""
     return beyond + quantity(data, reach.along, limit.value) + interval_of(
-        data, reach, limit) + star
+        reach, limit) + star

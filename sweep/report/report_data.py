@@ -303,9 +303,11 @@ def read_report_data(
                 snapshot(store), group="cost/tradeoff", consolidated=False, zarr_format=3
             ).load()
         results = open_dataset(store.url)
+    required = tuple(require) or store.pipeline.requirements
     return ReportData(
         store.url, results, store.pipeline, store.run_metadata, trade,
         tuple(outcome_of_finished(store).warnings),
-        tuple(each.text for each in parse_requirements(require)) if require else (), tuple(per),
+        tuple(each.text for each in parse_requirements(required)) if required else (),
+        tuple(per) or tuple(name for name in store.pipeline.require_per if name in results.dims),
         command,
     )

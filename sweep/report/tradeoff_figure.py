@@ -38,15 +38,20 @@ CHART_STYLE: Any = {
 } | {"savefig.transparent": True}
 
 
-def _render(data: ReportData) -> RenderedFigure:
-    if data.trade is None:
-        raise KeyError("cost/tradeoff")
-    trade = data.trade.drop_attrs(deep=False)  # the figure has a title of its own
-    criterion = next(
+def trade_criterion(trade: xr.Dataset) -> str:
+    """Return the error that ranks configurations: one that is finite in every condition."""
+    return next(
         (name for name in (CRITERION, OTHER_CRITERION)
          if np.isfinite(trade[name].values).any(axis=trade[name].dims.index("treatment")).all()),
         CRITERION,
     )
+
+
+def _render(data: ReportData) -> RenderedFigure:
+    if data.trade is None:
+        raise KeyError("cost/tradeoff")
+    trade = data.trade.drop_attrs(deep=False)  # the figure has a title of its own
+    criterion = trade_criterion(trade)
     poses = int(data.trade.attrs.get("poses", 0))
     alt = f"Cost in milliseconds a frame against {criterion}, a panel for each condition."
 

@@ -111,7 +111,7 @@ def _required(data: ReportData, course: Course) -> Verdict:
     if known.several or course.angle:
         tables.append(reach_table(
             data, reach, course.angle, order,
-            "How far all that is required is met, with 95 % intervals;" + STAR))
+            "How far all that is required is met (95 % interval);" + STAR))
     return Verdict(headline, reasons, tuple(tables), (_condition_table(data, checked, best),),
                    best)
 
@@ -249,21 +249,23 @@ def _how_far(data: ReportData) -> Verdict:
     orders = {rate: reach.order(preferred) for rate, reach in found.items()}
     best = orders[RATES[0]][0] if found[RATES[0]].limits[orders[RATES[0]][0]][-1].rank >= 0 else (
         orders[RATES[1]][0])
-    parts = []
+    parts, doubts = [], []
     for rate, reach in found.items():
         limit = reach.limits[best][-1]
-        doubt = "" if reach.decided(limit) else " (too few draws to be sure)"
-        parts.append(f"in at least {100 * rate:g} % of poses {limit_text(data, reach, limit)}"
-                     f"{doubt}")
+        parts.append(f"in at least {100 * rate:g} % {limit_text(data, reach, limit)}")
+        if not reach.decided(limit):
+            doubts.append(f"{100 * rate:g} %")
     where = angle_text(data, course.angle, found[RATES[0]].limits[best][-1])
     headline = (f"{'With ' + names[best] + ', d' if several else 'D'}etected "
                 f"{' and '.join(parts)}{', ' + where if where else ''}.")
+    if doubts:
+        headline = f"{headline[:-1]}; too few draws to be sure of {' and '.join(doubts)}."
     first = found[RATES[0]]
     tables = []
     if several or course.angle:
         tables = [
             reach_table(data, found[rate], course.angle, orders[rate],
-                        f"Detected in at least {100 * rate:g} %, with 95 % intervals;{STAR}")
+                        f"Detected in at least {100 * rate:g} % (95 % interval);{STAR}")
             for rate in RATES
         ]
     return Verdict(headline, limiting_text(data, first, course.angle, first.limits[best][-1])

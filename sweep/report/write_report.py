@@ -13,7 +13,7 @@ import xarray as xr
 
 from sweep.errors import ArgumentError, StoreError
 from sweep.measure.flags import DetectionStatus
-from sweep.report.answer import answer
+from sweep.report.answer import Answer, answer
 from sweep.report.figures import figure_kinds
 from sweep.report.gallery import scenes_of
 from sweep.report.grouping import AREA
@@ -110,8 +110,8 @@ def _check_folder(wanted: Path) -> None:
 
 def write_report(
     data: ReportData, output: Path, form: str = "html", figures: Path | None = None
-) -> int:
-    """Write the report of a store; return its number of figures.
+) -> tuple[int, Answer]:
+    """Write the report of a store; return its number of figures, and the answer.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def write_report(
     Raises
     ------
     ArgumentError
-        If ``form`` is neither of these.
+        If ``form`` is neither of these, or for what cannot be required.
     StoreError
         If there are no results, some are missing or cannot be read, or a file cannot be written.
     """
@@ -156,10 +156,11 @@ def write_report(
         scenes = scenes_of(data)
         if folder is not None and temporary is not None:
             text = markdown(
-                title, numbers, origin, rendered, scenes, temporary / "figures", folder.name
+                title, numbers, origin, rendered, scenes, temporary / "figures", folder.name,
+                data.require,
             )
         else:
-            text = page(title, numbers, origin, rendered, scenes)
+            text = page(title, numbers, origin, rendered, scenes, data.require)
         # Files are moved to their final paths only after all were written.
         if figures is not None:
             figures.mkdir(exist_ok=True)
@@ -171,7 +172,7 @@ def write_report(
             )
         # Invalid Unicode, which a file's name may hold, is written as a question mark.
         write_output_file(output, text.encode("utf-8", errors="replace"))
-    return len(rendered)
+    return len(rendered), numbers
 
 
 def _check_complete(data: ReportData) -> None:

@@ -1,0 +1,130 @@
+"""Which configuration: the best of them for each question, and what is as good."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from sweep.analysis.quantiles import IntervalOf
+from sweep.report.configurations import Configurations, configurations
+from sweep.report.figure import values_with_ends
+from sweep.report.formatting import interval_text, number, plural
+from sweep.report.report_data import ReportData
+from sweep.report.table import Table
+
+MAX_RIVALS = 3
+"""Configurations that are named as indistinguishable from the best."""
+
+
+class Criterion(NamedTuple):
+    """What configurations are compared by.
+
+    Attributes
+    ----------
+    words, variable, unit, scale
+        What it is, the variable of `sweep.analysis.error_statistics`, its unit and factor.
+    largest
+        Whether large values are good.
+    absolute
+        Whether its absolute value counts.
+    """
+
+    words: str
+    variable: str
+    unit: str
+    scale: float = 1.0
+    largest: bool = False
+    absolute: bool = False
+
+
+CRITERIA = (
+    Criterion("detected most often", "detection_rate", " %", 100.0, largest=True),
+    Criterion("smallest rotation error, median", "rotation_median_deg", "\u00b0"),
+    Criterion("smallest rotation error, p95", "rotation_p95_deg", "\u00b0"),
+    Criterion("smallest range error, median", "range_median_percent", " %"),
+    Criterion("smallest range error, p95", "range_p95_percent", " %"),
+    Criterion("smallest range bias", "range_bias_percent", " %", absolute=True),
+    Criterion("fewest flips", "flip_rate", " %", 100.0),
+)
+ACCURACY = CRITERIA[1]
+
+
+class Best(NamedTuple):
+    """The best configuration by a criterion: its number, value, interval, and what is as good."""
+
+    which: int
+    value: float
+    interval: str
+    rivals: list[int]
+
+
+def best_by(known: Configurations, criterion: Criterion) -> Best | None:
+    """Return the best configuration by a criterion, of those without a wrong belief.
+
+    What is as good has an interval that overlaps the best one's. None if no value is finite.
+    """
+    value, low, high = values_with_ends(known.summary, criterion.variable, criterion.scale)
+    shown = value
+    if criterion.absolute:
+        low, high = (np.where((low <= 0) & (high >= 0), 0.0, np.minimum(abs(low), abs(high))),
+                     np.maximum(abs(low), abs(high)))
+        value = abs(value)
+    usable = np.isfinite(value) & ~known.wrong
+    if not usable.any():
+        return None
+    sign = -1.0 if criterion.largest else 1.0
+    best = int(np.argmin(np.where(usable, sign * value, np.inf)))
+    interval = "" if math.isnan(low[best]) and math.isnan(high[best]) else (
+        f" ({interval_text(low[best], high[best], criterion.unit)})")
+    exact = known.summary["median_interval"].values == IntervalOf.nothing_drawn
+    # Without draws a value is exact; an unknown end otherwise lies beyond all draws.
+    low = np.where(np.isnan(low), np.where(exact, value, -np.inf), low)
+    high = np.where(np.isnan(high), np.where(exact, value, np.inf), high)
+    rivals = [
+        k for k in range(len(value)) if k != best and usable[k]
+        and low[k] <= high[best] and low[best] <= high[k]
+    ]
+    return Best(best, float(shown[best]), interval, rivals)
+
+
+def choice_sentence(data: ReportData) -> str:
+    """Return which configuration has the smallest median rotation error, as a sentence."""
+    known = configurations(data)
+    best = best_by(known, ACCURACY) if known.several else None
+    if best is None:
+        return ""
+    solved = 100 * float(known.summary["solved_rate"].values[best.which])
+    text = (f"Of the configurations, {known.names[best.which]} has the smallest median rotation "
+            f"error, {number(best.value)}\u00b0{best.interval}, and solves {number(solved)} %")
+    if best.rivals:
+        text += f"; it is indistinguishable from {_rivals(known, best)}"
+    wrong = int(known.wrong.sum())
+    note = "" if not wrong else (
+        f" {plural(wrong, 'configuration')} with a wrong belief "
+        f"{'is' if wrong == 1 else 'are'} no choice.")
+    return f"{text}.{note}"
+
+
+def _rivals(known: Configurations, best: Best) -> str:
+    listed = ", ".join(known.names[k] for k in best.rivals[:MAX_RIVALS])
+    if len(best.rivals) > MAX_RIVALS:
+        listed += f" and {len(best.rivals) - MAX_RIVALS:,} more"
+    return listed
+
+
+def choice_table(data: ReportData) -> list[Table]:
+    """Return the best configuration by each criterion; no table for a single one."""
+    known = configurations(data)
+    if not known.several:
+        return []
+    rows = []
+    for criterion in CRITERIA:
+        best = best_by(known, criterion) if criterion.variable in known.summary else None
+        if best is not None:
+            rows.append([
+                criterion.words, known.names[best.which],
+                f"{number(best.value)}{criterion.unit}{best.interval}", _rivals(known, best)])
+    return [Table("Which configuration, over the whole grid, with 95 % intervals",
+                  ["question", "configuration", "value", "indistinguishable"], rows, words=True)]

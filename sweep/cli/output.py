@@ -12,6 +12,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
+AS_MODULE = ("sweep", "__main__.py")
+"""How the program's path ends if Python was told to run the package."""
+
 MAX_LINES = 50
 """Lines of each kind that `sweep status` and `sweep verify` print."""
 
@@ -38,8 +41,7 @@ def say_next(command: str, meaning: str = "") -> None:
 
 def command_line(options: argparse.Namespace) -> str:
     """Return the command line as it was given, quoted for a shell, with how sweep was called."""
-    program = Path(sys.argv[0]).name if sys.argv else ""
-    called = "python -m sweep" if program == "__main__.py" else "sweep"
+    called = "python -m sweep" if Path(sys.argv[0]).parts[-2:] == AS_MODULE else "sweep"
     return shlex.join([*called.split(), *options.given])
 
 

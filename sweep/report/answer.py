@@ -11,6 +11,7 @@ import xarray as xr
 from sweep.analysis.registry import error_headings
 from sweep.errors import DatasetError, StoreError
 from sweep.plan.parameters import Stage
+from sweep.report.ambiguity_sentence import threshold_sentence
 from sweep.report.choice import choice_sentence, choice_table
 from sweep.report.configurations import configurations
 from sweep.report.figure import sentences, values_with_ends
@@ -96,7 +97,8 @@ def answer(data: ReportData) -> Answer:
     warnings = "".join(f"{line.strip()[:1].upper()}{line.strip()[1:]}. " for line in data.warnings)
     return Answer(
         found.headline,
-        warnings + sentences(found.reasons, choice_sentence(data), _cost(data), _size(data)),
+        warnings + sentences(found.reasons, choice_sentence(data),
+                             threshold_sentence(data, best), _cost(data), _size(data)),
         known.names[best] if known.several else "", tiles,
         (*found.tables, *size_errors_table(data, best), *choice_table(data)),
         (*found.details, _errors_table(one, known.names[best] if known.several else ""),

@@ -16,9 +16,6 @@ from sweep.tradeoff.pareto import interval
 MAX_ROWS = 300
 """Rows of a table that a page shows."""
 
-MAX_CAPTION_LINE = 80
-"""Characters of a caption that stand in one line."""
-
 MAX_LINE_CHARS = 28
 """Characters of a cell that stand in one line."""
 
@@ -56,11 +53,6 @@ class Table:
         if len(self.rows) <= MAX_ROWS:
             return self.caption
         return f"{self.caption} (the first {MAX_ROWS} of {len(self.rows):,} rows)"
-
-    @property
-    def caption_class(self) -> str:
-        """CSS class of the caption: ``long`` ones have several lines."""
-        return "long" if len(self.full_caption) > MAX_CAPTION_LINE else ""
 
     @property
     def column_classes(self) -> list[str]:

@@ -252,6 +252,8 @@ def _how_far(data: ReportData) -> Verdict:
     parts, doubts = [], []
     for rate, reach in found.items():
         limit = reach.limits[best][-1]
+        if parts and limit.rank == found[RATES[0]].limits[best][-1].rank and limit.rank >= 0:
+            continue  # the higher rate is reached as far
         parts.append(f"in at least {100 * rate:g} % {limit_text(data, reach, limit)}")
         if not reach.decided(limit):
             doubts.append(f"{100 * rate:g} %")

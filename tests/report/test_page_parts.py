@@ -37,8 +37,9 @@ def hostile_page():
               for picture in (b"png", None)]
     origin = Provenance({"Store": HOSTILE, "Report": HOSTILE}, (HOSTILE,), hostile_table(),
                         HOSTILE, HOSTILE, HOSTILE)
-    numbers = Answer(HOSTILE, (Tile(HOSTILE, HOSTILE, HOSTILE),), (hostile_table(),))
-    return page(HOSTILE, numbers, origin, [figure], scenes)
+    numbers = Answer(HOSTILE, HOSTILE, HOSTILE, (Tile(HOSTILE, HOSTILE, HOSTILE),),
+                     (hostile_table(),), (hostile_table(),))
+    return page(HOSTILE, numbers, origin, [figure], scenes, [HOSTILE])
 
 
 def test_all_text_of_a_store_is_escaped():

@@ -21,7 +21,6 @@ import xarray as xr
 from support.reports import CAMERA, FULL, command, made
 from sweep.analysis import (
     compare,
-    detection_limit,
     detection_rate,
     error_statistics,
     failure_composition,
@@ -32,8 +31,8 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.renderers import background_image
 from sweep.plan.experiment import Pipeline
 from sweep.report import report_data, scene_selection
-from sweep.report.answer import _best_sentence as best_sentence
 from sweep.report.answer import answer
+from sweep.report.choice import choice_sentence as best_sentence
 from sweep.report.figures import figure_kinds
 from sweep.report.formatting import coordinates, number
 from sweep.report.gallery import scenes_of
@@ -329,44 +328,47 @@ def test_bias_and_spread_stand_for_each_configuration(full, page):
             assert text == f"{value} ({low} to {high})", label
 
 
-def test_the_answer_is_that_of_plain_arithmetic(full, page):
+def test_the_numbers_are_those_of_one_configuration_by_plain_arithmetic(full, page):
     results = open_dataset(full).load()
-    detected = 100 * float((results["detection"] == DetectionStatus.detected).mean())
     solved = results["estimate"] == EstimateStatus.solved
-    ordered = np.sort(results["rotation_error_deg"].where(solved, np.inf).values.ravel())
-    median = ordered[math.ceil(len(ordered) / 2) - 1]
-    paragraph = re.search(r'<p class="answer">(.*?)</p>', page)[1]
-    assert f"detected in {number(detected)} %" in paragraph
-    assert f"median is {number(median)}\u00b0" in paragraph
-    poses = np.prod([results.sizes[axis] for axis in ("marker_id", "side_px", "tilt_deg", "trial")])
-    assert f'<span class="value">{poses}</span>' in page
-
-
-def test_the_answer_s_numbers_have_their_own_denominators(full, page, odd):
-    results = open_dataset(full).load()
-    paragraph = re.search(r'<p class="answer">(.*?)</p>', page)[1]
-    assert (f"looked for {results.detection.size} times, pooled over 2 detector settings,"
-            in paragraph)
-    solved = 100 * float((results["estimate"] == EstimateStatus.solved).mean())
-    assert (f"solved in {number(solved)} % of {results.estimate.size} results, pooled over 4 "
-            "configurations." in paragraph)
-    assert f"to {number(100 * float(error_statistics(results)['solved_rate_high']))} %, of " + str(
-        results.estimate.size) in page
-    single = answer(opened(odd("single pose"))).paragraph
-    assert single.startswith("The marker was looked for once and detected in 100 %; a pose was ")
-
-
-def test_the_limit_is_that_of_the_detector_s_first_setting(full, page):
-    results = open_dataset(full)
-    first = detection_limit(
-        results.isel(cornerRefinementMethod=0), rate=0.9, per=("tilt_deg",)).compute()
+    errors = results["rotation_error_deg"].where(solved, np.inf).stack(
+        each=("cornerRefinementMethod", "solver"), create_index=False)
+    ordered = np.sort(errors.transpose("each", ...).values.reshape(4, -1), axis=1)
+    medians = ordered[:, math.ceil(ordered.shape[1] / 2) - 1]
+    best = int(np.argmin(medians))
+    name = " \u00b7 ".join(
+        str(errors[axis].values[best]) for axis in ("cornerRefinementMethod", "solver"))
     shown = answer(opened(full))
-    assert ("With cornerRefinementMethod none, detected in at least 90 % of poses down to this "
-            "size: " in shown.paragraph)
-    tile = shown.tiles[-1]
-    assert tile.detail.endswith("with cornerRefinementMethod none")
-    assert tile.value.endswith(f"{number(float(first['side_px'][0]))} px")
-    assert tile.detail in page
+    assert shown.of == name
+    numbers = {tile.heading: tile for tile in shown.tiles}
+    assert numbers["rotation error, median"].value == f"{number(medians[best])}\u00b0"
+    detected = (results["detection"].sel(cornerRefinementMethod=name.split()[0])
+                == DetectionStatus.detected).values
+    assert numbers["detected"].value == f"{number(100 * detected.mean())} %"
+    assert numbers["detected"].detail.endswith(f" %, of {detected.size}")
+    assert f"With {name}, over the whole grid:" in page
+    assert f'<span class="value">{number(medians[best])}\u00b0</span>' in page
+
+
+def test_the_first_sentence_is_how_far_each_detector_detects(full, odd):
+    results = open_dataset(full).load()
+    detected = results["detection"] == DetectionStatus.detected
+    rates = detected.mean(("marker_id", "trial")).min("tilt_deg").sel(side_px=[40, 14, 7])
+    reached = {}
+    for refinement in ("none", "subpix"):
+        keeps = (rates.sel(cornerRefinementMethod=refinement) >= 0.9).values
+        reached[refinement] = int(np.argmin(keeps)) if not keeps.all() else 3
+    assert reached == {"none": 1, "subpix": 1}  # 40 px and not 14 px
+    shown = answer(opened(full))
+    assert shown.headline == (
+        "With none, detected in at least 99 % down to a side of 40 px (at least 40), at "
+        "tilts up to 50\u00b0; too few draws to be sure of 99 %.")
+    (table,) = (each for each in shown.tables if each.caption.startswith("Detected in at least 99"))
+    assert [row[0] for row in table.rows] == ["none", "subpix"]
+    assert answer(opened(odd("single pose"))).headline == "Detected in 100 % of 1 pose."
+    assert answer(opened(odd("no draws"))).headline == (
+        "Detected in at least 99 % at all sizes, down to a side of 20 px, at tilts up "
+        "to 30\u00b0.")
 
 
 def configured(medians, intervals, flag):
@@ -390,7 +392,7 @@ def test_the_best_configuration_is_named_with_those_that_are_indistinguishable_f
     nan, given, none, few = np.nan, *map(IntervalOf, (1, 2, 3))
     assert best_sentence(configured([2, 1, 9], [(1.4, 3), (0.5, 1.5), (8, 10)], given)) == (
         "Of the configurations, b has the smallest median rotation error, 1.00\u00b0 (0.500 to "
-        "1.50), and solves 100 %; it is indistinguishable from a.")
+        "1.50\u00b0), and solves 100 %; it is indistinguishable from a.")
     apart = best_sentence(configured([2, 1], [(1.6, 3), (0.5, 1.5)], given))
     assert apart.endswith("solves 100 %.")
     many = best_sentence(configured([1, 2, 3, 4, 5], [(0, 9)] * 5, given))
@@ -662,7 +664,8 @@ def test_a_report_goes_through_links_and_into_devices(tmp_path):
     assert len(list((behind / "pictures").iterdir())) == 3
     assert all((tmp_path / link).is_symlink() for link in ("r.md", "r_figures"))
     assert command("report", url, "-o", tmp_path / "null") == (
-        0, f"{tmp_path / 'null'}: 1 figures\nnext: look at {tmp_path / 'null'}\n", "")
+        0, (f"{tmp_path / 'null'}: 1 figure\nDetected in 100 % of 1 pose.\n"
+            f"next: look at {tmp_path / 'null'}\n"), "")
     for device in ("/dev/null", "/dev/full"):
         code, _, err = command("report", url, "-o", device, "--format", "md")
         assert code == 2

@@ -1,9 +1,10 @@
 """A report groups by the viewing angle as it does by the tilt, and areas in the world vary."""
 
+from sweep.report.limits import limits_of
+
 import sweep
 from support.here import calls_here
 from sweep.analysis import detection_limit
-from sweep.report.limits import limits_of
 from sweep.report.report_data import read_report_data
 from sweep.report.scene_figures import DETECTION, MAPS
 

@@ -249,7 +249,8 @@ def _how_far(data: ReportData) -> Verdict:
     orders = {rate: reach.order(preferred) for rate, reach in found.items()}
     best = orders[RATES[0]][0] if found[RATES[0]].limits[orders[RATES[0]][0]][-1].rank >= 0 else (
         orders[RATES[1]][0])
-    parts, doubts = [], []
+    parts: list[str] = []
+    doubts: list[str] = []
     for rate, reach in found.items():
         limit = reach.limits[best][-1]
         if parts and limit.rank == found[RATES[0]].limits[best][-1].rank and limit.rank >= 0:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis.dimensions import DRAWS, as_names, axes_of
+from sweep.analysis.image_sides import image_sides
 from sweep.analysis.requirements import (
     Decision,
     Requirement,
@@ -20,12 +22,6 @@ from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import Flag, flag
 from sweep.plan.attributes import describes
 from sweep.plan.schema import cf_attributes
-
-HARDER_WHEN_SMALLER = (
-    "side_px", "size_m", "fx_px", "fy_px", "focal_length_mm", "width_px", "height_px",
-    "white", "contrast",
-)
-"""Axes along which a marker is harder to find the smaller the value is."""
 
 
 class Reach(Flag):
@@ -49,8 +45,9 @@ def farthest_met(
     results, requirements
         As in `sweep.analysis.check_requirements`.
     along
-        An axis of the scene with numbers, such as ``distance_m``. It goes from easy to hard: sides
-        and focal lengths downwards, all others upwards.
+        An axis of the scene with numbers, such as ``distance_m``. It is read from easy to hard:
+        one that changes the size in the image towards smaller markers; another from the end at
+        which the requirements are met at more of the conditions, upwards if that is undecided.
     per
         Dimensions that are kept: a limit for each of their values.
     at_all
@@ -108,14 +105,14 @@ def farthest_met(
     if overlap:
         raise ArgumentError("at_all", ", ".join(overlap), "is in per, too; name it in one of them")
     table = check_requirements(results, required, per=[*names, *together, along])
-    upwards = not harder_when_smaller(results, along)
-    order = np.argsort(values if upwards else -values, kind="stable")
-    table = table.isel({along: order})
-    values = values[order]
-    inner = [*together, "requirement"]
     keeps = xr.zeros_like(table["value"], dtype=bool)
     for k, each in enumerate(required):
         keeps[{"requirement": k}] = each.holds(table["value"].isel(requirement=k))
+    upwards = is_harder_upwards(results, along, keeps)
+    order = np.argsort(values if upwards else -values, kind="stable")
+    table, keeps = table.isel({along: order}), keeps.isel({along: order})
+    values = values[order]
+    inner = [*together, "requirement"]
     applicable = table["decision"] != Decision.not_applicable
     judged = applicable.any(inner)
     all_keep = (keeps | ~applicable).all(inner) & judged
@@ -190,9 +187,14 @@ def axis_values(results: xr.Dataset, along: str) -> np.ndarray[Any, np.dtype[np.
     return values
 
 
-def harder_when_smaller(results: xr.Dataset, along: str) -> bool:  # noqa: ARG001
-    """Return whether small values of an axis are the hard ones."""
-    return along in HARDER_WHEN_SMALLER
+def is_harder_upwards(results: xr.Dataset, along: str, keeps: xr.DataArray) -> bool:
+    """Return whether large values of an axis are the hard ones; ``keeps``: what is fulfilled."""
+    first, last = ({along: int(k(results[along].values))} for k in (np.argmin, np.argmax))
+    with contextlib.suppress(DatasetError):
+        sides = image_sides(results, {})
+        if along in sides.dims:
+            return bool((sides.isel(last) <= sides.isel(first)).all())
+    return int(keeps.isel(first).sum()) >= int(keeps.isel(last).sum())
 
 
 def combined_decision(decision: xr.DataArray, dims: Sequence[str]) -> xr.DataArray:

@@ -93,8 +93,7 @@ def _execute(options: argparse.Namespace) -> int:
     else:
         for line in lines.text(found, worse, pooled):
             say(line)
-        if status == TOO_FEW_DRAWS:
-            say_next(lines.more_draws(found, results, options.store))
+        say_next(lines.more_draws(found, results, options.store))
     return status
 
 

@@ -89,7 +89,7 @@ def text(
     for one in worse:
         state = "worse" if one.worse else "not worse"
         yield (f"{state:10} {one.quantity}: {number(one.difference)} "
-               f"({interval(one.low, one.high)}) {one.units}, new minus old"
+               f"({interval(one.low, one.high)}){' ' * bool(one.units)}{one.units}, new minus old"
                f"{_at(one.condition)}{_configuration(one.configuration)}")
     if pooled:
         yield f"pooled over {', '.join(pooled)}; --per keeps axes apart as conditions"

@@ -16,6 +16,7 @@ from sweep.cli.output import print_json, say, say_next
 if TYPE_CHECKING:
     from sweep.execution.progress import Progress
     from sweep.isolation.child_process import Child
+    from sweep.plan.experiment import Pipeline
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -121,8 +122,25 @@ def _execute_beside(child: Child, options: argparse.Namespace) -> int:
     if summary.advice:
         say_next(summary.advice)
     else:
-        say_next(f"sweep report {shlex.quote(summary.store)}")
+        say_next(_requiring_command(pipeline, summary.store) if pipeline.requirements
+                 else f"sweep report {shlex.quote(summary.store)}")
     return int(summary.nothing_computed)
+
+
+def _requiring_command(pipeline: Pipeline, url: str) -> str:
+    """Return the command that decides on the pipeline's requirements.
+
+    A store keeps those that it was made with: others are given.
+    """
+    from sweep.store.lifecycle import open_store  # noqa: PLC0415
+
+    stored = open_store(url).pipeline
+    if (stored.requirements, stored.require_per) == (pipeline.requirements, pipeline.require_per):
+        return f"sweep require {shlex.quote(url)}"
+    say("the store keeps the requirements that it was made with; the next line has the new ones")
+    per = [name for name in pipeline.require_per if pipeline.axis(name) is not None]
+    return shlex.join(["sweep", "require", url, *pipeline.requirements,
+                       *(["--per", ",".join(per)] if per else [])])
 
 
 def _growing_command(options: argparse.Namespace, url: str) -> str:

@@ -188,13 +188,17 @@ def axis_values(results: xr.Dataset, along: str) -> np.ndarray[Any, np.dtype[np.
 
 
 def is_harder_upwards(results: xr.Dataset, along: str, keeps: xr.DataArray) -> bool:
-    """Return whether large values of an axis are the hard ones; ``keeps``: what is fulfilled."""
+    """Return whether large values of an axis are the hard ones.
+
+    ``keeps`` is large, or true, where the requirements are fulfilled: it decides for an axis that
+    does not change the size in the image.
+    """
     first, last = ({along: int(k(results[along].values))} for k in (np.argmin, np.argmax))
     with contextlib.suppress(DatasetError):
         sides = image_sides(results, {})
         if along in sides.dims:
             return bool((sides.isel(last) <= sides.isel(first)).all())
-    return int(keeps.isel(first).sum()) >= int(keeps.isel(last).sum())
+    return float(keeps.isel(first).sum()) >= float(keeps.isel(last).sum())
 
 
 def combined_decision(decision: xr.DataArray, dims: Sequence[str]) -> xr.DataArray:

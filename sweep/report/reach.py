@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import detection_rate
-from sweep.analysis.farthest import Reach, farthest_met, harder_when_smaller
+from sweep.analysis.farthest import Reach, farthest_met, is_harder_upwards
 from sweep.report.configurations import Settings
 from sweep.report.grouping import CONFIGURATION, by_configuration
 from sweep.report.question import Course
@@ -136,10 +136,10 @@ def reaches_without_draws(
 ) -> Reaches:
     """Return how far the detection rate is at least ``rate`` in a store without draws."""
     along, angle = str(course.along), course.angle
-    upwards = not harder_when_smaller(data.results, along)
-    values = _easy_first(data, along, upwards=upwards)
     table = detection_rate(_of_settings(data, settings), [
         *settings.axes, *([angle] if angle else []), *course.at_all, along]).compute()
+    upwards = is_harder_upwards(data.results, along, table["detection_rate"])
+    values = _easy_first(data, along, upwards=upwards)
     lowest = table["detection_rate"].min(list(course.at_all)).sel({along: list(values)})
     limits = []
     for each in _rows(lowest.to_dataset(name="rate"), settings, angle):

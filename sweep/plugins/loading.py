@@ -200,7 +200,7 @@ def _record(kind: str, found: Any) -> Plugin:
     if isinstance(found, Plugin) and isinstance(found, wanted):
         return found
     if isinstance(found, Plugin) or not callable(found) or kind not in FACTORY:
-        raise PluginError(f"a {wanted.__name__}, not a {type(found).__name__}")
+        raise PluginError(f"a record {wanted.__name__}, not a value of type {type(found).__name__}")
     made: Plugin = wanted(**{FACTORY[kind]: found})
     return made
 

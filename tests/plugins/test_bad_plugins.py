@@ -140,7 +140,7 @@ def test_a_detector_that_ends_its_process_or_never_returns_refuses_the_run(pipel
     ("import missing_library", "cannot be imported" ),
     ("x =", "SyntaxError"),
     ("raise SystemExit(2)", "SystemExit: 2 (line 1 of mine.py)"),
-    ("D = 3", "a DetectorPlugin, not a int"),
+    ("D = 3", "a record DetectorPlugin, not a value of type int"),
     ("", "a name in mine.py"),
     ("from sweep.plugins import DetectorPlugin\nD = DetectorPlugin(make=1)",
      "TypeError: make: expected a class or function of settings and family (line 2 of mine.py)"),
@@ -149,7 +149,7 @@ def test_a_detector_that_ends_its_process_or_never_returns_refuses_the_run(pipel
     ("from sweep.plugins import *\nD = DetectorPlugin(make=print, distribution='not-there-9')",
      "the distribution not-there-9, which is not installed: `pip install not-there-9`"),
     ("from sweep.plugins import *\nD = EstimatorPlugin(make=print)",
-     "a DetectorPlugin, not a EstimatorPlugin"),
+     "a record DetectorPlugin, not a value of type EstimatorPlugin"),
     ("""
 from dataclasses import dataclass
 from sweep.plugins import DetectorPlugin, parameter

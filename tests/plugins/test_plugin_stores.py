@@ -1,0 +1,131 @@
+"""Stores of runs with plug-ins: recorded, continued, reused, and read where the plug-in is not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import sweep
+from sweep.analysis.stored_parameters import parameter_value
+from sweep.cli import main
+from sweep.errors import OtherExperimentError, PipelineError, StoreError
+from sweep.execution.runner import execute
+from sweep.plan.experiment import Pipeline
+from sweep.store.lifecycle import open_store
+from sweep.store.provenance import fingerprint
+from tests.plugins.test_detector_plugins import MINE
+from tests.support.here import calls_here
+from tests.support.stores import same
+
+TEXT = """
+[camera]
+width_px = 160
+height_px = 120
+[marker]
+size_m = 0.05
+[pose]
+side_px = 50
+[detector]
+shift_px = 0.25
+[axes]
+tilt_deg = [0, 40]
+detector = ["opencv", "mine:TURNED"]
+"""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder with a pipeline, its plug-in, and its store."""
+    folder = tmp_path_factory.mktemp("plugged")
+    (folder / "mine.py").write_text(MINE)
+    (folder / "grid.toml").write_text(TEXT)
+    with calls_here():
+        execute(Pipeline.from_toml(folder / "grid.toml"), folder / "grid.zarr", workers=None)
+    return folder
+
+
+@pytest.fixture
+def without(made, tmp_path):
+    """The same folder, from which the plug-in's file was taken away."""
+    (made / "mine.py").rename(tmp_path / "mine.py")
+    yield made
+    (tmp_path / "mine.py").rename(made / "mine.py")
+
+
+@pytest.fixture
+def changed(made):
+    """The same folder, in which the plug-in's file was changed."""
+    (made / "mine.py").write_text(MINE + "# another version\n")
+    yield made
+    (made / "mine.py").write_text(MINE)
+
+
+def test_the_dataset_has_the_detector_and_its_setting(made):
+    results = sweep.open(made / "grid.zarr")
+    assert results.detector.values.tolist() == ["opencv", "mine:TURNED"]
+    assert float(results.shift_px) == 0.25
+    assert results.shift_px.attrs["units"] == "px"
+    shift = results.corner_error_px.diff("detector").values
+    np.testing.assert_allclose(shift, 0.25, atol=1e-5)  # paired: the same images
+    assert parameter_value(results.drop_vars("shift_px"), "shift_px") == 0.25
+
+
+def test_the_same_pipeline_is_finished_and_the_file_is_in_the_fingerprint(made):
+    pipeline = Pipeline.from_toml(made / "grid.toml")
+    assert open_store(str(made / "grid.zarr")).fingerprint == fingerprint(pipeline)
+    assert list(pipeline.files) == ["mine.py"]
+    assert execute(pipeline, made / "grid.zarr").computed_blocks == 0
+
+
+def test_a_changed_file_is_not_continued(changed):
+    pipeline = Pipeline.from_toml(changed / "grid.toml")
+    with pytest.raises(OtherExperimentError, match=r"files: the store has \{'mine.py': "):
+        execute(pipeline, changed / "grid.zarr")
+    with pytest.raises(StoreError, match="no cell of it can be reused"):
+        execute(pipeline, changed / "other.zarr", reuse=[changed / "grid.zarr"])
+
+
+def test_a_store_is_read_without_its_plug_in(without, capsys):
+    results = sweep.open(without / "grid.zarr")
+    assert (results.detection == 1).all()
+    assert parameter_value(results.drop_vars("shift_px"), "shift_px") == 0.25
+    assert main(["status", str(without / "grid.zarr")]) == 0
+    capsys.readouterr()
+    with pytest.raises(PipelineError, match=r"expected the file mine\.py in"):
+        Pipeline.from_toml(without / "grid.toml")
+
+
+@pytest.mark.long
+def test_a_store_is_reported_and_verified_without_its_plug_in(without, capsys):
+    store = str(without / "grid.zarr")
+    with calls_here():
+        assert main(["report", store, "--format", "md", "-o", str(without / "report.md")]) == 0
+        capsys.readouterr()
+        assert main(["verify", store]) == 0
+        assert "no scene recomputed" in capsys.readouterr().out
+        assert main(["repro", store]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "expected the file mine.py in" in line
+
+
+@pytest.mark.long
+def test_verify_and_repro_recompute_with_the_plug_in(made, capsys):
+    store = str(made / "grid.zarr")
+    assert main(["verify", store, "--sample", "2"]) == 0
+    assert "recomputed" in capsys.readouterr().out
+    for detector in ("opencv", "mine:TURNED"):
+        assert main(["repro", store, "--at", f"tilt_deg=40,detector={detector}"]) == 0
+        assert "the same" in capsys.readouterr().out
+
+
+@pytest.mark.long
+def test_cells_of_opencv_are_reused_beside_a_plug_in(made, tmp_path):
+    plain = Pipeline.from_text(TEXT.replace("shift_px = 0.25\n", "").replace(
+        'detector = ["opencv", "mine:TURNED"]\n', ""))
+    both = Pipeline.from_toml(made / "grid.toml")
+    with calls_here():
+        execute(plain, tmp_path / "plain.zarr")
+        assert "plugins" not in open_store(str(tmp_path / "plain.zarr")).fingerprint
+        summary = execute(both, tmp_path / "both.zarr", reuse=[tmp_path / "plain.zarr"])
+    assert summary.computed_estimates == 2  # of four: the others are OpenCV's
+    assert same(tmp_path / "both.zarr", made / "grid.zarr")

@@ -132,8 +132,8 @@ class _Poison:
         self._here.cells = cells
         return self._real["scene_values"](pipeline, indices)
 
-    def build_scenes(self, values, count):
-        scenes = self._real["build_scenes"](values, count)
+    def build_scenes(self, *arguments):
+        scenes = self._real["build_scenes"](*arguments)
         self._made.append((scenes, self._here.cells))
         self._act("truth", self._here.cells)
         return scenes

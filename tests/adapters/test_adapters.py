@@ -1,0 +1,135 @@
+"""The adapters of other packages' detectors; each test skips where its package is missing."""
+
+import importlib
+import importlib.metadata
+from unittest import mock
+
+import cv2
+import numpy as np
+import pytest
+
+import sweep
+from support.here import Here
+from sweep import Pipeline, PipelineError
+from sweep.conformance.check import check_detector
+from sweep.evaluation.inspection import scene_image
+from sweep.plan.cell_selection import cell
+from sweep.plugins.loading import load
+
+MODULES = {
+    "pyapriltags": "pyapriltags", "pupil-apriltags": "pupil_apriltags",
+    "robotpy-apriltag": "robotpy_apriltag", "locus-tag": "locus", "stag-python": "stag",
+}
+
+RUN = """
+title = "Detectors on the same images"
+seed = 4
+[camera]
+width_px = 320
+height_px = 240
+fx_px = 500.0
+[marker]
+dictionary = "DICT_APRILTAG_36h11"
+size_m = 0.1
+[pose]
+side_px = 70
+jitter_px = 0.5
+roll_deg = 30
+[scene]
+noise_grey = 2
+[detector]
+quad_decimate = 1
+[axes]
+tilt_deg = [0, 35]
+detector = ["opencv", "pyapriltags"]
+trial = 4
+"""
+
+
+@pytest.fixture(params=MODULES)
+def detector(request):
+    pytest.importorskip(MODULES[request.param])
+    return request.param
+
+
+def test_an_adapter_conforms(detector):
+    with mock.patch("sweep.conformance.check.Child", Here):
+        report = check_detector(detector, calls=0)
+    assert report.conforms, report.findings
+    assert max(map(abs, report.offset_px)) < 0.02
+
+
+@pytest.mark.long
+def test_all_families_of_an_adapter_come_in_our_order(detector):
+    for family in load("detector", detector, ".").families:
+        if family in ("tagCircle49h12", "tagCustom48h12", "tagStandard52h13"):
+            continue  # seconds and gigabytes each
+        with mock.patch("sweep.conformance.check.Child", Here):
+            report = check_detector(detector, family, calls=0)
+        assert report.detected >= 24, family
+        assert report.conforms, (family, report.findings)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("family", ["tagCircle49h12", "tagCustom48h12", "tagStandard52h13"])
+def test_large_families_come_in_our_order(family):
+    pytest.importorskip("pyapriltags")
+    report = check_detector("pyapriltags", family, calls=0, time_limit_s=300)
+    assert report.conforms, report.findings
+
+
+def test_a_run_is_a_plain_loop_with_the_package(tmp_path):
+    package = pytest.importorskip("pyapriltags")
+    pipeline = Pipeline.from_text(RUN)
+    results = sweep.run(pipeline, store=str(tmp_path / "run.zarr")).load()
+    plain = package.Detector(families="tag36h11", nthreads=1, quad_decimate=1.0)
+    square = 0.05 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]], dtype=float)
+    camera = np.array([[500, 0, 159.5], [0, 500, 119.5], [0, 0, 1.0]])
+    for tilt in (0, 35):
+        for trial in range(4):
+            single = cell(pipeline, f"tilt_deg={tilt},trial={trial},detector=pyapriltags")
+            image = np.ascontiguousarray(scene_image(single, whole_frame=True))
+            (tag,) = plain.detect(image)
+            ours = results.sel(tilt_deg=tilt, trial=trial, detector="pyapriltags")
+            truth, _ = cv2.projectPoints(
+                square, ours.true_rvec.values, ours.true_tvec_m.values, camera, None
+            )
+            # AprilTag's corners are TR, TL, BL, BR of OpenCV's marker, pixel centres at 0.5.
+            error = np.asarray(tag.corners)[[1, 0, 3, 2]] - 0.5 - truth[:, 0]
+            assert np.abs(ours.corner_error_px.values - error).max() < 1e-6
+            other = results.sel(tilt_deg=tilt, trial=trial, detector="opencv")
+            assert np.abs(other.corner_error_px.values).max() < 2
+
+
+def test_a_missing_package_is_told_with_its_command(monkeypatch):
+    if not importlib.metadata.entry_points(group="sweep.detectors", name="locus-tag"):
+        pytest.skip("installed before there were adapters")
+    version = importlib.metadata.version
+
+    def without(name):
+        if name == "locus-tag":
+            raise importlib.metadata.PackageNotFoundError(name)
+        return version(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", without)
+    with pytest.raises(PipelineError, match=r"pip install 'fiducial-sweep\[locus-tag\]'"):
+        Pipeline.from_text(
+            RUN.replace('["opencv", "pyapriltags"]', '["locus-tag"]').replace(
+                "quad_decimate = 1", ""
+            )
+        )
+
+
+def test_settings_of_adapters_reach_their_packages():
+    pytest.importorskip("pyapriltags")
+    plugin = load("detector", "pyapriltags", ".")
+    text = RUN.replace('detector = ["opencv", "pyapriltags"]', 'detector = ["pyapriltags"]')
+    image = np.ascontiguousarray(scene_image(
+        cell(Pipeline.from_text(text), "tilt_deg=35"), whole_frame=True))
+    corners = {}
+    for decimate in (1.0, 2.0):
+        corners[decimate] = plugin.make(plugin.settings(quad_decimate=decimate), "tag36h11")(image)
+        assert len(corners[decimate].ids) == 1
+    assert not np.array_equal(corners[1.0].corners, corners[2.0].corners)
+    strict = plugin.make(plugin.settings(min_decision_margin=250.0), "tag36h11")(image)
+    assert len(strict.ids) == 0

@@ -1,0 +1,104 @@
+"""All detectors on the same exact images: corners, offsets, misses, time.
+
+    pip install '.[detectors]'
+    python tests/benchmarks/bench_detectors.py              # 1,000 scenes, without and with noise
+
+Frames of 640 x 480 px with one 36h11 marker, sides of 60 to 150 px, tilts to 45°; the second half
+of the scenes is the point reflection of the first. Whole frames, one thread. STag has markers of
+its own (HD21), in the same poses. Offsets come with their standard error over pairs of scenes; RMS
+(of a corner's distance beside the mean offset) and the share that is found with 95 % intervals,
+by a bootstrap over pairs, and Wilson's; times are medians. Each detector has a process of its own.
+"""
+
+import argparse
+import time
+
+import bench_detectors  # functions that a child process calls are of a module
+import cv2
+import numpy as np
+
+from sweep.analysis.intervals import wilson
+from sweep.conformance.scenes import trial_pipeline, trial_scenes
+from sweep.isolation.child_process import Child, ChildDiedError
+from sweep.measure.detectors import make_detector
+
+TAG, STAG = "DICT_APRILTAG_36h11", "STAG_HD21"
+METHODS = {
+    **{f"opencv {name}": ("opencv", TAG, (f"cornerRefinementMethod={name}",))
+       for name in ("none", "contour", "subpix", "apriltag")},
+    **{f"{name}, quad_decimate {decimate}": (name, TAG, (f"quad_decimate={decimate}",))
+       for name in ("pupil-apriltags", "robotpy-apriltag", "pyapriltags") for decimate in (1, 2)},
+    **{f"locus-tag {name}": ("locus-tag", TAG, (f"locus_profile={name}",))
+       for name in ("standard", "high_accuracy")},
+    "stag-python": ("stag-python", STAG, ()),
+}
+
+
+def searched(name, scenes, noise):
+    """Return errors (scenes, 4, 2) px, NaN if missed, and seconds (scenes,)."""
+    cv2.setNumThreads(1)
+    detector, dictionary, chosen = METHODS[name]
+    shown = trial_scenes(
+        trial_pipeline(detector, dictionary, (*chosen, f"noise_grey={noise}"), ".", scenes)
+    )
+    find = make_detector(shown.setting)
+    find(shown.images[0], dictionary, 640)  # what is made once is made
+    errors, seconds = np.full((scenes, 4, 2), np.nan), np.full(scenes, np.nan)
+    for row, image in enumerate(shown.images):
+        begun = time.perf_counter()
+        corners, ids, _ = find(image, dictionary, 640)
+        seconds[row] = time.perf_counter() - begun
+        right = [] if ids is None else [
+            np.reshape(quad, (4, 2)) - shown.corners_px[row]
+            for quad, number in zip(corners, np.ravel(ids), strict=True)
+            if number == shown.marker_id[row]
+        ]
+        if right:
+            errors[row] = min(right, key=lambda error: (error**2).sum())
+    return errors, seconds
+
+
+def line(name, errors, seconds, rng):
+    """Return a row of the table."""
+    half = len(errors) // 2
+    found = ~np.isnan(errors).any(axis=(1, 2))
+    pairs = errors.reshape(2, half, 4, 2)[:, found.reshape(2, half).all(axis=0)]
+    means = pairs.mean(axis=(0, 2))
+    offset, spread = means.mean(axis=0), means.std(axis=0, ddof=1) / np.sqrt(len(means))
+    squares = ((pairs - offset) ** 2).sum(axis=3).mean(axis=(0, 2))
+    draws = rng.integers(len(squares), size=(2000, len(squares)))
+    low, high = np.sqrt(np.quantile(squares[draws].mean(axis=1), [0.025, 0.975]))
+    rate_low, rate_high = wilson(int(found.sum()), len(found))
+    return (
+        f"| {name} | {np.sqrt(squares.mean()):.3f} ({low:.3f}-{high:.3f}) "
+        f"| {offset[0]:+.3f} ± {spread[0]:.3f}, {offset[1]:+.3f} ± {spread[1]:.3f} "
+        f"| {found.mean():.3f} ({float(rate_low):.3f}-{float(rate_high):.3f}) "
+        f"| {1e3 * np.median(seconds):.1f} |"
+    )
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scenes", type=int, default=1000)
+    parser.add_argument("--noise", type=float, nargs="+", default=[0.0, 3.0])
+    parser.add_argument("--only", default="", help="methods whose names contain this")
+    options = parser.parse_args()
+    for noise in options.noise:
+        print(f"\n{options.scenes} scenes, noise of {noise:g} grey levels\n")
+        print("| detector | RMS, px | mean offset x, y, px | found | ms |")
+        print("| --- | --- | --- | --- | --- |")
+        for name in METHODS:
+            if options.only in name:
+                with Child("bench_detectors") as child:
+                    try:
+                        results = child.call(
+                            bench_detectors.searched, name, options.scenes, noise, limit_s=3600
+                        )
+                    except ChildDiedError as death:
+                        print(f"| {name} | ended its process: {death} |")
+                    else:
+                        print(line(name, *results, np.random.default_rng(4)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -246,7 +246,10 @@ def _axis(axis: Axis) -> list[PlannedArray]:
     attributes = {"zip": " ".join(axis.columns)} if axis.zipped else {}
     return [
         _coordinate(axis, axis.name, attributes),
-        *(_coordinate(Axis(name, values), axis.name, {}) for name, values in axis.zipped),
+        *(
+            _coordinate(Axis(name, values, plugged=axis.plugged), axis.name, {})
+            for name, values in axis.zipped
+        ),
     ]
 
 

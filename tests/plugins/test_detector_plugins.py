@@ -9,6 +9,7 @@ from sweep.errors import PipelineError
 from sweep.evaluation.cells import run_cells
 from sweep.measure.flags import DetectionStatus
 from sweep.plan.experiment import Pipeline
+from sweep.store.lifecycle import create_store, open_dataset
 
 MINE = '''
 from dataclasses import dataclass
@@ -73,6 +74,15 @@ def test_a_detector_of_other_conventions_gives_opencv_s_corners(folder):
     np.testing.assert_allclose(plain, opencv, rtol=0, atol=1e-5)  # OpenCV's corners are float32
     np.testing.assert_allclose(shifted, opencv + 0.25, rtol=0, atol=1e-5)
     assert (np.array(columns["detection"]) == DetectionStatus.detected).all()
+
+
+def test_detectors_go_together_with_their_settings_along_one_axis_of_a_store(folder):
+    grid = GRID.replace('detector = ["opencv", "mine:TURNED"]', """method = { zip = {
+        detector = ["opencv", "mine:TURNED"], shift_px = [0, 0.25] } }""").replace("\n    ", " ")
+    store = create_store(str(folder / "s.zarr"), Pipeline.from_text(grid, folder=folder), (2,))
+    along = open_dataset(store.url)["shift_px"]
+    assert (along.dims, along.values.tolist()) == (("method",), [0, 0.25])
+    assert along.attrs["units"] == "px"
 
 
 def test_settings_are_checked_as_our_own(folder):

@@ -10,6 +10,7 @@ from typing import NoReturn
 from sweep.cli.check_detector import CHECK_DETECTOR
 from sweep.cli.command import Command
 from sweep.cli.completion import COMPLETION
+from sweep.cli.error_model import ERROR_MODEL
 from sweep.cli.export import EXPORT
 from sweep.cli.output import flushed
 from sweep.cli.plan import PLAN
@@ -27,8 +28,13 @@ from sweep.messages import nearest
 from sweep.version import __version__
 
 COMMANDS = (
+<<<<<<< HEAD
     RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, VERIFY, STATUS, EXPORT, SCORE,
     CHECK_DETECTOR, PLUGINS, COMPLETION,
+=======
+    RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, ERROR_MODEL, VERIFY, STATUS, EXPORT,
+    COMPLETION,
+>>>>>>> 4d22264 (Error models to take away: bias and standard deviation of the pose over distance, side and viewing angle, with a check on held-out draws, as JSON, C++, Python, Java and ROS covariances)
 )
 """Every command, in the order in which the help lists them."""
 

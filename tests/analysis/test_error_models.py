@@ -1,0 +1,349 @@
+"""Error models against the laws that made the errors, plain NumPy, SciPy and real stores."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import optimize
+
+import sweep
+from support.here import calls_here
+from support.pose_errors import FX, SIZE_M, minimal_turn, poses_with_law, power_law
+from support.stores import by_hand
+from sweep.analysis import error_models, model_covariance, model_errors
+from sweep.analysis.error_models import Use
+from sweep.analysis.sight_frame import in_sight_frame, sight_rotation
+from sweep.errors import ArgumentError, DatasetError
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.plan.experiment import Pipeline
+
+SIX = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
+GRID = {"distance_m": [1.0, 1.5, 2.2, 3.3, 5.0], "tilt_deg": [0.0, 20.0, 40.0, 60.0]}
+
+
+def axes(trials, **others):
+    return GRID | others | {"trial": list(range(trials))}
+
+
+@pytest.fixture(scope="module")
+def results():
+    return poses_with_law(1, axes(150), power_law)
+
+
+@pytest.fixture(scope="module")
+def models(results):
+    return error_models(results)
+
+
+def in_sight(results):
+    """Return the errors (distance, tilt, trial, 6) in the sight frame, by a rotation per pose."""
+    position = results["true_tvec_m"].values
+    turn = minimal_turn(position / np.linalg.norm(position, axis=-1, keepdims=True))
+    return np.concatenate([
+        np.einsum("...ji,...j->...i", turn, results[name].values.astype(float))
+        for name in ("translation_error_m", "rotation_error_rad")], axis=-1)
+
+
+def test_a_known_law_is_found_again(models):
+    # 24 values of each of 6 errors: 4.9 standard errors, 1e-6 each.
+    at = models.isel(side_px=0)
+    distance, angle = np.meshgrid(at.distance_m, at.viewing_angle_deg, indexing="ij")
+    bias, sigma = power_law(distance, None, angle)
+    for k, name in enumerate(SIX):
+        one = at.sel(quantity=name)
+        error = np.log(one.sigma_high / one.sigma).values / 1.96
+        assert (np.abs(np.log(one.sigma.values / sigma[..., k])) < 4.9 * error).all(), name
+        error = (one.bias_high - one.bias).values / 1.96
+        assert (np.abs(one.bias.values - bias[..., k]) < 4.9 * error).all(), name
+    assert models.knots.sel(predictor="distance_m").values.tolist() == [2] * 6
+    error = (models.exponent_high - models.exponent).values / 1.96
+    assert (np.abs(models.exponent - [2, 2, 2.5, 1.5, 1.5, 1]) < 4.9 * error).all()
+
+
+def test_a_model_holds_in_nearly_all_cells_of_its_own_law(models):
+    # 20 cells of 6 errors; one of 150 errors is outside 0.93 - 0.017 or 0.97 + 0.017 in 6 %.
+    use = models.use.values
+    assert (use == Use.holds).mean() > 0.8
+    assert set(np.unique(use)) <= {Use.holds, Use.too_narrow, Use.too_wide}
+    assert float(models.coverage.mean()) == pytest.approx(0.9545, abs=0.01)
+
+
+def test_each_cell_as_a_knot_gives_the_moments_of_plain_numpy():
+    def jumping(distance, side, angle):
+        bias, sigma = power_law(distance, side, angle)
+        factor = np.where(np.isclose(distance, 2.2), 8.0, 1.0) * np.where(angle > 30, 5.0, 1.0)
+        factor *= np.where(np.isclose(distance, 1.5) & (angle > 50), 6.0, 1.0)
+        return bias, sigma * factor[..., None]
+
+    results = poses_with_law(2, axes(100), jumping)
+    models = error_models(results)
+    assert models.sizes["distance_m"] == 5
+    errors = in_sight(results)
+    full = models.knots.sel(predictor=["distance_m", "viewing_angle_deg"]).values.tolist() == (
+        [[5, 4]] * 6)
+    assert full
+    n = errors[..., 0].size
+    expected = errors.std(axis=2) * math.sqrt(n / (n - 20))
+    found = models.sigma.isel(side_px=0).transpose("distance_m", "viewing_angle_deg", "quantity")
+    # Knots at the ends lie 2e-6 outside; the ridge moves a knot by 1e-3 of what differs.
+    np.testing.assert_allclose(found, expected, rtol=0.02)
+    bias = models.bias.isel(side_px=0).transpose("distance_m", "viewing_angle_deg", "quantity")
+    assert (np.abs(bias - errors.mean(axis=2)) < 0.05 * expected).all()
+
+
+def test_the_fit_is_the_maximum_of_the_likelihood(results, models):
+    """SciPy's optimizer over the same four coefficients: a power law and two knots of the angle."""
+    errors = in_sight(results)[..., 5].ravel()
+    distance = results.true_tvec_m.values[..., 2].ravel()
+    angle = np.broadcast_to(np.array(GRID["tilt_deg"])[None, :, None], (5, 4, 150)).ravel()
+    assert models.knots.sel(quantity="rotation_z").values.tolist() == [2, 1, 2]
+    u = np.log(distance) / np.log(5.0)
+    v = angle / 60.0
+    basis = np.stack([(1 - u) * (1 - v), (1 - u) * v, u * (1 - v), u * v], axis=-1)
+
+    def loss(p):
+        log_sigma = basis @ p[:4]
+        return float((log_sigma + 0.5 * (errors - basis @ p[4:] * 1e-3)**2
+                      * np.exp(-2 * log_sigma)).mean())
+
+    start = np.concatenate([np.full(4, np.log(errors.std())), np.zeros(4)])
+    best = optimize.minimize(loss, start, method="BFGS", options={"gtol": 1e-9}).x
+    n = errors.size
+    corners = models.sel(quantity="rotation_z").isel(
+        side_px=0, distance_m=[0, -1], viewing_angle_deg=[0, -1])
+    np.testing.assert_allclose(corners.sigma.values.ravel(),
+                               np.exp(best[:4]) * math.sqrt(n / (n - 4)), rtol=5e-3)  # the ridge
+    assert (np.abs(corners.bias.values.ravel() - best[4:] * 1e-3)
+            < 0.01 * corners.sigma.values.ravel()).all()
+
+
+def test_the_coverage_is_that_of_errors_which_were_not_fitted():
+    """Every cell a knot: the other half's moments judge each half."""
+    def jumping(distance, side, angle):
+        bias, sigma = power_law(distance, side, angle)
+        return bias, sigma * np.where(np.isclose(distance, 2.2), 20.0, 1.0)[..., None]
+
+    grid = {"distance_m": [1.0, 2.2, 5.0], "tilt_deg": [30.0], "trial": list(range(400))}
+    results = poses_with_law(3, grid, jumping)
+    models = error_models(results)
+    errors = in_sight(results)[:, 0]
+    within = np.zeros((3, 6))
+    for half in (0, 1):
+        fitted, judged = errors[:, half::2], errors[:, 1 - half::2]
+        sigma = fitted.std(axis=1) * math.sqrt(600 / 597)
+        within += (np.abs(judged - fitted.mean(axis=1)[:, None]) <= 2 * sigma[:, None]).sum(axis=1)
+    found = models.coverage.isel(cell_side_px=0, cell_viewing_angle_deg=0).T
+    np.testing.assert_allclose(found, within / 400, atol=0.006)  # the ridge: 2 of 400
+
+
+def test_flips_missing_poses_and_tails_are_flagged():
+    grid = {"distance_m": [1.0, 2.0, 3.0, 4.0, 5.0], "tilt_deg": [30.0],
+            "trial": list(range(400))}
+
+    def law(rng, size):
+        unit = rng.normal(size=size)
+        # At 4 m: few large errors, most of them small; at 5 m: of one size.
+        unit[3] = np.where(rng.random(size[1:]) < 0.08, 3.5 * unit[3], 0.02 * unit[3])
+        unit[4] = np.sign(unit[4])
+        return unit
+
+    results = poses_with_law(4, grid, power_law, normal=law)
+    results["flipped"].values[0, 0, :20] = Flipped.flipped
+    results["rotation_error_rad"].values[0, 0, :20] = 1.0
+    lost = results["estimate"].values
+    lost[1, 0, :60] = EstimateStatus.no_detection
+    results["detection"].values[1, 0, :60] = DetectionStatus.no_candidate
+    results["translation_error_m"].values[1, 0, :60] = np.nan
+    results["rotation_error_rad"].values[1, 0, :60] = np.nan
+    models = error_models(results)
+    use = models.use.isel(cell_side_px=0, cell_viewing_angle_deg=0)
+    assert (use.isel(cell_distance_m=0) == Use.flips).all()
+    assert (use.isel(cell_distance_m=1) == Use.rarely_solved).all()
+    assert (use.isel(cell_distance_m=2) == Use.holds).sum() >= 3
+    assert (use.isel(cell_distance_m=4) == Use.too_wide).all()
+    assert models.flip_rate.values.ravel()[0] == pytest.approx(0.05)
+    assert models.solved_rate.values.ravel()[1] == pytest.approx(0.85)
+    first = models.isel(distance_m=0).sigma.sel(quantity="rotation_x")
+    assert float(first.max()) < 0.01  # the flips of 1 rad are not in it
+
+
+def test_off_the_axis_the_covariance_is_turned_with_the_line_of_sight():
+    results = poses_with_law(5, axes(100), power_law, bearing_deg=25.0)
+    models = error_models(results)
+    assert float(np.abs(models.camera_coverage - 0.9545).mean()) < 0.03
+    position = np.array([0.8, -0.6, 2.0])
+    angle = 30.0
+    pose = model_covariance(models, position, angle)
+    covariance, bias = pose.covariance.values, pose.bias.values
+    one = model_errors(models, 2.0, angle)
+    turn = minimal_turn(position / np.linalg.norm(position))
+    for part in (slice(0, 3), slice(3, 6)):
+        expected = turn @ np.diag(one.sigma.values[0, part]**2) @ turn.T
+        np.testing.assert_allclose(covariance[0, part, part], expected, rtol=1e-9, atol=1e-20)
+        np.testing.assert_allclose(bias[0, part], turn @ one.bias.values[0, part], atol=1e-15)
+    np.testing.assert_allclose(sight_rotation(position), turn, atol=1e-14)
+    np.testing.assert_allclose(in_sight_frame(turn[:, 2], position), [0, 0, 1], atol=1e-14)
+
+
+def test_size_and_distance_are_told_apart_where_both_vary():
+    def of_side(distance, side, angle):
+        bias, sigma = power_law(np.ones_like(distance), side, 0 * angle)
+        return bias, sigma * distance[..., None] * (100.0 / side[..., None]) ** 1.5
+
+    results = poses_with_law(6, {"size_m": [0.1, 0.2], "distance_m": [1.0, 2.0, 4.0],
+                                 "tilt_deg": [10.0, 40.0], "trial": list(range(120))}, of_side)
+    models = error_models(results)
+    assert models.attrs["focal_size_varies"]
+    with pytest.raises(ArgumentError, match="side_px = None"):
+        model_errors(models, 2.0, 20.0)
+    distance, side = np.array([1.0, 2.0, 2.0, 4.0]), FX * np.array([0.1, 0.1, 0.2, 0.2])
+    found = model_errors(models, distance, 20.0, side / distance)
+    expected = 1e-3 * distance * (100.0 / (side / distance)) ** 1.5
+    np.testing.assert_allclose(found.sigma.sel(quantity="z"), expected, rtol=0.15)
+    assert np.isnan(model_errors(models, 1.0, 20.0, 23.0).sigma).all()  # not in the store
+
+
+def test_configurations_are_not_pooled_and_chunks_do_not_matter():
+    axes = {"distance_m": [1.0, 3.0], "tilt_deg": [10.0, 40.0], "solver": ["a", "b"]}
+    results = poses_with_law(7, axes | {"trial": list(range(120))}, power_law)
+    results["translation_error_m"].values[..., 1, :] *= 3.0
+    models = error_models(results)
+    ratio = (models.sigma.sel(solver="b") / models.sigma.sel(solver="a")).sel(
+        quantity=["x", "y", "z"])
+    np.testing.assert_allclose(ratio, 3.0, rtol=0.5)
+    alone = error_models(results.isel(solver=[1]))
+    lazy = error_models(results.chunk({"distance_m": 1, "trial": 50}))
+    for name in ("coverage", "use", "judged", "exponent"):
+        np.testing.assert_allclose(lazy[name], models[name], rtol=1e-7)
+        np.testing.assert_allclose(
+            alone[name].isel(solver=0), models[name].isel(solver=1), rtol=1e-7)
+
+
+def test_outside_the_domain_nothing_is_told(models):
+    for distance, angle in ((0.9, 20.0), (5.1, 20.0), (2.0, 61.0), (-2.0, 20.0), (np.nan, 20.0)):
+        out = model_errors(models, distance, angle)
+        assert np.isnan(out.sigma).all()
+        assert np.isnan(out.bias).all()
+        assert (out.use == Use.no_poses).all()
+        assert np.isnan(out.flip_rate).all()
+    assert np.isfinite(model_errors(models, [1.0, 5.0], [0.0, 60.0]).sigma).all()
+    assert float(FX * SIZE_M / 1.0) == pytest.approx(models.attrs["focal_size_px_m"])
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    (lambda d: d.isel(trial=[0]), "trial has 1 value: an error model is fitted to some"),
+    (lambda d: d.isel(trial=slice(0, None, 2)), "trial has no even or no odd values"),
+    (lambda d: d.isel(trial=slice(0, 4)), "80 solved poses that are not flipped; an error model"),
+    (lambda d: d.assign(estimate=0 * d.estimate), "0 solved poses"),
+    (lambda d: d.assign(detection=0 * d.detection), "no pose was looked for"),
+    (lambda d: d.drop_vars("true_rvec"), "no variable true_rvec"),
+    (lambda d: d.assign_attrs(pipeline="").drop_attrs(), "not a coordinate, and the attributes"),
+])
+def test_what_cannot_be_modelled_says_so_in_a_line(results, change, words):
+    with pytest.raises(DatasetError, match=words) as caught:
+        error_models(change(results))
+    assert "\n" not in str(caught.value)
+
+
+def test_several_models_cannot_be_asked_at_once(models):
+    with pytest.raises(ArgumentError, match="choose one with models"):
+        model_errors(models.expand_dims(solver=["a"]), 2.0, 20.0)
+
+
+STORE = """
+seed = 3
+[camera]
+width_px = 640
+height_px = 480
+hfov_deg = 60
+[marker]
+dictionary = "DICT_4X4_50"
+size_m = 0.06
+[pose]
+azimuth_deg = {{ uniform = [0, 360] }}
+roll_deg = {{ uniform = [0, 360] }}
+bearing_x_deg = {{ uniform = [-15, 15] }}
+tilt_deg = {{ uniform = [0, 60] }}
+[scene]
+noise_grey = 2
+[detector]
+cornerRefinementMethod = "apriltag"
+[axes]
+distance_m = [0.3, 0.5, 0.7]
+trial = {trials}
+"""
+
+
+def stored(folder, trials, seed=3):
+    pipeline = Pipeline.from_text(STORE.format(trials=trials).replace("seed = 3", f"seed = {seed}"))
+    url = str(folder / f"tags{seed}.zarr")
+    with calls_here():
+        by_hand(url, pipeline)
+    return sweep.open(url)
+
+
+@pytest.mark.long
+def test_models_of_a_store_hold_for_another_store_where_they_say_so(tmp_path):
+    """Cells that hold cover 0.93 to 0.97 of the errors of another seed, with a binomial tolerance.
+
+    4.9 standard deviations a cell: 1e-6.
+    """
+    models = error_models(stored(tmp_path, 1500))
+    other = stored(tmp_path, 1500, seed=4)
+    position = other["true_tvec_m"].values.reshape(-1, 3)
+    rvec = other["true_rvec"].values.reshape(-1, 3)
+    from sweep.analysis.sight_frame import viewing_angle_of  # noqa: PLC0415
+    angle = viewing_angle_of(rvec, position)
+    said = model_errors(models, position[:, 2], angle)
+    turn = minimal_turn(position / np.linalg.norm(position, axis=-1, keepdims=True))
+    error = np.concatenate([
+        np.einsum("nji,nj->ni", turn, other[name].values.reshape(-1, 3).astype(float))
+        for name in ("translation_error_m", "rotation_error_rad")], axis=-1)
+    good = ((other.estimate.values.ravel() == EstimateStatus.solved)
+            & (other.flipped.values.ravel() == Flipped.not_flipped))
+    within = np.abs(error - said.bias.values) <= 2 * said.sigma.values
+    edges = np.append(models.cell_viewing_angle_deg_low, models.cell_viewing_angle_deg_high[-1])
+    checked, pooled = 0, []
+    for z in (0.3, 0.5, 0.7):
+        for low, high in itertools.pairwise(edges):
+            here = good & np.isclose(position[:, 2], z) & (angle >= low) & (angle < high)
+            for k in range(6):
+                used = here & (said.use.values[:, k] == Use.holds)
+                if used.sum() < 50:
+                    continue
+                tolerance = 4.9 * math.sqrt(0.95 * 0.05 / used.sum())
+                assert 0.93 - tolerance < within[used, k].mean() < 0.97 + tolerance
+                checked += 1
+                pooled.append(within[used, k])
+    print(f"{checked} cells, coverage of all {np.concatenate(pooled).mean():.4f}")
+    assert checked > 60
+    assert 0.94 < np.concatenate(pooled).mean() < 0.965
+
+
+@pytest.mark.long
+def test_intervals_hold_the_law_as_often_as_they_say():
+    """300 simulations: 0.95 of 300 x 4 corners within 0.90 to 0.98, normal and Laplace errors."""
+    for normal in (None, lambda rng, size: rng.laplace(size=size) / math.sqrt(2)):
+        held = {"sigma": [], "bias": [], "exponent": []}
+        for seed in range(300):
+            results = poses_with_law(seed, {
+                "distance_m": [1.0, 2.0, 4.0], "tilt_deg": [0.0, 40.0],
+                "trial": list(range(60))}, power_law, normal=normal)
+            models = error_models(results)
+            ends = models.isel(side_px=0, distance_m=[0, -1], viewing_angle_deg=[0, -1])
+            distance, angle = np.meshgrid(
+                ends.distance_m, ends.viewing_angle_deg, indexing="ij")
+            truth = dict(zip(("bias", "sigma"), power_law(distance, None, angle), strict=True))
+            truth["exponent"] = np.array([2, 2, 2.5, 1.5, 1.5, 1])
+            for name, value in truth.items():
+                of = models if name == "exponent" else ends
+                expected = np.moveaxis(value, -1, 0)
+                held[name].append(
+                    (of[f"{name}_low"] <= expected) & (expected <= of[f"{name}_high"]))
+        shares = {name: float(xr.concat(each, "seed").mean()) for name, each in held.items()}
+        print(shares)
+        # The six errors of a simulation are independent: 1,800 intervals at least.
+        assert all(0.92 < share < 0.975 for share in shares.values()), shares
+

@@ -1,0 +1,101 @@
+"""Datasets of poses whose errors follow a known law of distance, side and viewing angle."""
+
+import numpy as np
+import xarray as xr
+
+from sweep.analysis.sight_frame import viewing_angle_of
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.model.pose import rotation_of_vector, vector_of_rotation
+
+TEXT = """seed = 1
+[camera]
+width_px = 1280
+height_px = 800
+fx_px = {fx}
+[marker]
+{size}
+[pose]
+azimuth_deg = {{ uniform = [0, 360] }}
+{distance}
+[axes]
+{axes}
+"""
+FX, SIZE_M = 900.0, 0.165
+
+
+def minimal_turn(direction):
+    """Return rotations of (0, 0, 1) to unit vectors (..., 3) by the shortest way, by Rodrigues."""
+    z = np.array([0.0, 0.0, 1.0])
+    axis = np.cross(np.broadcast_to(z, direction.shape), direction)
+    sine = np.linalg.norm(axis, axis=-1, keepdims=True)
+    angle = np.arctan2(sine, direction[..., 2:])
+    return rotation_of_vector(axis / np.where(sine > 0, sine, 1.0) * angle)
+
+
+def poses_with_law(seed, axes, law, *, bearing_deg=0.0, normal=None):
+    """Return a dataset; ``law(distance, side, angle)`` gives bias and sigma (..., 6) in sight.
+
+    ``axes``: distance_m, tilt_deg, optionally size_m and solver, and trial; a law of solvers gets
+    the same values for each. ``normal`` draws the unit errors: ``normal(rng, shape)``.
+    """
+    rng = np.random.default_rng(seed)
+    scene = [name for name in axes if name != "solver"]
+    shape = tuple(len(axes[name]) for name in scene)
+    grid = dict(zip(scene, np.meshgrid(*(axes[n] for n in scene), indexing="ij"), strict=True))
+    z, tilt = grid["distance_m"], np.radians(grid["tilt_deg"])
+    bearings = np.tan(np.radians(rng.uniform(-bearing_deg, bearing_deg, (2, *shape))))
+    position = np.stack([z * bearings[0], z * bearings[1], z], axis=-1)
+    azimuth = rng.uniform(0, 2 * np.pi, shape)
+    axis = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(shape)], axis=-1)
+    turned = rotation_of_vector(axis * tilt[..., None])
+    rotation = turned @ rotation_of_vector(np.array([np.pi, 0.0, 0.0]))
+    rvec = vector_of_rotation(rotation.reshape(-1, 3, 3)).reshape(*shape, 3)
+    side = FX * grid.get("size_m", SIZE_M) / z
+    bias, sigma = law(z, side, viewing_angle_of(rvec, position))
+    draw = normal or (lambda rng, size: rng.normal(size=size))
+    dims, count = tuple(scene), len(axes.get("solver", [0]))
+    unit = position / np.linalg.norm(position, axis=-1, keepdims=True)
+    turn = minimal_turn(unit)
+    parts = []
+    for _ in range(count):
+        error = bias + sigma * draw(rng, sigma.shape)
+        parts.append(np.concatenate(
+            [np.einsum("...ij,...j->...i", turn, error[..., k : k + 3]) for k in (0, 3)], axis=-1))
+    errors = parts[0]
+    estimated = dims
+    if "solver" in axes:
+        errors, estimated = np.stack(parts, axis=-2), (*dims, "solver")
+    size = errors.shape[:-1]
+
+    def flags(names, value):
+        lengths = tuple(len(axes[name]) for name in names)
+        return names, np.full(lengths, value, dtype=np.uint8)
+
+    assert errors.shape[:-1] == size
+    listed = {name: list(map(float, axes[name])) for name in scene if name != "trial"}
+    text = TEXT.format(
+        fx=FX, size="" if "size_m" in axes else f"size_m = {SIZE_M}", distance="", axes="\n".join(
+            f"{name} = {values}" for name, values in listed.items()) + "\ntrial = 9")
+    return xr.Dataset(
+        {
+            "true_rvec": ((*dims, "xyz"), rvec), "true_tvec_m": ((*dims, "xyz"), position),
+            "marker_area_px": (dims, side**2),
+            "detection": flags(dims, DetectionStatus.detected),
+            "estimate": flags(estimated, EstimateStatus.solved),
+            "flipped": flags(estimated, Flipped.not_flipped),
+            "translation_error_m": ((*estimated, "xyz"), errors[..., :3].astype(np.float32)),
+            "rotation_error_rad": ((*estimated, "xyz"), errors[..., 3:].astype(np.float32)),
+        },
+        {name: list(values) for name, values in axes.items()} | {"xyz": ["x", "y", "z"]},
+        {"pipeline": text},
+    )
+
+
+def power_law(distance, side, angle):  # noqa: ARG001
+    """Return bias and sigma (..., 6): powers of the distance, exponential in the angle."""
+    ends = np.array([2.0, 2.0, 2.5, 1.5, 1.5, 1.0])
+    scale = np.array([1e-4, 1e-4, 1e-3, 2e-3, 2e-3, 1e-3])
+    sigma = scale * distance[..., None] ** ends * np.exp(0.01 * angle[..., None])
+    bias = np.zeros_like(sigma)
+    bias[..., 2] = 0.004 * distance  # 0.4 % of the distance
+    return bias, sigma

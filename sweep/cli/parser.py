@@ -28,13 +28,8 @@ from sweep.messages import nearest
 from sweep.version import __version__
 
 COMMANDS = (
-<<<<<<< HEAD
-    RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, VERIFY, STATUS, EXPORT, SCORE,
-    CHECK_DETECTOR, PLUGINS, COMPLETION,
-=======
     RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, ERROR_MODEL, VERIFY, STATUS, EXPORT,
-    COMPLETION,
->>>>>>> 4d22264 (Error models to take away: bias and standard deviation of the pose over distance, side and viewing angle, with a check on held-out draws, as JSON, C++, Python, Java and ROS covariances)
+    SCORE, CHECK_DETECTOR, PLUGINS, COMPLETION,
 )
 """Every command, in the order in which the help lists them."""
 

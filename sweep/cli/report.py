@@ -40,6 +40,11 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help="axes whose values are conditions, such as distance_m,tilt_deg (default: those of "
         "[require], else the axes of size and angle)",
     )
+    parser.add_argument(
+        "--error-model", action="append", default=[], metavar="FILE",
+        help="also write the error models, as `sweep error-model` does, in the format of FILE's "
+        "suffix: .json, .hpp, .py, .java or .yaml; may be repeated",
+    )
     add_json(parser)
 
 
@@ -47,6 +52,10 @@ def _execute(options: argparse.Namespace) -> int:
     quiet_matplotlib()
     from sweep.errors import ArgumentError  # noqa: PLC0415
     from sweep.messages import byte_count  # noqa: PLC0415
+    from sweep.report.error_model_file import (  # noqa: PLC0415
+        check_error_model_file,
+        written_error_models,
+    )
     from sweep.report.formatting import plural  # noqa: PLC0415
     from sweep.report.output_file import is_standard_stream  # noqa: PLC0415
     from sweep.report.report_data import read_report_data  # noqa: PLC0415
@@ -56,6 +65,8 @@ def _execute(options: argparse.Namespace) -> int:
         value = getattr(options, name)
         if value is not None and not value.strip():
             raise ArgumentError(name, repr(value), "expected a name")
+    for path in options.error_model:
+        check_error_model_file(path)
     suffix = Path(options.output or "").suffix.lower()
     if suffix in NO_REPORTS:
         raise ArgumentError("output", options.output, "expected a file that ends in .html or .md")
@@ -66,6 +77,9 @@ def _execute(options: argparse.Namespace) -> int:
     data = read_report_data(options.store, options.requirements, per, command_line(options))
     if options.json and is_standard_stream(output):
         raise ArgumentError("json", "", "and the report both go to standard output; choose -o FILE")
+    if options.error_model:
+        data = data.in_memory()
+        written_error_models(data, options.error_model)
     count, found = write_report(data, output, form, figures)
     if is_standard_stream(output):
         return 0  # a line more would not be HTML

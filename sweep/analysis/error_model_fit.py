@@ -66,7 +66,7 @@ class BinSums:
         some = self.count > 0
         return BinSums(self.count[some], self.at[some], self.powers[some])
 
-    def about(self, centre: Floats, power: int) -> Floats:
+    def power_mean(self, centre: Floats, power: int) -> Floats:
         """Return the mean 2nd or 4th power of the errors minus ``centre`` (bins,)."""
         n = np.maximum(self.count, 1.0)
         s1, s2, s3, s4 = self.powers.T / n
@@ -89,7 +89,7 @@ class Fit:
     def score(self, sums: BinSums, basis: Floats) -> float:
         """Return the log-likelihood of normal errors of other poses, up to a constant."""
         log_variance = basis @ self.log_variance
-        square = sums.about(basis @ self.bias, 2)
+        square = sums.power_mean(basis @ self.bias, 2)
         return float(-0.5 * (sums.count * (log_variance + square * np.exp(-log_variance))).sum())
 
     def at(self, basis: Floats) -> Fit:
@@ -177,10 +177,10 @@ def fit_error(sums: BinSums, basis: Floats, penalty: Floats) -> Fit:
     count = sums.count
     mean = sums.powers[:, 0] / np.maximum(count, 1.0)
     bias = _weighted(basis, penalty, count, mean)
-    square = sums.about(basis @ bias, 2)
+    square = sums.power_mean(basis @ bias, 2)
     log_variance = _weighted(basis, penalty, count, np.log(square))
     for _ in range(ITERATIONS):
-        ratio = sums.about(basis @ bias, 2) * np.exp(-(basis @ log_variance))
+        ratio = sums.power_mean(basis @ bias, 2) * np.exp(-(basis @ log_variance))
         step = np.clip(_weighted(basis, penalty, count, ratio - 1.0, log_variance), -2.0, 2.0)
         log_variance = log_variance + step
         bias = _bias(basis, penalty, count, mean, log_variance)[0]
@@ -188,8 +188,8 @@ def fit_error(sums: BinSums, basis: Floats, penalty: Floats) -> Fit:
             break
     fitted = basis @ log_variance
     bias, bias_covariance = _bias(basis, penalty, count, mean, log_variance)
-    kurtosis = sums.about(basis @ bias, 4) * np.exp(-2.0 * fitted)
-    ratio = sums.about(basis @ bias, 2) * np.exp(-fitted)
+    kurtosis = sums.power_mean(basis @ bias, 4) * np.exp(-2.0 * fitted)
+    ratio = sums.power_mean(basis @ bias, 2) * np.exp(-fitted)
     bread = np.linalg.inv(_normal(basis, penalty, count)).astype(np.float64)
     spread = np.maximum(kurtosis - 2.0 * ratio + 1.0, 0.0)  # mean of (residual² / variance - 1)²
     meat = (basis * (count * spread)[:, None]).T @ basis

@@ -70,14 +70,14 @@ def check_error_model_file(path: str) -> str:
     return form
 
 
-def error_model_text(models: xr.Dataset, about: Mapping[str, Any], path: str) -> str:
+def error_model_text(models: xr.Dataset, facts: Mapping[str, Any], path: str) -> str:
     """Return the content of a file.
 
     Parameters
     ----------
     models
         As `sweep.analysis.error_models` returns them.
-    about
+    facts
         What the models are of: ``store``, ``title``, ``fingerprint``, ``camera``, ``marker``.
     path
         The file: its suffix says which format.
@@ -87,7 +87,7 @@ def error_model_text(models: xr.Dataset, about: Mapping[str, Any], path: str) ->
         raise ArgumentError("error_model", path, f"{models['sigma'].size:,} numbers are too many "
                             "for code; choose a configuration, or write JSON")
     if form == "json":
-        return json.dumps(document(models, about), indent=1, allow_nan=False) + "\n"
+        return json.dumps(document(models, facts), indent=1, allow_nan=False) + "\n"
     flat = stacked(models)
     edges = {name: cell_edges(models, name).tolist() for name in PREDICTORS}
     shape = [flat.sizes[name] for name in PREDICTORS]
@@ -95,7 +95,7 @@ def error_model_text(models: xr.Dataset, about: Mapping[str, Any], path: str) ->
     position = np.arange(len(QUANTITIES))[None, :, None, None, None] < 3
     template = _environment().get_template(f"error_model.{form}.jinja")
     return template.render(
-        about=about, version=__version__, name=Path(path).stem, frame=FRAME,
+        facts=facts, version=__version__, name=Path(path).stem, frame=FRAME,
         interpolation=INTERPOLATION, flags=list(Use), predictors=list(PREDICTORS),
         quantities=list(QUANTITIES), configurations=configuration_names(models),
         count=flat.sizes["model"], shape=shape,
@@ -114,12 +114,12 @@ def error_model_text(models: xr.Dataset, about: Mapping[str, Any], path: str) ->
     )
 
 
-def document(models: xr.Dataset, about: Mapping[str, Any]) -> dict[str, Any]:
+def document(models: xr.Dataset, facts: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of the JSON file; what is not a number is null."""
     flat = stacked(models)
     edges = {name: cell_edges(models, name).tolist() for name in PREDICTORS}
     return {
-        "schema": SCHEMA, "sweep": __version__, **about,
+        "schema": SCHEMA, "sweep": __version__, **facts,
         "frame": FRAME, "interpolation": INTERPOLATION,
         "errors": "estimated minus true; rotations as rotation vector of R_est R_trueᵀ; poses that "
                   "are solved and not flipped",

@@ -208,10 +208,10 @@ def warnings_of(models: xr.Dataset) -> list[str]:
     """Return sentences on where the models must not be used, beside the flags of the cells."""
     lines, uses = [], stacked(models)["use"].values
     for use, name in zip(uses, configuration_names(models), strict=True):
-        there = use[:, (use != Use.no_poses).any(axis=0)]
-        parts = [f"{100 * float((there == flag).mean()):.0f} % {flag.name}" for flag in Use
-                 if flag != Use.no_poses and (there == flag).any()]
-        lines.append(f"{name}: of {there.size:,} cells (times errors): {', '.join(parts)}")
+        counted = use[:, (use != Use.no_poses).any(axis=0)]
+        parts = [f"{100 * float((counted == flag).mean()):.0f} % {flag.name}" for flag in Use
+                 if flag != Use.no_poses and (counted == flag).any()]
+        lines.append(f"{name}: of {counted.size:,} cells (times errors): {', '.join(parts)}")
     for name in PREDICTORS:
         if models.sizes[name] == 1 and not (
             name == "side_px" and models.sizes["distance_m"] > 1

@@ -63,8 +63,12 @@ def _execute(options: argparse.Namespace) -> int:
         for line in summary.warnings:
             notice(line)
         store = summary.store
+    question = {"criterion": options.criterion}
+    if options.budget_ms is not None:
+        question["budget_ms"] = options.budget_ms
     with stage_display() as report:
-        trade, renderers = measure_trade(store, options.per, options.limit_s, report)
+        trade, renderers = measure_trade(
+            store, options.per, options.limit_s, report, question=question)
     budget = [] if options.budget_ms is None else budget_advice(
         trade, options.criterion, options.budget_ms)
     if output is not None:
@@ -74,7 +78,7 @@ def _execute(options: argparse.Namespace) -> int:
         from sweep.report.tradeoff_chart import draw_trade  # noqa: PLC0415
 
         figure = io.BytesIO()
-        draw_trade(trade, options.criterion, figure, output.suffix[1:].lower())
+        draw_trade(trade, options.criterion, figure, output.suffix[1:].lower(), options.budget_ms)
         write_output_file(output, figure.getvalue())
     from sweep.report.renderer_table import renderer_lines  # noqa: PLC0415
     from sweep.report.tradeoff_table import as_json, table_markdown, table_text  # noqa: PLC0415

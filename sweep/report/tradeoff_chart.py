@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+import textwrap
+from collections.abc import Sequence
 from itertools import cycle
 from typing import IO, Any, NamedTuple
 
@@ -40,6 +42,15 @@ LABEL_OFFSETS = np.concatenate([
 ])
 """Positions of a label, in points right of and above its point, in order of preference."""
 
+BUDGET_REACH = 10.0
+"""A budget beyond the costs by a larger factor is named in the legend, not drawn."""
+
+KEY_LINE_INCHES = 0.15
+"""Height of a line of the legend."""
+
+
+BUDGET_COLOUR, BUDGET_DASHES = COLOURS[1], (0, (1.5, 1.5))
+
 
 class Encoding(NamedTuple):
     """How the values of a setting are drawn: value -> colour, or value -> shape."""
@@ -50,16 +61,17 @@ class Encoding(NamedTuple):
 
 def draw_trade(
     trade: xr.Dataset, criterion: str, path: str | os.PathLike[str] | IO[bytes],
-    form: str | None = None,
+    form: str | None = None, budget_ms: float | None = None,
 ) -> None:
     """Write a chart of cost, ms a frame, against the criterion, both logarithmic.
 
-    There is a panel for each condition. Of the settings that ``trade`` has as coordinates of
-    ``treatment`` the first is the colour and the last the shape. Bars are 95 % intervals; the
-    stepped line is the Pareto front, whose points are filled and labelled. Configurations without
-    a finite criterion stand in a strip at the top; ``bound_rotation_deg`` or
-    ``bound_range_percent``, if ``trade`` has it, is a dashed line. Costs and errors of 0 cannot be
-    drawn.
+    There is a panel for each condition in which any configuration has a finite criterion; the
+    others are named below. Of the settings that ``trade`` has as coordinates of ``treatment`` the
+    first is the colour and the last the shape. Every point has its configuration's number in the
+    legend beside it, those of the Pareto front (filled, on the stepped line) also its name. Bars
+    are 95 % intervals. Configurations without a finite criterion stand in a strip at the top;
+    ``bound_rotation_deg`` or ``bound_range_percent``, if ``trade`` has it, is a dashed line, and so
+    is the budget, what lies beyond it shaded. Costs and errors of 0 cannot be drawn.
 
     Parameters
     ----------
@@ -71,6 +83,8 @@ def draw_trade(
         File to write, or an open one.
     form
         ``png``, ``svg`` or another of matplotlib's formats (default: by the file's suffix).
+    budget_ms
+        Most milliseconds a frame; None for no budget.
 
     Raises
     ------
@@ -82,15 +96,23 @@ def draw_trade(
         If the file cannot be written.
     """
     conditions = list(by_condition(mark_front(trade, criterion), criterion))
+    drawn = [each for each in conditions if np.isfinite(each[1][criterion]).any()]
+    left_out = [label or "all" for label, condition in conditions
+                if not np.isfinite(condition[criterion]).any()]
+    drawn = drawn or conditions[:1]
     colours, shapes = _encodings(trade)
-    columns = min(len(conditions), COLUMNS)
-    rows = math.ceil(len(conditions) / columns)
+    columns = min(len(drawn), COLUMNS)
+    rows = math.ceil(len(drawn) / columns)
     width = WIDTH if columns > 1 else WIDTH * 2 / 3
     figure = Figure((width, rows * PANEL_HEIGHT), layout="constrained")
-    panels = [figure.add_subplot(rows, columns, k + 1) for k in range(len(conditions))]
-    cost_limits = _limits(trade["cost_ms"].to_numpy())
-    for panel, (label, condition) in zip(panels, conditions, strict=True):
+    panels = [figure.add_subplot(rows, columns, k + 1) for k in range(len(drawn))]
+    costs = trade["cost_ms"].to_numpy()
+    if budget_ms is not None and _within_reach(budget_ms, costs):
+        costs = np.append(costs, budget_ms)
+    cost_limits = _limits(costs)
+    for panel, (label, condition) in zip(panels, drawn, strict=True):
         _draw_condition(panel, condition, criterion, cost_limits, colours, shapes)
+        _draw_budget(panel, budget_ms)
         panel.set_title(label, loc="left", fontsize=10, color=INK)
     for panel in panels[::columns]:
         panel.set_ylabel(heading_of(criterion), color=INK)
@@ -98,14 +120,52 @@ def draw_trade(
         panel.set_xlabel("cost, ms a frame", color=INK)
     if trade.attrs.get("title"):
         figure.suptitle(trade.attrs["title"], x=0.008, ha="left", fontsize=12, color=INK)
-    has_bound = any(np.isfinite(_bound(condition, criterion)) for _, condition in conditions)
-    _draw_legend(figure, colours, shapes, has_bound=has_bound)
+    if left_out:
+        figure.supxlabel(_left_out_text(left_out, criterion), x=0.008, ha="left",
+                         fontsize=LABEL_SIZE, color=FAINT)
+    has_bound = any(np.isfinite(_bound(condition, criterion)) for _, condition in drawn)
+    _draw_legend(figure, trade, colours, shapes, has_bound=has_bound,
+                 budget=_budget_text(budget_ms, cost_limits))
     # Labels avoid the points and lines, whose final positions the layout decides.
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
-    for panel, (_, condition) in zip(panels, conditions, strict=True):
-        _label_front(panel, condition, criterion, figure.dpi / 72)
+    for panel, (_, condition) in zip(panels, drawn, strict=True):
+        _label_points(panel, condition, criterion, figure.dpi / 72)
     figure.savefig(path, dpi=DOTS_PER_INCH, format=form)
+
+
+def _left_out_text(labels: list[str], criterion: str) -> str:
+    """Return which conditions are not drawn, in lines that fit the figure."""
+    text = f"not drawn, since no configuration has a finite {criterion}: {'; '.join(labels)}"
+    return textwrap.fill(text, 130)
+
+
+def _within_reach(budget_ms: float, costs: Floats) -> bool:
+    """Return whether a budget is near enough to the costs to be drawn beside them."""
+    known = costs[np.isfinite(costs) & (costs > 0)]
+    if not known.size:
+        return False
+    return bool(known.min() / BUDGET_REACH <= budget_ms <= known.max() * BUDGET_REACH)
+
+
+def _budget_text(budget_ms: float | None, cost_limits: tuple[float, float]) -> str:
+    """Return the budget's entry in the legend; empty without one."""
+    if budget_ms is None:
+        return ""
+    low, high = cost_limits
+    where = "" if low < budget_ms < high else " (all within)" if budget_ms >= high else (
+        " (none within)")
+    return f"budget {budget_ms:g} ms{where}"
+
+
+def _draw_budget(panel: Axes, budget_ms: float | None) -> None:
+    """Draw the budget as a line, and shade what lies beyond it."""
+    low, high = panel.get_xlim()
+    if budget_ms is None or not low < budget_ms < high:
+        return
+    panel.axvspan(budget_ms, high, color=STRIP, lw=0, zorder=0.5)
+    panel.axvline(budget_ms, color=BUDGET_COLOUR, linewidth=1.3, linestyle=BUDGET_DASHES,
+                  zorder=1.6)
 
 
 def _encodings(trade: xr.Dataset) -> tuple[Encoding, Encoding]:
@@ -141,9 +201,10 @@ def _draw_condition(
         panel.set_yticks([])
     if not finite.all():
         panel.fill_between([0, 1], STRIP_BASE, 1, transform=panel.transAxes, color=STRIP, lw=0)
-        panel.set_title(
-            f"{np.count_nonzero(~finite)} of {finite.size} not finite", loc="right",
-            fontsize=LABEL_SIZE, color=FAINT,
+        numbers = [n for n, known in zip(_numbers(condition), finite, strict=True) if not known]
+        panel.text(
+            0.98, STRIP_BASE - 0.01, textwrap.fill(f"not finite: {ranges_text(numbers)}", 44),
+            transform=panel.transAxes, ha="right", va="top", fontsize=LABEL_SIZE, color=FAINT,
         )
     if on_front.any():
         x, y = _front(condition, criterion)[:2]
@@ -221,67 +282,83 @@ def _bars(condition: xr.Dataset, name: str, chosen: Booleans) -> Floats:
     return np.asarray(np.nan_to_num(np.clip([value - low, high - value], 0, 1e3 * value)))
 
 
-def _draw_legend(figure: Figure, colours: Encoding, shapes: Encoding, *, has_bound: bool) -> None:
-    """Draw the legend at the right: the settings, then the elements of every such chart."""
+def _draw_legend(
+    figure: Figure, trade: xr.Dataset, colours: Encoding, shapes: Encoding, *, has_bound: bool,
+    budget: str,
+) -> None:
+    """Draw the legend at the right: the numbered configurations, then the lines."""
     def entry(label: str, shape: str = "", **style: Any) -> Line2D:
         return Line2D([], [], marker=shape, label=label, **{"linestyle": ""} | style)
 
-    if colours.setting == shapes.setting:
-        groups = {colours.setting: [
-            entry(text, shapes.styles[text], **_mark(colour, filled=True))
-            for text, colour in colours.styles.items()
-        ]}
-    else:
-        groups = {
-            colours.setting: [
-                entry(text, "o", **_mark(colour, filled=True))
-                for text, colour in colours.styles.items()
-            ],
-            shapes.setting: [
-                entry(text, shape, **_mark(FAINT, filled=False))
-                for text, shape in shapes.styles.items()
-            ],
-        }
-    entries = []
-    for heading, group in groups.items():
-        entries += [entry(heading), *group, entry(" ")]
-    entries.append(entry("best for its cost", "o", linestyle="-", **_mark(FAINT, filled=True)))
+    entries = [
+        entry(f"{number}  {name}", shapes.styles[shape],
+              **_mark(colours.styles[colour], filled=True))
+        for number, name, colour, shape in zip(
+            _numbers(trade), _texts(trade, "treatment"), _texts(trade, colours.setting),
+            _texts(trade, shapes.setting), strict=True)
+    ]
+    entries += [entry(" "), entry("best for its cost (filled)", "o", linestyle="-",
+                                  **_mark(FAINT, filled=True))]
     if has_bound:
         entries.append(entry("bound of RMSE", color=INK, linewidth=0.9, linestyle=REFERENCE_DASHES))
-    legend = figure.legend(
+    if budget:
+        entries.append(entry(budget, color=BUDGET_COLOUR, linewidth=1.3, linestyle=BUDGET_DASHES))
+    lines = max(8, int(figure.get_figheight() / KEY_LINE_INCHES) - 3)
+    figure.legend(
         handles=entries, loc="outside right center", frameon=False, fontsize=LABEL_SIZE,
-        labelcolor=INK, handlelength=1.8,
+        labelcolor=INK, handlelength=1.8, labelspacing=0.25, ncols=math.ceil(len(entries) / lines),
     )
-    for text in legend.get_texts():
-        if text.get_text() in groups:
-            text.set_fontweight("bold")
 
 
-def _label_front(panel: Axes, condition: xr.Dataset, criterion: str, scale: float) -> None:
-    """Label the points of the front, each where its label covers the least.
+def _numbers(trade: xr.Dataset) -> range:
+    """Return the numbers of the configurations, from 1, in their order."""
+    return range(1, trade.sizes["treatment"] + 1)
+
+
+def ranges_text(numbers: Sequence[int]) -> str:
+    """Return increasing numbers as text, runs of three or more by their ends.
+
+    >>> ranges_text([1, 2, 3, 4, 7, 8])
+    '1\u20134, 7, 8'
+    """
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    return ", ".join(
+        f"{run[0]}\u2013{run[-1]}" if len(run) > 2 else ", ".join(map(str, run)) for run in runs)
+
+
+def _label_points(panel: Axes, condition: xr.Dataset, criterion: str, scale: float) -> None:
+    """Label all points, those of the front first, each where its label covers the least.
 
     ``scale`` is the number of pixels in a typographic point.
     """
-    x, y, labels = _front(condition, criterion)
-    finite = np.isfinite(condition[criterion].to_numpy())
-    points = panel.transData.transform(
-        np.column_stack([condition[name].to_numpy()[finite] for name in ("cost_ms", criterion)])
-    )
+    cost, error = condition["cost_ms"].to_numpy(), condition[criterion].to_numpy()
+    drawn = np.isfinite(cost) & (cost > 0) & np.isfinite(error) & (error > 0)
+    points = panel.transData.transform(np.column_stack([cost, error]))
+    on_front = condition["on_front"].to_numpy()
     # The stepped line goes along each point's error to the next point's cost, then down to it.
+    x, y, _ = _front(condition, criterion)
     line = panel.transData.transform(np.column_stack([np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]]))
-    occupied: list[Bbox] = []
-    for k, label in enumerate(labels):
-        size = scale * np.array(text_to_path.get_text_width_height_descent(label, FONT, False)[:2])
+    texts = [f"{number} {name}" if front else f"{number}" for number, name, front in zip(
+        _numbers(condition), _texts(condition, "treatment"), on_front, strict=True)]
+    occupied = [text.get_window_extent() for text in panel.texts]
+    for k in sorted(np.flatnonzero(drawn).tolist(), key=lambda k: (not on_front[k], cost[k])):
+        size = scale * np.array(
+            text_to_path.get_text_width_height_descent(texts[k], FONT, False)[:2])
         # The corner of the label, or the middle of its side, that is nearest to the point.
-        nearest = line[2 * k] + scale * LABEL_OFFSETS
+        nearest = points[k] + scale * LABEL_OFFSETS
         lowest = nearest - np.multiply(size, 1 - np.sign(LABEL_OFFSETS)) / 2
         boxes = [Bbox([corner, corner + size]) for corner in lowest]
         penalties = [
             # In increasing weight: order of preference, on the line, connector across another
             # label, on points, outside the panel, on another label.
-            rank + 12 * Path(line).intersects_bbox(box, filled=False)
-            + 20 * sum(Path([line[2 * k], near]).intersects_bbox(other) for other in occupied)
-            + 40 * box.padded(4 * scale).count_contains(points)
+            rank + 12 * (len(line) > 1 and Path(line).intersects_bbox(box, filled=False))
+            + 20 * sum(Path([points[k], near]).intersects_bbox(other) for other in occupied)
+            + 40 * box.padded(4 * scale).count_contains(points[drawn])
             + 1e3 * (panel.bbox.count_contains(box.get_points()) < 2)
             + 1e4 * box.padded(2 * scale).count_overlaps(occupied)
             for rank, (box, near) in enumerate(zip(boxes, nearest, strict=True))
@@ -289,8 +366,10 @@ def _label_front(panel: Axes, condition: xr.Dataset, criterion: str, scale: floa
         best = int(np.argmin(penalties))
         occupied.append(boxes[best])
         panel.annotate(
-            label, (x[k], y[k]), (lowest[best] - line[2 * k]) / scale,
-            textcoords="offset points", va="bottom", fontsize=LABEL_SIZE, color=INK, zorder=6,
+            texts[k], tuple(panel.transData.inverted().transform(points[k]).tolist()),
+            (lowest[best] - points[k]) / scale,
+            textcoords="offset points", va="bottom", fontsize=LABEL_SIZE,
+            color=INK if on_front[k] else FAINT, zorder=6,
             path_effects=[withStroke(linewidth=2.5, foreground="white")], parse_math=False,
             arrowprops={
                 "arrowstyle": "-", "color": FAINT, "linewidth": 0.7, "shrinkA": 0, "shrinkB": 4,

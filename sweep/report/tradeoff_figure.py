@@ -18,8 +18,8 @@ from sweep.report.svg import inline_svg
 from sweep.report.table import Table, cells
 from sweep.report.theme import MATPLOTLIB_STYLE
 from sweep.report.tradeoff_chart import draw_trade
-from sweep.tradeoff.advice import advice
-from sweep.tradeoff.pareto import by_condition, mark_front
+from sweep.tradeoff.advice import advice, budget_advice
+from sweep.tradeoff.pareto import CRITERIA, by_condition, mark_front
 
 CRITERION = "rotation_p95_deg"
 OTHER_CRITERION = "rotation_median_deg"
@@ -39,11 +39,13 @@ CHART_STYLE: Any = {
 
 
 def trade_criterion(trade: xr.Dataset) -> str:
-    """Return the error that ranks configurations: one that is finite in every condition."""
+    """Return the error that ranks configurations: that asked for, if it is finite everywhere."""
+    asked = trade.attrs.get("criterion")
+    names = ([asked] if asked in CRITERIA and asked in trade else []) + [CRITERION, OTHER_CRITERION]
     return next(
-        (name for name in (CRITERION, OTHER_CRITERION)
+        (name for name in names
          if np.isfinite(trade[name].values).any(axis=trade[name].dims.index("treatment")).all()),
-        CRITERION,
+        names[0],
     )
 
 
@@ -51,19 +53,19 @@ def _render(data: ReportData) -> RenderedFigure:
     if data.trade is None:
         raise KeyError("cost/tradeoff")
     trade = data.trade.drop_attrs(deep=False)  # the figure has a title of its own
-    criterion = trade_criterion(trade)
+    criterion, budget_ms = trade_criterion(data.trade), budget_of(data.trade)
     poses = int(data.trade.attrs.get("poses", 0))
     alt = f"Cost in milliseconds a frame against {criterion}, a panel for each condition."
 
     def write(path: str) -> None:
         with mpl.rc_context({"text.parse_math": False, "svg.hashsalt": "sweep"}):
-            draw_trade(trade, criterion, path)
+            draw_trade(trade, criterion, path, budget_ms=budget_ms)
 
     def svg(prefix: str) -> Markup:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "trade.svg"
             with mpl.rc_context(CHART_STYLE):
-                draw_trade(trade, criterion, path)
+                draw_trade(trade, criterion, path, budget_ms=budget_ms)
             return inline_svg(path.read_text(encoding="utf-8"), alt, prefix, clipped=True)
 
     return RenderedFigure(
@@ -71,12 +73,22 @@ def _render(data: ReportData) -> RenderedFigure:
         sentences(
             f"Cost of detection and estimation, ms a frame, against {criterion}, of each "
             "configuration on the same images, both logarithmic; bars are 95 % intervals; filled "
-            "points form the Pareto front: no other configuration is both cheaper and better.",
+            "points form the Pareto front: no other configuration is both cheaper and better. "
+            "Numbers are those of the legend.",
+            f"The dotted line is the budget of {budget_ms:g} ms." if budget_ms else "",
             f"Of {poses:,} poses." if poses else "",
+            *(f"{sentence}." for sentence in (
+                budget_advice(trade, criterion, budget_ms) if budget_ms else [])),
             *(f"{sentence}." for sentence in advice(trade, criterion)),
         ),
         _table(trade, criterion), svg=svg, write=write,
     )
+
+
+def budget_of(trade: xr.Dataset) -> float | None:
+    """Return the budget, ms a frame, that the tradeoff was asked for; None for none."""
+    budget = trade.attrs.get("budget_ms")
+    return None if budget is None else float(budget)
 
 
 def _table(trade: xr.Dataset, criterion: str) -> Table:

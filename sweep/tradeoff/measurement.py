@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -51,7 +51,7 @@ REFERENCE = "exact"
 
 def measure_trade(
     url: str, per: Sequence[str] = (), limit_s: float = 60.0,
-    progress: StageReport | None = None,
+    progress: StageReport | None = None, *, question: Mapping[str, str | float] | None = None,
 ) -> tuple[xr.Dataset, xr.Dataset | None]:
     """Measure the tradeoff of a finished store, and write it to its group ``cost/tradeoff``.
 
@@ -70,6 +70,9 @@ def measure_trade(
         leaves 30 % of them.
     progress
         Called with what is being done, and the share of it that is done.
+    question
+        What is asked of the tradeoff, ``criterion`` and ``budget_ms``: kept in its attributes for
+        the report.
 
     Returns
     -------
@@ -123,6 +126,7 @@ def measure_trade(
             )
             results = results.sel(renderer=REFERENCE, drop=True)
         trade = _trade(pipeline, results, per, started + limit_s, limit_s, interrupts, report)
+        trade.attrs.update(question or {})
         if renderers is not None:
             write_group(store, "cost/renderers", renderers)
         write_group(store, "cost/tradeoff", trade)

@@ -9,6 +9,8 @@ import pytest
 import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
+from matplotlib.text import Annotation, Text
 
 from sweep.errors import ArgumentError
 from sweep.report.tradeoff_chart import draw_trade
@@ -310,3 +312,43 @@ def test_a_figure_is_written(trade, suffix, start, tmp_path):
 def test_a_figure_of_an_unknown_format_is_refused(tmp_path):
     with pytest.raises(ValueError, match="Format"):
         draw_trade(synthetic([20], treatments=1), P95, tmp_path / "trade.nonsense")
+
+
+def drawn_figure(monkeypatch, trade, **options):
+    """Return the figure of a trade, as it was about to be written."""
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
+    draw_trade(trade, P95, "unwritten.png", **options)
+    return figures[0]
+
+
+def test_every_point_has_a_label_and_no_two_overlap(monkeypatch):
+    trade = synthetic([20])
+    figure = drawn_figure(monkeypatch, trade, budget_ms=1.0)
+    figure.draw_without_rendering()
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    names = trade["treatment"].values.tolist()
+    assert legend[:len(names)] == [f"{k + 1}  {name}" for k, name in enumerate(names)]
+    assert "budget 1 ms" in legend
+    for panel, side in zip(figure.axes, trade["side_px"].values, strict=True):
+        labels = [text for text in panel.texts if isinstance(text, Annotation)]
+        error = trade[P95].sel(side_px=side).values
+        finite = {str(k + 1) for k in np.flatnonzero(np.isfinite(error))}
+        assert {label.get_text().split()[0] for label in labels} == finite
+        # Without the room that a line has above and below its letters.
+        boxes = [Text.get_window_extent(label).expanded(0.98, 0.7) for label in panel.texts]
+        assert all(box.count_overlaps(boxes) == 1 for box in boxes)
+        assert any(np.allclose(line.get_xdata(), 1.0) for line in panel.lines)
+        unknown = [text.get_text() for text in panel.texts if text not in labels]
+        assert bool(unknown) == (len(finite) < len(names))
+
+
+def test_a_condition_without_a_finite_criterion_is_named_and_has_no_panel(monkeypatch):
+    figure = drawn_figure(monkeypatch, spoilt(), budget_ms=1e6)
+    assert [panel.get_title(loc="left") for panel in figure.axes] == ["side_px = 50"]
+    assert "side_px = 20" in figure.get_supxlabel()
+    assert "budget 1e+06 ms (all within)" in [
+        text.get_text() for text in figure.legends[0].get_texts()]
+    nothing = synthetic([20], treatments=2)
+    nothing[P95][:] = np.inf
+    assert len(drawn_figure(monkeypatch, nothing).axes) == 1

@@ -40,8 +40,9 @@ CHART_STYLE: Any = {
 
 def trade_criterion(trade: xr.Dataset) -> str:
     """Return the error that ranks configurations: that asked for, if it is finite everywhere."""
-    asked = trade.attrs.get("criterion")
-    names = ([asked] if asked in CRITERIA and asked in trade else []) + [CRITERION, OTHER_CRITERION]
+    asked = str(trade.attrs.get("criterion", CRITERION))
+    names = [name for name in (asked, CRITERION, OTHER_CRITERION)
+             if name in CRITERIA and name in trade]
     return next(
         (name for name in names
          if np.isfinite(trade[name].values).any(axis=trade[name].dims.index("treatment")).all()),

@@ -22,6 +22,7 @@ from typing import Any
 from sweep.errors import PluginError
 from sweep.messages import nearest, plain
 from sweep.plugins import FACTORY, RECORDS, Plugin
+from sweep.plugins.printing import printing_to_stderr
 from sweep.plugins.recording import is_recording, recorded_detector
 
 OWN_DISTRIBUTION = "fiducial-sweep"
@@ -133,7 +134,7 @@ def entry_point(kind: str, name: str) -> EntryPoint:
 @lru_cache(maxsize=256)
 def _of_entry_point(kind: str, name: str) -> Plugin:
     entry = entry_point(kind, name)
-    with _import_faults(), contextlib.redirect_stdout(sys.stderr):
+    with _import_faults(), printing_to_stderr():
         found = entry.load()
     return _record(kind, found)
 
@@ -156,7 +157,7 @@ def _module(path: str, digest: str, source: bytes) -> ModuleType:
     module.__file__ = path
     sys.modules[name] = module  # dataclasses find their annotations there
     known = set(sys.modules)
-    with _import_faults(path), contextlib.redirect_stdout(sys.stderr):
+    with _import_faults(path), printing_to_stderr():
         exec(compile(source, path, "exec"), module.__dict__)  # noqa: S102  (the user's own file)
     folder = Path(path).parent.resolve()
     for other in set(sys.modules) - known:

@@ -21,10 +21,12 @@ from sweep.evaluation.estimation import detections_for
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import SearchResult, search, visibility_flags, whole_frames
 from sweep.isolation.interrupts import Interrupts
-from sweep.measure.detectors import FindFunction, make_detector
+from sweep.measure.detector import DetectorSetting
+from sweep.measure.detectors import AnyDetectorSetting, FindFunction, make_detector
 from sweep.measure.estimation import Detections, PoseEstimator
 from sweep.measure.estimators import EstimatorSetting, build
 from sweep.measure.flags import DetectionStatus
+from sweep.measure.foreign_detector import ForeignSetting
 from sweep.model.renderers import Grey
 from sweep.model.scene import Scenes, build_scenes
 from sweep.plan.experiment import Pipeline
@@ -144,7 +146,19 @@ def measure(
         return costs(seconds).ratio
 
     left_s = max(limit_s - (time.perf_counter() - started), 0.1)
-    return costs(time_in_turns(parts, ratios, left_s, interrupts, progress))
+    return costs(time_in_turns(parts, ratios, left_s, interrupts, progress, clock_of(settings)))
+
+
+def clock_of(settings: Sequence[AnyDetectorSetting]) -> Callable[[], float]:
+    """Return the clock that counts all that detectors do.
+
+    OpenCV's own works in this thread, plug-ins may have threads of their own, and the detector of
+    another environment is another process.
+    """
+    if all(isinstance(setting, DetectorSetting) for setting in settings):
+        return time.thread_time
+    foreign = any(isinstance(setting, ForeignSetting) for setting in settings)
+    return time.perf_counter if foreign else time.process_time
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import math
@@ -25,6 +26,7 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import estimators
 from sweep.plan.parameters import Stage
 from sweep.plan.same_meaning import wrong_configurations
+from sweep.plugins.printing import printing_to_stderr
 from sweep.plugins.recording import is_recording
 from sweep.store.closing import write_group
 from sweep.store.lifecycle import open_dataset, open_store
@@ -115,7 +117,11 @@ def measure_trade(
         raise StoreError("\n".join([f"{url}: its costs cannot be measured here:", *lines]))
     renderers = None
     report = progress or (lambda _what, _share: None)
-    with locked(store), Interrupts() as interrupts:
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(locked(store))
+        interrupts = stack.enter_context(Interrupts())
+        if pipeline.plugins:
+            stack.enter_context(printing_to_stderr())
         if "renderer" in results.dims:
             names = [str(name) for name in results["renderer"].values.tolist()]
             report("measuring renderers", 0.0)

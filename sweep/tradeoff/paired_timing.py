@@ -34,6 +34,7 @@ NARROW = 0.03
 def time_in_turns(
     parts: Sequence[Callable[[], Any]], ratios: Callable[[Floats], Floats], limit_s: float,
     interrupts: Interrupts, progress: Callable[[float], None] | None = None,
+    clock: Callable[[], float] | None = None,
 ) -> Floats:
     """Time P parts in R rounds, each round in a random order of its own.
 
@@ -50,13 +51,15 @@ def time_in_turns(
         Checked between two parts.
     progress
         Called after each round with the share of the time limit that is used.
+    clock
+        Returns the seconds that are counted (default: this thread's own time).
 
     Returns
     -------
-    (R, P) seconds of this thread's own time, without the first round, which warms up.
+    (R, P) seconds of the clock, without the first round, which warms up.
     """
+    clock = clock or time.thread_time
     generator = np.random.Generator(np.random.PCG64(0))
-    clock = time.thread_time
     rounds = np.zeros((MAX_ROUNDS, len(parts)))
     started = time.perf_counter()
     for count in range(MAX_ROUNDS):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,8 @@ from sweep.isolation.child_process import Child
 from sweep.isolation.plugin_check import check_plugins, use
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import detector_settings
+from sweep.tradeoff.configuration_costs import clock_of
 from tests.support.here import Here
 
 DETECTORS = '''
@@ -285,3 +289,20 @@ E = EffectPlugin(apply=lambda light, patch: {result}, settings=Settings)
     ]
     (failure,) = cells.failures
     assert told in failure.text.splitlines()[-1]
+
+
+def test_what_compiled_code_prints_on_import_goes_to_the_standard_error(tmp_path, capfd):
+    (tmp_path / "loud.py").write_text(
+        'import os\nos.write(1, b"compiled\\n")\nprint("python")\nD = print\n'
+    )
+    text = '[pose]\nside_px = 24\n[detector]\ndetector = "loud:D"\n'
+    assert Pipeline.from_text(text, folder=tmp_path).plugins
+    assert capfd.readouterr() == ("", "compiled\npython\n")
+
+
+def test_costs_are_counted_by_a_clock_that_sees_all_that_works(tmp_path):
+    (tmp_path / "mine.py").write_text("def D(settings, family): return lambda image: ([], [])\n")
+    text = '[pose]\nside_px = 24\n[axes]\ndetector = ["opencv", "mine:D"]\n'
+    settings = detector_settings(Pipeline.from_text(text, folder=tmp_path))
+    assert clock_of(settings[:1]) is time.thread_time
+    assert clock_of(settings) is time.process_time

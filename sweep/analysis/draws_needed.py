@@ -23,7 +23,7 @@ MAX_DRAWS = 1e9
 
 def draws_needed(
     requirement: Requirement, value: xr.DataArray, low: xr.DataArray, high: xr.DataArray,
-    draws: xr.DataArray, undecided: xr.DataArray,
+    draws: xr.DataArray, solved: xr.DataArray, undecided: xr.DataArray,
 ) -> xr.DataArray:
     """Return about how many draws would decide a requirement, infinite if no number would.
 
@@ -31,17 +31,19 @@ def draws_needed(
 
     For a rate it is the least n at which Clopper and Pearson's end for n times the rate reaches
     the limit. Other intervals narrow with the root of the number of draws; a quantile needs as
-    many as its interval's ends need to exist.
+    many as its interval's ends need to exist and, if its end is infinite for too few poses are
+    ``solved`` (a share), as many as decide whether enough are.
     """
     what = requirement.requirable
     needed: xr.DataArray = xr.apply_ufunc(
         np.vectorize(lambda *numbers: _needed(what, requirement, *numbers), otypes=[float]),
-        value.where(undecided), low, high, draws.astype(np.float64))
+        value.where(undecided), low, high, draws.astype(np.float64), solved)
     return needed
 
 
 def _needed(
-    what: Requirable, requirement: Requirement, value: float, low: float, high: float, draws: float
+    what: Requirable, requirement: Requirement, value: float, low: float, high: float, draws: float,
+    solved: float,
 ) -> float:
     if math.isnan(value):
         return math.nan
@@ -54,6 +56,8 @@ def _needed(
     # The end that has to pass the limit.
     end = low if good == requirement.at_least else high
     gap = abs(value - requirement.limit)
+    if what.percent is not None and math.inf in (end, value) and draws >= least:
+        return max(least, _of_rate(solved, what.percent / 100.0, what.level))
     if not math.isfinite(end) or not math.isfinite(value):
         return max(least, 2.0 * draws)
     if gap == 0.0:

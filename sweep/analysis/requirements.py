@@ -307,7 +307,8 @@ def _judged(
     decision = (xr.full_like(value, Decision.undecided).where(~not_met, Decision.not_met)
                 .where(~met, Decision.met).where(~no_number, Decision.not_applicable))
     needed = draws_needed(
-        requirement, value, low, high, draws, decision == Decision.undecided)
+        requirement, value, low, high, draws, table["solved"] / table["looked_for"],
+        decision == Decision.undecided)
     words = {
         "value": (value, "value"),
         "low": (low, "lower end of the interval by which it is decided"),

@@ -11,11 +11,13 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis.dimensions import DRAWS, axes_of
+from sweep.analysis.replicates import is_replicated
 from sweep.analysis.requirements import Decision, configuration_axes
 from sweep.analysis.verdicts import Verdict, described
 from sweep.errors import ArgumentError
 from sweep.messages import label, nearest, plain
 from sweep.plan.cell_selection import parse_selection
+from sweep.plan.sobol import REPLICATES
 
 if TYPE_CHECKING:
     from sweep.analysis.regressions import Regression
@@ -139,6 +141,8 @@ def more_draws(found: Sequence[Verdict], results: xr.Dataset, store: str) -> str
     if not factors or max(factors) <= 1.0:
         return f"sweep report {shlex.quote(store)}"
     count = math.ceil(trials * max(factors))
+    if is_replicated(results):
+        count = math.ceil(count / REPLICATES) * REPLICATES
     return (f"sweep run {shlex.quote(store)} --set trial={count} --store more.zarr "
             f"--reuse {shlex.quote(store)}")
 

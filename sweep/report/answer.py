@@ -12,7 +12,7 @@ from sweep.analysis.registry import error_headings
 from sweep.errors import DatasetError, StoreError
 from sweep.plan.parameters import Stage
 from sweep.report.ambiguity_sentence import threshold_sentence
-from sweep.report.choice import choice_sentence, choice_table
+from sweep.report.choice import belief_sentence, belief_table, choice_sentence, choice_table
 from sweep.report.configurations import configurations
 from sweep.report.figure import sentences, values_with_ends
 from sweep.report.formatting import interval_text, number, plural
@@ -98,9 +98,11 @@ def answer(data: ReportData) -> Answer:
     return Answer(
         found.headline,
         warnings + sentences(found.reasons, choice_sentence(data),
+                             belief_sentence(data, best),
                              threshold_sentence(data, best), _cost(data), _size(data)),
-        known.names[best] if known.several else "", tiles,
-        (*found.tables, *size_errors_table(data, best), *choice_table(data)),
+        known.spoken(best) if known.several else "", tiles,
+        (*found.tables, *belief_table(data, best), *size_errors_table(data, best),
+         *choice_table(data)),
         (*found.details, _errors_table(one, known.names[best] if known.several else ""),
          signed_errors_table(data)),
     )

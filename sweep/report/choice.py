@@ -12,7 +12,8 @@ from sweep.report.configurations import Configurations, configurations
 from sweep.report.figure import values_with_ends
 from sweep.report.formatting import interval_text, number, plural
 from sweep.report.report_data import ReportData
-from sweep.report.table import Table
+from sweep.report.table import Table, cells
+from sweep.tradeoff.labels import WRONG
 
 MAX_RIVALS = 3
 """Configurations that are named as indistinguishable from the best."""
@@ -92,23 +93,67 @@ def best_by(known: Configurations, criterion: Criterion) -> Best | None:
 def choice_sentence(data: ReportData) -> str:
     """Return which configuration has the smallest median rotation error, as a sentence."""
     known = configurations(data)
-    best = best_by(known, ACCURACY) if known.several else None
+    best = best_by(known, ACCURACY) if known.choices > 1 else None
     if best is None:
         return ""
     solved = 100 * float(known.summary["solved_rate"].values[best.which])
-    text = (f"Of the configurations, {known.names[best.which]} has the smallest median rotation "
+    text = (f"Of the configurations, {known.spoken(best.which)} has the smallest median rotation "
             f"error, {number(best.value)}\u00b0{best.interval}, and solves {number(solved)} %")
     if best.rivals:
         text += f"; it is indistinguishable from {_rivals(known, best)}"
-    wrong = int(known.wrong.sum())
-    note = "" if not wrong else (
-        f" {plural(wrong, 'configuration')} with a wrong belief "
-        f"{'is' if wrong == 1 else 'are'} no choice.")
-    return f"{text}.{note}"
+    return f"{text}."
+
+
+def belief_sentence(data: ReportData, best: int) -> str:
+    """Return what the wrong beliefs of a store cost, beside one configuration."""
+    known = configurations(data)
+    beside = _believing_otherwise(known, best)
+    if not beside:
+        return ""
+    bias = known.summary["range_bias_percent"].values
+    changed = "; ".join(
+        f"{known.spoken(k).removesuffix(WRONG)}: {number(float(bias[k]))} %"
+        for k in beside[:MAX_RIVALS])
+    count = int(known.wrong.sum())
+    return (f"{plural(count, 'configuration')} with a wrong belief {'is' if count == 1 else 'are'} "
+            f"no choice; the range bias is {number(float(bias[best]))} % with the truth, with "
+            f"{changed}.")
+
+
+def belief_table(data: ReportData, best: int) -> list[Table]:
+    """Return the errors with the truth, and with each wrong belief in its place."""
+    known = configurations(data)
+    beside = _believing_otherwise(known, best)
+    if not beside:
+        return []
+    columns = [criterion for criterion in CRITERIA[1:] if criterion.variable in known.summary]
+    texts = [cells(known.summary, criterion.variable, criterion.scale) for criterion in columns]
+    return [Table(
+        "What a wrong belief costs, with 95 % intervals",
+        ["configuration", *(f"{each.words.removeprefix('smallest ').removeprefix('fewest ')},"
+                            f"{each.unit if each.unit.startswith(' ') else ' ' + each.unit}"
+                            for each in columns)],
+        [[known.names[k], *(text[k] for text in texts)] for k in (best, *beside)])]
+
+
+def _believing_otherwise(known: Configurations, best: int) -> list[int]:
+    """Return the configurations with a wrong belief that are else those of one without."""
+    if known.wrong[best]:
+        return []
+    combinations = known.settings.combinations
+    beliefs = {name for k in np.flatnonzero(known.wrong) for name, index in
+               combinations[k].items() if all(
+                   combinations[k][name] != combinations[j][name]
+                   for j in np.flatnonzero(~known.wrong))}
+    return [
+        int(k) for k in np.flatnonzero(known.wrong)
+        if all(combinations[k][name] == index for name, index in combinations[best].items()
+               if name not in beliefs)
+    ]
 
 
 def _rivals(known: Configurations, best: Best) -> str:
-    listed = ", ".join(known.names[k] for k in best.rivals[:MAX_RIVALS])
+    listed = ", ".join(known.spoken(k) for k in best.rivals[:MAX_RIVALS])
     if len(best.rivals) > MAX_RIVALS:
         listed += f" and {len(best.rivals) - MAX_RIVALS:,} more"
     return listed
@@ -117,7 +162,7 @@ def _rivals(known: Configurations, best: Best) -> str:
 def choice_table(data: ReportData) -> list[Table]:
     """Return the best configuration by each criterion; no table for a single one."""
     known = configurations(data)
-    if not known.several:
+    if known.choices < 2:
         return []
     rows = []
     for criterion in CRITERIA:

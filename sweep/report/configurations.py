@@ -109,6 +109,19 @@ class Configurations:
         return len(self.names) > 1
 
     @property
+    def choices(self) -> int:
+        """How many there are without a wrong belief."""
+        return int((~self.wrong).sum())
+
+    def spoken(self, k: int) -> str:
+        """Return a label as it stands in a sentence: ``none`` behind the name of its setting."""
+        parts = self.names[k].split(" \u00b7 ")
+        return " \u00b7 ".join(
+            f"{axis} {part}" if part == "none" else part
+            for axis, part in zip(self.settings.axes, parts, strict=True)
+        ) if len(parts) == len(self.settings.axes) else self.names[k]
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Sentences on values of settings that are not shown."""
         return self.settings.grouping.notes

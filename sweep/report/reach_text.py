@@ -28,7 +28,7 @@ def quantity(data: ReportData, name: str, value: float) -> str:
     return f"{coordinate(float(value))}{'' if unit in ('', '°') else ' '}{unit}"
 
 
-def _words(reach: Reaches) -> tuple[str, str, str]:
+def _words(data: ReportData, reach: Reaches) -> tuple[str, str, str]:
     known = SIZES.get(reach.along)
     if known is not None:
         return known
@@ -36,13 +36,13 @@ def _words(reach: Reaches) -> tuple[str, str, str]:
         name = ANGLES[reach.along]
         return f"up to a {name} of {{}}", f"at no {name}", f"at every {name}, up to {{}}"
     bound = "up to" if reach.upwards else "down to"
-    return (f"{bound} {reach.along} {{}}", f"at no {reach.along}",
-            f"at every {reach.along}, {bound} {{}}")
+    words = data.label(reach.along).split(",")[0]
+    return (f"{bound} a {words} of {{}}", f"at no {words}", f"at every {words}, {bound} {{}}")
 
 
 def limit_text(data: ReportData, reach: Reaches, limit: Limit) -> str:
     """Return a limit with its interval: ``up to 2.25 m (2 m to 2.5 m)``."""
-    to, none, everywhere = _words(reach)
+    to, none, everywhere = _words(data, reach)
     if not limit.judged:
         return "nothing was looked for"
     if limit.rank < 0:
@@ -58,7 +58,7 @@ def interval_of(reach: Reaches, limit: Limit) -> str:
         return ""
     low, high = (coordinate(end) if math.isfinite(end) else "" for end in (near, far))
     if low and high:
-        return f" ({low} to {high})"
+        return f" ({low} to {high})" if reach.upwards else f" ({high} to {low})"
     more = "more" if reach.upwards else "less"
     if low:
         return f" ({low} or {more})"
@@ -77,7 +77,8 @@ def limiting_text(data: ReportData, reach: Reaches, angle: str | None, limit: Li
     if not limit.limited_by:
         return ""
     where = [f"at {quantity(data, reach.along, limit.fails_at)}" if reach.along in SIZES else
-             f"at {reach.along} {quantity(data, reach.along, limit.fails_at)}"]
+             f"at a {data.label(reach.along).split(',')[0]} of "
+             f"{quantity(data, reach.along, limit.fails_at)}"]
     if angle is not None and limit.fails_at_angle is not None:
         where.append(f"a {ANGLES[angle]} of {quantity(data, angle, limit.fails_at_angle)}")
     if limit.fails_where:

@@ -33,6 +33,7 @@ from sweep.report.figure import (
     uncapitalised,
 )
 from sweep.report.grouping import AREA, CONFIGURATION, Grouping, by_configuration, group_labels
+from sweep.report.question import course_of
 from sweep.report.report_data import Analysis, ReportData
 from sweep.report.svg import Panel
 from sweep.report.table import Table, table_of
@@ -119,8 +120,9 @@ def signed_error_statistics(
 
 
 def signed_axis(data: ReportData) -> str | None:
-    """Return the axis along which bias is shown: the size, or the angle; None without either."""
-    return data.size or data.angle_axis
+    """Return the axis along which bias is shown: of sizes, other numbers, or angles."""
+    along = course_of(data, data.per).along
+    return along if along not in (None, data.angle_axis) else data.size or data.angle_axis
 
 
 def _signed(data: ReportData) -> RenderedFigure:

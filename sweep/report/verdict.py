@@ -83,11 +83,11 @@ def _required(data: ReportData, course: Course) -> Verdict:
     best = order[0]
     limits = reach.limits[best]
     limit = _farthest(limits)
-    whose = f", with {known.names[best]}" if known.several else ""
+    whose = f", with {known.spoken(best)}" if known.several else ""
     where = angle_text(data, course.angle, limit)
     together = f" {where}" if where else ""
     reached = limit_text(data, reach, limit)
-    others = [known.names[k] for k in order[1:]
+    others = [known.spoken(k) for k in order[1:]
               if not known.wrong[k] and _same(reach.limits[k], limits)]
     if not limit.judged:
         headline = "There is nothing to judge: the marker was looked for in no pose."
@@ -105,7 +105,7 @@ def _required(data: ReportData, course: Course) -> Verdict:
         _largest_angle(data, reach, course, limits, limit),
         limiting_text(data, reach, course.angle, limits[-1]),
         _draws_needed(checked) if not reach.decided(limit) else "",
-        f"As far: {', '.join(others)}." if others else "", *known.notes,
+        f"As far with {', '.join(others)}." if others else "", *known.notes,
     )
     tables = []
     if known.several or course.angle:
@@ -197,7 +197,7 @@ def _at_all_conditions(data: ReportData, course: Course) -> Verdict:
     best = order[0]
     failed, undecided, count = counts[best]
     checked = _checked(data, course, best)
-    whose = f", with {known.names[best]}" if known.several else ""
+    whose = f", with {known.spoken(best)}" if known.several else ""
     conditions = count // max(1, len(data.require))
     where = f" at all {conditions:,} conditions" if conditions > 1 else ""
     if failed:
@@ -242,7 +242,7 @@ def _how_far(data: ReportData) -> Verdict:
         return Verdict(
             "The marker was looked for in no pose: it was visible and modelled in none.")
     if course.along is None:
-        return _how_often(names, rates)
+        return _how_often(settings, names, rates)
     wrong = [False] * len(names)
     found = {rate: _detected(data, rate, course, settings, names, wrong) for rate in RATES}
     preferred = list(range(len(names)))
@@ -259,7 +259,7 @@ def _how_far(data: ReportData) -> Verdict:
         if not reach.decided(limit):
             doubts.append(f"{100 * rate:g} %")
     where = angle_text(data, course.angle, found[RATES[0]].limits[best][-1])
-    headline = (f"{'With ' + names[best] + ', d' if several else 'D'}etected "
+    headline = (f"{'With ' + _spoken(settings, names[best]) + ', d' if several else 'D'}etected "
                 f"{' and '.join(parts)}{', ' + where if where else ''}.")
     if doubts:
         headline = f"{headline[:-1]}; too few draws to be sure of {' and '.join(doubts)}."
@@ -289,13 +289,18 @@ def _detected(
     return reaches(data, [f"detection_rate >= {rate:g}"], course, settings, names, wrong)
 
 
-def _how_often(names: Sequence[str], rates: xr.Dataset) -> Verdict:
+def _spoken(settings: Settings, name: str) -> str:
+    """Return a label as it stands in a sentence: ``none`` behind the name of its setting."""
+    return f"{next(iter(settings.axes))} none" if name == "none" else name
+
+
+def _how_often(settings: Settings, names: Sequence[str], rates: xr.Dataset) -> Verdict:
     """Return the detection rate of each setting of the detector."""
     value = 100 * rates["detection_rate"].values
     best = int(np.nanargmax(value))
     low, high = (100 * rates[f"detection_rate_{end}"].values[best] for end in ("low", "high"))
     interval = f" ({interval_text(low, high)})" if math.isfinite(low) else ""
     looked_for = int(rates["looked_for"].values[best])
-    whose = f"With {names[best]}, d" if len(names) > 1 else "D"
+    whose = f"With {_spoken(settings, names[best])}, d" if len(names) > 1 else "D"
     return Verdict(f"{whose}etected in {number(float(value[best]))} %{interval} of "
                    f"{plural(looked_for, 'pose')}.")

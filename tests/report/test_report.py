@@ -339,14 +339,14 @@ def test_the_numbers_are_those_of_one_configuration_by_plain_arithmetic(full, pa
     name = " \u00b7 ".join(
         str(errors[axis].values[best]) for axis in ("cornerRefinementMethod", "solver"))
     shown = answer(opened(full))
-    assert shown.of == name
+    assert shown.of == name.replace("none", "cornerRefinementMethod none")
     numbers = {tile.heading: tile for tile in shown.tiles}
     assert numbers["rotation error, median"].value == f"{number(medians[best])}\u00b0"
     detected = (results["detection"].sel(cornerRefinementMethod=name.split()[0])
                 == DetectionStatus.detected).values
     assert numbers["detected"].value == f"{number(100 * detected.mean())} %"
     assert numbers["detected"].detail.endswith(f" %, of {detected.size}")
-    assert f"With {name}, over the whole grid:" in page
+    assert f"With {shown.of}, over the whole grid:" in page
     assert f'<span class="value">{number(medians[best])}\u00b0</span>' in page
 
 
@@ -361,8 +361,8 @@ def test_the_first_sentence_is_how_far_each_detector_detects(full, odd):
     assert reached == {"none": 1, "subpix": 1}  # 40 px and not 14 px
     shown = answer(opened(full))
     assert shown.headline == (
-        "With none, detected in at least 99 % down to a side of 40 px (at least 40), at "
-        "tilts up to 50\u00b0; too few draws to be sure of 99 %.")
+        "With cornerRefinementMethod none, detected in at least 99 % down to a side of 40 px (at "
+        "least 40), at tilts up to 50\u00b0; too few draws to be sure of 99 %.")
     (table,) = (each for each in shown.tables if each.caption.startswith("Detected in at least 99"))
     assert [row[0] for row in table.rows] == ["none", "subpix"]
     assert answer(opened(odd("single pose"))).headline == "Detected in 100 % of 1 pose."

@@ -33,6 +33,9 @@ def small(tmp_path_factory):
     return made(tmp_path_factory.mktemp("small"), SMALL, "small")
 
 
+NONE = "cornerRefinementMethod none"
+"""How a configuration is called in a sentence."""
+
 SIZES = {"distance_m": 4, "tilt_deg": 2, "trial": 400, "cornerRefinementMethod": 2}
 
 
@@ -64,8 +67,8 @@ def test_the_headline_is_of_the_best_configuration_and_never_of_several_together
     # Pooled, 3 of 4 would be detected at 0.4 m; of each configuration all or half are.
     rates = [[[1, 1], [1, 1]], [[1, 0.5], [1, 0.5]], [[1, 0.5], [0.5, 0.5]], [[0.5, 0], [0, 0]]]
     shown = answer(synthetic(rates))
-    assert shown.headline == "Yes up to 0.4 m at tilts up to 30\u00b0, with none."
-    assert shown.of == "none"
+    assert shown.headline == f"Yes up to 0.4 m at tilts up to 30\u00b0, with {NONE}."
+    assert shown.of == NONE
     assert ("It is limited by detection_rate >= 0.9, which is 0.500 at 0.8 m and a tilt of "
             "30\u00b0." in shown.paragraph)
     (table,) = (each for each in shown.tables if each.caption.startswith("How far"))
@@ -77,11 +80,11 @@ def test_the_headline_is_of_the_best_configuration_and_never_of_several_together
 
 @pytest.mark.parametrize(("near", "headline"), [
     (0.5, "No: at no distance at tilts up to 30\u00b0, with none of the configurations."),
-    (0.9, ("Perhaps up to 0.2 m (at most 0.2) at tilts up to 30\u00b0, with none: too few draws "
+    (0.9, (f"Perhaps up to 0.2 m (at most 0.2) at tilts up to 30\u00b0, with {NONE}: too few draws "
            "to tell.")),
-    (0.88, ("Probably not: at no distance at tilts up to 30\u00b0, with none, but there are too "
+    (0.88, (f"Probably not: at no distance at tilts up to 30\u00b0, with {NONE}, but there are too "
             "few draws to tell.")),
-    (1, "Yes up to 0.2 m at tilts up to 30\u00b0, with none."),
+    (1, f"Yes up to 0.2 m at tilts up to 30\u00b0, with {NONE}."),
 ])
 def test_the_answer_says_yes_perhaps_or_no(near, headline):
     rates = np.zeros((4, 2, 2))
@@ -95,7 +98,7 @@ def test_where_large_angles_fail_the_answer_is_of_the_smaller_ones_and_says_so()
     rates[-1, 0, 1] = 0.2
     shown = answer(synthetic(rates))
     assert shown.headline == (
-        "Yes at all distances, up to 1.6 m (1.6 or more) at tilts up to 0\u00b0, with none.")
+        f"Yes at all distances, up to 1.6 m (1.6 or more) at tilts up to 0\u00b0, with {NONE}.")
     assert shown.paragraph.startswith("At tilts up to 30\u00b0: at no distance.")
 
 
@@ -103,18 +106,21 @@ def test_without_an_ordered_condition_the_answer_is_of_all_conditions():
     rates = np.ones((4, 2, 2))
     rates[..., 1] = 0.2
     shown = answer(synthetic(rates, per=("cornerRefinementMethod",)))
-    assert shown.headline == "Yes, with none."
+    assert shown.headline == f"Yes, with {NONE}."
 
 
 def test_a_wrong_belief_is_in_no_answer():
     shown = answer(synthetic(np.ones((4, 2, 2)), believed_focal_scale=[0.99, 1.0, 1.01]))
-    text = shown.headline + shown.paragraph + shown.of
-    assert "believed_focal_scale 1" in shown.of
-    assert "1.01" not in text
-    assert "0.99 " not in text.replace("detection_rate >= 0.99 ", "")
-    assert "4 configurations with a wrong belief are no choice." in shown.paragraph
+    assert shown.of == f"{NONE} \u00b7 believed_focal_scale 1.0"
+    assert "wrong" not in shown.headline + shown.of
+    assert "4 configurations with a wrong belief are no choice; the range bias is " in (
+        shown.paragraph)
     (table,) = (each for each in shown.tables if each.caption.startswith("Which configuration"))
     assert not any("wrong" in cell for row in table.rows for cell in row)
+    (table,) = (each for each in shown.tables if each.caption.startswith("What a wrong belief"))
+    assert [row[0] for row in table.rows] == [
+        f"none \u00b7 believed_focal_scale {scale}"
+        for scale in ("1.0", "0.99 (wrong)", "1.01 (wrong)")]
 
 
 def test_page_markdown_json_and_terminal_have_the_same_answer(small, tmp_path):

@@ -12,6 +12,7 @@ from sweep.analysis.bound_ratios import efficiency
 from sweep.analysis.comparisons import compare
 from sweep.analysis.covariances import covariance_trust
 from sweep.analysis.detection_limits import detection_limit
+from sweep.analysis.environments import environment_differences
 from sweep.analysis.error_model_values import model_covariance, model_errors
 from sweep.analysis.error_models import error_models
 from sweep.analysis.error_summaries import error_statistics
@@ -23,7 +24,7 @@ from sweep.analysis.requirements import check_requirements
 
 __all__ = [
     "ambiguity", "check_requirements", "compare", "covariance_trust", "detection_limit",
-    "detection_rate", "efficiency", "error_models", "error_statistics", "failure_composition",
-    "farthest_met", "flip_rate", "marker_ranking", "model_covariance", "model_errors",
-    "renderer_bias",
+    "detection_rate", "efficiency", "environment_differences", "error_models", "error_statistics",
+    "failure_composition", "farthest_met", "flip_rate", "marker_ranking", "model_covariance",
+    "model_errors", "renderer_bias",
 ]

@@ -10,6 +10,7 @@ from typing import NoReturn
 from sweep.cli.check_detector import CHECK_DETECTOR
 from sweep.cli.command import Command
 from sweep.cli.completion import COMPLETION
+from sweep.cli.environments import ENVIRONMENTS
 from sweep.cli.error_model import ERROR_MODEL
 from sweep.cli.export import EXPORT
 from sweep.cli.output import flushed
@@ -29,7 +30,7 @@ from sweep.version import __version__
 
 COMMANDS = (
     RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, ERROR_MODEL, VERIFY, STATUS, EXPORT,
-    SCORE, CHECK_DETECTOR, PLUGINS, COMPLETION,
+    SCORE, CHECK_DETECTOR, PLUGINS, ENVIRONMENTS, COMPLETION,
 )
 """Every command, in the order in which the help lists them."""
 

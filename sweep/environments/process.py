@@ -167,6 +167,11 @@ class DetectorProcess:
                 raise DetectorProcessError(self._death()) from None
 
     @property
+    def process_id(self) -> int:
+        """The number by which the system knows it."""
+        return self._process.pid
+
+    @property
     def ended(self) -> bool:
         """Whether it cannot be asked any more."""
         return self._process.poll() is not None

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.evaluation.machine_faults import local_fault, raise_machine_fault
+from sweep.evaluation.foreign_search import ForeignSearch
+from sweep.evaluation.machine_faults import raise_machine_fault
 from sweep.evaluation.recorded_search import (
     RecordedPoses,
     recorded_candidates,
@@ -28,7 +29,7 @@ from sweep.measure.detectors import (
     uneven_light_needs_frame,
 )
 from sweep.measure.flags import DetectionStatus
-from sweep.measure.foreign_detector import ForeignDetector, detector_output
+from sweep.measure.foreign_detector import ForeignDetector
 from sweep.model.columns import Column, map_columns
 from sweep.model.extent import hidden, marker_boxes, not_modelled, outside_frame
 from sweep.model.renderers import render_all
@@ -171,6 +172,13 @@ def search(
     dictionary, sides = scenes.dictionary, scenes.frame.max(axis=1).tolist()
     render_s = 0.0
     row_s = [0.0] * len(scenes)
+    searches = [
+        ForeignSearch(
+            each.find, k, dictionary, sides, row_s, failures, each.candidates, each.failed,
+            each.crashed,
+        ) if isinstance(each.find, ForeignDetector) else None
+        for k, each in enumerate(passes)
+    ]
     clock = time.perf_counter
     asked = imaged.T.tolist()
     for rows in _groups(np.flatnonzero(imaged.any(axis=1)), widest, scenes.plain):
@@ -182,19 +190,8 @@ def search(
             row_s[row] = (now - begun) / len(rows)
         for k, (setting_pass, crop, ask) in enumerate(zip(passes, crops, asked, strict=True)):
             find, note = setting_pass.find, setting_pass.candidates.append
+            elsewhere = searches[k]
             begun = now = clock()
-            if isinstance(find, ForeignDetector):
-                chosen = [
-                    (row, image if image is None or crop is None else cropped(image, crop[row]))
-                    for row, image in zip(rows.tolist(), images, strict=True) if ask[row]
-                ]
-                setting_pass.search_elsewhere(find, k, chosen, dictionary, sides, row_s, failures)
-                if keep:
-                    setting_pass.images.update(
-                        (row, image) for row, image in chosen if image is not None
-                    )
-                setting_pass.seconds += clock() - begun
-                continue
             for row, image in zip(rows.tolist(), images, strict=True):
                 if not ask[row]:
                     continue
@@ -204,10 +201,15 @@ def search(
                     continue
                 searched = image
                 if crop is not None:
-                    searched = cropped(image, crop[row])
+                    x0, y0, x1, y1 = crop[row]
+                    searched = image[y0:y1, x0:x1]
                 if keep:
                     setting_pass.images[row] = searched
                 if recordings[k] is not None:
+                    continue
+                if elsewhere is not None:
+                    elsewhere.add(row, searched)
+                    now = clock()
                     continue
                 try:
                     note((row, *find(searched, dictionary[row], sides[row])))
@@ -218,6 +220,12 @@ def search(
                 now = clock()
                 row_s[row] += now - start
             setting_pass.seconds += now - begun
+
+    for setting_pass, elsewhere in zip(passes, searches, strict=True):
+        if elsewhere is not None:
+            begun = clock()
+            elsewhere.search()
+            setting_pass.seconds += clock() - begun
 
     results = []
     marker_id = np.array(scenes.marker_id, dtype=np.int64)
@@ -261,36 +269,6 @@ class _Pass:
     failed: list[int] = field(default_factory=list)
     crashed: list[int] = field(default_factory=list)
     seconds: float = 0.0
-
-    def search_elsewhere(
-        self, find: ForeignDetector, setting: int, chosen: Sequence[tuple[int, Grey | None]],
-        dictionary: Sequence[str], sides: Sequence[int], row_s: list[float],
-        failures: list[Failure],
-    ) -> None:
-        """Search the images (h, w) of rows together in the process of another environment."""
-        self.failed += [row for row, image in chosen if image is None]
-        rendered = [(row, image) for row, image in chosen if image is not None]
-        answers = find.search_all(
-            [image for _, image in rendered], [dictionary[row] for row, _ in rendered],
-            [sides[row] for row, _ in rendered],
-        )
-        for (row, _), answer in zip(rendered, answers, strict=True):
-            row_s[row] += answer.seconds
-            if answer.of_the_machine:
-                raise local_fault(answer.error)
-            if answer.error:
-                failures.append(
-                    Failure(row, "detection", answer.error, setting, crashed=answer.died)
-                )
-                (self.crashed if answer.died else self.failed).append(row)
-            else:
-                self.candidates.append((row, *detector_output(answer)))
-
-
-def cropped(image: Grey, window: Sequence[int]) -> Grey:
-    """Return the part of an image (h, w) within left, top, right, bottom."""
-    x0, y0, x1, y1 = window
-    return image[y0:y1, x0:x1]
 
 
 GROUP_PX = 1 << 24

@@ -14,6 +14,7 @@ from sweep.plan.parameters import Stage
 from sweep.report.ambiguity_sentence import threshold_sentence
 from sweep.report.choice import belief_sentence, belief_table, choice_sentence, choice_table
 from sweep.report.configurations import configurations
+from sweep.report.environment_differences import environment_tables
 from sweep.report.figure import sentences, values_with_ends
 from sweep.report.formatting import interval_text, number, plural
 from sweep.report.grouping import CONFIGURATION
@@ -102,7 +103,7 @@ def answer(data: ReportData) -> Answer:
                              threshold_sentence(data, best), _cost(data), _size(data)),
         known.spoken(best) if known.several else "", tiles,
         (*found.tables, *belief_table(data, best), *size_errors_table(data, best),
-         *choice_table(data)),
+         *choice_table(data), *environment_tables(data)),
         (*found.details, _errors_table(one, known.names[best] if known.several else ""),
          signed_errors_table(data)),
     )

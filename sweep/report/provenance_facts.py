@@ -63,6 +63,9 @@ def provenance(data: ReportData, output: str) -> Provenance:
         "Camera": "; ".join([camera_facts(data.pipeline).line(), *notes(data.pipeline)]),
         "Run": _dates(data.run_metadata),
         "Versions": versions,
+        **({"Environments": "; ".join(
+            f"{name}: {what}" for name, what in fingerprint["environments"].items()
+        )} if fingerprint.get("environments") else {}),
         "Processor": str(environment.get("cpu", "unknown")),
         "Seed": str(fingerprint.get("seed", data.pipeline.seed)),
         "Fingerprint": f"{digest[:16]} (numbers {fingerprint.get('numbers', '?')})",

@@ -72,7 +72,7 @@ def stub_python(folder, cv2_text=STUB):
     (folder / "cv2.py").write_text(textwrap.dedent(cv2_text))
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50)
     np.save(folder / "markers.npy", dictionary.bytesList)
-    return script(folder / "python", f'PYTHONPATH="{folder}" exec "{sys.executable}" "$@"')
+    return script(folder / "python", f'PYTHONPATH="$(dirname "$0")" exec "{sys.executable}" "$@"')
 
 
 def script(path, command):

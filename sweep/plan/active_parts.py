@@ -62,7 +62,8 @@ def _needs_images(pipeline: Pipeline, solver: str) -> bool:
 def _described(plugin: DeclaredPlugin) -> str:
     """Return a plug-in in words: kind, name, versions."""
     versions = ", ".join(f"{name} {version}" for name, version in plugin.versions)
-    return f"{plugin.kind} {plugin.name}" + (f" ({versions})" if versions else "")
+    threads = f", {plugin.threads} threads" if plugin.threads > 1 else ""
+    return f"{plugin.kind} {plugin.name}" + (f" ({versions})" if versions else "") + threads
 
 
 def parts(pipeline: Pipeline) -> list[Part]:

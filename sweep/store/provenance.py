@@ -101,6 +101,7 @@ def fingerprint(pipeline: Pipeline) -> dict[str, Any]:
         **({} if pipeline.sampling == SAMPLINGS[0] else {"sampling": pipeline.sampling}),
         "files": dict(sorted(pipeline.files.items())),
         **({"plugins": versions_used} if (versions_used := plugin_versions(pipeline)) else {}),
+        **({"effects": effects} if (effects := effects_in_order(pipeline)) else {}),
         **({"environments": others} if (others := environment_versions(pipeline)) else {}),
     }
 
@@ -115,6 +116,11 @@ def environment_versions(pipeline: Pipeline) -> dict[str, str]:
             except EnvironmentFaultError as error:
                 versions_of[name] = f"none ({error})"
     return versions_of
+
+
+def effects_in_order(pipeline: Pipeline) -> list[str]:
+    """Return the names of the plug-ins' effects in the order in which they act."""
+    return [each.name for each in pipeline.plugins if each.kind == "effect"]
 
 
 def plugin_versions(pipeline: Pipeline) -> dict[str, dict[str, str]]:

@@ -9,13 +9,15 @@ import sweep
 from sweep.analysis.stored_parameters import parameter_value
 from sweep.cli import main
 from sweep.errors import OtherExperimentError, PipelineError, StoreError
+from sweep.evaluation.inspection import scene_image
+from sweep.execution.reuse import match
 from sweep.execution.runner import execute
 from sweep.plan.experiment import Pipeline
 from sweep.store.lifecycle import open_store
-from sweep.store.provenance import fingerprint
+from sweep.store.provenance import differences, fingerprint
 from tests.plugins.test_detector_plugins import MINE
 from tests.support.here import calls_here
-from tests.support.stores import same
+from tests.support.stores import by_hand, same
 
 TEXT = """
 [camera]
@@ -115,7 +117,7 @@ def test_verify_and_repro_recompute_with_the_plug_in(made, capsys):
     assert "recomputed" in capsys.readouterr().out
     for detector in ("opencv", "mine:TURNED"):
         assert main(["repro", store, "--at", f"tilt_deg=40,detector={detector}"]) == 0
-        assert "the same" in capsys.readouterr().out
+        assert "agrees with the store bit for bit" in capsys.readouterr().out
 
 
 @pytest.mark.long
@@ -129,3 +131,35 @@ def test_cells_of_opencv_are_reused_beside_a_plug_in(made, tmp_path):
         summary = execute(both, tmp_path / "both.zarr", reuse=[tmp_path / "plain.zarr"])
     assert summary.computed_estimates == 2  # of four: the others are OpenCV's
     assert same(tmp_path / "both.zarr", made / "grid.zarr")
+
+
+FOG = """
+from dataclasses import dataclass
+from sweep.plugins import EffectPlugin, parameter
+@dataclass(frozen=True)
+class Settings:
+    {name}: float = parameter(0.0, "share of it in the light", low=0, high=1)
+E = EffectPlugin(
+    apply=lambda light, patch: light + patch.values["{name}"] * ({level} - light),
+    settings=Settings,
+)
+"""
+
+
+def test_effects_and_their_order_make_another_experiment(tmp_path):
+    (tmp_path / "fog.py").write_text(FOG.format(name="fog", level=200))
+    (tmp_path / "smoke.py").write_text(FOG.format(name="smoke", level=20))
+    clear = "[pose]\nside_px = 50\ntilt_deg = 30\n[camera]\nwidth_px = 160\nheight_px = 120\n"
+    foggy = clear + "[scene]\nfog = 0.3\nsmoke = 0.2\n"
+    first = Pipeline.from_text('effects = ["fog:E", "smoke:E"]\n' + foggy, folder=tmp_path)
+    second = Pipeline.from_text('effects = ["smoke:E", "fog:E"]\n' + foggy, folder=tmp_path)
+    without = Pipeline.from_text(clear, folder=tmp_path)
+    images = [scene_image(pipeline) for pipeline in (first, second, without)]
+    assert (images[0] != images[1]).any()
+    store = by_hand(str(tmp_path / "first.zarr"), first)
+    for other in (second, without):
+        assert any(line.startswith("effects: ")
+                   for line in differences(other, store.pipeline, store.fingerprint))
+        with pytest.raises(StoreError, match="no cell of it can be reused"):
+            match(other, store)
+    assert not differences(first, store.pipeline, store.fingerprint)

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sweep.errors import SweepError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene
@@ -19,14 +18,9 @@ from sweep.plan.cell_selection import cell, coordinates_text, selection_text
 from sweep.plan.experiment import Pipeline
 from sweep.report.formatting import degrees, number
 from sweep.report.report_data import ReportData, store_errors
-from sweep.report.scene_drawing import CAPTION_HEIGHT, MAX_SIDE, draw_scene
+from sweep.report.scene_drawing import cut_to_marker, draw_outlines
 from sweep.report.scene_selection import Index, select_scenes
 from sweep.report.stored_cell import difference_from_store, stored_cell
-
-MARGIN = 0.35
-"""Of the marker's side, shown around it."""
-
-MIN_CUT_PX = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +85,7 @@ def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
         single = cell(data.pipeline, at)
         inspected = inspect_scene(single)
         scene = dataclasses.replace(scene, coordinates=coordinates_text(data.pipeline, single))
-        picture = _picture(inspected)
+        picture = draw_outlines(cut_to_marker(inspected))  # the page has a caption of its own
         difference = difference_from_store(data, inspected.values, stored, index)
     except (SweepError, OSError, ValueError, cv2.error, np.linalg.LinAlgError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
@@ -109,34 +103,6 @@ def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
 def pipeline_file(pipeline: Pipeline) -> str:
     """Return the name of the file with a pipeline's text, quoted for a shell."""
     return shlex.quote(f"{pipeline.name}.toml")
-
-
-def _picture(scene: SceneInspection) -> NDArray[np.uint8]:
-    """Return the drawn scene without its caption, cut to the marker and its surroundings."""
-    cut = _cut(scene)
-    height, width = cut.image.shape
-    scale = max(1, min(MAX_SIDE // max(height, width), 24))
-    drawn = draw_scene(cut, "")
-    # The page has a caption of its own.
-    bottom = drawn.shape[0] - CAPTION_HEIGHT
-    left = (drawn.shape[1] - width * scale) // 2
-    return np.ascontiguousarray(drawn[:bottom, left : left + width * scale])
-
-
-def _cut(scene: SceneInspection) -> SceneInspection:
-    corners = scene.true_corners
-    left, top, right, bottom = scene.window
-    if not np.isfinite(corners).all():
-        return scene
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    margin = max(4.0, MARGIN * float((high - low).max()))
-    x0, y0 = np.maximum(np.floor(low - margin), (left, top)).astype(int)
-    x1, y1 = np.minimum(np.ceil(high + margin) + 1, (right, bottom)).astype(int)
-    if x1 - x0 < MIN_CUT_PX or y1 - y0 < MIN_CUT_PX:
-        return scene
-    image = scene.image[y0 - top : y1 - top, x0 - left : x1 - left]
-    return dataclasses.replace(
-        scene, image=np.ascontiguousarray(image), window=(int(x0), int(y0), int(x1), int(y1)))
 
 
 def _flags_text(detection: DetectionStatus, estimate: EstimateStatus) -> str:

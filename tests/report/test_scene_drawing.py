@@ -1,0 +1,73 @@
+"""The picture of one scene: what its caption says, and that a small marker is seen in it."""
+
+import numpy as np
+import pytest
+
+from sweep.evaluation.inspection import inspect_scene
+from sweep.plan.cell_selection import cell
+from sweep.plan.experiment import Pipeline
+from sweep.report import scene_drawing
+from sweep.report.scene_drawing import DETECTED, TRUTH, cut_to_marker, draw_outlines, draw_scene
+
+FRAME = {
+    "camera": {"width_px": 1600, "height_px": 1200, "fx_px": 1000},
+    "scene": {"background": 120}, "pose": {"azimuth_deg": {"uniform": [0, 360]}, "tilt_deg": 30},
+    "axes": {"bearing_x_deg": [-30, 0, 30], "side_px": [12, 60, 700], "trial": 2},
+}
+
+
+def inspected(at, *, whole_frame=True):
+    return inspect_scene(cell(Pipeline.from_dict(FRAME), at), whole_frame=whole_frame)
+
+
+def share_of(picture, colour, box):
+    x0, y0, x1, y1 = box
+    return float((picture[y0:y1, x0:x1] == colour).all(axis=2).mean())
+
+
+@pytest.mark.parametrize(("bearing", "corner"), [(-30, "right"), (30, "left")])
+def test_a_small_marker_is_enlarged_in_the_corner_that_is_farthest_from_it(bearing, corner):
+    scene = inspected(f"bearing_x_deg={bearing},side_px=60")
+    picture = draw_scene(scene, "title")
+    left, right = (0, 0, 600, 1200), (1000, 0, 1600, 1200)
+    assert share_of(picture, TRUTH, right if corner == "right" else left) > 0.0005
+    plain = draw_outlines(scene)
+    assert share_of(plain, TRUTH, right if corner == "right" else left) == 0
+    assert picture.shape[0] > plain.shape[0]
+
+
+@pytest.mark.parametrize("at", ["side_px=700", "side_px=12,bearing_x_deg=-30"])
+def test_what_is_drawn_in_place_stays_in_place(at):
+    scene = inspected(at)
+    picture, plain = draw_scene(scene, "title"), draw_outlines(scene)
+    if at == "side_px=700":
+        assert np.array_equal(picture[:1200], plain)
+    else:
+        assert scene.detection.name != "detected"
+        assert share_of(picture, DETECTED, (0, 0, 1600, 1200)) == 0
+
+
+def test_the_caption_names_what_was_drawn_and_fits_its_picture(monkeypatch):
+    texts = []
+    monkeypatch.setattr(scene_drawing.cv2, "putText", lambda page, text, at, font, size, *rest: (
+        texts.append((text, at[0] + scene_drawing.cv2.getTextSize(
+            text, font, size, rest[1])[0][0], page.shape[1]))))
+    scene = inspected("side_px=60", whole_frame=False)
+    draw_scene(scene, ", ".join(f"axis_{k} {k}" for k in range(30)))
+    assert all(end <= width for _, end, width in texts), texts
+    words = " ".join(text for text, _, _ in texts)
+    assert f"drawn: azimuth_deg {float(scene.values['azimuth_deg']):.5g}" in words
+    for said in ("axis_29 29", "true outline", "detected corners (dot: the first)", "estimated x",
+                 "detected, area", "rotation error"):
+        assert said in words
+
+
+def test_a_cut_is_the_marker_with_its_surroundings_within_the_window():
+    scene = inspected("side_px=60")
+    cut = cut_to_marker(scene)
+    x0, y0, x1, y1 = cut.window
+    assert np.array_equal(cut.image, scene.image[y0:y1, x0:x1])
+    low, high = scene.true_corners.min(axis=0), scene.true_corners.max(axis=0)
+    assert (low >= [x0, y0]).all()
+    assert (high < [x1, y1]).all()
+    assert max(x1 - x0, y1 - y0) < 2 * (high - low).max()

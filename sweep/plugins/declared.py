@@ -8,11 +8,13 @@ import math
 import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from sweep.declaration import Declaration, plain_types
 from sweep.errors import PluginError
 from sweep.plugins import RECORDS, DetectorPlugin, Plugin
+from sweep.plugins.calls import call
 from sweep.plugins.loading import file_of, load, read_source, versions_of
 from sweep.plugins.recording import RecordedDetector
 
@@ -160,9 +162,14 @@ class PluginSetting:
         return self.plugin.record(self.folder)
 
     def instance(self) -> Any:
-        """Return its settings as an instance of the plug-in's own dataclass; None without."""
+        """Return its settings as an instance of the plug-in's own dataclass; None without.
+
+        PluginError if the dataclass refuses them.
+        """
         settings = self.record().settings
-        return None if settings is None else settings(**dict(self.values))
+        if settings is None:
+            return None
+        return call(self.plugin.name, partial(settings, **dict(self.values)))
 
 
 def recorded_plugins(metadata: Mapping[str, Any]) -> tuple[DeclaredPlugin, ...]:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sweep.errors import PipelineError
+from sweep.errors import PipelineError, PluginError
 from sweep.evaluation.cells import run_cells
+from sweep.isolation.plugin_check import use
 from sweep.measure.flags import DetectionStatus
+from sweep.plan.cell_selection import cell
 from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import detector_settings
 from sweep.store.lifecycle import create_store, open_dataset
 
 MINE = '''
@@ -95,3 +98,38 @@ def test_settings_are_checked_as_our_own(folder):
         Pipeline.from_text(GRID + "shift_pixels = [0, 10]\n", folder=folder)
     chosen = Pipeline.from_text(GRID, ["shift_px=1.5"], folder=folder)
     assert chosen.values_of("shift_px") == (1.5,)
+
+
+def test_a_detector_goes_together_with_its_settings(folder):
+    text = GRID.replace('detector = ["opencv", "mine:TURNED"]', """
+by = { zip = { detector = ["opencv", "mine:TURNED"], shift_px = [0, 0.5] } }""")
+    pipeline = Pipeline.from_text(text, folder=folder)
+    columns = run_cells(pipeline, [np.arange(2)]).columns
+    opencv, shifted = columns["corner_error_px"]
+    np.testing.assert_allclose(shifted, opencv + 0.5, rtol=0, atol=1e-5)
+    at = cell(pipeline, "by=1,tilt_deg=40")
+    assert (at.fixed["detector"], at.fixed["shift_px"]) == ("mine:TURNED", 0.5)
+    assert cell(pipeline, "by=0,tilt_deg=0").fixed["detector"] == "opencv"
+
+
+def test_two_plug_ins_share_a_setting_only_if_it_is_declared_equally(folder):
+    (folder / "other.py").write_text(MINE)
+    both = GRID.replace('"mine:TURNED"]', '"mine:TURNED", "other:TURNED"]\nshift_px = [0, 1]')
+    settings = detector_settings(Pipeline.from_text(both, folder=folder))
+    assert len(settings) == 6
+    (folder / "other.py").write_text(MINE.replace("high=9", "high=8"))
+    with pytest.raises(PipelineError) as refused:
+        Pipeline.from_text(both, folder=folder)
+    assert str(refused.value) == (
+        'pipeline: axes.detector = "other:TURNED": expected its setting shift_px to be declared '
+        "as that of mine:TURNED, or another name"
+    )
+
+
+def test_settings_that_the_plug_in_refuses_are_a_line(folder):
+    (folder / "mine.py").write_text(MINE.replace(
+        "high=9)\n", 'high=9)\n\n    def __post_init__(self):\n'
+        '        if self.shift_px:\n            raise ValueError("no shift on Sundays")\n'))
+    pipeline = Pipeline.from_text(GRID + "shift_px = [0, 1]\n", folder=folder)
+    with pytest.raises(PluginError, match="mine:TURNED: raises ValueError: no shift on Sundays"):
+        use(pipeline, "detector", "mine:TURNED")

@@ -37,7 +37,7 @@ from sweep.analysis.pose_view import SIGNED_INPUTS, pose_arrays
 from sweep.errors import DatasetError
 from sweep.measure.flags import Flag, flag
 from sweep.plan.schema import cf_attributes
-from sweep.typing import Floats
+from sweep.typing import Floats, Integers
 
 NOMINAL = 0.9545
 """Share of normal errors within two standard deviations."""
@@ -106,7 +106,9 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
         - ``coverage`` (quantity, cells): share of errors within two sigma of the bias, by a model
           of the other half of the trials (even, odd); ``judged`` poses. ``camera_coverage``: the
           same along and about the camera's own axes.
-        - ``use`` (quantity, cells): whether the model may be used there (`Use`).
+        - ``use`` (quantity, cells): whether the model may be used there (`Use`): the coverage lies
+          within 0.93 to 0.97, with a tolerance of a standard error, and that of each half of the
+          trials with one of two.
         - ``flip_rate``, ``solved_rate`` and ``looked_for`` (cells). Flipped and missing poses are
           in these, not in sigma.
 
@@ -276,19 +278,24 @@ def _cell_variables(
     judged: Sequence[Floats], bins: Bins, kept: Sequence[str], shape: tuple[int, ...],
 ) -> dict[str, Any]:
     cells = tuple(f"cell_{name}" for name in PREDICTORS)
-    sums = np.stack([each.sum(axis=0) for each in judged])  # (models, cells, columns)
+    halves = np.stack(judged)  # (models, halves, cells, columns)
+    sums = halves.sum(axis=1)
     counts = {name: np.rint(sums[..., k]).astype(np.int64) for k, name in enumerate(COUNTS)}
     n = counts["judged"]
     with np.errstate(invalid="ignore", divide="ignore"):
         shares = sums[..., len(COUNTS):] / n[..., None]
         flip_rate = counts["flipped"] / counts["solved"]
         solved_rate = counts["solved"] / counts["looked_for"]
-        spread = np.sqrt(NOMINAL * (1.0 - NOMINAL) / n)[..., None]
+        low, high = _limits(n)
+        half_low, half_high = _limits(halves[..., COUNTS.index("judged")], 2.0)
+        of_half = halves[..., len(COUNTS) : len(COUNTS) + len(QUANTITIES)] / (
+            halves[..., [COUNTS.index("judged")]])
     coverage, camera = shares[..., : len(QUANTITIES)], shares[..., len(QUANTITIES):]
     use = np.select(
         [(counts["looked_for"] == 0)[..., None], (solved_rate < MIN_DETECTION)[..., None],
          (flip_rate > MAX_FLIPS)[..., None], (n < MIN_JUDGED)[..., None],
-         coverage < COVERAGE[0] - spread, coverage > COVERAGE[1] + spread],
+         (coverage < low) | (of_half < half_low).any(axis=1),
+         (coverage > high) | (of_half > half_high).any(axis=1)],
         [Use.no_poses, Use.rarely_solved, Use.flips, Use.few_draws, Use.too_narrow, Use.too_wide],
         Use.holds)
 
@@ -309,6 +316,13 @@ def _cell_variables(
         "solved_rate": by_cell(solved_rate, "solved of the poses looked for"),
         "flip_rate": by_cell(flip_rate, "nearer to the mirror of the truth, of the solved"),
     }
+
+
+def _limits(n: Integers | Floats, errors: float = 1.0) -> tuple[Floats, Floats]:
+    """Return the limits of the coverage of n errors (..., 1): wider by some standard errors."""
+    with np.errstate(divide="ignore"):
+        spread = errors * np.sqrt(NOMINAL * (1.0 - NOMINAL) / n)[..., None]
+    return COVERAGE[0] - spread, COVERAGE[1] + spread
 
 
 def _exponents(

@@ -15,6 +15,7 @@ from sweep.report.ambiguity_sentence import threshold_sentence
 from sweep.report.choice import belief_sentence, belief_table, choice_sentence, choice_table
 from sweep.report.configurations import configurations
 from sweep.report.environment_differences import environment_tables
+from sweep.report.error_model_table import error_model_tables
 from sweep.report.figure import sentences, values_with_ends
 from sweep.report.formatting import interval_text, number, plural
 from sweep.report.grouping import CONFIGURATION
@@ -105,7 +106,7 @@ def answer(data: ReportData) -> Answer:
         (*found.tables, *belief_table(data, best), *size_errors_table(data, best),
          *choice_table(data), *environment_tables(data)),
         (*found.details, _errors_table(one, known.names[best] if known.several else ""),
-         signed_errors_table(data)),
+         signed_errors_table(data), *error_model_tables(data)),
     )
 
 

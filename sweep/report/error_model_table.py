@@ -11,9 +11,10 @@ import xarray as xr
 from sweep.analysis.error_model_bins import PREDICTORS
 from sweep.analysis.error_model_sums import QUANTITIES
 from sweep.analysis.error_model_values import model_errors
-from sweep.analysis.error_models import Use
+from sweep.analysis.error_models import Use, error_models
 from sweep.report.error_model_file import RULE_M, configuration_names, stacked
 from sweep.report.formatting import interval_text, number
+from sweep.report.report_data import ReportData
 from sweep.report.table import Table
 
 CAPTION = (
@@ -23,6 +24,12 @@ CAPTION = (
 MAX_DISTANCES, MAX_SIDES = 4, 3
 ANGLES_DEG = (0.0, 30.0, 60.0)
 """The table has the knots nearest to these."""
+
+
+def error_model_tables(data: ReportData) -> tuple[Table, ...]:
+    """Return the table of a store's error models if they were made, as `--error-model` does."""
+    models = data.known(error_models.__name__)
+    return () if models is None else (error_model_table(models),)
 
 
 def error_model_table(models: xr.Dataset) -> Table:

@@ -257,6 +257,10 @@ class ReportData:
                 self._analyses[key] = lazy.compute()
         return self._analyses[key]
 
+    def known(self, key: Any) -> xr.Dataset | None:
+        """Return what `once` has returned for a key; None if it was not called."""
+        return self._analyses.get(key)
+
 
 @contextlib.contextmanager
 def store_errors(store: str) -> Iterator[None]:

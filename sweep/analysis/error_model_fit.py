@@ -191,12 +191,16 @@ def fit_error(sums: BinSums, basis: Floats, penalty: Floats) -> Fit:
     kurtosis = sums.power_mean(basis @ bias, 4) * np.exp(-2.0 * fitted)
     ratio = sums.power_mean(basis @ bias, 2) * np.exp(-fitted)
     bread = np.linalg.inv(_normal(basis, penalty, count)).astype(np.float64)
-    spread = np.maximum(kurtosis - 2.0 * ratio + 1.0, 0.0)  # mean of (residual² / variance - 1)²
+    # Mean of (residual² / variance - 1)². A bin's own is too small as often as it has not seen
+    # its tails: it is at least that of all.
+    spread = np.maximum(kurtosis - 2.0 * ratio + 1.0, 0.0)
+    spread = np.maximum(spread, (count * spread).sum() / count.sum())
     meat = (basis * (count * spread)[:, None]).T @ basis
     total, free = count.sum(), basis.shape[1]
+    few = 1.0 + 2.0 / max(total / free - 2.0, 1.0)  # variance of Student's t of a knot's poses
     return Fit(
         bias, log_variance + np.log(total / max(total - free, 1.0)),
-        np.asarray(bias_covariance), np.asarray(bread @ meat @ bread))
+        np.asarray(bias_covariance * few), np.asarray(bread @ meat @ bread * few))
 
 
 def _bias(

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache, lru_cache
 from typing import Any
 
 from sweep.errors import PluginError
+from sweep.messages import MAX_FAULTS
 from sweep.plan.parameters import PARAMETERS, SECTIONS, Parameter
 from sweep.plugins.declared import DeclaredPlugin, declare
 from sweep.plugins.loading import installed_names
@@ -29,12 +30,13 @@ def section_of_settings(kind: str) -> str:
 def named(document: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
     """Yield kind, name and key of each plug-in that a document names, in its order, once."""
     seen = set()
+    installed = cache(installed_names)
     for kind, parameter in NAMED_BY.items():
         for key, value in _values(document, parameter.section, parameter.name):
             for name in value if isinstance(value, list) else [value]:
                 if (
                     isinstance(name, str) and (kind, name) not in seen
-                    and is_plugin(parameter, name)
+                    and is_plugin(parameter, name, installed)
                 ):
                     seen.add((kind, name))
                     yield kind, name, key
@@ -45,15 +47,20 @@ def named(document: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
             yield "effect", name, EFFECTS_KEY
 
 
-def is_plugin(parameter: Parameter, name: str) -> bool:
-    """Return whether a value names a plug-in, or is meant to: it is none of the choices."""
+def is_plugin(
+    parameter: Parameter, name: str, installed: Callable[[str], Sequence[str]]
+) -> bool:
+    """Return whether a value names a plug-in, or is meant to: it is none of the choices.
+
+    ``installed`` returns the names of the installed plug-ins of a kind.
+    """
     try:
         parameter.check(name)
     except ValueError:
         kind = parameter.declaration.plugin
         # Where there are several choices, a misspelt one is more likely.
         few = len(parameter.declaration.choices) == 1
-        return few or ":" in name or name in installed_names(kind)
+        return few or ":" in name or name in installed(kind)
     return False
 
 
@@ -90,8 +97,10 @@ def read_plugins(
             for kind, name, key in named(document) if (kind, name) not in recorded
         ]
     plugins = []
-    faults = []
+    faults: list[tuple[str, str, str, str]] = []
     for kind, name, key in named(document):
+        if len(faults) == MAX_FAULTS:
+            break  # no more are told
         try:
             plugin = declare(kind, name, folder)
             parameters_with((*plugins, plugin))

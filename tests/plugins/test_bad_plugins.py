@@ -9,6 +9,7 @@ import pytest
 
 from sweep.errors import PipelineError, PluginError
 from sweep.evaluation.cells import run_cells
+from sweep.execution.worker_versions import _worker_identity
 from sweep.isolation.child_process import Child
 from sweep.isolation.plugin_check import check_plugins, use
 from sweep.measure.flags import DetectionStatus, EstimateStatus
@@ -306,3 +307,27 @@ def test_costs_are_counted_by_a_clock_that_sees_all_that_works(tmp_path):
     settings = detector_settings(Pipeline.from_text(text, folder=tmp_path))
     assert clock_of(settings[:1]) is time.thread_time
     assert clock_of(settings) is time.process_time
+
+
+def test_many_names_of_plug_ins_are_refused_at_once(tmp_path):
+    names = ", ".join(f'"nowhere{k}:D"' for k in range(20_000))
+    words = ", ".join(f'"solver{k}"' for k in range(20_000))
+    started = time.perf_counter()
+    with pytest.raises(PipelineError) as refused:
+        Pipeline.from_text(
+            f"effects = [{names}]\n[pose]\nside_px = 24\n[axes]\ndetector = [{names}]\n"
+            f"solver = [{words}]\n", folder=tmp_path,
+        )
+    assert len(refused.value.faults) <= 21
+    assert time.perf_counter() - started < 20  # 0.5 s by itself
+
+
+def test_a_worker_says_which_plug_ins_it_lacks(pipeline, tmp_path):
+    bad = pipeline("nan")
+    assert _worker_identity(bad)[2] == []
+    (tmp_path / "bad.py").rename(tmp_path / "gone.py")
+    (line,) = _worker_identity(bad)[2]
+    assert line.startswith(f"detector bad:nan: expected the file bad.py in {tmp_path}")
+    (tmp_path / "bad.py").write_text(DETECTORS + "# changed\n")
+    (line,) = _worker_identity(bad)[2]
+    assert "bad.py as it was when the run began" in line

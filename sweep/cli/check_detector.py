@@ -73,7 +73,7 @@ def _execute(options: argparse.Namespace) -> int:
 
 
 CHECK_DETECTOR = Command(
-    "check-detector", "try whether a detector's corners, their order and IDs are what it declares",
+    "check-detector", "try whether a detector's conventions are what it declares",
     "sweep/adapters/README.md",
     (
         Example(

@@ -54,7 +54,7 @@ def _execute(options: argparse.Namespace) -> int:
 
 ERROR_MODEL = Command(
     "error-model",
-    "write models of the pose's error to take away: JSON, C++, Python, Java, ROS covariances",
+    "write models of the pose's error for C++, Python, Java, ROS",
     "sweep/analysis/README.md",
     (
         Example("sweep error-model runs/tags.zarr",

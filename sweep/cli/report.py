@@ -100,7 +100,7 @@ def _execute(options: argparse.Namespace) -> int:
 
 
 REPORT = Command(
-    "report", "write a report of a store: the answer, figures, example scenes",
+    "report", "write a report of a store: answer, figures, example scenes",
     "sweep/analysis/README.md",
     (
         Example(

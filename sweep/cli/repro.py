@@ -121,7 +121,7 @@ def _say_next(options: argparse.Namespace, again: Reproduction, status: int) -> 
 
 
 REPRO = Command(
-    "repro", "recompute one cell of a store and compare it with the stored one",
+    "repro", "recompute one cell of a store, compared with the stored one",
     "sweep/integrity/README.md",
     (
         Example(

@@ -152,7 +152,7 @@ def _plain(values: dict[str, Any]) -> dict[str, Any]:
 
 
 REQUIRE = Command(
-    "require", "decide whether a store's results meet requirements (exit status 0, 1 or 3)",
+    "require", "decide whether a store's results meet requirements",
     "sweep/analysis/README.md",
     (
         Example(

@@ -92,7 +92,7 @@ def _execute(options: argparse.Namespace) -> int:
 
 
 SCORE = Command(
-    "score", "score detections or poses that another program made of an export",
+    "score", "score what another program detected in an export's images",
     "sweep/exchange/README.md",
     (
         Example(

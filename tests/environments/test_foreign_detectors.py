@@ -61,7 +61,7 @@ def cells(pipeline):
     return run_cells(pipeline, [index.ravel() for index in np.indices(shape)])
 
 
-@pytest.mark.parametrize(("window", "count"), [("auto", 40), ("full", 3)])
+@pytest.mark.parametrize(("window", "count"), [("auto", 24), ("full", 3)])
 def test_this_python_through_its_own_process_gives_the_same_bits(window, count):
     pipeline = Pipeline.from_text(
         PAIRED.format(window=window, count=count, python=sys.executable))

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.evaluation.estimation import detections_for
+from sweep.evaluation.foreign_search import ForeignSearch
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import SearchResult, search, visibility_flags, whole_frames
 from sweep.isolation.interrupts import Interrupts
@@ -26,7 +27,7 @@ from sweep.measure.detectors import AnyDetectorSetting, FindFunction, make_detec
 from sweep.measure.estimation import Detections, PoseEstimator
 from sweep.measure.estimators import EstimatorSetting, build
 from sweep.measure.flags import DetectionStatus
-from sweep.measure.foreign_detector import ForeignSetting
+from sweep.measure.foreign_detector import ForeignDetector, ForeignSetting
 from sweep.model.renderers import Grey
 from sweep.model.scene import Scenes, build_scenes
 from sweep.plan.experiment import Pipeline
@@ -214,6 +215,15 @@ def _search_all(
     find: FindFunction, images: Mapping[int, Grey], scenes: Scenes,
     sides: Sequence[int],
 ) -> None:
+    if isinstance(find, ForeignDetector):
+        # One at a time there, and together on the way, which is little of the cost then.
+        foreign = ForeignSearch(
+            find, 0, scenes.dictionary, sides, [0.0] * len(scenes), [], [], [], []
+        )
+        for row, image in images.items():
+            foreign.add(row, image)
+        foreign.search()
+        return
     for row, image in images.items():
         # If it raises, the run has flagged the pose; the attempt has a cost as well.
         with suppress(Exception):

@@ -10,6 +10,7 @@ from sweep.report.grouping import CONFIGURATION, Grouping
 from sweep.report.report_data import ReportData
 
 CHOICES = {
+    ThresholdChoice.not_needed: "no threshold is needed for {wanted} %",
     ThresholdChoice.none: "no threshold brings them to {wanted} %",
     ThresholdChoice.too_few_draws: "there are too few draws to tell whether a threshold brings "
                                    "them to {wanted} %",
@@ -34,9 +35,12 @@ def threshold_sentence(data: ReportData, best: int) -> str:
     wanted = f"{100 * float(table.attrs['flip_rate']):g}"
     choice = ThresholdChoice(int(one["choice"]))
     flips = 100 * float(one["flipped"]) / float(one["solved"])
+    begin = f"Flips to the mirrored pose are {number(flips)} % of the solved"
+    if int(one["without_alternative"]) == int(one["solved"]):
+        return f"{begin}; this solver returns one solution, so that no threshold tells them."
     text = (
-        f"Flips to the mirrored pose are {number(flips)} % of the solved; the usual threshold of "
-        f"{USUAL:g} on the ambiguity rejects {number(100 - 100 * float(usual['kept_rate']))} % of "
+        f"{begin}; the usual threshold of {USUAL:g} on the ambiguity rejects "
+        f"{number(100 - 100 * float(usual['kept_rate']))} % of "
         f"the poses, {number(100 * float(usual['rejected_right_rate']))} % of them right, and "
         f"keeps {number(100 * float(usual['kept_flip_rate']))} % flips")
     if choice == ThresholdChoice.found:

@@ -1,0 +1,75 @@
+"""Questions as users ask them: short files, and answers on the first screen of the report."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from support.reports import command, made
+from sweep.analysis.required_pipeline import check_required
+from sweep.plan.experiment import Pipeline
+
+FOLDER = Path(__file__).parents[2] / "pipelines" / "questions"
+QUESTIONS = sorted(path.stem for path in FOLDER.glob("*.toml"))
+MAX_LINES = 12
+
+SMALL = {
+    "how_far": ["distance_m=[0.5, 3]", "tilt_deg=[0, 60]"],
+    "which": ["distance_m=[0.5, 2]"],
+    "which_size": ["size_m=[0.06, 0.4]", "tilt_deg=[0, 60]"],
+    "flips": ["tilt_deg=[5, 30]"],
+    "focal_length": ["distance_m=[0.5, 1.5]"],
+    "field_of_view": ["hfov_deg=[30, 110]", "tilt_deg=[0, 60]"],
+    "blur": ["blur_px=[0, 3]"],
+    "dictionary": ["side_px=[15, 40]"],
+    "threshold": ["adaptiveThreshConstant=[2, 7, 15]"],
+    "room": [],
+}
+"""Few values of each axis."""
+
+EXPECTED = {
+    "how_far": "up to 0.5 m",
+    "which": "etected in at least 99 %",
+    "which_size": "with markers of 0.4 m and larger",
+    "flips": "tilt",
+    "focal_length": "etected in at least 99 % at all distances",
+    "field_of_view": "up to a hfov of 30\u00b0",
+    "blur": "up to a blur of 0 px",
+    "dictionary": "down to a side of 40 px",
+    "threshold": "etected in ",
+    "room": "etected in ",
+}
+"""A part of the first sentence on the small grid."""
+
+
+@pytest.mark.parametrize("name", QUESTIONS)
+def test_a_question_is_short_and_what_it_requires_can_be(name):
+    path = FOLDER / f"{name}.toml"
+    assert path.read_text().count("\n") <= MAX_LINES
+    pipeline = Pipeline.from_toml(path)
+    check_required(pipeline.requirements, str(path))
+    assert name in SMALL
+    assert f"({name}.toml)" in (FOLDER / "README.md").read_text()
+
+
+def asked(name, folder, trials):
+    text = (FOLDER / f"{name}.toml").read_text()
+    url = made(folder, text, name, settings=[*SMALL[name], f"trial={trials}"])
+    code, out, err = command("report", url, "-o", folder / "report.html", "--json")
+    assert (code, err) == (0, "")
+    return json.loads(out)
+
+
+@pytest.mark.parametrize(
+    "name", [name if name == "focal_length" else pytest.param(name, marks=pytest.mark.long)
+             for name in QUESTIONS])
+def test_the_first_sentence_answers_the_question(name, tmp_path):
+    shown = asked(name, tmp_path, 8 if name == "focal_length" else 150)
+    assert EXPECTED[name] in shown["answer"]
+    if name == "focal_length":
+        (table,) = (each for each in shown["tables"]
+                    if each["caption"].startswith("What a wrong belief"))
+        bias = [float(row[table["headings"].index("range bias, %")].split()[0].replace(
+            "\u2212", "-")) for row in table["rows"]]
+        assert bias[1] - bias[0] == pytest.approx(-1, abs=0.05)
+        assert bias[2] - bias[0] == pytest.approx(1, abs=0.05)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 from sweep.environments.interpreters import find_python
@@ -65,13 +64,11 @@ def identify(environment: str, folder: str) -> EnvironmentIdentity:
 
 def process_of(python: str) -> DetectorProcess:
     """Return the process of an interpreter that this process keeps, started if it has ended."""
-    process = _kept(python, os.getpid())
-    if process.ended:
-        _kept.cache_clear()
-        process = _kept(python, os.getpid())
+    key = python, os.getpid()  # a fork has none
+    process = _kept.get(key)
+    if process is None or process.ended:
+        process = _kept[key] = DetectorProcess(python)
     return process
 
 
-@lru_cache(maxsize=64)
-def _kept(python: str, _process_id: int) -> DetectorProcess:
-    return DetectorProcess(python)
+_kept: dict[tuple[str, int], DetectorProcess] = {}

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from support.stub_opencv import script, stub_python
+from sweep.environments.identity import process_of
 from sweep.environments.process import DetectorProcess, DetectorProcessError, SearchDefinition
 from sweep.errors import EnvironmentFaultError, MachineFaultError, PipelineError
 from sweep.evaluation.cells import run_cells
@@ -186,6 +187,14 @@ def test_a_search_that_ends_its_process_or_raises_costs_its_own_cell_alone(stub)
     assert dead.text.endswith("ended: SIGSEGV")
     assert not raised.crashed
     assert raised.text == "cv2.error: no such image"
+
+
+def test_a_process_that_ended_is_replaced_and_others_are_kept(stub):
+    first, other = process_of(stub), process_of(sys.executable)
+    first.close()
+    assert process_of(stub) is not first
+    assert process_of(stub) is process_of(stub)
+    assert process_of(sys.executable) is other
 
 
 @pytest.mark.parametrize("level", [204, 205])

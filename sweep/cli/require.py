@@ -107,7 +107,7 @@ def _open(store: str, at: list[str]) -> tuple[xr.Dataset, Pipeline]:
     if not opened.finished:
         raise StoreError(f"{store}: is not finished, and its requirements are of all poses; "
                          f"`sweep run {store}` continues it")
-    return selected(open_dataset(store), at), opened.pipeline
+    return selected(open_dataset(store), at, opened.pipeline), opened.pipeline
 
 
 def _required(

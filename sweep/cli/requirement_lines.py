@@ -21,6 +21,7 @@ from sweep.plan.sobol import REPLICATES
 
 if TYPE_CHECKING:
     from sweep.analysis.regressions import Regression
+    from sweep.plan.experiment import Pipeline
 
 MAX_ROWS = 500
 """Conditions that a table in Markdown lists."""
@@ -29,16 +30,18 @@ WORDS = {Decision.met: "met", Decision.not_met: "not met", Decision.undecided: "
          Decision.not_applicable: "nothing to judge"}
 
 
-def selected(results: xr.Dataset, at: Sequence[str]) -> xr.Dataset:
-    """Return results at some values of axes.
+def selected(results: xr.Dataset, at: Sequence[str], pipeline: Pipeline) -> xr.Dataset:
+    """Return results at some values of axes, or of parameters that go together along one.
 
     Raises
     ------
     ArgumentError
         For an axis or a value that the store does not have.
     """
-    for name, value in parse_selection(",".join(at)).items() if at else ():
-        if name not in results.dims:
+    for name, value in parse_selection(",".join(at), pipeline).items() if at else ():
+        axis = str(results[name].dims[0]) if name in results.coords and (
+            results[name].ndim == 1) else ""
+        if axis not in axes_of(results):
             axes = axes_of(results)
             raise ArgumentError("at", name, f"no such axis{nearest(name, axes)}; "
                                 f"there are {', '.join(axes)}")
@@ -50,7 +53,7 @@ def selected(results: xr.Dataset, at: Sequence[str]) -> xr.Dataset:
         if not same.any():
             shown = ", ".join(label(each) for each in values[:20].tolist())
             raise ArgumentError("at", f"{name}={label(value)}", f"no such value; there are {shown}")
-        results = results.isel({name: np.nonzero(same)[0][:1]})
+        results = results.isel({axis: np.nonzero(same)[0]})
     return results
 
 

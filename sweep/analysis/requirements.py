@@ -123,7 +123,7 @@ def parse_requirements(texts: str | Iterable[str]) -> tuple[Requirement, ...]:
     if faults:
         first, *others = faults
         raise ArgumentError("requirements", first[0], "\n".join(
-            [first[1], *(f"requirements = {text}: {problem}" for text, problem in others)]))
+            [first[1], *(f"{text}: {problem}" for text, problem in others)]))
     return tuple(requirements)
 
 

@@ -125,10 +125,8 @@ def test_export_then_a_plain_opencv_script_then_score_equals_run(ran, scored):
 
 
 def test_a_scored_store_is_a_store(scored, capsys):
-    for command in ("verify", "status", "run"):
-        arguments = ["--store", str(scored)] if command == "run" else []
-        assert cli.main([command, str(scored), *arguments]) == 0, command
-    assert re.search(r"sound: .* \d+ scenes recomputed", capsys.readouterr().out)
+    assert cli.main(["verify", str(scored), "--sample", "0"]) == 0
+    assert cli.main(["run", str(scored), "--store", str(scored)]) == 0
     assert cli.main(["tradeoff", str(scored)]) == 2
     assert "the detections of mine.npz were recorded" in capsys.readouterr().err
     scene = inspect_scene(cell(open_store(str(scored)).pipeline, "tilt_deg=50,trial=2"))
@@ -139,6 +137,8 @@ def test_a_scored_store_is_a_store(scored, capsys):
 
 @pytest.mark.long
 def test_a_scored_store_is_reported_and_its_cells_reproduced(scored, tmp_path, capsys):
+    assert cli.main(["verify", str(scored)]) == 0
+    assert re.search(r"sound: .* \d+ scenes recomputed", capsys.readouterr().out)
     assert cli.main(["repro", str(scored), "--at", "tilt_deg=50"]) == 0
     assert "agrees with the store bit for bit" in capsys.readouterr().out
     page = tmp_path / "report.html"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sweep.errors import PluginError
 from sweep.measure.detector import DetectorOutput
 from sweep.plugins import DetectorPlugin
-from sweep.plugins.calls import call
+from sweep.plugins.calls import call, real_numbers
 from sweep.typing import Floats
 
 MAX_MARKERS = 1000
@@ -101,18 +101,17 @@ class PluggedDetector:
             raise PluginError(
                 f"{self._name}: returned ids of type {ids.dtype}; expected whole numbers"
             )
+        if np.ma.is_masked(returned[1]):
+            raise PluginError(f"{self._name}: returned ids of which some are masked")
+        if (ids > np.iinfo(np.int64).max).any():
+            raise PluginError(f"{self._name}: returned the ID {ids.max()}; expected below 2^63")
         if (ids < 0).any():
             raise PluginError(f"{self._name}: returned the ID {ids.min()}; expected at least 0")
         return list(corners[:, None]), ids.astype(np.int64), list(rejected[:, None])
 
     def _quadrilaterals(self, what: str, returned: Any) -> Floats:
         """Return corners (n, 4, 2) in our order, with pixel centres at whole numbers."""
-        try:
-            quads = np.asarray(returned, dtype=np.float64)
-        except Exception:
-            raise PluginError(
-                f"{self._name}: returned {what} that are no array of numbers"
-            ) from None
+        quads = real_numbers(self._name, what, returned)
         if quads.size == 0 and quads.shape[:1] in ((0,), (1,)):
             return np.empty((0, 4, 2))
         if quads.ndim != 3 or quads.shape[1:] != (4, 2):

@@ -14,7 +14,7 @@ from sweep.measure.estimation import Detections, Estimates
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.solver import reprojection_errors_px
 from sweep.plugins import EstimatorPlugin, Poses
-from sweep.plugins.calls import call
+from sweep.plugins.calls import call, real_numbers
 from sweep.typing import Floats
 
 ROTATION_ATOL = 1e-6
@@ -117,10 +117,7 @@ class PluggedEstimator:
         return Poses(**arrays)
 
     def _array(self, name: str, value: Any, shape: tuple[int, ...]) -> Floats:
-        try:
-            array = np.array(value, dtype=np.float64)
-        except Exception:
-            raise PluginError(f"{self._name}: returned a {name} that is no array") from None
+        array = real_numbers(self._name, f"values of {name}", value)
         if array.shape != shape:
             raise PluginError(
                 f"{self._name}: returned a {name} of shape {array.shape}; expected {shape}"

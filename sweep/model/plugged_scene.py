@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sweep.errors import PluginError
 from sweep.model.effects import EFFECTS, Effect, Patch
-from sweep.plugins.calls import call
+from sweep.plugins.calls import call, real_numbers
 from sweep.typing import Floats
 
 
@@ -93,7 +93,7 @@ def checked_effect(
     """Return an effect's function that raises PluginError for results that are no levels."""
 
     def applied(levels: Floats, patch: Patch) -> Floats:
-        returned = _array(name, "levels", call(name, apply, levels.copy(), patch))
+        returned = real_numbers(name, "levels", call(name, apply, levels.copy(), patch))
         return _checked(name, "levels", returned, levels.shape)
 
     return applied
@@ -111,7 +111,7 @@ def checked_renderer(name: str, render: Callable[[Any], Any]) -> Render:
             )
         shape = (bottom - top, right - left)
         levels, share = (
-            _checked(name, what, _array(name, what, each), shape)
+            _checked(name, what, real_numbers(name, what, each), shape)
             for what, each in zip(("levels", "share"), returned, strict=True)
         )
         if ((share < 0) | (share > 1)).any():
@@ -119,13 +119,6 @@ def checked_renderer(name: str, render: Callable[[Any], Any]) -> Render:
         return levels, share
 
     return rendered
-
-
-def _array(name: str, what: str, returned: Any) -> Floats:
-    try:
-        return np.array(returned, dtype=np.float64)
-    except Exception:
-        raise PluginError(f"{name}: returned {what} that are no array of numbers") from None
 
 
 def _checked(name: str, what: str, array: Floats, shape: tuple[int, ...]) -> Floats:

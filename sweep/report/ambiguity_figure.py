@@ -86,7 +86,7 @@ def by_configurations(data: ReportData, grouping: Grouping) -> tuple[list[str], 
     table = table.isel(dict.fromkeys(single, 0), drop=True)
     if not data.setting_axes:
         return ["all"], table.expand_dims(CONFIGURATION)
-    names, stacked = by_configuration(table, data.setting_axes)
+    names, stacked = by_configuration(data.pipeline, table, data.setting_axes)
     return names, stacked.transpose(CONFIGURATION, ...)
 
 

@@ -124,6 +124,9 @@ def _size(data: ReportData) -> str:
     """Return how many poses and configurations there are, as a sentence."""
     poses = data.pipeline.size(Stage.scene)
     count = data.pipeline.size(Stage.detection, Stage.estimation)
+    known = configurations(data)
+    if math.prod(map(len, known.settings.axes.values())) == count:
+        count = len(known.names)  # without those that are the same
     each = f", each with {plural(count, 'configuration')}" if count > 1 else ""
     return f"{plural(poses, 'pose')}{each}."
 

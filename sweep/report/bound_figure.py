@@ -43,7 +43,7 @@ def _render(data: ReportData) -> RenderedFigure:
     sizes = data.along(along, SIZE_COLUMNS) if along else Grouping()
     settings, per = list(grouping.dims), list(sizes.dims)
     ratio = _over_bound(data.analysed(efficiency, grouping + sizes))
-    names, summary = by_configuration(ratio, settings)
+    names, summary = by_configuration(data.pipeline, ratio, settings)
     columns = group_labels(summary, along) if along else ["all"]
     label = data.label(along) if along else ""
 

@@ -64,7 +64,8 @@ class Best(NamedTuple):
 def best_by(known: Configurations, criterion: Criterion) -> Best | None:
     """Return the best configuration by a criterion, of those without a wrong belief.
 
-    What is as good has an interval that overlaps the best one's. None if no value is finite.
+    What is as good has an interval that overlaps the best one's; of equals the more exact is
+    named. None if no value is finite.
     """
     value, low, high = values_with_ends(known.summary, criterion.variable, criterion.scale)
     shown = value
@@ -76,7 +77,7 @@ def best_by(known: Configurations, criterion: Criterion) -> Best | None:
     if not usable.any():
         return None
     sign = -1.0 if criterion.largest else 1.0
-    best = int(np.argmin(np.where(usable, sign * value, np.inf)))
+    best = min((k for k in known.order if usable[k]), key=lambda k: float(sign * value[k]))
     interval = "" if math.isnan(low[best]) and math.isnan(high[best]) else (
         f" ({interval_text(low[best], high[best], criterion.unit)})")
     exact = known.summary["median_interval"].values == IntervalOf.nothing_drawn

@@ -85,7 +85,7 @@ def _map_by_size(data: ReportData, grouping: Grouping) -> tuple[Panel, tuple[str
     axis = str(data.size_axis)
     sizes = data.along(axis, SIZE_COLUMNS)
     names, summary = by_configuration(
-        data.analysed(error_statistics, grouping + sizes), grouping.dims)
+        data.pipeline, data.analysed(error_statistics, grouping + sizes), grouping.dims)
     values = summary["rotation_median_deg"].transpose(CONFIGURATION, axis).values
     columns = group_labels(summary, axis)
     return Panel(
@@ -131,7 +131,7 @@ def _paired(data: ReportData) -> RenderedFigure:
     results = data.results.isel({name: list(some) for name, some in grouping.chosen})
     summary = data.once("paired", lambda: compare(
         _with_first_configuration(results, grouping.dims), results, grouping.dims))
-    names, differences = by_configuration(summary, grouping.dims)
+    names, differences = by_configuration(data.pipeline, summary, grouping.dims)
     others = differences.isel({CONFIGURATION: slice(1, None)})
     return RenderedFigure(
         "paired", f"Each configuration against the first: {names[0]}",

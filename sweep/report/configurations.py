@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sweep.analysis import error_statistics
 from sweep.plan.parameters import Stage
 from sweep.plan.same_meaning import wrong_configurations
+from sweep.plan.used_settings import distinct, used_settings
 from sweep.report.formatting import plural
 from sweep.report.grouping import Grouping, by_configuration
 from sweep.report.report_data import ReportData
@@ -42,16 +43,20 @@ class Settings:
         Axis -> indices of its values.
     grouping
         Of analyses that keep them apart.
+    kept
+        Which of all combinations, the last axis fastest, are configurations of their own: the first
+        of those that differ in settings alone which they do not use.
     """
 
     axes: dict[str, tuple[int, ...]]
     grouping: Grouping
+    kept: tuple[int, ...]
 
     @property
     def combinations(self) -> list[dict[str, int]]:
-        """The index along each axis, of every combination; one that is empty without axes."""
-        return [dict(zip(self.axes, index, strict=True))
-                for index in itertools.product(*self.axes.values())]
+        """The index along each axis, of every configuration; one that is empty without axes."""
+        every = list(itertools.product(*self.axes.values()))
+        return [dict(zip(self.axes, every[k], strict=True)) for k in self.kept]
 
 
 def settings_of(
@@ -75,7 +80,10 @@ def settings_of(
         part = data.along(name, length, binned=False)
         axes[name] = dict(part.chosen).get(name, tuple(range(length)))
         grouping += part
-    return Settings(axes, grouping)
+    values = [[data.results[name].values.tolist()[k] for k in some] for name, some in axes.items()]
+    kept = distinct(data.pipeline, [
+        dict(zip(axes, each, strict=True)) for each in itertools.product(*values)])
+    return Settings(axes, grouping, tuple(kept))
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,11 +143,12 @@ def configurations(data: ReportData) -> Configurations:
 def _configurations(data: ReportData) -> Configurations:
     settings = settings_of(data)
     names, summary = by_configuration(
-        data.analysed(error_statistics, settings.grouping), settings.grouping.dims)
+        data.pipeline, data.analysed(error_statistics, settings.grouping), settings.grouping.dims)
     axes = [axis for axis in data.pipeline.axes_of(*BOTH) if axis.name in settings.axes]
     flags = np.array(wrong_configurations(data.pipeline, axes)).reshape(
         [len(axis) for axis in axes])
     wrong = flags[np.ix_(*settings.axes.values())].reshape(-1) if axes else flags.reshape(-1)
+    wrong = wrong[list(settings.kept)]
     names = [name + WRONG * bool(flag) for name, flag in zip(names, wrong, strict=True)]
     median = summary["rotation_median_deg"].values.astype(np.float64)
     solved = np.nan_to_num(summary["solved_rate"].values.astype(np.float64))
@@ -147,8 +156,8 @@ def _configurations(data: ReportData) -> Configurations:
     return Configurations(settings, names, wrong, summary, tuple(order.tolist()))
 
 
-def shown_lines(data: ReportData, settings: Settings, most: int = MAX_LINES) -> list[int]:
-    """Return which combinations a chart shows: the first in order, as they stand in the grid."""
+def most_exact_first(data: ReportData, settings: Settings) -> list[int]:
+    """Return the combinations of some settings in the order of their best configurations."""
     known = configurations(data)
     all_of_them = known.settings.combinations
 
@@ -159,7 +168,12 @@ def shown_lines(data: ReportData, settings: Settings, most: int = MAX_LINES) -> 
         ), len(known.order))
 
     ranks = [rank_of(each) for each in settings.combinations]
-    return sorted(sorted(range(len(ranks)), key=lambda k: (ranks[k], k))[:most])
+    return sorted(range(len(ranks)), key=lambda k: (ranks[k], k))
+
+
+def shown_lines(data: ReportData, settings: Settings, most: int = MAX_LINES) -> list[int]:
+    """Return which combinations a chart shows: the first in order, as they stand in the grid."""
+    return sorted(most_exact_first(data, settings)[:most])
 
 
 def shown_note(shown: Sequence[int], count: int) -> str:
@@ -177,4 +191,4 @@ def first_detector(data: ReportData) -> tuple[dict[str, int], str]:
     names = {axis.name for axis in data.pipeline.axes_of(Stage.detection)}
     index = {name: k for name, k in best.items() if name in names}
     values = {name: data.results[name].values.tolist()[k] for name, k in index.items()}
-    return index, configuration_label(values) if index else ""
+    return index, configuration_label(used_settings(data.pipeline, values)) if index else ""

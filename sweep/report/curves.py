@@ -166,7 +166,8 @@ def curves_of(
     if angles and along != data.angle_axis:
         by = data.by_angle(MAX_ANGLE_PANELS if several else MAX_ANGLES, binned=not several)
     grouping = settings.grouping + by + groups
-    _, summary = by_configuration(data.analysed(analysis, grouping), settings.grouping.dims)
+    _, summary = by_configuration(
+        data.pipeline, data.analysed(analysis, grouping), settings.grouping.dims)
     return Curves(data, along, by.dims[0] if by.dims else None, settings, summary, grouping.notes)
 
 

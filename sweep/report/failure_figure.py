@@ -60,7 +60,7 @@ class _Outcomes:
     def __init__(self, data: ReportData, axis: str | None, groups: Grouping, label: str) -> None:
         settings = settings_of(data)
         self.names, summary = by_configuration(
-            data.analysed(failure_composition, settings.grouping + groups),
+            data.pipeline, data.analysed(failure_composition, settings.grouping + groups),
             settings.grouping.dims)
         self.several = len(self.names) > 1
         if axis and axis in summary.indexes and np.issubdtype(summary[axis].dtype, np.number):

@@ -74,7 +74,7 @@ def _render(data: ReportData) -> RenderedFigure:
         return detection_rate(results.assign(_in_frame(results, view).data_vars), per, bins)
 
     names, summary = by_configuration(
-        data.analysed(over_frame, settings.grouping + bins), settings.grouping.dims)
+        data.pipeline, data.analysed(over_frame, settings.grouping + bins), settings.grouping.dims)
     shown = shown_lines(data, settings, MAX_MAPPED)
     several = len(names) > 1
     columns, rows = group_labels(summary, ACROSS), group_labels(summary, DOWN)[::-1]

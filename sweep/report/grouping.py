@@ -10,6 +10,8 @@ import numpy as np
 import xarray as xr
 
 from sweep.plan.axes import Axis, Distribution
+from sweep.plan.experiment import Pipeline
+from sweep.plan.used_settings import distinct, used_settings
 from sweep.report.formatting import bin_text, coordinates
 from sweep.tradeoff.labels import configuration_label
 from sweep.typing import Floats
@@ -131,18 +133,20 @@ def group_labels(table: xr.Dataset, name: str) -> list[str]:
     return coordinates(table[name].values.tolist())
 
 
-def by_configuration(table: xr.Dataset, dims: Sequence[str]) -> tuple[list[str], xr.Dataset]:
+def by_configuration(
+    pipeline: Pipeline, table: xr.Dataset, dims: Sequence[str]
+) -> tuple[list[str], xr.Dataset]:
     """Return the labels of all combinations of the settings ``dims``, and the table by them.
 
     In the table the dimension ``configuration`` stands in place of ``dims``; without any it has
-    one row.
+    one row. Combinations that differ in settings alone which they do not use are one.
     """
     values = [table[dim].values.tolist() for dim in dims]
-    labels = [
-        configuration_label(dict(zip(dims, chosen, strict=True)))
-        for chosen in itertools.product(*values)
-    ]
+    combinations = [dict(zip(dims, chosen, strict=True)) for chosen in itertools.product(*values)]
+    kept = distinct(pipeline, combinations)
+    labels = [configuration_label(used_settings(pipeline, combinations[k])) for k in kept]
     stacked = table.stack({CONFIGURATION: list(dims)}, create_index=False) if dims else (
         table.expand_dims(CONFIGURATION))
-    stacked = stacked.drop_vars([*dims], errors="ignore").assign_coords({CONFIGURATION: labels})
+    stacked = stacked.isel({CONFIGURATION: kept}).drop_vars([*dims], errors="ignore")
+    stacked = stacked.assign_coords({CONFIGURATION: labels})
     return labels, stacked.transpose(CONFIGURATION, ...)

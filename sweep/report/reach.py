@@ -123,7 +123,7 @@ def reaches(
         farthest_met(results, requirements, along, per=[angle] if angle else [],
                      at_all=course.at_all)))
     upwards = table.attrs["harder"] == "upwards"
-    rows = _rows(table.drop_dims([along]), settings, angle)
+    rows = _rows(data, table.drop_dims([along]), settings, angle)
     values = _easy_first(data, along, upwards=upwards)
     limits = [_cumulated([_limit(row, values, angle) for row in each], upwards=upwards)
               for each in rows]
@@ -142,7 +142,7 @@ def reaches_without_draws(
     values = _easy_first(data, along, upwards=upwards)
     lowest = table["detection_rate"].min(list(course.at_all)).sel({along: list(values)})
     limits = []
-    for each in _rows(lowest.to_dataset(name="rate"), settings, angle):
+    for each in _rows(data, lowest.to_dataset(name="rate"), settings, angle):
         row = []
         for part in each:
             rates = part["rate"].values
@@ -169,10 +169,13 @@ def _easy_first(data: ReportData, along: str, *, upwards: bool) -> tuple[float, 
     return tuple(sorted(map(float, data.results[along].values.tolist()), reverse=not upwards))
 
 
-def _rows(table: xr.Dataset, settings: Settings, angle: str | None) -> list[list[xr.Dataset]]:
+def _rows(
+    data: ReportData, table: xr.Dataset, settings: Settings, angle: str | None
+) -> list[list[xr.Dataset]]:
     """Return the parts of a table for each configuration and, the smallest first, angle."""
     others = {dim: 0 for dim in table.dims if dim != angle and dim not in settings.axes}
-    names, stacked = by_configuration(table.isel(others, drop=True), list(settings.axes))
+    names, stacked = by_configuration(
+        data.pipeline, table.isel(others, drop=True), list(settings.axes))
     parts = [stacked.isel({CONFIGURATION: k}) for k in range(len(names))]
     if angle is None:
         return [[part] for part in parts]

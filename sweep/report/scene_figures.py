@@ -165,7 +165,7 @@ class _Maps:
         grouping: Grouping = settings.grouping + data.along(self.angle, MAP_ROWS) + data.along(
             self.along, MAP_COLUMNS)
         self.names, self.summary = by_configuration(
-            data.analysed(analysis, grouping), settings.grouping.dims)
+            data.pipeline, data.analysed(analysis, grouping), settings.grouping.dims)
         self.several = len(self.names) > 1
         self.shown = shown_lines(data, settings, MAX_MAPPED)
         self.notes = (shown_note(self.shown, len(self.names)), *grouping.notes,

@@ -22,7 +22,7 @@ def signed_errors_table(data: ReportData) -> Table:
     """Return the table, with rows for each configuration."""
     grouping = configurations(data).settings.grouping
     labels, summary = by_configuration(
-        data.analysed(_signed_error_statistics, grouping), grouping.dims)
+        data.pipeline, data.analysed(_signed_error_statistics, grouping), grouping.dims)
     names = labels if grouping.dims else []
     rows = []
     for quantity in (each for group in GROUPS for each in SIGNED[group]):

@@ -25,7 +25,7 @@ def size_errors_table(data: ReportData, best: int) -> list[Table]:
     axis = signed_axis(data)
     groups = data.along(axis, MAX_ROWS) if axis else Grouping()
     _, table = by_configuration(
-        data.analysed(signed_error_statistics, known.settings.grouping + groups),
+        data.pipeline, data.analysed(signed_error_statistics, known.settings.grouping + groups),
         known.settings.grouping.dims)
     table = table.isel({CONFIGURATION: best})
     if not np.nan_to_num(table["solved"].values).sum():

@@ -13,7 +13,12 @@ from sweep.analysis import detection_rate
 from sweep.analysis.requirements import Decision, check_requirements
 from sweep.plan.axes import TRIAL
 from sweep.plan.parameters import Stage
-from sweep.report.configurations import Settings, configurations, settings_of
+from sweep.report.configurations import (
+    Settings,
+    configurations,
+    most_exact_first,
+    settings_of,
+)
 from sweep.report.figure import sentences
 from sweep.report.formatting import interval_text, number, plural
 from sweep.report.grouping import CONFIGURATION, by_configuration
@@ -242,10 +247,10 @@ def _how_far(data: ReportData) -> Verdict:
         return Verdict(
             "The marker was looked for in no pose: it was visible and modelled in none.")
     if course.along is None:
-        return _how_often(settings, names, rates)
+        return _how_often(settings, names, rates, most_exact_first(data, settings))
     wrong = [False] * len(names)
     found = {rate: _detected(data, rate, course, settings, names, wrong) for rate in RATES}
-    preferred = list(range(len(names)))
+    preferred = most_exact_first(data, settings)
     orders = {rate: reach.order(preferred) for rate, reach in found.items()}
     best = orders[RATES[0]][0] if found[RATES[0]].limits[orders[RATES[0]][0]][-1].rank >= 0 else (
         orders[RATES[1]][0])
@@ -277,7 +282,7 @@ def _how_far(data: ReportData) -> Verdict:
 
 def _rates(data: ReportData, settings: Settings) -> tuple[list[str], xr.Dataset]:
     return by_configuration(
-        data.analysed(detection_rate, settings.grouping), settings.grouping.dims)
+        data.pipeline, data.analysed(detection_rate, settings.grouping), settings.grouping.dims)
 
 
 def _detected(
@@ -294,10 +299,12 @@ def _spoken(settings: Settings, name: str) -> str:
     return f"{next(iter(settings.axes))} none" if name == "none" else name
 
 
-def _how_often(settings: Settings, names: Sequence[str], rates: xr.Dataset) -> Verdict:
-    """Return the detection rate of each setting of the detector."""
+def _how_often(
+    settings: Settings, names: Sequence[str], rates: xr.Dataset, preferred: Sequence[int]
+) -> Verdict:
+    """Return the detection rate of the setting that detects most; of equals the most exact."""
     value = 100 * rates["detection_rate"].values
-    best = int(np.nanargmax(value))
+    best = max(preferred, key=lambda k: np.nan_to_num(float(value[k]), nan=-1.0))
     low, high = (100 * rates[f"detection_rate_{end}"].values[best] for end in ("low", "high"))
     interval = f" ({interval_text(low, high)})" if math.isfinite(low) else ""
     looked_for = int(rates["looked_for"].values[best])

@@ -26,6 +26,7 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import estimators
 from sweep.plan.parameters import Stage
 from sweep.plan.same_meaning import wrong_configurations
+from sweep.plan.used_settings import distinct, used_settings
 from sweep.plugins.printing import printing_to_stderr
 from sweep.plugins.recording import is_recording
 from sweep.store.closing import write_group
@@ -177,7 +178,7 @@ def _trade(
         ],
         compat="no_conflicts", join="exact",
     ).compute()
-    trade = _flattened(accuracy, axes, wrong_configurations(pipeline, axes))
+    trade = _flattened(pipeline, accuracy, axes)
     lengths = [results.sizes[name] for name in per]
     conditions = list(np.ndindex(*lengths))
     configurations = trade.sizes["treatment"]
@@ -208,6 +209,7 @@ def _trade(
     add("detection_ms", "detection of a frame", "ms", median_interval(1e3 * each))
     add("estimation_ms", "estimation of a frame", "ms", median_interval(1e3 * costs.estimation))
     whole = whole_frames_of(pipeline)
+    trade = trade.isel(treatment=distinct(pipeline, _settings(axes)))
     trade.attrs = {
         "title": pipeline.heading,
         "poses": pipeline.size(Stage.scene),
@@ -265,18 +267,25 @@ def _add(
         table[name + ending] = (dims, values, {"long_name": meaning + words, "units": unit})
 
 
+def _settings(axes: Sequence[Axis]) -> list[dict[str, Any]]:
+    """Return the value along each axis of every combination, the last axis fastest."""
+    names = [axis.name for axis in axes]
+    return [dict(zip(names, chosen, strict=True))
+            for chosen in itertools.product(*(axis.values for axis in axes))]
+
+
 def _flattened(
-    accuracy: xr.Dataset, axes: Sequence[Axis], wrong: Sequence[bool]
+    pipeline: Pipeline, accuracy: xr.Dataset, axes: Sequence[Axis]
 ) -> xr.Dataset:
     """Return a dataset with one dimension ``treatment``, by label, for the settings' axes.
 
     Those with a wrong belief are marked: they show what an error costs, and are no choices.
     """
     names = [axis.name for axis in axes]
+    wrong = wrong_configurations(pipeline, axes)
     labels = [
-        configuration_label(dict(zip(names, chosen, strict=True))) + WRONG * believed_wrongly
-        for chosen, believed_wrongly in zip(
-            itertools.product(*(axis.values for axis in axes)), wrong, strict=True)
+        configuration_label(used_settings(pipeline, values)) + WRONG * believed_wrongly
+        for values, believed_wrongly in zip(_settings(axes), wrong, strict=True)
     ]
     if not axes:
         return accuracy.expand_dims(treatment=labels)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 
 import numpy as np
@@ -15,6 +16,7 @@ from sweep.isolation.plugin_check import check_plugins, use
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings
+from sweep.plugins.calls import call
 from sweep.tradeoff.configuration_costs import clock_of
 from tests.support.here import Here
 
@@ -37,6 +39,12 @@ nan = at(lambda image: (ONE * np.nan, [0]))
 shape = at(lambda image: (ONE[0], [0]))
 many = at(lambda image: (np.zeros((10000, 4, 2)), np.zeros(10000, int)))
 words = at(lambda image: ([["a"]], [0]))
+ragged = at(lambda image: ([[1.0], [1.0, 2.0]], [0]))
+texts = at(lambda image: (ONE.astype(str), [0]))
+complexes = at(lambda image: (ONE + 1j, [0]))
+masked = at(lambda image: (np.ma.masked_array(ONE, mask=True), [0]))
+ids_masked = at(lambda image: (ONE, np.ma.masked_array([0], mask=True)))
+ids_huge = at(lambda image: (ONE, np.array([2**64 - 1], np.uint64)))
 ids_float = at(lambda image: (ONE, [0.0]))
 ids_negative = at(lambda image: (ONE, [-1]))
 ids_missing = at(lambda image: (ONE, None))
@@ -88,7 +96,13 @@ def pipeline(tmp_path):
     ("nan", "returned corners that are not finite"),
     ("shape", "returned corners of shape (4, 2); expected (n, 4, 2)"),
     ("many", "returned 10,000 corners for one image; expected at most 1,000"),
-    ("words", "returned corners that are no array of numbers"),
+    ("words", "returned corners of type <U1; expected real numbers"),
+    ("ragged", "returned corners that are no array of numbers"),
+    ("texts", "returned corners of type <U32; expected real numbers"),
+    ("complexes", "returned corners of type complex128; expected real numbers"),
+    ("masked", "returned corners of which some are masked; expected NaN or none"),
+    ("ids_masked", "returned ids of which some are masked"),
+    ("ids_huge", "returned the ID 18446744073709551615; expected below 2^63"),
     ("ids_float", "returned ids of type float64; expected whole numbers"),
     ("ids_negative", "returned the ID -1; expected at least 0"),
     ("ids_missing", "returned ids of shape (); expected (1,), one of each marker"),
@@ -109,6 +123,20 @@ def test_an_image_at_which_a_detector_is_at_fault_is_flagged(pipeline, name, tol
     (failure,) = cells.failures
     assert (failure.stage, failure.setting) == ("detection", 1)
     assert f"PluginError: bad:{name}: {told}" in failure.text.splitlines()[-1]
+
+
+def test_an_interrupt_that_a_plug_in_raises_itself_is_its_fault_in_a_worker():
+    def interrupted():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):  # as the user's
+        call("bad:interrupted", interrupted)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as workers are
+    try:
+        with pytest.raises(PluginError, match="raises KeyboardInterrupt"):
+            call("bad:interrupted", interrupted)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_what_a_plug_in_prints_does_not_mix_with_results(pipeline, capfd):
@@ -271,7 +299,7 @@ def test_a_solver_s_faults_never_pass_as_solved(tmp_path, name, status, told):
 @pytest.mark.parametrize(("result", "told"), [
     ("light * float('nan')", "returned levels that are not finite"),
     ("light[1:]", "returned levels of shape"),
-    ("None", "returned levels of shape ()"),
+    ("None", "returned levels of type object; expected real numbers"),
     ("1 / 0", "raises ZeroDivisionError"),
 ])
 def test_an_effect_s_faults_are_its_scene_s(tmp_path, result, told):

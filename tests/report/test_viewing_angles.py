@@ -1,12 +1,11 @@
 """A report groups by the viewing angle as it does by the tilt, and areas in the world vary."""
 
-from sweep.report.limits import limits_of
-
 import sweep
-from support.here import calls_here
 from sweep.analysis import detection_limit
+from sweep.report.question import course_of
 from sweep.report.report_data import read_report_data
 from sweep.report.scene_figures import DETECTION, MAPS
+from tests.support.here import calls_here
 
 
 def made(tmp_path, pose, axes):
@@ -24,8 +23,7 @@ def test_a_viewing_angle_is_an_angle_as_the_tilt_is(tmp_path):
     assert MAPS.applies(data)
     assert "by viewing angle" in DETECTION.render(data).caption
     assert detection_limit(data.results, rate=1)["side_px"].dims == ("view_angle_deg",)
-    assert [limit.condition for limit in limits_of(data).limits] == [
-        "viewing angle 0°", "viewing angle 60°"]
+    assert (course_of(data).along, course_of(data).angle) == ("distance_m", "view_angle_deg")
 
 
 def test_sizes_in_the_world_vary_with_the_places(tmp_path):

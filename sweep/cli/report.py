@@ -36,9 +36,9 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         "[require] of the store's pipeline)",
     )
     parser.add_argument(
-        "--per", action="append", default=[], metavar="AXES",
-        help="axes whose values are conditions, such as distance_m,tilt_deg (default: those of "
-        "[require], else the axes of size and angle)",
+        "--per", action="append", metavar="AXES",
+        help="axes whose values are conditions, such as distance_m,tilt_deg; '' pools all "
+        "(default: those of [require], else the axes of size and angle)",
     )
     parser.add_argument(
         "--error-model", action="append", default=[], metavar="FILE",
@@ -73,7 +73,8 @@ def _execute(options: argparse.Namespace) -> int:
     form = options.form or ("md" if str(options.output).lower().endswith(".md") else "html")
     output = Path(options.output or f"report.{form}")
     figures = Path(options.figures) if options.figures else None
-    per = [name for part in options.per for each in part.split(",") if (name := each.strip())]
+    per = None if options.per is None else [
+        name for part in options.per for each in part.split(",") if (name := each.strip())]
     data = read_report_data(options.store, options.requirements, per, command_line(options))
     if options.json and is_standard_stream(output):
         raise ArgumentError("json", "", "and the report both go to standard output; choose -o FILE")

@@ -32,7 +32,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--per", metavar="AXES",
         help="axes whose values are conditions, at each of which all must hold, such as "
-        "distance_m,tilt_deg; others are pooled (default: those of [require])",
+        "distance_m,tilt_deg; others are pooled, with '' all (default: those of [require], else "
+        "the axes of size and angle)",
     )
     parser.add_argument(
         "--pipeline", metavar="FILE",
@@ -86,12 +87,13 @@ def _execute(options: argparse.Namespace) -> int:
         decision = Decision.not_met
     status = {Decision.met: 0, Decision.not_met: 1}.get(decision, TOO_FEW_DRAWS)
     pooled = lines.pooled_axes(results, per)
+    usual = per if options.per is None and list(pipeline.require_per) != per else []
     if options.json:
         print_json(_as_json(found, worse, decision.name, per, pooled))
     elif options.markdown:
         say(lines.markdown(found, worse, table, decision, pooled))
     else:
-        for line in lines.text(found, worse, pooled):
+        for line in lines.text(found, worse, pooled, usual):
             say(line)
         say_next(lines.more_draws(found, results, options.store))
     return status
@@ -102,11 +104,11 @@ def _open(store: str, at: list[str]) -> tuple[xr.Dataset, Pipeline]:
     from sweep.cli.requirement_lines import selected  # noqa: PLC0415
     from sweep.errors import StoreError  # noqa: PLC0415
     from sweep.store.lifecycle import open_dataset, open_store  # noqa: PLC0415
+    from sweep.store.unfinished import unfinished_line  # noqa: PLC0415
 
     opened = open_store(store)
     if not opened.finished:
-        raise StoreError(f"{store}: is not finished, and its requirements are of all poses; "
-                         f"`sweep run {store}` continues it")
+        raise StoreError(unfinished_line(opened))
     return selected(open_dataset(store), at, opened.pipeline), opened.pipeline
 
 
@@ -114,6 +116,7 @@ def _required(
     options: argparse.Namespace, pipeline: Pipeline, results: xr.Dataset
 ) -> tuple[list[str], list[str]]:
     """Return the requirements' texts and the axes of conditions."""
+    from sweep.analysis.conditions import conditions  # noqa: PLC0415
     from sweep.analysis.required_pipeline import check_required  # noqa: PLC0415
     from sweep.store.stored_pipeline import read_pipeline  # noqa: PLC0415
 
@@ -121,10 +124,9 @@ def _required(
         pipeline = read_pipeline(options.pipeline)
         check_required(pipeline.requirements, options.pipeline)
     texts = options.requirements or list(pipeline.requirements)
-    if options.per is None:
-        # An axis that a setting fixed has a single value, which is no condition.
-        return texts, [name for name in pipeline.require_per if name in results.dims]
-    return texts, [name for part in options.per.split(",") if (name := part.strip())]
+    per = None if options.per is None else [
+        name for part in options.per.split(",") if (name := part.strip())]
+    return texts, list(conditions(results, per, pipeline.require_per))
 
 
 def _as_json(

@@ -84,9 +84,13 @@ def interval(low: float, high: float) -> str:
 
 
 def text(
-    found: Sequence[Verdict], worse: Sequence[Regression], pooled: Sequence[str]
+    found: Sequence[Verdict], worse: Sequence[Regression], pooled: Sequence[str],
+    usual: Sequence[str] = (),
 ) -> Iterator[str]:
-    """Yield a line for each requirement and configuration, and one for each comparison."""
+    """Yield a line for each requirement and configuration, and one for each comparison.
+
+    ``pooled`` axes are named, and ``usual`` ones, which nobody asked to be conditions.
+    """
     width = max((len(each.requirement) for each in found), default=0)
     for each in found:
         yield (f"{WORDS[each.decision]:10} {each.requirement:{width}}  {_value(each)}"
@@ -96,6 +100,8 @@ def text(
         yield (f"{state:10} {one.quantity}: {number(one.difference)} "
                f"({interval(one.low, one.high)}){' ' * bool(one.units)}{one.units}, new minus old"
                f"{_at(one.condition)}{_configuration(one.configuration)}")
+    if usual:
+        yield f"at each value of {', '.join(usual)}; --per '' pools all"
     if pooled:
         yield f"pooled over {', '.join(pooled)}; --per keeps axes apart as conditions"
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sweep.report.grouping import ANGLES, IDS, is_numeric
+from sweep.analysis.conditions import SIZES_BESIDE, usual_conditions
+from sweep.report.grouping import ANGLES, is_numeric
 from sweep.report.report_data import ReportData
-
-SIZES_BESIDE = ("size_m", "hfov_deg", "focal_length_mm", "fx_px", "width_px")
-"""Axes along which the size in the image changes, too."""
 
 
 @dataclass(frozen=True)
@@ -30,17 +28,10 @@ class Course:
     at_all: tuple[str, ...]
 
 
-def course_of(data: ReportData, per: tuple[str, ...] = ()) -> Course:
-    """Return how requirements are followed over the conditions ``per``.
-
-    By default these are the axis of sizes, or the first other one of numbers, and that of angles.
-    """
+def course_of(data: ReportData, per: tuple[str, ...] | None = None) -> Course:
+    """Return how requirements are followed over conditions: by default the usual ones."""
     axes = {axis.name: axis for axis in data.pipeline.axes}
-    if not per:
-        sizes = [data.size_axis, *(name for name in SIZES_BESIDE if data.length(name) > 1), *(
-            name for name in data.scene_axes if is_numeric(axes[name])
-            and name not in ANGLES and name != IDS)]
-        per = tuple(name for name in (next(filter(None, sizes), None), data.angle_axis) if name)
+    per = usual_conditions(data.results) if per is None else per
     conditions = tuple(name for name in per if name not in data.setting_axes)
     ordered = [name for name in conditions
                if name in data.scene_axes and is_numeric(axes[name])]

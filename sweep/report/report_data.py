@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 import xarray as xr
 
+from sweep.analysis.conditions import conditions
 from sweep.analysis.detection_limits import SIZE_AXES
 from sweep.analysis.requirements import parse_requirements
 from sweep.errors import StoreError, SweepError
@@ -276,7 +277,7 @@ def store_errors(store: str) -> Iterator[None]:
 
 
 def read_report_data(
-    url: str, require: Sequence[str] = (), per: Sequence[str] = (), command: str = ""
+    url: str, require: Sequence[str] = (), per: Sequence[str] | None = None, command: str = ""
 ) -> ReportData:
     """Open a finished store for its report.
 
@@ -285,8 +286,8 @@ def read_report_data(
     url
         Path or URL of the store.
     require, per
-        What is required, and the dimensions whose values are conditions; by default what the
-        pipeline requires.
+        What is required, by default by the pipeline, and the dimensions whose values are
+        conditions, by default those of `sweep.analysis.conditions`.
     command
         The command line that asked for the report.
 
@@ -312,6 +313,6 @@ def read_report_data(
         store.url, results, store.pipeline, store.run_metadata, trade,
         tuple(outcome_of_finished(store).warnings),
         tuple(each.text for each in parse_requirements(required)) if required else (),
-        tuple(per) or tuple(name for name in store.pipeline.require_per if name in results.dims),
+        conditions(results, per, store.pipeline.require_per),
         command,
     )

@@ -7,6 +7,8 @@ import pytest
 from support.stores import by_hand
 from sweep import Pipeline, cli
 from sweep.execution.finalize import close
+from sweep.report.report_data import read_report_data
+from sweep.report.verdict import verdict
 from sweep.store.lifecycle import create_store
 
 TEXT = """
@@ -29,6 +31,8 @@ def folder(tmp_path_factory):
     pipeline = Pipeline.from_text(TEXT, name="two")
     create_store(str(folder / "begun.zarr"), pipeline, (2, 60))
     close(by_hand(str(folder / "two.zarr"), pipeline))
+    bare = TEXT.partition("[require]")[0] + "[axes]" + TEXT.partition("[axes]")[2]
+    close(by_hand(str(folder / "bare.zarr"), Pipeline.from_text(bare)))
     close(by_hand(str(folder / "once.zarr"), Pipeline.from_text("[pose]\nside_px = 40\n")))
     (folder / "other.toml").write_text(TEXT.replace("0.8", "0.01"))
     return folder
@@ -75,6 +79,21 @@ def test_pooled_axes_are_named(require):
     assert "pooled over side_px" in out
 
 
+def test_without_conditions_each_size_is_one_as_in_the_report(folder, require):
+    code, out, _ = require("bare.zarr", "detection >= 0.45")
+    assert code == 1
+    assert "at side_px=11; not met at 1 of 2" in out
+    assert "at each value of side_px; --per '' pools all" in out
+    url = str(folder / "bare.zarr")
+    for per in (None, [], ["side_px"]):
+        data = read_report_data(url, ["detection >= 0.45"], per)
+        pooled = require("bare.zarr", "detection >= 0.45", *(
+            [] if per is None else ["--per", ",".join(per)]), "--json")[1]
+        assert json.loads(pooled)["per"] == list(data.per)
+        assert verdict(data).headline.startswith({0: "Yes", 1: "Yes down to a side of 40 px"}[
+            json.loads(pooled)["decision"] == "not_met"])
+
+
 def test_markdown_has_every_condition(require):
     code, out, _ = require("two.zarr", "--markdown", "--at", "solver=iterative")
     assert code == 1
@@ -110,7 +129,7 @@ def test_a_worse_store_is_not_met(folder, require):
 
 
 @pytest.mark.parametrize(("arguments", "line"), [
-    (["begun.zarr"], "begun.zarr: is not finished"),
+    (["begun.zarr"], "begun.zarr: unfinished: 0 of "),
     (["none.zarr"], "none.zarr: "),
     (["two.zarr", "detection"], "REQUIREMENT detection: expected NAME >= NUMBER"),
     (["two.zarr", "detection >= 99 %"], "write 0.99"),

@@ -90,9 +90,9 @@ def _execute(options: argparse.Namespace) -> int:
         return 0
     size = f", {byte_count(output.stat().st_size)}" if output.is_file() else ""
     say(f"{output}: {plural(count, 'figure')}{size}")
-    say(found.headline)
     for line in data.warnings:
         say(line)
+    say(found.headline)
     if data.trade is None and data.setting_axes:
         say_next(f"sweep tradeoff {shlex.quote(options.store)}", "what each configuration costs")
     else:

@@ -43,6 +43,7 @@ class _State:
     scenes: TrialScenes | None = None
     find: FindFunction | None = None
     threads: int = 0
+    processes: set[str] = field(default_factory=set)
     arguments: tuple[str, Sequence[str], str] = field(default=("", (), ""))
 
 
@@ -72,7 +73,7 @@ class Searched:
     printed
         The beginning of what was printed meanwhile.
     threads, processes
-        Threads more than before the detector was made, and child processes.
+        Threads, and child processes, more than before the detector was made.
     cpu_share
         Processor time over elapsed time.
     """
@@ -92,7 +93,7 @@ def open_trial(detector: str, dictionary: str, settings: Sequence[str], folder: 
     _state.arguments = (detector, settings, folder)
     _state.scenes = trial_scenes(trial_pipeline(detector, dictionary, settings, folder))
     _state.find = None
-    _state.threads = _threads()
+    _state.threads, _state.processes = _threads(), _processes()
     return Opened(_state.scenes.marker_id, _state.scenes.corners_px)
 
 
@@ -113,7 +114,8 @@ def search_scenes(order: Sequence[int]) -> Searched:
             seconds.append(time.perf_counter() - start)
     share = (time.process_time() - used) / max(time.perf_counter() - began, 1e-9)
     return Searched(
-        found, tuple(faults), seconds, printed[0], _threads() - _state.threads, _processes(), share
+        found, tuple(faults), seconds, printed[0], _threads() - _state.threads,
+        len(_processes() - _state.processes), share,
     )
 
 
@@ -198,12 +200,12 @@ def _threads() -> int:
         return threading.active_count()
 
 
-def _processes() -> int:
+def _processes() -> set[str]:
     """Return the processes that this one started and that still run."""
     try:
-        return len(Path(f"/proc/self/task/{os.getpid()}/children").read_text().split())
+        return set(Path(f"/proc/self/task/{os.getpid()}/children").read_text().split())
     except OSError:
-        return 0
+        return set()
 
 
 def _memory() -> int:

@@ -98,6 +98,8 @@ def read_source(file: str, folder: str) -> bytes:
     """Return the content of a plug-in's file; PluginError if it cannot be read."""
     try:
         path = Path(folder) / file
+        if path.exists() and not path.is_file():
+            raise ValueError("not a regular file")
         if path.stat().st_size > MAX_SOURCE_BYTES:
             raise PluginError(f"a file of at most {MAX_SOURCE_BYTES:,} bytes ({file})")
         return path.read_bytes()

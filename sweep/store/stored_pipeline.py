@@ -8,10 +8,11 @@ from pathlib import Path
 
 from sweep.errors import PipelineError
 from sweep.messages import plain, refusal
+from sweep.model.image_file import read_regular
 from sweep.plan.experiment import Pipeline
 from sweep.plan.overrides import apply_settings, parse_settings
 from sweep.plan.required import texts_in
-from sweep.plan.toml_text import read_document
+from sweep.plan.toml_text import MAX_BYTES, read_document
 
 
 def names_store(path: str | os.PathLike[str]) -> bool:
@@ -53,7 +54,7 @@ def read_pipeline(path: str | os.PathLike[str], settings: Sequence[str] = ()) ->
 def texts_required(path: str | os.PathLike[str], settings: Sequence[str] = ()) -> list[str]:
     """Return what a TOML file that has faults requires; nothing if it is no file of TOML."""
     try:
-        document = read_document(Path(path).read_text(encoding="utf-8"))
+        document = read_document(read_regular(path, MAX_BYTES).decode())
         apply_settings(document, parse_settings(settings))
     except (OSError, ValueError, PipelineError):
         return []

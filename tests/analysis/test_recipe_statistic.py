@@ -116,5 +116,5 @@ def test_an_added_statistic_has_attributes_and_a_row_in_every_table():
             assert table[name].attrs["units"] == unit
             assert "mean absolute" in table[name].attrs["description"]
     assert "| `*_mae_*` | error: mean absolute error of the solved |" in registry.guide_table()
-    rows = _errors_table(table).rows
+    rows = _errors_table(table, "").rows
     assert "mean of the smaller half of the errors" in [row[0] for row in rows]

@@ -430,7 +430,7 @@ def test_workers_with_other_versions_are_refused(pipeline, cluster, tmp_path, mo
     from sweep.store.provenance import fingerprint  # noqa: PLC0415
 
     async def elsewhere(_, given):
-        return {"tcp://worker": ({**fingerprint(given), "opencv": "0.0"}, ("elsewhere", 1))}
+        return {"tcp://worker": ({**fingerprint(given), "opencv": "0.0"}, ("elsewhere", 1), [])}
 
     monkeypatch.setattr(worker_versions, "_worker_identities", elsewhere)
     for given in ({"scheduler": cluster.scheduler_address}, {"client": cluster}):

@@ -22,7 +22,7 @@ from sweep.measure.detector import (
 )
 from sweep.measure.flags import DetectionStatus
 from sweep.model.extent import marker_boxes
-from sweep.model.marker import dictionary_names, marker_count, module_count
+from sweep.model.marker import marker_count, module_count, opencv_dictionary_names
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
 from sweep.plan.experiment import Pipeline
@@ -177,7 +177,7 @@ def ids_of(dictionary):
     return [0, count // 2, count - (2 if dictionary == "DICT_ARUCO_ORIGINAL" else 1)]
 
 
-@pytest.mark.parametrize("dictionary", dictionary_names())
+@pytest.mark.parametrize("dictionary", opencv_dictionary_names())
 def test_every_dictionary_is_rendered_and_found_with_its_id_and_rotation(dictionary):
     # A whole even number of pixels a module: every module's edges lie between pixels.
     side = module_count(dictionary) * (140 // module_count(dictionary) // 2 * 2)

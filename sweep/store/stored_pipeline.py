@@ -54,7 +54,7 @@ def read_pipeline(path: str | os.PathLike[str], settings: Sequence[str] = ()) ->
 def texts_required(path: str | os.PathLike[str], settings: Sequence[str] = ()) -> list[str]:
     """Return what a TOML file that has faults requires; nothing if it is no file of TOML."""
     try:
-        document = read_document(read_regular(path, MAX_BYTES).decode())
+        document = read_document(read_regular(os.fspath(path), MAX_BYTES).decode())
         apply_settings(document, parse_settings(settings))
     except (OSError, ValueError, PipelineError):
         return []

@@ -86,15 +86,18 @@ POSE_STATISTICS: tuple[PoseStatistic, ...] = (
 )
 """What is known of the poses as such."""
 
+QUANTILES = ErrorStatistic(
+    {"median": "median (not solved: infinite)", "p95": "95 % quantile (p95)",
+     "p99": "99 % quantile (p99)"},
+    lambda quantity: Quantiles(
+        quantity.named("{}"), f"absolute {quantity.words}", quantity.units, quantity.norm,
+        lambda poses: poses.solved, lambda poses: poses.looked_for,
+        # Why an end is missing is the same for all kinds of error.
+        with_reason=quantity is QUANTITIES[0]))
+"""Quantiles of absolute errors, which take a second pass over the poses."""
+
 ERROR_STATISTICS: tuple[ErrorStatistic, ...] = (
-    ErrorStatistic(
-        {"median": "median (not solved: infinite)", "p95": "95 % quantile (p95)",
-         "p99": "99 % quantile (p99)"},
-        lambda quantity: Quantiles(
-            quantity.named("{}"), f"absolute {quantity.words}", quantity.units, quantity.norm,
-            lambda poses: poses.solved, lambda poses: poses.looked_for,
-            # Why an end is missing is the same for all kinds of error.
-            with_reason=quantity is QUANTITIES[0])),
+    QUANTILES,
     ErrorStatistic(
         {"rmse": "RMSE of the solved"}, _root_mean_square),
     ErrorStatistic(
@@ -112,6 +115,11 @@ ERROR_STATISTICS: tuple[ErrorStatistic, ...] = (
         of_signed=True),
 )
 """What is computed of each kind of error; of those of `SIGNED` only what says so."""
+
+
+def quantiles_of(quantity: Quantity) -> PoseStatistic:
+    """Return the quantiles of a kind of error, also of one with a sign: of the absolute values."""
+    return PoseStatistic(QUANTILES.make(quantity), (*QUANTILES.inputs, *quantity.inputs))
 
 
 def registered(quantities: Sequence[Quantity] = QUANTITIES) -> list[PoseStatistic]:

@@ -1,7 +1,8 @@
 """What can be required of results: every output of a statistic that has an interval.
 
 The names are those of `sweep.analysis.error_statistics` (all kinds of error), `efficiency` and
-`covariance_trust`; they come from the records there, so that a new statistic can be required, too.
+`covariance_trust`, and quantiles of the absolute errors along axes and about angles; they come from
+the records there, so that a new statistic can be required, too.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from sweep.analysis.means import Mean
 from sweep.analysis.pose_view import DEPTH, ERROR_INPUTS, ESTIMATE_INPUTS, Poses, pose_arrays
 from sweep.analysis.quantiles import PERCENTS, Quantiles
 from sweep.analysis.quantities import QUANTITIES, SIGNED, Quantity
-from sweep.analysis.registry import PoseStatistic, registered
+from sweep.analysis.registry import PoseStatistic, quantiles_of, registered
 from sweep.analysis.statistic import Output, Statistic
 from sweep.errors import DatasetError
 from sweep.typing import Masks
@@ -165,8 +166,9 @@ def requirables() -> dict[str, Requirable]:
     >>> requirables()["rotation_p95_deg"].units, requirables()["detection_rate"].largest
     ('degree', 1.0)
     """
-    quantities = [*QUANTITIES, *(each for group in SIGNED.values() for each in group)]
-    records = [*registered(quantities), NEES_MEAN]
+    signed = [each for group in SIGNED.values() for each in group]
+    quantities = [*QUANTITIES, *signed]
+    records = [*registered(quantities), *map(quantiles_of, signed), NEES_MEAN]
     found = [each for record in records for each in _of_record(record, quantities)]
     found += [_of_ratio(ratio) for ratio in RATIOS]
     return {each.name: each for each in found}

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sweep.analysis.quantiles import PERCENTS
-from sweep.analysis.quantities import QUANTITIES
+from sweep.analysis.quantities import QUANTITIES, SIGNED
 from sweep.analysis.requirable import Requirable, requirables
-from sweep.messages import nearest
+from sweep.messages import nearest, plain
 from sweep.plan.requirement_text import RequirementText
 
 UNITS = {"deg": "degrees", "rad": "radians", "m": "metres", "mm": "millimetres", "percent": "%",
          "px": "pixels", "cm": "centimetres"}
 """Units that names end with."""
 
-ENDINGS = ("_rate", "_mean", "_efficiency")
+STATISTICS = (*PERCENTS, "bias", "sd", "rmse")
+"""What names of statistics of errors have in the middle."""
+
+ENDINGS = ("_rate", "_mean")
 """Endings of names that may be left out."""
 
 
@@ -33,20 +37,27 @@ def named(name: str) -> Requirable:
     ('detection_rate', 'range_p95_percent')
     """
     known = requirables()
-    plain = name.lower().replace("_error_", "_").replace("_errors_", "_")
-    for candidate in (plain, *(f"{plain}{ending}" for ending in ENDINGS)):
+    short = re.sub("_errors?(?=_|$)", "", name.lower())
+    for candidate in (short, *(f"{short}{ending}" for ending in ENDINGS)):
         if candidate in known:
             return known[candidate]
-    head, _, tail = plain.rpartition("_")
-    stem = head if tail in UNITS else plain
+    head, _, tail = short.rpartition("_")
+    stem = head if tail in UNITS else short
     same = [other for other in known if other.rpartition("_")[0] == stem]
-    if same:
-        problem = f"its unit is {UNITS[same[0].rpartition('_')[2]]}: write {same[0]}"
+    if same and (ending := same[0].rpartition("_")[2]) in UNITS:
+        problem = f"its unit is {UNITS[ending]}: write {same[0]}"
+        raise ValueError(problem)
+    if f"{stem}_rate" in known:
+        problem = f"is a share from 0 to 1: write {stem}_rate"
+        raise ValueError(problem)
+    if kinds := [other for other in known if other.startswith(f"{stem}_") and any(
+            f"_{each}_" in other for each in STATISTICS)]:
+        problem = f"which statistic of it? There are {', '.join(kinds)}"
         raise ValueError(problem)
     counted = {"looked_for", "detected", "count", "draws"}
-    if plain in counted:
+    if short in counted:
         raise ValueError("is a count, which has no interval; expected a rate or an error")
-    hint = nearest(plain, [*known])
+    hint = nearest(short, [*known])
     raise ValueError(f"{name}: nothing of this name has an interval{hint}" + (
         "" if hint else f"; there are {', '.join(_examples())} and the other variables of "
         "error_statistics, in the guide sweep/analysis/README.md"))
@@ -84,12 +95,15 @@ def fault_of(what: Requirable, given: RequirementText) -> str:
 
 
 def _wrong_unit(what: Requirable, given: RequirementText) -> str:
+    if decimal := re.fullmatch(r",(\d+)", given.unit):
+        return f"a comma in a number: write {given.limit:g}.{decimal[1]}"
     unit = "percent" if given.unit == "%" else given.unit
     if what.is_rate and unit == "percent":
         return f"the limit is a share from 0 to 1: write {given.limit / 100:g}"
     ending = what.name.rpartition("_")[2]
     words = f"in {UNITS[ending]}" if ending in UNITS else "without a unit"
-    return f"{given.unit} after the limit: expected the number alone, {words}"
+    more = "; each requirement is a text of its own" if re.search(r"[<>≤≥]", unit) else ""
+    return f"{plain(given.unit)} after the limit: expected the number alone, {words}{more}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +140,7 @@ def contradictions(given: Sequence[Side]) -> list[tuple[str, str]]:
 
 def _ordered() -> frozenset[tuple[str, str]]:
     pairs = {("solved_rate", "detection_rate")}
-    for quantity in QUANTITIES:
+    for quantity in (*QUANTITIES, *(each for group in SIGNED.values() for each in group)):
         names = [quantity.named(each) for each in PERCENTS]
         pairs |= {(a, b) for k, a in enumerate(names) for b in names[k + 1 :]}
         pairs.add((quantity.named("bias"), quantity.named("rmse_unflipped")))

@@ -33,6 +33,7 @@ from sweep.analysis.requirable import MIN_DRAWS, Requirable, requirable_arrays, 
 from sweep.analysis.requirement_faults import Side, contradictions, fault_of, named
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import Flag, flag
+from sweep.messages import plain
 from sweep.plan.attributes import describes
 from sweep.plan.parameters import Stage
 from sweep.plan.requirement_text import read_requirement
@@ -141,7 +142,7 @@ def read_requirements(
         try:
             requirement = _parsed(text)
         except ValueError as error:
-            faults.append((text, str(error)))
+            faults.append((plain(text), str(error)))
         else:
             requirements.append(requirement)
     faults += contradictions([

@@ -98,12 +98,15 @@ def interval_of(variable, found, level):
         case "x_bias_m":
             values = np.array([float(p["translation_error_m"][0]) for p in good])
             return *absolute(student(values, run, level)), len(good)
+        case "x_p95_m":
+            along = errors_of(found, lambda p: p["translation_error_m"][:1].astype(float))
+            return *order_statistics(along, 95, level), len(seen)
     raise ValueError(variable)
 
 
 LEVELS = {"detection_rate": EXACT, "solved_rate": EXACT, "flip_rate": EXACT,
           "range_median_percent": EXACT, "rotation_p95_deg": EXACT, "range_rmse_percent": MEANS,
-          "range_bias_percent": MEANS, "x_bias_m": MEANS}
+          "range_bias_percent": MEANS, "x_bias_m": MEANS, "x_p95_m": EXACT}
 
 
 def decision_of(variable, relation, limit, found, count):
@@ -262,6 +265,14 @@ def test_poses_that_cannot_be_seen_are_no_condition():
     (["rotation_p95_rad <= 1"], "its unit is degrees: write rotation_p95_deg"),
     (["rotation_p95 <= 1"], "write rotation_p95_deg"),
     (["rotation_p95_deg <= 0.01 rad"], "the number alone, in degrees"),
+    (["detection_percent >= 99"], "a share from 0 to 1: write detection_rate"),
+    (["rotation_error <= 5"], "which statistic of it? There are rotation_median_deg, "),
+    (["rotation_deg <= 5"], "which statistic of it?"),
+    (["range <= 1"], "which statistic of it? There are range_median_percent, "),
+    (["x <= 0.01"], "x_p95_m"),
+    (["detection >= 0,95"], "write 0.95"),
+    (["detection >= 0.9\nsolved >= 0.9"], "each requirement is a text of its own"),
+    (["x_p95_m <= 0.005", "x_median_m >= 0.01"], "contradicts"),
     (["range_p95_percent <= -1"], "never negative"),
     (["yaw_bias_deg >= -1"], "the absolute value is required"),
     (["rotation_p95_deg >= 200"], "never above 180"),

@@ -73,7 +73,7 @@ def _execute(options: argparse.Namespace) -> int:
     for line in scored.lines:
         notice(line)
     store = options.store or f"runs/{scored.name}.zarr"
-    with progress_display() as display:
+    with progress_display() as display, scored.withdrawn_if_refused():
         summary = execute(
             scored.pipeline, store, workers=options.workers, overwrite=options.overwrite,
             progress=display,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,13 @@ from typing import Any
 import numpy as np
 import tomlkit
 
-from sweep.errors import ArgumentError, StoreError
+from sweep.errors import (
+    ArgumentError,
+    OtherExperimentError,
+    PipelineError,
+    StoreError,
+    SweepError,
+)
 from sweep.exchange.answers import Answers, read_answers
 from sweep.exchange.conventions import Conventions
 from sweep.exchange.export import EXPERIMENT, read_mark
@@ -41,11 +48,23 @@ class Scored:
         What its store is named after.
     lines
         What the answers hold, and what may be wrong with their conventions, in lines.
+    written
+        Recordings that were not there before.
     """
 
     pipeline: Pipeline
     name: str
     lines: list[str]
+    written: tuple[Path, ...] = ()
+
+    @contextlib.contextmanager
+    def withdrawn_if_refused(self) -> Iterator[None]:
+        """Remove the recordings that were written if the body refuses to score them."""
+        try:
+            yield
+        except (OtherExperimentError, ArgumentError, PipelineError):
+            _remove(self.written)
+            raise
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,17 +142,28 @@ def prepare(
                               conventions or Conventions())
         ]
         recordings.append((home / f"{label}{SUFFIX}", _recording(answers, images).content()))
-    for path, content in recordings:
-        _write_recording(path, content)
+    written = tuple(path for path, _ in recordings if not path.exists())
     detectors = [f"{label}{SUFFIX}" for label in labels]
     solver = "recorded" if poses and not beside else ""
-    pipeline = _pipeline(home, labels[0], detectors, beside, solver, settings)
+    try:
+        for path, content in recordings:
+            _write_recording(path, content)
+        pipeline = _pipeline(home, labels[0], detectors, beside, solver, settings)
+    except SweepError:
+        _remove(written)
+        raise
     if poses and corners and not any("solver" in each for each in settings):
         lines.append(
             "the poses are scored; --set solver=ippe_square scores those of the corners, "
             "--set 'solver=[\"recorded\", \"ippe_square\"]' both"
         )
-    return Scored(pipeline, "-".join(labels), lines)
+    return Scored(pipeline, "-".join(labels), lines, written)
+
+
+def _remove(paths: Iterable[Path]) -> None:
+    for path in paths:
+        with contextlib.suppress(OSError):
+            path.unlink()
 
 
 def _labels(files: Sequence[str | Path], names: Sequence[str]) -> list[str]:

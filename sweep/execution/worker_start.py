@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+
+from sweep.isolation.interrupts import in_main_thread
 from sweep.isolation.machine_memory import be_killed_before_others
 
 SCORE = 500
@@ -9,5 +12,11 @@ SCORE = 500
 
 
 def dask_setup(worker: object) -> None:  # noqa: ARG001  (Dask's name and arguments)
-    """Have a worker killed rather than the client if memory runs out."""
+    """Have a worker killed rather than the client if memory runs out, and ignore Ctrl-C.
+
+    That is the client's to act on. A worker that is started in the place of another has not
+    inherited it.
+    """
     be_killed_before_others(SCORE)
+    if in_main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)

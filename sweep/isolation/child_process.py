@@ -11,6 +11,7 @@ import importlib
 import json
 import os
 import pickle
+import signal
 import struct
 import subprocess
 import sys
@@ -173,6 +174,8 @@ def serve(module: str) -> None:
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     be_killed_before_others(1000)
+    # It has a session of its own: whoever interrupts, the caller ends it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     with contextlib.suppress(Exception):
         importlib.import_module(module)  # an error is raised by the call that needs it
     # Numba is slow to import, and the caller needs none of it.

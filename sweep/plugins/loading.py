@@ -44,8 +44,8 @@ def installed_names(kind: str) -> list[str]:
 def file_of(name: str) -> str | None:
     """Return the file that ``module:attribute`` names, relative to the pipeline; None for others.
 
-    >>> file_of("mine:Detector"), file_of("own/mine.py:Detector"), file_of("pyapriltags")
-    ('mine.py', 'own/mine.py', None)
+    >>> file_of("mine:Detector"), file_of("../own/mine:Detector"), file_of("pyapriltags")
+    ('mine.py', '../own/mine.py', None)
 
     A file of recorded detections is its own name.
 
@@ -57,7 +57,9 @@ def file_of(name: str) -> str | None:
         return name
     if not colon:
         return None
-    return module if module.endswith(".py") else f"{module.replace('.', '/')}.py"
+    if module.endswith(".py"):
+        return module
+    return f"{module if '/' in module else module.replace('.', '/')}.py"
 
 
 def load(kind: str, name: str, folder: str, digest: str = "") -> Plugin:

@@ -409,6 +409,15 @@ def test_what_cannot_be_scored_is_refused_in_a_line(exported, tmp_path):
             Conventions.of(*wrong)
 
 
+def test_refused_answers_leave_no_recording(exported, scored, capsys):
+    before = sorted((exported / "experiment").iterdir())
+    arguments = ["score", str(exported), str(exported / "detections.csv"), "--name", "refused"]
+    assert cli.main([*arguments, "--store", str(scored)]) == 2
+    assert "holds another experiment" in capsys.readouterr().err
+    assert cli.main([*arguments, "--set", "solver=nothing"]) == 2
+    assert sorted((exported / "experiment").iterdir()) == before
+
+
 def test_frames_are_rotations():
     assert len(right_handed_frames()) == 24
     for words in right_handed_frames():

@@ -8,8 +8,10 @@ import time
 import numpy as np
 import pytest
 
+import sweep
 from sweep.errors import PipelineError, PluginError
 from sweep.evaluation.cells import run_cells
+from sweep.execution.runner import execute
 from sweep.execution.worker_versions import _worker_identity
 from sweep.isolation.child_process import Child
 from sweep.isolation.plugin_check import check_plugins, use
@@ -64,6 +66,7 @@ def talking(image):
     print("found nothing")
     return [], []
 
+aborts = at(lambda image: os.abort())
 forks = at(forking)
 prints = at(talking)
 never_made = lambda settings, family: 1 / 0
@@ -359,3 +362,15 @@ def test_a_worker_says_which_plug_ins_it_lacks(pipeline, tmp_path):
     (tmp_path / "bad.py").write_text(DETECTORS + "# changed\n")
     (line,) = _worker_identity(bad)[2]
     assert "bad.py as it was when the run began" in line
+
+
+@pytest.mark.long
+def test_of_several_detectors_the_one_that_aborts_loses_only_its_own_cells(tmp_path):
+    (tmp_path / "bad.py").write_text(DETECTORS)
+    text = GRID.format(name="aborts").replace('["opencv", ', '["opencv", "bad:prints", ')
+    (tmp_path / "grid.toml").write_text(text + "tilt_deg = [0, 20, 40]\n")
+    execute(Pipeline.from_toml(tmp_path / "grid.toml"), tmp_path / "grid.zarr", workers=2)
+    flags = sweep.open(tmp_path / "grid.zarr").detection.transpose("detector", ...).values
+    assert (flags[0] == DetectionStatus.detected).all()
+    assert (flags[1] == DetectionStatus.no_candidate).all()
+    assert (flags[2] == DetectionStatus.crashed).all()

@@ -31,6 +31,7 @@ class Reach(Flag):
     found = flag(1, "They are met up to a value within the grid.", present=True)
     never = flag(2, "They are not met at the easiest value.")
     always = flag(3, "They are met at all values: the limit may lie beyond.", present=True)
+    within = flag(4, "They are met between two values, but not at the easiest.", present=True)
 
 
 @describes
@@ -60,7 +61,11 @@ def farthest_met(
         Dimensions (*configuration, *per), computed.
 
         - ``value``: the last value of the axis up to which, without a gap, the values of all
-          requirements keep their limits; NaN for never.
+          requirements keep their limits; NaN for never. ``start``: the value from which they do,
+          which is the easiest, or the first of the longest run of values if they do not there:
+          near 0 tilt poses flip, near the camera a marker is cut off.
+        - ``start_limited_by``, ``start_fails_at``, ``start_fails_where``, ``start_failing_value``:
+          as the following, of the value before ``start``.
         - ``low``, ``high``: ends of its interval, in the axis' unit. Up to the end nearer to the
           easy values they are decided to be met, beyond the other end a requirement is decided not
           to be met. -inf or inf: the limit may lie beyond the grid's end.
@@ -120,42 +125,47 @@ def farthest_met(
     kept = [dim for dim in decision.dims if dim != along]
     shape = decision.transpose(*kept, along)
     out: dict[str, Any] = {name: np.full(shape.shape[:-1], np.nan) for name in (
-        "value", "low", "high", "fails_at", "failing_value", "met_beyond", "farthest_beyond")}
+        "value", "low", "high", "fails_at", "failing_value", "met_beyond", "farthest_beyond",
+        "start", "start_fails_at", "start_failing_value")}
     out["reach"] = np.zeros(shape.shape[:-1], np.uint8)
     texts = {name: np.full(shape.shape[:-1], "", dtype=object) for name in (
-        "limited_by", "fails_where")}
+        "limited_by", "fails_where", "start_limited_by", "start_fails_where")}
     for index in np.ndindex(*shape.shape[:-1]):
         at = dict(zip(kept, index, strict=True))
         one = {"keeps": all_keep.isel(at).values, "judged": judged.isel(at).values,
                "decision": decision.isel(at).values}
-        numbers, failing = _limit(values, upwards, **one)
+        numbers, before, beyond = _limit(values, upwards, **one)
         for name, number in numbers.items():
             out[name][index] = number
-        if failing is not None:
-            cell = table.isel({**at, along: failing})
-            words = _cause(cell, keeps.isel({**at, along: failing}), together)
-            texts["limited_by"][index], texts["fails_where"][index] = words[:2]
-            out["failing_value"][index] = words[2]
+        for which, failing in (("start_", before), ("", beyond)):
+            if failing is None:
+                continue
+            cell = {**at, along: failing}
+            words = _cause(table.isel(cell), keeps.isel(cell), together)
+            texts[f"{which}limited_by"][index], texts[f"{which}fails_where"][index] = words[:2]
+            out[f"{which}failing_value"][index] = words[2]
     units = str(results[along].attrs.get("units", ""))
     meanings = {
         "value": f"{along} up to which all requirements are met",
         "low": f"lower end of the interval: {along} up to which all are met",
         "high": f"upper end of the interval: {along} up to which all are met",
+        "start": f"{along} from which all requirements are met",
         "fails_at": f"first {along} at which one is not",
+        "start_fails_at": f"last {along} before the start at which one is not",
+        "start_failing_value": "value of the requirement that fails there",
         "farthest_beyond": f"farthest {along} beyond it at which all are met again",
         "failing_value": "value of the requirement that fails there",
         "met_beyond": "values beyond it at which all are met again",
     }
     variables: dict[str, Any] = {
         name: (kept, out[name], {"long_name": meaning, "units": {
-            "failing_value": "", "met_beyond": "1"}.get(name, units)})
+            "failing_value": "", "start_failing_value": "", "met_beyond": "1"}.get(name, units)})
         for name, meaning in meanings.items()}
     variables["reach"] = (kept, out["reach"], cf_attributes(
         "how far the requirements are met", flags=Reach))
-    variables["limited_by"] = (kept, texts["limited_by"].astype(str),
-                               {"long_name": "requirement that first fails"})
-    variables["fails_where"] = (kept, texts["fails_where"].astype(str),
-                                {"long_name": "where it fails"})
+    variables |= {name: (kept, words.astype(str), {
+        "long_name": "requirement that fails" if "by" in name else "where it fails"})
+        for name, words in texts.items()}
     variables["decision"] = decision.transpose(*kept, along)
     variables["keeps"] = all_keep.transpose(*kept, along).assign_attrs(
         long_name="whether all values keep their limits", units="1")
@@ -219,14 +229,22 @@ def combined_decision(decision: xr.DataArray, dims: Sequence[str]) -> xr.DataArr
 def _limit(
     values: np.ndarray[Any, Any], upwards: bool, *, keeps: np.ndarray[Any, Any],
     judged: np.ndarray[Any, Any], decision: np.ndarray[Any, Any],
-) -> tuple[dict[str, float], int | None]:
-    """Return the limit along the axis, from easy to hard, and the index of the first failure."""
+) -> tuple[dict[str, float], int | None, int | None]:
+    """Return the limit along the axis, from easy to hard, and the indices of failures around it.
+
+    The first is that before the values at which all are met, the second that beyond.
+    """
     if not judged.any():
-        return {"reach": Reach.not_run}, None
+        return {"reach": Reach.not_run}, None, None
     none, beyond = (-np.inf, np.inf) if upwards else (np.inf, -np.inf)
+    run = met_run(keeps, judged)
+    before_run = np.nonzero(~keeps & judged)[0]
+    before_run = before_run[before_run < run[0]] if run else before_run[:0]
+    if before_run.size:
+        judged = judged & (np.arange(len(values)) > before_run[-1])
     failing = np.nonzero(~keeps & judged)[0]
     unsure = np.nonzero((decision != Decision.met) & judged)[0]
-    failed = np.nonzero(decision == Decision.not_met)[0]
+    failed = np.nonzero((decision == Decision.not_met) & judged)[0]
 
     def before(indices: np.ndarray[Any, Any], all_of_them: float) -> float:
         """Return the last judged value before the first of some indices."""
@@ -240,15 +258,45 @@ def _limit(
     ends = sorted((before(unsure, last), before(failed, beyond)))
     numbers = {"value": value if np.isfinite(value) else np.nan, "low": ends[0], "high": ends[1],
                "met_beyond": 0.0}
+    if run:
+        numbers["start"] = float(values[run[0]])
+    easier = int(before_run[-1]) if before_run.size else None
+    if easier is not None:
+        numbers["start_fails_at"] = float(values[easier])
     if not len(failing):
-        return {**numbers, "reach": Reach.always}, None
+        return {**numbers, "reach": Reach.always if easier is None else Reach.within}, easier, None
     first = int(failing[0])
     again = np.nonzero(keeps & judged)[0]
     again = again[again > first]
     numbers |= {"fails_at": float(values[first]), "met_beyond": float(len(again)),
                 "farthest_beyond": float(values[again[-1]]) if len(again) else np.nan,
-                "reach": Reach.found if np.isfinite(value) else Reach.never}
-    return numbers, first
+                "reach": Reach.never if run is None else
+                Reach.found if easier is None else Reach.within}
+    return numbers, easier, first
+
+
+def met_run(
+    keeps: np.ndarray[Any, Any], judged: np.ndarray[Any, Any]
+) -> tuple[int, int] | None:
+    """Return the first and the last index of the run of values that are kept, without a gap.
+
+    It is that from the first judged value on, or, if that is not kept, the longest; of several the
+    first. Values that are not judged (n,) neither count nor make a gap. None without any.
+
+    >>> met_run(np.array([0, 1, 0, 1, 1], bool), np.ones(5, bool))
+    (3, 4)
+    """
+    runs: list[list[int]] = []
+    inside = False
+    for index in np.nonzero(judged)[0]:
+        if keeps[index]:
+            runs = [*runs[:-1], [*runs[-1], int(index)]] if inside else [*runs, [int(index)]]
+        inside = bool(keeps[index])
+    if not runs:
+        return None
+    first = int(np.nonzero(judged)[0][0])
+    run = runs[0] if runs[0][0] == first else max(runs, key=len)
+    return run[0], run[-1]
 
 
 def _cause(

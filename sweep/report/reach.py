@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis import detection_rate
-from sweep.analysis.farthest import Reach, farthest_met, is_harder_upwards
+from sweep.analysis.farthest import Reach, farthest_met, is_harder_upwards, met_run
 from sweep.report.configurations import Settings
 from sweep.report.grouping import CONFIGURATION, by_configuration
 from sweep.report.question import Course
@@ -27,9 +27,9 @@ class Limit:
     ----------
     angle
         The largest of the angles; None if they are not told apart.
-    rank
-        Number of the last value of the axis, from easy to hard, up to which they are met; -1 for
-        none.
+    rank, first
+        Number of the last value of the axis, from easy to hard, up to which they are met, -1 for
+        none; and of the first from which they are, 0 for the easiest.
     value, low, high
         That value, and the ends of its interval; infinite: the limit may lie beyond the grid; NaN:
         there is none, or without an interval.
@@ -39,6 +39,10 @@ class Limit:
         The requirement that fails first beyond; its quantity's value, and where that is.
     met_beyond, farthest_beyond
         At how many values beyond they are met again, and the farthest of these.
+    start_limited_by, start_failing_value, start_fails_at
+        The same of the value before the first, if that is not the easiest.
+    smallest_angle
+        The smallest of the angles; None if it is that of the grid.
     """
 
     angle: float | None
@@ -54,6 +58,16 @@ class Limit:
     fails_where: str = ""
     met_beyond: int = 0
     farthest_beyond: float = math.nan
+    first: int = 0
+    start_limited_by: str = ""
+    start_failing_value: float = math.nan
+    start_fails_at: float = math.nan
+    smallest_angle: float | None = None
+
+    @property
+    def count(self) -> int:
+        """How many values of the axis they are met at, without a gap."""
+        return self.rank - self.first + 1 if self.rank >= 0 else 0
 
 
 @dataclass(frozen=True)
@@ -97,7 +111,7 @@ class Reaches:
         nearer end, then the order ``preferred``.
         """
         def key(k: int) -> tuple[object, ...]:
-            ranks = [-limit.rank for limit in reversed(self.limits[k])]
+            ranks = [-limit.count for limit in reversed(self.limits[k])]
             last = self.limits[k][-1]
             low = last.low if math.isfinite(last.low) else -math.inf if self.upwards else math.inf
             return (self.wrong[k], *ranks, -low if self.upwards else low,
@@ -125,8 +139,8 @@ def reaches(
     upwards = table.attrs["harder"] == "upwards"
     rows = _rows(data, table.drop_dims([along]), settings, angle)
     values = _easy_first(data, along, upwards=upwards)
-    limits = [_cumulated([_limit(row, values, angle) for row in each], upwards=upwards)
-              for each in rows]
+    limits = _cumulated(
+        [[_limit(row, values, angle) for row in each] for each in rows], upwards=upwards)
     return Reaches(along, upwards, values, names, wrong, limits)
 
 
@@ -146,17 +160,22 @@ def reaches_without_draws(
         row = []
         for part in each:
             rates = part["rate"].values
-            failing = np.flatnonzero(~(rates >= rate) & ~np.isnan(rates))
-            rank = int(failing[0]) - 1 if failing.size else len(values) - 1
+            judged = ~np.isnan(rates)
+            first, rank = met_run(rates >= rate, judged) or (0, -1)
+            failing = np.flatnonzero(~(rates >= rate) & judged)
+            beyond, before = failing[failing > rank], failing[(failing < first)]
             at = None if angle is None else float(part[angle])
+            required = f"detection_rate >= {rate:g}"
             row.append(Limit(
                 at, rank, values[rank] if rank >= 0 else math.nan, math.nan, math.nan,
-                not np.isnan(rates).all(),
-                f"detection_rate >= {rate:g}" if failing.size else "",
-                float(rates[rank + 1]) if failing.size else math.nan,
-                values[rank + 1] if failing.size else math.nan, at))
-        limits.append(_cumulated(row, upwards=upwards))
-    return Reaches(along, upwards, values, names, wrong, limits)
+                bool(judged.any()), required if beyond.size else "",
+                float(rates[beyond[0]]) if beyond.size else math.nan,
+                values[beyond[0]] if beyond.size else math.nan, at, first=first,
+                start_limited_by=required if before.size else "",
+                start_failing_value=float(rates[before[-1]]) if before.size else math.nan,
+                start_fails_at=values[before[-1]] if before.size else math.nan))
+        limits.append(row)
+    return Reaches(along, upwards, values, names, wrong, _cumulated(limits, upwards=upwards))
 
 
 def _of_settings(data: ReportData, settings: Settings) -> xr.Dataset:
@@ -184,7 +203,7 @@ def _rows(
 
 
 def _limit(row: xr.Dataset, values: Sequence[float], angle: str | None) -> Limit:
-    value = float(row["value"])
+    value, start = float(row["value"]), float(row["start"])
     at = None if angle is None else float(row[angle])
     return Limit(
         at, values.index(value) if math.isfinite(value) else -1, value, float(row["low"]),
@@ -194,19 +213,45 @@ def _limit(row: xr.Dataset, values: Sequence[float], angle: str | None) -> Limit
         fails_where=str(row["fails_where"].item()),
         met_beyond=int(np.nan_to_num(float(row["met_beyond"]))),
         farthest_beyond=float(row["farthest_beyond"]),
+        first=values.index(start) if int(row["reach"]) == Reach.within else 0,
+        start_limited_by=str(row["start_limited_by"].item()),
+        start_failing_value=float(row["start_failing_value"]),
+        start_fails_at=float(row["start_fails_at"]),
     )
 
 
-def _cumulated(limits: Sequence[Limit], *, upwards: bool) -> list[Limit]:
-    """Return the limits at all angles up to each: of each the nearer one."""
+def _cumulated(rows: Sequence[Sequence[Limit]], *, upwards: bool) -> list[list[Limit]]:
+    """Return the limits at all angles up to each, by configuration: of each the nearer one.
+
+    They begin with the smallest angle at which any configuration meets what is required anywhere.
+    """
+    met = [k for k, limits in enumerate(zip(*rows, strict=True))
+           if any(limit.rank >= 0 for limit in limits)]
+    skipped = met[0] if met else 0
+    out = []
+    for row in rows:
+        smallest = row[skipped].angle if skipped else None
+        held = [dataclasses.replace(limit, smallest_angle=smallest) for limit in row[skipped:]]
+        out.append([*row[:skipped], *_up_to_each(held, upwards=upwards)])
+    return out
+
+
+def _up_to_each(limits: Sequence[Limit], *, upwards: bool) -> list[Limit]:
     nearer = min if upwards else max
 
-    def both(first: Limit, second: Limit) -> Limit:
+    def together(first: Limit, second: Limit) -> Limit:
         if not (first.judged and second.judged):
             return dataclasses.replace(second if second.judged else first, angle=second.angle)
         worse = second if second.rank <= first.rank else first
-        return dataclasses.replace(
+        later = second if second.first >= first.first else first
+        both = dataclasses.replace(
             worse, angle=second.angle, low=nearer(first.low, second.low),
-            high=nearer(first.high, second.high))
+            high=nearer(first.high, second.high), first=later.first,
+            start_limited_by=later.start_limited_by,
+            start_failing_value=later.start_failing_value, start_fails_at=later.start_fails_at)
+        if both.rank >= both.first or both.rank < 0:
+            return both
+        # No value of the axis is met at all of these angles.
+        return dataclasses.replace(both, rank=-1, value=math.nan, low=math.nan, high=math.nan)
 
-    return list(itertools.accumulate(limits, both))
+    return list(itertools.accumulate(limits, together))

@@ -28,6 +28,10 @@ def quantity(data: ReportData, name: str, value: float) -> str:
     return f"{coordinate(float(value))}{'' if unit in ('', '°') else ' '}{unit}"
 
 
+BETWEEN = {"distance_m": "from {}", "side_px": "at sides of {}", "size_m": "with markers of {}"}
+"""Axis -> words for values between two."""
+
+
 def _words(data: ReportData, reach: Reaches) -> tuple[str, str, str]:
     known = SIZES.get(reach.along)
     if known is not None:
@@ -47,8 +51,28 @@ def limit_text(data: ReportData, reach: Reaches, limit: Limit) -> str:
         return "nothing was looked for"
     if limit.rank < 0:
         return none
+    if limit.first > 0 or (reach.along in ANGLES and not reach.upwards):
+        name = ANGLES.get(reach.along)
+        if limit.count == 1:
+            values = _between(data, reach, limit)
+            return f"only at {f'a {name} of ' if name else ''}{values}"
+        words = BETWEEN.get(reach.along, f"at {name}s of {{}}" if name else
+                            f"at a {data.label(reach.along).split(',')[0]} of {{}}")
+        return words.format(_between(data, reach, limit))
     text = everywhere if limit.rank == len(reach.values) - 1 else to
     return text.format(quantity(data, reach.along, limit.value)) + interval_of(reach, limit)
+
+
+def _between(data: ReportData, reach: Reaches, limit: Limit) -> str:
+    """Return the values from the first to the last, the smaller first: ``20° to 60° (55 to 65)``.
+
+    The interval stands behind the limit that it is of.
+    """
+    start = quantity(data, reach.along, reach.values[limit.first])
+    end = quantity(data, reach.along, limit.value) + interval_of(reach, limit)
+    if limit.count == 1:
+        return end
+    return f"{start} to {end}" if reach.upwards else f"{end} to {start}"
 
 
 def interval_of(reach: Reaches, limit: Limit) -> str:
@@ -69,13 +93,23 @@ def angle_text(data: ReportData, angle: str | None, limit: Limit) -> str:
     """Return up to which angle a limit holds: ``at tilts up to 45°``."""
     if angle is None or limit.angle is None:
         return ""
-    return f"at {ANGLES[angle]}s up to {quantity(data, angle, limit.angle)}"
+    return f"at {_angles(data, angle, limit)}"
+
+
+def _angles(data: ReportData, angle: str, limit: Limit) -> str:
+    """Return the angles of a limit: ``tilts up to 45°``, ``tilts of 20° to 45°``."""
+    largest, smallest = (None if each is None else quantity(data, angle, each)
+                         for each in (limit.angle, limit.smallest_angle))
+    if smallest is None:
+        return f"{ANGLES[angle]}s up to {largest}"
+    return (f"a {ANGLES[angle]} of {largest}" if smallest == largest else
+            f"{ANGLES[angle]}s of {smallest} to {largest}")
 
 
 def limiting_text(data: ReportData, reach: Reaches, angle: str | None, limit: Limit) -> str:
     """Return what limits the reach: which requirement fails first, at which condition."""
     if not limit.limited_by:
-        return ""
+        return _start_text(data, reach, limit)
     where = [f"at {quantity(data, reach.along, limit.fails_at)}" if reach.along in SIZES else
              f"at a {data.label(reach.along).split(',')[0]} of "
              f"{quantity(data, reach.along, limit.fails_at)}"]
@@ -88,7 +122,29 @@ def limiting_text(data: ReportData, reach: Reaches, angle: str | None, limit: Li
         + (f" and {limit.met_beyond - 1:,} nearer" if limit.met_beyond > 1 else "")
         + ", all are met again: the limit is that of the first dip.")
     value = "" if math.isnan(limit.failing_value) else f", which is {number(limit.failing_value)}"
-    return sentences(f"It is limited by {limit.limited_by}{value} {' and '.join(where)}.", again)
+    return sentences(f"It is limited by {limit.limited_by}{value} {' and '.join(where)}.", again,
+                     _start_text(data, reach, limit))
+
+
+def _start_text(data: ReportData, reach: Reaches, limit: Limit) -> str:
+    """Return which requirement fails before the first value, as a sentence; or nothing."""
+    if limit.first == 0 or limit.rank < 0:
+        return ""
+    return (f"Not at {quantity(data, reach.along, limit.start_fails_at)}: there "
+            f"{limit.start_limited_by} is not met, it is {number(limit.start_failing_value)}.")
+
+
+def skipped_text(
+    data: ReportData, reach: Reaches, angle: str | None, limits: Sequence[Limit]
+) -> str:
+    """Return at which angles what is required is met nowhere, before those at which it is."""
+    first = limits[-1].smallest_angle
+    if angle is None or first is None:
+        return ""
+    before = [limit for limit in limits if limit.angle is not None and limit.angle < first]
+    none = "nothing was looked for" if not before[-1].judged else (
+        f"{_words(data, reach)[1]} ({_short_cause(data, reach, angle, before[-1])})")
+    return f"At {ANGLES[angle]}s below {quantity(data, angle, first)}: {none}."
 
 
 def reach_table(
@@ -99,8 +155,8 @@ def reach_table(
     A star stands behind what too few draws were made for.
     """
     first = reach.limits[0]
-    headings = [f"{ANGLES[angle]}s up to {quantity(data, angle, limit.angle)}"
-                if angle and limit.angle is not None else "limit" for limit in first]
+    headings = [_angles(data, angle, limit) if angle and limit.angle is not None else "limit"
+                for limit in first]
     rows = [[reach.names[k], *(short_limit(data, reach, limit) for limit in reach.limits[k]),
              _short_cause(data, reach, angle, reach.limits[k][-1])]
             for k in order]
@@ -127,6 +183,8 @@ def short_limit(data: ReportData, reach: Reaches, limit: Limit) -> str:
     star = "" if reach.decided(limit) else " *"
     if limit.rank < 0:
         return f"none{star}"
+    if limit.first > 0:
+        return _between(data, reach, limit) + star
     beyond = ("\u2265 " if reach.upwards else "\u2264 ") if (
         limit.rank == len(reach.values) - 1) else ""
     return beyond + quantity(data, reach.along, limit.value) + interval_of(

@@ -30,6 +30,7 @@ from sweep.report.reach_text import (
     limiting_text,
     quantity,
     reach_table,
+    skipped_text,
 )
 from sweep.report.report_data import ReportData
 from sweep.report.table import Table
@@ -108,6 +109,7 @@ def _required(data: ReportData, course: Course) -> Verdict:
     checked = _checked(data, course, best)
     reasons = sentences(
         _largest_angle(data, reach, course, limits, limit),
+        skipped_text(data, reach, course.angle, limits),
         limiting_text(data, reach, course.angle, limits[-1]),
         _draws_needed(checked) if not reach.decided(limit) else "",
         f"As far with {', '.join(others)}." if others else "", *known.notes,
@@ -127,7 +129,7 @@ def _farthest(limits: Sequence[Limit]) -> Limit:
 
 
 def _same(first: Sequence[Limit], second: Sequence[Limit]) -> bool:
-    return [limit.rank for limit in first] == [limit.rank for limit in second]
+    return [(one.first, one.rank) for one in first] == [(one.first, one.rank) for one in second]
 
 
 def _largest_angle(

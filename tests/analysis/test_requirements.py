@@ -202,6 +202,15 @@ def test_a_dip_ends_the_limit_and_is_told():
     assert one["keeps"].values.tolist() == [True, False, True, True]
 
 
+def test_values_at_which_all_is_met_need_not_begin_at_the_easiest():
+    one = farthest_met(with_detected([0.3, 1.0, 0.5, 1.0, 1.0, 0.2]), ["detection >= 0.9"],
+                       "distance_m").isel(solver=0)
+    assert Reach(int(one["reach"])) is Reach.within
+    assert [float(one[name]) for name in ("start", "low", "value", "high")] == [4.0, 5.0, 5.0, 5.0]
+    assert (float(one["start_fails_at"]), float(one["fails_at"])) == (3.0, 6.0)
+    assert (float(one["start_failing_value"]), float(one["failing_value"])) == (0.5, 0.2)
+
+
 def test_requirements_hold_at_all_tilts_together():
     results = with_detected([1.0, 1.0, 1.0], tilts=[1.0, 0.5])
     apart = farthest_met(results, ["detection >= 0.9"], "distance_m", per=["tilt_deg"])

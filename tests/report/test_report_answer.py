@@ -102,6 +102,32 @@ def test_where_large_angles_fail_the_answer_is_of_the_smaller_ones_and_says_so()
     assert shown.paragraph.startswith("At tilts up to 30\u00b0: at no distance.")
 
 
+def test_what_is_met_between_two_values_is_said_so():
+    rates = np.full((4, 2, 2), 0.2)
+    rates[1:3] = 1
+    shown = answer(synthetic(rates))
+    assert shown.headline == "Yes from 0.4 m to 0.8 m at tilts up to 30\u00b0, with subpix."
+    assert "0.200 at 1.6 m and a tilt of 30" in shown.paragraph
+    assert "Not at 0.2 m: there detection_rate >= 0.9 is not met, it is 0.200." in shown.paragraph
+
+
+def test_small_angles_at_which_nothing_is_met_are_named():
+    rates = np.ones((4, 2, 2))
+    rates[:, 0] = 0.2
+    rates[2:] = 0.2
+    shown = answer(synthetic(rates))
+    assert shown.headline == f"Yes up to 0.4 m at a tilt of 30\u00b0, with {NONE}."
+    assert shown.paragraph.startswith(
+        "At tilts below 30\u00b0: at no distance (detection_rate 0.200 at 0.2 m, 0\u00b0).")
+
+
+def test_angles_of_which_the_large_are_the_easy_ones_are_told_from_small_to_large():
+    rates = np.ones((4, 2, 2))
+    rates[:, 0] = 0.2
+    shown = answer(synthetic(rates, per=("tilt_deg",)))
+    assert shown.headline == "Yes only at a tilt of 30\u00b0, with subpix."
+
+
 def test_without_an_ordered_condition_the_answer_is_of_all_conditions():
     rates = np.ones((4, 2, 2))
     rates[..., 1] = 0.2

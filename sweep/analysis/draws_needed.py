@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
+from scipy import special
 
 from sweep.analysis.intervals import clopper_pearson
 from sweep.analysis.quantiles import interval_ranks
@@ -30,7 +31,8 @@ def draws_needed(
     NaN where it is not ``undecided``, and without a value.
 
     For a rate it is the least n at which Clopper and Pearson's end for n times the rate reaches
-    the limit. Other intervals narrow with the root of the number of draws; a quantile needs as
+    the limit. Other intervals narrow with the root of the number of draws (those of spreads on the
+    scale of logarithms, on which they are made); a quantile needs as
     many as its interval's ends need to exist and, if its end is infinite for too few poses are
     ``solved`` (a share), as many as decide whether enough are.
     """
@@ -62,7 +64,14 @@ def _needed(
         return max(least, 2.0 * draws)
     if gap == 0.0:
         return math.inf
-    return _rounded(max(least, draws * ((end - value) / gap) ** 2))
+    reach = (end - value) / gap
+    if what.is_of_logarithm and min(value, end) > 0.0:
+        reach = math.log(end / value) / math.log(requirement.limit / value)
+    if 2.0 <= draws < MIN_DRAWS and not what.exact:
+        # Student's factor of so few draws is far above that of many.
+        end_probability = (1.0 + what.level) / 2.0
+        reach *= special.ndtri(end_probability) / special.stdtrit(draws - 1.0, end_probability)
+    return _rounded(max(least, draws * reach ** 2))
 
 
 def _of_rate(rate: float, limit: float, level: float) -> float:

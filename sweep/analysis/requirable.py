@@ -96,6 +96,12 @@ class Requirable:
         return self.exact and self.largest == 1.0
 
     @property
+    def is_of_logarithm(self) -> bool:
+        """Whether its interval is one of the logarithm: a spread's without a largest value."""
+        parts = self.name.split("_")
+        return ("sd" in parts or "rmse" in parts) and math.isinf(self.largest)
+
+    @property
     def percent(self) -> int | None:
         """The percent of a quantile."""
         parts = self.name.split("_")

@@ -248,6 +248,16 @@ def test_about_as_many_draws_as_are_said_decide():
     assert Decision(int(many["decision"].item())) is Decision.met
 
 
+@pytest.mark.parametrize("trials", [2, 3, 10, 40])
+def test_few_draws_of_a_spread_far_below_its_limit_need_no_endless_number(trials):
+    results = with_detected([1.0], trials=trials)
+    results["translation_error_m"].values[..., 0] = np.random.default_rng(8).normal(
+        0.0, 1e-4, results["translation_error_m"].shape[:-1])
+    table = check_requirements(results, ["x_sd_m <= 0.01"])
+    assert Decision(int(table["decision"].item())) is Decision.undecided
+    assert table["draws_needed"].item() == 50
+
+
 def test_poses_that_cannot_be_seen_are_no_condition():
     results = with_detected([1.0, 1.0])
     results["detection"].values[1] = DetectionStatus.not_visible

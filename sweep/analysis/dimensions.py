@@ -128,6 +128,12 @@ def kept_dimensions(results: xr.Dataset, per: Sequence[str]) -> tuple[str, ...]:
     require_poses(results)
     axes = axes_of(results)
     missing = [name for name in dict.fromkeys(names) if name not in axes]
+    drawn = [name for name in missing
+             if name in results.coords and DRAWS in results[name].dims and name != DRAWS]
+    if drawn:
+        raise ArgumentError(
+            "per", ", ".join(drawn), "is drawn in this store, which has no axis of it: run it with "
+            f'{drawn[0]} = [...] under [axes], or, in Python, give bins={{"{drawn[0]}": [...]}}')
     if missing:
         raise ArgumentError("per", ", ".join(missing),
                             f"no such dimension; there are {', '.join(axes) or 'none'}")

@@ -27,6 +27,7 @@ from sweep.report.grouping import (
     is_numeric,
 )
 from sweep.report.report_data import ReportData
+from sweep.report.scales import FLOOR_NOTE, below_floor
 from sweep.report.svg import Panel
 from sweep.report.table import Table, cells
 
@@ -71,6 +72,9 @@ def _configurations(data: ReportData) -> RenderedFigure:
             "Share of the poses looked for that are solved, and the median errors, of each "
             "configuration on the same images; a pose that is not solved counts as an infinite "
             "error (right edge, \u221e).",
+            FLOOR_NOTE.replace("lower", "left") if any(
+                below_floor(summary[name].values) for name in (
+                    "rotation_median_deg", "range_median_percent")) else "",
             interval_sentence(summary, "solved_rate"), denominators(summary), *notes,
             data.pooled(),
         ),

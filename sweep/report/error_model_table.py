@@ -44,8 +44,9 @@ def error_model_table(models: xr.Dataset) -> Table:
     sided = ["side, px"] if models.sizes["side_px"] > 1 else []
     headings = [
         *several, "distance, m", *sided, "viewing angle, deg",
-        "x, mm", "y, mm", "z, mm", "rotation x, deg", "rotation y, deg", "rotation z, deg",
-        "bias of z, mm", "0.02 d² / sigma z", "held-out check",
+        "held-out check", "x, mm", "y, mm", "z, mm",
+        "rotation x, deg", "rotation y, deg", "rotation z, deg",
+        "bias of z, mm", "0.02 d² / sigma z",
     ]
     return Table(CAPTION, headings, rows, stub=len(several) + 2 + len(sided))
 
@@ -101,7 +102,7 @@ def _row(model: xr.Dataset, at: dict[str, int]) -> list[str]:
     sided = [number(float(point["side_px"]))] if model.sizes["side_px"] > 1 else []
     bias = 1e3 * float(point["bias"].sel(quantity="z"))
     ratio = RULE_M * distance**2 / float(point["sigma"].sel(quantity="z"))
-    return [number(distance), *sided, number(angle), *texts, number(bias), number(ratio), _use(use)]
+    return [number(distance), *sided, number(angle), _use(use), *texts, number(bias), number(ratio)]
 
 
 def _use(use: Iterable[int]) -> str:

@@ -17,6 +17,13 @@ LOGARITHMIC_FROM = 6
 """Values that span a larger ratio are drawn on a logarithmic scale."""
 
 
+FLOOR_RATIO = 1e-6
+"""Values below this part of the largest are drawn at the lower edge of a logarithmic axis: errors
+of rounding would compress all others."""
+
+FLOOR_NOTE = "Errors below a millionth of the largest are drawn at the lower edge."
+
+
 class Series(NamedTuple):
     """Values (n,) of a line, or of rows of dots, with the ends of their intervals or NaN."""
 
@@ -34,6 +41,12 @@ def spans(values: Floats, ratio: float) -> bool:
     finite = values[np.isfinite(values)]
     positive = finite[finite > 0]
     return bool(positive.size and finite.min() >= 0 and positive.max() > ratio * positive.min())
+
+
+def below_floor(values: Floats) -> bool:
+    """Return whether any value is too small, or 0, to be drawn at its place beside the largest."""
+    finite = values[np.isfinite(values)]
+    return bool(finite.size and finite.min() < FLOOR_RATIO * finite.max())
 
 
 def grow_by_factors(values: Floats) -> bool:
@@ -83,7 +96,9 @@ def value_scale(
     logarithmic = spans(values, LOGARITHMIC_FROM)
     if logarithmic:
         # Long intervals are cut off, so that they do not compress everything else.
-        held = ends[(ends > positive.min() / 10) & (ends < positive.max() * 10)]
+        values = values[values >= FLOOR_RATIO * positive.max()]
+        lowest = max(positive.min(), FLOOR_RATIO * positive.max())
+        held = ends[(ends > lowest / 10) & (ends < positive.max() * 10)]
     else:
         held = ends
     everything = np.concatenate([values, held])

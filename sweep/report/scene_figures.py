@@ -35,6 +35,7 @@ from sweep.report.figure import (
 from sweep.report.grouping import AREA, CONFIGURATION, Grouping, by_configuration, group_labels
 from sweep.report.question import course_of
 from sweep.report.report_data import Analysis, ReportData
+from sweep.report.scales import FLOOR_NOTE, below_floor
 from sweep.report.svg import Panel
 from sweep.report.table import Table, table_of
 
@@ -100,8 +101,8 @@ def _errors(data: ReportData) -> RenderedFigure:
             f"Error of the estimated pose against the marker's {long_name(along)}"
             f"{_by_angle(data)}: median and 95 % quantile (p95) of the rotation error and of the "
             "range error (depth, relative to the true depth).",
-            "An error of 0 is drawn at the lower edge."
-            if (curves.summary["rotation_median_deg"] == 0).any() else "",
+            FLOOR_NOTE if any(below_floor(curves.summary[each.variable].values)
+                              for each in ERROR_CURVES) else "",
             interval_sentence(curves.summary, "rotation_median_deg", "range_p95_percent",
                               marks="Bars and bands"), INFINITE_ERRORS, curves.remarks(),
         ),

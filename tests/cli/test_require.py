@@ -33,6 +33,8 @@ def folder(tmp_path_factory):
     close(by_hand(str(folder / "two.zarr"), pipeline))
     bare = TEXT.partition("[require]")[0] + "[axes]" + TEXT.partition("[axes]")[2]
     close(by_hand(str(folder / "bare.zarr"), Pipeline.from_text(bare)))
+    close(by_hand(str(folder / "drawn.zarr"), Pipeline.from_text(
+        "[pose]\ndistance_m = { uniform = [0.1, 0.3] }\n[axes]\ntrial = 2\n")))
     close(by_hand(str(folder / "once.zarr"), Pipeline.from_text("[pose]\nside_px = 40\n")))
     (folder / "other.toml").write_text(TEXT.replace("0.8", "0.01"))
     return folder
@@ -135,6 +137,7 @@ def test_a_worse_store_is_not_met(folder, require):
     (["two.zarr", "detection >= 99 %"], "write 0.99"),
     (["two.zarr", "nees <= 7"], "nees_mean: no pose of this store has such a number"),
     (["two.zarr", "--per", "side"], "--per side: no such dimension"),
+    (["drawn.zarr", "detection >= 0.5", "--per", "distance_m"], "is drawn in this store"),
     (["two.zarr", "--per", "trial"], "intervals are over the draws"),
     (["two.zarr", "--at", "side=40"], "--at side=40: unknown parameter; did you mean side_px?"),
     (["two.zarr", "--at", "side_px=41"], "no such value; there are 11.0, 40.0"),

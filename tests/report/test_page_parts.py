@@ -15,7 +15,7 @@ from sweep.report.figure import RenderedFigure
 from sweep.report.gallery import Scene
 from sweep.report.page import page
 from sweep.report.provenance_facts import Provenance
-from sweep.report.scales import Series
+from sweep.report.scales import Series, below_floor, value_scale
 from sweep.report.scene_selection import FAILURES
 from sweep.report.svg import Panel
 from sweep.report.table import MAX_ROWS, Table
@@ -114,3 +114,14 @@ def test_values_that_grow_by_factors_are_on_a_logarithmic_axis(values, scale):
     ones = np.ones(len(values))
     draw_lines(axes, [Series("", values, ones, ones, ones)], ("x", "y"))
     assert axes.get_xscale() == scale
+
+
+def test_errors_of_rounding_do_not_compress_the_others():
+    none = np.full(4, np.nan)
+    y = np.array([1e-14, 0.02, 0.5, 3.0])
+    assert below_floor(y)
+    assert not below_floor(y[1:])
+    logarithmic, (low, high) = value_scale([Series("", np.arange(4.0), y, none, none)], share=False)
+    assert logarithmic
+    assert 1e-3 < low < 0.02
+    assert 3 < high < 10

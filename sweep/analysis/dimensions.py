@@ -134,6 +134,10 @@ def kept_dimensions(results: xr.Dataset, per: Sequence[str]) -> tuple[str, ...]:
         raise ArgumentError(
             "per", ", ".join(drawn), "is drawn in this store, which has no axis of it: run it with "
             f'{drawn[0]} = [...] under [axes], or, in Python, give bins={{"{drawn[0]}": [...]}}')
+    for name in missing:
+        along = results[name].dims if name in results.coords else ()
+        if len(along) == 1 and along[0] in axes:
+            raise ArgumentError("per", name, f"goes with the axis {along[0]}: name that")
     if missing:
         raise ArgumentError("per", ", ".join(missing),
                             f"no such dimension; there are {', '.join(axes) or 'none'}")

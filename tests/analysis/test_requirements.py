@@ -328,6 +328,13 @@ def test_a_store_that_cannot_answer_says_so(change, text, problem):
         check_requirements(results, [text])
 
 
+def test_a_member_of_an_axis_of_several_names_the_axis():
+    results = perfect(np.random.default_rng(1), {"side_px": 2, "trial": 60, "solver": 1})
+    results = results.assign_coords(size_m=("side_px", [0.1, 0.2]))
+    with pytest.raises(ArgumentError, match="size_m: goes with the axis side_px: name that"):
+        check_requirements(results, ["detection >= 0.5"], per=["size_m"])
+
+
 def test_configurations_are_never_pooled():
     results = mixed({"side_px": 2, "trial": 60, "cornerRefinementMethod": 2, "solver": 2})
     table = check_requirements(results, ["detection >= 0.5"])

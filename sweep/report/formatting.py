@@ -82,6 +82,16 @@ def coordinates(values: Sequence[Any]) -> list[str]:
     return texts
 
 
+def short_coordinate(value: float, values: Sequence[float]) -> str:
+    """Return a coordinate with as few digits as keep it apart from the others of its axis.
+
+    >>> short_coordinate(0.208424, [0.15, 0.208424, 1.5]), short_coordinate(0.3, [])
+    ('0.208', '0.3')
+    """
+    given = [float(each) for each in values]
+    return dict(zip(given, coordinates(given), strict=True)).get(value, coordinate(value))
+
+
 def bin_text(low: float, high: float) -> str:
     """Return the ends of a bin.
 

@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 
 from sweep.report.figure import sentences
-from sweep.report.formatting import coordinate, number
-from sweep.report.grouping import ANGLES, CONFIGURATION
+from sweep.report.formatting import number, short_coordinate
+from sweep.report.grouping import ANGLES, CONFIGURATION, is_numeric
 from sweep.report.reach import Limit, Reaches
 from sweep.report.report_data import ReportData
 from sweep.report.table import Table
@@ -25,7 +25,9 @@ def quantity(data: ReportData, name: str, value: float) -> str:
     """Return a value of an axis with its unit: ``2.25 m``, ``45°``."""
     unit = str(data.results[name].attrs.get("units", "")) if name in data.results.variables else ""
     unit = {"degree": "\u00b0", "px2": "px²", "1": ""}.get(unit, unit)
-    return f"{coordinate(float(value))}{'' if unit in ('', '°') else ' '}{unit}"
+    axis = data.pipeline.axis(name)
+    text = short_coordinate(float(value), axis.values if axis and is_numeric(axis) else ())
+    return f"{text}{'' if unit in ('', '°') else ' '}{unit}"
 
 
 BETWEEN = {"distance_m": "from {}", "side_px": "at sides of {}", "size_m": "with markers of {}"}
@@ -80,7 +82,8 @@ def interval_of(reach: Reaches, limit: Limit) -> str:
     near, far = (limit.low, limit.high) if reach.upwards else (limit.high, limit.low)
     if math.isnan(near) or (near == far and near == limit.value):
         return ""
-    low, high = (coordinate(end) if math.isfinite(end) else "" for end in (near, far))
+    low, high = (short_coordinate(float(end), reach.values) if math.isfinite(end) else ""
+                 for end in (near, far))
     if low and high:
         return f" ({low} to {high})" if reach.upwards else f" ({high} to {low})"
     more = "more" if reach.upwards else "less"

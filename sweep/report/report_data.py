@@ -38,7 +38,7 @@ from sweep.store.outcome import outcome_of_finished
 from sweep.store.snapshot import snapshot
 from sweep.store.unfinished import unfinished_line
 
-MAX_LOADED_BYTES = 300_000_000
+MAX_LOADED_BYTES = 600_000_000
 """Results up to this size are loaded at once: many figures read the same values, and many small
 chunks are slow to read."""
 

@@ -84,7 +84,7 @@ def value_scale(
     share
         Whether the values are shares in percent, whose axis is always the same.
     level
-        A reference that must lie on the axis, too.
+        A reference that must lie on the axis, too; with 0 the axis is linear.
     """
     if share:
         return False, (-3.0, 103.0)
@@ -93,10 +93,10 @@ def value_scale(
     if level is not None:
         values = np.append(values, level)
     positive = values[np.isfinite(values) & (values > 0)]
-    logarithmic = spans(values, LOGARITHMIC_FROM)
+    logarithmic = spans(values, LOGARITHMIC_FROM) and (level is None or level > 0)
     if logarithmic:
-        # Long intervals are cut off, so that they do not compress everything else.
         values = values[values >= FLOOR_RATIO * positive.max()]
+        # Long intervals are cut off, so that they do not compress everything else.
         lowest = max(positive.min(), FLOOR_RATIO * positive.max())
         held = ends[(ends > lowest / 10) & (ends < positive.max() * 10)]
     else:

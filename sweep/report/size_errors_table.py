@@ -47,10 +47,19 @@ def size_errors_table(data: ReportData, best: int) -> list[Table]:
 def _row(part: xr.Dataset) -> list[str]:
     def signed(name: str, unit: str, scale: float) -> str:
         bias, spread = (scale * float(part[f"{name}_{what}_{unit}"]) for what in ("bias", "sd"))
-        return number(bias) if np.isnan(spread) else f"{number(bias)} ± {number(spread)}"
+        return number(bias) if np.isnan(spread) else f"{_beside(bias, spread)} ± {number(spread)}"
 
     return [
         number(100 * float(part["detection_rate"])), number(float(part["range_p95_percent"])),
         *(signed(name, "m", 1000.0) for name in IN_MM),
         signed("yaw", "deg", 1.0),
     ]
+
+
+def _beside(value: float, spread: float) -> str:
+    """Return a value with no more decimals than its spread has: 0.00042 beside 0.00742."""
+    _, point, decimals = number(spread).partition(".")
+    if not point or not decimals.isdigit():
+        return number(value)
+    text = f"{value:.{len(decimals)}f}"
+    return text.replace("-", "\u2212") if float(text) else text.removeprefix("-")

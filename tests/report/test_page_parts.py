@@ -125,3 +125,4 @@ def test_errors_of_rounding_do_not_compress_the_others():
     assert logarithmic
     assert 1e-3 < low < 0.02
     assert 3 < high < 10
+    assert not value_scale([Series("", np.arange(4.0), y, none, none)], share=False, level=0.0)[0]

@@ -4,10 +4,13 @@ import json
 import re
 import shutil
 import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
 
+from benchmarks.bench_analysis import write_store
 from support.reports import FULL, command, made
 
 PIPELINES = Path(__file__).parents[2] / "pipelines"
@@ -109,6 +112,80 @@ SMALLER = {
                             "perspectiveRemovePixelPerCell=[4, 8]"],
     "faults": ["trial=2", "exposure_s=[0, 0.002]", "distance_m=[0.8, 1.6]"],
 }
+
+
+KINDS = {
+    "one pose": "[pose]\nside_px = 40\n",
+    "sobol": """seed = 1
+sampling = "sobol"
+[pose]
+jitter_px = 0.5
+[scene]
+noise_grey = 2
+[axes]
+side_px = [20, 40]
+trial = 32
+""",
+    "together": """seed = 1
+[pose]
+jitter_px = 0.5
+[axes]
+view = { zip = { tilt_deg = [0, 30, 60], side_px = [40, 30, 20] } }
+trial = 10
+""",
+    "angles": """seed = 1
+[pose]
+side_px = 40
+jitter_px = 0.5
+azimuth_deg = { uniform = [0, 360] }
+[scene]
+noise_grey = 2
+[require]
+all = ["detection >= 0.9", "flip_rate <= 0.05"]
+[axes]
+tilt_deg = [5, 20, 40, 60, 80]
+trial = 40
+""",
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", KINDS)
+def test_reports_of_other_kinds_are_right_and_print(name, tmp_path):
+    page, paper = tmp_path / "report.html", tmp_path / "report.pdf"
+    url = made(tmp_path, KINDS[name], name.replace(" ", ""))
+    code, _, err = command("report", url, "-o", page)
+    assert (code, err) == (0, "")
+    check(page, tmp_path)
+    subprocess.run(
+        [BROWSER, "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage",
+         "--no-first-run", f"--print-to-pdf={paper}", page.as_uri()],
+        capture_output=True, timeout=120, check=True)
+    assert paper.read_bytes()[:5] == b"%PDF-"
+    assert paper.stat().st_size > 20_000
+
+
+@pytest.mark.long
+def test_a_report_of_a_million_poses_is_written_and_opened_in_time(tmp_path):
+    """Times are of two quiet cores; the start of the browser is that of an empty page."""
+    url, results = write_store(tmp_path, 2 * 10**6)
+    assert results == 2 * 10**6  # a million poses, each with two solvers
+    page, empty = tmp_path / "report.html", tmp_path / "empty.html"
+    empty.write_text("<!DOCTYPE html><title>empty</title>")
+    begun = time.perf_counter()
+    subprocess.run([sys.executable, "-m", "sweep", "report", url, "-o", page], check=True,
+                   capture_output=True)
+    written = time.perf_counter() - begun
+
+    def opened(place):
+        begun = time.perf_counter()
+        browse(place)
+        return time.perf_counter() - begun
+
+    start, shown = (min(opened(place) for _ in range(3)) for place in (empty, page))
+    print(f"\nwritten in {written:.1f} s, opened in {shown - start:.2f} s")
+    assert written < 30
+    assert shown - start < 2
 
 
 @pytest.mark.long

@@ -137,7 +137,7 @@ def reaches(
         farthest_met(results, requirements, along, per=[angle] if angle else [],
                      at_all=course.at_all)))
     upwards = table.attrs["harder"] == "upwards"
-    rows = _rows(data, table.drop_dims([along]), settings, angle)
+    rows = _rows(data, table.drop_dims([along]), settings, angle, along)
     values = _easy_first(data, along, upwards=upwards)
     limits = _cumulated(
         [[_limit(row, values, angle) for row in each] for each in rows], upwards=upwards)
@@ -156,7 +156,7 @@ def reaches_without_draws(
     values = _easy_first(data, along, upwards=upwards)
     lowest = table["detection_rate"].min(list(course.at_all)).sel({along: list(values)})
     limits = []
-    for each in _rows(data, lowest.to_dataset(name="rate"), settings, angle):
+    for each in _rows(data, lowest.to_dataset(name="rate"), settings, angle, along):
         row = []
         for part in each:
             rates = part["rate"].values
@@ -189,10 +189,14 @@ def _easy_first(data: ReportData, along: str, *, upwards: bool) -> tuple[float, 
 
 
 def _rows(
-    data: ReportData, table: xr.Dataset, settings: Settings, angle: str | None
+    data: ReportData, table: xr.Dataset, settings: Settings, angle: str | None, along: str
 ) -> list[list[xr.Dataset]]:
-    """Return the parts of a table for each configuration and, the smallest first, angle."""
-    others = {dim: 0 for dim in table.dims if dim != angle and dim not in settings.axes}
+    """Return the parts of a table for each configuration and, the smallest first, angle.
+
+    A part may have the dimension ``along``.
+    """
+    kept = {angle, along, *settings.axes}
+    others = {dim: 0 for dim in table.dims if dim not in kept}
     names, stacked = by_configuration(
         data.pipeline, table.isel(others, drop=True), list(settings.axes))
     parts = [stacked.isel({CONFIGURATION: k}) for k in range(len(names))]

@@ -366,9 +366,11 @@ def test_the_first_sentence_is_how_far_each_detector_detects(full, odd):
     (table,) = (each for each in shown.tables if each.caption.startswith("Detected in at least 99"))
     assert [row[0] for row in table.rows] == ["none", "subpix"]
     assert answer(opened(odd("single pose"))).headline == "Detected in 100 % of 1 pose."
-    assert answer(opened(odd("no draws"))).headline == (
-        "Detected in at least 99 % at all sizes, down to a side of 20 px, at tilts up "
-        "to 30\u00b0.")
+    undrawn = opened(odd("no draws"))
+    assert (undrawn.results["detection"] == DetectionStatus.detected).values.tolist() == [
+        [True, False], [True, True]]  # (side_px, tilt_deg)
+    assert answer(undrawn).headline == (
+        "Detected in at least 99 % down to a side of 40 px, at tilts up to 30\u00b0.")
 
 
 def configured(medians, intervals, flag):
@@ -383,7 +385,7 @@ def configured(medians, intervals, flag):
     solvers = ["ippe", "iterative", "sqpnp", "epnp", "ippe_square", "ap3p"][:len(medians)]
     text = f"{CAMERA}[pose]\nside_px = 40\n[axes]\nsolver = {solvers}\n"
     pipeline = Pipeline.from_text(text, name="configured")
-    data = ReportData("configured", xr.Dataset(), pipeline, {})
+    data = ReportData("configured", xr.Dataset(coords={"solver": solvers}), pipeline, {})
     data._analyses["error_statistics", ("solver",), (), ()] = found
     return data
 

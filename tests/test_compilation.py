@@ -62,6 +62,7 @@ def test_folder_of_the_environment_is_used(tmp_path):
     assert list(folder.glob("supersampling._unit*.nbc"))
 
 
+@pytest.mark.long
 def test_code_compiled_from_an_older_version_of_another_file_is_not_used(tmp_path):
     package, cached = tmp_path / "package", str(tmp_path / "cached")
     ignored = shutil.ignore_patterns("__pycache__")
@@ -76,6 +77,7 @@ def test_code_compiled_from_an_older_version_of_another_file_is_not_used(tmp_pat
     assert float(second) == float(interpreted)
 
 
+@pytest.mark.long
 def test_read_only_package_without_a_home_uses_a_private_temporary_folder(tmp_path):
     script = (
         "import os, pathlib\n"

@@ -248,6 +248,7 @@ def test_several_programs_and_our_own_detector_are_paired_on_one_axis(exported, 
                for line in ready.lines)
 
 
+@pytest.mark.long
 def test_windows_are_scored_as_whole_frames_are(exported, ran, tmp_path):
     pipeline = Pipeline.from_text(TEXT.replace('window = "full"', ""), name="scored")
     export(pipeline, tmp_path / "windows", windowed=True)
@@ -373,6 +374,7 @@ def test_an_image_that_is_named_without_a_marker_counts_as_searched(exported, tm
         "nothing-found: no marker: each of 24 images counts as searched in vain"]
 
 
+@pytest.mark.long
 def test_of_doubled_rows_the_nearest_counts_if_asked_for(exported, ran, tmp_path):
     rows = [row for row in rows_of(exported / "detections.csv") if row["id"] != "-1"]
     far = [{**row, "x0": repr(float(row["x0"]) + 3)} for row in rows]

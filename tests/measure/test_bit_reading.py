@@ -344,8 +344,8 @@ def test_sweep_loses_an_id_with_lone_cells_at_its_dip_and_none_without():
 
 @pytest.mark.parametrize(("dictionary", "tilt", "azimuth", "areas"), [
     (DICTIONARY, 0, 0, (121, 159, 169, 196)),
-    ("DICT_4X4_100", 45, 0, (87, 130, 174)),
-    ("DICT_7X7_100", 60, 90, (284, 397, 480)),
+    pytest.param("DICT_4X4_100", 45, 0, (87, 130, 174), marks=pytest.mark.long),
+    pytest.param("DICT_7X7_100", 60, 90, (284, 397, 480), marks=pytest.mark.long),
 ])
 def test_rates_below_two_pixels_a_module_are_predicted_within_a_tenth(
     dictionary, tilt, azimuth, areas

@@ -60,9 +60,8 @@ def asked(name, folder, trials):
     return json.loads(out)
 
 
-@pytest.mark.parametrize(
-    "name", [name if name == "focal_length" else pytest.param(name, marks=pytest.mark.long)
-             for name in QUESTIONS])
+@pytest.mark.long
+@pytest.mark.parametrize("name", QUESTIONS)
 def test_the_first_sentence_answers_the_question(name, tmp_path):
     shown = asked(name, tmp_path, 8 if name == "focal_length" else 150)
     assert EXPECTED[name] in shown["answer"]

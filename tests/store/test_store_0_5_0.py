@@ -161,6 +161,7 @@ def see_similar(url, other):
         assert float((ours.detection == theirs.detection).mean()) > 0.9
 
 
+@pytest.mark.long
 @same_versions
 def test_cell_of_an_old_store_is_reproduced(unpacked):
     again = reproduce(str(unpacked / "finished.zarr"), AT)

@@ -13,6 +13,7 @@ from support.here import Here
 from sweep import Pipeline, PipelineError
 from sweep.conformance.check import check_detector
 from sweep.evaluation.inspection import scene_image
+from sweep.isolation.child_process import Child
 from sweep.plan.cell_selection import cell
 from sweep.plugins.loading import load
 
@@ -53,7 +54,10 @@ def detector(request):
 
 
 def test_an_adapter_conforms(detector):
-    with mock.patch("sweep.conformance.check.Child", Here):
+    # Images of few pixels, which are tried too, leave pupil-apriltags' heap corrupted: the process
+    # may die when it ends.
+    child = Child if detector == "pupil-apriltags" else Here
+    with mock.patch("sweep.conformance.check.Child", child):
         report = check_detector(detector, calls=0)
     assert report.conforms, report.findings
     assert max(map(abs, report.offset_px)) < 0.02

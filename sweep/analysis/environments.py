@@ -11,19 +11,16 @@ import xarray as xr
 from sweep.analysis.aggregate import aggregate
 from sweep.analysis.counts import Count, Rate
 from sweep.analysis.dimensions import axes_of, require_dimension
-from sweep.analysis.means import Mean, RootMeanSquare
 from sweep.analysis.pose_pairs import Pair, paired_arrays
-from sweep.analysis.pose_view import DETECTION_INPUTS, ERROR_INPUTS, norm_squared, pose_arrays
-from sweep.analysis.quantities import QUANTITIES
+from sweep.analysis.pose_shifts import CORNERS, corner_shift, pose_shifts
+from sweep.analysis.pose_view import DETECTION_INPUTS, ERROR_INPUTS, pose_arrays
 from sweep.errors import ArgumentError
 from sweep.measure.flags import DetectionStatus
 from sweep.plan.attributes import describes
 from sweep.plan.parameters import Stage
-from sweep.typing import Floats, Masks
+from sweep.typing import Masks
 
 ENVIRONMENT = "environment"
-CORNERS = "corner_error_px"
-ROTATION = "rotation_error_rad"
 
 
 @describes
@@ -90,16 +87,6 @@ def environment_differences(results: xr.Dataset, reference: str | None = None) -
         differ = (pair.first[CORNERS] != pair.second[CORNERS]).any(axis=(-2, -1))
         return np.asarray(differ & detected_in_both(pair))
 
-    def corner_shift(pair: Pair) -> Floats:
-        shift = np.subtract(pair.second[CORNERS], pair.first[CORNERS], dtype=np.float64)
-        return np.asarray((shift**2).mean(axis=(-2, -1))[..., None])
-
-    rotation, depth = QUANTITIES[:2]
-
-    def rotation_shift(pair: Pair) -> Floats:
-        shift = np.subtract(pair.second[ROTATION], pair.first[ROTATION], dtype=np.float64)
-        return norm_squared(np.degrees(shift))[..., None]
-
     detections = aggregate(
         results, pairs(*DETECTION_INPUTS, CORNERS), kept("detection"),
         [
@@ -115,27 +102,12 @@ def environment_differences(results: xr.Dataset, reference: str | None = None) -
             Rate("corners_moved", "moved of detected_in_both", moved, detected_in_both,
                  counts=(("detected_in_both", "poses detected in both environments"),
                          ("moved", "of them, poses of which a corner has another value"))),
-            RootMeanSquare(
-                "corner_shift_rms_px", "RMS of a corner's coordinate minus the other's", "px",
-                corner_shift, detected_in_both),
+            corner_shift("the other's"),
         ],
         Pair,
     )
     poses = aggregate(
-        results, pairs(*ERROR_INPUTS), kept("estimate"),
-        [
-            Mean("range_bias_percent",
-                 "mean depth error minus the other's, of the true depth, both solved",
-                 "percent", lambda pair: depth.vector(pair.second) - depth.vector(pair.first),
-                 lambda pair: pair.both_solved),
-            RootMeanSquare(
-                "rotation_shift_deg",
-                "RMS of the rotation error minus the other's, both solved and not flipped",
-                rotation.units, rotation_shift,
-                lambda pair: pair.first.unflipped & pair.second.unflipped),
-        ],
-        Pair,
-    )
+        results, pairs(*ERROR_INPUTS), kept("estimate"), pose_shifts("the other's"), Pair)
     table = detections.drop_vars("draws").assign(poses)
     names = results[ENVIRONMENT].values[_compared_with(results, reference)]
     return table.assign_coords(compared_with=(ENVIRONMENT, names))

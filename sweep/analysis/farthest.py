@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.dimensions import DRAWS, as_names, axes_of
+from sweep.analysis.dimensions import DRAWS, as_names, axes_of, configuration_axes
 from sweep.analysis.image_sides import image_sides
 from sweep.analysis.requirements import (
     Decision,
     Requirement,
     check_requirements,
-    configuration_axes,
     parse_requirements,
 )
 from sweep.errors import ArgumentError, DatasetError

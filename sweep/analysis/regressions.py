@@ -11,10 +11,9 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis.comparisons import paired_table
-from sweep.analysis.dimensions import as_names, kept_dimensions
+from sweep.analysis.dimensions import as_names, configuration_axes, kept_dimensions
 from sweep.analysis.intervals import LEVEL
 from sweep.analysis.quantities import QUANTITIES, SIGNED, Quantity
-from sweep.analysis.requirements import configuration_axes
 from sweep.errors import DatasetError
 
 MARGIN = 0.01

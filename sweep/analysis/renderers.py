@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import numpy as np
 import xarray as xr
 
 from sweep.analysis.aggregate import aggregate
 from sweep.analysis.counts import Rate
 from sweep.analysis.dimensions import axes_of, require_dimension
-from sweep.analysis.means import Mean, RootMeanSquare
 from sweep.analysis.pose_pairs import Pair, paired_arrays
-from sweep.analysis.pose_view import DETECTION_INPUTS, ERROR_INPUTS, norm_squared, pose_arrays
-from sweep.analysis.quantities import QUANTITIES
+from sweep.analysis.pose_shifts import CORNERS, corner_shift, pose_shifts
+from sweep.analysis.pose_view import DETECTION_INPUTS, ERROR_INPUTS, pose_arrays
 from sweep.errors import ArgumentError
 from sweep.plan.attributes import describes
 from sweep.plan.parameters import Stage
-from sweep.typing import Floats
-
-CORNERS = "corner_error_px"
-ROTATION = "rotation_error_rad"
 
 
 @describes
@@ -79,16 +73,6 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
     def pairs(*names: str) -> dict[str, xr.DataArray]:
         return paired_arrays(pose_arrays(others, names), pose_arrays(results, names))
 
-    def corner_shift(pair: Pair) -> Floats:
-        moved = np.subtract(pair.second[CORNERS], pair.first[CORNERS], dtype=np.float64)
-        return np.asarray((moved**2).mean(axis=(-2, -1))[..., None])
-
-    rotation, depth = QUANTITIES[:2]
-
-    def rotation_shift(pair: Pair) -> Floats:
-        moved = np.subtract(pair.second[ROTATION], pair.first[ROTATION], dtype=np.float64)
-        return norm_squared(np.degrees(moved))[..., None]
-
     detections = aggregate(
         results, pairs(*DETECTION_INPUTS, CORNERS), kept("detection"),
         [
@@ -97,25 +81,10 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
                  lambda pair: pair.compared,
                  counts=(("compared", "poses that were looked for with both renderers"),
                          ("differing", "poses detected with one of both renderers only"))),
-            RootMeanSquare(
-                "corner_shift_rms_px", "RMS of a corner's coordinate minus the reference's", "px",
-                corner_shift, lambda pair: pair.first.detected & pair.second.detected),
+            corner_shift("the reference's"),
         ],
         Pair,
     )
     poses = aggregate(
-        results, pairs(*ERROR_INPUTS), kept("estimate"),
-        [
-            Mean("range_bias_percent",
-                 "mean depth error minus the reference's, of the true depth, both solved",
-                 "percent", lambda pair: depth.vector(pair.second) - depth.vector(pair.first),
-                 lambda pair: pair.both_solved),
-            RootMeanSquare(
-                "rotation_shift_deg",
-                "RMS of the rotation error minus the reference's, both solved and not flipped",
-                rotation.units, rotation_shift,
-                lambda pair: pair.first.unflipped & pair.second.unflipped),
-        ],
-        Pair,
-    )
+        results, pairs(*ERROR_INPUTS), kept("estimate"), pose_shifts("the reference's"), Pair)
     return detections.drop_vars("draws").assign(poses)

@@ -25,7 +25,7 @@ import xarray as xr
 from sweep.analysis.aggregate import aggregate
 from sweep.analysis.binning import Bins
 from sweep.analysis.counts import Count
-from sweep.analysis.dimensions import DRAWS, as_names, axes_of, kept_dimensions
+from sweep.analysis.dimensions import DRAWS, as_names, configuration_axes, kept_dimensions
 from sweep.analysis.draws_needed import draws_needed
 from sweep.analysis.pose_view import Poses
 from sweep.analysis.replicates import is_replicated
@@ -35,7 +35,6 @@ from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import Flag, flag
 from sweep.messages import plain
 from sweep.plan.attributes import describes
-from sweep.plan.parameters import Stage
 from sweep.plan.requirement_text import read_requirement
 from sweep.plan.schema import cf_attributes
 
@@ -259,13 +258,6 @@ def _requirements(given: Iterable[Requirement | str]) -> tuple[Requirement, ...]
     listed = [given] if isinstance(given, str | Requirement) else list(given)
     return parse_requirements([
         each.text if isinstance(each, Requirement) else each for each in listed])
-
-
-def configuration_axes(results: xr.Dataset) -> list[str]:
-    """Return the axes of detector and estimator: they are never pooled."""
-    scene = axes_of(results, Stage.scene)
-    return [name for name in axes_of(results, Stage.detection, Stage.estimation)
-            if name not in scene]
 
 
 def require_draws(results: xr.Dataset, kept: Sequence[str]) -> None:

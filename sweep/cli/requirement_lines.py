@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.dimensions import DRAWS, axes_of
+from sweep.analysis.dimensions import DRAWS, axes_of, configuration_axes
 from sweep.analysis.replicates import is_replicated
-from sweep.analysis.requirements import Decision, configuration_axes
+from sweep.analysis.requirements import Decision
 from sweep.analysis.verdicts import Verdict, described
 from sweep.errors import ArgumentError
 from sweep.messages import label, nearest, plain

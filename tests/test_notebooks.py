@@ -152,6 +152,7 @@ def printed(notebook, until):
     return texts
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [
     name if name == "first_analysis" else pytest.param(name, marks=pytest.mark.long)
     for name in FIGURES

@@ -58,6 +58,7 @@ def test_examples_of_the_docstrings_run(tmp_path):
         assert runner.run(test).failed == 0
 
 
+@pytest.mark.long
 def test_pipeline_is_given_as_a_mapping_a_path_or_a_pipeline(finished, tmp_path):
     path = tmp_path / "pipeline.toml"
     path.write_text(TEXT)
@@ -113,6 +114,7 @@ def test_what_is_no_pipeline_is_an_argument_error():
         sweep.run(3)
 
 
+@pytest.mark.long
 def test_arguments_of_version_0_5_are_accepted_with_a_warning(finished, tmp_path):
     pipeline = sweep.Pipeline.from_text(TEXT)
     with pytest.warns(DeprecationWarning, match="second positional argument; use store="):

@@ -74,6 +74,7 @@ def finished(tmp_path_factory):
     return made(tmp_path_factory.mktemp("stores"), GRID, "small")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("environment", "command"), list(cases()))
 def test_a_command_works_or_is_refused_in_one_line(environment, command, finished, tmp_path):
     before, after, changes = ENVIRONMENTS[environment]

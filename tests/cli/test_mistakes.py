@@ -173,6 +173,7 @@ def test_python_is_told_that_nothing_was_detected(tmp_path, capsys):
     ]
 
 
+@pytest.mark.long
 def test_a_script_without_a_main_guard_runs_once(tmp_path):
     (tmp_path / "script.py").write_text(
         "import sweep\nprint('begun')\n"

@@ -227,6 +227,7 @@ TRUTH = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [*TRUTH, "believed_focal_scale"])
 def test_an_unset_belief_is_the_truth_where_cells_are_reused(name, tmp_path):
     truth = TRUTH.get(name, 1.0)
@@ -242,6 +243,7 @@ def test_an_unset_belief_is_the_truth_where_cells_are_reused(name, tmp_path):
               open_store(str(tmp_path / "0.zarr")))
 
 
+@pytest.mark.long
 def test_an_axis_of_beliefs_reuses_the_cell_that_believed_the_truth(tmp_path):
     axes = {"distance_m": [0.5], "believed_focal_scale": [0.99, 1.0]}
     url = str(tmp_path / "old.zarr")

@@ -181,6 +181,7 @@ def computes():
         return client.submit(sum, [1, 2]).result(timeout=60) == 3
 
 
+@pytest.mark.long
 def test_embedded_cluster_computes_whatever_dask_is_configured_to_do(monkeypatch, tmp_path):
     # As the worker processes read it by themselves: variables, and files.
     monkeypatch.setenv("DASK_DISTRIBUTED__WORKER__LIFETIME__DURATION", "1s")

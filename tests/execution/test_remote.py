@@ -416,6 +416,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "case",
     [

@@ -66,6 +66,7 @@ def copied(failed, tmp_path):
     return shutil.copytree(failed, str(tmp_path / "copied.zarr"))
 
 
+@pytest.mark.long
 def test_retry_computes_what_failed_and_nothing_else(pipeline, clean, copied):
     before = status(copied)
     assert [len(before.failed), len(before.crashed)] == [1, 1]

@@ -243,6 +243,7 @@ def test_bound_is_reused_with_its_flag(tmp_path):
     assert same(new, fresh)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_child")
 def test_halves_of_a_grid_are_joined(pipeline, undisturbed, tmp_path):
     halves = []

@@ -110,6 +110,7 @@ def compute(store, child):
         ).compute(iter(range(len(store.blocks))), Tally(store))
 
 
+@pytest.mark.long
 def test_block_that_ends_its_process_each_time_is_named(undisturbed, monkeypatch):
     monkeypatch.setattr(small_run, "MAX_DEATHS", 1)
     monkeypatch.setattr(small_run, "compute_block", suicide)

@@ -167,6 +167,7 @@ def outcome(client, url):
         return str(error), 0
 
 
+@pytest.mark.long
 def test_block_whose_receipt_died_with_its_worker_is_submitted_again(
     cluster, tmp_path, undisturbed, monkeypatch
 ):

@@ -383,6 +383,7 @@ def blurred_scenes(count, sigma, **given):
     return [value for value in scenes if Drawing(value).found().std[0, :3].max() < 0.3]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("unknown_blur", [False, True])
 @pytest.mark.parametrize("sigma", [0.3, 0.5, 1.0, 2.0])
 @lengths(2, 24)

@@ -6,6 +6,8 @@ import dataclasses
 import inspect
 import re
 
+import pytest
+
 from sweep.measure.detector import DetectorSetting
 from tests.support.recipes import added, printed_by
 
@@ -49,6 +51,7 @@ print(json.dumps({
 '''
 
 
+@pytest.mark.long
 def test_setting_is_one_field(tmp_path):
     source = inspect.getsource(DetectorSetting)
     field = re.search(rf"    {NAME}: float = parameter\(.*?\n    \)\n", source, re.DOTALL)[0]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from sweep.analysis.rates import OUTCOMES
 from sweep.measure.flags import EstimateStatus
 from tests.support.recipes import added, printed_by
@@ -62,6 +64,7 @@ print(json.dumps({
 """
 
 
+@pytest.mark.long
 def test_flag_is_one_member(tmp_path):
     (last,) = (flag for flag in EstimateStatus if flag == VALUE - 1)
     anchor = f'"{last.meaning}",\n        present=True,\n    )\n'

@@ -331,6 +331,7 @@ def undistortion_error(coefficients, radius, turn):
     return float(mp.hypot(*(mpf(number) - root for number, root in zip(found, truth, strict=True))))
 
 
+@pytest.mark.long
 @lengths(3, 60)
 def test_undistorted_points_are_the_roots_that_fifty_digits_find(count, table):
     # 1e-12 is 1e-9 px at 1000 px. Measured 5e-16: roundings of the model, over its slope.

@@ -207,6 +207,7 @@ def test_an_axis_of_fields_of_view_is_set_on_the_command_line():
 
 # 3. What is told.
 
+@pytest.mark.long
 def test_plan_names_focal_lengths_fields_of_view_and_sides(tmp_path, capsys):
     file = tmp_path / "p.toml"
     file.write_text(

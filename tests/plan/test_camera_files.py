@@ -543,6 +543,7 @@ def test_set_of_a_camera_file_replaces_the_camera_and_keeps_comments(tmp_path):
     assert "focal_length_mm" not in chosen.to_toml()
 
 
+@pytest.mark.long
 def test_a_store_does_not_need_its_camera_file_any_more(tmp_path):
     write(tmp_path / "c.yaml", GOOD)
     url = str(tmp_path / "s.zarr")
@@ -582,6 +583,7 @@ def test_a_store_does_not_need_its_camera_file_any_more(tmp_path):
         execute(other, url)
 
 
+@pytest.mark.long
 def test_show_and_plan_take_a_camera_file(tmp_path, capsys):
     write(tmp_path / "c.yaml", GOOD)
     file = write(tmp_path / "p.toml", '[camera]\ncamera_file = "c.yaml"\n[pose]\nside_px = 60\n')

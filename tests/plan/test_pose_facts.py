@@ -91,6 +91,7 @@ def test_a_grid_of_any_size_is_looked_at():
         assert 1 <= facts.sampled <= MAX_SAMPLE
 
 
+@pytest.mark.long
 def test_plan_says_how_the_marker_is_seen(tmp_path, capsys):
     path = tmp_path / "seen.toml"
     path.write_text("[pose]\ntilt_deg = 60\nazimuth_deg = 90\n[axes]\n"

@@ -182,6 +182,7 @@ def kinds(url):
     return [kind.name for kind in figure_kinds(opened(url))]
 
 
+@pytest.mark.long
 def test_each_figure_applies_where_it_should(full, odd):
     assert kinds(full) == [
         "detection", "errors", "bias", "configurations", "paired", "maps", "flips", "ambiguity",
@@ -215,6 +216,7 @@ def test_an_axis_of_too_many_configurations_has_a_figure_of_its_own(tmp_path):
     assert command("report", url, "-o", tmp_path / "report.html")[::2] == (0, "")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [
     name if name in ("nothing visible", "distances drawn")
     else pytest.param(name, marks=pytest.mark.long) for name in ODD
@@ -655,6 +657,7 @@ def test_a_report_is_never_written_into_a_store(tmp_path):
     assert held() == before
 
 
+@pytest.mark.long
 def test_a_report_goes_through_links_and_into_devices(tmp_path):
     url = made(tmp_path, ODD["single pose"], "one")
     behind = tmp_path / "behind"
@@ -727,6 +730,7 @@ def test_a_folder_that_cannot_be_written_is_told(full, tmp_path):
     assert "cannot be written: Permission denied" in err
 
 
+@pytest.mark.long
 def test_a_report_is_whole_or_not_there(full, tmp_path, monkeypatch):
     output = tmp_path / "report.html"
     output.write_text("the one before")

@@ -167,6 +167,7 @@ def test_page_markdown_json_and_terminal_have_the_same_answer(small, tmp_path):
         assert f"**{each['value']}**" in text.read_text(encoding="utf-8")
 
 
+@pytest.mark.long
 def test_origin_stands_last_and_the_command_is_the_one_that_was_given(small, tmp_path):
     page = tmp_path / "a report.html"
     given = ["report", small, "--require", "detection >= 0.5", "--per", "side_px", "-o", page]

@@ -81,6 +81,7 @@ def test_damaged_entry_of_builds_is_a_difference():
     assert [name for name, *_ in changes({**ours, "builds": 3}, ours)] == ["builds"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("loaded", ["4.12.0", "5.1.0-dev"])
 def test_opencv_that_contradicts_its_metadata_is_refused_by_library_and_workers(
     loaded, monkeypatch, tmp_path

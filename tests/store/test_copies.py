@@ -90,6 +90,7 @@ def test_blocks_whose_chunks_are_missing_are_found(count, written, tmp_path):
         shutil.rmtree(copied)
 
 
+@pytest.mark.long
 def test_copy_that_was_made_during_a_run_is_continued_to_the_same_store(
     pipeline, written, finished, tmp_path, capsys
 ):

@@ -80,6 +80,7 @@ def sound_blocks(url):
     return found.blocks_done
 
 
+@pytest.mark.long
 @lengths(2, 150)
 def test_nothing_committed_is_lost_and_the_same_store_comes_about(
     count, recorded, tmp_path

@@ -214,6 +214,7 @@ def test_old_store_is_reused(unpacked, tmp_path):
         np.testing.assert_allclose(angle, np.broadcast_to(fresh[..., None], angle.shape), atol=0.1)
 
 
+@pytest.mark.long
 @same_versions
 def test_unfinished_old_store_is_continued_in_its_format(unpacked, unfinished):
     url = str(unfinished)

@@ -324,6 +324,7 @@ def test_renderers_are_told_beside_the_table(renderer_store):
         assert f"\n{name} " in out
 
 
+@pytest.mark.long
 def test_treatments_on_exact_images_are_measured_on_all_their_trials(renderers):
     assert renderers["attrs"]["poses"] == 24
 
@@ -399,6 +400,7 @@ def test_without_exact_images_renderers_are_not_compared(tmp_path):
 
 # Nothing to be seen.
 
+@pytest.mark.long
 def test_where_nothing_is_to_be_seen_nothing_has_a_cost(unseen_store):
     content = json.loads(told(unseen_store, "--per", "tilt_deg", "--seconds", "0.1", "--json"))
     for name in ("cost_ms", "cost_ratio", "detection_ms", "estimation_ms"):
@@ -623,6 +625,7 @@ def test_budget_without_any_finite_error_says_why():
         f"nothing fits 2 ms: no configuration has a finite rotation_p95_deg: {reason}"]
 
 
+@pytest.mark.long
 def test_budget_is_told_by_the_command_and_checked(store):
     text = told(store, "--seconds", "0.2", "--budget-ms", "1e-6")
     assert "nothing fits 1e-06 ms a frame; the nearest is " in text

@@ -54,6 +54,22 @@ class Decision(Flag):
         counted=False)
 
 
+@dataclass(frozen=True, slots=True)
+class ErrorShares:
+    """Shares of `ERROR_PROBABILITY` that single decisions may spend.
+
+    Attributes
+    ----------
+    met
+        Of a false "met"; less than 1 where several looks or choices could go wrong.
+    not_met
+        Of a false "not met".
+    """
+
+    met: float = 1.0
+    not_met: float = 1.0
+
+
 @dataclass(frozen=True)
 class Requirement:
     """What is required of a quantity.
@@ -219,23 +235,57 @@ def check_requirements(
     ['not_met', 'undecided', 'met']
     """
     required = _requirements(requirements)
+    out = decide(results, required, per, bins)
+    table = out.drop_vars(["looked_for", "solved"])
+    share = (out["solved"] / out["looked_for"]).where(out["looked_for"] > 0)
+    needed = [
+        draws_needed(each, one["value"], one["low"], one["high"], one["draws"], share,
+                     one["decision"] == Decision.undecided)
+        for number, each in enumerate(required) for one in [table.isel(requirement=number)]]
+    return table.assign(draws_needed=xr.concat(
+        needed, "requirement", coords="minimal", compat="override").transpose(
+        *table["value"].dims).assign_attrs(
+        long_name="draws that would decide it, if the value stays", units="1"))
+
+
+def decide(
+    results: xr.Dataset, required: Sequence[Requirement], per: Sequence[str] = (),
+    bins: Bins | None = None, shares: ErrorShares | None = None,
+) -> xr.Dataset:
+    """Return decisions as `check_requirements`, without ``draws_needed``, at other levels.
+
+    Parameters
+    ----------
+    results, required, per, bins
+        As there.
+    shares
+        Shares of the error probability that a decision may spend.
+
+    Returns
+    -------
+    xr.Dataset
+        As there, with ``looked_for`` and ``solved``: poses of the condition (without
+        ``requirement``).
+    """
     dims = (*configuration_axes(results), *as_names(per))
     kept = kept_dimensions(results, tuple(dict.fromkeys(dims)))
     require_draws(results, kept)
     count = math.prod(results.sizes[name] for name in kept if name not in
                       configuration_axes(results))
     count *= math.prod(len(edges) - 1 for edges in (bins or {}).values()) * len(required)
+    spent = shares or ErrorShares(not_met=1.0 / count)
     inputs = requirable_arrays(results, [each.requirable for each in required])
     statistics = [
         Count("looked_for", "", lambda poses: poses.looked_for),
         Count("solved", "", lambda poses: poses.solved),
-        *(statistic for number, each in enumerate(required) for prefix, level in (
-            (f"{number} one ", each.requirable.level),
-            (f"{number} all ", 1.0 - (1.0 - each.requirable.level) / count))
-          for statistic in each.requirable.computed(prefix, level)),
+        *(statistic for number, each in enumerate(required) for prefix, share in (
+            (f"{number} one ", spent.met), (f"{number} all ", spent.not_met))
+          for statistic in each.requirable.computed(
+              prefix, 1.0 - (1.0 - each.requirable.level) * share)),
     ]
     table = aggregate(results, inputs, kept, statistics, Poses, bins).compute()
-    _require_numbers(table, required)
+    if shares is None:
+        _require_numbers(table, required)
     replicated = is_replicated(results)
     judged = [_judged(table, number, each, replicated) for number, each in enumerate(required)]
     index = xr.DataArray([each.text for each in required], dims="requirement", attrs={
@@ -250,7 +300,7 @@ def check_requirements(
     out = out.transpose(..., "requirement")
     out.attrs["configuration_dims"] = [
         name for name in configuration_axes(results) if name in out.dims]
-    return out
+    return out.assign(looked_for=table["looked_for"], solved=table["solved"])
 
 
 def _requirements(given: Iterable[Requirement | str]) -> tuple[Requirement, ...]:
@@ -299,15 +349,11 @@ def _judged(
         (table["looked_for"] == 0) | (table["solved"] > 0))
     decision = (xr.full_like(value, Decision.undecided).where(~not_met, Decision.not_met)
                 .where(~met, Decision.met).where(~no_number, Decision.not_applicable))
-    needed = draws_needed(
-        requirement, value, low, high, draws, table["solved"] / table["looked_for"],
-        decision == Decision.undecided)
     words = {
         "value": (value, "value"),
         "low": (low, "lower end of the interval by which it is decided"),
         "high": (high, "upper end of the interval by which it is decided"),
         "draws": (draws, "random draws that the value is worth"),
-        "draws_needed": (needed, "draws that would decide it, if the value stays"),
     }
     out = {name: array.assign_attrs(long_name=meaning, units="1" if "draws" in name else "")
            for name, (array, meaning) in words.items()}

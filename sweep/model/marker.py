@@ -133,6 +133,32 @@ def _runs(line: NDArray[np.int64]) -> list[tuple[int, int, int, int]]:
     return runs
 
 
+def cell_edges(
+    codes: NDArray[np.int64],
+) -> tuple[list[tuple[float, float, float, float]], list[tuple[int, int]]]:
+    """Return the maximal edges between square cells, and the areas beside each.
+
+    ``codes`` (h + 2, w + 2) are the areas' codes, with those around the cells; the ends are
+    (column, row, to column, to row) in cells from the top left corner.
+    """
+    ends: list[tuple[float, float, float, float]] = []
+    sides: list[tuple[int, int]] = []
+    height, width = codes.shape[0] - 2, codes.shape[1] - 2
+    for line in range(max(height, width) + 1):
+        if line <= width:
+            beside = np.stack([codes[1:-1, line], codes[1:-1, line + 1]], axis=1)
+            for start, stop, left, right in _runs(beside):
+                ends.append((line, start, line, stop))
+                sides.append((left, right))
+        if line <= height:
+            stacked = np.stack([codes[line, 1:-1], codes[line + 1, 1:-1]], axis=1)
+            for start, stop, above, below in _runs(stacked):
+                # A quarter turn takes "down with the right side at greater x" to "right, above".
+                ends.append((start, line, stop, line))
+                sides.append((below, above))
+    return ends, sides
+
+
 @lru_cache(maxsize=8192)
 def edges(dictionary: str, marker_id: int, margin: float) -> MarkerEdges:
     """Return the maximal straight edges between areas of different colour.
@@ -149,18 +175,7 @@ def edges(dictionary: str, marker_id: int, margin: float) -> MarkerEdges:
         constant_values=surround,
     )
     n = len(codes) - 2
-    ends: list[tuple[float, float, float, float]] = []
-    sides: list[tuple[int, int]] = []
-    for line in range(n + 1):
-        beside = np.stack([codes[1:-1, line], codes[1:-1, line + 1]], axis=1)
-        for start, stop, left, right in _runs(beside):
-            ends.append((line, start, line, stop))
-            sides.append((left, right))
-        stacked = np.stack([codes[line, 1:-1], codes[line + 1, 1:-1]], axis=1)
-        for start, stop, above, below in _runs(stacked):
-            # A quarter turn takes "down with the right side at greater x" to "right, above".
-            ends.append((start, line, stop, line))
-            sides.append((below, above))
+    ends, sides = cell_edges(codes)
     if surround == WHITE:
         border, codes_beside = _square(beyond - margin, n - beyond + margin, OUTSIDE, WHITE)
         ends += border

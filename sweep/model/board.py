@@ -1,0 +1,166 @@
+"""A planar target: markers, chessboard and sheet, and the edges of all that is printed on it.
+
+The board's frame is that of a marker: x right, y up, z out towards the viewer, in metres. Boards
+are made by the kinds of :mod:`sweep.model.board_kinds`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from sweep.model.coverage import MarkerEdges
+from sweep.model.marker import (
+    OUTSIDE,
+    WHITE,
+    cell_edges,
+    edges,
+    marker_corners,
+    module_count,
+    overhang,
+)
+from sweep.typing import Floats, Integers
+
+
+class Print(NamedTuple):
+    """One printed thing: a marker, a chessboard, the outline of the sheet.
+
+    Attributes
+    ----------
+    edges
+        Its edges, right and down in units, as :func:`sweep.model.coverage.accumulate` takes them.
+    unit_m
+        Metres in a unit: a marker's module.
+    half_m
+        How far left of and above its centre the edges' origin lies.
+    x_m, y_m
+        Its centre in the board's frame.
+    roll_rad
+        Its turn in the board's plane, from x to y.
+    """
+
+    edges: MarkerEdges
+    unit_m: float
+    half_m: float
+    x_m: float = 0.0
+    y_m: float = 0.0
+    roll_rad: float = 0.0
+
+    def plane(self, rotation: Floats, translation: Floats) -> Floats:
+        """Return what takes (column, row, 1) to the camera frame, (3, 3).
+
+        For a board at ``rotation`` (3, 3) and ``translation`` (3,). The plane of a marker alone
+        (:func:`sweep.model.scene.build_scenes`) is the same to the bit.
+        """
+        cosine, sine = math.cos(self.roll_rad), math.sin(self.roll_rad)
+        right = rotation[:, 0] * cosine + rotation[:, 1] * sine
+        up = rotation[:, 1] * cosine - rotation[:, 0] * sine
+        centre = translation + rotation[:, 0] * self.x_m + rotation[:, 1] * self.y_m
+        return np.stack(
+            [right * self.unit_m, -up * self.unit_m, centre - (right - up) * self.half_m], axis=1
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Board:
+    """A planar target.
+
+    Attributes
+    ----------
+    dictionary
+        That of all its markers.
+    marker_ids
+        The ID of each of its n markers.
+    corners_m
+        (n, 4, 3) the corners of their black squares in the board's frame: TL, TR, BR, BL, as
+        OpenCV's ArUco module finds them.
+    prints
+        All that is printed, the markers first and in their order.
+    chessboard_m
+        (m, 3) the inner corners of a ChArUco board's squares in the board's frame, by rows from
+        the top left as ``cv2.aruco.CharucoBoard`` counts them; (0, 3) of other boards.
+    """
+
+    dictionary: str
+    marker_ids: tuple[int, ...]
+    corners_m: Floats
+    prints: tuple[Print, ...]
+    chessboard_m: Floats
+
+    def __len__(self) -> int:
+        return len(self.marker_ids)
+
+    def edges(self, leave_out: Sequence[int] = ()) -> MarkerEdges:
+        """Return the edges of all prints in metres, right and *down* from the board's origin.
+
+        Their plane is (rotation[:, 0], -rotation[:, 1], translation). ``leave_out``: indices of
+        prints that are not wanted, such as a marker's.
+        """
+        kept = [each for i, each in enumerate(self.prints) if i not in set(leave_out)]
+        on_sheet = [each.plane(np.eye(3), np.array([0.0, 0.0, 1.0])) for each in kept]
+        ends = [
+            (each.edges.ends.reshape(-1, 2) @ plane[:2, :2].T + plane[:2, 2]).reshape(-1, 4)
+            for each, plane in zip(kept, on_sheet, strict=True)
+        ]
+        return MarkerEdges(
+            np.concatenate([*ends, np.empty((0, 4))]) * [1.0, -1.0, 1.0, -1.0],
+            np.concatenate([
+                *(each.edges.sides for each in kept), np.empty((0, 2), dtype=np.int64)
+            ]),
+        )
+
+
+def marker_print(
+    dictionary: str, marker_id: int, size_m: float, quiet_zone_modules: float | None,
+    x_m: float = 0.0, y_m: float = 0.0, roll_deg: float = 0.0,
+) -> Print:
+    """Return a marker with its centre at (x, y), on a sheet of its own or on a white one.
+
+    ``quiet_zone_modules`` is the width of the white that surrounds it on its own sheet; None if
+    it is printed on white that another print encloses.
+    """
+    outline = edges(dictionary, marker_id, overhang(dictionary) + (quiet_zone_modules or 0.0))
+    if quiet_zone_modules is None:
+        sides = np.where(outline.sides == OUTSIDE, WHITE, outline.sides)
+        seen = sides[:, 0] != sides[:, 1]
+        outline = MarkerEdges(outline.ends[seen], sides[seen])
+    return Print(
+        outline, size_m / module_count(dictionary), size_m / 2, x_m, y_m, math.radians(roll_deg)
+    )
+
+
+def corners_of(size_m: float, x_m: float, y_m: float, roll_deg: float = 0.0) -> Floats:
+    """Return the corners (4, 3) of a marker's square in the board's frame: TL, TR, BR, BL."""
+    corners = marker_corners(np.array([size_m]))[0]
+    cosine, sine = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
+    turn = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(corners @ turn + [x_m, y_m, 0.0])
+
+
+def cells_print(codes: Integers, side_m: float) -> Print:
+    """Return square cells (h, w) of areas ``codes`` on white, their middle at the origin."""
+    ends, sides = cell_edges(np.pad(codes, 1, constant_values=WHITE))
+    height, width = codes.shape
+    shifted = np.array(ends, dtype=np.float64) - np.tile([width / 2, height / 2], 2)
+    return Print(MarkerEdges(shifted, np.array(sides, dtype=np.int64)), side_m, 0.0)
+
+
+def rectangles_print(boxes_m: Floats, outside: int, inside: int) -> Print:
+    """Return rectangles (n, 4) of left, top, right, bottom in metres, right and down.
+
+    ``outside`` and ``inside`` are the codes of the areas.
+    """
+    left, top, right, bottom = boxes_m.T
+    ends = np.concatenate([
+        np.stack([left, top, left, bottom], axis=1), np.stack([right, top, right, bottom], axis=1),
+        np.stack([left, top, right, top], axis=1), np.stack([left, bottom, right, bottom], axis=1),
+    ])
+    codes = [(outside, inside), (inside, outside), (inside, outside), (outside, inside)]
+    return Print(
+        MarkerEdges(ends, np.repeat(np.array(codes, dtype=np.int64), len(boxes_m), axis=0)),
+        1.0, 0.0,
+    )

@@ -1,0 +1,380 @@
+"""The kinds of boards: what a user writes of each, what it must fulfil, and its layout.
+
+The layouts are those of ``cv2.aruco.CharucoBoard`` (today's and the legacy pattern) and
+``cv2.aruco.GridBoard``, with the black squares of Kalibr's AprilGrid if wanted. The board's origin
+is the middle of the chessboard or of the grid; of a table of markers it is the table's own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sweep.declaration import parameter
+from sweep.model.board import (
+    Board,
+    Print,
+    cells_print,
+    corners_of,
+    marker_print,
+    rectangles_print,
+)
+from sweep.model.board_overlap import first_overlap
+from sweep.model.marker import (
+    BLACK,
+    OUTSIDE,
+    WHITE,
+    marker_count,
+    missing_package,
+    module_count,
+    overhang,
+)
+from sweep.model.marker import Marker as SingleMarker
+from sweep.typing import Floats, Integers
+
+MAX_MARKERS = 4000
+"""The most markers of a board; a dictionary of OpenCV has 1,000, of AprilTag's most have fewer."""
+
+_DICTIONARY = SingleMarker.__dataclass_fields__["dictionary"].metadata["declaration"]
+
+
+class Fault(NamedTuple):
+    """A key whose value cannot be, and what was expected."""
+
+    key: str
+    value: Any
+    expected: str
+
+
+def _required(meaning: str, **declared: Any) -> Any:
+    """Return a declared field without a default."""
+    return parameter(dataclasses.MISSING, meaning, **declared)
+
+
+def _dictionary() -> Any:
+    return _required(
+        "the dictionary of all markers, as of a single marker", choices=_DICTIONARY.choices,
+        prefix=_DICTIONARY.prefix,
+        numbers=_DICTIONARY.numbers,
+    )
+
+
+def _length(meaning: str) -> Any:
+    return _required(meaning, unit="m", low=0, high=1e6, open_low=True)
+
+
+def _margin(meaning: str) -> Any:
+    return parameter(None, meaning, unit="m", low=0, high=1e6)
+
+
+def _first_id() -> Any:
+    return parameter(
+        None, "ID of the first marker, from which they count in reading order (default: 0)",
+        low=0, high=10**6,
+    )
+
+
+def _ids() -> Any:
+    return parameter(None, "IDs of all markers in reading order, in place of first_id")
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Charuco:
+    """A chessboard with markers in its white squares."""
+
+    dictionary: str = _dictionary()
+    squares_x: int = _required("squares in a row", low=2, high=1000)
+    squares_y: int = _required("squares in a column", low=2, high=1000)
+    square_m: float = _length("side of a square")
+    marker_m: float = _length("side of a marker's black square")
+    first_id: int | None = _first_id()
+    ids: tuple[int, ...] | None = _ids()
+    legacy_pattern: bool = parameter(
+        False, "the pattern before OpenCV 4.6: an even number of squares_y begins with white at "
+        "the top left",
+    )
+    margin_m: float | None = _margin(
+        "width of the white sheet beyond the chessboard (default: one module of a marker)"
+    )
+
+    @property
+    def _begins_white(self) -> bool:
+        return self.legacy_pattern and self.squares_y % 2 == 0
+
+    def _codes(self) -> Integers:
+        row, column = np.indices((self.squares_y, self.squares_x))
+        black = (row + column + self._begins_white) % 2 == 0
+        return np.where(black, BLACK, WHITE).astype(np.int64)
+
+    def faults(self) -> list[Fault]:
+        """Return what keeps the values from being a board."""
+        whole = _printed_side(self.dictionary, self.marker_m)
+        faults = []
+        if whole >= self.square_m:
+            faults.append(Fault(
+                "marker_m", self.marker_m,
+                f"below square_m = {self.square_m:g}{_with_overhang(self.dictionary, whole)}",
+            ))
+        return faults + _id_faults(self, int((self._codes() == WHITE).sum()))
+
+    def board(self) -> Board:
+        """Return the board; ValueError with its faults, a line each."""
+        _refuse(self.faults())
+        codes = self._codes()
+        rows, columns = np.nonzero(codes == WHITE)
+        middle = np.array([self.squares_x, self.squares_y]) / 2 * self.square_m
+        centres = (np.stack([columns, rows], axis=1) + 0.5) * self.square_m - middle
+        inner = np.indices((self.squares_y - 1, self.squares_x - 1)).reshape(2, -1)[::-1].T + 1
+        chessboard = (inner * self.square_m - middle) * [1.0, -1.0]
+        return _on_sheet(
+            self.dictionary, _ids_of(self, len(rows)), centres * [1.0, -1.0], self.marker_m,
+            [cells_print(codes, self.square_m)], middle, self.margin_m, chessboard,
+        )
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Grid:
+    """Markers in rows and columns: ArUco's GridBoard, Kalibr's AprilGrid."""
+
+    dictionary: str = _dictionary()
+    rows: int = _required("rows of markers", low=1, high=1000)
+    columns: int = _required("markers in a row", low=1, high=1000)
+    marker_m: float = _length("side of a marker's black square")
+    gap_m: float = _required(
+        "distance between the black squares of neighbours", unit="m", low=0, high=1e6
+    )
+    first_id: int | None = _first_id()
+    ids: tuple[int, ...] | None = _ids()
+    corner_squares: bool = parameter(
+        False, "black squares of the gap's size at the corners of every marker, as an AprilGrid "
+        "has them",
+    )
+    margin_m: float | None = _margin(
+        "width of the white sheet beyond the markers and squares (default: one module of a marker)"
+    )
+
+    def faults(self) -> list[Fault]:
+        """Return what keeps the values from being a board."""
+        whole = _printed_side(self.dictionary, self.marker_m)
+        faults = []
+        if self.marker_m + self.gap_m < whole:
+            faults.append(Fault(
+                "gap_m", self.gap_m,
+                f"at least {whole - self.marker_m:g}{_with_overhang(self.dictionary, whole)}",
+            ))
+        if self.corner_squares and self.gap_m == 0:
+            faults.append(Fault("gap_m", self.gap_m, "above 0 beside corner_squares = true"))
+        if self.corner_squares and whole > self.marker_m:
+            faults.append(Fault(
+                "corner_squares", self.corner_squares,
+                f"false: the markers of {self.dictionary} have modules where the squares are",
+            ))
+        return faults + _id_faults(self, self.rows * self.columns)
+
+    def board(self) -> Board:
+        """Return the board; ValueError with its faults, a line each."""
+        _refuse(self.faults())
+        step = self.marker_m + self.gap_m
+        row, column = np.indices((self.rows, self.columns)).reshape(2, -1)
+        shape = np.array([self.columns, self.rows])
+        middle = (shape * step - self.gap_m) / 2
+        centres = np.stack([column, row], axis=1) * step + self.marker_m / 2 - middle
+        others = []
+        half = middle
+        if self.corner_squares:
+            row, column = np.indices((self.rows + 1, self.columns + 1)).reshape(2, -1)
+            low = np.stack([column, row], axis=1) * step - self.gap_m - middle
+            others = [rectangles_print(np.hstack([low, low + self.gap_m]), WHITE, BLACK)]
+            half = middle + self.gap_m
+        return _on_sheet(
+            self.dictionary, _ids_of(self, len(centres)), centres * [1.0, -1.0], self.marker_m,
+            others, half, self.margin_m, np.empty((0, 2)),
+        )
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class BoardMarker:
+    """One of a table of markers."""
+
+    marker_id: int = _required("the marker's ID in its dictionary", low=0, high=10**6)
+    x_m: float = _required("its centre, right of the origin", unit="m", low=-1e6, high=1e6)
+    y_m: float = _required("its centre, above the origin", unit="m", low=-1e6, high=1e6)
+    size_m: float = _length("side of its black square")
+    roll_deg: float = parameter(
+        0.0, "its turn in the board's plane, from x to y", unit="degree", low=-360, high=360
+    )
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Markers:
+    """A table of markers in one plane, each on a sheet of its own or all on one."""
+
+    dictionary: str = _dictionary()
+    markers: tuple[BoardMarker, ...] = _required("tables [[markers]], one for each")
+    quiet_zone_modules: float | None = parameter(
+        None, "width of the white that surrounds each marker on its own sheet (default: 1)",
+        unit="module", low=0, high=100,
+    )
+    margin_m: float | None = _margin(
+        "width of the one white sheet beyond all markers; without it each has its own"
+    )
+
+    def faults(self) -> list[Fault]:
+        """Return what keeps the values from being a board."""
+        faults = []
+        if self.margin_m is not None and self.quiet_zone_modules is not None:
+            faults.append(Fault(
+                "margin_m", self.margin_m,
+                "margin_m (one sheet) or quiet_zone_modules (a sheet each), not both; delete one "
+                "of them",
+            ))
+        ids = [each.marker_id for each in self.markers]
+        faults += _listed_faults("markers", ids, self.dictionary)
+        if not faults:
+            pair = first_overlap(
+                np.array([[each.x_m, each.y_m] for each in self.markers]),
+                self._sides(), np.radians([each.roll_deg for each in self.markers]),
+            )
+            if pair is not None:
+                quiet = "" if self.margin_m is not None else " with their quiet zones"
+                faults.append(Fault(
+                    "markers", [ids[i] for i in pair],
+                    f"markers that do not overlap{quiet}; these two do",
+                ))
+        return faults
+
+    def _sides(self) -> Floats:
+        """Return the side (n,) of what is printed of each marker, with its quiet zone."""
+        quiet = self._quiet or 0.0
+        around = 1 + 2 * (overhang(self.dictionary) + quiet) / module_count(self.dictionary)
+        return np.array([each.size_m * around for each in self.markers])
+
+    @property
+    def _quiet(self) -> float | None:
+        if self.margin_m is not None:
+            return None
+        return 1.0 if self.quiet_zone_modules is None else self.quiet_zone_modules
+
+    def board(self) -> Board:
+        """Return the board; ValueError with its faults, a line each."""
+        _refuse(self.faults())
+        prints = [
+            marker_print(
+                self.dictionary, each.marker_id, each.size_m, self._quiet, each.x_m, each.y_m,
+                each.roll_deg,
+            )
+            for each in self.markers
+        ]
+        corners = np.array([
+            corners_of(each.size_m, each.x_m, each.y_m, each.roll_deg) for each in self.markers
+        ])
+        if self.margin_m is not None:
+            printed = np.concatenate([
+                corners_of(side, each.x_m, each.y_m, each.roll_deg)[:, :2] * [1.0, -1.0]
+                for each, side in zip(self.markers, self._sides().tolist(), strict=True)
+            ])
+            box = [*(printed.min(axis=0) - self.margin_m), *(printed.max(axis=0) + self.margin_m)]
+            prints.append(rectangles_print(np.array([box]), OUTSIDE, WHITE))
+        return Board(
+            self.dictionary, tuple(each.marker_id for each in self.markers), corners,
+            tuple(prints), np.empty((0, 3)),
+        )
+
+
+KINDS: dict[str, type[Charuco | Grid | Markers]] = {
+    "charuco": Charuco, "grid": Grid, "markers": Markers,
+}
+"""The kinds of boards by the names that files have for them."""
+
+
+def _refuse(faults: Sequence[Fault]) -> None:
+    if faults:
+        raise ValueError(
+            "\n".join(f"{key} = {value}: expected {expected}" for key, value, expected in faults)
+        )
+
+
+def _printed_side(dictionary: str, marker_m: float) -> float:
+    """Return the side of all modules of a marker, those beyond its square included."""
+    return marker_m * (1 + 2 * overhang(dictionary) / module_count(dictionary))
+
+
+def _with_overhang(dictionary: str, whole_m: float) -> str:
+    if not overhang(dictionary):
+        return ""
+    return f": markers of {dictionary} have modules beyond their square, {whole_m:g} m in all"
+
+
+def _id_faults(kind: Charuco | Grid, count: int) -> list[Fault]:
+    """Return the faults of IDs in reading order, of which ``count`` are needed."""
+    if kind.ids is not None and kind.first_id is not None:
+        return [Fault("first_id", kind.first_id, "ids or first_id, not both; delete one of them")]
+    if count > MAX_MARKERS:
+        key = "squares_x" if isinstance(kind, Charuco) else "rows"
+        return [Fault(
+            key, getattr(kind, key), f"a board of at most {MAX_MARKERS} markers; it has {count}"
+        )]
+    if kind.ids is None:
+        first = kind.first_id or 0
+        key = "first_id" if kind.first_id is not None else "dictionary"
+        return _listed_faults(
+            key, list(range(first, first + count)), kind.dictionary, getattr(kind, key)
+        )
+    if len(kind.ids) != count:
+        return [Fault("ids", list(kind.ids), f"{count} IDs, one for each marker in reading order")]
+    return _listed_faults("ids", list(kind.ids), kind.dictionary)
+
+
+def _listed_faults(
+    key: str, ids: list[int], dictionary: str, written: Any = None
+) -> list[Fault]:
+    """Return the faults of markers' IDs; ``written`` is what the key has if not these."""
+    missing = missing_package(dictionary)
+    if missing is not None:
+        return [Fault("dictionary", dictionary, f"one whose package is installed: {missing}")]
+    written = ids if written is None else written
+    if not 1 <= len(ids) <= MAX_MARKERS:
+        return [Fault(key, ids, f"1 to {MAX_MARKERS} markers; these are {len(ids)}")]
+    faults = []
+    twice = [marker_id for marker_id, count in Counter(ids).items() if count > 1]
+    if twice:
+        faults.append(Fault(key, written, f"each ID once; {twice[0]} is listed more than once"))
+    count = marker_count(dictionary)
+    if min(ids) < 0 or max(ids) >= count:
+        faults.append(Fault(
+            key, written,
+            f"IDs from 0 to {count - 1}, which is what {dictionary} has; the board has "
+            f"{len(ids)} markers with IDs up to {max(ids)}",
+        ))
+    return faults
+
+
+def _ids_of(kind: Charuco | Grid, count: int) -> tuple[int, ...]:
+    first = kind.first_id or 0
+    return kind.ids if kind.ids is not None else tuple(range(first, first + count))
+
+
+def _on_sheet(
+    dictionary: str, ids: tuple[int, ...], centres_m: Floats, marker_m: float,
+    others: list[Print], half_m: Floats, margin_m: float | None, chessboard_m: Floats,
+) -> Board:
+    """Return markers of one size at ``centres_m`` (n, 2) with other prints on one sheet.
+
+    The sheet extends ``half_m`` (2,) and the margin from the origin.
+    """
+    margin = marker_m / module_count(dictionary) if margin_m is None else margin_m
+    prints = [
+        marker_print(dictionary, marker_id, marker_m, None, x, y)
+        for marker_id, (x, y) in zip(ids, centres_m.tolist(), strict=True)
+    ]
+    sheet = rectangles_print(np.array([[*(-half_m - margin), *(half_m + margin)]]), OUTSIDE, WHITE)
+    corners = np.array([corners_of(marker_m, x, y) for x, y in centres_m.tolist()])
+    return Board(
+        dictionary, ids, corners, (*prints, *others, sheet),
+        np.column_stack([chessboard_m, np.zeros(len(chessboard_m))]),
+    )
+

@@ -1,0 +1,163 @@
+"""Boards have OpenCV's layouts: corners, IDs and the picture, of its own drawing functions."""
+
+import cv2
+import numpy as np
+import pytest
+
+from sweep.model.board_kinds import BoardMarker, Charuco, Grid, Markers
+from sweep.model.board_overlap import first_overlap
+
+DICTIONARY = "DICT_4X4_250"
+OPENCV = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
+
+
+def painted(board, low, high, px_per_m):
+    """The board's picture, 0 or 255 a pixel, with outside 128: a pixel's level is the sum of the
+    jumps at the edges that a ray from its left crosses. ``low``, ``high``: right and down, m."""
+    edges, (left, top) = board.edges(), low
+    width, height = np.round((np.array(high) - low) * px_per_m).astype(int)
+    x = left + (np.arange(width) + 0.5) / px_per_m
+    y = top + (np.arange(height) + 0.5) / px_per_m
+    level = np.array([128.0, 0.0, 255.0])
+    image = np.full((height, width), level[0])
+    for (x0, y0, x1, y1), (before, after) in zip(edges.ends, edges.sides, strict=True):
+        rows = (min(y0, y1) <= y) & (y < max(y0, y1))
+        at = x0 + (x1 - x0) * (y[rows] - y0) / (y1 - y0) if y0 != y1 else y[rows]
+        image[rows] += np.sign(y1 - y0) * (level[after] - level[before]) * (x > at[:, None])
+    return image
+
+
+def in_our_frame(points, middle):
+    """Points (..., 3) of OpenCV's boards (down from the top left, z in) in our frame."""
+    return (points - [*middle, 0]) * [1, -1, -1]
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+@pytest.mark.parametrize("shape", [(3, 4), (4, 3), (5, 5), (4, 6)])
+def test_charuco_board_is_opencvs(shape, legacy):
+    ours = Charuco(
+        dictionary=DICTIONARY, squares_x=shape[0], squares_y=shape[1], square_m=0.02,
+        marker_m=0.012, first_id=7, legacy_pattern=legacy, margin_m=0.01,
+    ).board()
+    ids = np.arange(7, 7 + len(ours))
+    theirs = cv2.aruco.CharucoBoard(shape, 0.02, 0.012, OPENCV, ids)
+    theirs.setLegacyPattern(legacy)
+    middle = np.array(shape) * 0.01
+    corners = in_our_frame(np.array(theirs.getObjPoints()), middle)
+    assert ours.marker_ids == tuple(theirs.getIds().ravel())
+    assert np.abs(ours.corners_m - corners).max() < 1e-8
+    chessboard = in_our_frame(np.array(theirs.getChessboardCorners()), middle)
+    assert np.abs(ours.chessboard_m - chessboard).max() < 1e-8
+    # 10 px a module of the markers, 100 px a square.
+    reference = theirs.generateImage((shape[0] * 100, shape[1] * 100), marginSize=0)
+    found = painted(ours, -middle, middle, 5000)
+    assert (found != reference).mean() < 0.02  # OpenCV rounds the markers' corners to pixels
+    small = cv2.erode((found != reference).astype(np.uint8), np.ones((3, 3)))
+    assert not small.any()
+    assert (painted(ours, -middle - 0.01, middle + 0.01, 5000)[:49] == 255).all()
+    assert (painted(ours, -middle - 0.02, -middle, 5000)[:49, :49] == 128).all()
+
+
+@pytest.mark.parametrize("ids", [None, (19, 18, 17, 16, 15, 14)])
+def test_grid_is_opencvs(ids):
+    ours = Grid(
+        dictionary=DICTIONARY, rows=2, columns=3, marker_m=0.03, gap_m=0.006, ids=ids, margin_m=0,
+    ).board()
+    listed = np.arange(6) if ids is None else np.array(ids)
+    theirs = cv2.aruco.GridBoard((3, 2), 0.03, 0.006, OPENCV, listed)
+    middle = np.array([0.051, 0.033])
+    assert ours.marker_ids == tuple(listed)
+    corners = in_our_frame(np.array(theirs.getObjPoints()), middle)
+    assert np.abs(ours.corners_m - corners).max() < 1e-8
+    reference = theirs.generateImage((1020, 660), marginSize=0)
+    assert (painted(ours, -middle, middle, 10000) == reference).all()
+
+
+def test_squares_of_an_april_grid_lie_at_the_corners_of_every_marker():
+    board = Grid(
+        dictionary="DICT_APRILTAG_36h10", rows=4, columns=5, marker_m=0.016, gap_m=0.004,
+        ids=tuple(range(19, -1, -1)), corner_squares=True,
+    ).board()
+    middle = np.array([0.048, 0.038])
+    low = -middle - 0.004
+    image = painted(board, low, -low, 1000)  # 2 px a module
+    expected = np.full(image.shape, 255.0)
+    theirs = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h10)
+    for row in range(5):
+        for column in range(6):
+            y, x = 20 * row, 20 * column
+            expected[y : y + 4, x : x + 4] = 0
+            if row < 4 and column < 5:
+                tag = cv2.aruco.generateImageMarker(theirs, 19 - 5 * row - column, 16)
+                expected[y + 4 : y + 20, x + 4 : x + 20] = tag
+    assert (image == expected).all()
+    around = painted(board, low - 0.002, -low + 0.002, 1000)
+    assert (around[2:-2, 2:-2] == image).all()
+    assert (around[:2] == 255).all()  # a sheet of one module more
+    assert (painted(board, low - 0.004, -low, 1000)[:2, :2] == 128).all()
+
+
+def test_markers_of_a_table_have_their_own_sheets_sizes_and_turns():
+    board = Markers(dictionary=DICTIONARY, markers=(
+        BoardMarker(marker_id=3, x_m=0.1, y_m=0.2, size_m=0.06),
+        BoardMarker(marker_id=9, x_m=-0.1, y_m=0.0, size_m=0.12, roll_deg=90.0),
+    )).board()
+    left_top = [[-0.03, 0.03], [0.03, 0.03], [0.03, -0.03], [-0.03, -0.03]]
+    assert np.abs(board.corners_m[0, :, :2] - [0.1, 0.2] - left_top).max() < 1e-15
+    # A quarter turn from x to y takes the top left corner to the bottom left.
+    turned = [[-0.06, -0.06], [-0.06, 0.06], [0.06, 0.06], [0.06, -0.06]]
+    assert np.abs(board.corners_m[1, :, :2] - [-0.1, 0.0] - turned).max() < 1e-15
+    image = painted(board, (-0.2, -0.3), (0.2, 0.1), 1000)
+    expected = np.full((400, 400), 128)
+    expected[60:140, 260:340] = 255
+    expected[70:130, 270:330] = cv2.aruco.generateImageMarker(OPENCV, 3, 60)
+    expected[220:380, 20:180] = 255
+    tag = cv2.aruco.generateImageMarker(OPENCV, 9, 120)
+    expected[240:360, 40:160] = cv2.rotate(tag, cv2.ROTATE_90_COUNTERCLOCKWISE)
+    assert (image == expected).all()
+
+
+def test_a_table_on_one_sheet_is_white_between_its_markers():
+    board = Markers(dictionary=DICTIONARY, margin_m=0.01, markers=(
+        BoardMarker(marker_id=3, x_m=0.0, y_m=0.0, size_m=0.06),
+        BoardMarker(marker_id=4, x_m=0.1, y_m=0.0, size_m=0.06),
+    )).board()
+    image = painted(board, (-0.05, -0.05), (0.15, 0.05), 1000)
+    assert (image[:10] == 128).all()
+    assert (image[10:90, 80:120] == 255).all()
+    assert (image[20:80, 20:80] == cv2.aruco.generateImageMarker(OPENCV, 3, 60)).all()
+
+
+def test_edges_can_leave_a_marker_out():
+    board = Grid(
+        dictionary=DICTIONARY, rows=1, columns=2, marker_m=0.06, gap_m=0.01, margin_m=0
+    ).board()
+    with_both, without = board.edges(), board.edges(leave_out=[1])
+    own = board.prints[1].edges
+    assert len(without.ends) == len(with_both.ends) - len(own.ends)
+    assert without.ends[:, [0, 2]].max() == pytest.approx(0.065)  # the sheet's
+
+
+def test_squares_overlap_as_their_clipped_polygons_do():
+    rng = np.random.default_rng(4)
+    seen = set()
+    for _ in range(300):
+        centres, sides = rng.uniform(-1, 1, (2, 2)), rng.uniform(0.3, 1.5, 2)
+        rolls = rng.uniform(0, 7, 2)
+        boxes = [((float(x), float(y)), (float(s), float(s)), float(np.degrees(r)))
+                 for (x, y), s, r in zip(centres, sides, rolls, strict=True)]
+        state, region = cv2.rotatedRectangleIntersection(*boxes)
+        area = 0.0 if region is None else cv2.contourArea(cv2.convexHull(region))
+        if state == cv2.INTERSECT_NONE or area > 1e-4:
+            seen.add(area > 0)
+            assert (first_overlap(centres, sides, rolls) is not None) == (area > 0)
+    assert seen == {True, False}
+    assert first_overlap(np.array([[0, 0], [1.0, 0]]), np.ones(2), np.zeros(2)) is None
+
+
+def test_a_board_that_cannot_be_is_a_value_error_with_every_fault():
+    wrong = Charuco(
+        dictionary="DICT_4X4_50", squares_x=20, squares_y=20, square_m=0.01, marker_m=0.01
+    )
+    with pytest.raises(ValueError, match=r"marker_m = 0.01: .*\n.*IDs from 0 to 49"):
+        wrong.board()

@@ -16,7 +16,8 @@ class Declaration:
 
     ``low`` and ``high`` are inclusive unless ``open_low`` excludes the lower end. ``drawable``
     parameters may be drawn from a distribution per trial. ``lengths`` are those that a list of
-    numbers may have. ``plugin`` is the kind of plug-in that may be named in place of a choice.
+    numbers may have, ``list_text`` says so in words. ``plugin`` is the kind of plug-in that may be
+    named in place of a choice.
     """
 
     meaning: str
@@ -29,6 +30,7 @@ class Declaration:
     numbers: tuple[tuple[str, int], ...] = ()
     drawable: bool = False
     lengths: tuple[int, ...] = ()
+    list_text: str = ""
     plugin: str = ""
 
     def range_text(self) -> str:

@@ -8,124 +8,16 @@ checks, the list of active parts, random draws, the bound and the windows follow
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from hashlib import sha256
-from typing import Any, Literal
-
-import numpy as np
+from typing import Any
 
 from sweep.declaration import parameter
-from sweep.model.sensor import standard_normals
-from sweep.typing import Floats
+from sweep.model.demosaic import METHODS, PATTERNS
+from sweep.model.effect import Effect, is_coded
 
 VELOCITIES = (
     "velocity_x_m_s", "velocity_y_m_s", "velocity_z_m_s",
     "rotation_x_deg_s", "rotation_y_deg_s", "rotation_z_deg_s",
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Patch:
-    """The pixels of one scene that a pointwise effect is applied to.
-
-    Attributes
-    ----------
-    values
-        Every parameter of the effects in this scene; NaN if it is not given.
-    left, top
-        The first pixel's column and row in the frame.
-    frame
-        Width and height of the frame in pixels.
-    intrinsics
-        (4,) fx, fy, cx, cy in pixels.
-    noise_key
-        Key of the scene's random numbers.
-    """
-
-    values: Mapping[str, float]
-    left: int
-    top: int
-    frame: tuple[int, int]
-    intrinsics: Floats
-    noise_key: np.uint64
-
-    def normals(self, stream: str, shape: tuple[int, ...]) -> Floats:
-        """Return standard normal numbers (h, w), a function of scene, stream and pixel alone.
-
-        ``stream`` is a name of the effect's own, such as its switch. Whatever window is rendered,
-        a pixel of the frame has the same number.
-        """
-        normals = np.empty(shape)
-        own = np.uint64(int.from_bytes(sha256(stream.encode()).digest()[:8], "little"))
-        standard_normals(self.noise_key ^ own, self.left, self.top, normals)
-        return normals
-
-
-@dataclass(frozen=True, slots=True)
-class Effect:
-    """One effect.
-
-    Attributes
-    ----------
-    label
-        Its name in ``sweep plan`` and in tables.
-    step
-        The step of the image chain on which it acts. "edges": on the marker's edges, before
-        pixels (only the renderer ``exact`` has these effects); "light": on the levels of light
-        that falls on the pixels; "signal": on the pixels' signal, with its noise and gain, before
-        quantisation; "readout": on quantisation.
-    parameters
-        Its parameters by name, as :func:`sweep.declaration.parameter` declares them. The
-        first is its switch: the effect is active if that has another value than its default.
-    needs
-        Parameter -> parameters of which one must be given beside it.
-    random
-        Whether it draws random numbers.
-    in_bound
-        Whether the accuracy bound's model of the image has it.
-    widens
-        Whether more than the usual window must be searched: "noise" makes candidates around the
-        marker that reach into one another, "uneven light" makes candidates of a plain background.
-    apply
-        Of a pointwise effect: a function of levels (h, w) and their :class:`Patch` that returns
-        the levels after it. Applied at its ``step``, "light" or "signal", after the built-in
-        effects of that step, in the order of :data:`EFFECTS`. None for the built-in effects, which
-        renderers, :func:`sweep.model.sensor.illuminate` and :func:`sweep.model.sensor.read_out`
-        apply in one pass.
-    """
-
-    label: str
-    step: Literal["edges", "light", "signal", "readout"]
-    parameters: Mapping[str, Any]
-    needs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    random: bool = False
-    in_bound: bool = False
-    widens: Literal["nothing", "noise", "uneven light"] = "nothing"
-    apply: Callable[[Floats, Patch], Floats] | None = None
-
-    @property
-    def switch(self) -> str:
-        """The parameter that switches it on."""
-        return next(iter(self.parameters))
-
-    @property
-    def off(self) -> Any:
-        """The value of its switch at which it is absent."""
-        return self.parameters[self.switch].default
-
-    def is_on(self, value: Any) -> bool:
-        """Return whether its switch has another value than its neutral one."""
-        return bool(value != self.off)
-
-    def is_active(self, strength: Any) -> Any:
-        """Return whether it is on: numbers (...) as scenes hold them, NaN if not given."""
-        return ~np.isnan(strength) if self.off is None else strength != self.off
-
-    def applying(self, apply: Callable[[Floats, Patch], Floats]) -> Effect:
-        """Return it as a pointwise effect."""
-        return dataclasses.replace(self, apply=apply)
-
 
 EFFECTS: tuple[Effect, ...] = (
     Effect(
@@ -235,6 +127,31 @@ EFFECTS: tuple[Effect, ...] = (
         },
     ),
     Effect(
+        "sharpening", "edges",
+        {
+            "sharpening": parameter(
+                0.0, "amount of unsharp masking in the camera: the exact image plus so many times "
+                "its difference from the image blurred by sharpening_px; the noise stays as it is",
+                low=-1, high=100, drawable=True,
+            ),
+            "sharpening_px": parameter(
+                1.0, "radius of sharpening: standard deviation of the Gaussian whose blurred image "
+                "is subtracted", unit="px", low=0, high=1000, open_low=True, drawable=True,
+            ),
+        },
+        needs={"sharpening_px": ("sharpening",)},
+    ),
+    Effect(
+        "bloom", "light",
+        {
+            "bloom": parameter(
+                0.0, "widening of bright areas: a level that is a share s of the way from black to "
+                "white is lifted by bloom · s · (1 - s) of it", low=-1, high=1, drawable=True,
+            ),
+        },
+        steepens=True,
+    ),
+    Effect(
         "vignetting", "light",
         {
             "vignetting": parameter(
@@ -279,6 +196,81 @@ EFFECTS: tuple[Effect, ...] = (
         random=True, in_bound=True, widens="noise",
     ),
     Effect(
+        "correlated noise", "signal",
+        {
+            "noise_correlation": parameter(
+                0.0, "correlation of the grey noise (noise_grey, noise_table) of neighbouring "
+                "pixels; at d px about its power d²; the standard deviation stays",
+                low=0, high=0.99, drawable=True,
+            ),
+        },
+        needs={"noise_correlation": ("noise_grey", "noise_table")},
+    ),
+    Effect(
+        "demosaicing", "signal",
+        {
+            "bayer": parameter(
+                "none", "colour filters of the frame's first two by two pixels; none: a grey "
+                "camera", choices=("none", *PATTERNS),
+            ),
+            "demosaic": parameter(
+                "bilinear", "how colours are interpolated (OpenCV), before they are turned to grey",
+                choices=tuple(METHODS),
+            ),
+            "bayer_red": parameter(
+                1.0, "gain of the red pixels relative to the green ones", low=0, high=100,
+                drawable=True,
+            ),
+            "bayer_blue": parameter(
+                1.0, "gain of the blue pixels relative to the green ones", low=0, high=100,
+                drawable=True,
+            ),
+        },
+        needs=dict.fromkeys(("demosaic", "bayer_red", "bayer_blue"), ("bayer",)),
+    ),
+    Effect(
+        "gamma", "signal",
+        {
+            "tone_gamma": parameter(
+                1.0, "exponent of the camera's response: level 255 · (signal / 255) ^ tone_gamma; "
+                "below 1 dark areas are lifted", low=0.1, high=10, drawable=True,
+            ),
+        },
+        steepens=True,
+    ),
+    Effect(
+        "toe", "signal",
+        {
+            "tone_toe": parameter(
+                0.0, "compression of the lower half of the scale towards black: the response has "
+                "the slope 1 - tone_toe at black", low=-1, high=1, drawable=True,
+            ),
+        },
+        steepens=True,
+    ),
+    Effect(
+        "knee", "signal",
+        {
+            "tone_knee": parameter(
+                0.0, "compression of the upper half of the scale towards white: the response has "
+                "the slope 1 - tone_knee at white", low=-1, high=1, drawable=True,
+            ),
+        },
+        steepens=True,
+    ),
+    Effect(
+        "noise by level", "signal",
+        {
+            "noise_table": parameter(
+                (), "standard deviation of Gaussian noise over the level in the image: level, "
+                "deviation, level, deviation, ..., ascending, interpolated, constant beyond",
+                unit="grey level", lengths=(0, *range(2, 513, 2)),
+                list_text="a list of an even number of finite numbers, at most 512",
+            ),
+        },
+        random=True, widens="noise",
+    ),
+    Effect(
         "bit depth", "readout",
         {
             "bit_depth": parameter(
@@ -286,6 +278,16 @@ EFFECTS: tuple[Effect, ...] = (
                 "rounded to 8", unit="bit", low=8, high=16,
             ),
         },
+    ),
+    Effect(
+        "JPEG", "readout",
+        {
+            "jpeg_quality": parameter(
+                0, "quality of JPEG compression (OpenCV's encoder), 1 to 100; 0: not compressed",
+                low=0, high=100,
+            ),
+        },
+        steepens=True,
     ),
 )
 """Every effect, in physical order."""
@@ -320,6 +322,12 @@ NEUTRAL: dict[str, Any] = {name: each.default for name, each in _declared().item
 SWITCHES: dict[str, Any] = {effect.switch: effect.off for effect in EFFECTS}
 """Parameters that switch an effect on -> the value at which it is absent."""
 
+CODED = tuple(name for name, default in NEUTRAL.items() if is_coded(default))
+"""Parameters that are text or lists: scenes hold the numbers of their values."""
+
+PLAIN = tuple(name for name in NEUTRAL if name not in CODED)
+"""Parameters that are numbers."""
+
 GEOMETRIC = tuple(effect.switch for effect in EFFECTS if effect.step == "edges")
 """Switches of the effects that only the ``exact`` renderer has."""
 
@@ -336,14 +344,3 @@ NEEDS: dict[str, tuple[str, ...]] = {
 
 POINTWISE = tuple(effect for effect in EFFECTS if effect.apply is not None)
 """Effects that are applied by a function of their own."""
-
-
-def apply_pointwise(
-    effects: Sequence[Effect], step: str, levels: Floats, patch: Patch
-) -> Floats:
-    """Return levels (h, w) after the active ones of pointwise effects, those of a step."""
-    for effect in effects:
-        if effect.step == step and effect.is_active(patch.values[effect.switch]):
-            assert effect.apply is not None  # noqa: S101  (for the type checker)
-            levels = effect.apply(levels, patch)
-    return levels

@@ -54,10 +54,13 @@ class Shutter(NamedTuple):
     panels: int
 
 
-def marker_exposure(scenes: Scenes, row: int, box: Box, levels: Floats) -> Floats:
+def marker_exposure(
+    scenes: Scenes, row: int, box: Box, levels: Floats, added_px: float = 0.0
+) -> Floats:
     """Return the levels (height, width) of ``box``, from levels (4,) of the four areas.
 
-    The areas are outside, black, white and the occluding sheet.
+    The areas are outside, black, white and the occluding sheet. ``added_px`` is a Gaussian's
+    standard deviation that the point spread is widened by, in quadrature.
     """
     effect = scenes.effect(row)
     key = scenes.markers[scenes.marker[row]]
@@ -66,7 +69,8 @@ def marker_exposure(scenes: Scenes, row: int, box: Box, levels: Floats) -> Float
         if effect["occlusion"] > 0 else edges(*key)
     )
     motion = scenes.motion(row)
-    spread, varies = _spreads(scenes, row, box)
+    wanted = defocus_px(scenes, row, box, added_px)
+    spread, varies = _spreads(wanted)
     even = not varies and math.isnan(effect["aperture_mm"])
     if motion is None and even and not scenes.cameras.distorted[row]:
         # The same blur everywhere: without the functions of moving markers, and compiling them.
@@ -91,7 +95,7 @@ def marker_exposure(scenes: Scenes, row: int, box: Box, levels: Floats) -> Float
         coverage.sum_levels(cover, levels[0], image)
     if not varies:
         return np.asarray(images[0])
-    return _focused(images, np.array(spread), defocus_px(scenes, row, box))
+    return _focused(images, np.array(spread), wanted)
 
 
 @compiled
@@ -145,11 +149,11 @@ def _is_seen(
     )
 
 
-def defocus_px(scenes: Scenes, row: int, box: Box) -> Floats:
+def defocus_px(scenes: Scenes, row: int, box: Box, added_px: float = 0.0) -> Floats:
     """Return the point spread's standard deviation (height, width) at the marker's depth.
 
     The depth is that of the marker's plane in each pixel's direction; its inverse is linear in the
-    image.
+    image. ``added_px`` widens the point spread, in quadrature.
     """
     fx, fy, cx, cy = scenes.cameras.view[row]
     normal = scenes.rotation[row][:, 2]
@@ -160,12 +164,14 @@ def defocus_px(scenes: Scenes, row: int, box: Box) -> Floats:
     )
     # Beyond the marker its plane may come near the camera, or end; nothing is blurred there.
     depth = corner_depths(scenes, row)
-    return spread_px(scenes, row, np.clip(inverse, 1 / depth.max(), 1 / depth.min()))
+    return spread_px(scenes, row, np.clip(inverse, 1 / depth.max(), 1 / depth.min()), added_px)
 
 
-def _spreads(scenes: Scenes, row: int, box: Box) -> tuple[list[float], bool]:
-    """Return the point spreads to compute, ascending, and whether they vary over the box."""
-    wanted = defocus_px(scenes, row, box)
+def _spreads(wanted: Floats) -> tuple[list[float], bool]:
+    """Return the point spreads to compute, ascending, and whether they vary.
+
+    ``wanted`` (height, width) are those of the pixels.
+    """
     low, high = float(wanted.min()), float(wanted.max())
     even = high <= low * 1.001
     if even and (high == 0.0 or low >= SHARPEST_PX / 4):

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model import lens as lens_model
+from sweep.model.demosaic import REACH_PX
+from sweep.model.jpeg import BLOCK_PX
 from sweep.model.marker import marker_corners
 from sweep.model.motion import BEHIND, MEANINGLESS, Motion, MovingMarker, row_times, track
 from sweep.model.point_spread import REACH
@@ -63,9 +65,15 @@ def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
     for row in np.flatnonzero(scenes.affected & np.isfinite(low).all(axis=1)).tolist():
         low[row], high[row] = _exposed_extent(scenes, row, low[row], high[row])
     limit = scenes.frame.astype(np.float64)
+    if scenes.effects is not None:
+        reach = np.where(scenes.effects["bayer"] > 0, REACH_PX, 0.0)[:, None]
+        low, high = low - reach, high + reach
     with np.errstate(invalid="ignore"):
         start = np.clip(np.floor(low + 0.5), 0, limit)
         stop = np.clip(np.ceil(high + 0.5), 0, limit)
+        if scenes.effects is not None:
+            block = np.where(scenes.effects["jpeg_quality"] > 0, BLOCK_PX, 1)[:, None]
+            start, stop = start // block * block, np.minimum(-(-stop // block) * block, limit)
         inside = (stop > start).all(axis=1)
     boxes = np.concatenate([start, stop], axis=1)
     return np.where(inside[:, None], boxes, 0.0).astype(np.int64)
@@ -172,22 +180,31 @@ def _exposed_extent(
 
 
 def _largest_spread_px(scenes: Scenes, row: int) -> float:
-    """Return the largest point spread on the marker, at one of its outline's corners."""
-    return float(spread_px(scenes, row, 1 / corner_depths(scenes, row)).max())
+    """Return the largest point spread on the marker, at one of its outline's corners.
+
+    Of sharpening it is that of the negative lobe.
+    """
+    effect = scenes.effect(row)
+    added_px = effect["sharpening_px"] if effect["sharpening"] != 0 else 0.0
+    return float(spread_px(scenes, row, 1 / corner_depths(scenes, row), added_px).max())
 
 
-def spread_px(scenes: Scenes, row: int, inverse_depth: Floats) -> Floats:
+def spread_px(
+    scenes: Scenes, row: int, inverse_depth: Floats, added_px: float = 0.0
+) -> Floats:
     """Return the point spread's standard deviation in px at inverse depths (...) in 1/m.
 
     The circle of confusion of a thin lens has the diameter fx · aperture · |1/focus - 1/z| in
-    pixels; a disk's standard deviation along an axis is a quarter of its diameter.
+    pixels; a disk's standard deviation along an axis is a quarter of its diameter. ``added_px`` is
+    that of one more point spread.
     """
     effect = scenes.effect(row)
+    blur_px = math.hypot(effect["blur_px"], added_px)
     if math.isnan(effect["aperture_mm"]):
-        return np.full(inverse_depth.shape, effect["blur_px"])
+        return np.full(inverse_depth.shape, blur_px)
     aperture_px = scenes.cameras.view[row, 0] * effect["aperture_mm"] * 1e-3
     diameter = aperture_px * (1 / effect["focus_distance_m"] - inverse_depth)
-    return np.asarray(np.hypot(effect["blur_px"], diameter / 4))
+    return np.asarray(np.hypot(blur_px, diameter / 4))
 
 
 def corner_depths(scenes: Scenes, row: int) -> Floats:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import PluginError
-from sweep.model.effects import EFFECTS, Effect, Patch
+from sweep.model.effect import Effect, Patch
+from sweep.model.effects import EFFECTS
 from sweep.plugins.calls import call, real_numbers
 from sweep.typing import Floats
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import threading
 from collections.abc import Sequence
@@ -13,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model import coverage, drawing
-from sweep.model.effects import POINTWISE, Patch, apply_pointwise
 from sweep.model.exposure import marker_exposure
 from sweep.model.extent import WARP_PX_PER_MODULE
 from sweep.model.image_file import decode_grey
 from sweep.model.marker import edge_table, edges, modules, overhang
 from sweep.model.plugged_scene import MarkerView
 from sweep.model.scene import Box, Scenes
-from sweep.model.sensor import Light, Readout, add_noise, digitise, illuminate, read_out
+from sweep.model.sensing import sensed, sensed_window
 from sweep.model.supersampling import SampledMarker, supersample
+from sweep.model.tone import bloomed
 
 Grey = NDArray[np.uint8]
 
@@ -79,7 +78,10 @@ def render_all(
 
 def _compose(scenes: Scenes, row: int, box: Sequence[int], window: Sequence[int]) -> Grey:
     """Return the image of a scene with any renderer and any background."""
-    left, top, right, bottom = window
+    asked = window[0], window[1], window[2], window[3]
+    left, top, right, bottom = computed = (
+        sensed_window(scenes, row, asked) if scenes.affected[row] else asked
+    )
     x0, y0, x1, y1 = box
     inner = np.s_[y0 - top : y1 - top, x0 - left : x1 - left]
     background = scenes.background[row]
@@ -91,9 +93,20 @@ def _compose(scenes: Scenes, row: int, box: Sequence[int], window: Sequence[int]
         behind = image if isinstance(background, str) else float(background)
         levels = np.empty(image.shape)
         levels[:] = behind
+        overshoot = None
+        effect = scenes.effect(row)
         if x1 > x0:
-            levels[inner] = _exposed(scenes, row, (x0, y0, x1, y1), levels[inner])
-        return _sensed(scenes, row, levels, left, top)
+            marker_box = (x0, y0, x1, y1)
+            plain = _exposed(scenes, row, marker_box, levels[inner])
+            if effect["sharpening"] != 0:
+                wide = _exposed(scenes, row, marker_box, levels[inner], effect["sharpening_px"])
+                overshoot = np.zeros(image.shape)
+                overshoot[inner] = effect["sharpening"] * (plain - wide)
+            levels[inner] = plain
+        if effect["bloom"] != 0:
+            _, black, white = scenes.levels[row].tolist()
+            levels = bloomed(levels, black, white, effect["bloom"])
+        return sensed(scenes, row, levels, overshoot, computed, asked)
     if x1 > x0:
         if scenes.renderer[row] == "warp" and not isinstance(background, str):
             _warp_grey(scenes, row, (x0, y0, x1, y1), image[inner])
@@ -105,9 +118,12 @@ def _compose(scenes: Scenes, row: int, box: Sequence[int], window: Sequence[int]
 
 
 def _exposed(
-    scenes: Scenes, row: int, box: Box, behind: NDArray[np.float64]
+    scenes: Scenes, row: int, box: Box, behind: NDArray[np.float64], added_px: float = 0.0
 ) -> NDArray[np.float64]:
-    """Return the levels (h, w) of ``box`` over those ``behind`` it, with the effects on edges."""
+    """Return the levels (h, w) of ``box`` over those ``behind`` it, with the effects on edges.
+
+    ``added_px`` is a Gaussian's standard deviation by which the marker is blurred once more.
+    """
     if scenes.renderer[row] != "exact":
         mean, share = marker_levels(scenes, row, box)
     else:
@@ -115,42 +131,10 @@ def _exposed(
         sheet = scenes.effect(row)["occluder"]
         if not isinstance(scenes.background[row], str):
             areas = np.array([scenes.levels[row, 0], black, white, sheet])
-            return marker_exposure(scenes, row, box, areas)
-        mean = marker_exposure(scenes, row, box, np.array([0.0, black, white, sheet]))
-        share = marker_exposure(scenes, row, box, np.array([0.0, 1.0, 1.0, 1.0]))
+            return marker_exposure(scenes, row, box, areas, added_px)
+        mean = marker_exposure(scenes, row, box, np.array([0.0, black, white, sheet]), added_px)
+        share = marker_exposure(scenes, row, box, np.array([0.0, 1.0, 1.0, 1.0]), added_px)
     return np.asarray(mean + (1.0 - share) * behind)
-
-
-def _sensed(scenes: Scenes, row: int, levels: NDArray[np.float64], left: int, top: int) -> Grey:
-    """Return the sensor's image of light levels (h, w), whose top left pixel is (left, top)."""
-    effect = scenes.effect(row)
-    width, height = scenes.frame[row].tolist()
-    slope = effect["illumination_gradient"] / width
-    if slope != 0 or effect["vignetting"] > 0:
-        turn = math.radians(effect["illumination_deg"])
-        light = Light(
-            slope * math.cos(turn), slope * math.sin(turn), (width - 1) / 2, (height - 1) / 2,
-            effect["vignetting"],
-        )
-        illuminate(levels, left, top, light, scenes.cameras.view[row])
-    pointwise = (*POINTWISE, *scenes.plugins.effects)
-    if pointwise:
-        patch = Patch(
-            effect, left, top, (width, height), scenes.cameras.view[row], scenes.noise_key[row]
-        )
-        levels = apply_pointwise(pointwise, "light", levels, patch)
-    image = np.empty(levels.shape, dtype=np.uint8)
-    readout = Readout(
-        scenes.noise_key[row], effect["full_well_e"], effect["read_noise_e"], effect["gain"],
-        effect["noise_grey"], int(effect["bit_depth"]),
-    )
-    if any(each.step == "signal" for each in pointwise):
-        add_noise(levels, left, top, readout)
-        levels = apply_pointwise(pointwise, "signal", levels, patch)
-        digitise(levels, readout.bits, image)
-    else:
-        read_out(levels, left, top, readout, image)
-    return image
 
 
 def _draw(

@@ -14,7 +14,7 @@ from sweep.declaration import parameter
 from sweep.model import lens as lens_model
 from sweep.model.camera import VIEW_PARAMETERS, Camera, Cameras, intrinsics
 from sweep.model.columns import Column, map_columns
-from sweep.model.effects import NEUTRAL, VELOCITIES
+from sweep.model.effects import CODED, NEUTRAL, PLAIN, VELOCITIES
 from sweep.model.marker import MarkerKey, marker_corners, module_count, overhang
 from sweep.model.plugged_scene import NO_PLUGINS, ScenePlugins
 from sweep.model.pose import rotation_of_angles, transform_points
@@ -83,6 +83,9 @@ class Scenes:
     effects, affected, noise_key
         (N,) each: every parameter of the effects, NaN if not given (``effects`` is None if no
         effect is active in any of the scenes), whether one is active, and the key of the noise.
+    coded
+        Parameter of an effect that is text or a list -> the values that the numbers in ``effects``
+        stand for.
     plugins, plugin_values
         The plug-ins' effects and renderers, and (N,) each setting of the renderers.
     corners_px, outline_px
@@ -110,6 +113,7 @@ class Scenes:
     effects: Mapping[str, Floats] | None
     affected: NDArray[np.bool_]
     noise_key: NDArray[np.uint64]
+    coded: Mapping[str, Sequence[Any]] = field(default_factory=dict)
     plugins: ScenePlugins = NO_PLUGINS
     plugin_values: Mapping[str, Floats] = field(default_factory=dict)
 
@@ -123,11 +127,19 @@ class Scenes:
 
     @property
     def uneven_gain(self) -> Floats:
-        """Amplification of uneven light in each scene, at least 1; 0 if the light is even."""
+        """Amplification of uneven light in each scene, at least 1; 0 if the light is even.
+
+        Infinite beside an effect that steepens it.
+        """
         if self.effects is None:
             return np.zeros(len(self))
         uneven = self._any_active("uneven light")
-        return np.where(uneven, np.maximum(self.effects["gain"], 1.0), 0.0)
+        steep = np.zeros(len(self), dtype=bool)
+        for effect in self.plugins.all_effects:
+            if effect.steepens:
+                steep |= effect.is_active(self.effects[effect.switch])
+        gain = np.where(steep, np.inf, np.maximum(self.effects["gain"], 1.0))
+        return np.where(uneven, gain, 0.0)
 
     def _any_active(self, widens: str) -> NDArray[np.bool_]:
         """Return whether an effect that widens the windows in this way is active, (N,)."""
@@ -146,6 +158,10 @@ class Scenes:
         if self.effects is None:
             raise ValueError("no effect is active")
         return {name: float(column[row]) for name, column in self.effects.items()}
+
+    def meaning(self, name: str, effect: Mapping[str, float]) -> Any:
+        """Return the text or list that a number of :meth:`effect` stands for."""
+        return self.coded[name][int(effect[name])]
 
     def active(self, row: int) -> list[str]:
         """Return the switches of the effects that are active in one scene."""
@@ -257,10 +273,14 @@ def build_scenes(
         axis=1,
     )
     effects, affected = None, np.zeros(count, dtype=bool)
+    coded: dict[str, Sequence[Any]] = {}
     every = plugins.all_effects
     if any(column(each.switch).differs_from(each.off) for each in every):
         own = [name for each in plugins.effects for name in each.parameters]
-        effects = {name: numbers(name) for name in (*NEUTRAL, *own)}
+        effects = {name: numbers(name) for name in (*PLAIN, *own)}
+        for name in CODED:
+            coded[name], number = distinct([NEUTRAL[name], *column(name).listed(count)])
+            effects[name] = number[1:].astype(np.float64)
         for each in every:
             affected |= each.is_active(effects[each.switch])
     plain = np.array(
@@ -289,6 +309,7 @@ def build_scenes(
         effects=effects,
         affected=affected,
         noise_key=column("noise_key").broadcast(count, np.uint64),
+        coded=coded,
         plugins=plugins,
         plugin_values={name: numbers(name) for name in plugins.settings},
     )

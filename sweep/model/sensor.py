@@ -202,8 +202,11 @@ def digitise(levels: Floats, bits: int, image: NDArray[np.uint8]) -> None:
 
 
 @compiled
-def standard_normals(key: np.uint64, left: int, top: int, normals: Floats) -> None:
-    """Fill ``normals`` (h, w) with standard normal numbers, a function of key and pixel alone."""
+def standard_normals(key: np.uint64, draw: int, left: int, top: int, normals: Floats) -> None:
+    """Fill ``normals`` (h, w) with standard normal numbers, a function of key and pixel alone.
+
+    From draws number ``draw`` and the next of each pixel; the first pixel is (left, top).
+    """
     for i in range(normals.shape[0]):
         for j in range(normals.shape[1]):
-            normals[i, j] = _normal(_pixel_key(key, left + j, top + i), 0)
+            normals[i, j] = _normal(_pixel_key(key, left + j, top + i), draw)

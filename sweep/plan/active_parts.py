@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 from sweep.environments.identity import identify
@@ -12,8 +13,9 @@ from sweep.measure.detector import NOISE_MARGIN_PX, DetectorSetting
 from sweep.measure.detectors import full_frame_reason, margin_px, uneven_light_needs_frame
 from sweep.measure.estimators import SOLVERS
 from sweep.measure.foreign_detector import own_defaults
+from sweep.messages import label
 from sweep.model.camera import canonical_distortion
-from sweep.model.effects import Effect
+from sweep.model.effect import Effect, is_coded
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings
 from sweep.plan.parameters import PARAMETERS
@@ -43,14 +45,16 @@ class Part:
 
 def _effect(pipeline: Pipeline, effect: Effect) -> Part:
     name, switch = effect.label, effect.switch
-    off = "not given" if effect.off is None else f"{effect.off:g}"
     if switch in pipeline.distributions:
         return Part(name, True, f"{switch} is drawn: {pipeline.distributions[switch]}", switch)
     values = [value for value in pipeline.values_of(switch) if effect.is_on(value)]
     if not values:
-        return Part(name, False, f"{switch} is {off}", switch)
-    low, high = min(values), max(values)
-    extent = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+        return Part(name, False, f"{switch} is {effect.off_text}", switch)
+    if is_coded(effect.off):
+        extent = ", ".join(dict.fromkeys(map(label, values)))
+    else:
+        low, high = min(values), max(values)
+        extent = f"{low:g}" if low == high else f"{low:g} to {high:g}"
     return Part(name, True, f"{switch} is {extent}", switch)
 
 
@@ -86,11 +90,14 @@ def parts(pipeline: Pipeline) -> list[Part]:
     settings = detector_settings(pipeline)
     whole = sorted({reason for s in settings if (reason := full_frame_reason(s)) is not None})
     gain = max([1.0, *(value for value in pipeline.values_of("gain"))])
-    uneven = any(
-        pipeline.any_value(effect.switch, effect.is_on)
+    on = [
+        effect for effect in effects
+        if pipeline.any_value(effect.switch, effect.is_on)
         or effect.switch in pipeline.distributions
-        for effect in effects if effect.widens == "uneven light"
-    )
+    ]
+    if any(effect.steepens for effect in on):
+        gain = math.inf
+    uneven = any(effect.widens == "uneven light" for effect in on)
     if uneven and any(uneven_light_needs_frame(setting, gain) for setting in settings):
         whole.append("adaptiveThreshConstant is low for uneven light")
     if image:

@@ -65,6 +65,8 @@ class Parameter:
     def expected(self) -> str:
         """Return the allowed values in words."""
         if tuple in self.types:
+            if self.declaration.list_text:
+                return self.declaration.list_text
             *counts, last = self.declaration.lengths
             return f"a list of {', '.join(map(str, counts))} or {last} finite numbers"
         words = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}

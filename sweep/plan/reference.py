@@ -138,14 +138,14 @@ def solver_table() -> str:
 
 def effect_table() -> str:
     """Return the effects in physical order: name, the parameter that switches it on, meaning."""
-    rows = []
-    for effect in EFFECTS:
-        neutral = "not given" if effect.off is None else f"{effect.off:g}"
-        rows.append([
-            effect.label, f"`{effect.switch}`", neutral, effect.step,
+    rows = [
+        [
+            effect.label, f"`{effect.switch}`", effect.off_text, effect.step,
             "yes" if effect.random else "no", "yes" if effect.in_bound else "no",
             PARAMETERS[effect.switch].declaration.meaning,
-        ])
+        ]
+        for effect in EFFECTS
+    ]
     return markdown_table(
         ["effect", "switched on by", "absent at", "acts on", "random", "in the bound", "meaning"],
         rows,

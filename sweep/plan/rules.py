@@ -31,6 +31,7 @@ from sweep.plan.axes import TRIAL
 from sweep.plan.background_files import check_backgrounds
 from sweep.plan.beliefs import beliefs_in_one_way
 from sweep.plan.camera_values import one_camera
+from sweep.plan.effect_values import mosaics_have_room, noise_tables_ascend
 from sweep.plan.parameters import PARAMETERS, SECTIONS, Stage
 from sweep.plan.reader import HEADER, Reading
 from sweep.plan.schema import LABELS, VARIABLES
@@ -331,6 +332,8 @@ RULES: tuple[Callable[[Reading], None], ...] = (
     dictionaries_can_be_drawn,
     effects_need_partners,
     effects_need_the_exact_renderer,
+    noise_tables_ascend,
+    mosaics_have_room,
     threshold_windows_in_order,
     check_backgrounds,
     fields_of_the_installed_opencv,

@@ -6,7 +6,8 @@ from collections.abc import Iterable
 from functools import lru_cache
 from typing import Any, cast
 
-from sweep.model.effects import EFFECTS, Effect
+from sweep.model.effect import Effect
+from sweep.model.effects import EFFECTS
 from sweep.model.plugged_scene import ScenePlugins, checked_effect, checked_renderer
 from sweep.plan.experiment import Pipeline
 from sweep.plugins import EffectPlugin, RendererPlugin

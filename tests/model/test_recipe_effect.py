@@ -99,8 +99,12 @@ print(json.dumps({
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
-    change = "model/effects.py", "EFFECTS: tuple[Effect, ...] = (", RECORDS
-    return printed_by(added(tmp_path_factory.mktemp("recipe"), change), SCRIPT)
+    file = "model/effects.py"
+    changes = (
+        (file, "import dataclasses\n", "import numpy as np\n"),
+        (file, "EFFECTS: tuple[Effect, ...] = (", RECORDS),
+    )
+    return printed_by(added(tmp_path_factory.mktemp("recipe"), *changes), SCRIPT)
 
 
 def test_pixels_are_those_of_plain_numpy(result):

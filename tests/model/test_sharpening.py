@@ -1,0 +1,132 @@
+"""Sharpening: the exact image less one that is blurred more, against filters of finer images."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.special import ndtr
+
+from support.exact_image import clipped_image, values
+from support.lengths import lengths
+from support.small_scenes import SMALL, image_of
+
+FINE = 8
+"""Pixels of the reference's finer image along a side of a pixel."""
+
+ROUNDING = 0.5
+"""Half a grey level: images are compared after quantisation."""
+
+TOLERANCE = 0.35
+"""Of the reference, which converges as 1 / FINE² and is off by up to 0.24 levels of 255 at FINE =
+8 (tests/model/test_effects.py); here the contrast is 191 and two blurs are weighted 2 and 1."""
+
+
+def finer_blurred(sigmas, **given):
+    """The marker of SMALL at FINE times the resolution, blurred by SciPy, averaged in pixels."""
+    pad = math.ceil(5 * max(sigmas)) + 2
+    width, height = 57 + 2 * pad, 45 + 2 * pad
+    value = values(**{
+        "width_px": FINE * width, "height_px": FINE * height, "fx_px": FINE * 80.0, "size_m": 0.1,
+        "distance_m": 0.4, "tilt_deg": 35.0, "azimuth_deg": 70.0, "roll_deg": 25.0, "black": 30.3,
+        "white": 221.7,
+    } | given)
+    levels, share = clipped_image(value)
+    sharp = levels + (1 - share) * 90.4
+    for sigma in sigmas:
+        image = gaussian_filter(sharp, FINE * sigma, mode="nearest", truncate=6.0)
+        binned = image.reshape(height, FINE, width, FINE).mean(axis=(1, 3))
+        yield binned[pad:-pad, pad:-pad]
+
+
+@pytest.mark.parametrize(
+    ("amount", "radius", "blur"), [(1.0, 1.5, 0.6), (-0.5, 2.0, 0.4), (0.4, 0.7, 1.2)]
+)
+@lengths(1, 3)
+def test_sharpening_is_the_image_plus_its_difference_from_a_blurred_one(
+    count, amount, radius, blur
+):
+    for bearing_x in (0.0, 15.0, -22.0)[:count]:  # the last two are cut by the frame
+        plain, wide = finer_blurred([blur, math.hypot(blur, radius)], bearing_x_deg=bearing_x)
+        expected = np.clip(plain + amount * (plain - wide), 0, 255)
+        image = image_of([
+            f"sharpening={amount}", f"sharpening_px={radius}", f"blur_px={blur}",
+            f"bearing_x_deg={bearing_x}",
+        ])
+        worst = np.abs(image - expected).max()
+        print(f"\n| sharpening {amount} {radius} | gaussian_filter | {worst:.3g} |")
+        assert worst <= ROUNDING + TOLERANCE
+        # The effect is there: it moves levels by far more than the tolerance.
+        assert np.abs(image - plain).max() > 5
+
+
+@pytest.mark.parametrize("radius", [0.3, 2.0, 20.0])
+@pytest.mark.parametrize("amount", [0.2, 1.0])
+def test_sharpening_of_a_long_edge_is_its_closed_form(amount, radius):
+    """The box of a pixel, convolved with two Gaussians: integrals of the normal distribution."""
+    def edge(t, sigma):
+        def integral(t):
+            density = np.exp(-0.5 * (t / sigma) ** 2) / math.sqrt(2 * math.pi)
+            return t * ndtr(t / sigma) + sigma * density
+        return integral(t + 0.5) - integral(t - 0.5)
+
+    # A square of one level, 4000 px wide, whose right side is 0.3 px from the frame's middle.
+    shift_deg = math.degrees(math.atan((0.3 - 2000) / 80))
+    image = image_of([
+        "tilt_deg=0", "roll_deg=0", "distance_m=0.002", f"bearing_x_deg={shift_deg}",
+        "quiet_zone_modules=0", "black=140", "white=140", "background=90", "blur_px=0.5",
+        f"sharpening={amount}", f"sharpening_px={radius}",
+    ])
+    t = 28.3 - np.arange(57)
+    plain, wide = edge(t, 0.5), edge(t, math.hypot(0.5, radius))
+    expected = 90 + 50 * (plain + amount * (plain - wide))
+    assert np.abs(image[22] - expected).max() <= ROUNDING + 0.02
+    assert (image == image[22]).all()
+
+
+def test_amount_zero_and_a_radius_of_next_to_nothing_change_no_pixel():
+    blurred = image_of(["blur_px=0.8"])
+    np.testing.assert_array_equal(image_of(["blur_px=0.8", "sharpening=0"]), blurred)
+    tiny = image_of(["blur_px=0.8", "sharpening=1", "sharpening_px=1e-4"])
+    np.testing.assert_array_equal(tiny, blurred)
+
+
+def test_sharpening_leaves_the_noise_as_it_is_and_follows_gain_and_light():
+    plain = "black=100", "white=140", "background=90", "blur_px=0.6"
+    sharp = *plain, "sharpening=1", "sharpening_px=1.5"
+
+    def image(*settings):
+        return image_of(settings).astype(float)
+
+    added = image(*sharp) - image(*plain)
+    assert np.abs(added).max() > 5
+    noisy = image(*sharp, "noise_grey=6") - image(*plain, "noise_grey=6")
+    assert np.abs(noisy - added).max() <= 2  # four roundings
+    brighter = image(*sharp, "gain=1.5") - image(*plain, "gain=1.5")
+    assert np.abs(brighter - 1.5 * added).max() <= 2.5
+    dark = image(*sharp, "vignetting=4") - image(*plain, "vignetting=4")
+    v, u = np.mgrid[:45, :57]
+    fall_off = (1 + ((u - 28) ** 2 + (v - 22) ** 2) / 80**2) ** -2
+    assert np.abs(dark - fall_off * added).max() <= 2
+    # Shot noise is that of the light, not of the overshoot: dark pixels stay at 0 electrons.
+    shots = image(*sharp, "full_well_e=2000") - image(*plain, "full_well_e=2000")
+    assert np.abs(shots - added).max() <= 2
+
+
+def test_sharpening_over_a_background_image_acts_on_the_marker_alone(tmp_path):
+    import cv2  # noqa: PLC0415
+
+    rng = np.random.default_rng(4)
+    behind = rng.integers(60, 160, (45, 57)).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "wall.png"), behind)
+    settings = "sharpening=1", "sharpening_px=1.5", "blur_px=0.5", "distance_m=1.2"
+    text = SMALL.replace("background = 90.4", f'background = "{tmp_path / "wall.png"}"')
+    image = image_of(settings, text=text).astype(int)
+    assert (image[:6] == behind[:6]).all()
+    assert (image[-6:] == behind[-6:]).all()
+    even = behind * 0 + 100
+    cv2.imwrite(str(tmp_path / "wall.png"), even.astype(np.uint8))
+    from sweep.model.renderers import background_image  # noqa: PLC0415
+    background_image.cache_clear()
+    flat = image_of([*settings, "background=100"])
+    np.testing.assert_array_equal(image_of(settings, text=text), flat)

@@ -1,0 +1,43 @@
+"""Images of the one scene of a small pipeline, in any window."""
+
+import numpy as np
+
+from sweep.model.extent import marker_boxes
+from sweep.model.renderers import render_all
+from sweep.model.scene import build_scenes
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import scene_axes, scene_values
+
+SMALL = """
+seed = 11
+[camera]
+width_px = 57
+height_px = 45
+fx_px = 80.0
+fy_px = 80.0
+[marker]
+size_m = 0.1
+[pose]
+distance_m = 0.4
+tilt_deg = 35.0
+azimuth_deg = 70.0
+roll_deg = 25.0
+[scene]
+black = 30.3
+white = 221.7
+background = 90.4
+"""
+"""A marker of 20 px in a frame of 57 x 45 px, with a quiet zone that is seen."""
+
+
+def scenes_of(settings=(), text=SMALL):
+    pipeline = Pipeline.from_text(text, list(settings))
+    first = [np.array([0])] * len(scene_axes(pipeline))
+    return build_scenes(scene_values(pipeline, first), 1)
+
+
+def image_of(settings=(), window=None, text=SMALL):
+    """The image (h, w) in a window (left, top, right, bottom), by default the whole frame."""
+    scenes = scenes_of(settings, text)
+    window = window or (0, 0, *scenes.frame[0].tolist())
+    return render_all(scenes, np.array([0]), marker_boxes(scenes), np.array([window]))[0]

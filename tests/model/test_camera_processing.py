@@ -1,0 +1,300 @@
+"""JPEG, demosaicing, and all effects of the camera's processing together: windows, extremes."""
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+
+from support.exact_image import clipped_image, values
+from support.lengths import lengths
+from support.small_scenes import SMALL, image_of, scenes_of
+from sweep.errors import PipelineError
+from sweep.evaluation.cells import run_cells
+from sweep.measure.flags import BoundStatus
+from sweep.model.extent import marker_boxes
+from sweep.model.jpeg import compressed
+from sweep.plan.active_parts import parts
+from sweep.plan.experiment import Pipeline
+
+EVERYTHING = [
+    "blur_px=0.6", "sharpening=1", "sharpening_px=1.5", "bloom=0.2", "tone_gamma=0.8",
+    "tone_toe=0.3", "tone_knee=0.4", "noise_grey=2", "noise_correlation=0.5",
+    "noise_table=[0, 3, 255, 1]", "bayer=GRBG", "demosaic=edge_aware", "bayer_red=0.9",
+    "bayer_blue=1.1", "jpeg_quality=60",
+]
+
+
+def exact_levels():
+    """The levels of SMALL by polygon clipping."""
+    levels, share = clipped_image(values(
+        width_px=57, height_px=45, fx_px=80.0, size_m=0.1, distance_m=0.4, tilt_deg=35.0,
+        azimuth_deg=70.0, roll_deg=25.0, black=30.3, white=221.7,
+    ))
+    return levels + (1 - share) * 90.4
+
+
+# JPEG.
+
+@pytest.mark.parametrize("quality", [1, 10, 50, 95, 100])
+def test_jpeg_is_opencvs_encoder_on_the_whole_frame(quality):
+    plain = image_of(["noise_grey=5"])
+    done, code = cv2.imencode(".jpg", plain, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert done
+    expected = cv2.imdecode(code, cv2.IMREAD_GRAYSCALE)
+    image = image_of(["noise_grey=5", f"jpeg_quality={quality}"])
+    np.testing.assert_array_equal(image, expected)
+    # 57 and 45 px are no multiples of 8: so are the windows' ends.
+    left, top, right, bottom = marker_boxes(
+        scenes_of(["noise_grey=5", f"jpeg_quality={quality}"])
+    )[0].tolist()
+    for window in ((left, top, right, bottom), (left, top, 57, 45), (left - 3, 0, 55, bottom + 1)):
+        a, b, c, d = window
+        part = image_of(["noise_grey=5", f"jpeg_quality={quality}"], window)
+        np.testing.assert_array_equal(part, expected[b:d, a:c])
+
+
+def test_jpeg_reaches_as_far_as_its_blocks():
+    settings = ["jpeg_quality=5", "bearing_x_deg=2", "distance_m=0.9"]
+    left, top, right, bottom = marker_boxes(scenes_of(settings))[0].tolist()
+    assert left % 8 == top % 8 == 0
+    assert right % 8 == 0 or right == 57
+    image = image_of(settings).copy()
+    image[top:bottom, left:right] = image[0, 0]
+    assert (image == image[0, 0]).all()
+
+
+def test_images_larger_than_jpeg_are_compressed_in_parts():
+    rng = np.random.default_rng(8)
+    image = rng.integers(0, 256, (9, 70_001)).astype(np.uint8)
+    parts_of_it = [
+        cv2.imdecode(
+            cv2.imencode(".jpg", piece, [cv2.IMWRITE_JPEG_QUALITY, 70])[1], cv2.IMREAD_GRAYSCALE
+        )
+        for piece in (image[:, :40_000], image[:, 40_000:])
+    ]
+    np.testing.assert_array_equal(compressed(image, 70), np.concatenate(parts_of_it, axis=1))
+
+
+# Demosaicing.
+
+def mosaic_of(levels, pattern, gains):
+    """The raw image, pixel by pixel, in 16 bits."""
+    raw = np.empty(levels.shape, dtype=np.uint16)
+    for v, u in np.ndindex(levels.shape):
+        gain = gains[pattern[2 * (v % 2) + u % 2]]
+        raw[v, u] = min(max(np.floor(gain * levels[v, u] * 257 + 0.5), 0), 65535)
+    return raw
+
+
+def bilinear_grey(raw, pattern):
+    """Mean of the nearest neighbours of each colour, inside the border; then grey."""
+    height, width = raw.shape
+    grey = np.full(raw.shape, np.nan)
+    for v, u in itertools.product(range(1, height - 1), range(1, width - 1)):
+        colours = {}
+        for colour in "RGB":
+            for reach in ([(0, 0)], [(0, 1), (0, -1), (1, 0), (-1, 0)],
+                          [(1, 1), (1, -1), (-1, 1), (-1, -1)]):
+                same = [
+                    float(raw[v + dv, u + du]) for dv, du in reach
+                    if pattern[2 * ((v + dv) % 2) + (u + du) % 2] == colour
+                ]
+                if same:
+                    colours[colour] = sum(same) / len(same)
+                    break
+        grey[v, u] = 0.299 * colours["R"] + 0.587 * colours["G"] + 0.114 * colours["B"]
+    return grey / 257
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
+def test_bilinear_demosaicing_is_the_mean_of_neighbours(pattern):
+    gains = {"R": 0.8, "G": 1.0, "B": 1.1}
+    expected = bilinear_grey(mosaic_of(exact_levels(), pattern, gains), pattern)[1:-1, 1:-1]
+    image = image_of([f"bayer={pattern}", "bayer_red=0.8", "bayer_blue=1.1"])
+    # Half a level of quantisation, and roundings of 16 bits.
+    assert np.abs(image[1:-1, 1:-1] - expected).max() <= 0.5 + 0.01
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
+@pytest.mark.parametrize("method", ["bilinear", "edge_aware"])
+def test_demosaicing_is_opencvs_on_the_whole_frame(pattern, method):
+    settings = [f"bayer={pattern}", f"demosaic={method}", "bayer_red=0.7"]
+    raw = mosaic_of(exact_levels(), pattern, {"R": 0.7, "G": 1.0, "B": 1.0})
+    ending = "" if method == "bilinear" else "_EA"
+    colour = cv2.cvtColor(raw, getattr(cv2, f"COLOR_Bayer{pattern}2BGR{ending}"))
+    expected = colour @ np.array([0.114, 0.587, 0.299]) / 257
+    image = image_of(settings)
+    # Quantisation, and a unit of 16 bits of OpenCV's grey and of the levels in `raw`.
+    assert np.abs(image - expected).max() <= 0.5 + 0.02
+
+
+def test_even_scene_of_equal_gains_stays_as_it_is():
+    for background in (0, 1, 77, 128, 254, 255):
+        settings = [f"background={background}", "distance_m=10", "quiet_zone_modules=0"]
+        for method in ("bilinear", "edge_aware"):
+            image = image_of([*settings, "bayer=RGGB", f"demosaic={method}"])
+            assert (image[:15] == background).all()
+
+
+# Windows.
+
+COMBINATIONS = {
+    "all": EVERYTHING,
+    "sharpening": ["sharpening=2", "sharpening_px=3"],
+    "wide sharpening": ["sharpening=1", "sharpening_px=20", "noise_grey=3"],
+    "correlated": ["noise_grey=9", "noise_correlation=0.99", "noise_table=[0, 9, 255, 1]"],
+    "bayer and JPEG": ["bayer=BGGR", "full_well_e=900", "jpeg_quality=1"],
+    "tone and light": ["tone_gamma=2.2", "vignetting=4", "illumination_gradient=0.5", "bloom=1"],
+    "fine bits": ["tone_knee=1", "bit_depth=12", "sharpening=0.5", "gain=1.4"],
+    "defocus": ["aperture_mm=9", "focus_distance_m=0.5", "sharpening=1", "tone_toe=0.5"],
+    "motion": ["exposure_s=0.01", "velocity_x_m_s=2", "row_time_s=1e-4", "sharpening=1"],
+}
+
+
+@pytest.mark.parametrize("name", COMBINATIONS)
+@lengths(2, 60)
+def test_window_has_the_pixels_of_the_whole_frame(count, name):
+    rng = np.random.default_rng(12)
+    for trial in range(count):
+        settings = [
+            *COMBINATIONS[name], f"distance_m={rng.uniform(0.5, 2)}",
+            f"bearing_x_deg={rng.uniform(-20, 20)}", f"bearing_y_deg={rng.uniform(-15, 15)}",
+            f"seed={trial}",
+        ]
+        scenes = scenes_of(settings)
+        box = marker_boxes(scenes)[0]
+        frame = image_of(settings)
+        for _ in range(3):
+            left, top = (rng.integers(0, box[:2] + 1)).tolist()
+            right, bottom = rng.integers(box[2:], np.array([57, 45]) + 1).tolist()
+            if right <= left or bottom <= top:
+                continue
+            image = image_of(settings, (left, top, right, bottom))
+            np.testing.assert_array_equal(image, frame[top:bottom, left:right])
+
+
+@pytest.mark.parametrize(
+    "settings", [["sharpening=1", "sharpening_px=2"], ["bayer=RGGB"], ["jpeg_quality=30"]],
+    ids=["sharpening", "bayer", "JPEG"],
+)
+def test_nothing_of_the_marker_lies_beyond_its_box(settings):
+    for bearing in (-20, 0, 13, 25):
+        given = [*settings, "distance_m=0.8", f"bearing_x_deg={bearing}"]
+        left, top, right, bottom = marker_boxes(scenes_of(given))[0].tolist()
+        image = image_of(given).copy()
+        outside = np.ones(image.shape, dtype=bool)
+        outside[top:bottom, left:right] = False
+        # The background goes through the same chain: it has one level.
+        assert len(np.unique(image[outside])) <= 1
+
+
+# Extremes.
+
+EXTREMES = [
+    ["distance_m=8"], ["black=90.4", "white=90.4"], ["black=255", "white=0", "background=255"],
+    ["jpeg_quality=1", "sharpening=100", "sharpening_px=20"], ["noise_correlation=0.99"],
+    ["sharpening_px=20", "sharpening=-1"], ["sharpening_px=1000", "blur_px=0"],
+    ["tone_gamma=0.1", "tone_toe=1", "tone_knee=-1"], ["tone_gamma=10", "bloom=-1"],
+    ["bayer_red=100", "bayer_blue=0"], ["noise_table=[0, 1e6]"], ["gain=1e6"], ["gain=1e-300"],
+    ["width_px=3", "height_px=3"], ["width_px=8", "height_px=1000"], ["full_well_e=1"],
+    ["bit_depth=16", "tone_knee=1"], ["vignetting=100", "illumination_gradient=2"],
+]
+
+
+@pytest.mark.parametrize("given", EXTREMES, ids=",".join)
+def test_extremes_of_all_together_end_without_a_warning(given):
+    image = image_of([*EVERYTHING, *given])
+    frame = scenes_of([*EVERYTHING, *given]).frame[0]
+    assert image.shape == (frame[1], frame[0])
+    assert image.dtype == np.uint8
+
+
+def test_levels_of_one_value_stay_one_value():
+    image = image_of([
+        "black=90", "white=90", "background=90", "sharpening=9", "sharpening_px=4", "bloom=1",
+        "bayer=RGGB", "jpeg_quality=100",
+    ])
+    assert (image == 90).all()
+
+
+# What follows from the declarations.
+
+def test_effects_are_axes_and_distributions_and_the_bound_says_that_it_lacks_them():
+    text = SMALL + """bound = "known_blur"
+noise_grey = 2
+tone_toe = { uniform = [0.1, 0.5] }
+[axes]
+jpeg_quality = [0, 40]
+bayer = ["none", "RGGB"]
+noise_table = [[], [0, 2, 255, 1]]
+sharpening = [0, 0.5]
+trial = 2
+"""
+    pipeline = Pipeline.from_text(text)
+    indices = [index.ravel() for index in np.indices((2, 2, 2, 2, 2))]
+    cells = run_cells(pipeline, indices)
+    status = np.asarray(cells.columns["bound"][0])
+    assert (status == BoundStatus.not_in_model).all()
+    reasons = {part.name: part.reason for part in parts(pipeline) if part.active}
+    assert reasons["JPEG"] == "jpeg_quality is 40"
+    assert reasons["demosaicing"] == "bayer is RGGB"
+    assert reasons["noise by level"] == "noise_table is [0.0, 2.0, 255.0, 1.0]"
+    assert reasons["sharpening"] == "sharpening is 0.5"
+    assert "tone_toe is drawn" in reasons["toe"]
+    assert "random draws" in reasons
+
+
+def test_effects_off_leave_the_bound_given():
+    text = SMALL + 'bound = "known_blur"\nnoise_grey = 2\nbayer = "none"\njpeg_quality = 0\n'
+    cells = run_cells(Pipeline.from_text(text), [])
+    assert np.asarray(cells.columns["bound"][0]).item() == BoundStatus.given
+
+
+BROKEN = {
+    "quality": ("jpeg_quality = 101", "jpeg_quality = 101: expected a whole number from 0 to 100"),
+    "half a quality": ("jpeg_quality = 0.5", "expected a whole number from 0 to 100"),
+    "drawn quality": ("jpeg_quality = { uniform = [1, 9] }", "expected a fixed value"),
+    "pattern": ('bayer = "RGBG"', "expected one of none, RGGB, BGGR, GRBG, GBRG"),
+    "method alone": ('demosaic = "edge_aware"', "expected bayer beside it"),
+    "gain alone": ("bayer_red = 0.5", "scene.bayer_red = 0.5: expected bayer beside it"),
+    "gamma": ("tone_gamma = 0", "tone_gamma = 0: expected a number from 0.1 to 10"),
+    "toe": ("tone_toe = 1.5", "tone_toe = 1.5: expected a number from -1 to 1"),
+    "radius alone": ("sharpening_px = 2", "expected sharpening beside it"),
+    "no radius": (
+        "sharpening = 1\nsharpening_px = 0", "sharpening_px = 0: expected a number above 0",
+    ),
+    "correlation": ("noise_grey = 1\nnoise_correlation = 1", "expected a number from 0 to 0.99"),
+    "correlation of nothing": (
+        "noise_correlation = 0.5", "expected noise_grey or noise_table beside it",
+    ),
+    "odd table": ("noise_table = [0, 1, 2]", "expected a list of an even number of finite numbers"),
+    "table that descends": (
+        "noise_table = [9, 1, 2, 1]", "levels that ascend from 0 to 255, deviations of at least 0",
+    ),
+    "negative deviation": ("noise_table = [9, -1]", "deviations of at least 0"),
+    "sharpening of the warp": (
+        'renderer = "warp"\nsharpening = 1', "expected renderer = exact; warp does not have it",
+    ),
+    "frame of 2 px": ('bayer = "RGGB"', "camera.width_px = 2: expected at least 3"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_effect_that_cannot_be_is_said_in_one_line(name):
+    lines, expected = BROKEN[name]
+    text = SMALL + lines
+    if "2 px" in name:
+        text = text.replace("width_px = 57", "width_px = 2")
+    with pytest.raises(PipelineError) as raised:
+        Pipeline.from_text(text, source="broken.toml")
+    faults = str(raised.value).splitlines()
+    assert len(faults) == 1, faults
+    assert expected in faults[0]
+
+
+def test_all_faults_of_effects_come_at_once():
+    lines = 'jpeg_quality = 101\nbayer = "X"\ntone_gamma = 0\nnoise_table = [9, 1, 2, 1]\n'
+    with pytest.raises(PipelineError) as raised:
+        Pipeline.from_text(SMALL + lines)
+    assert len(str(raised.value).splitlines()) == 4

@@ -1,0 +1,143 @@
+"""Correlated noise and noise by level against closed forms; all statistics are seeded.
+
+A correct sensor passes each statistical test with a probability of at least 1 - 1e-6.
+"""
+
+import math
+
+import mpmath
+import numpy as np
+import pytest
+from scipy import stats
+
+from support.lengths import lengths
+from support.small_scenes import image_of
+from sweep.model.correlated_noise import deviations, noise_kernel, normal_field
+
+FAR = 5.5
+"""Standard deviations that a normal number exceeds with a probability of 4e-8."""
+
+CORRELATIONS = (1e-9, 0.01, 0.3, 0.5, 0.8, 0.99)
+
+
+def theta_ratio(sigma, lag):
+    """Correlation at a lag of an endless Gaussian kernel: ratios of Jacobi's theta functions."""
+    nome = mpmath.exp(-1 / sigma**2)
+    top = mpmath.jtheta(2 if lag % 2 else 3, 0, nome)
+    return mpmath.exp(-(lag**2) / (4 * sigma**2)) * top / mpmath.jtheta(3, 0, nome)
+
+
+@pytest.mark.parametrize("correlation", CORRELATIONS)
+def test_weights_have_the_correlation_of_the_closed_form(correlation):
+    kernel = noise_kernel(correlation)
+    at = [math.fsum(kernel[: len(kernel) - lag] * kernel[lag:]) for lag in range(5)]
+    assert at[0] == pytest.approx(1, abs=1e-14)
+    assert at[1] == pytest.approx(correlation, rel=1e-10)
+    sigma = mpmath.findroot(
+        lambda s: mpmath.log(theta_ratio(s, 1)) - mpmath.log(correlation),
+        (0.5 / math.sqrt(-math.log(correlation)), 0.75 / math.sqrt(-math.log(correlation))),
+        solver="anderson", tol=1e-20, verify=False,
+    )
+    for lag in (2, 3, 4):
+        # Cut off at 5 standard deviations: exp(-12.5) = 4e-6 of the largest weight.
+        assert at[lag] == pytest.approx(float(theta_ratio(sigma, lag)), abs=1e-5)
+        if correlation >= 0.3:
+            assert at[lag] == pytest.approx(correlation ** (lag**2), abs=0.03)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.3, 0.5, 0.9])
+@lengths(300, 1500)
+def test_field_has_mean_variance_and_correlations_of_the_weights(count, correlation):
+    field = normal_field(np.uint64(77), 0, 5, 9, (count, count), correlation)
+    kernel = noise_kernel(correlation) if correlation else np.ones(1)
+    reach = 2 * len(kernel) + 4
+    padded = np.convolve(kernel, kernel[::-1])
+    along = np.zeros(2 * reach + 1)
+    half = len(padded) // 2
+    along[reach - half : reach + half + 1] = padded
+    plane = np.outer(along, along)
+    deviation = math.sqrt(plane.sum()) / count
+    assert abs(field.mean()) < FAR * deviation
+    for down, right in ((0, 0), (0, 1), (1, 0), (1, 1), (0, 2), (3, 0)):
+        product = field[down:, right:] * field[: count - down, : count - right]
+        expected = plane[reach + down, reach + right]
+        # Covariances of products of a normal field (Isserlis): r(k)² + r(k + d) r(k - d).
+        moved = np.roll(plane, (down, right), (0, 1)) * np.roll(plane, (-down, -right), (0, 1))
+        deviation = math.sqrt((plane**2 + moved).sum() / product.size)
+        assert abs(product.mean() - expected) < FAR * deviation, (down, right)
+
+
+@pytest.mark.parametrize("correlation", [0.5, 0.95])
+def test_field_is_normal(correlation):
+    field = normal_field(np.uint64(5), 0, 0, 0, (1200, 1200), correlation)
+    # Pixels that share no white number are independent.
+    step = len(noise_kernel(correlation))
+    independent = field[::step, ::step].ravel()
+    assert stats.kstest(independent, "norm").pvalue > 1e-6
+
+
+def test_number_of_a_pixel_depends_on_the_pixel_alone():
+    for correlation in (0.0, 0.5, 0.99):
+        whole = normal_field(np.uint64(3), 2, 0, 0, (90, 110), correlation)
+        for left, top, right, bottom in ((0, 0, 1, 1), (7, 3, 64, 90), (109, 89, 110, 90)):
+            part = normal_field(
+                np.uint64(3), 2, left, top, (bottom - top, right - left), correlation
+            )
+            np.testing.assert_array_equal(part, whole[top:bottom, left:right])
+
+
+def test_no_correlation_is_the_limit_of_little_correlation():
+    settings = ["noise_grey=20"]
+    np.testing.assert_array_equal(image_of([*settings, "noise_correlation=0"]), image_of(settings))
+    little = image_of([*settings, "noise_correlation=1e-9"]).astype(int)
+    assert np.abs(little - image_of(settings)).max() <= 1
+
+
+# In images: levels, table, quantisation.
+
+FLAT = ["background=120", "distance_m=10", "width_px=400", "height_px=300", "quiet_zone_modules=0"]
+"""A marker of 1 px, and the background around it."""
+
+
+def corner(settings, background=120):
+    image = image_of([*FLAT, f"background={background}", *settings]).astype(float)
+    return image[:, :190]
+
+
+def test_image_has_the_noise_and_its_correlation():
+    noise = corner(["noise_grey=12", "noise_correlation=0.6"]) - 120
+    # About 1 / sum of r² independent pixels each: 57,000 / 8 of them, by FAR standard deviations.
+    assert noise.std() == pytest.approx(math.sqrt(144 + 1 / 12), rel=FAR / math.sqrt(2 * 57000 / 8))
+    right = (noise[:, 1:] * noise[:, :-1]).mean() / noise.var()
+    down = (noise[1:] * noise[:-1]).mean() / noise.var()
+    # Rounding adds 1/12 of variance that is not correlated.
+    expected = 0.6 * 144 / (144 + 1 / 12)
+    assert right == pytest.approx(expected, abs=0.04)
+    assert down == pytest.approx(expected, abs=0.04)
+
+
+@pytest.mark.parametrize("table", [(0, 2.0, 255, 10.0), (60, 8.0, 120, 3.0, 200, 5.0), (9, 4.0)])
+@pytest.mark.parametrize("correlation", [0.0, 0.5])
+def test_noise_over_the_level_is_the_table(table, correlation):
+    settings = [f"noise_table={list(table)}", f"noise_correlation={correlation}"]
+    for level in (45, 90, 120, 190, 230):
+        noise = corner(settings if correlation else settings[:1], level) - level
+        levels, spreads = table[::2], table[1::2]
+        # Straight lines between the rows, written as the point that lies between them.
+        if level <= levels[0]:
+            spread = spreads[0]
+        elif level >= levels[-1]:
+            spread = spreads[-1]
+        else:
+            i = max(k for k in range(len(levels)) if levels[k] <= level)
+            t = (level - levels[i]) / (levels[i + 1] - levels[i])
+            spread = (1 - t) * spreads[i] + t * spreads[i + 1]
+        pixels = noise.size / (6 if correlation else 1)
+        # Clipping takes less than 1e-4 of a normal number's variance beyond 4 deviations.
+        theory = math.sqrt(spread**2 + 1 / 12)
+        assert noise.std() == pytest.approx(theory, rel=FAR / math.sqrt(2 * pixels) + 2e-4)
+
+
+def test_deviations_go_on_beyond_the_table():
+    levels = np.array([[-20.0, 10.0, 15.0, 20.0, 300.0]])
+    assert deviations(levels, (10.0, 1.0, 20.0, 3.0)).tolist() == [[1.0, 1.0, 2.0, 3.0, 3.0]]

@@ -1,0 +1,132 @@
+"""The response curve and bloom against closed forms; they keep the order of levels."""
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from support.exact_image import clipped_image, values
+from support.small_scenes import image_of
+from sweep.model.tone import apply_tone, bloomed
+
+SLOPES = st.floats(-1, 1)
+GAMMAS = st.floats(0.1, 10)
+EXAMPLES = settings(derandomize=True, deadline=None, max_examples=40)
+
+
+def cubics(share, gamma, toe, knee):
+    """The response as two cubics, multiplied out, and a power; in 30 digits."""
+    with mpmath.workdps(30):
+        x, a, b = mpmath.mpf(share), mpmath.mpf(toe), mpmath.mpf(knee)
+        if x < 0.5:
+            y = (1 - a) * x + 4 * a * x**2 - 4 * a * x**3
+        else:
+            z = 1 - x
+            y = 1 - ((1 - b) * z + 4 * b * z**2 - 4 * b * z**3)
+        return mpmath.power(y, mpmath.mpf(gamma))
+
+
+def toned(levels, gamma, toe, knee):
+    levels = np.array(levels, dtype=float).reshape(1, -1)
+    apply_tone(levels, gamma, toe, knee)
+    return levels[0]
+
+
+@EXAMPLES
+@given(share=st.floats(0, 1), gamma=GAMMAS, toe=SLOPES, knee=SLOPES)
+def test_response_is_its_closed_form(share, gamma, toe, knee):
+    expected = float(255 * cubics(share, gamma, toe, knee))
+    # A rounding of the power's base near 0 or 1 is multiplied by gamma, of at most 10.
+    (level,) = toned([255 * share], gamma, toe, knee)
+    assert level == pytest.approx(expected, rel=1e-13, abs=1e-13)
+
+
+@EXAMPLES
+@given(gamma=GAMMAS, toe=SLOPES, knee=SLOPES)
+def test_response_grows_from_black_to_white_and_ends_on_the_scale(gamma, toe, knee):
+    levels = toned(np.linspace(0, 255, 4097), gamma, toe, knee)
+    # A rounding of a share, at slope 0: neighbours may be equal, never exchanged by more.
+    assert (np.diff(levels) >= -1e-12).all()
+    assert levels[0] == 0.0
+    assert levels[-1] == 255.0
+    assert levels[2048] == pytest.approx(255 * 0.5**gamma)
+    assert toned([-40, 300], gamma, toe, knee).tolist() == [0.0, 255.0]
+
+
+def test_ends_of_the_curve_have_the_stated_slopes():
+    h = 1e-6
+    for toe, knee in ((0.5, 0.0), (-1.0, 0.3), (1.0, 1.0)):
+        low, high, middle = (
+            np.diff(toned([255 * (at - h), 255 * (at + h)], 1.0, toe, knee))[0] / (510 * h)
+            for at in (h, 1 - h, 0.5)
+        )
+        # The curvature at the ends is at most 8, times the step.
+        assert low == pytest.approx(1 - toe, abs=1e-5)
+        assert high == pytest.approx(1 - knee, abs=1e-5)
+        assert middle == pytest.approx(1, abs=1e-5)
+
+
+def test_neutral_response_is_the_identity_to_the_bit():
+    levels = np.random.default_rng(3).uniform(0, 255, 1000)
+    levels[:6] = 0.0, 255.0, 127.5, 1e-300, 254.99999999999997, 100.0
+    # Division by 255 and multiplication round once each.
+    np.testing.assert_allclose(toned(levels, 1.0, 0.0, 0.0), levels, rtol=2.3e-16)
+    for neutral in (["tone_gamma=1"], ["tone_toe=0", "tone_knee=0"], ["bloom=0"]):
+        np.testing.assert_array_equal(image_of(neutral), image_of())
+
+
+@pytest.mark.parametrize("background", [0, 1, 37, 128, 200, 254, 255])
+def test_image_has_the_response_to_each_level(background):
+    for gamma, toe, knee in ((0.45, 0.0, 0.0), (1.0, 0.6, 0.4), (2.2, -0.5, 0.9)):
+        image = image_of([
+            f"background={background}", f"tone_gamma={gamma}", f"tone_toe={toe}",
+            f"tone_knee={knee}", "distance_m=2",
+        ])
+        expected = float(255 * cubics(background / 255, gamma, toe, knee))
+        assert image[0, 0] == np.floor(expected + 0.5)
+
+
+# Bloom.
+
+@EXAMPLES
+@given(
+    bloom=SLOPES, ends=st.tuples(st.floats(0, 255), st.floats(0, 255)),
+    levels=st.lists(st.floats(-50, 400), min_size=2, max_size=20),
+)
+def test_bloom_keeps_order_ends_and_what_lies_outside(bloom, ends, levels):
+    levels = np.sort(levels)[None]
+    grown = bloomed(levels, *ends, bloom)
+    assert (np.diff(grown) >= -1e-9).all()
+    dark, bright = sorted(ends)
+    outside = (levels <= dark) | (levels >= bright)
+    np.testing.assert_array_equal(grown[outside], levels[outside])
+    if bloom >= 0:
+        assert (grown >= levels).all()
+
+
+def test_bloom_is_the_term_in_share_times_the_rest():
+    value = values(
+        width_px=57, height_px=45, fx_px=80.0, size_m=0.1, distance_m=0.4, tilt_deg=35.0,
+        azimuth_deg=70.0, roll_deg=25.0, black=30.3, white=221.7,
+    )
+    levels, share = clipped_image(value)
+    sharp = levels + (1 - share) * 90.4
+    for bloom in (0.3, -1.0, 1.0):
+        bright = (sharp - 30.3) / (221.7 - 30.3)
+        expected = 30.3 + (221.7 - 30.3) * (bright + bloom * bright * (1 - bright))
+        assert np.abs(image_of([f"bloom={bloom}"]) - expected).max() <= 0.5 + 1e-6
+    same = image_of(["black=100", "white=100", "background=100", "bloom=1"])
+    assert (same == 100).all()
+    # White on black, exchanged: what is bright grows all the same.
+    swapped = image_of(["black=221.7", "white=30.3", "bloom=0.3"]).astype(int)
+    assert (swapped - image_of(["black=221.7", "white=30.3"]) >= 0).all()
+
+
+def test_bloom_comes_before_uneven_light():
+    both = ["vignetting=3", "bloom=0.5"]
+    v, u = np.mgrid[:45, :57]
+    fall_off = (1 + ((u - 28) ** 2 + (v - 22) ** 2) / 80**2) ** -1.5
+    even = image_of(both[1:])
+    # Both are rounded.
+    assert np.abs(image_of(both) - fall_off * even).max() <= 1.0

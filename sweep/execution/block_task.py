@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import socket
 import time
 from collections.abc import Mapping, Sequence
@@ -19,6 +20,7 @@ from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.results import CellsResult, to_dataset_layout
 from sweep.evaluation.warm_up import warm_up
 from sweep.execution.limits import TIME_LIMIT_S
+from sweep.execution.needed_scenes import own_cells, with_scenes
 from sweep.execution.reuse import ReusedCells, Source, match, read_cells
 from sweep.isolation.crash_isolation import WHOLE, run_cells_isolated
 from sweep.isolation.repetition import check_repeatable
@@ -29,7 +31,15 @@ from sweep.plan.grid import Block, block_indices
 from sweep.plan.parameters import Stage
 from sweep.plan.plugins import lacking_plugins
 from sweep.plan.schema import Variable
-from sweep.store.blocks import begin_block, withdraw_block, write_block
+from sweep.plan.stopping import StoppingRule
+from sweep.sampling.deciding import Decider, Decision
+from sweep.store.blocks import (
+    begin_block,
+    receipt_of,
+    recommit_block,
+    withdraw_block,
+    write_block,
+)
 from sweep.store.failures import MAX_ROWS, recorded
 from sweep.store.lifecycle import open_store
 from sweep.store.locations import exists
@@ -89,6 +99,29 @@ def _source(url: str, run_id: str, old: str) -> Source:
     return match(_opened(url, run_id).pipeline, open_store(old))
 
 
+@lru_cache(maxsize=2)
+def _decider(url: str, run_id: str, durable: bool, rule: StoppingRule) -> Decider:
+    """Make the rule by which sampling of a store stops once in each process."""
+    return Decider.of(_opened(url, run_id, durable), rule)
+
+
+def compute_blocks(
+    url: str,
+    run_id: str,
+    blocks: Sequence[Block],
+    decision: Decision | None,
+    reuse: Sequence[str] = (),
+    time_limit_s: float = TIME_LIMIT_S,
+    quota: Mapping[str, int] = FAILURE_QUOTA,
+    durable: bool = False,
+) -> list[Receipt]:
+    """Compute blocks one after another, as :func:`compute_block` does; return their receipts."""
+    return [
+        compute_block(url, run_id, block, reuse, time_limit_s, quota, durable, decision)
+        for block in blocks
+    ]
+
+
 def compute_block(
     url: str,
     run_id: str,
@@ -97,6 +130,7 @@ def compute_block(
     time_limit_s: float = TIME_LIMIT_S,
     quota: Mapping[str, int] = FAILURE_QUOTA,
     durable: bool = False,
+    decision: Decision | None = None,
 ) -> Receipt:
     """Compute, write and commit one block; return its receipt, also if it is run twice.
 
@@ -117,6 +151,9 @@ def compute_block(
         Rows of failures that the receipt may hold of each kind.
     durable
         Flush the block to the disk before it counts as committed.
+    decision
+        What the needed scenes follow from; all scenes are needed without one. A block that is
+        committed on another basis is computed again, its computed scenes taken from itself.
 
     Raises
     ------
@@ -129,10 +166,18 @@ def compute_block(
     try:
         with machine_faults_raised():
             store = _opened(url, run_id, durable)
+            needed, before = np.ones(len(block), dtype=bool), None
+            if decision is not None:
+                before = receipt_of(store, block)
+                if before is not None and before.basis == decision.basis:
+                    return before
+                needed = _decider(url, run_id, durable, decision.rule).needed(block, decision)
             begun_before = begin_block(store, block)
             try:
                 return _compute_begun(
-                    store, url, block, reuse, time_limit_s, quota, isolated=begun_before
+                    store, url, block, reuse, time_limit_s, quota, isolated=begun_before,
+                    needed=needed, basis=None if decision is None else decision.basis,
+                    before=before,
                 )
             except Exception:
                 if not begun_before:  # it did not end this process
@@ -146,18 +191,30 @@ def compute_block(
 
 def _compute_begun(
     store: RunStore, url: str, block: Block, reuse: Sequence[str], time_limit_s: float,
-    quota: Mapping[str, int], *, isolated: bool,
+    quota: Mapping[str, int], *, isolated: bool, needed: NDArray[np.bool_],
+    basis: int | None = None, before: Receipt | None = None,
 ) -> Receipt:
-    """Compute, write and commit a block that is marked as begun."""
+    """Compute, write and commit a block that is marked as begun.
+
+    Only the ``needed`` scenes (N,) are computed; ``before`` is the receipt of the block as it was
+    committed on another basis.
+    """
     start = time.perf_counter()
     pipeline = store.pipeline
     shape = (len(block), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
     reused: ReusedCells | None = None
-    need = np.ones(shape, dtype=bool)
-    if reuse:
+    need = np.broadcast_to(needed[:, None, None], shape).copy()
+    own = None if before is None else own_cells(store, block)
+    if before is not None and own is not None:
+        if (needed == own.needed).all():
+            receipt = dataclasses.replace(before, basis=basis, computed=_NOTHING)
+            recommit_block(store, receipt)
+            return receipt
+        need[own.whole] = False
+    if reuse and need.any():
         sources = [_source(url, store.run_id, old) for old in reuse]
         reused = read_cells(pipeline, block, sources)
-        need = ~reused.available.reshape(shape)
+        need &= ~reused.available.reshape(shape)
     # Scenes of which every cell is reused are not rendered.
     rows = np.flatnonzero(need.any(axis=(1, 2)))
     cells = None
@@ -172,6 +229,13 @@ def _compute_begun(
     }
     if reused is not None:
         values = {v.name: _merged(v, values, reused) for v in store.variables}
+    if own is not None:
+        values = with_scenes(
+            store.variables, pipeline, block, own.whole & needed, values, own.values
+        )
+    if not needed.all():
+        values = with_scenes(store.variables, pipeline, block, ~needed, values)
+    seconds = _NO_SECONDS if cells is None else cells.seconds
     receipt = Receipt(
         run_id=store.run_id,
         processor=processor(),
@@ -183,13 +247,13 @@ def _compute_begun(
         },
         detection=np.bincount(values["detection"].ravel()).tolist(),
         estimate=np.bincount(values["estimate"].ravel()).tolist(),
-        seconds=cells.seconds if cells is not None else _NO_SECONDS,
+        seconds=seconds if before is None else _summed(before.seconds, seconds),
         failures=recorded(cells.failures if cells is not None else [], rows.tolist(), quota),
         wall_s=time.perf_counter() - start,
         written=time.time(),
+        basis=basis,
     )
-    write_block(store, block, values, receipt)
-    return receipt
+    return write_block(store, block, values, receipt)
 
 
 def _compute(
@@ -223,6 +287,19 @@ def _computed_here(
 
 _NO_SECONDS: dict[str, list[float]] = {"scene": [], "detection": [], "estimation": []}
 """The cost of a block of which nothing was computed."""
+
+_NOTHING = {"scenes": 0, "detections": 0, "estimates": 0}
+
+
+def _summed(
+    first: Mapping[str, Sequence[float]], second: Mapping[str, Sequence[float]]
+) -> dict[str, list[float]]:
+    """Return the seconds of a block that was computed in two parts."""
+    return {
+        stage: [a + b for a, b in zip(first[stage], second[stage], strict=True)]
+        if first[stage] and second[stage] else [*first[stage], *second[stage]]
+        for stage in first
+    }
 
 
 def _columns(

@@ -24,14 +24,17 @@ from sweep.execution.limits import (
     MAX_BLOCKS,
     MIN_BLOCK_S,
     TIME_LIMIT_S,
+    WAVE_BLOCK_S,
 )
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.isolation.watchdog import compilation_s
-from sweep.plan.axes import Axis
+from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import bytes_per_block
+from sweep.sampling.rules import make_rule
+from sweep.sampling.stopping import Stopping, block_unit
 
 MAX_BATCH = 1536
 """Most scenes measured at a time."""
@@ -285,16 +288,20 @@ def block_extents(
         Block timeout in seconds, if the user gave one.
     """
     total_s = pipeline.size(Stage.scene) * calibration.scene_s
+    rule = make_rule(pipeline)
+    if rule is not None:
+        # What is written of a block costs as much if few of its scenes are needed.
+        total_s = max(total_s * rule.ends[0] / rule.ends[-1], WAVE_BLOCK_S * BLOCKS_PER_WORKER)
     work_s = block_work_s(total_s, workers, time_limit_s) if block_s is None else block_s
     most = min(MAX_BLOCK_SCENES, MAX_BLOCK_BYTES // bytes_per_block(pipeline, 1))
     target = max(min(int(work_s / calibration.scene_s), most), 1)
-    extents = _cut(pipeline, calibration, target)
+    extents = _cut(pipeline, calibration, target, rule)
     if block_s is None:
         # Blocks that fit into the axes are smaller than wanted, so that there may be more.
         most = min(most, int(longest_block_s(time_limit_s) / calibration.scene_s))
         while target < most and _count(pipeline, extents) > MAX_BLOCKS:
             target = min(math.ceil(LARGER * target), most)
-            extents = _cut(pipeline, calibration, target)
+            extents = _cut(pipeline, calibration, target, rule)
     return extents
 
 
@@ -306,8 +313,13 @@ def _count(pipeline: Pipeline, extents: tuple[int, ...]) -> int:
     return len(Blocks(tuple(len(axis) for axis in scene_axes(pipeline)), extents))
 
 
-def _cut(pipeline: Pipeline, calibration: Calibration, target: int) -> tuple[int, ...]:
-    """Return the extents of blocks of at most ``target`` scenes."""
+def _cut(
+    pipeline: Pipeline, calibration: Calibration, target: int, rule: Stopping | None = None
+) -> tuple[int, ...]:
+    """Return the extents of blocks of at most ``target`` scenes.
+
+    With a rule, the trials of a block are those of a wave, or an equal part of them.
+    """
     axes = scene_axes(pipeline)
     order = sorted(
         range(len(axes)),
@@ -315,6 +327,14 @@ def _cut(pipeline: Pipeline, calibration: Calibration, target: int) -> tuple[int
         reverse=True,
     )
     extents = [1] * len(axes)
+    if rule is not None:
+        trial = next(k for k, axis in enumerate(axes) if axis.name == TRIAL)
+        unit = block_unit(rule.ends)
+        extents[trial] = max(k for k in range(1, min(unit, target) + 1) if unit % k == 0)
+        order = [k for k in order if k != trial and axes[k].name in rule.coupled] + [
+            k for k in order if k != trial and axes[k].name not in rule.coupled]
+        if extents[trial] < unit:
+            order = []
     for k in order:
         most = max(target // math.prod(extents), 1)
         length = len(axes[k])

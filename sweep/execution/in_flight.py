@@ -7,11 +7,10 @@ does not grow with the grid. Workers write the blocks; the client receives and c
 from __future__ import annotations
 
 import contextlib
-import itertools
 import time
 import uuid
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -19,7 +18,7 @@ from distributed import Client, Future, KilledWorker
 
 from sweep.errors import RunError, StoreReplacedError
 from sweep.evaluation.machine_faults import machine_fault
-from sweep.execution.block_task import compute_block
+from sweep.execution.block_task import compute_block, compute_blocks
 from sweep.execution.cluster import thread_count
 from sweep.execution.distributed_internals import worker_deaths
 from sweep.execution.limits import (
@@ -32,9 +31,11 @@ from sweep.execution.limits import (
 )
 from sweep.execution.stall import StallWatch
 from sweep.execution.tally import Tally
+from sweep.execution.waiting import Waiting, Work, in_any_order
 from sweep.execution.worker_faults import WorkerFaults
 from sweep.isolation.interrupts import POLL_S, Interrupts
 from sweep.isolation.machine_memory import deaths_reason, memory_kills, memory_ran_out
+from sweep.store.receipt import Receipt
 from sweep.store.run_store import RunStore
 
 
@@ -107,13 +108,13 @@ class BlocksInFlight:
         self._time_limit_s = time_limit_s
         self._interrupts = interrupts
         self._finished: SimpleQueue[Future[Any]] = SimpleQueue()
-        self._numbers: dict[Future[Any], int] = {}
+        self._works: dict[Future[Any], Work] = {}
         self._deaths: Counter[int] = Counter()
         self._worker_faults = WorkerFaults(client)
         self._kills = memory_kills()
 
-    def compute(self, numbers: Iterable[int], tally: Tally) -> None:
-        """Compute blocks by their numbers, and count them.
+    def compute(self, waiting: Iterable[int] | Waiting, tally: Tally) -> None:
+        """Compute the blocks that wait, and count them; numbers are in any order.
 
         Raises
         ------
@@ -123,52 +124,60 @@ class BlocksInFlight:
             If the store was moved, deleted or replaced.
         """
         try:
-            self._compute(iter(numbers), tally)
+            self._compute(in_any_order(waiting), tally)
         finally:
             self._cancel()
         tally.check()
 
-    def _compute(self, waiting: Iterator[int], tally: Tally) -> None:
+    def _compute(self, waiting: Waiting, tally: Tally) -> None:
         limit = InFlightLimit(self._client)
         watch = StallWatch(self._client, self._time_limit_s)
-        for number in itertools.islice(waiting, limit.blocks()):
-            self._submit(number, tally)
-        while self._numbers:
+        self._fill(waiting, limit.blocks(), tally)
+        while self._works:
             self._interrupts.check()
             most = limit.blocks()
             try:
                 future = self._finished.get(timeout=POLL_S)
             except Empty:
-                watch.check(len(self._numbers))
+                watch.check(len(self._works))
                 continue
             watch.finished()
-            number = self._numbers.pop(future)
+            work = self._works.pop(future)
             if future.status == "finished":
-                tally.add(future.result())
-                self._worker_faults.computed(number)
+                done = future.result()
+                found = [done] if isinstance(done, Receipt) else done
+                for number, receipt in zip(work.numbers, found, strict=True):
+                    tally.add(receipt)
+                    waiting.committed(number, receipt)
+                self._worker_faults.computed(work.numbers[0])
             else:
-                self._note_failure(number, future, tally)
+                self._note_failure(work, future, tally)
             future.release()
             if not tally.hopeless:
-                for following in itertools.islice(waiting, max(most - len(self._numbers), 0)):
-                    self._submit(following, tally)
+                self._fill(waiting, most, tally)
 
-    def _submit(
-        self, number: int, tally: Tally, workers: Sequence[str] | None = None
-    ) -> None:
-        """Give a block to the cluster: to one of ``workers``, unless they leave meanwhile."""
-        block = self._store.blocks[number]
+    def _fill(self, waiting: Waiting, most: int, tally: Tally) -> None:
+        """Submit what can be computed now, until so much is in flight."""
+        while len(self._works) < most and (work := waiting.next()) is not None:
+            self._submit(work, tally)
+
+    def _submit(self, work: Work, tally: Tally, workers: Sequence[str] | None = None) -> None:
+        """Give blocks to the cluster: to one of ``workers``, unless they leave meanwhile."""
+        blocks = [self._store.blocks[number] for number in work.numbers]
+        beside = self._sources, self._time_limit_s, tally.quota(), self._store.durable
+        one = work.decision is None
         future = self._client.submit(
-            compute_block, self._url, self._store.run_id, block, self._sources,
-            self._time_limit_s, tally.quota(), self._store.durable, pure=False,
-            key=f"block-{block}-{uuid.uuid4().hex[:8]}",
+            compute_block if one else compute_blocks, self._url, self._store.run_id,
+            *([blocks[0]] if one else [blocks, work.decision]), *beside, pure=False,
+            key=f"block-{blocks[0]}-{uuid.uuid4().hex[:8]}",
             workers=workers, allow_other_workers=workers is not None,
         )
-        self._numbers[future] = number
+        self._works[future] = work
         future.add_done_callback(self._finished.put)
 
-    def _note_failure(self, number: int, future: Future[Any], tally: Tally) -> None:
-        """Submit a block again that may still be computed; else note why it failed."""
+    def _note_failure(self, work: Work, future: Future[Any], tally: Tally) -> None:
+        """Submit blocks again that may still be computed; else note why they failed."""
+        number = work.numbers[0]
         # "lost": the worker died after it committed the block, and its receipt died with it.
         lost = future.status == "lost" and self._client.status == "running"
         if not lost and future.status in ("cancelled", "lost"):
@@ -181,7 +190,7 @@ class BlocksInFlight:
             # A block that ends its process is computed in isolation when it is begun again, but
             # it may have been queued behind one, or its workers were killed from outside.
             self._deaths[number] += 1
-            self._submit(number, tally)
+            self._submit(work, tally)
             return
         block = self._store.blocks[number]
         fault = None if error is None else machine_fault(error)
@@ -194,13 +203,13 @@ class BlocksInFlight:
             return
         others = self._worker_faults.others(number, str(future.key), fault)
         if others:
-            self._submit(number, tally, others)
+            self._submit(work, tally, others)
         else:
             tally.add_failed(f"block {block}: {fault}", machine_fault=True)
 
     def _cancel(self) -> None:
         """Take back what is still in flight; a caller's cluster outlives the run."""
-        if self._numbers and self._client.status == "running":
+        if self._works and self._client.status == "running":
             with contextlib.suppress(OSError, TimeoutError):
-                self._client.cancel(list(self._numbers))
-        self._numbers.clear()
+                self._client.cancel(list(self._works))
+        self._works.clear()

@@ -92,6 +92,9 @@ BLOCK_S = 2.0
 
 MIN_BLOCK_S = 0.1
 
+WAVE_BLOCK_S = 0.5
+"""Least work in a block of a run in waves, if all its scenes are needed: soon few of them are."""
+
 BLOCKS_PER_S = 75
 """Blocks that all workers together finish in a second: a scheduler does about 180 of them, so that
 larger clusters get larger blocks."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import itertools
 import math
 import os
 import time
@@ -42,6 +41,7 @@ from sweep.execution.reuse import is_reusable, match
 from sweep.execution.small_run import BlocksInChild
 from sweep.execution.summary import Summary, summary_of, summary_of_complete
 from sweep.execution.tally import Tally
+from sweep.execution.waiting import AnyOrder, InWaves, Waiting
 from sweep.execution.work_left import block_s_of, demand_left, demand_of, thread_count_of, work_s
 from sweep.isolation.child_process import Child
 from sweep.isolation.interrupts import Interrupts
@@ -49,6 +49,7 @@ from sweep.isolation.plugin_check import check_plugins
 from sweep.messages import notice
 from sweep.plan.experiment import Pipeline
 from sweep.plan.notes import notes
+from sweep.sampling.rules import make_rule
 from sweep.store.blocks import committed, drop_block
 from sweep.store.lifecycle import create_store, open_store, read_run_metadata, remove_store
 from sweep.store.locations import check_writable, checked_url, exists, is_remote, open_storage
@@ -231,7 +232,7 @@ def recompute(
             connection = stack.enter_context(connected(store.pipeline, workers=workers))
         with _continuable_errors():
             _compute(
-                store, iter(chosen), Tally(store), child, connection, (),
+                store, _waiting(store, chosen), Tally(store), child, connection, (),
                 block_time_limit_s(time_limit_s, each_s), interrupts,
             )
 
@@ -310,10 +311,12 @@ def _compute_and_close(
             thread.submit(importlib.import_module, module)
         done = _committed_whole(store)
         tally = Tally(store, progress)
+        left = (number for number in range(len(store.blocks)) if number not in done)
+        waiting: Waiting = AnyOrder(lock.checked(left))
+        if (sampling := make_rule(store.pipeline)) is not None and store.pipeline.stopping:
+            waiting = InWaves(store, store.pipeline.stopping, sampling, check=lock.check)
+            done = waiting.current
         tally.begin(done)
-        waiting = lock.checked(
-            number for number in range(len(store.blocks)) if number not in done
-        )
         _compute(store, waiting, tally, child, client, sources, time_limit_s, interrupts)
         lock.check(now=True)
         close(store)
@@ -334,8 +337,16 @@ def _committed_whole(store: RunStore) -> set[int]:
     return done - missing.keys()
 
 
+def _waiting(store: RunStore, numbers: Sequence[int]) -> Waiting:
+    """Return chosen blocks of a store in the order in which they can be computed."""
+    sampling = make_rule(store.pipeline)
+    if sampling is None or store.pipeline.stopping is None:
+        return AnyOrder(numbers)
+    return InWaves(store, store.pipeline.stopping, sampling, only=set(numbers))
+
+
 def _compute(
-    store: RunStore, waiting: Iterator[int], tally: Tally, child: Child, client: Client | None,
+    store: RunStore, waiting: Waiting, tally: Tally, child: Child, client: Client | None,
     sources: Sequence[str], time_limit_s: float, interrupts: Interrupts,
 ) -> None:
     """Compute blocks on a cluster; without one in the child, as long as that is quick."""
@@ -345,12 +356,12 @@ def _compute(
             BlocksInChild(
                 store, child, url, sources, time_limit_s, interrupts=interrupts
             ).compute(waiting, tally)
-            following = next(waiting, None)
+            following = waiting.next()
             if following is None:
                 return
+            waiting.put_back(following)
             from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
 
-            waiting = itertools.chain([following], waiting)
             client = stack.enter_context(connected(store.pipeline))
         from sweep.execution.in_flight import BlocksInFlight  # noqa: PLC0415  (slow to import)
 

@@ -8,14 +8,15 @@ isolation when it is begun again, and a block is committed by its receipt.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 from sweep.errors import MachineFaultError, StoreReplacedError, SweepError
 from sweep.evaluation.machine_faults import machine_faults_raised
-from sweep.execution.block_task import compute_block
+from sweep.execution.block_task import compute_block, compute_blocks
 from sweep.execution.limits import MAX_DEATHS, SMALL_RUN_LIMIT_S, TIME_LIMIT_S
 from sweep.execution.tally import Tally
+from sweep.execution.waiting import Waiting, Work, in_any_order
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
 from sweep.isolation.interrupts import Interrupts
 from sweep.isolation.machine_memory import explained, memory_kills
@@ -53,10 +54,10 @@ class BlocksInChild:
         self._time_limit_s = time_limit_s
         self._interrupts = interrupts
 
-    def compute(self, waiting: Iterator[int], tally: Tally) -> None:
-        """Compute blocks by their numbers for at most :data:`SMALL_RUN_LIMIT_S` seconds.
+    def compute(self, waiting: Iterable[int] | Waiting, tally: Tally) -> None:
+        """Compute the blocks that wait for at most :data:`SMALL_RUN_LIMIT_S` seconds.
 
-        ``waiting`` keeps the numbers of those that were not begun.
+        ``waiting`` keeps those that were not begun; numbers are in any order.
 
         Raises
         ------
@@ -65,11 +66,12 @@ class BlocksInChild:
         StoreReplacedError
             If the store was moved, deleted or replaced.
         """
+        waiting = in_any_order(waiting)
         deadline = time.monotonic() + SMALL_RUN_LIMIT_S
         with machine_faults_raised(), ThreadPoolExecutor(1) as thread:
             try:
-                for number in waiting:
-                    self._compute_block(thread, number, tally)
+                while (work := waiting.next()) is not None:
+                    self._compute_work(thread, work, waiting, tally)
                     if tally.hopeless or time.monotonic() > deadline:
                         break
             except BaseException:
@@ -77,18 +79,22 @@ class BlocksInChild:
                 raise
         tally.check()
 
-    def _compute_block(self, thread: ThreadPoolExecutor, number: int, tally: Tally) -> None:
-        block = self._store.blocks[number]
+    def _compute_work(
+        self, thread: ThreadPoolExecutor, work: Work, waiting: Waiting, tally: Tally
+    ) -> None:
+        blocks = [self._store.blocks[number] for number in work.numbers]
+        block, task = blocks[0], compute_block if work.decision is None else compute_blocks
+        what = (block,) if work.decision is None else (blocks, work.decision)
         faults, kills = 0, memory_kills()
         for _ in range(1 + MAX_DEATHS):
             call = thread.submit(
-                self._child.call, compute_block, self._url, self._store.run_id, block,
-                self._sources, self._time_limit_s, tally.quota(), self._store.durable,
+                self._child.call, task, self._url, self._store.run_id, *what, self._sources,
+                self._time_limit_s, tally.quota(), self._store.durable,
                 # The block keeps its own time limit; this one is for what surrounds it.
                 limit_s=2 * self._time_limit_s,
             )
             try:
-                receipt: Receipt = self._interrupts.await_result(call)
+                done: Receipt | list[Receipt] = self._interrupts.await_result(call)
             except StoreReplacedError:
                 raise
             except ChildDiedError as error:
@@ -107,7 +113,10 @@ class BlocksInChild:
             except SweepError as error:
                 fault, reason = False, f"{type(error).__name__}: {error}"
             else:
-                tally.add(receipt)
+                found = [done] if isinstance(done, Receipt) else done
+                for number, receipt in zip(work.numbers, found, strict=True):
+                    tally.add(receipt)
+                    waiting.committed(number, receipt)
                 return
             break
         tally.add_failed(f"block {block}: {reason}", machine_fault=fault)

@@ -84,6 +84,7 @@ class DetectionStatus(Flag):
     not_modelled = flag(6, "The lens model folds at the marker.", counted=False)
     failed = flag(7, "An exception was raised.")
     crashed = flag(8, "The process died.")
+    not_needed = flag(9, "The precision that was asked for did not need the trial.", counted=False)
 
 
 class EstimateStatus(Flag):
@@ -103,6 +104,7 @@ class EstimateStatus(Flag):
         7, "The estimator's model does not explain the pixels; the pose is stored all the same.",
         present=True,
     )
+    not_needed = flag(8, "The precision that was asked for did not need the trial.", counted=False)
 
 
 class BoundStatus(Flag):
@@ -119,6 +121,7 @@ class BoundStatus(Flag):
     )
     not_in_model = flag(5, "An active effect is not part of the bound's model of the image.")
     not_visible = flag(6, "The marker is not visible, or not modelled.", counted=False)
+    not_needed = flag(7, "The precision that was asked for did not need the trial.", counted=False)
 
 
 class Flipped(Flag):
@@ -128,6 +131,7 @@ class Flipped(Flag):
     not_flipped = flag(1, "The solution is nearer to the truth.", present=True)
     flipped = flag(2, "The solution is nearer to the mirror of the truth.", present=True)
     no_estimate = flag(3, "There is no solution.", counted=False)
+    not_needed = flag(4, "The precision that was asked for did not need the trial.", counted=False)
 
 
 def present_values(flags: Iterable[Flag]) -> list[int]:
@@ -147,7 +151,7 @@ def uncounted_values(flags: Iterable[Flag]) -> list[int]:
     Examples
     --------
     >>> uncounted_values(DetectionStatus)
-    [0, 5, 6]
+    [0, 5, 6, 9]
     """
     return [int(member) for member in flags if not member.counted]
 
@@ -161,7 +165,7 @@ def outcomes(counted: bool) -> tuple[str, ...]:
     Examples
     --------
     >>> outcomes(counted=False)
-    ('not_visible', 'not_modelled', 'not_run')
+    ('not_visible', 'not_modelled', 'not_run', 'not_needed')
     """
     detection, estimation = (
         [member.name for member in flags if member.ends and member.counted == counted]

@@ -22,6 +22,7 @@ from sweep.plan.plugins import EFFECTS_KEY, NAMED_BY, parameters_with, read_plug
 from sweep.plan.reader import read_keys
 from sweep.plan.required import read_required
 from sweep.plan.rules import check_rules
+from sweep.plan.stopping import SECTIONS, StoppingRule, read_stopping
 from sweep.plan.toml_text import MAX_BYTES, document_text, read_document
 from sweep.plugins.declared import DeclaredPlugin
 
@@ -60,6 +61,8 @@ class Pipeline:
     requirements, require_per
         What is required of the results, as texts, and the axes whose values are conditions: the
         section [require]. No part of an experiment's identity.
+    stopping
+        When sampling stops, as a section such as [precision] says; None if every trial is computed.
 
     Examples
     --------
@@ -85,6 +88,7 @@ class Pipeline:
     plugins: tuple[DeclaredPlugin, ...] = ()
     requirements: tuple[str, ...] = ()
     require_per: tuple[str, ...] = ()
+    stopping: StoppingRule | None = None
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
@@ -333,7 +337,8 @@ def _checked(
     plugins: Sequence[DeclaredPlugin] | None,
 ) -> Pipeline:
     """Return the pipeline of a document; PipelineError with all its faults."""
-    reading = read_keys(document, source, folder, files, camera_files, plugins)
+    reading = read_keys(document, source, folder, files, camera_files, plugins, SECTIONS)
+    read_stopping(reading)
     read_camera_file(reading)
     resolve_sensor(reading)
     check_rules(reading)
@@ -349,4 +354,5 @@ def _checked(
         axes=tuple(reading.axes.values()), text=text, files=reading.files,
         folder=str(folder.resolve()), plugins=reading.plugins,
         requirements=reading.requirements, require_per=reading.require_per,
+        stopping=reading.stopping,
     )

@@ -15,6 +15,7 @@ from sweep.plan.camera_files import FILE_DEVIATIONS, FILE_VALUES, OTHER_WAYS
 from sweep.plan.parameters import PARAMETERS, Parameter
 from sweep.plan.reader import HEADER, REQUIRE, is_zip, section_of
 from sweep.plan.required import KEYS
+from sweep.plan.stopping import MAX_TRIALS, SECTIONS
 from sweep.plan.toml_text import python_boolean, quoted_if_bare, read_value
 
 _PX = ("fx_px", "fy_px")
@@ -72,8 +73,8 @@ def parse_settings(
             faults.append(f"{start}expected a TOML value, such as [0, 45] or 'text'")
             continue
         home = section_of(name, parameters)
-        if section == REQUIRE and name in KEYS:
-            chosen[f"{REQUIRE}.{name}"] = value
+        if (section == REQUIRE and name in KEYS) or section in SECTIONS:
+            chosen[f"{section}.{name}"] = value
         elif not home and name not in HEADER and not is_zip(value):
             known = [*parameters, TRIAL, *HEADER]
             hint = nearest(name, known) if len(faults) < MAX_FAULTS else ""
@@ -117,18 +118,27 @@ def apply_settings(
     """
     _leave_camera_file(document, chosen)
     _delete(document, displaced_by(chosen))
+    _delete(document, _other_counts(chosen))
     for name, value in chosen.items():
         if name in HEADER:
             document[name] = value
-        elif name.startswith(f"{REQUIRE}."):
-            if isinstance(document.setdefault(REQUIRE, {}), dict):
-                document[REQUIRE][name.partition(".")[2]] = value
+        elif "." in name:  # a key of a section that has no parameters
+            section, _, key = name.partition(".")
+            if isinstance(document.setdefault(section, {}), dict):
+                document[section][key] = value
         elif all(
             isinstance(document.get(table, {}), dict)
             for table in (section_of(name, parameters), "axes")
         ):
             _write(document, name, value, parameters)
         # Otherwise a section is no table, which reading the document reports.
+
+
+def _other_counts(chosen: Collection[str]) -> set[str]:
+    """Return the keys that say how many trials there are in another way than chosen ones."""
+    if any(name.endswith(f".{MAX_TRIALS}") for name in chosen):
+        return {TRIAL}
+    return {MAX_TRIALS} if TRIAL in chosen else set()
 
 
 def _leave_camera_file(document: Any, chosen: Collection[str]) -> None:
@@ -150,7 +160,8 @@ def fix_values(
     another value is chosen for one of them.
     """
     axes = document.get("axes", {})
-    document.pop(REQUIRE, None)  # one pose fulfils or fails nothing
+    for section in (REQUIRE, *SECTIONS):  # one pose fulfils or fails nothing
+        document.pop(section, None)
     _leave_camera_file(document, chosen)
     _delete(document, {
         TRIAL, *displaced_by(chosen), *(name for name, value in axes.items() if is_zip(value)),

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sweep.messages import MAX_FAULTS, nearest, plain, shown
 from sweep.plan.axes import (
@@ -28,6 +28,9 @@ from sweep.plan.plugins import (
     section_of_settings,
 )
 from sweep.plugins.declared import DeclaredPlugin
+
+if TYPE_CHECKING:
+    from sweep.plan.stopping import StoppingRule
 
 MAX_TITLE_LENGTH = 200
 
@@ -60,7 +63,7 @@ class Reading:
         As :class:`sweep.plan.experiment.Pipeline` has them; ``axes`` by name.
     given
         Names of the parameters that the document has, even with a value that cannot be.
-    requirements, require_per
+    requirements, require_per, stopping
         As :class:`sweep.plan.experiment.Pipeline` has them.
     plugins, parameters
         The plug-ins that the document names, and every parameter by its name, theirs included.
@@ -89,6 +92,7 @@ class Reading:
     given: set[str] = field(default_factory=set)
     requirements: tuple[str, ...] = ()
     require_per: tuple[str, ...] = ()
+    stopping: StoppingRule | None = None
     stated: dict[str, Any] = field(default_factory=dict)
     plugins: tuple[DeclaredPlugin, ...] = ()
     parameters: Mapping[str, Parameter] = field(default_factory=lambda: PARAMETERS)
@@ -140,15 +144,18 @@ class Reading:
 def read_keys(
     document: Mapping[str, Any], source: str, folder: Path,
     known_files: Mapping[str, str] | None = None, known_cameras: Mapping[str, str] | None = None,
-    known_plugins: Sequence[DeclaredPlugin] | None = None,
+    known_plugins: Sequence[DeclaredPlugin] | None = None, others: Collection[str] = (),
 ) -> Reading:
-    """Return what the keys of a document say, each checked on its own (as :class:`Reading`)."""
+    """Return what the keys of a document say, each checked on its own (as :class:`Reading`).
+
+    ``others`` are the names of sections that are read elsewhere.
+    """
     reading = Reading(document, source, folder, known_files, known_cameras, known_plugins)
     _read_header(reading)
     _read_plugins(reading)
-    known = [*HEADER, *SECTIONS, "axes", REQUIRE]
+    known = [*HEADER, *SECTIONS, "axes", REQUIRE, *others]
     for key, value in document.items():
-        if key in HEADER or key == REQUIRE:
+        if key in HEADER or key == REQUIRE or key in others:
             continue
         if key == "axes" or key in SECTIONS:
             if not isinstance(value, dict):

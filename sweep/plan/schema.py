@@ -165,6 +165,13 @@ class Variable:
         return 0 if self.flags is not None else float("nan")
 
     @property
+    def not_needed(self) -> float | int:
+        """The value of cells that were not needed: NaN, or the flag ``not_needed``."""
+        if self.flags is None:
+            return self.fill
+        return int(getattr(self.flags, "not_needed", self.fill))
+
+    @property
     def inner_shape(self) -> tuple[int, ...]:
         """Lengths of the inner dimensions."""
         return tuple(len(LABELS[name]) for name in self.inner)

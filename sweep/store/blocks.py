@@ -89,14 +89,20 @@ def withdraw_block(store: RunStore, block: Block) -> None:
 
 def write_block(
     store: RunStore, block: Block, values: Mapping[str, NDArray[Any]], receipt: Receipt
-) -> None:
-    """Write a block's values, then commit them by its receipt, to which the digests are added."""
+) -> Receipt:
+    """Write a block's values, then commit them by its receipt; return it with the digests.
+
+    A block that is committed on the same basis stays as it is; on another one, it is replaced.
+    """
     number = store.blocks.number(block)
     with translate_errors(store.url, "written"):
         check_not_replaced(store)
         if sync(store.storage.exists(receipt_key(number))):
-            withdraw_block(store, block)
-            return  # another worker was given it too, perhaps of another processor
+            if receipt.basis is None or committed_basis(store, number) == receipt.basis:
+                withdraw_block(store, block)
+                # Another worker was given it too, perhaps of another processor.
+                return receipt_of(store, block) or receipt
+            sync(store.storage.delete(receipt_key(number)))
         for variable in in_writing_order(store.variables):
             array = store.array(variable.name)
             array[region(variable, store.pipeline, block)] = values[variable.name]
@@ -105,13 +111,43 @@ def write_block(
         digests = {name: _take_digest(store, key) for name, key in keys.items()}
         if isinstance(store.storage.below, DurableStore):
             store.storage.below.flush(keys.values())
-        text = dataclasses.replace(
-            receipt, digests=digests, block=number
-        ).to_json(store.format)
-        store.array(RECEIPTS)[number : number + 1] = np.array([text], dtype=object)
-        store.storage.digests.pop(receipt_key(number), None)
-        with contextlib.suppress(FileNotFoundError):
-            sync(store.storage.delete(f"{BEGUN}/{number}"))
+        receipt = dataclasses.replace(receipt, digests=digests, block=number)
+        _commit(store, receipt)
+    return receipt
+
+
+def _commit(store: RunStore, receipt: Receipt) -> None:
+    """Write a receipt, in the place of another if there is one."""
+    number = receipt.block
+    if number is None:
+        raise AssertionError(receipt)
+    text = receipt.to_json(store.format)
+    store.array(RECEIPTS)[number : number + 1] = np.array([text], dtype=object)
+    store.storage.digests.pop(receipt_key(number), None)
+    with contextlib.suppress(FileNotFoundError):
+        sync(store.storage.delete(f"{BEGUN}/{number}"))
+
+
+def recommit_block(store: RunStore, receipt: Receipt) -> None:
+    """Replace a block's receipt; its values stay as they are."""
+    with translate_errors(store.url, "written"):
+        check_not_replaced(store)
+        _commit(store, receipt)
+
+
+def receipt_of(store: RunStore, block: Block) -> Receipt | None:
+    """Return a block's receipt; None if it is not committed, or its receipt is damaged."""
+    number = store.blocks.number(block)
+    try:
+        return parsed_receipt(store, number, receipt_texts(store, [number])[0])
+    except (ValueError, AttributeError, KeyError, TypeError, OSError):
+        return None
+
+
+def committed_basis(store: RunStore, number: int) -> int | None:
+    """Return the basis of a committed block."""
+    receipt = receipt_of(store, store.blocks[number])
+    return None if receipt is None else receipt.basis
 
 
 def in_writing_order(variables: Iterable[Variable]) -> list[Variable]:

@@ -22,6 +22,7 @@ from sweep.measure.foreign_detector import provenance
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
 from sweep.plan.draws import SAMPLINGS
 from sweep.plan.experiment import Pipeline
+from sweep.plan.stopping import not_continued
 from sweep.version import __version__
 
 NUMBERS_VERSION = 4
@@ -234,6 +235,8 @@ def differences(ours: Pipeline, theirs: Pipeline, stored: dict[str, Any]) -> lis
             and name != "camera_file"
             and their_values.get(name) != our_values.get(name)
         ]
+    if problem := not_continued(ours.stopping, theirs.stopping):
+        lines.append(problem)
     if any(line.startswith("sensor_") for line in lines):
         lines.append("pixels are square unless both sides of the sensor are given")
     return lines

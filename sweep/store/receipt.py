@@ -104,6 +104,9 @@ class Receipt:
         Variable -> CRC-32 of its chunk.
     block
         The block's number; None in stores of formats before 4.
+    basis
+        A digest of what the block's needed scenes follow from: the rule by which sampling stops,
+        and the results of earlier waves; None where all scenes are needed.
     """
 
     run_id: str
@@ -118,6 +121,7 @@ class Receipt:
     written: float
     digests: Mapping[str, int] = field(default_factory=dict)
     block: int | None = None
+    basis: int | None = None
 
     def to_json(self, store_format: int) -> str:
         """Return the text that a store of a format holds."""
@@ -128,6 +132,8 @@ class Receipt:
             ]
         if store_format < NAMING_FORMAT:
             del content["block"]
+        if self.basis is None:
+            del content["basis"]
         return json.dumps(content, separators=(",", ":"))
 
     @classmethod
@@ -156,6 +162,7 @@ class Receipt:
             and _is_number(content["written"])
             and _is_number(content.get("wall_s", 0.0))
             and (content.get("block") is None or _is_count(content["block"]))
+            and (content.get("basis") is None or _is_count(content["basis"]))
         )
         if not valid:
             raise ValueError("a value of a wrong type")
@@ -172,6 +179,7 @@ class Receipt:
             written=content["written"],
             digests=_digests(content["digests"]),
             block=content.get("block"),
+            basis=content.get("basis"),
         )
 
     def check(self, scenes: int, settings: int, estimates: int) -> None:

@@ -1,0 +1,1 @@
+"""Which trials are needed: trials come in waves, and each wave is decided by those before."""

@@ -1,0 +1,99 @@
+"""Waves: where they end, which blocks they have, and that results do not depend on the blocks."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from support.stores import same
+from sweep.errors import PipelineError
+from sweep.execution.block_task import compute_block
+from sweep.execution.waiting import InWaves
+from sweep.measure.flags import DetectionStatus
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import Blocks
+from sweep.sampling.rules import make_rule
+from sweep.sampling.stopping import block_unit, wave_ends
+from sweep.sampling.waves import Waves
+from sweep.store.lifecycle import create_store, open_dataset
+
+TEXT = """
+seed = 3
+camera = { width_px = 64, height_px = 48 }
+pose = { jitter_px = 0.5 }
+scene = { renderer = "warp" }
+axes = { tilt_deg = [0, 60], side_px = [8, 13, 30] }
+precision = { detection_rate = 0.1, max_trials = 100, per = ["side_px"] }
+"""
+
+
+@pytest.fixture(scope="module")
+def pipeline():
+    return Pipeline.from_text(TEXT, name="waves")
+
+
+@pytest.mark.parametrize("unit", [1, 7, 50])
+@pytest.mark.parametrize("most", [1, 49, 50, 51, 2400, 100_000])
+def test_waves_end_at_multiples_of_their_unit_and_grow_by_a_quarter(most, unit):
+    ends = wave_ends(most, unit)
+    assert ends[-1] == most
+    assert ends == tuple(sorted(set(ends)))
+    assert all(end % unit == 0 for end in ends[:-1])
+    steps = np.diff((0, *ends[:-1]))
+    assert all(step <= max(unit, end / 4 + unit) for end, step in zip((0, *ends), steps,
+                                                                      strict=False))
+    assert len(ends) <= 12 + 4 * math.log(most / unit) if most > unit else len(ends) == 1
+    assert all(end % block_unit(ends) == 0 for end in ends[:-1])
+
+
+@pytest.mark.parametrize("extents", [(1, 1, 25), (2, 1, 5), (1, 2, 25), (2, 3, 1)])
+def test_each_block_is_in_one_wave_of_one_group(extents, pipeline):
+    rule = make_rule(pipeline)
+    blocks = Blocks((2, 3, 100), extents)
+    waves = Waves.of(pipeline, rule, blocks)
+    found = [
+        (number, group, wave)
+        for group, wave in itertools.product(range(waves.groups), range(len(rule.ends)))
+        for number in waves.numbers(group, wave)
+    ]
+    assert sorted(number for number, _, _ in found) == list(range(len(blocks)))
+    for number, group, wave in found:
+        block = blocks[number]
+        assert (waves.group(number), waves.wave(number)) == (group, wave)
+        assert (0, *rule.ends)[wave] <= block.starts[2] < block.stops[2] <= rule.ends[wave]
+        assert group == block.starts[1] // extents[1]  # tilt_deg is pooled
+
+
+def in_waves(url, pipeline, extents):
+    """Compute a store in this process, in the order of its waves."""
+    store = create_store(url, pipeline, extents)
+    waiting = InWaves(store, pipeline.stopping, make_rule(pipeline))
+    while (work := waiting.next()) is not None:
+        for number in work.numbers:
+            waiting.committed(number, compute_block(
+                url, store.run_id, store.blocks[number], decision=work.decision))
+    return store
+
+
+def test_needed_trials_are_those_of_the_rule_whatever_the_blocks(pipeline, tmp_path):
+    url, other = str(tmp_path / "a.zarr"), str(tmp_path / "b.zarr")
+    in_waves(url, pipeline, (2, 3, 25))
+    flags = open_dataset(url).detection.to_numpy()
+    assert (flags != DetectionStatus.not_run).all()
+    unneeded = flags == DetectionStatus.not_needed
+    counts = 100 - unneeded.sum(axis=2)
+    assert (counts[0] == counts[1]).all()  # the tilts are pooled
+    assert (np.sort(unneeded, axis=2) == unneeded).all()  # nothing is needed again
+    assert set(counts[0]) <= {25, 50, 75, 100}
+    assert len(set(counts[0])) > 1
+    in_waves(other, pipeline, (1, 2, 25))
+    assert same(url, other)
+
+
+@pytest.mark.parametrize(("change", "expected"), [
+    ("precision.detection_rte=0.1", "no quantity; did you mean detection_rate?"),
+])
+def test_unknown_quantity_is_refused_by_the_rule(change, expected):
+    with pytest.raises(PipelineError, match=expected.replace("?", r"\?")):
+        make_rule(Pipeline.from_text(TEXT, [change]))

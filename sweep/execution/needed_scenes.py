@@ -14,6 +14,7 @@ from sweep.measure.flags import DetectionStatus
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
 from sweep.plan.schema import Variable
+from sweep.sampling.deciding import by_scene
 from sweep.store.blocks import region
 from sweep.store.run_store import RunStore
 from sweep.typing import Masks
@@ -48,7 +49,7 @@ def own_cells(store: RunStore, block: Block) -> OwnCells:
         for variable in store.variables
     }
     flags = {
-        variable.name: _by_scene(variable, pipeline, block, values[variable.name])
+        variable.name: by_scene(variable, pipeline, block, values[variable.name])
         for variable in store.variables if variable.name in LOST
     }
     needed = (flags["detection"] != DetectionStatus.not_needed).all(axis=1)
@@ -74,14 +75,3 @@ def with_scenes(
         other = variable.not_needed if others is None else others[variable.name]
         taken[variable.name] = np.where(mask, other, values[variable.name]).astype(variable.dtype)
     return taken
-
-
-def _by_scene(
-    variable: Variable, pipeline: Pipeline, block: Block, values: NDArray[Any]
-) -> NDArray[Any]:
-    """Return a block's values of a variable in the dimensions (N, configurations)."""
-    names = variable.dimensions(pipeline)
-    scene = [axis.name for axis in scene_axes(pipeline)]
-    order = [*(names.index(name) for name in scene),
-             *(k for k, name in enumerate(names) if name not in scene)]
-    return values.transpose(order).reshape(len(block), -1)

@@ -259,7 +259,8 @@ def _read_from(
     )
     # A cell is finished if its block is committed and its flags say that it was run. What failed is
     # computed, so that the new store has the reasons of all its failures.
-    fresh = ready & (_along(order, pipeline, "estimate", old) != 0)
+    run = _along(order, pipeline, "estimate", old)
+    fresh = ready & ~np.isin(run, (EstimateStatus.not_run, EstimateStatus.not_needed))
     for name, flags in LOST.items():
         fresh &= ~np.isin(_along(order, pipeline, name, old), flags)
     fresh &= ~available[np.ix_(*(positions[name] for name in order))]

@@ -12,7 +12,6 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from sweep.measure.flags import DetectionStatus
 from sweep.plan.stopping import StoppingRule, digest_of
 from sweep.sampling.deciding import Decision
 from sweep.sampling.stopping import Stopping
@@ -94,6 +93,8 @@ class _Group:
         For each wave from 1 to ``wave`` what it follows from.
     settled
         Whether nothing was needed in the wave before.
+    share
+        Of the scenes of the wave before, those that were needed.
     pending
         Blocks of the wave (if it is settled, of all that is left) that are not committed yet.
     """
@@ -101,6 +102,7 @@ class _Group:
     wave: int = 0
     bases: tuple[int, ...] = ()
     settled: bool = False
+    share: float = 1.0
     pending: set[int] = field(default_factory=set)
 
 
@@ -130,7 +132,6 @@ class InWaves:
         self._waves = Waves.of(store.pipeline, sampling, store.blocks)
         self._names = sorted({"detection", *sampling.variables})
         self._first = zlib.crc32(digest_of(rule).encode())
-        self._settings = store.configurations[0]
         self._only, self._check = only, check
         self._known: dict[int, _Known] = {}
         self._ready: deque[Work] = deque()
@@ -180,12 +181,11 @@ class InWaves:
             self._advance(group)
 
     def _note(self, number: int, receipt: Receipt) -> None:
-        skipped = sum(receipt.detection[DetectionStatus.not_needed :][:1])
         content = zlib.crc32(json.dumps(
-            [number, *(receipt.digests[name] for name in self._names)]
+            [number, *(receipt.digests.get(name, 0) for name in self._names)]
         ).encode())
         self._known[number] = _Known(
-            receipt.basis, content, receipt.scenes - skipped // self._settings, receipt.scenes
+            receipt.basis, content, receipt.scenes_needed, receipt.scenes
         )
 
     def _advance(self, group: int) -> None:
@@ -220,6 +220,7 @@ class InWaves:
                                *(each.content for each in found)])
             state.bases = (*state.bases, zlib.crc32(text.encode()))
             state.settled = state.wave > 0 and needed == 0
+            state.share = needed / scenes
             state.wave += 1
 
     def _count_settled(self, group: int, settled: int, scenes: int) -> None:
@@ -238,6 +239,9 @@ class InWaves:
             yield from (Work((number,)) for number in numbers)
             return
         decision = Decision(self._rule, state.wave, state.bases, state.settled)
-        size = SETTLED_AT_ONCE if state.settled else 1
+        size = SETTLED_AT_ONCE
+        if not state.settled:
+            # As much work as in a block of which all is needed, if few scenes are.
+            size = min(max(int(1 / max(state.share, 1e-9)), 1), SETTLED_AT_ONCE)
         for at in range(0, len(numbers), size):
             yield Work(tuple(numbers[at : at + size]), decision)

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from sweep.integrity.consistency import contradiction
 from sweep.integrity.damage import BlockDamage, Damage, FileDamage
-from sweep.plan.grid import Block
+from sweep.plan.grid import Block, scene_axes
 from sweep.plan.schema import Variable
-from sweep.store.blocks import parsed_receipt, receipt_key, region
+from sweep.store.blocks import names_written, parsed_receipt, receipt_key, region
 from sweep.store.checksums import digest
 from sweep.store.layout import RECEIPTS, decoded_chunk
 from sweep.store.receipt import Receipt
@@ -81,8 +81,15 @@ class BlockCheck:
             if receipt is None:
                 faults[key] = CHANGED
         values: dict[str, NDArray[Any]] = {}
+        written = store.variable_names if receipt is None else names_written(store, receipt)
         for variable in store.variables:
             content = contents[chunks[variable.name]]
+            if variable.name not in written:
+                faults.pop(chunks[variable.name], None)
+                if content is not None:
+                    faults[chunks[variable.name]] = "numbers of a block of which none was needed"
+                values[variable.name] = self._fill(variable, block)
+                continue
             if content is None:
                 continue
             decoded = self._values(content, variable, block, receipt)
@@ -99,6 +106,16 @@ class BlockCheck:
             number, sum(len(content) for content in contents.values() if content is not None),
             receipt, damage,
         )
+
+    def _fill(self, variable: Variable, block: Block) -> NDArray[Any]:
+        """Return what a block holds of a variable of which it has no chunk."""
+        pipeline = self._store.pipeline
+        along = dict(zip((axis.name for axis in scene_axes(pipeline)), block.shape, strict=True))
+        shape = [
+            along.get(name, length) for name, length in zip(
+                variable.dimensions(pipeline), variable.shape(pipeline), strict=True)
+        ]
+        return np.full(shape, variable.fill, dtype=variable.dtype)
 
     def _receipt(self, number: int, content: bytes | None) -> Receipt | None:
         """Return a block's receipt from its chunk; None if it is damaged."""

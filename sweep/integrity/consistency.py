@@ -22,6 +22,7 @@ from sweep.measure.flags import (
 from sweep.plan.experiment import Pipeline
 from sweep.plan.schema import LOST, UNSEEN, VARIABLES, Variable
 from sweep.store.receipt import Receipt
+from sweep.typing import Masks
 
 Values = Mapping[str, NDArray[Any]]
 
@@ -50,6 +51,9 @@ def contradiction(
     for name, counts in (("detection", receipt.detection), ("estimate", receipt.estimate)):
         if np.bincount(values[name].ravel()).tolist() != list(counts):
             return f"{name}: flags other than its receipt counts"
+    unneeded = values["detection"] == DetectionStatus.not_needed
+    if unneeded.any() and (fault := _not_needed_fault(pipeline, variables, values, unneeded)):
+        return fault
     for variable in variables:
         if fault := _number_fault(pipeline, variable, values):
             return f"{variable.name}: {fault}"
@@ -81,13 +85,30 @@ def _number_fault(pipeline: Pipeline, variable: Variable, values: Values) -> str
     return ""
 
 
+def _not_needed_fault(
+    pipeline: Pipeline, variables: Sequence[Variable], values: Values, unneeded: Masks
+) -> str:
+    """Return what contradicts that scenes were not needed: nothing of them may be there."""
+    detection = VARIABLES["detection"]
+    scenes = _any_configuration(pipeline, detection, VARIABLES["bound"], unneeded)
+    for variable in variables:
+        found = _spread(pipeline, VARIABLES["bound"], scenes, variable)
+        if variable.flags is None:
+            if (found & ~np.isnan(values[variable.name])).any():
+                return f"{variable.name}: a number of a scene that was not needed"
+        elif ((values[variable.name] == variable.not_needed) != found).any():
+            return f"{variable.name}: contradicts that scenes were not needed"
+    return ""
+
+
 def _flag_contradiction(pipeline: Pipeline, values: Values) -> str:
     """Return how the flags of different stages contradict each other."""
     detection, estimate = VARIABLES["detection"], VARIABLES["estimate"]
+    needed = values["estimate"] != EstimateStatus.not_needed
     solved = values["estimate"] == EstimateStatus.solved
     flipped_exists = np.isin(values["flipped"], present_values(Flipped))
     no_estimate = values["flipped"] == Flipped.no_estimate
-    if ((flipped_exists != solved) | (no_estimate == solved)).any():
+    if ((flipped_exists != solved) | (needed & (no_estimate == solved))).any():
         return "flipped: contradicts estimate"
     detected = _spread(
         pipeline, detection,
@@ -95,7 +116,7 @@ def _flag_contradiction(pipeline: Pipeline, values: Values) -> str:
     )
     if (np.isin(values["estimate"], present_values(EstimateStatus)) & ~detected).any():
         return "estimate: a pose although nothing was detected"
-    if ((values["estimate"] == EstimateStatus.no_detection) == detected).any():
+    if (needed & ((values["estimate"] == EstimateStatus.no_detection) == detected)).any():
         return "estimate: contradicts detection"
     if (values["detection"] == DetectionStatus.not_run).any():
         return "detection: not run"

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sweep.compilation import processor
 from sweep.errors import SweepError
@@ -20,6 +21,7 @@ from sweep.plan.cell_selection import selection_text
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
 from sweep.plan.parameters import Stage
+from sweep.sampling.deciding import scenes_needed
 from sweep.store.run_store import RunStore
 
 
@@ -65,8 +67,10 @@ class SampleCheck:
     def __init__(self, store: RunStore) -> None:
         self._store = store
 
-    def run(self, count: int, sound: Mapping[int, str]) -> SampleFindings:
-        """Recompute up to ``count`` scenes.
+    def run(
+        self, count: int, sound: Mapping[int, str], needed: Mapping[int, int] | None = None
+    ) -> SampleFindings:
+        """Recompute up to ``count`` scenes, none of them one that was not needed.
 
         Parameters
         ----------
@@ -74,6 +78,8 @@ class SampleCheck:
             Scenes that are drawn, with replacement.
         sound
             Number of each sound block -> features of the processor that computed it.
+        needed
+            Number of each -> how many of its scenes were needed; all by default.
         """
         if not count:
             return SampleFindings(reason="a sample of 0 scenes was asked for")
@@ -84,21 +90,28 @@ class SampleCheck:
         except SweepError as error:
             return SampleFindings(reason=str(error).splitlines()[-1].strip())
         # Scenes whose process died are not tried again.
-        scenes = [scene for scene in self._drawn(count, sound) if not scene.crashed]
+        sizes = needed or {number: len(self._store.blocks[number]) for number in sound}
+        scenes = [scene for scene in self._drawn(count, sizes) if not scene.crashed]
         if not scenes:
             return SampleFindings(reason="every scene that was drawn had crashed")
         return self._compare(scenes, self._recomputed(pipeline, scenes), sound)
 
-    def _drawn(self, count: int, sound: Mapping[int, str]) -> list[_Scene]:
-        """Draw scenes, each with the same probability, without repetitions."""
+    def _drawn(self, count: int, needed: Mapping[int, int]) -> list[_Scene]:
+        """Draw needed scenes, each with the same probability, without repetitions."""
         blocks = self._store.blocks
         generator = np.random.default_rng()
-        sizes = np.array([len(blocks[number]) for number in sound])
-        numbers = generator.choice(np.array(list(sound)), size=count, p=sizes / sizes.sum())
+        sizes = np.array(list(needed.values()))
+        numbers = generator.choice(np.array(list(needed)), size=count, p=sizes / sizes.sum())
         drawn = {
-            (number, int(generator.integers(len(blocks[number])))) for number in numbers.tolist()
+            (number, int(generator.choice(self._needed(number))) if needed[number] < len(
+                blocks[number]) else int(generator.integers(len(blocks[number]))))
+            for number in numbers.tolist()
         }
         return [_Scene(*each, stored_scene(self._store, *each)) for each in sorted(drawn)]
+
+    def _needed(self, number: int) -> NDArray[np.intp]:
+        """Return the numbers of a block's scenes that were needed."""
+        return np.flatnonzero(scenes_needed(self._store, self._store.blocks[number]))
 
     def _recomputed(self, pipeline: Pipeline, scenes: list[_Scene]) -> list[Values]:
         """Recompute scenes; return their values with scene axes of length 1."""

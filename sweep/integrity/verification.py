@@ -14,6 +14,7 @@ from sweep.integrity.block_check import BlockCheck
 from sweep.integrity.damage import Damage, FileDamage, as_json
 from sweep.integrity.failure_check import FailureCheck, is_doubtful
 from sweep.integrity.file_check import FileCheck
+from sweep.integrity.needed_check import NeededCheck
 from sweep.integrity.sample_check import SampleCheck
 from sweep.store.blocks import BEGUN, committed
 from sweep.store.layout import planned_arrays
@@ -176,15 +177,18 @@ class Verification:
         self._damage += files.damage
         size = files.bytes
         sound: dict[int, str] = {}
+        needed: dict[int, int] = {}
         doubtful = []
         for block in BlockCheck(store).run(numbers):
             size += block.bytes
             self._damage += block.damage
             if not block.damage and block.receipt is not None:
                 sound[block.number] = block.receipt.processor
+                needed[block.number] = block.receipt.scenes_needed
                 if is_doubtful(block.receipt):
                     doubtful.append(block.number)
-        sampled = SampleCheck(store).run(sample, sound)
+        self._damage += NeededCheck(store).run(sound)
+        sampled = SampleCheck(store).run(sample, sound, needed)
         self._damage += sampled.damage
         retried = FailureCheck(store).run(doubtful if sample else [])
         self._damage += retried.damage

@@ -89,7 +89,7 @@ class Tolerance:
     limit: float = 0.0
 
 
-LOST = (DetectionStatus.failed, DetectionStatus.crashed)
+LOST = (DetectionStatus.failed, DetectionStatus.crashed, DetectionStatus.not_needed)
 """Detections of a scene for which not even the truth may have been computed."""
 
 UNSEEN = (*LOST, DetectionStatus.not_visible)

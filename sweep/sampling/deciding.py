@@ -17,6 +17,7 @@ from sweep.plan.axes import TRIAL
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
 from sweep.plan.parameters import Stage
+from sweep.plan.schema import VARIABLES, Variable
 from sweep.plan.stopping import StoppingRule
 from sweep.sampling.rules import make_rule
 from sweep.sampling.stopping import GroupResults, Stopping
@@ -182,3 +183,22 @@ class Decider:
             *(axis.name for axis in pipeline.axes_of(Stage.estimation)), *variable.inner,
         ]
         return values.transpose([names.index(each) for each in order if each in names])
+
+
+def by_scene(
+    variable: Variable, pipeline: Pipeline, block: Block, values: NDArray[Any]
+) -> NDArray[Any]:
+    """Return a block's values of a variable in the dimensions (N, configurations)."""
+    names = variable.dimensions(pipeline)
+    scene = [axis.name for axis in scene_axes(pipeline)]
+    order = [*(names.index(name) for name in scene),
+             *(k for k, name in enumerate(names) if name not in scene)]
+    return values.transpose(order).reshape(len(block), -1)
+
+
+def scenes_needed(store: RunStore, block: Block) -> Masks:
+    """Return which of a committed block's scenes (N,) were needed, as its flags say."""
+    variable, pipeline = VARIABLES["detection"], store.pipeline
+    values = np.asarray(store.array(variable.name)[region(variable, pipeline, block)])
+    flags = by_scene(variable, pipeline, block, values)
+    return np.asarray((flags != DetectionStatus.not_needed).all(axis=1))

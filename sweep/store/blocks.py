@@ -92,7 +92,8 @@ def write_block(
 ) -> Receipt:
     """Write a block's values, then commit them by its receipt; return it with the digests.
 
-    A block that is committed on the same basis stays as it is; on another one, it is replaced.
+    A block that is committed on the same basis stays as it is; on another one, it is replaced. Of a
+    block of which nothing was needed, only the flags are written: its numbers are fill values.
     """
     number = store.blocks.number(block)
     with translate_errors(store.url, "written"):
@@ -102,12 +103,16 @@ def write_block(
                 withdraw_block(store, block)
                 # Another worker was given it too, perhaps of another processor.
                 return receipt_of(store, block) or receipt
-            sync(store.storage.delete(receipt_key(number)))
-        for variable in in_writing_order(store.variables):
+            if receipt.any_needed:
+                sync(store.storage.delete(receipt_key(number)))
+            else:
+                drop_block(store, block)
+        written = [v for v in store.variables if receipt.any_needed or v.flags is not None]
+        for variable in in_writing_order(written):
             array = store.array(variable.name)
             array[region(variable, store.pipeline, block)] = values[variable.name]
         check_not_replaced(store)
-        keys = {variable.name: chunk_key(store, variable, block) for variable in store.variables}
+        keys = {variable.name: chunk_key(store, variable, block) for variable in written}
         digests = {name: _take_digest(store, key) for name, key in keys.items()}
         if isinstance(store.storage.below, DurableStore):
             store.storage.below.flush(keys.values())
@@ -148,6 +153,11 @@ def committed_basis(store: RunStore, number: int) -> int | None:
     """Return the basis of a committed block."""
     receipt = receipt_of(store, store.blocks[number])
     return None if receipt is None else receipt.basis
+
+
+def names_written(store: RunStore, receipt: Receipt) -> frozenset[str]:
+    """Return the names of the variables of which a block has a chunk, by its receipt."""
+    return store.variable_names if receipt.any_needed else store.flag_names
 
 
 def in_writing_order(variables: Iterable[Variable]) -> list[Variable]:
@@ -256,6 +266,6 @@ def parsed_receipt(store: RunStore, number: int, text: str) -> Receipt:
         raise ValueError(f"block {number} has the receipt of block {receipt.block}")
     settings, estimators = store.configurations
     receipt.check(len(store.blocks[number]), settings, settings * estimators)
-    if receipt.digests.keys() != store.variable_names:
+    if receipt.digests.keys() != names_written(store, receipt):
         raise ValueError("digests of other variables than the store's")
     return receipt

@@ -23,7 +23,8 @@ MAX_GROUPS = 5
 MAX_REASON = 200
 
 NOT_TRIED = (
-    "not_run", "no_detection", DetectionStatus.not_visible.name, DetectionStatus.not_modelled.name
+    "not_run", "no_detection", DetectionStatus.not_visible.name, DetectionStatus.not_modelled.name,
+    DetectionStatus.not_needed.name,
 )
 """Flags of cells on which a stage was not tried."""
 
@@ -210,7 +211,10 @@ class _Counts:
 
     def most(self) -> tuple[Flag, int] | None:
         """Return the most frequent flag and its count; None if there are no cells."""
-        counted = [pair for pair in zip(self.flags, self.counts, strict=False) if pair[1]]
+        counted = [
+            (flag, count) for flag, count in zip(self.flags, self.counts, strict=False)
+            if count and flag.name != "not_needed"
+        ]
         return max(counted, key=lambda pair: pair[1]) if counted else None
 
 

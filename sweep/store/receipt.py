@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from sweep.measure.flags import DetectionStatus
 from sweep.plan.schema import schema_of
 
 POSITIONAL_FORMAT = 2
@@ -122,6 +123,17 @@ class Receipt:
     digests: Mapping[str, int] = field(default_factory=dict)
     block: int | None = None
     basis: int | None = None
+
+    @property
+    def scenes_needed(self) -> int:
+        """How many of its scenes were needed, for the precision that was asked for."""
+        unneeded = sum(self.detection[DetectionStatus.not_needed :][:1])
+        return self.scenes - unneeded * self.scenes // max(sum(self.detection), 1)
+
+    @property
+    def any_needed(self) -> bool:
+        """Whether any of its scenes was needed; if none was, it has chunks of flags alone."""
+        return self.basis is None or self.scenes_needed > 0
 
     def to_json(self, store_format: int) -> str:
         """Return the text that a store of a format holds."""

@@ -66,6 +66,11 @@ class RunStore:
         return frozenset(variable.name for variable in self.variables)
 
     @cached_property
+    def flag_names(self) -> frozenset[str]:
+        """The names of the variables that are flags."""
+        return frozenset(variable.name for variable in self.variables if variable.flags is not None)
+
+    @cached_property
     def configurations(self) -> tuple[int, int]:
         """How many detector settings there are, and how many estimators for each."""
         return self.pipeline.size(Stage.detection), self.pipeline.size(Stage.estimation)

@@ -5,7 +5,7 @@ A writer may be at any block meanwhile, or may have been killed in the midst of 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from operator import floordiv
 from pathlib import Path
 from typing import Self
@@ -16,7 +16,7 @@ from zarr.abc.store import ByteRequest, Store
 from zarr.storage import LocalStore, WrapperStore
 
 from sweep.plan.grid import Block, Blocks, scene_axes
-from sweep.store.blocks import committed, receipt_key
+from sweep.store.blocks import committed, receipt_key, receipts
 from sweep.store.checksums import may_be_read
 from sweep.store.layout import RECEIPTS
 from sweep.store.run_store import RunStore
@@ -75,11 +75,18 @@ class BlockKeys:
         index = self._index(number)
         return {name: template.format(*index) for name, template in self._templates.items()}
 
-    def missing(self, store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
-        """Return those of the blocks of which chunks are missing, each with the key of one."""
+    def missing(
+        self, store: RunStore, numbers: Iterable[int], names: Collection[str] | None = None
+    ) -> dict[int, str]:
+        """Return those of the blocks of which chunks are missing, each with the key of one.
+
+        Of all variables, or of those of some names.
+        """
         indices = {number: self._index(number) for number in numbers}
         missing: dict[int, str] = {}
         for name, template in self._templates.items():
+            if names is not None and name not in names:
+                continue
             keys = {
                 template.format(*index): number
                 for number, index in indices.items() if number not in missing
@@ -108,8 +115,20 @@ def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
     """Return those of the committed blocks of which chunks are missing, each with the key of one.
 
     A copy that was made while the store was written has such blocks, for instance.
+
+    Raises
+    ------
+    StoreError
+        If the receipt of a block without chunks is damaged.
     """
-    return BlockKeys(store).missing(store, numbers)
+    keys = BlockKeys(store)
+    missing = keys.missing(store, numbers)
+    if store.pipeline.stopping is None or not missing:
+        return missing
+    # Blocks of which nothing was needed have chunks of flags alone.
+    flags = [number for number, receipt in receipts(store, missing) if not receipt.any_needed]
+    lacking = keys.missing(store, flags, store.flag_names)
+    return {number: key for number, key in missing.items() if number not in set(flags)} | lacking
 
 
 class Snapshot(WrapperStore[Store]):

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+import importlib
+from collections.abc import Mapping
+from typing import cast
 
 from sweep.plan.experiment import Pipeline
 from sweep.plan.precision_rule import PrecisionRule
-from sweep.sampling.precision import precision_sampling
 from sweep.sampling.stopping import Stopping
 
-RULES: Mapping[type, Callable[[Pipeline, Any], Stopping]] = {
-    PrecisionRule: precision_sampling,
+RULES: Mapping[type, str] = {
+    PrecisionRule: "sweep.sampling.precision:precision_sampling",
 }
-"""Class of what a section says -> the function that makes its rule, of a pipeline and the class.
+"""Class of what a section says -> module and function that make its rule, of a pipeline and that.
 
 The sections are in `sweep.plan.stopping.SECTIONS`. The function raises PipelineError with a line
-for each name that it does not know.
+for each name that it does not know. Its module is imported on use: runs of fixed trials need none.
 """
 
 
@@ -30,4 +30,6 @@ def make_rule(pipeline: Pipeline) -> Stopping | None:
     """
     if pipeline.stopping is None:
         return None
-    return RULES[type(pipeline.stopping)](pipeline, pipeline.stopping)
+    module, _, name = RULES[type(pipeline.stopping)].partition(":")
+    make = getattr(importlib.import_module(module), name)
+    return cast("Stopping", make(pipeline, pipeline.stopping))

@@ -30,10 +30,13 @@ from sweep.model.projection import (
     ModuleEdge,
     Projection,
     chord_count,
+    chords_within_tolerance,
     clip,
+    distance_from_chord,
     distorted_point,
     homogeneous_pixel,
 )
+from sweep.model.sheet import Sheet, piece_count, sheet_pixel
 from sweep.typing import Floats
 
 ROUNDING_SNAP = 1e-9
@@ -318,6 +321,55 @@ def accumulate(
             else:
                 _add_projected(cover, jump, Segment(x, y, 1.0, u, v, 1.0))
             x, y = u, v
+
+
+@compiled
+def accumulate_curved(
+    cover: Floats, edges: MarkerEdges, levels: Floats, projection: Projection, left: int, top: int,
+    sigma: float, sheet: Sheet,
+) -> None:
+    """As :func:`accumulate`, of a sheet that is bent or shifted.
+
+    Each edge is divided into pieces, and each piece into chords of which none is farther from the
+    edge's image than 1e-4 px.
+    """
+    ends, sides = edges.ends, edges.sides
+    for e in range(ends.shape[0]):
+        jump = levels[sides[e, 1]] - levels[sides[e, 0]]
+        if jump == 0.0:
+            continue
+        edge = ModuleEdge(ends[e, 0], ends[e, 1], ends[e, 2], ends[e, 3])
+        columns, rows = edge.to_column - edge.column, edge.to_row - edge.row
+        pieces = piece_count(edge, projection, sheet)
+        x, y = sheet_pixel(edge.column, edge.row, projection, sheet)
+        for piece in range(pieces):
+            distance = 0.0
+            t = (piece + 1.0) / pieces
+            u1, v1 = sheet_pixel(
+                edge.column + t * columns, edge.row + t * rows, projection, sheet
+            )
+            for quarter in range(1, 4):
+                t = (piece + 0.25 * quarter) / pieces
+                u, v = sheet_pixel(
+                    edge.column + t * columns, edge.row + t * rows, projection, sheet
+                )
+                distance = max(distance, distance_from_chord(u, v, x, y, u1, v1))
+            chords = chords_within_tolerance(distance)
+            for chord in range(1, chords + 1):
+                u, v = u1, v1
+                if chord < chords:
+                    t = (piece + chord / chords) / pieces
+                    u, v = sheet_pixel(
+                        edge.column + t * columns, edge.row + t * rows, projection, sheet
+                    )
+                segment = Segment(
+                    x + (0.5 - left), y + (0.5 - top), 1.0, u + (0.5 - left), v + (0.5 - top), 1.0
+                )
+                if sigma > 0.0:
+                    _add_blurred(cover, jump, sigma, segment)
+                else:
+                    _add_projected(cover, jump, segment)
+                x, y = u, v
 
 
 @compiled

@@ -21,6 +21,34 @@ VELOCITIES = (
 
 EFFECTS: tuple[Effect, ...] = (
     Effect(
+        "printed size", "edges",
+        {
+            "marker_scale": parameter(
+                1.0, "size of the printed marker relative to size_m, which truth and belief keep",
+                low=0, high=10, open_low=True, drawable=True,
+            ),
+        },
+    ),
+    Effect(
+        "bend", "edges",
+        {
+            "curvature_per_m": parameter(
+                0.0, "curvature of the marker's sheet; positive if it bulges towards the viewer; "
+                "the true pose is that of the tangent plane at the centre",
+                unit="1/m", low=-1e6, high=1e6, drawable=True,
+            ),
+            "bend": parameter(
+                "cylinder", "shape of the bent sheet: cylinder: paper on a can, not stretched; "
+                "saddle: curved as much the other way across", choices=("cylinder", "saddle"),
+            ),
+            "bend_deg": parameter(
+                0.0, "direction in which the sheet curves, in the marker's plane: 0 right, 90 up",
+                unit="degree", low=-360, high=360, drawable=True,
+            ),
+        },
+        needs=dict.fromkeys(("bend", "bend_deg"), ("curvature_per_m",)),
+    ),
+    Effect(
         "occlusion", "edges",
         {
             "occlusion": parameter(
@@ -125,6 +153,22 @@ EFFECTS: tuple[Effect, ...] = (
         needs={
             "aperture_mm": ("focus_distance_m",), "focus_distance_m": ("aperture_mm",),
         },
+    ),
+    Effect(
+        "image shift", "edges",
+        {
+            "geometry_px": parameter(
+                0.0, "standard deviation, right and down, of shifts of the image that vary slowly "
+                "over the frame, as of a lens that its model does not describe; drawn anew for "
+                "each frame",
+                unit="px", low=0, high=1000, drawable=True,
+            ),
+            "geometry_length_px": parameter(
+                100.0, "distance at which the correlation of these shifts has fallen to 0.61",
+                unit="px", low=1, high=1e6, drawable=True,
+            ),
+        },
+        needs={"geometry_length_px": ("geometry_px",)}, random=True,
     ),
     Effect(
         "sharpening", "edges",

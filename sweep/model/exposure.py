@@ -15,6 +15,8 @@ from sweep.model.motion import MovingMarker, moved_plane, outline_extent
 from sweep.model.point_spread import NODES, REACH, WEIGHTS
 from sweep.model.projection import Projection
 from sweep.model.scene import Box, Scenes
+from sweep.model.scene_sheet import scene_sheet
+from sweep.model.sheet import FLAT, Sheet
 from sweep.typing import Floats
 
 SHARP_PANEL_PX = 3 / 16
@@ -72,6 +74,15 @@ def marker_exposure(
     wanted = defocus_px(scenes, row, box, added_px)
     spread, varies = _spreads(wanted)
     even = not varies and math.isnan(effect["aperture_mm"])
+    sheet = scene_sheet(scenes, row)
+    if motion is None and even and sheet is not None:
+        image = np.empty((box[3] - box[1], box[2] - box[0]))
+        cover = np.zeros((image.shape[0], image.shape[1] + 2))
+        coverage.accumulate_curved(
+            cover, outlines, levels, scenes.projection(row), box[0], box[1], spread[0], sheet
+        )
+        coverage.sum_levels(cover, levels[0], image)
+        return image
     if motion is None and even and not scenes.cameras.distorted[row]:
         # The same blur everywhere: without the functions of moving markers, and compiling them.
         image = np.empty((box[3] - box[1], box[2] - box[0]))
@@ -91,7 +102,10 @@ def marker_exposure(
         panel = max(SHARP_PANEL_PX, 1.5 * sigma)
         panels = math.ceil(min(path / panel, MAX_PANELS if row_time_s == 0 else MAX_ROW_PANELS))
         shutter = Shutter(exposure_s, row_time_s, (scenes.frame[row, 1] - 1) / 2, panels)
-        _expose(cover, marker, outlines, levels, shutter, box[0], box[1], sigma)
+        _expose(
+            cover, marker, outlines, levels, shutter, box[0], box[1], sigma,
+            FLAT if sheet is None else sheet, sheet is not None,
+        )
         coverage.sum_levels(cover, levels[0], image)
     if not varies:
         return np.asarray(images[0])
@@ -101,7 +115,7 @@ def marker_exposure(
 @compiled
 def _expose(
     cover: Floats, marker: MovingMarker, edges: coverage.MarkerEdges, levels: Floats,
-    shutter: Shutter, left: int, top: int, sigma: float,
+    shutter: Shutter, left: int, top: int, sigma: float, sheet: Sheet, curved: bool,
 ) -> None:
     """Add a marker's edges to ``cover``, averaged over each row's exposure.
 
@@ -126,12 +140,17 @@ def _expose(
                 at_instant = Projection(plane, projection.optics)
                 if _is_seen(
                     at_instant, marker.outline, left, top + group, rows.shape[0],
-                    rows.shape[1] - 2, REACH * sigma + 2.0,
+                    rows.shape[1] - 2, REACH * sigma + 2.0 + sheet.largest_px,
                 ):
-                    coverage.accumulate(
-                        rows, edges, levels * (weight / max(panels, 1)), at_instant, left,
-                        top + group, sigma,
-                    )
+                    weighted = levels * (weight / max(panels, 1))
+                    if curved:
+                        coverage.accumulate_curved(
+                            rows, edges, weighted, at_instant, left, top + group, sigma, sheet
+                        )
+                    else:
+                        coverage.accumulate(
+                            rows, edges, weighted, at_instant, left, top + group, sigma
+                        )
 
 
 @compiled
@@ -152,7 +171,8 @@ def _is_seen(
 def defocus_px(scenes: Scenes, row: int, box: Box, added_px: float = 0.0) -> Floats:
     """Return the point spread's standard deviation (height, width) at the marker's depth.
 
-    The depth is that of the marker's plane in each pixel's direction; its inverse is linear in the
+    The depth is that of the marker's plane (of a bent one, the tangent plane at its centre) in each
+    pixel's direction; its inverse is linear in the
     image. ``added_px`` widens the point spread, in quadrature.
     """
     fx, fy, cx, cy = scenes.cameras.view[row]

@@ -16,6 +16,8 @@ from sweep.model.motion import BEHIND, MEANINGLESS, Motion, MovingMarker, row_ti
 from sweep.model.point_spread import REACH
 from sweep.model.pose import transform_points
 from sweep.model.scene import Box, Scenes
+from sweep.model.scene_sheet import curved_rows, scene_sheet, sheet_folds, sheet_outline_px
+from sweep.model.sheet import bent_point
 from sweep.typing import Floats
 
 WARP_PX_PER_MODULE = 10
@@ -34,9 +36,12 @@ def _square(low: Floats, high: Floats, per_side: int) -> Floats:
 
 
 def _outline(scenes: Scenes, rows: NDArray[np.intp], quiet: bool, per_side: int) -> Floats:
-    """Return points (n, 4 · per_side, 2) along the images of the outline or the black square."""
+    """Return points (n, 4 · per_side, 2) along the images of the outline or the black square.
+
+    The outline is that of the printed marker, the black square that of ``size_m``.
+    """
     modules = scenes.modules[rows]
-    margin = scenes.margin[rows] if quiet else np.zeros(len(rows))
+    margin = scenes.margin[rows] if quiet else _beyond_print(scenes, rows)
     square = _square(-margin, modules + margin, per_side)
     flat = np.concatenate([square, np.ones_like(square[..., :1])], axis=2)
     return scenes.cameras.take(rows).project(
@@ -44,9 +49,20 @@ def _outline(scenes: Scenes, rows: NDArray[np.intp], quiet: bool, per_side: int)
     )
 
 
+def _beyond_print(scenes: Scenes, rows: NDArray[np.intp]) -> Floats:
+    """Return how far the square of ``size_m`` extends beyond the printed one, (n,) in modules."""
+    if scenes.effects is None:
+        return np.zeros(len(rows))
+    return np.asarray(scenes.modules[rows] / 2 * (1 / scenes.effects["marker_scale"][rows] - 1))
+
+
 CHORDS_PER_SIDE = 32
 """Points of a side at which a curved outline is sampled for its extent: between them it bulges by
 less than 1/1000 of the side's bulge, well inside the 2 px that :func:`marker_boxes` adds."""
+
+
+CURVED_PER_SIDE = 128
+"""As :data:`CHORDS_PER_SIDE`, of bent sheets and shifted images."""
 
 
 def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
@@ -59,6 +75,9 @@ def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
     if len(curved):
         points = _outline(scenes, curved, quiet=True, per_side=CHORDS_PER_SIDE)
         low[curved], high[curved] = points.min(axis=1) - 2, points.max(axis=1) + 2
+    for row in curved_rows(scenes).tolist():
+        points = sheet_outline_px(scenes, row, _outline_on_sheet(scenes, row, CURVED_PER_SIDE))
+        low[row], high[row] = points.min(axis=0) - 2, points.max(axis=0) + 2
     warp_rows = np.flatnonzero([name == "warp" for name in scenes.renderer])
     if len(warp_rows):
         low[warp_rows], high[warp_rows] = _warp_extent(scenes, warp_rows)
@@ -112,11 +131,23 @@ _COARSE_TURN = math.pi / 8
 """Turn between two instants above which the marker may point anywhere between them."""
 
 
-def outline_modules(scenes: Scenes, row: int) -> Floats:
-    """Return points (M, 2) of a marker's outline in modules: its corners, or more under a lens."""
+def _outline_on_sheet(scenes: Scenes, row: int, per_side: int) -> Floats:
+    """Return points (M, 2) of a marker's outline in modules, before its sheet is bent."""
     margin = scenes.margin[row : row + 1]
-    per_side = CHORDS_PER_SIDE if scenes.cameras.distorted[row] else 1
     return np.asarray(_square(-margin, scenes.modules[row : row + 1] + margin, per_side)[0])
+
+
+def outline_modules(scenes: Scenes, row: int) -> Floats:
+    """Return points (M, 3) of a marker's outline: column, row, and height in modules.
+
+    Its corners, or more under a lens or on a bent sheet.
+    """
+    sheet = scene_sheet(scenes, row)
+    curved = scenes.cameras.distorted[row] or sheet is not None
+    outline = _outline_on_sheet(scenes, row, CHORDS_PER_SIDE if curved else 1)
+    if sheet is None:
+        return np.column_stack([outline, np.zeros(len(outline))])
+    return np.array([bent_point(column, line, sheet) for column, line in outline.tolist()])
 
 
 def moving_marker(scenes: Scenes, row: int, velocity: Floats) -> MovingMarker:
@@ -140,6 +171,9 @@ def _exposed_extent(
     reach = reach + 1 if reach > 0 else 0.0
     if motion is None:
         return low - reach, high + reach
+    sheet = scene_sheet(scenes, row)
+    if sheet is not None:
+        reach += sheet.largest_px + 2
     exposure_s, row_time_s, velocity = motion
     height = int(scenes.frame[row, 1])
     begin, end = row_times(0, height, height, exposure_s, row_time_s)
@@ -315,17 +349,25 @@ def not_modelled(scenes: Scenes) -> NDArray[np.bool_]:
     """Return (N,) whether the image has no meaning.
 
     That is so if the lens model folds on the marker, or if during the exposure it does so, or the
-    marker comes behind the camera or shows its back.
+    marker comes behind the camera or shows its back; and if a bent marker hides a part of itself,
+    or shifts fold its image, in the middle of the exposure.
     """
     folded = np.zeros(len(scenes), dtype=bool)
+    for row in curved_rows(scenes).tolist():
+        folded[row] = (
+            np.isfinite(scenes.outline_px[row]).all() and sheet_folds(scenes, row)
+        )
     for row in np.flatnonzero(scenes.affected).tolist():
         low, high = scenes.outline_px[row].min(axis=0), scenes.outline_px[row].max(axis=0)
         if np.isfinite(low).all() and scenes.motion(row) is not None:
-            folded[row] = not np.isfinite(_exposed_extent(scenes, row, low, high)).all()
+            folded[row] |= not np.isfinite(_exposed_extent(scenes, row, low, high)).all()
     rows = np.flatnonzero(scenes.cameras.distorted & np.isfinite(scenes.outline_px).all((1, 2)))
     if len(rows):
         widened = 1 + 2 * scenes.margin[rows] / scenes.modules[rows]
-        outline = marker_corners(scenes.size_m[rows] * widened)
+        printed = scenes.size_m[rows]
+        if scenes.effects is not None:
+            printed = printed * scenes.effects["marker_scale"][rows]
+        outline = marker_corners(printed * widened)
         points = transform_points(outline, scenes.rotation[rows], scenes.translation[rows])
         folded[rows] |= lens_model.folds(
             np.ascontiguousarray(points[..., :2] / points[..., 2:]),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sweep.compilation import compiled
 from sweep.model.lens import distort, jacobian
 from sweep.model.projection import Projection
+from sweep.model.sheet import plane_normal
 from sweep.typing import Floats
 
 
@@ -39,7 +40,7 @@ class MovingMarker(NamedTuple):
     motion
         How the marker moves.
     outline
-        (M, 2) points of its outline in module coordinates.
+        (M, 3) points of its outline: column, row, and height over the plane in modules.
     """
 
     projection: Projection
@@ -87,7 +88,7 @@ def outline_extent(
 ) -> tuple[int, bool]:
     """Write left, top, right, bottom in px of an outline's image to ``extent`` (4,).
 
-    The extent is that of the points (M, 2), in module coordinates, in front of the camera.
+    The extent is that of the points (M, 3), in modules, that are in front of the camera.
     Returns how many are behind it, and whether the lens folds at one of the others.
     """
     plane, optics = projection.plane, projection.optics
@@ -95,13 +96,17 @@ def outline_extent(
     behind, folds = 0, False
     extent[0] = extent[1] = math.inf
     extent[2] = extent[3] = -math.inf
+    normal = plane_normal(plane)
     for j in range(len(outline)):
+        height = outline[j, 2]
         z = plane[2, 0] * outline[j, 0] + plane[2, 1] * outline[j, 1] + plane[2, 2]
+        z += height * normal[2]
         if not z > 0.0:
             behind += 1
             continue
-        x = (plane[0, 0] * outline[j, 0] + plane[0, 1] * outline[j, 1] + plane[0, 2]) / z
-        y = (plane[1, 0] * outline[j, 0] + plane[1, 1] * outline[j, 1] + plane[1, 2]) / z
+        x = plane[0, 0] * outline[j, 0] + plane[0, 1] * outline[j, 1] + plane[0, 2]
+        y = plane[1, 0] * outline[j, 0] + plane[1, 1] * outline[j, 1] + plane[1, 2]
+        x, y = (x + height * normal[0]) / z, (y + height * normal[1]) / z
         if optics.distorted:
             a, b, c, d = jacobian(x, y, lens)
             folds = folds or not (math.hypot(x, y) < lens[23] and a * d - b * c > 0.0)

@@ -91,7 +91,7 @@ def distorted_point(t: float, projection: Projection, edge: ModuleEdge) -> tuple
 
 
 @compiled
-def _distance_from_chord(
+def distance_from_chord(
     px: float, py: float, x0: float, y0: float, x1: float, y1: float
 ) -> float:
     """Return the distance of a point from the straight line through two others."""
@@ -99,6 +99,12 @@ def _distance_from_chord(
     if length == 0.0:
         return math.hypot(px - x0, py - y0)
     return abs((px - x0) * (y1 - y0) - (py - y0) * (x1 - x0)) / length
+
+
+@compiled_inline
+def chords_within_tolerance(distance: float) -> int:
+    """Return the chords that replace a curve whose single chord is ``distance`` px from it."""
+    return min(max(math.ceil(math.sqrt(distance / CHORD_TOLERANCE_PX)), 1), 4096)
 
 
 @compiled
@@ -112,8 +118,8 @@ def chord_count(projection: Projection, edge: ModuleEdge) -> int:
     distance = 0.0
     for quarter in range(1, 4):
         u, v = distorted_point(0.25 * quarter, projection, edge)
-        distance = max(distance, _distance_from_chord(u, v, u0, v0, u1, v1))
-    return min(max(math.ceil(math.sqrt(distance / CHORD_TOLERANCE_PX)), 1), 4096)
+        distance = max(distance, distance_from_chord(u, v, u0, v0, u1, v1))
+    return chords_within_tolerance(distance)
 
 
 @compiled

@@ -75,7 +75,8 @@ class Scenes:
     rotation, translation
         (N, 3, 3) and (N, 3): the true pose, metres, camera frame.
     plane
-        (N, 3, 3) takes module coordinates (column, row, 1) to the camera frame.
+        (N, 3, 3) takes module coordinates (column, row, 1) of the printed marker to the camera
+        frame; of a bent one those of its tangent plane at the centre.
     levels
         (N, 3) grey levels of the background (0 if it is an image), black and white.
     plain
@@ -89,7 +90,8 @@ class Scenes:
     plugins, plugin_values
         The plug-ins' effects and renderers, and (N,) each setting of the renderers.
     corners_px, outline_px
-        (N, 4, 2) images of the black square's and of the quiet zone's corners; NaN at z <= 0.
+        (N, 4, 2) images of the corners of the black square of ``size_m`` and of the printed quiet
+        zone, both flat; NaN at z <= 0.
     """
 
     cameras: Cameras
@@ -251,14 +253,15 @@ def build_scenes(
     markers, marker = distinct(keys)
     modules = np.array([module_count(key[0]) for key in markers], dtype=np.float64)[marker]
     margin = np.array([key[2] for key in markers])[marker]
-    half, module = size / 2, size / modules
+    printed = size * numbers("marker_scale")
+    half, module = printed / 2, printed / modules
     plane = np.empty((count, 3, 3))
     plane[:, :, 0] = rotation[:, :, 0] * module[:, None]
     plane[:, :, 1] = -rotation[:, :, 1] * module[:, None]
     plane[:, :, 2] = (
         translation - (rotation[:, :, 0] - rotation[:, :, 1]) * half[:, None]
     )
-    outline_size = size * (1 + 2 * margin / modules)
+    outline_size = printed * (1 + 2 * margin / modules)
     corners_px, outline_px = (
         cameras.project(transform_points(marker_corners(side), rotation, translation))
         for side in (size, outline_size)

@@ -1,0 +1,316 @@
+"""Bent sheets, printed sizes and shifted images, against rays and sums written in these tests."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from support.exact_image import LENSES, modules_of, plane_of, values
+from sweep.model.effects import NEUTRAL
+from sweep.model.exposure import marker_exposure
+from sweep.model.extent import areas_px, hidden, marker_boxes, not_modelled
+from sweep.model.image_shift import shift_waves
+from sweep.model.renderers import marker_levels, render
+from sweep.model.scene import build_scenes
+
+LEVELS = {"black": 10.0, "white": 240.0, "background": 100.0}
+
+
+def scenes_of(**given):
+    value = values(**(NEUTRAL | {
+        "width_px": 48, "height_px": 44, "fx_px": 60.0, "size_m": 0.1, "side_px": 24.0,
+    } | LEVELS | given))
+    return value, build_scenes(value, 1)
+
+
+def exact_frame(scenes, value):
+    """Levels of the whole frame before the sensor."""
+    box = marker_boxes(scenes)[0]
+    frame = np.full((value["height_px"], value["width_px"]), value["background"])
+    areas = np.array([value["background"], value["black"], value["white"], 0.0])
+    if box[2] > box[0]:
+        inner = marker_exposure(scenes, 0, tuple(box.tolist()), areas)
+        frame[box[1] : box[3], box[0] : box[2]] = inner
+    return frame
+
+
+def on_bent_sheet(directions, value):
+    """Column and row on the flat sheet of the points that rays (n, 3) from the camera meet first
+    (a bulge towards the viewer) or last (a hollow); NaN where they miss."""
+    plane = plane_of(value).astype(np.float64)
+    n = len(modules_of(value)) - 2
+    module = np.linalg.norm(plane[:, 0])
+    right, up = plane[:, 0] / module, -plane[:, 1] / module
+    frame = np.column_stack([right, up, np.cross(right, up)])
+    centre = plane @ [n / 2, n / 2, 1]
+    turn = np.radians(value["bend_deg"])
+    along = np.array([[np.cos(turn), np.sin(turn), 0], [-np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    origin = along @ (frame.T @ -centre)
+    d = directions @ frame @ along.T
+    k = value["curvature_per_m"]
+    if value["bend"] == "cylinder":
+        # x² + (z + 1/k)² = 1/k²
+        a = d[:, 0] ** 2 + d[:, 2] ** 2
+        b = 2 * (origin[0] * d[:, 0] + (origin[2] + 1 / k) * d[:, 2])
+        c = origin[0] ** 2 + origin[2] ** 2 + 2 * origin[2] / k
+    else:
+        # z + k (x² - y²) / 2 = 0
+        a = k / 2 * (d[:, 0] ** 2 - d[:, 1] ** 2)
+        b = d[:, 2] + k * (origin[0] * d[:, 0] - origin[1] * d[:, 1])
+        c = origin[2] + k / 2 * (origin[0] ** 2 - origin[1] ** 2)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        root = np.sqrt(b * b - 4 * a * c)
+        if value["bend"] == "cylinder":
+            t = (-b - np.sign(k) * root) / (2 * a)
+        else:
+            # The root that stays finite as k goes to 0.
+            t = -2 * c / (b + np.sign(b) * root)
+    x, y, z = (origin + t[:, None] * d).T
+    if value["bend"] == "cylinder":
+        x = np.arctan2(k * x, k * z + 1) / k
+    flat = np.column_stack([x, y]) @ along[:2, :2]
+    return flat[:, 0] / module + n / 2, n / 2 - flat[:, 1] / module
+
+
+def sampled_frame(value, per_side, shifted=None):
+    """Levels of the frame by samples, each at random in its cell of a pixel."""
+    rng = np.random.default_rng(8)
+    shape = value["height_px"] * per_side, value["width_px"] * per_side
+    v, u = (np.indices(shape) + rng.random((2, *shape))) / per_side - 0.5
+    if shifted is not None:
+        # What is seen at p was at q, q + shift(q) = p.
+        q = np.stack([u, v], axis=-1).reshape(-1, 2)
+        p = q.copy()
+        for _ in range(10):
+            q = p - shifted(q)
+        u, v = q.T.reshape(2, *shape)
+    centre = (np.array([value["width_px"], value["height_px"]]) - 1) / 2
+    rays = np.stack([(u - centre[0]) / value["fx_px"], (v - centre[1]) / value["fx_px"],
+                     np.ones_like(u)], axis=-1).reshape(-1, 3)
+    if value["curvature_per_m"] == 0:
+        flat = rays @ np.linalg.inv(plane_of(value).astype(np.float64)).T
+        column, row = (flat[:, :2] / flat[:, 2:]).T
+    else:
+        column, row = on_bent_sheet(rays, value)
+    white, quiet = modules_of(value), value["quiet_zone_modules"]
+    n = len(white) - 2
+    level = np.full(len(column), value["background"])
+    on = (np.minimum(column, row) > -quiet) & (np.maximum(column, row) < n + quiet)
+    i, j = (np.clip(np.floor(at[on]) + 1, 0, n + 1).astype(int) for at in (row, column))
+    level[on] = np.where(white[i, j], value["white"], value["black"])
+    return level.reshape(value["height_px"], per_side, -1, per_side).mean(axis=(1, 3))
+
+
+def assert_sampled(found, expected, per_side):
+    """An edge of 230 levels crosses n to 2n cells of a pixel of n² samples: a standard deviation
+    of at most 230 sqrt(2 n / 6) / n², of which 5 hold in about 1,000 pixels of an edge."""
+    deviation = 230 * np.sqrt(2 * per_side / 6) / per_side**2
+    assert np.abs(found - expected).max() < 5 * deviation
+    assert np.sqrt(np.mean((found - expected) ** 2)) < 0.7 * deviation
+    assert abs(np.mean(found - expected)) < 0.03 * deviation + 0.01
+
+
+CURVES = [
+    ("cylinder", 4.0, 0.0, 0.0), ("cylinder", -6.0, 30.0, 0.0), ("cylinder", 10.0, -100.0, 20.0),
+    ("cylinder", 1e-6, 10.0, 40.0), ("saddle", 5.0, 20.0, 25.0), ("saddle", -3.0, 0.0, 50.0),
+]
+
+
+@pytest.mark.parametrize(("bend", "curvature", "bend_deg", "tilt_deg"), [
+    CURVES[1], CURVES[4],
+    *(pytest.param(*curve, marks=pytest.mark.long) for curve in CURVES),
+])
+def test_bent_marker_is_what_rays_meet(bend, curvature, bend_deg, tilt_deg):
+    value, scenes = scenes_of(
+        bend=bend, curvature_per_m=curvature, bend_deg=bend_deg, tilt_deg=tilt_deg,
+        azimuth_deg=40.0, roll_deg=15.0,
+    )
+    assert not not_modelled(scenes)[0]
+    assert_sampled(exact_frame(scenes, value), sampled_frame(value, 16), 16)
+
+
+@pytest.mark.parametrize("bend", ["cylinder", "saddle"])
+@pytest.mark.parametrize("curvature", [-8.0, 1e-3, 8.0])
+@pytest.mark.parametrize("distortion", [(), LENSES[1]])
+def test_area_of_a_bent_marker_is_that_of_its_curved_outline(bend, curvature, distortion):
+    # Chords are within 1e-4 px of an outline of 100 px; the outline of 40,000 points is exact.
+    value, scenes = scenes_of(
+        bend=bend, curvature_per_m=curvature, bend_deg=25.0, tilt_deg=20.0, roll_deg=33.0,
+        distortion=distortion, width_px=80, height_px=80,
+    )
+    value = value | {"black": 1.0, "white": 1.0, "background": 0.0}
+    found = exact_frame(scenes, value).sum()
+    plane, n = plane_of(value).astype(np.float64), len(modules_of(value)) - 2
+    module = np.linalg.norm(plane[:, 0])
+    t = np.arange(10_000) / 10_000
+    ends = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]) * (n + 2) - 1
+    flat = np.concatenate([a + t[:, None] * (b - a) for a, b in itertools.pairwise(ends)])
+    turn = np.radians(25.0)
+    x, y = ((flat - n / 2) * [1, -1]).T * module
+    a, b = x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn)
+    if bend == "cylinder":
+        a, z = np.sin(curvature * a) / curvature, (np.cos(curvature * a) - 1) / curvature
+    else:
+        z = -curvature * (a * a - b * b) / 2
+    x, y = a * np.cos(turn) - b * np.sin(turn), a * np.sin(turn) + b * np.cos(turn)
+    right, up = plane[:, 0] / module, -plane[:, 1] / module
+    points = plane @ [n / 2, n / 2, 1] + np.outer(x, right) + np.outer(y, up)
+    points += np.outer(z, np.cross(right, up))
+    flat = points[:, :2] / points[:, 2:]
+    if distortion:
+        k1, k2, p1, p2, k3, k4, k5, k6 = distortion
+        x, y = flat.T
+        r2 = x * x + y * y
+        radial = (1 + ((k3 * r2 + k2) * r2 + k1) * r2) / (1 + ((k6 * r2 + k5) * r2 + k4) * r2)
+        flat = np.column_stack([
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ])
+    u, v = (flat * value["fx_px"]).T
+    area = abs(np.sum(u * np.roll(v, -1) - v * np.roll(u, -1))) / 2
+    assert abs(found - area) < 100 * 1e-4
+
+
+def test_a_bend_of_nothing_is_the_flat_marker():
+    value, scenes = scenes_of(curvature_per_m=1e-12, tilt_deg=50.0, roll_deg=20.0)
+    flat = build_scenes(value | {"curvature_per_m": 0.0}, 1)
+    levels, share = marker_levels(flat, 0, (0, 0, 48, 44))
+    expected = levels + (1 - share) * value["background"]
+    assert np.abs(exact_frame(scenes, value) - expected).max() < 0.01
+
+
+def test_true_pose_and_corners_are_those_of_the_tangent_plane():
+    value, scenes = scenes_of(
+        curvature_per_m=5.0, geometry_px=1.0, marker_scale=1.1, tilt_deg=30.0
+    )
+    flat = build_scenes(values(**(value | NEUTRAL)), 1)
+    for name in ("corners_px", "rotation", "translation", "size_m"):
+        assert np.array_equal(getattr(scenes, name), getattr(flat, name))
+    assert np.array_equal(areas_px(scenes), areas_px(flat))
+
+
+@pytest.mark.parametrize("distortion", [(), LENSES[0]])
+def test_a_printed_size_is_that_of_a_larger_marker_at_the_same_distance(distortion):
+    given = {"tilt_deg": 40.0, "roll_deg": 10.0, "distortion": distortion, "distance_m": 0.25}
+    value, scenes = scenes_of(marker_scale=1.25, side_px=None, **given)
+    _, larger = scenes_of(size_m=0.125, side_px=None, **given)
+    window = (0, 0, 48, 44)
+    assert np.array_equal(
+        render(scenes, 0, marker_boxes(scenes)[0], window),
+        render(larger, 0, marker_boxes(larger)[0], window),
+    )
+    nominal = build_scenes(value | {"marker_scale": 1.0}, 1)
+    assert areas_px(scenes) == pytest.approx(areas_px(nominal), rel=1e-9)
+
+
+# Where a bent sheet hides a part of itself, it has no image here.
+
+@pytest.mark.parametrize(("curvature", "tilt_deg", "modelled"), [
+    (10.0, 0.0, True),  # radius = side: half a side turns by 0.5 rad, 0.64 with the quiet zone
+    (20.0, 0.0, True),
+    (26.0, 0.0, False),  # the quiet zone's rim turns by 1.67 rad
+    (10.0, 40.0, True),
+    (10.0, 70.0, False),
+    (-10.0, 70.0, False),  # the near rim of a hollow hides its inside
+    (1e6, 0.0, False),
+])
+def test_a_sheet_that_hides_a_part_of_itself_is_not_modelled(curvature, tilt_deg, modelled):
+    # Seen from far: a part turned by more than 90° from the line of sight is seen from behind.
+    _, scenes = scenes_of(
+        curvature_per_m=curvature, bend_deg=90.0, tilt_deg=tilt_deg, fx_px=6000.0,
+    )
+    assert not hidden(scenes)[0]
+    assert not_modelled(scenes)[0] != modelled
+
+
+def test_a_sheet_that_bends_around_the_camera_is_not_modelled():
+    _, scenes = scenes_of(curvature_per_m=-9.0, size_m=0.3, side_px=200.0)
+    assert not_modelled(scenes)[0]
+
+
+# Shifts of the image.
+
+def shift_of(waves):
+    """The field that waves (2, M, 4) are: points (n, 2) to shifts (n, 2)."""
+    def shift(points):
+        phase = points @ waves[:, :, :2].transpose(0, 2, 1)
+        return np.sum(waves[:, None, :, 2] * np.cos(phase) + waves[:, None, :, 3] * np.sin(phase),
+                      axis=2).T
+    return shift
+
+
+@pytest.mark.parametrize(("geometry_px", "length_px"), [
+    (0.4, 20.0), pytest.param(1.5, 15.0, marks=pytest.mark.long),
+    pytest.param(8.0, 400.0, marks=pytest.mark.long),
+])
+def test_shifted_image_is_that_of_shifted_samples(geometry_px, length_px):
+    value, scenes = scenes_of(
+        geometry_px=geometry_px, geometry_length_px=length_px, noise_key=77, tilt_deg=30.0,
+        roll_deg=15.0, width_px=28, height_px=26, side_px=14.0,
+    )
+    assert not not_modelled(scenes)[0]
+    shifted = shift_of(shift_waves(geometry_px, length_px, np.uint64(77)))
+    assert_sampled(exact_frame(scenes, value), sampled_frame(value, 8, shifted), 8)
+
+
+def test_shifts_are_normal_and_correlated_as_said():
+    # 4,000 frames; means of squares have a standard error of 1.41/sqrt(8,000) = 1.6 %, products
+    # of points at a distance less than that: 5.5 % are beyond an error probability of 1e-6.
+    at = np.array([[0.0, 0.0], [30.0, 40.0], [500.0, 0.0]])
+    drawn = np.array([shift_of(shift_waves(2.0, 50.0, np.uint64(key)))(at) for key in range(4000)])
+    second = np.einsum("kpi,kqi->pq", drawn, drawn) / drawn[:, 0].size
+    distance = np.linalg.norm(at[:, None] - at[None], axis=2)
+    assert np.abs(second / 4 - np.exp(-0.5 * (distance / 50) ** 2)).max() < 0.055
+    across = np.mean(drawn[:, 0, 0] * drawn[:, 0, 1]) / 4
+    assert abs(across) < 5 / np.sqrt(4000)
+    # Normal: the share within one standard deviation is 0.6827 ± 5 x 0.0030 (24,000, correlated
+    # in pairs).
+    assert abs(np.mean(np.abs(drawn) < 2) - 0.6827) < 0.02
+
+
+def test_image_with_shifts_and_bends_does_not_depend_on_the_window():
+    rng = np.random.default_rng(2)
+    for given in (
+        {"geometry_px": 1.0, "geometry_length_px": 15.0, "noise_key": 5},
+        {"curvature_per_m": 6.0, "blur_px": 0.7},
+        {"curvature_per_m": 3.0, "geometry_px": 0.5, "exposure_s": 0.01, "velocity_x_m_s": 1.0,
+         "noise_key": 6},
+        {"curvature_per_m": 3.0, "row_time_s": 1e-4, "velocity_x_m_s": 1.0},
+    ):
+        value, scenes = scenes_of(tilt_deg=20.0, bearing_x_deg=10.0, **given)
+        box = marker_boxes(scenes)[0]
+        frame = render(scenes, 0, box, (0, 0, 48, 44))
+        # Nothing of the marker lies beyond its box.
+        wide = np.full((44, 48), 0.0)
+        wide[:] = marker_exposure(
+            scenes, 0, (0, 0, 48, 44), np.array([100.0, 10.0, 240.0, 0.0])
+        )
+        assert np.abs(wide - exact_frame(scenes, value)).max() < 1e-3
+        for _ in range(3):
+            left, top = rng.integers(0, box[:2] + 1).tolist()
+            right, bottom = rng.integers(box[2:], np.array([48, 44]) + 1).tolist()
+            image = render(scenes, 0, box, (left, top, right, bottom))
+            assert np.array_equal(image, frame[top:bottom, left:right])
+
+
+def test_shifts_that_fold_the_image_are_not_modelled():
+    _, scenes = scenes_of(geometry_px=40.0, geometry_length_px=5.0)
+    assert not_modelled(scenes)[0]
+    _, scenes = scenes_of(geometry_px=40.0, geometry_length_px=2000.0)
+    assert not not_modelled(scenes)[0]
+
+
+def test_a_moving_bent_marker_is_the_mean_of_resting_ones():
+    count = 200
+    value, scenes = scenes_of(
+        curvature_per_m=6.0, bend_deg=20.0, tilt_deg=25.0, exposure_s=0.1, velocity_x_m_s=0.1,
+        geometry_px=0.3, noise_key=9,
+    )
+    found = exact_frame(scenes, value)
+    times = ((np.arange(count) + 0.5) / count - 0.5) * 0.1
+    still = value | {"exposure_s": 0.0, "velocity_x_m_s": 0.0}
+    mean = np.zeros_like(found)
+    for time in times:
+        _, resting = scenes_of(**(still | {"x_m": 0.1 * float(time), "y_m": 0.0, "side_px": None}))
+        mean += exact_frame(resting, value) / count
+    assert np.abs(found - mean).max() < 0.2

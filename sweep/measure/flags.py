@@ -81,7 +81,10 @@ class DetectionStatus(Flag):
         5, "The marker is wholly outside the frame, seen from behind, or has a corner at z <= 0.",
         counted=False,
     )
-    not_modelled = flag(6, "The image folds at the marker: by the lens model, a bent sheet or shifts.", counted=False)
+    not_modelled = flag(
+        6, "The image folds at the marker: by the lens model, a bent sheet or shifts.",
+        counted=False,
+    )
     failed = flag(7, "An exception was raised.")
     crashed = flag(8, "The process died.")
     not_needed = flag(9, "The precision that was asked for did not need the trial.", counted=False)

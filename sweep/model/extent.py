@@ -61,10 +61,6 @@ CHORDS_PER_SIDE = 32
 less than 1/1000 of the side's bulge, well inside the 2 px that :func:`marker_boxes` adds."""
 
 
-CURVED_PER_SIDE = 128
-"""As :data:`CHORDS_PER_SIDE`, of bent sheets and shifted images."""
-
-
 def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
     """Return the boxes (N, 4) left, top, right, bottom (half-open) of pixels a marker may touch.
 
@@ -76,7 +72,7 @@ def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
         points = _outline(scenes, curved, quiet=True, per_side=CHORDS_PER_SIDE)
         low[curved], high[curved] = points.min(axis=1) - 2, points.max(axis=1) + 2
     for row in curved_rows(scenes).tolist():
-        points = sheet_outline_px(scenes, row, _outline_on_sheet(scenes, row, CURVED_PER_SIDE))
+        points = sheet_outline_px(scenes, row, _outline_on_sheet(scenes, row, CHORDS_PER_SIDE))
         low[row], high[row] = points.min(axis=0) - 2, points.max(axis=0) + 2
     warp_rows = np.flatnonzero([name == "warp" for name in scenes.renderer])
     if len(warp_rows):

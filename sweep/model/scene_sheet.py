@@ -12,7 +12,7 @@ from sweep.model.scene import Scenes
 from sweep.model.sheet import NO_WAVES, Shape, Sheet, folds_over, sheet_of, sheet_pixels
 from sweep.typing import Floats
 
-FOLD_CELLS = 16
+FOLD_CELLS = 8
 """Least number of cells along a marker's side whose images are checked for folds."""
 
 FOLD_RAD = 0.05

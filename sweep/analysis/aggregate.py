@@ -18,11 +18,13 @@ from dask.typing import Key
 from numpy.typing import NDArray
 
 from sweep.analysis.binning import Binning, Bins, read_bins
-from sweep.analysis.dimensions import is_fixed
+from sweep.analysis.dimensions import is_fixed, is_sampling_stopped
 from sweep.analysis.graph import ChunkReader, ReadBlock, TaskLayer, add_pass, array_of_blocks
 from sweep.analysis.layout import Arrays, Layout, Lengths
+from sweep.analysis.pose_view import COMMON
 from sweep.analysis.replicates import replicate_order, replicated
 from sweep.analysis.states import BlockState, Nothing, State
+from sweep.analysis.stopped_sampling import as_stopped, common_trials
 from sweep.analysis.statistic import Output, SinglePass, Statistic, Variables, ViewT
 
 
@@ -33,6 +35,8 @@ def aggregate(
     statistics: Sequence[Statistic[ViewT, Any, Any, Any]],
     view: Callable[[Arrays], ViewT],
     bins: Bins | None = None,
+    *,
+    stopped: bool | None = None,
 ) -> xr.Dataset:
     """Return the statistics of the poses of each combination of ``kept`` and of bins.
 
@@ -50,6 +54,9 @@ def aggregate(
         Makes the view from a block's arrays, (groups, cells, draws, settings, ...).
     bins
         Edges (n + 1,) of bins [low, high) of a variable or coordinate of the scene.
+    stopped
+        Whether sampling was stopped (`sweep.analysis.stopped_sampling`); by default what the
+        dataset's attributes say.
 
     Returns
     -------
@@ -63,6 +70,10 @@ def aggregate(
     """
     binning, binned = read_bins(results, kept, bins or {})
     lazy = any(array.chunks is not None for array in inputs.values())
+    if is_sampling_stopped(results) if stopped is None else stopped:
+        statistics = [as_stopped(statistic) for statistic in statistics]
+        if (common := common_trials(results, inputs, kept)) is not None:
+            inputs = {**inputs, COMMON: common}
     dataset = xr.Dataset(
         {name: array.reset_coords(drop=True) for name, array in inputs.items()} | binned)
     layout = Layout.of(dataset, kept)

@@ -18,11 +18,17 @@ from numpy.typing import ArrayLike
 from sweep.analysis.aggregate import aggregate
 from sweep.analysis.binning import Bins
 from sweep.analysis.counts import Count, Rate, scaled_to_draws
-from sweep.analysis.dimensions import as_names, configuration_axes, kept_dimensions
+from sweep.analysis.dimensions import (
+    as_names,
+    configuration_axes,
+    is_sampling_stopped,
+    kept_dimensions,
+)
 from sweep.analysis.intervals import TAIL, clopper_pearson
 from sweep.analysis.pose_view import ESTIMATE_INPUTS, Poses, pose_arrays
 from sweep.analysis.rates import FLIPPED, SOLVED
 from sweep.analysis.statistic import Statistic
+from sweep.analysis.stopped_sampling import TAIL_SHARE
 from sweep.errors import ArgumentError
 from sweep.measure.flags import Flag, flag
 from sweep.plan.attributes import describes
@@ -179,7 +185,8 @@ def ambiguity(
     ]
     table = aggregate(
         results, pose_arrays(results, RATIO_INPUTS), kept, statistics, AmbiguousPoses, bins)
-    return _with_choice(_along_thresholds(table, tried), flip_rate, min_kept)
+    tail = TAIL * TAIL_SHARE if is_sampling_stopped(results) else TAIL
+    return _with_choice(_along_thresholds(table, tried), flip_rate, min_kept, tail)
 
 
 def _is_number(value: object) -> bool:
@@ -271,13 +278,15 @@ CHOSEN = {
 }
 
 
-def _with_choice(table: xr.Dataset, flip_rate: float, min_kept: float) -> xr.Dataset:
+def _with_choice(
+    table: xr.Dataset, flip_rate: float, min_kept: float, tail: float
+) -> xr.Dataset:
     """Return the table with the chosen threshold of each group."""
     inputs = [table[name] for name in (
         "threshold", "kept", "kept_flipped", "draws", "kept_rate", "kept_flip_rate",
         "kept_flip_rate_low", "right_rejected_rate")]
     choice, *values = xr.apply_ufunc(
-        functools.partial(_choose, flip_rate=flip_rate, min_kept=min_kept), *inputs,
+        functools.partial(_choose, flip_rate=flip_rate, min_kept=min_kept, tail=tail), *inputs,
         input_core_dims=[["threshold"]] * len(inputs), dask="parallelized",
         output_core_dims=[[]] * (1 + len(CHOSEN)),
         output_dtypes=[np.uint8, *[np.float64] * len(CHOSEN)],
@@ -291,11 +300,11 @@ def _with_choice(table: xr.Dataset, flip_rate: float, min_kept: float) -> xr.Dat
 
 def _choose(
     thresholds: Floats, n: Integers, hits: Integers, draws: Integers, share: Floats, rate: Floats,
-    low: Floats, right_rejected: Floats, flip_rate: float, min_kept: float,
+    low: Floats, right_rejected: Floats, flip_rate: float, min_kept: float, tail: float,
 ) -> tuple[Any, ...]:
     """Return the flag and the values of `CHOSEN`; arrays are (..., thresholds)."""
     _, most = scaled_to_draws(hits, n, draws)
-    bound = clopper_pearson(most, draws, 1.0 - 2.0 * TAIL / len(thresholds))[1]
+    bound = clopper_pearson(most, draws, 1.0 - 2.0 * tail / len(thresholds))[1]
     useful = (share >= min_kept) | np.isinf(thresholds)
     meets = useful & ~np.isnan(low) & (bound <= flip_rate)
     last = len(thresholds) - 1

@@ -11,7 +11,7 @@ import xarray as xr
 from sweep.analysis.aggregate import aggregate
 from sweep.analysis.binning import Bins
 from sweep.analysis.counts import Count, CountOfDraws
-from sweep.analysis.dimensions import kept_dimensions
+from sweep.analysis.dimensions import DRAWS, is_sampling_stopped, kept_dimensions
 from sweep.analysis.intervals import LEVEL
 from sweep.analysis.means import Mean, RootMeanSquareRatio
 from sweep.analysis.paired_rates import newcombe_and_mcnemar
@@ -19,6 +19,7 @@ from sweep.analysis.pose_pairs import TRUTH, Pair, paired_arrays, require_pairs
 from sweep.analysis.pose_view import ERROR_INPUTS, Poses, norm_squared, pose_arrays
 from sweep.analysis.quantities import QUANTITIES, Quantity
 from sweep.analysis.statistic import Statistic
+from sweep.analysis.stopped_sampling import stopped_level
 from sweep.plan.attributes import describes
 from sweep.typing import Floats, Masks
 
@@ -52,6 +53,8 @@ def compare(
           ``neither_detected`` of them; the same four of ``solved``.
         - ``detection_difference`` of the rates, with its interval. ``detection_p_value``: how
           often chance alone makes the two discordant counts as unequal.
+        - ``run_in_one``: poses that one of the two alone ran, as in stores whose sampling stopped
+          after different trials: only trials that both have are compared.
         - ``different_scenes``: compared poses whose truth differs, as in stores with other
           distributions. Unless it is 0 nothing is paired, and the test compares two samples.
         - Of the poses solved in both: ``*_difference_*``, the mean difference of the absolute
@@ -104,6 +107,9 @@ def paired_table(
     Beside it there is the first's mean absolute error of the poses that both solved, and whether
     any cell has two draws, ``drawn``. ``level`` is that of the intervals of errors.
     """
+    stopped = is_sampling_stopped(first) or is_sampling_stopped(second)
+    if stopped:
+        first, second = _of_common_trials(first, second)
     require_pairs(first, second)
     own = [name for name, value in first.coords.items() if not value.dims
            and not (name in second.coords and value.equals(second.coords[name]))]
@@ -116,12 +122,24 @@ def paired_table(
         *_flipped_in_one(),
         CountOfDraws("compared", "poses that were looked for in both",
                      lambda pair: pair.compared),
+        Count("run_in_one", "poses that one of the two alone ran, which are not compared",
+              lambda pair: pair.first.run != pair.second.run),
         Count("different_scenes", "compared poses whose truth differs, so that they are no pairs",
               lambda pair: pair.compared & pair.differing),
         *(statistic for quantity in quantities for statistic in _differences(quantity, level)),
     ]
-    table = aggregate(first, inputs, kept, statistics, Pair, bins)
-    return table.assign(_tested(table))
+    table = aggregate(first, inputs, kept, statistics, Pair, bins, stopped=stopped)
+    return table.assign(_tested(table, stopped_level(LEVEL) if stopped else LEVEL))
+
+
+def _of_common_trials(
+    first: xr.Dataset, second: xr.Dataset
+) -> tuple[xr.Dataset, xr.Dataset]:
+    """Return two datasets with the trials that are on the axes of both."""
+    if not all(DRAWS in side.dims for side in (first, second)):
+        return first, second
+    common = np.intersect1d(first[DRAWS].values, second[DRAWS].values)
+    return first.sel({DRAWS: common}), second.sel({DRAWS: common})
 
 
 def _errors_and_truth(results: xr.Dataset, names: Iterable[str]) -> dict[str, xr.DataArray]:
@@ -179,12 +197,12 @@ def _differences(quantity: Quantity, level: float) -> list[PairStatistic]:
         lambda pair: pair.first.unflipped & pair.second.unflipped)]
 
 
-def _tested(table: xr.Dataset) -> dict[str, xr.DataArray]:
+def _tested(table: xr.Dataset, level: float) -> dict[str, xr.DataArray]:
     """Return the difference of the detection rates with its interval, and McNemar's test."""
     counts = [table[f"{name}_detected"] for name in (
         "both", "only_first", "only_second", "neither")]
     arrays = xr.apply_ufunc(
-        newcombe_and_mcnemar, *counts, table["draws"], table["drawn"],
+        newcombe_and_mcnemar, *counts, table["draws"], table["drawn"], kwargs={"level": level},
         output_core_dims=[[]] * 4, dask="parallelized", output_dtypes=[np.float64] * 4,
     )
     difference = "detection rate, second minus first"

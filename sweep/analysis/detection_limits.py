@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,12 +15,14 @@ from sweep.analysis.dimensions import (
     DRAWS,
     as_names,
     axes_of,
+    is_sampling_stopped,
     kept_dimensions,
     require_poses,
 )
 from sweep.analysis.image_sides import image_sides, parameters_along, require_size_axes
-from sweep.analysis.intervals import LEVEL, wilson
+from sweep.analysis.intervals import LEVEL, clopper_pearson, wilson
 from sweep.analysis.rates import detection_rate
+from sweep.analysis.stopped_sampling import stopped_level, with_common_trials
 from sweep.analysis.stored_parameters import parameter_value
 from sweep.errors import ArgumentError
 from sweep.measure.flags import Flag, flag
@@ -125,6 +127,10 @@ def detection_limit(
     if DRAWS in kept or not along:
         name = DRAWS if DRAWS in kept else ", ".join(map(str, sides.dims))
         raise ArgumentError("per", name, "the limit is over this dimension; it cannot be kept")
+    distinct = _distinct(sides, along)
+    stopped = is_sampling_stopped(results)
+    if stopped and distinct < math.prod(sides.sizes[name] for name in along):
+        results = with_common_trials(results, kept)  # those of the same side are pooled
     table = detection_rate(results, (*kept, *(name for name in along if name not in bins)), bins)
     n, draws, hits = (table[name] for name in ("looked_for", "draws", "detected"))
     drawn = table["detection_rate_low"].notnull()
@@ -132,7 +138,7 @@ def detection_limit(
               for array in (hits, n, draws, drawn)]
     *values, limit = xr.apply_ufunc(
         _limit, sides, *counts, dask="parallelized",
-        kwargs={"rate": rate, "dims": len(along), "count": _distinct(sides, along)},
+        kwargs={"rate": rate, "dims": len(along), "count": distinct, "stopped": stopped},
         input_core_dims=[along] * 5, output_core_dims=[[]] * 5, output_dtypes=[np.float64] * 5,
     )
     limits = dict(zip(("side_px", "side_px_low", "side_px_high", "side_px_below"), values,
@@ -172,11 +178,12 @@ def _is_next(sides: Floats) -> Masks:
 
 def _limit(
     sides: Floats, hits: Integers, n: Integers, draws: Integers, drawn: Masks, *, rate: float,
-    dims: int, count: int,
+    dims: int, count: int, stopped: bool,
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Return side, low, high, next smaller side and flag; arrays are (..., *sides), ``dims`` these.
 
     Poses of the same side are pooled; ``count`` is the largest number of distinct sides.
+    ``stopped`` says whether sampling was stopped (`sweep.analysis.stopped_sampling`).
     """
     shape = (*n.shape[: n.ndim - dims], math.prod(n.shape[n.ndim - dims :]))
     sides = np.broadcast_to(sides, n.shape).reshape(shape)
@@ -192,8 +199,10 @@ def _limit(
     # Of draws, rounded outwards, as in `Rate`.
     fewest, most = scaled_to_draws(hits, n, draws)
     joint = 1.0 - (1.0 - LEVEL) / count
-    surely = wilson(fewest, draws)[0] >= rate
-    possibly = wilson(most, draws, joint)[1] >= rate
+    interval: Callable[..., tuple[Floats, Floats]] = clopper_pearson if stopped else wilson
+    levels = [stopped_level(level) if stopped else level for level in (LEVEL, joint)]
+    surely = interval(fewest, draws, levels[0])[0] >= rate
+    possibly = interval(most, draws, levels[1])[1] >= rate
 
     def smallest(holds: Masks, none: float) -> tuple[Floats, Masks]:
         """Return the smallest side down to which it holds, and whether it holds for all."""

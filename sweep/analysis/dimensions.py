@@ -10,12 +10,13 @@ from typing import Any
 import xarray as xr
 
 from sweep.analysis.pose_view import REQUIRED_VARIABLES
-from sweep.errors import ArgumentError, DatasetError
+from sweep.errors import ArgumentError, DatasetError, SweepError
 from sweep.plan.camera_values import SQUARE_FORMAT, stored_text
 from sweep.plan.coordinates import FIXED
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS, Stage
 from sweep.plan.schema import LABELS, SCHEMA
+from sweep.plan.stopping import SECTIONS
 from sweep.plugins.declared import recorded_plugins
 
 DRAWS = "trial"
@@ -85,6 +86,16 @@ def stored_pipeline(results: xr.Dataset) -> Pipeline:
         pipeline_text(results), files=fingerprint_of(results).get("files", {}),
         plugins=recorded_plugins(metadata),
     )
+
+
+def is_sampling_stopped(results: xr.Dataset) -> bool:
+    """Return whether a dataset is of a pipeline whose sampling stops when results suffice."""
+    try:
+        text = pipeline_text(results)
+        return any(f"[{name}]" in text for name in SECTIONS) and (
+            stored_pipeline(results).stopping is not None)
+    except (KeyError, SweepError):
+        return False
 
 
 def _run_metadata(results: xr.Dataset) -> Mapping[str, Any]:

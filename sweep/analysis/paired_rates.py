@@ -6,13 +6,13 @@ import numpy as np
 from scipy import special
 
 from sweep.analysis.counts import scaled_to_draws
-from sweep.analysis.intervals import wilson
+from sweep.analysis.intervals import LEVEL, wilson
 from sweep.typing import Floats, Integers, Masks
 
 
 def newcombe_and_mcnemar(
     both: Integers, first: Integers, second: Integers, neither: Integers, draws: Integers,
-    drawn: Masks,
+    drawn: Masks, level: float = LEVEL,
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Return the difference of two paired rates, its interval's ends, and McNemar's p-value.
 
@@ -28,8 +28,8 @@ def newcombe_and_mcnemar(
         for hits in (both + second, both + first):
             rates.append(hits / n)
             fewest, most = scaled_to_draws(hits, n, draws)
-            lows.append(wilson(fewest, draws)[0])
-            highs.append(wilson(most, draws)[1])
+            lows.append(wilson(fewest, draws, level)[0])
+            highs.append(wilson(most, draws, level)[1])
         margins = ((both + first) * (second + neither)).astype(np.float64) * (
             (both + second) * (first + neither))
         cross = both.astype(np.float64) * neither - first.astype(np.float64) * second

@@ -23,6 +23,9 @@ NOT_LOOKED_FOR = tuple(uncounted_values(DetectionStatus))
 INSIDE = "inside"
 """Name of the mask of the poses that count at all, if not all do."""
 
+COMMON = "common"
+"""Name of the mask of the trials that all pooled cells have, where sampling was stopped."""
+
 DEPTH = "true_depth_m"
 """Name, beside those of the dataset's variables, of z of the true position."""
 
@@ -59,13 +62,13 @@ def pose_arrays(results: xr.Dataset, names: Iterable[str]) -> dict[str, xr.DataA
 class Poses:
     """Poses of a block: arrays (groups, cells, draws, settings, ...), by name.
 
-    Those outside the mask `INSIDE` count as not run. The masks and errors have the shape (groups,
+    Those outside the mask `INSIDE` count as not run, those outside `COMMON` as not needed. The masks and errors have the shape (groups,
     cells, draws, settings), but for axes of length 1 that broadcast.
 
     Parameters
     ----------
     arrays
-        The arrays, by the names of `pose_arrays` with ``prefix`` in front, and `INSIDE`.
+        The arrays, by the names of `pose_arrays` with ``prefix`` in front, `INSIDE` and `COMMON`.
     prefix
         What stands before the names of these poses' arrays in ``arrays``, if it has others too.
     """
@@ -81,7 +84,10 @@ class Poses:
         array = self._arrays[self._prefix + name]
         if name in VARIABLES and VARIABLES[name].flags is not None:
             # A dataset that was cut or joined has NaN where nothing was run.
-            return np.where(self.inside, np.nan_to_num(array, nan=0.0), 0)
+            array = np.where(self.inside, np.nan_to_num(array, nan=0.0), 0)
+            if COMMON in self._arrays:
+                needless = VARIABLES[name].flags["not_needed"]
+                array = np.where(self._arrays[COMMON] | (array == 0), array, needless)
         return array
 
     def __contains__(self, name: object) -> bool:
@@ -106,7 +112,12 @@ class Poses:
     @cached_property
     def draws(self) -> Masks:
         """Which draws were run: (groups, cells, draws)."""
-        return np.asarray((self.detection != DetectionStatus.not_run).any(axis=3))
+        return np.asarray(self.run.any(axis=3))
+
+    @cached_property
+    def run(self) -> Masks:
+        """Poses that were run."""
+        return ~np.isin(self.detection, (DetectionStatus.not_run, DetectionStatus.not_needed))
 
     @cached_property
     def looked_for(self) -> Masks:

@@ -18,6 +18,7 @@ from sweep.analysis.dimensions import (
 )
 from sweep.analysis.rates import detection_rate
 from sweep.analysis.replicates import is_replicated
+from sweep.analysis.stopped_sampling import with_common_trials
 from sweep.errors import ArgumentError
 from sweep.plan.attributes import describes
 from sweep.typing import Floats
@@ -86,6 +87,7 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
         raise ArgumentError("per", DRAWS, "the ranking is over the trials; they cannot be kept")
     cells = [name for name in axes_of(results) if name in results["detection"].dims
              and name not in (*kept, DRAWS) and is_grid_axis(name, results)]
+    results = with_common_trials(results, kept)
     table = detection_rate(results, kept)[
         ["looked_for", "detection_rate", "detection_rate_low", "detection_rate_high"]]
     counts = detection_rate(results, (*kept, *cells))

@@ -1,0 +1,221 @@
+"""Half-widths of intervals, by which sampling stops, and whether they are as small as is wanted.
+
+Of rates they are as they are, of a bias relative to the root mean square error, of all else
+relative to the value. The intervals are those that the analysis shows of a store whose sampling
+was stopped (`sweep.analysis.stopped_sampling`).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+from sweep.analysis.counts import CountOfDraws
+from sweep.analysis.intervals import LEVEL, clopper_pearson
+from sweep.analysis.pose_view import Poses
+from sweep.analysis.quantiles import interval_ranks
+from sweep.analysis.requirable import Requirable, requirables
+from sweep.analysis.requirement_faults import named
+from sweep.analysis.statistic import Statistic
+from sweep.analysis.stopped_sampling import as_stopped, stopped_level
+from sweep.measure.flags import Flag, flag
+from sweep.typing import Floats, Masks
+
+PoseStatistic = Statistic[Poses, Any, Any, Any]
+
+MIN_DRAWS = 300
+"""Draws below which no interval of a mean or a root mean square is narrow enough.
+
+Their formulas need draws to tell how the errors spread: the interval of a lucky start is narrow.
+"""
+
+MIN_OF_RATE = 50
+"""Poses that count below which a rate is not worth waiting for."""
+
+NEVER_LEVEL = 0.999
+"""Level of the interval that says that too few numbers will come."""
+
+
+class Reached(Flag):
+    """Whether a quantity is known as well as was wanted."""
+
+    not_run = flag(0, "Nothing was computed.", counted=False)
+    reached = flag(1, "The interval is as narrow as was wanted.", present=True)
+    not_reached = flag(2, "The interval is wider than was wanted.", present=True)
+    too_rare = flag(
+        3, "Poses that have such a number are too rare for an interval as narrow as was wanted.")
+    not_applicable = flag(4, "No pose was looked for.", counted=False)
+
+
+@dataclass(frozen=True)
+class WantedPrecision:
+    """The half-width that is wanted of the interval of a quantity.
+
+    Attributes
+    ----------
+    requirable
+        The quantity.
+    half_width
+        As the module says; above 0, below 1.
+    """
+
+    requirable: Requirable
+    half_width: float
+
+    @property
+    def name(self) -> str:
+        """Name of the quantity."""
+        return self.requirable.name
+
+    @property
+    def relative_to(self) -> str:
+        """What the half-width is a share of; empty for a rate."""
+        if self.requirable.is_rate:
+            return ""
+        return "RMSE" if self._spread else "value"
+
+    @property
+    def _spread(self) -> str:
+        """Of a bias the name of the standard deviation; else empty."""
+        name = self.name.replace("_bias_", "_sd_")
+        return name if name != self.name and name in requirables() else ""
+
+    def statistics(self, prefix: str) -> list[PoseStatistic]:
+        """Return what must be computed, the names of their variables beginning with a prefix."""
+        parts = list(self.requirable.computed(prefix, LEVEL))
+        if self._spread:
+            parts += requirables()[self._spread].statistics(f"{prefix}of ", LEVEL)
+        return [as_stopped(statistic) for statistic in parts]
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """The dataset's variables that it is computed of."""
+        return tuple(dict.fromkeys(self.requirable.variables))
+
+    @functools.cached_property
+    def least_draws(self) -> int:
+        """Draws with a number below which it is useless to go on.
+
+        It does not depend on the half-width, so that a smaller one never needs fewer trials.
+        """
+        if self.requirable.is_rate:
+            return MIN_OF_RATE
+        if (percent := self.requirable.percent) is None:
+            return MIN_DRAWS
+        n = 1
+        while not _has_ends(n, percent, stopped_level(LEVEL)):
+            n += 1
+        return n
+
+    def judge(
+        self, table: Mapping[str, Any], prefix: str, looked_for: Any, run: Any, total: Any
+    ) -> tuple[Any, Any, Any]:
+        """Return the value, its half-width and a flag of `Reached`, each (...).
+
+        Parameters
+        ----------
+        table
+            The variables of `statistics`, each (...).
+        prefix
+            As there.
+        looked_for, run, total
+            Poses that were looked for, that were run, and that all trials would be, each (...).
+        """
+        value, low, high = (np.asarray(each, dtype=np.float64)
+                            for each in self._interval(table, prefix))
+        with np.errstate(all="ignore"):
+            half = (high - low) / 2.0
+            if self._spread:
+                spread = np.asarray(table[f"{prefix}of {self._spread}"], dtype=np.float64)
+                half = np.where(half == 0.0, 0.0, half / np.hypot(value, spread))
+            elif not self.requirable.is_rate:
+                half = np.where(half == 0.0, 0.0, half / np.abs(value))
+        # Too many poses are lost for a quantile: it is infinite, which is all there is to know.
+        half = np.where(np.isposinf(low), 0.0, half)
+        draws, used = (np.asarray(table[f"{prefix}{name}"]) for name in ("draws", "used"))
+        enough = draws >= (1 if self.requirable.exact else MIN_DRAWS)
+        narrow = (half <= self.half_width) & enough
+        rare = ~narrow & self._too_rare(draws, used, np.asarray(run), np.asarray(total))
+        flags = np.select(
+            [np.asarray(run) == 0, np.asarray(looked_for) == 0, narrow, rare],
+            [Reached.not_run, Reached.not_applicable, Reached.reached, Reached.too_rare],
+            Reached.not_reached)
+        return value, half, flags.astype(np.uint8)
+
+    def _interval(self, table: Mapping[str, Any], prefix: str) -> Sequence[Any]:
+        """Return value, low and high; of a bias with its sign."""
+        if self.requirable.signed:
+            return [table[f"{prefix}{self.name}{end}"] for end in ("", "_low", "_high")]
+        return self.requirable.interval(cast("Any", table), prefix)
+
+    def _too_rare(self, draws: Any, used: Any, run: Any, total: Any) -> Masks:
+        """Return where even all trials give fewer draws with a number than `least_draws`.
+
+        By the upper end of the share of poses that have one; ``used`` poses are worth ``draws``.
+        """
+        run = np.maximum(run, used)
+        share: Floats = clopper_pearson(used, run, NEVER_LEVEL)[1]
+        worth = np.where(used > 0, draws / np.maximum(used, 1), 1.0)
+        return np.asarray((share * total * worth < self.least_draws) & (total >= self.least_draws))
+
+
+def _has_ends(n: int, percent: int, level: float) -> bool:
+    low, high = interval_ranks(n, percent, level)
+    return low >= 1 and high <= n
+
+
+def wanted_precisions(wanted: Mapping[str, float]) -> tuple[WantedPrecision, ...]:
+    """Return what some names and half-widths want.
+
+    Names are those of requirements (`sweep.analysis.requirements.parse_requirements`).
+
+    Raises
+    ------
+    ValueError
+        One line for each name that does not exist, each half-width that cannot be, and each
+        quantity that is named twice.
+
+    Examples
+    --------
+    >>> [(each.name, each.half_width) for each in wanted_precisions({"detection": 0.02})]
+    [('detection_rate', 0.02)]
+    """
+    precisions: dict[str, WantedPrecision] = {}
+    faults = []
+    for name, half_width in wanted.items():
+        try:
+            what = named(name)
+        except ValueError as error:
+            text = str(error)
+            faults.append(text if text.startswith(f"{name}:") else f"{name}: {text}")
+            continue
+        if not 0.0 < half_width < 1.0:
+            faults.append(f"{name}: expected the half-width of an interval, above 0 and below 1")
+        elif what.name in precisions:
+            faults.append(f"{name}: {what.name} has another half-width; delete one")
+        else:
+            precisions[what.name] = WantedPrecision(what, float(half_width))
+    if faults:
+        raise ValueError("\n".join(faults))
+    return tuple(precisions.values())
+
+
+def looked_for_and_run() -> list[PoseStatistic]:
+    """Return what counts the poses that were looked for, and those that were run."""
+    return [
+        CountOfDraws("looked_for", "poses that were run, visible and modelled",
+                     lambda poses: poses.looked_for, "draws", "drawn"),
+        CountOfDraws("run", "poses that were run", lambda poses: poses.run, "run draws", "run drawn"),
+    ]
+
+
+def evaluate(statistics: Sequence[PoseStatistic], poses: Poses) -> dict[str, Any]:
+    """Return the variables (groups,) of statistics of poses that are in memory as one block."""
+    variables: dict[str, Any] = {}
+    for statistic in statistics:
+        known = statistic.prepare_second(statistic.first_pass(poses).fold())
+        variables |= statistic.finish(known, statistic.second_pass(poses, known).fold())
+    return variables

@@ -17,6 +17,7 @@ from sweep.analysis.error_model_values import model_covariance, model_errors
 from sweep.analysis.error_models import error_models
 from sweep.analysis.error_summaries import error_statistics
 from sweep.analysis.farthest import farthest_met
+from sweep.analysis.precision import precision_reached
 from sweep.analysis.ranking import marker_ranking
 from sweep.analysis.rates import detection_rate, failure_composition, flip_rate
 from sweep.analysis.renderers import renderer_bias
@@ -26,5 +27,5 @@ __all__ = [
     "ambiguity", "check_requirements", "compare", "covariance_trust", "detection_limit",
     "detection_rate", "efficiency", "environment_differences", "error_models", "error_statistics",
     "failure_composition", "farthest_met", "flip_rate", "marker_ranking", "model_covariance",
-    "model_errors", "renderer_bias",
+    "model_errors", "precision_reached", "renderer_bias",
 ]

@@ -24,8 +24,8 @@ from sweep.analysis.layout import Arrays, Layout, Lengths
 from sweep.analysis.pose_view import COMMON
 from sweep.analysis.replicates import replicate_order, replicated
 from sweep.analysis.states import BlockState, Nothing, State
-from sweep.analysis.stopped_sampling import as_stopped, common_trials
 from sweep.analysis.statistic import Output, SinglePass, Statistic, Variables, ViewT
+from sweep.analysis.stopped_sampling import as_stopped, common_trials
 
 
 def aggregate(

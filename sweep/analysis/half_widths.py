@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
+
 from sweep.analysis.counts import CountOfDraws
 from sweep.analysis.intervals import LEVEL, clopper_pearson
 from sweep.analysis.pose_view import Poses
@@ -84,11 +85,14 @@ class WantedPrecision:
         return name if name != self.name and name in requirables() else ""
 
     def statistics(self, prefix: str) -> list[PoseStatistic]:
-        """Return what must be computed, the names of their variables beginning with a prefix."""
+        """Return what must be computed, the names of their variables beginning with a prefix.
+
+        Their intervals are to be those of `sweep.analysis.stopped_sampling.as_stopped`.
+        """
         parts = list(self.requirable.computed(prefix, LEVEL))
         if self._spread:
             parts += requirables()[self._spread].statistics(f"{prefix}of ", LEVEL)
-        return [as_stopped(statistic) for statistic in parts]
+        return parts
 
     @property
     def variables(self) -> tuple[str, ...]:
@@ -208,14 +212,18 @@ def looked_for_and_run() -> list[PoseStatistic]:
     return [
         CountOfDraws("looked_for", "poses that were run, visible and modelled",
                      lambda poses: poses.looked_for, "draws", "drawn"),
-        CountOfDraws("run", "poses that were run", lambda poses: poses.run, "run draws", "run drawn"),
+        CountOfDraws("run", "poses that were run", lambda poses: poses.run, "run draws",
+                     "run drawn"),
     ]
 
 
 def evaluate(statistics: Sequence[PoseStatistic], poses: Poses) -> dict[str, Any]:
-    """Return the variables (groups,) of statistics of poses that are in memory as one block."""
+    """Return the variables (groups,) of poses that are in memory as one block.
+
+    Those of the statistics as they are where sampling was stopped.
+    """
     variables: dict[str, Any] = {}
-    for statistic in statistics:
+    for statistic in map(as_stopped, statistics):
         known = statistic.prepare_second(statistic.first_pass(poses).fold())
         variables |= statistic.finish(known, statistic.second_pass(poses, known).fold())
     return variables

@@ -62,8 +62,9 @@ def pose_arrays(results: xr.Dataset, names: Iterable[str]) -> dict[str, xr.DataA
 class Poses:
     """Poses of a block: arrays (groups, cells, draws, settings, ...), by name.
 
-    Those outside the mask `INSIDE` count as not run, those outside `COMMON` as not needed. The masks and errors have the shape (groups,
-    cells, draws, settings), but for axes of length 1 that broadcast.
+    Those outside the mask `INSIDE` count as not run, those outside `COMMON` as not needed. The
+    masks and errors have the shape (groups, cells, draws, settings), but for axes of length 1 that
+    broadcast.
 
     Parameters
     ----------
@@ -86,8 +87,8 @@ class Poses:
             # A dataset that was cut or joined has NaN where nothing was run.
             array = np.where(self.inside, np.nan_to_num(array, nan=0.0), 0)
             if COMMON in self._arrays:
-                needless = VARIABLES[name].flags["not_needed"]
-                array = np.where(self._arrays[COMMON] | (array == 0), array, needless)
+                array = np.where(
+                    self._arrays[COMMON] | (array == 0), array, VARIABLES[name].not_needed)
         return array
 
     def __contains__(self, name: object) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -118,7 +119,8 @@ def _table(
     configuration: Sequence[str],
 ) -> xr.Dataset:
     run, poses = (table[name].transpose(*kept) for name in ("run", "poses"))
-    judged = {name: [] for name in ("value", "half_width", "reached", "used", "draws")}
+    judged: dict[str, list[Any]] = {
+        name: [] for name in ("value", "half_width", "reached", "used", "draws")}
     variables = {str(name): each.transpose(*kept).values for name, each in table.items()}
     for number, precision in enumerate(precisions):
         found = precision.judge(

@@ -26,10 +26,11 @@ from sweep.analysis.counts import Rate
 from sweep.analysis.dimensions import DRAWS, axes_of, is_sampling_stopped
 from sweep.analysis.flip_mixture import FlipMixture
 from sweep.analysis.means import RootMeanSquare
-from sweep.analysis.pose_view import COMMON, NOT_LOOKED_FOR
+from sweep.analysis.pose_view import NOT_LOOKED_FOR
 from sweep.analysis.statistic import Statistic, ViewT
 from sweep.measure.flags import DetectionStatus
 from sweep.plan.parameters import Stage
+from sweep.plan.schema import VARIABLES
 
 TAIL_SHARE = 0.6
 """Tails of intervals of stores whose sampling was stopped, of those that they would have.
@@ -56,9 +57,7 @@ def stopped_level(level: float, share: float = TAIL_SHARE) -> float:
 
 def as_stopped(statistic: Statistic[ViewT, Any, Any, Any]) -> Statistic[ViewT, Any, Any, Any]:
     """Return a statistic with the intervals that it has where sampling was stopped."""
-    fields = {field.name for field in dataclasses.fields(cast("Any", statistic))} \
-        if dataclasses.is_dataclass(statistic) else set()
-    if "level" not in fields:
+    if not hasattr(statistic, "level"):
         return statistic
     share = SPREAD_TAIL_SHARE if isinstance(statistic, RootMeanSquare | FlipMixture) else TAIL_SHARE
     level = stopped_level(cast("Any", statistic).level, share)
@@ -112,8 +111,7 @@ def with_common_trials(results: xr.Dataset, kept: Sequence[str]) -> xr.Dataset:
     flags = {name: results[name] for name in ("detection", "estimate", "flipped")
              if name in results}
     return results.assign({
-        name: array.where(common, np.uint8(0)).astype(array.dtype).assign_attrs(array.attrs)
+        name: array.where(common, VARIABLES[name].not_needed).astype(np.uint8).assign_attrs(
+            array.attrs)
         for name, array in flags.items()})
 
-
-__all__ = ["COMMON", "as_stopped", "common_trials", "stopped_level", "with_common_trials"]

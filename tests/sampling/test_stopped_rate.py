@@ -40,9 +40,9 @@ def of_all_sequences(half_width, ends, rate):
 
 @pytest.mark.parametrize("rate", [0.02, 0.3, 0.5])
 def test_the_enumeration_has_the_properties_of_all_sequences(rate):
-    expected = of_all_sequences(0.31, (4, 7, 11), rate)
-    assert StoppedRate(0.31, (4, 7, 11)).at(rate) == pytest.approx(expected, abs=1e-12)
-    assert expected[2] < 11  # some stop before
+    expected = of_all_sequences(0.31, (3, 6, 9), rate)
+    assert StoppedRate(0.31, (3, 6, 9)).at(rate) == pytest.approx(expected, abs=1e-12)
+    assert expected[2] < 9   # some stop before
 
 
 def test_probabilities_add_up_to_one():
@@ -60,7 +60,7 @@ def test_coverage_is_kept_at_rates_from_0_to_1(half_width):
 
 def test_waves_are_what_saves_poses():
     rule = StoppedRate(0.02, wave_ends(3000, 50))
-    assert rule.at(0.0).draws < 150
+    assert rule.at(0.0).draws <= 150
     assert rule.at(0.5).draws > 2500
 
 

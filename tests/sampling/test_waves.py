@@ -92,7 +92,8 @@ def test_needed_trials_are_those_of_the_rule_whatever_the_blocks(pipeline, tmp_p
 
 
 @pytest.mark.parametrize(("change", "expected"), [
-    ("precision.detection_rte=0.1", "no quantity; did you mean detection_rate?"),
+    ("precision.detection_rte=0.1",
+     "nothing of this name has an interval; did you mean detection_rate?"),
 ])
 def test_unknown_quantity_is_refused_by_the_rule(change, expected):
     with pytest.raises(PipelineError, match=expected.replace("?", r"\?")):

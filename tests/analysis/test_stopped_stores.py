@@ -1,0 +1,182 @@
+"""Stores whose sampling stopped at different trials: pooled values and intervals that hold."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import stats
+
+from sweep.analysis import (
+    ambiguity,
+    compare,
+    detection_limit,
+    detection_rate,
+    error_statistics,
+    failure_composition,
+    marker_ranking,
+    precision_reached,
+)
+from sweep.analysis.half_widths import Reached
+from sweep.errors import ArgumentError
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+
+TRIALS = 200
+STOPPED_AT = np.array([50, 200, 100])
+"""Trials of three sides: the hard one has most."""
+
+RATES = np.array([0.9, 0.3, 1.0])
+
+PIPELINE = """
+seed = 1
+marker = { size_m = 0.05 }
+pose = { jitter_px = 0.5 }
+precision = { detection_rate = 0.08, max_trials = 200 }
+axes = { side_px = [10, 20, 30], solver = ["ippe", "iterative"] }
+"""
+
+
+@pytest.fixture(scope="module")
+def full():
+    """Return the store of all trials, with errors that grow with the side."""
+    rng = np.random.default_rng(5)
+    shape = (3, TRIALS, 2)
+    seen = rng.random((3, TRIALS)) < RATES[:, None]
+    solved = seen[..., None] & np.ones(2, bool)
+    error = rng.normal(size=(*shape, 3)) * 0.01 * np.array([1, 2, 3])[:, None, None, None]
+    error[~solved] = np.nan
+    flipped = rng.random(shape) < 0.1
+    dims = ("side_px", "trial", "solver")
+    return xr.Dataset(
+        {
+            "detection": (dims[:2], np.where(
+                seen, DetectionStatus.detected, DetectionStatus.no_candidate).astype(np.uint8)),
+            "estimate": (dims, np.where(
+                solved, EstimateStatus.solved, EstimateStatus.no_detection).astype(np.uint8)),
+            "flipped": (dims, np.where(~solved, Flipped.no_estimate, np.where(
+                flipped, Flipped.flipped, Flipped.not_flipped)).astype(np.uint8)),
+            "rotation_error_rad": ((*dims, "xyz"), error),
+            "translation_error_m": ((*dims, "xyz"), error),
+            "true_tvec_m": ((*dims[:2], "xyz"), np.ones((3, TRIALS, 3))),
+            "reprojection_error_px": (dims, np.where(solved, 0.1, np.nan)),
+            "alternative_reprojection_error_px": (dims, np.where(solved, 0.4, np.nan)),
+        },
+        {"side_px": [10, 20, 30], "trial": np.arange(TRIALS), "solver": ["ippe", "iterative"],
+         "xyz": ["x", "y", "z"]},
+    )
+
+
+@pytest.fixture(scope="module")
+def stopped(full):
+    """Return the store of the trials that were needed, as `sweep.open` has it."""
+    run = xr.DataArray(np.arange(TRIALS) < STOPPED_AT[:, None], dims=("side_px", "trial"))
+    flags = {"detection": DetectionStatus, "estimate": EstimateStatus, "flipped": Flipped}
+    return full.assign({
+        name: full[name].where(run, flags[name].not_needed).astype(np.uint8)
+        if name in flags else full[name].where(run) for name in full.data_vars
+    }).assign_attrs(pipeline=PIPELINE)
+
+
+def test_conditions_have_all_their_trials_and_clopper_and_pearsons_interval(stopped, full):
+    table = detection_rate(stopped, ["side_px"])
+    assert table.looked_for.values.tolist() == STOPPED_AT.tolist()
+    for k, n in enumerate(STOPPED_AT):
+        hits = int((full.detection.values[k, :n] == 1).sum())
+        low = stats.beta.ppf(0.015, hits, n - hits + 1) if hits else 0.0
+        high = stats.beta.isf(0.015, hits + 1, n - hits) if hits < n else 1.0
+        row = table.isel(side_px=k)
+        assert row.detection_rate == hits / n
+        assert row.detection_rate_low == pytest.approx(low, rel=1e-9)
+        assert row.detection_rate_high == pytest.approx(high, rel=1e-9)
+
+
+def test_what_is_pooled_is_pooled_over_the_trials_that_all_have(stopped, full):
+    """Else the side of which most trials were run would weigh most."""
+    common = full.isel(trial=slice(0, 50))
+    for analysis in (detection_rate, failure_composition, ambiguity, error_statistics):
+        ours, expected = analysis(stopped), analysis(common)
+        for name in expected.data_vars:
+            exact = name.endswith(("_low", "_high", "_interval", "count")) or (
+                name.startswith("chosen") or name == "choice")
+            if not exact:
+                np.testing.assert_allclose(ours[name].values, expected[name].values)
+    plain = (stopped.detection == 1).sum() / stopped.detection.isin(range(1, 5)).sum()
+    assert abs(plain - detection_rate(stopped).detection_rate) > 0.05  # the trap
+
+
+def test_poses_that_are_left_out_are_not_needed(stopped):
+    counts = failure_composition(stopped)["count"]
+    assert counts.sel(outcome="not_run") == 0
+    assert counts.sel(outcome="not_needed") == 2 * 3 * (TRIALS - 50)
+
+
+def test_cells_in_which_nothing_was_looked_for_do_not_lessen_the_trials(stopped):
+    flags = stopped.detection.copy()
+    flags[0, :50] = DetectionStatus.not_visible
+    assert detection_rate(stopped.assign(detection=flags)).looked_for == 2 * 100
+
+
+def test_chunks_do_not_matter(stopped):
+    lazy = stopped.chunk(side_px=2, trial=60)
+    for per in ([], ["solver"], ["side_px"]):
+        expected = error_statistics(stopped, per)
+        xr.testing.assert_allclose(error_statistics(lazy, per).compute(), expected)
+
+
+def test_intervals_of_errors_are_wider_than_those_of_fixed_trials(stopped, full):
+    ours = error_statistics(stopped, ["side_px", "solver"]).isel(side_px=1)
+    fixed = error_statistics(full, ["side_px", "solver"]).isel(side_px=1)
+    for name, level in (("range_bias_percent", 0.97), ("position_rmse_unflipped_m", 0.99)):
+        assert (ours[name] == fixed[name]).all()
+        ends = (np.log(each[f"{name}_high"] / each[name]) if "rmse" in name
+                else each[f"{name}_high"] - each[name] for each in (ours, fixed))
+        freedom = 60  # about, which hardly matters
+        expected = stats.t.isf((1 - level) / 2, freedom) / stats.t.isf(0.025, freedom)
+        np.testing.assert_allclose(np.divide(*ends), expected, rtol=0.02)
+
+
+def test_a_detection_limit_takes_the_interval_of_stopped_rates(stopped):
+    assert detection_limit(stopped, 0.9).side_px == 30
+    assert detection_limit(stopped, 0.9).side_px_low == 30
+
+
+def test_markers_are_ranked_over_common_trials(stopped):
+    """Of two markers, one with more trials of the hard side: it is not weak for that."""
+    easy = stopped.copy(deep=True)
+    easy.detection[1, 100:] = DetectionStatus.not_needed
+    both = xr.concat([stopped, easy], "marker_id").assign_coords(marker_id=[0, 1])
+    both = both.assign_attrs(stopped.attrs)
+    table = marker_ranking(both)
+    assert table.detection_rate.values[0] == pytest.approx(table.detection_rate.values[1])
+    np.testing.assert_allclose(table.expected_rate, table.detection_rate)
+
+
+def test_stores_that_stopped_at_other_trials_are_compared_on_the_common_ones(stopped, full):
+    other = full.isel(trial=slice(0, 150))
+    for pair in ((stopped, other), (other, stopped)):
+        table = compare(*(side.sel(solver="ippe") for side in pair), ["side_px"])
+        assert table.compared.values.tolist() == [50, 150, 100]
+        assert table.run_in_one.values.tolist() == [100, 0, 50]
+        assert (table.only_first_detected == 0).all()
+        assert (table.different_scenes == 0).all()
+    pooled = compare(*(side.sel(solver="ippe") for side in (stopped, other)))
+    assert pooled.compared == 3 * 50
+
+
+def test_what_was_reached_is_told_by_condition(stopped):
+    table = precision_reached(stopped)
+    assert table.wanted.values.tolist() == [0.08]
+    assert table.run.isel(solver=0).values.tolist() == STOPPED_AT.tolist()
+    assert (table.poses == TRIALS).all()
+    named = [Reached(each).name for each in table.reached.isel(solver=0, quantity=0).values]
+    assert named == ["not_reached", "reached", "reached"]
+    assert table.settled.values.tolist() == [each == "reached" for each in named]
+    half = detection_rate(stopped, ["side_px"])
+    np.testing.assert_allclose(
+        table.half_width.isel(solver=0, quantity=0),
+        (half.detection_rate_high - half.detection_rate_low) / 2)
+
+
+def test_wishes_that_cannot_be_are_refused(stopped, full):
+    with pytest.raises(ArgumentError, match=r"no \[precision\]"):
+        precision_reached(full)
+    with pytest.raises(ArgumentError, match="above 0 and below 1"):
+        precision_reached(stopped, {"detection_rate": 2.0})

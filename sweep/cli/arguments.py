@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from sweep.messages import plain
@@ -24,6 +25,50 @@ def add_pipeline(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_precision(parser: argparse.ArgumentParser) -> None:
+    """Add how well quantities are to be known, in the place of a number of trials."""
+    parser.add_argument(
+        "--precision", action="append", default=[], metavar="NAME=WIDTH",
+        help="compute trials until the interval of this quantity is as narrow at each condition: "
+        "half-width of a rate, of another quantity as a share of it, such as "
+        "'detection_rate = 0.02' or 'rotation_error_rmse_deg = 5 %%'; may be repeated",
+    )
+    parser.add_argument(
+        "--max-trials", type=int, metavar="N", help="the most trials of a condition",
+    )
+
+
+def precision_settings(precision: Sequence[str], max_trials: int | None) -> list[str]:
+    """Return settings, as ``--set`` takes them, that say how well quantities are to be known.
+
+    Raises
+    ------
+    ArgumentError
+        If one has not the form of such.
+
+    Examples
+    --------
+    >>> precision_settings(["detection_rate = 2 %"], 2400)
+    ['precision.detection_rate="2 %"', 'precision.max_trials=2400']
+    """
+    from sweep.errors import ArgumentError  # noqa: PLC0415
+
+    settings = []
+    for text in precision:
+        name, equals, width = (part.strip() for part in text.partition("="))
+        if not equals or not name.isidentifier() or not width:
+            raise ArgumentError(
+                "precision", text,
+                "expected a quantity and the half-width of its interval, such as "
+                "'detection_rate = 0.02'",
+            )
+        quoted = width if not width.endswith("%") else f'"{width}"'
+        settings.append(f"precision.{name}={quoted}")
+    if max_trials is not None:
+        settings.append(f"precision.max_trials={max_trials}")
+    return settings
+
+
 def read_pipeline(options: argparse.Namespace) -> Pipeline:
     """Return the pipeline of a command that takes one.
 
@@ -39,6 +84,8 @@ def read_pipeline(options: argparse.Namespace) -> Pipeline:
     from sweep.store.stored_pipeline import texts_required  # noqa: PLC0415
 
     source = plain(options.pipeline)
+    options.settings = [*options.settings, *precision_settings(
+        getattr(options, "precision", ()), getattr(options, "max_trials", None))]
     try:
         pipeline = read(options.pipeline, options.settings)
     except PipelineError as error:
@@ -51,6 +98,10 @@ def read_pipeline(options: argparse.Namespace) -> Pipeline:
         from sweep.analysis.required_pipeline import check_required  # noqa: PLC0415
 
         check_required(pipeline.requirements, source)
+    if pipeline.stopping is not None:
+        from sweep.sampling.rules import make_rule  # noqa: PLC0415
+
+        make_rule(pipeline)
     return pipeline
 
 

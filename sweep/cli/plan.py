@@ -6,13 +6,20 @@ import argparse
 import dataclasses
 import shlex
 
-from sweep.cli.arguments import add_json, add_pipeline, add_workers, read_pipeline
+from sweep.cli.arguments import (
+    add_json,
+    add_pipeline,
+    add_precision,
+    add_workers,
+    read_pipeline,
+)
 from sweep.cli.command import Command, Example
 from sweep.cli.output import print_json, say, say_next
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add_pipeline(parser)
+    add_precision(parser)
     add_workers(parser)
     add_json(parser)
 

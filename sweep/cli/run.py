@@ -9,18 +9,26 @@ import shlex
 import sys
 from typing import TYPE_CHECKING
 
-from sweep.cli.arguments import add_json, add_pipeline, add_workers, read_pipeline
+from sweep.cli.arguments import (
+    add_json,
+    add_pipeline,
+    add_precision,
+    add_workers,
+    read_pipeline,
+)
 from sweep.cli.command import CONTINUES, Command, Example
 from sweep.cli.output import print_json, say, say_next
 
 if TYPE_CHECKING:
     from sweep.execution.progress import Progress
+    from sweep.execution.summary import Summary
     from sweep.isolation.child_process import Child
     from sweep.plan.experiment import Pipeline
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add_pipeline(parser)
+    add_precision(parser)
     parser.add_argument(
         "--store", metavar="STORE", help="path or URL of the store (default: runs/NAME.zarr)"
     )
@@ -113,7 +121,7 @@ def _execute_beside(child: Child, options: argparse.Namespace) -> int:
         say(f"{summary.store} is already finished; --overwrite recomputes it{failed}")
     rate = summary.computed_scenes / max(summary.seconds, 1e-3)
     say(
-        f"{summary.poses:,} poses, {summary.results:,} results, {summary.detected:,} detected"
+        f"{_poses(summary)}, {summary.detected:,} detected"
         + (f", {summary.seconds:.1f} s ({rate:,.0f} poses/s)" if rate else "")
     )
     say(f'xarray.open_zarr("{summary.data}")')
@@ -125,6 +133,17 @@ def _execute_beside(child: Child, options: argparse.Namespace) -> int:
         say_next(_requiring_command(pipeline, summary.store) if pipeline.requirements
                  else f"sweep report {shlex.quote(summary.store)}")
     return int(summary.nothing_computed)
+
+
+def _poses(summary: Summary) -> str:
+    """Return how many poses and results there are; of a run to a precision, how many it needed."""
+    if summary.needed is None:
+        return f"{summary.poses:,} poses, {summary.results:,} results"
+    settled = (summary.conditions or 0) - (summary.unsettled or 0)
+    return (
+        f"{settled:,} of {summary.conditions:,} conditions settled with {summary.needed:,} of at "
+        f"most {summary.poses:,} poses"
+    )
 
 
 def _requiring_command(pipeline: Pipeline, url: str) -> str:

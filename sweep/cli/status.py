@@ -33,7 +33,11 @@ def _execute(options: argparse.Namespace) -> int:
         what = "stopped"
     say(f"{state.title}: {what}")
     say(f"  blocks      {state.blocks_done:,} of {state.blocks:,}")
-    say(f"  poses       {state.poses_done:,} of {state.poses:,}")
+    if state.conditions is None:
+        say(f"  poses       {state.poses_done:,} of {state.poses:,}")
+    else:
+        say(f"  conditions  {state.settled:,} of {state.conditions:,} settled")
+        say(f"  poses       {state.needed:,} needed so far, of at most {state.poses:,}")
     for name, counts in (("detection", state.detection), ("estimate", state.estimate)):
         listed = ", ".join(f"{flag} {count:,}" for flag, count in counts.items())
         say(f"  {name:11} {listed or 'nothing yet'}")

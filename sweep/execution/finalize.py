@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sweep.errors import StoreError
+from sweep.execution.settled import sampled_conditions
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plan.axes import Axis
 from sweep.plan.parameters import Stage
@@ -45,7 +46,9 @@ def close(store: RunStore) -> None:
     cells: list[FailedCell] = []
     kept: Counter[str] = Counter()
     counts = {"detection": [0] * len(DetectionStatus), "estimate": [0] * len(EstimateStatus)}
+    needed: dict[int, int] = {}
     for number, receipt in receipts(store, done):
+        needed[number] = receipt.scenes_needed
         if receipt.seconds["scene"]:
             blocks.append((number, receipt.seconds))
         for name, flags in (("detection", receipt.detection), ("estimate", receipt.estimate)):
@@ -56,7 +59,10 @@ def close(store: RunStore) -> None:
             if kept[cell.kind] <= MAX_ROWS:
                 cells.append(cell)
     failures = failure_table(cells, lost(counts["detection"], counts["estimate"]))
-    finish(store, {"cost": _cost(store, blocks), "failures": failures}, counts)
+    sampled = sampled_conditions(store, needed)
+    recorded: dict[str, Any] = dict(counts) if sampled is None else {
+        **counts, "sampled": sampled.to_json()}
+    finish(store, {"cost": _cost(store, blocks), "failures": failures}, recorded)
 
 
 def lost(detection: list[int], estimate: list[int]) -> dict[str, int]:

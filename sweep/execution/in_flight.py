@@ -147,8 +147,8 @@ class BlocksInFlight:
                 done = future.result()
                 found = [done] if isinstance(done, Receipt) else done
                 for number, receipt in zip(work.numbers, found, strict=True):
-                    tally.add(receipt)
                     waiting.committed(number, receipt)
+                    tally.add(receipt)
                 self._worker_faults.computed(work.numbers[0])
             else:
                 self._note_failure(work, future, tally)

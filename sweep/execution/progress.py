@@ -28,11 +28,17 @@ class Progress:
         Poses of the grid.
     detected
         Detections among those that are committed, over all detector settings.
+    needed, settled, conditions
+        Of a run to a precision, how many of ``done`` were needed, and how many of the conditions
+        need no more trials; None of a run of fixed trials.
     """
 
     done: int
     total: int
     detected: int
+    needed: int | None = None
+    settled: int | None = None
+    conditions: int | None = None
 
 
 ProgressReport = Callable[[Progress], None]
@@ -127,12 +133,26 @@ def _bar() -> Iterator[ProgressReport]:
         task = bar.add_task("starting", total=None, count="")
 
         def report(progress: Progress) -> None:
+            if progress.conditions is not None:
+                bar.update(
+                    task, description="running", total=progress.conditions,
+                    completed=progress.settled, count=_of_conditions(progress),
+                )
+                return
             bar.update(
                 task, description="running", total=progress.total, completed=progress.done,
                 count=f"{progress.done:,} of {progress.total:,} poses",
             )
 
         yield report
+
+
+def _of_conditions(progress: Progress) -> str:
+    """Return how far a run to a precision is."""
+    return (
+        f"{progress.settled:,} of {progress.conditions:,} conditions settled, "
+        f"{progress.needed:,} poses"
+    )
 
 
 @contextlib.contextmanager
@@ -180,11 +200,12 @@ class ProgressLines:
         first = self._last is None
         self.report(progress, time.monotonic())
         if self._ends and (first or progress.done == progress.total):
-            notice(f"{progress.done:,} of {progress.total:,} poses")
+            notice(_of_conditions(progress) if progress.conditions is not None
+                   else f"{progress.done:,} of {progress.total:,} poses")
 
     def report(self, progress: Progress, now: float) -> None:
         """Take a run's progress at a time in seconds."""
-        self._first = self._first or (now, progress.done)
+        self._first = self._first or (now, _computed(progress))
         self._last = progress
 
     def line(self, now: float) -> str:
@@ -193,12 +214,24 @@ class ProgressLines:
             return "starting"
         started, before = self._first
         progress = self._last
-        line = f"{progress.done:,} of {progress.total:,} poses"
-        computed = progress.done - before
+        whole = progress.conditions is None
+        line = f"{progress.done:,} of {progress.total:,} poses" if whole else (
+            _of_conditions(progress))
+        computed = _computed(progress) - before
         if not computed or now <= started:
             return line
         rate = computed / (now - started)
+        if not whole:  # how many are needed is not known
+            return f"{line}, {_rate(rate)}"
         left = duration((progress.total - progress.done) / rate)
         share = progress.done / progress.total
-        poses_per_s = f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
-        return f"{line} ({100 * share:.0f} %), {poses_per_s} poses/s, {left} left"
+        return f"{line} ({100 * share:.0f} %), {_rate(rate)}, {left} left"
+
+
+def _computed(progress: Progress) -> int:
+    """Return how many poses were computed."""
+    return progress.done if progress.needed is None else progress.needed
+
+
+def _rate(rate: float) -> str:
+    return f"{rate:,.0f} poses/s" if rate >= 10 else f"{rate:.2g} poses/s"

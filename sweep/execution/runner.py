@@ -41,6 +41,7 @@ from sweep.execution.reuse import is_reusable, match
 from sweep.execution.small_run import BlocksInChild
 from sweep.execution.summary import Summary, summary_of, summary_of_complete
 from sweep.execution.tally import Tally
+from sweep.execution.tightening import tighten
 from sweep.execution.waiting import AnyOrder, InWaves, Waiting
 from sweep.execution.work_left import block_s_of, demand_left, demand_of, thread_count_of, work_s
 from sweep.isolation.child_process import Child
@@ -138,13 +139,15 @@ def execute(
         If blocks failed; the others are in the store, and another run continues.
     """
     started = time.perf_counter()
+    make_rule(pipeline)  # it refuses names that it does not know
     _check_arguments(workers, scheduler, client, block_s, time_limit_s)
     url = os.fspath(store) if store is not None else f"runs/{pipeline.name}.zarr"
     if retry_failed and reuse:
         raise ArgumentError("reuse", os.fspath(reuse[0]), "expected no retry_failed beside it")
     unfinished = _store_to_continue(url, pipeline, overwrite)
     again = set(failed_blocks(unfinished)) if retry_failed and unfinished is not None else set()
-    if unfinished is not None and unfinished.finished and not again:
+    stricter = unfinished is not None and unfinished.pipeline.stopping != pipeline.stopping
+    if unfinished is not None and unfinished.finished and not (again or stricter):
         return summary_of_complete(unfinished, started)
     for line in notes(pipeline):
         notice(line)
@@ -193,6 +196,8 @@ def execute(
         elif not (yes or sources):
             check_affordable(url, demand_left(unfinished, done, calibration, connection))
         retry = Retry()
+        if stricter:
+            unfinished = tighten(unfinished, pipeline)
         if again:  # once nothing refuses the run
             unfinished, retry = drop_failed(unfinished)
         if durable:
@@ -316,6 +321,7 @@ def _compute_and_close(
         if (sampling := make_rule(store.pipeline)) is not None and store.pipeline.stopping:
             waiting = InWaves(store, store.pipeline.stopping, sampling, check=lock.check)
             done = waiting.current
+            tally.watch(waiting)
         tally.begin(done)
         _compute(store, waiting, tally, child, client, sources, time_limit_s, interrupts)
         lock.check(now=True)

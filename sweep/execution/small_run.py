@@ -115,8 +115,8 @@ class BlocksInChild:
             else:
                 found = [done] if isinstance(done, Receipt) else done
                 for number, receipt in zip(work.numbers, found, strict=True):
-                    tally.add(receipt)
                     waiting.committed(number, receipt)
+                    tally.add(receipt)
                 return
             break
         tally.add_failed(f"block {block}: {reason}", machine_fault=fault)

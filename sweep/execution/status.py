@@ -6,13 +6,17 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from sweep.execution.settled import condition_count
+from sweep.execution.waiting import InWaves
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plan.parameters import Stage
+from sweep.sampling.rules import make_rule
 from sweep.store.blocks import committed, receipts
 from sweep.store.failures import MAX_ROWS, FailedCell, failed_cells
 from sweep.store.lifecycle import open_store
 from sweep.store.lock import holder
 from sweep.store.outcome import FailureGroup, first_cell, outcome_of
+from sweep.store.run_store import RunStore
 
 RATE_S = 60.0
 """Seconds over which the rate is measured, up to the last block that was written."""
@@ -48,6 +52,9 @@ class Status:
         store that nobody writes, the rate of the last minute of work, and None. None if unknown.
     crashed, failed
         Cells whose process died and cells that raised, at most 1,000 of each.
+    needed, settled, conditions
+        Of a run to a precision, how many of the committed poses were needed, and how many of the
+        conditions need no more trials; None of a run of fixed trials.
     nothing_computed, failed_share, failures, warnings, advice
         As `sweep.execution.summary.Summary` has them, of the committed blocks.
     """
@@ -71,6 +78,9 @@ class Status:
     failures: list[FailureGroup]
     warnings: list[str]
     advice: str
+    needed: int | None = None
+    settled: int | None = None
+    conditions: int | None = None
 
 
 def status(url: str) -> Status:
@@ -86,17 +96,18 @@ def status(url: str) -> Status:
     estimate: Counter[str] = Counter()
     written: list[WrittenBlock] = []
     cells: dict[str, list[FailedCell]] = {"crashed": [], "failed": []}
-    done = poses = 0
+    done = poses = needed = 0
     for number, receipt in receipts(store, committed(store)):
         done += 1
         poses += receipt.scenes
+        needed += receipt.scenes_needed
         for flags, counts, counter in (
             (DetectionStatus, receipt.detection, detection),
             (EstimateStatus, receipt.estimate, estimate),
         ):
             for flag, count in zip(flags, counts, strict=False):
                 counter[flag.name] += count
-        written.append(WrittenBlock(receipt.written, receipt.wall_s, receipt.scenes))
+        written.append(WrittenBlock(receipt.written, receipt.wall_s, receipt.scenes_needed))
         for cell in failed_cells(store, number, receipt):
             if len(cells[cell.kind]) < MAX_ROWS:
                 cells[cell.kind].append(cell)
@@ -120,14 +131,29 @@ def status(url: str) -> Status:
         detection={name: count for name, count in detection.items() if count},
         estimate={name: count for name, count in estimate.items() if count},
         poses_per_s=rate,
-        seconds_left=(total - poses) / rate if rate and writer else None,
-        **cells,
+        seconds_left=(
+            (total - poses) / rate if rate and writer and store.pipeline.stopping is None else None
+        ),
+        crashed=cells["crashed"],
+        failed=cells["failed"],
         nothing_computed=outcome.nothing_computed,
         failed_share=round(outcome.failed_share, 6),
         failures=outcome.failures,
         warnings=outcome.warnings,
         advice=outcome.advice,
+        needed=None if store.pipeline.stopping is None else needed,
+        settled=_settled(store),
+        conditions=None if store.pipeline.stopping is None else condition_count(store.pipeline),
     )
+
+
+def _settled(store: RunStore) -> int | None:
+    """Return how many conditions need no more trials; None of a run of fixed trials."""
+    rule, sampling = store.pipeline.stopping, make_rule(store.pipeline)
+    if rule is None or sampling is None:
+        return None
+    waves = InWaves(store, rule, sampling)
+    return int(waves.settled / waves.cells * condition_count(store.pipeline))
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from sweep.errors import StoreError
 from sweep.execution.finalize import lost
@@ -52,6 +53,9 @@ class Summary:
         The lines of ``sweep run`` on failures, and on a run in which nothing was detected.
     advice
         The command that recomputes a cell for each reason; empty without warnings.
+    needed, conditions, unsettled
+        Of a run to a precision, the poses that were needed, the conditions, and those of them that
+        would need more than ``max_trials``; None of a run of fixed trials.
     retried, recovered
         Failed and crashed cells that were tried again, and those that did not fail again.
     """
@@ -75,6 +79,9 @@ class Summary:
     advice: str = ""
     retried: int = 0
     recovered: int = 0
+    needed: int | None = None
+    conditions: int | None = None
+    unsettled: int | None = None
 
 
 def summary_of_complete(store: RunStore, started: float) -> Summary:
@@ -103,6 +110,7 @@ def summary_of(
     counts = store.run_metadata["counts"]
     missing = lost(counts["detection"], counts["estimate"])
     outcome = outcome_of_finished(store)
+    sampled = counts.get("sampled") or {}
     return Summary(
         store=store.url,
         data=store.data_url,
@@ -118,8 +126,28 @@ def summary_of(
         nothing_computed=outcome.nothing_computed,
         failed_share=round(outcome.failed_share, 6),
         failures=outcome.failures,
-        warnings=outcome.warnings,
+        warnings=[*outcome.warnings, *_unsettled_lines(store, sampled)],
         advice=outcome.advice,
         retried=retry.cells,
         recovered=retry.recovered(store),
+        needed=sampled.get("needed"),
+        conditions=sampled.get("conditions"),
+        unsettled=sampled.get("unsettled"),
     )
+
+
+MAX_CONDITIONS = 3
+"""Conditions that are not settled of which a line each is printed."""
+
+
+def _unsettled_lines(store: RunStore, sampled: Mapping[str, Any]) -> list[str]:
+    """Return lines on the conditions that would need more than ``max_trials``; often none."""
+    count, rule = sampled.get("unsettled"), store.pipeline.stopping
+    if not count or rule is None:
+        return []
+    of = f"{count:,} of {sampled['conditions']:,}"
+    lines = [f"warning: {of} conditions are not settled after all {rule.max_trials:,} trials"]
+    lines += [f"  {at or 'all poses together'}" for at in sampled["at"][:MAX_CONDITIONS]]
+    if count > MAX_CONDITIONS:
+        lines.append(f"  and {count - MAX_CONDITIONS:,} more")
+    return lines

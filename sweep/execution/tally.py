@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
@@ -9,6 +10,8 @@ from collections.abc import Set as AbstractSet
 from sweep.errors import RunError
 from sweep.execution.limits import MAX_FAILED_BLOCKS
 from sweep.execution.progress import Progress, ProgressReport
+from sweep.execution.settled import condition_count
+from sweep.execution.waiting import InWaves
 from sweep.measure.flags import DetectionStatus
 from sweep.plan.parameters import Stage
 from sweep.store.blocks import receipts
@@ -32,11 +35,18 @@ class Tally:
         self._store = store
         self._report = report
         self._progress = Progress(0, store.pipeline.size(Stage.scene), 0)
+        self._waves: InWaves | None = None
+        self._conditions = 0
         self._failures = Counter({"failed": 0, "crashed": 0})
         self._failed_blocks: list[str] = []
         self._machine_faults = 0
         self.computed: Counter[str] = Counter()
         """Blocks, scenes, detections and estimates that were computed and not reused."""
+
+    def watch(self, waves: InWaves) -> None:
+        """Report progress by conditions that are settled."""
+        self._waves, self._conditions = waves, condition_count(self._store.pipeline)
+        self._progress = dataclasses.replace(self._progress, needed=0)
 
     def begin(self, done: AbstractSet[int]) -> None:
         """Count the blocks that are committed already.
@@ -85,11 +95,19 @@ class Tally:
     def _count(self, receipt: Receipt) -> None:
         self._failures.update(failure.kind for failure in receipt.failures)
         counts, detected = receipt.detection, DetectionStatus.detected
+        needed = self._progress.needed
         self._progress = Progress(
             self._progress.done + receipt.scenes, self._progress.total,
             self._progress.detected + (counts[detected] if len(counts) > detected else 0),
+            None if needed is None else needed + receipt.scenes_needed,
         )
 
     def _notify(self) -> None:
-        if self._report is not None:
-            self._report(self._progress)
+        if self._report is None:
+            return
+        if self._waves is not None:
+            share = self._waves.settled / self._waves.cells
+            self._progress = dataclasses.replace(
+                self._progress, settled=int(share * self._conditions), conditions=self._conditions
+            )
+        self._report(self._progress)

@@ -14,6 +14,7 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.parameters import Stage
 from sweep.plan.schema import bytes_per_block
+from sweep.sampling.rules import make_rule
 from sweep.store.blocks import receipts
 from sweep.store.run_store import RunStore
 
@@ -28,12 +29,17 @@ def work_s(
     pipeline: Pipeline, unfinished: RunStore | None, done: AbstractSet[int],
     calibration: Calibration | None,
 ) -> float:
-    """Return the estimated seconds of work that are left when the blocks ``done`` are committed."""
+    """Return the estimated seconds of work that are left when the blocks ``done`` are committed.
+
+    In waves, at least the first one is left.
+    """
     if unfinished is not None:
         return (len(unfinished.blocks) - len(done)) * block_s_of(unfinished, done, calibration)
     if calibration is None:
         return math.inf
-    return pipeline.size(Stage.scene) * calibration.scene_s
+    rule = make_rule(pipeline)
+    share = 1.0 if rule is None else rule.ends[0] / rule.ends[-1]
+    return share * pipeline.size(Stage.scene) * calibration.scene_s
 
 
 def thread_count_of(client: Client | None) -> int:

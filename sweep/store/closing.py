@@ -28,10 +28,11 @@ def finish(store: RunStore, groups: Mapping[str, xr.Dataset], counts: dict[str, 
     _write_groups(store, groups, metadata)
 
 
-def reopen(store: RunStore) -> None:
+def reopen(store: RunStore, text: str | None = None) -> None:
     """Mark a finished store unfinished, so that blocks of it can be computed again.
 
-    Its groups go, since they sum the blocks up.
+    Its groups go, since they sum the blocks up. With a ``text``, that is its pipeline from then on:
+    one of the same cells. A kill at any instant leaves a store with one of the two.
     """
     metadata = {
         key: value for key, value in store.run_metadata.items()
@@ -47,6 +48,8 @@ def reopen(store: RunStore) -> None:
         write_manifest(store.storage, Manifest(dict(store.group.attrs), files))
         root = parsed(sync(store.storage.get("zarr.json", default_buffer_prototype()))) or {}
         root["attributes"]["sweep"] = {**metadata, "finished": False}
+        if text is not None:
+            root["attributes"]["pipeline"] = text
         root.pop("consolidated_metadata", None)
         put(store.storage, "zarr.json", root)
         for name in ("cost", "failures"):

@@ -48,6 +48,12 @@ trial = %d
 """
 SHORT_TRIALS, LONG_TRIALS = 250, 1500
 
+IN_WAVES = """
+[precision]
+detection_rate = 0.03
+per = ["distance_m", "tilt_deg"]
+"""
+
 CLIENT = """
 import sys
 from sweep.execution.runner import execute
@@ -72,8 +78,9 @@ def whole(url, pipeline, reference):
     assert same(url, reference)
     with xr.open_zarr(url) as opened:  # a warning where its metadata is not in one place
         assert opened.sizes
+    computed = sum(receipt.any_needed for _, receipt in told)
     with xr.open_zarr(url, group="cost") as cost:
-        assert cost.sizes["block"] == count
+        assert cost.sizes["block"] == computed
 
 
 def prepared(folder, text, name):
@@ -293,6 +300,22 @@ def test_kills_at_random_instants_change_no_bit_and_lose_no_block(count, tmp_pat
         f"clients that ended of themselves, by status: {dict(chaos.ended)}; "
         f"{time.monotonic() - begun:.0f} s; left behind: "
         f"{sum(1 for _ in tmp_path.rglob('*.partial'))} partial files"
+    )
+
+
+@pytest.mark.long
+@lengths(5, 20)
+def test_kills_of_a_run_to_a_precision_change_no_bit(count, tmp_path):
+    text = (GRID % 2000).replace("[0.2, 0.3, 0.4]", "[0.2, 1.1, 1.2, 1.3, 1.4]") + IN_WAVES
+    pipeline, path, reference = prepared(tmp_path, text, "undisturbed")
+    chaos = Chaos(tmp_path, pipeline, path, reference, SEED)
+    chaos.run(count)
+    needed = open_store(reference)
+    needed = sum(receipt.scenes_needed for _, receipt in receipts(needed, committed(needed)))
+    assert 0 < needed < pipeline.size(Stage.scene)
+    print(
+        f"{chaos.killed.total()} kills ({dict(chaos.killed)}), {chaos.stores} stores of "
+        f"{needed:,} needed scenes of {pipeline.size(Stage.scene):,}, 0 differences"
     )
 
 

@@ -6,17 +6,15 @@ import math
 import numpy as np
 import pytest
 
-from support.stores import same
+from support.stores import by_hand, same
 from sweep.errors import PipelineError
-from sweep.execution.block_task import compute_block
-from sweep.execution.waiting import InWaves
 from sweep.measure.flags import DetectionStatus
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks
 from sweep.sampling.rules import make_rule
 from sweep.sampling.stopping import block_unit, wave_ends
 from sweep.sampling.waves import Waves
-from sweep.store.lifecycle import create_store, open_dataset
+from sweep.store.lifecycle import open_dataset
 
 TEXT = """
 seed = 3
@@ -65,20 +63,9 @@ def test_each_block_is_in_one_wave_of_one_group(extents, pipeline):
         assert group == block.starts[1] // extents[1]  # tilt_deg is pooled
 
 
-def in_waves(url, pipeline, extents):
-    """Compute a store in this process, in the order of its waves."""
-    store = create_store(url, pipeline, extents)
-    waiting = InWaves(store, pipeline.stopping, make_rule(pipeline))
-    while (work := waiting.next()) is not None:
-        for number in work.numbers:
-            waiting.committed(number, compute_block(
-                url, store.run_id, store.blocks[number], decision=work.decision))
-    return store
-
-
 def test_needed_trials_are_those_of_the_rule_whatever_the_blocks(pipeline, tmp_path):
     url, other = str(tmp_path / "a.zarr"), str(tmp_path / "b.zarr")
-    in_waves(url, pipeline, (2, 3, 25))
+    by_hand(url, pipeline, (2, 3, 25))
     flags = open_dataset(url).detection.to_numpy()
     assert (flags != DetectionStatus.not_run).all()
     unneeded = flags == DetectionStatus.not_needed
@@ -87,7 +74,7 @@ def test_needed_trials_are_those_of_the_rule_whatever_the_blocks(pipeline, tmp_p
     assert (np.sort(unneeded, axis=2) == unneeded).all()  # nothing is needed again
     assert set(counts[0]) <= {25, 50, 75, 100}
     assert len(set(counts[0])) > 1
-    in_waves(other, pipeline, (1, 2, 25))
+    by_hand(other, pipeline, (1, 3, 25))
     assert same(url, other)
 
 

@@ -3,17 +3,42 @@
 import xarray as xr
 
 from sweep.execution.block_task import compute_block
+from sweep.execution.waiting import InWaves
+from sweep.plan.axes import TRIAL
 from sweep.plan.grid import scene_axes
+from sweep.sampling.rules import make_rule
+from sweep.sampling.stopping import block_unit
 from sweep.store.lifecycle import create_store
 
 
 def by_hand(url, pipeline, extents=None):
-    """Compute a store in this process, without a cluster; as one block unless extents are given."""
-    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
+    """Compute a store in this process, without a cluster; as one block unless extents are given.
+
+    In waves, extents are such that a block is of one wave.
+    """
+    rule = make_rule(pipeline)
+    lengths = tuple(
+        block_unit(rule.ends) if rule and axis.name == TRIAL else len(axis)
+        for axis in scene_axes(pipeline)
+    )
     store = create_store(url, pipeline, extents or lengths)
-    for block in store.blocks:
-        compute_block(url, store.run_id, block)
+    if rule is None:
+        for block in store.blocks:
+            compute_block(url, store.run_id, block)
+    else:
+        in_waves(store, pipeline)
     return store
+
+
+def in_waves(store, pipeline, most=None):
+    """Compute blocks of a store in this process by the pipeline's rule; return how many."""
+    waiting, count = InWaves(store, pipeline.stopping, make_rule(pipeline)), 0
+    while (work := waiting.next()) is not None and (most is None or count < most):
+        for number in work.numbers:
+            waiting.committed(number, compute_block(
+                store.url, store.run_id, store.blocks[number], decision=work.decision))
+            count += 1
+    return count
 
 
 def same(a, b):

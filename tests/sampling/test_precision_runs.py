@@ -1,0 +1,143 @@
+"""Runs to a precision: equal bits whatever computes them, tightened, reused, verified, repaired."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from support.here import calls_here
+from support.stores import by_hand, in_waves, same
+from sweep.errors import OtherExperimentError
+from sweep.execution.finalize import close
+from sweep.execution.runner import execute
+from sweep.execution.status import status
+from sweep.execution.tightening import tighten
+from sweep.integrity.repair import repair
+from sweep.integrity.verification import verify
+from sweep.measure.flags import DetectionStatus
+from sweep.plan.experiment import Pipeline
+from sweep.store.blocks import committed, drop_block, receipts
+from sweep.store.lifecycle import open_dataset
+
+TEXT = """
+seed = 3
+camera = { width_px = 64, height_px = 48 }
+pose = { jitter_px = 0.5 }
+scene = { renderer = "warp" }
+axes = { side_px = [8, 13, 30] }
+precision = { detection_rate = %s, max_trials = 150 }
+"""
+
+WIDTHS = ("0.4", "0.14", "0.1")
+
+
+def precise(width, settings=()):
+    return Pipeline.from_text(TEXT % width, settings, name="precise")
+
+
+@pytest.fixture(scope="module")
+def at_once(tmp_path_factory):
+    """A store of the narrowest precision, asked for at once."""
+    url = str(tmp_path_factory.mktemp("once") / "once.zarr")
+    close(by_hand(url, precise(WIDTHS[-1]), (3, 50)))
+    return url
+
+
+def test_tightened_twice_and_interrupted_is_as_asked_for_at_once(at_once, tmp_path):
+    url = str(tmp_path / "tightened.zarr")
+    store = by_hand(url, precise(WIDTHS[0]), (1, 50))
+    needed = [sum(r.scenes_needed for _, r in receipts(store, committed(store)))]
+    for width in WIDTHS[1:]:
+        pipeline = precise(width)
+        store = tighten(store, pipeline)
+        assert store.pipeline.stopping == pipeline.stopping
+        in_waves(store, pipeline, most=1)
+        in_waves(store, pipeline)  # as a run that continues
+        needed.append(sum(r.scenes_needed for _, r in receipts(store, committed(store))))
+    assert needed == sorted(set(needed))
+    assert needed[0] == 150 < needed[-1] < 450
+    assert same(url, at_once)
+    assert in_waves(store, precise(WIDTHS[-1])) == 0
+
+
+def test_verify_finds_flags_that_the_results_contradict(at_once, tmp_path):
+    url = str(tmp_path / "wrong.zarr")
+    assert verify(at_once, 1).damage == []
+    assert status(at_once).settled == 3
+    # Under another precision, the same flags are wrong.
+    store = by_hand(url, precise(WIDTHS[-1]), (3, 50))
+    tighten(store, precise("0.05"))
+    damage = verify(url, 0).damage
+    assert {each.block for each in damage} == {1}
+    assert "not flagged as the results of earlier trials demand" in damage[0].what
+
+
+@pytest.mark.long
+def test_repair_computes_the_needed_scenes_of_damaged_blocks(at_once, tmp_path):
+    url = str(tmp_path / "damaged.zarr")
+    store = by_hand(url, precise(WIDTHS[-1]), (1, 50))
+    close(store)
+    for number in (1, 4, 5):
+        drop_block(store, store.blocks[number])
+    with calls_here():
+        report = repair(url, 0)
+    assert report.damage == []
+    assert len({each.block for each in report.repaired}) == 3
+    assert same(url, at_once)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("first", "second"), list(itertools.permutations(("fixed", "waves"))))
+def test_fixed_trials_and_waves_reuse_each_other(first, second, tmp_path):
+    pipelines = {
+        "fixed": Pipeline.from_text(
+            (TEXT % 0.1).split("precision")[0].replace(
+                "side_px = [8, 13, 30]", "side_px = [8, 13, 30], trial = 150"), name="fixed"),
+        "waves": precise(WIDTHS[-1]),
+    }
+    source, reference = (str(tmp_path / f"{name}.zarr") for name in ("source", "reference"))
+    target = str(tmp_path / "target.zarr")
+    execute(pipelines[first], source)
+    with pytest.raises(OtherExperimentError, match="trials: the store has") as refused:
+        execute(pipelines[second], source)
+    assert refused.value.reusable
+    whole = execute(pipelines[second], reference)
+    summary = execute(pipelines[second], target, reuse=[source])
+    assert same(target, reference)
+    assert summary.computed_scenes < whole.computed_scenes
+    assert (summary.computed_scenes == 0) == (first == "fixed")
+
+
+@pytest.mark.long
+def test_workers_and_blocks_and_tightening_change_no_bit(tmp_path):
+    change = ["side_px = {linspace = [8, 30, 12]}", "precision.max_trials = 600"]
+    reference = str(tmp_path / "reference.zarr")
+    summary = execute(precise("0.05", change), reference)
+    assert summary.unsettled == 0
+    assert summary.needed < summary.poses == 12 * 600
+    for workers, block_s in itertools.product((1, 2, 4), (0.01, 0.1, 1.0)):
+        url = str(tmp_path / f"{workers}-{block_s}.zarr")
+        for width in ("0.2", "0.1", "0.05") if block_s == 0.1 else ("0.05",):
+            execute(precise(width, change), url, workers=workers, block_s=block_s)
+        assert same(url, reference), url
+        assert verify(url, 5).damage == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("settings", "needed"), [
+    (["precision.max_trials = 1"], 3),
+    (["precision.per = []"], None),
+    (["side_px = 30"], None),
+    (["side_px = 30", "bearing_x_deg = 80", "precision.max_trials = 5000"], 50),
+    (["side_px = 30", "marker_id = {range = [0, 50]}", "precision.per = ['side_px']"], None),
+])
+def test_extremes_end(settings, needed, tmp_path):
+    url = str(tmp_path / "extreme.zarr")
+    pipeline = precise("0.1", settings)
+    summary = execute(pipeline, url)
+    assert needed in {None, summary.needed}
+    assert verify(url, 3).damage == []
+    flags = open_dataset(url).detection.to_numpy()
+    assert (flags != DetectionStatus.not_needed).sum() == summary.needed
+    assert (flags != DetectionStatus.not_run).all()
+    assert np.isnan(open_dataset(url).true_rvec).any() == (summary.needed < summary.poses)

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ArgumentError", "DatasetError", "Pipeline", "PipelineError", "Progress", "RunError",
     "StoreError", "SweepError", "__version__", "decode_flags",
-    "open", "run",
+    "open", "photos", "run",
 ]
 
 _IMPORTED_ON_USE = {"Pipeline": "sweep.plan.experiment", "Progress": "sweep.execution.progress",
@@ -251,3 +251,65 @@ def open(store: str | os.PathLike[str]) -> xr.Dataset:  # noqa: A001  (as xarray
     from sweep.store.lifecycle import open_dataset  # noqa: PLC0415  (xarray is slow to import)
 
     return open_dataset(store)
+
+
+def photos(
+    *folders: str | os.PathLike[str],
+    camera: str | os.PathLike[str] | None = None,
+    board: str | os.PathLike[str] | None = None,
+    poses: str | os.PathLike[str] | None = None,
+    stereo: str | os.PathLike[str] | None = None,
+    settings: Sequence[str] = (),
+    store: str | os.PathLike[str] | None = None,
+    workers: int | None = None,
+    overwrite: bool = False,
+    progress: bool | Callable[[Progress], None] | None = None,
+) -> xr.Dataset:
+    """Measure detectors and estimators on photographs of known markers.
+
+    Parameters
+    ----------
+    folders
+        A folder of photographs of one camera; with ``stereo`` two, or one of images whose halves
+        are the left and the right camera's.
+    camera
+        The file of a calibration, or "calibrate": from the board in the photographs.
+    board
+        The board's TOML file. The truth of a marker is the board's pose by all other corners.
+    poses
+        A file of the true poses, as ``sweep score`` reads them.
+    stereo
+        The file of a stereo calibration: the truth is the pose in the other camera's image.
+    settings
+        "key=value" with TOML values, as ``--set`` takes them: ``'solver=["ippe", "sqpnp"]'``.
+    store
+        Path or URL of the store (default: ``runs/NAME.zarr`` with the folder's name).
+    workers, overwrite, progress
+        As for :func:`run`.
+
+    Returns
+    -------
+    xarray.Dataset
+        The results, with the dimensions of a simulation's: ``trial`` is the photograph's number,
+        and ``photograph`` its file. Lines on what was found are told on stderr.
+
+    Raises
+    ------
+    ArgumentError, PipelineError, StoreError, RunError
+        As for :func:`run`; photographs, cameras and boards that do not fit are told in a line.
+    """
+    from sweep.messages import notice  # noqa: PLC0415
+    from sweep.photographs.prepare import prepare  # noqa: PLC0415
+    from sweep.photographs.record_files import record_home  # noqa: PLC0415
+
+    home, name = record_home(store)
+    prepared = prepare(
+        folders, camera, board=board, poses=poses, stereo=stereo, settings=settings, home=home,
+        name=name, overwrite=overwrite,
+    )
+    for line in prepared.lines:
+        notice(line)
+    return _run(
+        prepared.pipeline, store=store or os.path.join(home, f"{prepared.pipeline.name}.zarr"),  # noqa: PTH118
+        workers=workers, overwrite=overwrite, progress=progress,
+    )

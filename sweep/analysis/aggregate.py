@@ -18,9 +18,10 @@ from dask.typing import Key
 from numpy.typing import NDArray
 
 from sweep.analysis.binning import Binning, Bins, read_bins
-from sweep.analysis.dimensions import is_fixed, is_sampling_stopped
+from sweep.analysis.dimensions import is_fixed, is_sampling_stopped, of_photographs
 from sweep.analysis.graph import ChunkReader, ReadBlock, TaskLayer, add_pass, array_of_blocks
 from sweep.analysis.layout import Arrays, Layout, Lengths
+from sweep.analysis.photograph_rates import by_photograph
 from sweep.analysis.pose_view import COMMON
 from sweep.analysis.replicates import replicate_order, replicated
 from sweep.analysis.states import BlockState, Nothing, State
@@ -76,7 +77,10 @@ def aggregate(
             inputs = {**inputs, COMMON: common}
     dataset = xr.Dataset(
         {name: array.reset_coords(drop=True) for name, array in inputs.items()} | binned)
-    layout = Layout.of(dataset, kept)
+    photographs = of_photographs(results)
+    layout = Layout.of(dataset, kept, has_cells=not photographs)
+    if photographs:
+        statistics = [by_photograph(statistic) for statistic in statistics]
     if (order := replicate_order(results, layout.draws)) is not None:
         settings = math.prod(results.sizes[name] for name in layout.settings)
         layout = dataclasses.replace(layout, order=order)

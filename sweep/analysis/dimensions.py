@@ -11,6 +11,7 @@ import xarray as xr
 
 from sweep.analysis.pose_view import REQUIRED_VARIABLES
 from sweep.errors import ArgumentError, DatasetError, SweepError
+from sweep.plan.alternatives import PHOTOGRAPHS
 from sweep.plan.camera_values import SQUARE_FORMAT, stored_text
 from sweep.plan.coordinates import FIXED
 from sweep.plan.experiment import Pipeline
@@ -37,11 +38,19 @@ def configuration_axes(results: xr.Dataset) -> list[str]:
     return [name for name in axes_of(results) if name not in scene]
 
 
+def of_photographs(results: xr.Dataset) -> bool:
+    """Return whether the poses are those of photographs: the draws are then photographs."""
+    return PHOTOGRAPHS in results.coords
+
+
 def is_grid_axis(name: object, results: xr.Dataset) -> bool:
     """Return whether a dimension is of the camera, the marker or the pose: it makes cells.
 
-    Of parameters that go together one such suffices.
+    Of parameters that go together one such suffices. Photographs have no cells: what is seen in
+    one photograph together counts as one draw, for its errors are correlated.
     """
+    if of_photographs(results):
+        return False
     attributes = results[name].attrs if name in results.coords else {}
     return any(
         each in PARAMETERS and PARAMETERS[each].section in GEOMETRY_SECTIONS

@@ -55,10 +55,13 @@ class Layout:
     order: NDArray[np.intp] | None = None
 
     @classmethod
-    def of(cls, dataset: xr.Dataset, kept: Sequence[str]) -> Layout:
-        """Return that of a dataset's arrays."""
+    def of(cls, dataset: xr.Dataset, kept: Sequence[str], *, has_cells: bool = True) -> Layout:
+        """Return that of a dataset's arrays; without cells other dimensions are settings."""
         pooled = [str(dim) for dim in dataset.dims if dim not in LABELS and dim not in kept]
-        cells = tuple(name for name in pooled if name != DRAWS and is_grid_axis(name, dataset))
+        cells = tuple(
+            name for name in pooled
+            if has_cells and name != DRAWS and is_grid_axis(name, dataset)
+        )
         draws = tuple(name for name in pooled if name == DRAWS)
         return cls(
             {str(name): tuple(map(str, array.dims)) for name, array in dataset.items()},

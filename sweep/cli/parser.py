@@ -14,6 +14,7 @@ from sweep.cli.environments import ENVIRONMENTS
 from sweep.cli.error_model import ERROR_MODEL
 from sweep.cli.export import EXPORT
 from sweep.cli.output import flushed
+from sweep.cli.photos import PHOTOS
 from sweep.cli.plan import PLAN
 from sweep.cli.plugins import PLUGINS
 from sweep.cli.report import REPORT
@@ -30,7 +31,7 @@ from sweep.version import __version__
 
 COMMANDS = (
     RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, ERROR_MODEL, VERIFY, STATUS, EXPORT,
-    SCORE, CHECK_DETECTOR, PLUGINS, ENVIRONMENTS, COMPLETION,
+    SCORE, PHOTOS, CHECK_DETECTOR, PLUGINS, ENVIRONMENTS, COMPLETION,
 )
 """Every command, in the order in which the help lists them."""
 

@@ -32,6 +32,7 @@ from sweep.evaluation.variables import (
     SceneResults,
     compute,
     compute_estimation,
+    photograph_variables,
 )
 from sweep.measure.accuracy import pose_error
 from sweep.measure.bound import Bounds, bounds
@@ -42,6 +43,7 @@ from sweep.model.columns import Column
 from sweep.model.derivatives import POSE
 from sweep.model.extent import marker_boxes
 from sweep.model.scene import Scenes, build_scenes
+from sweep.plan.alternatives import PHOTOGRAPHS
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings, estimators, scene_values
 from sweep.plan.image_keys import image_keys
@@ -146,6 +148,8 @@ def _run_batch(
         variable.name: values[variable.drawn_as].broadcast(count)
         for variable in drawn_variables(pipeline)
     })
+    if PHOTOGRAPHS in pipeline.given:
+        add(photograph_variables(scenes, values))
     seconds = {
         "scene": [geometry_s + render_s + time.perf_counter() - start],
         "detection": [result.seconds for result in results],

@@ -75,13 +75,17 @@ def whole_frames(values: Mapping[str, Column], count: int) -> Masks:
 
 
 def visibility_flags(scenes: Scenes) -> NDArray[np.uint8]:
-    """Return not_visible, not_modelled, or not_run for scenes (N,) that must be searched."""
+    """Return why scenes (N,) are not searched; not_run for those that must be.
+
+    A pose that is NaN is that of a marker that a photograph does not show.
+    """
     flags = np.full(len(scenes), DetectionStatus.not_run, dtype=np.uint8)
     behind = hidden(scenes)
     flags[behind] = DetectionStatus.not_visible
     flags[not_modelled(scenes) & ~behind] = DetectionStatus.not_modelled
     open_rows = np.flatnonzero(flags == DetectionStatus.not_run)
     flags[open_rows[outside_frame(scenes, open_rows)]] = DetectionStatus.not_visible
+    flags[np.isnan(scenes.translation).any(axis=1)] = DetectionStatus.not_in_photograph
     return flags
 
 
@@ -211,8 +215,12 @@ def search(
                     elsewhere.add(row, searched)
                     now = clock()
                     continue
+                if setting_pass.searched is searched and setting_pass.sought == dictionary[row]:
+                    note((row, *setting_pass.candidates[-1][1:]))  # another marker of a photograph
+                    continue
                 try:
                     note((row, *find(searched, dictionary[row], sides[row])))
+                    setting_pass.searched, setting_pass.sought = searched, dictionary[row]
                 except Exception as error:
                     raise_machine_fault(error)
                     failures.append(Failure(row, "detection", exception_text(failures), k))
@@ -261,7 +269,11 @@ def search(
 
 @dataclass(slots=True)
 class _Pass:
-    """The search with one setting: its candidates by row, and the rows for which it raised."""
+    """The search with one setting: its candidates by row, and the rows for which it raised.
+
+    ``searched`` is the image of the last of the candidates, ``sought`` its dictionary: what was
+    found in a photograph counts for all its markers.
+    """
 
     find: FindFunction
     candidates: list[tuple[int, *DetectorOutput]] = field(default_factory=list)
@@ -269,6 +281,8 @@ class _Pass:
     failed: list[int] = field(default_factory=list)
     crashed: list[int] = field(default_factory=list)
     seconds: float = 0.0
+    searched: Grey | None = None
+    sought: str = ""
 
 
 GROUP_PX = 1 << 24

@@ -18,6 +18,7 @@ from sweep.measure.bound import Bounds
 from sweep.measure.covariance import squared_deviations
 from sweep.measure.estimation import Detections, Estimates
 from sweep.measure.flags import EstimateStatus, Flipped
+from sweep.model.columns import Column
 from sweep.model.extent import areas_px
 from sweep.model.pose import vector_of_rotation, viewing_angle
 from sweep.model.scene import Scenes
@@ -97,6 +98,20 @@ SCENE: dict[str, Callable[[SceneResults], NDArray[Any]]] = {
     "mirror_distance": lambda results: results.bounds.mirror_distance,
 }
 """Variable of the scene -> its values (N, ...)."""
+
+
+def photograph_variables(scenes: Scenes, values: Mapping[str, Column]) -> dict[str, NDArray[Any]]:
+    """Return the variables (N, ...) that photographs have besides, by name."""
+    distance = scenes.translation[:, 2]
+    centre = scenes.cameras.project(scenes.translation[:, None])[:, 0]
+    return {
+        "side_px": scenes.cameras.view[:, 0] * scenes.size_m / distance,
+        "distance_m": distance,
+        "tilt_deg": values["resolved_tilt_deg"].values,
+        "image_x_px": centre[:, 0], "image_y_px": centre[:, 1],
+        "truth": values["truth"].values, "truth_std": values["truth_std"].values,
+    }
+
 
 DETECTION: dict[str, Callable[[DetectionResults], NDArray[Any]]] = {
     "detection": lambda results: results.flags,

@@ -28,10 +28,12 @@ from sweep.execution.limits import (
 )
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.isolation.watchdog import compilation_s
+from sweep.plan.alternatives import PHOTOGRAPHS
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.parameters import Stage
+from sweep.plan.photographs import along_photographs
 from sweep.plan.schema import bytes_per_block
 from sweep.sampling.rules import make_rule
 from sweep.sampling.stopping import Stopping, block_unit
@@ -138,12 +140,12 @@ def calibrate(
     costs: list[BatchCost] = []
     picks: list[Indices] = []
     batch, growing = 1, True
-    indices = sample(axes, generator, batch)
+    indices = _sample(pipeline, generator, batch)
     try:
         cost(pipeline, indices)
         started = time.perf_counter()
         while len(costs) < MAX_BATCHES:
-            indices = sample(axes, generator, batch)
+            indices = _sample(pipeline, generator, batch)
             costs.append(cost(pipeline, indices))
             picks.append(indices)
             left = budget_s - (time.perf_counter() - started)
@@ -159,7 +161,7 @@ def calibrate(
             batch = min(wanted, GROWTH * batch, max(int(left / scene_s), 1))
     except TimeoutError as error:
         over_s = error.args[0]
-        count = batch if axes else 1
+        count = len(indices[0]) if axes else 1
         costs.append(BatchCost(over_s, np.full(count, over_s / count), over_s))
         return _calibration(pipeline, [*picks, indices], costs, over=True)
     return _calibration(pipeline, picks, costs)
@@ -240,6 +242,18 @@ def sample(
     return [generator.integers(0, len(axis), count).astype(np.intp) for axis in axes]
 
 
+def _sample(pipeline: Pipeline, generator: np.random.Generator, count: int) -> Indices:
+    """Return the indices of a random sample of scenes: of photographs all markers of one."""
+    axes = scene_axes(pipeline)
+    if PHOTOGRAPHS not in pipeline.given:
+        return sample(axes, generator, count)
+    each = [
+        generator.integers(0, len(axis), 1) if along else np.arange(len(axis))
+        for axis, along in zip(axes, along_photographs(axes), strict=True)
+    ]
+    return [grid.ravel().astype(np.intp) for grid in np.meshgrid(*each, indexing="ij")]
+
+
 def block_work_s(total_s: float, workers: int, time_limit_s: float | None = None) -> float:
     """Return the seconds of work in a block of a run that takes ``total_s`` of one worker.
 
@@ -287,6 +301,12 @@ def block_extents(
     time_limit_s
         Block timeout in seconds, if the user gave one.
     """
+    axes = scene_axes(pipeline)
+    if PHOTOGRAPHS in pipeline.given:  # each is searched once, for all its markers
+        return tuple(
+            1 if along else len(axis)
+            for axis, along in zip(axes, along_photographs(axes), strict=True)
+        )
     total_s = pipeline.size(Stage.scene) * calibration.scene_s
     rule = make_rule(pipeline)
     if rule is not None:

@@ -88,6 +88,28 @@ class DetectionStatus(Flag):
     failed = flag(7, "An exception was raised.")
     crashed = flag(8, "The process died.")
     not_needed = flag(9, "The precision that was asked for did not need the trial.", counted=False)
+    not_in_photograph = flag(
+        10, "The photograph does not show the whole marker, or its pose is not known.",
+        counted=False,
+    )
+
+
+class TruthSource(Flag):
+    """Origin of the true pose of a marker in a photograph."""
+
+    not_run = flag(0, "The pose was not computed.", counted=False)
+    none = flag(
+        1, "There is no truth: errors are differences from a pose estimated from the marker's own "
+        "corners.",
+    )
+    board_without_this_marker = flag(
+        2, "The pose of the board, fitted to all its corners except those of this marker.",
+        present=True,
+    )
+    poses_file = flag(3, "A file of poses that the user gave.", present=True)
+    stereo_partner = flag(
+        4, "The pose in the other camera's image of the same moment.", present=True
+    )
 
 
 class EstimateStatus(Flag):
@@ -154,7 +176,7 @@ def uncounted_values(flags: Iterable[Flag]) -> list[int]:
     Examples
     --------
     >>> uncounted_values(DetectionStatus)
-    [0, 5, 6, 9]
+    [0, 5, 6, 9, 10]
     """
     return [int(member) for member in flags if not member.counted]
 
@@ -168,7 +190,7 @@ def outcomes(counted: bool) -> tuple[str, ...]:
     Examples
     --------
     >>> outcomes(counted=False)
-    ('not_visible', 'not_modelled', 'not_run', 'not_needed')
+    ('not_visible', 'not_modelled', 'not_in_photograph', 'not_run', 'not_needed')
     """
     detection, estimation = (
         [member.name for member in flags if member.ends and member.counted == counted]

@@ -23,6 +23,9 @@ BYTES_PER_PIXEL = 8
 
 MAX_PATH_LENGTH = 4096
 
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".pbm")
+"""Ends of the names of image files, in lower case."""
+
 JPEG = b"\xff\xd8\xff"
 """First bytes of a JPEG file."""
 

@@ -16,6 +16,7 @@ from sweep.model.exposure import marker_exposure
 from sweep.model.extent import WARP_PX_PER_MODULE
 from sweep.model.image_file import decode_grey
 from sweep.model.marker import edge_table, edges, modules, overhang
+from sweep.model.photograph import photograph_image
 from sweep.model.plugged_scene import MarkerView
 from sweep.model.scene import Box, Scenes
 from sweep.model.sensing import sensed, sensed_window
@@ -25,6 +26,10 @@ from sweep.model.tone import bloomed
 Grey = NDArray[np.uint8]
 
 SUPERSAMPLE = re.compile(r"supersample-([1-9][0-9]{0,2})(-jittered)?")
+
+
+PHOTOGRAPH = "photograph"
+"""Renderer of scenes whose background is a photograph that shows the marker already."""
 
 
 def renderer_fault(name: str) -> str | None:
@@ -85,6 +90,11 @@ def _compose(scenes: Scenes, row: int, box: Sequence[int], window: Sequence[int]
     x0, y0, x1, y1 = box
     inner = np.s_[y0 - top : y1 - top, x0 - left : x1 - left]
     background = scenes.background[row]
+    if scenes.renderer[row] == PHOTOGRAPH:
+        photograph = photograph_image(str(background))
+        if window == [0, 0, photograph.shape[1], photograph.shape[0]]:
+            return photograph  # the same array for all its markers: it is searched once
+        return photograph[top:bottom, left:right].copy()
     if isinstance(background, str):
         image = background_image(background)[top:bottom, left:right].copy()
     else:

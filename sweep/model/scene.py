@@ -53,6 +53,12 @@ class Scene:
         "the pipeline file)",
         unit="grey level", low=0, high=255, drawable=True,
     )
+    photographs: str | None = parameter(
+        None,
+        "photographs with the poses of their markers, in place of simulated images: a file that "
+        "`sweep photos` writes (path relative to the pipeline file); trial is then the "
+        "photograph's number",
+    )
 
 
 @dataclass(frozen=True, slots=True)

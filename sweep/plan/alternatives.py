@@ -29,6 +29,9 @@ CHOICES: tuple[tuple[tuple[str, ...], ...], ...] = (
 """The ways, each of one or more parameters, in which a part of a pose is given in the camera's
 frame: one of them, not two."""
 
+PHOTOGRAPHS = "photographs"
+"""The parameter that takes poses and images from a record of photographs."""
+
 RIVALS: dict[str, frozenset[str]] = {
     name: frozenset(
         other for ways in CHOICES for way in ways
@@ -49,6 +52,8 @@ def superseded(given: Collection[str]) -> set[str]:
     >>> sorted(superseded({"view_angle_deg", "distance_m"}))
     ['pitch_deg', 'side_px', 'tilt_deg', 'yaw_deg']
     """
+    if PHOTOGRAPHS in given:
+        return {*IN_CAMERA, *WORLD, "jitter_px"}
     if any(name in given for name in WORLD):
         return set(IN_CAMERA)
     return {rival for name in given for rival in RIVALS.get(name, ())}

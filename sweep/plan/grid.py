@@ -26,6 +26,7 @@ from sweep.plan.beliefs import CALIBRATED, believed_calibration, calibrated_colu
 from sweep.plan.draws import bits, even_uniform, geometry_keys, jointly_drawn, uniform
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
+from sweep.plan.photographs import recorded_poses
 from sweep.plan.pose_values import resolve_pose
 from sweep.plan.scene_plugins import effects_of
 from sweep.plugins.declared import DeclaredPlugin, PluginSetting
@@ -151,6 +152,8 @@ def scene_values(
         effect.switch in drawn or values[effect.switch].differs_from(effect.off)
         for effect in effects_of(pipeline.plugins) if effect.random
     )
+    if not values["photographs"].missing:
+        return values | _photographed(pipeline, values, trials)
     calibration = believed_calibration(pipeline.fixed, pipeline.values_of("believed"))
     if not drawn and not noisy and not (jitter > 0).any() and calibration is None:
         resolve_pose(values)
@@ -177,6 +180,16 @@ def scene_values(
         values["noise_key"] = Column.of(bits(pipeline.seed, "noise", keys, trials))
     resolve_pose(values)
     return values
+
+
+def _photographed(
+    pipeline: Pipeline, values: Mapping[str, Column], trials: NDArray[np.int64]
+) -> dict[str, Column]:
+    """Return the parameters of scenes that are photographs, numbered by ``trials`` (N,)."""
+    names = values["photographs"].listed(len(trials))
+    ids = values["marker_id"].broadcast(len(trials), np.int64)
+    poses = recorded_poses(names, pipeline.folder, trials, ids)
+    return {name: Column.of(column) for name, column in poses.items()}
 
 
 def _absolute(folder: str, background: Any) -> Any:

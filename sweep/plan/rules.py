@@ -26,13 +26,14 @@ from sweep.model.marker import (
     missing_package,
     opencv_dictionary_names,
 )
-from sweep.plan.alternatives import IN_CAMERA, WORLD, contradictions
+from sweep.plan.alternatives import IN_CAMERA, PHOTOGRAPHS, WORLD, contradictions
 from sweep.plan.axes import TRIAL
 from sweep.plan.background_files import check_backgrounds
 from sweep.plan.beliefs import beliefs_in_one_way
 from sweep.plan.camera_values import one_camera
 from sweep.plan.effect_values import mosaics_have_room, noise_tables_ascend
 from sweep.plan.parameters import PARAMETERS, SECTIONS, Stage
+from sweep.plan.photograph_rules import photographs_alone
 from sweep.plan.reader import HEADER, Reading
 from sweep.plan.schema import LABELS, VARIABLES
 from sweep.plan.sobol import REPLICATES
@@ -46,6 +47,8 @@ MAX_CONFIGURATIONS = 10_000
 
 def pose_in_one_way(reading: Reading) -> None:
     """Demand a distance, and each quantity of the pose in one way."""
+    if PHOTOGRAPHS in reading.given:
+        return
     for first, other in contradictions(reading.given):
         reading.fault(
             other, reading.written(other), f"{first} or {other}, not both; delete one of them"
@@ -225,6 +228,8 @@ def names_of_settings(reading: Reading) -> None:
 
 def something_random_to_repeat(reading: Reading) -> None:
     """Demand a random quantity if there is more than one trial."""
+    if PHOTOGRAPHS in reading.given:
+        return
     trials = len(reading.axes[TRIAL]) if TRIAL in reading.axes else 1
     jitter = reading.values("jitter_px")
     noisy = any(is_active(reading, name) for name in RANDOM)
@@ -274,7 +279,8 @@ RESERVED = {
     *VARIABLES, *LABELS, *HEADER, *SECTIONS, "axes", TRIAL,
     *(flag.name for flags in (BoundStatus, DetectionStatus, EstimateStatus, Flipped)
       for flag in flags),
-    "block", "commits", "compared", "cost", "count", "draws", "failure", "failures",
+    "block", "commits", "compared", "cost", "count", "draws", "failure", "failures", "image_x_px",
+    "image_y_px",
     "jitter_u_px", "jitter_v_px", "level", "looked_for", "outcome", "share", "treatment",
 }
 """Names in datasets and tables that no axis may take."""
@@ -325,6 +331,7 @@ def size_of_whole_frames(reading: Reading) -> None:
 
 
 RULES: tuple[Callable[[Reading], None], ...] = (
+    photographs_alone,
     pose_in_one_way,
     one_camera,
     beliefs_in_one_way,

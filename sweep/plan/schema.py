@@ -13,7 +13,15 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flag, Flipped
+from sweep.measure.flags import (
+    BoundStatus,
+    DetectionStatus,
+    EstimateStatus,
+    Flag,
+    Flipped,
+    TruthSource,
+)
+from sweep.plan.alternatives import PHOTOGRAPHS
 from sweep.plan.axes import Axis
 from sweep.plan.coordinates import drawn_quantities
 from sweep.plan.parameters import Stage
@@ -89,8 +97,11 @@ class Tolerance:
     limit: float = 0.0
 
 
-LOST = (DetectionStatus.failed, DetectionStatus.crashed, DetectionStatus.not_needed)
-"""Detections of a scene for which not even the truth may have been computed."""
+LOST = (
+    DetectionStatus.failed, DetectionStatus.crashed, DetectionStatus.not_needed,
+    DetectionStatus.not_in_photograph,
+)
+"""Detections of a scene for which not even the truth may be known."""
 
 UNSEEN = (*LOST, DetectionStatus.not_visible)
 """Detections of a scene in which a corner may be behind the camera: the marker has no image."""
@@ -281,6 +292,29 @@ VARIABLES: dict[str, Variable] = {variable.name: variable for variable in SCHEMA
 """Every variable by its name."""
 
 
+PHOTOGRAPH_SCHEMA: tuple[Variable, ...] = (
+    Variable("side_px", _S, "f8", "side of the black square if it were parallel to the image plane",
+             "px", present_when=_TRUTH, tolerance=Tolerance("relative", TRUTH_RTOL),
+             since_format=5, drawn_as="side_px"),
+    Variable("distance_m", _S, "f8", "depth of the marker's centre along the optical axis", "m",
+             present_when=_TRUTH, tolerance=Tolerance("relative", TRUTH_RTOL), since_format=5,
+             drawn_as="distance_m"),
+    Variable("tilt_deg", _S, "f8", "angle between the marker's plane and the image plane", "degree",
+             present_when=_TRUTH, tolerance=Tolerance("absolute", 180 * TRUTH_RTOL),
+             since_format=5, drawn_as="tilt_deg"),
+    Variable("image_x_px", _S, "f8", "image of the marker's centre, x", "px", present_when=_TRUTH,
+             tolerance=Tolerance("absolute", 1e-6), since_format=5, drawn_as="image_x_px"),
+    Variable("image_y_px", _S, "f8", "image of the marker's centre, y", "px", present_when=_TRUTH,
+             tolerance=Tolerance("absolute", 1e-6), since_format=5, drawn_as="image_y_px"),
+    Variable("truth", _S, "u1", "origin of the true pose", flags=TruthSource, tolerance=_EQUAL,
+             since_format=5),
+    Variable("truth_std", _S, "f4",
+             "standard deviation of the true pose, as far as it is known; camera frame",
+             "radian, m", ("pose_parameter",), present_when=FlagRule("truth", "only"),
+             tolerance=Tolerance("relative", 1e-6), since_format=5),
+)
+"""The variables that stores of photographs have besides."""
+
 DRAWN_FORMAT = 5
 """The store format from which on drawn quantities are variables."""
 
@@ -318,7 +352,8 @@ def variables_of(pipeline: Pipeline, store_format: float = math.inf) -> tuple[Va
     ['jitter_u_px', 'jitter_v_px']
     """
     drawn = drawn_variables(pipeline) if store_format >= DRAWN_FORMAT else ()
-    return schema_of(store_format) + drawn
+    photographed = PHOTOGRAPH_SCHEMA if PHOTOGRAPHS in pipeline.given else ()
+    return schema_of(store_format) + drawn + photographed
 
 
 def bytes_per_block(pipeline: Pipeline, scenes: int) -> int:

@@ -18,8 +18,10 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.dtype import parse_dtype
 from zarr.storage import MemoryStore
 
+from sweep.model.image_file import IMAGE_SUFFIXES
+from sweep.plan.alternatives import PHOTOGRAPHS
 from sweep.plan.attributes import with_description
-from sweep.plan.axes import Axis
+from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.coordinates import FixedValue, fixed_values
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
@@ -203,6 +205,7 @@ def planned_arrays(
     used = {name for variable in variables for name in variable.inner}
     planned += [_labels(name, LABELS[name], {}) for name in sorted(used)]
     planned += _distance(pipeline)
+    planned += _photographs(pipeline)
     if store_format >= DRAWN_FORMAT:
         planned += [_fixed(each) for each in fixed_values(pipeline) if each.name not in VARIABLES]
     planned += [_variable(variable, pipeline, scene_extent) for variable in variables]
@@ -303,6 +306,31 @@ def _distance(pipeline: Pipeline) -> list[PlannedArray]:
             lambda start, stop: distance[start:stop] if distance.ndim else distance,
             coordinate=True,
         )
+    ]
+
+
+def _photographs(pipeline: Pipeline) -> list[PlannedArray]:
+    """Return names and digests of photographs as coordinates along their numbers."""
+    trials = pipeline.axis(TRIAL)
+    if PHOTOGRAPHS not in pipeline.given or trials is None:
+        return []
+    # Photographs of a record are in the order of their names.
+    files = sorted(
+        (name, digest) for name, digest in pipeline.files.items()
+        if name.lower().endswith(IMAGE_SUFFIXES)
+    )[: len(trials)]
+    if len(files) < len(trials):
+        return []
+    columns = {
+        "photograph": ([name.rpartition("/")[2] for name, _ in files], "file of the photograph"),
+        "sha256": ([digest for _, digest in files], "SHA-256 of the photograph's file"),
+    }
+    return [
+        dataclasses.replace(
+            _labels(TRIAL, values, {"long_name": meaning}), path=name, coordinate=True,
+            optional=True,
+        )
+        for name, (values, meaning) in columns.items()
     ]
 
 

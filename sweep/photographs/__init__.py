@@ -1,0 +1,1 @@
+"""Photographs measured as simulated images are: their files, their truth, their store."""

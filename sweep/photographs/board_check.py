@@ -1,0 +1,194 @@
+"""Whether photographs show the board that was described; if not, which one fits better."""
+
+from __future__ import annotations
+
+import itertools
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from sweep.errors import ArgumentError, SweepError
+from sweep.measure.detectors import FindFunction
+from sweep.messages import plain, shown
+from sweep.model.board import Board
+from sweep.model.marker import opencv_dictionary_names
+from sweep.photographs.corners import detect_markers
+from sweep.photographs.folder import Photograph
+from sweep.plan.board_files import board_of
+from sweep.typing import Floats, Integers
+
+MIN_FITTING = 0.8
+"""Share of the detected markers that lie where the board has them."""
+
+FITTING_SHARE = 0.2
+"""Distance of a corner to that of the board's homography, as a share of the marker's side."""
+
+MAX_SIZE_ERROR = 0.08
+"""Relative difference of the markers' measured side to the board's that is refused; blur makes
+detected markers up to 5 % smaller."""
+
+MAX_TRIED = 3
+"""Photographs in which other dictionaries are searched for."""
+
+Seen = Sequence[tuple[Integers, Floats]]
+"""IDs (k,) and corners (k, 4, 2) px of each photograph."""
+
+
+def check_board(
+    path: Path, board: Board, seen: Seen, find: FindFunction, photographs: Sequence[Photograph]
+) -> None:
+    """Refuse a board that the photographs do not show.
+
+    Raises
+    ------
+    ArgumentError
+        One line: what is wrong, and which board fits.
+    """
+    if not any(len(ids) for ids, _ in seen):
+        raise ArgumentError("board", plain(path), _no_marker(board, find, photographs))
+    known = {each for ids, _ in seen for each in ids.tolist()} & set(board.marker_ids)
+    if not known:
+        ids = sorted({each for some, _ in seen for each in some.tolist()})
+        raise ArgumentError(
+            "board", plain(path),
+            f"none of its markers is in the photographs, which show IDs {shown(ids)}; correct "
+            "first_id or ids",
+        )
+    share = fitting_share(board, seen)
+    if share < MIN_FITTING:
+        fits = next(
+            (words for words, other in _others(path)
+             if fitting_share(other, seen) >= max(MIN_FITTING, share + 0.1)), None,
+        )
+        raise ArgumentError(
+            "board", plain(path),
+            f"only {100 * share:.0f} % of the detected markers lie where it has them; "
+            + (f"{fits} fits" if fits else "correct its kind, its rows and columns, or its IDs"),
+        )
+    ratio = measured_side(board, seen)
+    if abs(ratio - 1.0) > MAX_SIZE_ERROR:
+        side = float(np.linalg.norm(board.corners_m[0, 1] - board.corners_m[0, 0]))
+        raise ArgumentError(
+            "board", plain(path),
+            f"markers of {side:g} m do not fit its other lengths, beside which the photographs "
+            f"show about {side * ratio:.3g} m; correct marker_m, or the squares or gaps",
+        )
+
+
+def fitting_share(board: Board, seen: Seen) -> float:
+    """Return the share of all detected markers that lie where a board has them."""
+    fitting = total = 0
+    for ids, quads in seen:
+        total += len(ids)
+        transform, known = _homography(board, ids, quads)
+        if transform is None:
+            continue
+        index = {each: k for k, each in enumerate(board.marker_ids)}
+        flat = board.corners_m[[index[each] for each in ids[known].tolist()]][..., :2]
+        mapped = cv2.perspectiveTransform(flat.reshape(1, -1, 2), transform).reshape(-1, 4, 2)
+        side = np.linalg.norm(np.roll(quads[known], -1, axis=1) - quads[known], axis=2).mean(axis=1)
+        distance = np.linalg.norm(mapped - quads[known], axis=2).max(axis=1)
+        fitting += int((distance < FITTING_SHARE * side).sum())
+    return fitting / total if total else 0.0
+
+
+def measured_side(board: Board, seen: Seen) -> float:
+    """Return the side of the markers over the board's, by the distances of their centres."""
+    ratios: list[float] = []
+    index = {each: k for k, each in enumerate(board.marker_ids)}
+    for ids, quads in seen:
+        known = np.array([each in index for each in ids.tolist()], dtype=bool)
+        if known.sum() < 4:
+            continue
+        flat = board.corners_m[[index[each] for each in ids[known].tolist()]][..., :2]
+        tolerance = float(np.ptp(flat[0], axis=0).max()) / 4
+        transform, _ = cv2.findHomography(
+            quads[known].mean(axis=1), flat.mean(axis=1), cv2.RANSAC, tolerance
+        )
+        if transform is None:
+            continue
+        back = cv2.perspectiveTransform(
+            quads[known].reshape(1, -1, 2), np.asarray(transform)
+        ).reshape(-1, 4, 2)
+        sides = [np.linalg.norm(np.roll(each, -1, axis=1) - each, axis=2).mean(axis=1)
+                 for each in (back, flat)]
+        ratios += (sides[0] / sides[1]).tolist()
+    return float(np.median(ratios)) if ratios else 1.0
+
+
+def _homography(board: Board, ids: Integers, quads: Floats) -> tuple[Any, Any]:
+    """Return what takes the board's plane to a photograph, and which markers it has."""
+    index = {each: k for k, each in enumerate(board.marker_ids)}
+    known = np.array([each in index for each in ids.tolist()], dtype=bool)
+    if known.sum() < 2:
+        return None, known
+    flat = board.corners_m[[index[each] for each in ids[known].tolist()]][..., :2]
+    side = float(np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2).mean())
+    transform, _ = cv2.findHomography(
+        flat.reshape(-1, 2), quads[known].reshape(-1, 2), cv2.RANSAC, FITTING_SHARE * side / 2
+    )
+    return transform, known
+
+
+def _others(path: Path) -> Iterator[tuple[str, Board]]:
+    """Yield boards that differ from a file's in what is often mistaken, each in words."""
+    document = tomllib.loads(path.read_text())
+    legacy = bool(document.get("legacy_pattern", False))
+    changes: list[dict[str, Any]] = []
+    if document.get("kind") == "charuco":
+        pattern = {"legacy_pattern": not legacy}
+        swapped = {"squares_x": document["squares_y"], "squares_y": document["squares_x"]}
+        changes = [pattern, swapped, {**pattern, **swapped}]
+        changes += [
+            {"squares_x": document["squares_x"] + x, "squares_y": document["squares_y"] + y, **also}
+            for x, y in itertools.product((-1, 0, 1), repeat=2) if (x, y) != (0, 0)
+            for also in ({}, pattern)
+        ]
+    elif document.get("kind") == "grid":
+        rows, columns = document["rows"], document["columns"]
+        changes = [{"rows": columns, "columns": rows}]
+        changes += [
+            {"rows": rows + y, "columns": columns + x}
+            for x, y in itertools.product((-1, 0, 1), repeat=2) if (x, y) != (0, 0)
+        ]
+        count = rows * columns
+        ids = list(document.get("ids", range(count)))
+        changes.append({"ids": ids[::-1], "first_id": None})
+        if len(ids) == count:
+            by_rows = [ids[k * columns : (k + 1) * columns] for k in range(rows)]
+            changes.append({"ids": [each for row in by_rows[::-1] for each in row],
+                            "first_id": None})
+    for change in changes:
+        changed = {key: value for key, value in {**document, **change}.items() if value is not None}
+        try:
+            other = board_of(changed, "board")
+        except SweepError:
+            continue
+        words = ", ".join(
+            f"{key} = {shown(value)}" for key, value in change.items() if value is not None
+        )
+        yield words, other
+
+
+def _no_marker(
+    board: Board, find: FindFunction, photographs: Sequence[Photograph]
+) -> str:
+    """Return the line for photographs without a marker of a board's dictionary."""
+    best, count = "", 1
+    for name in opencv_dictionary_names():
+        found = sum(
+            len(detect_markers(find, each.image, name)[0]) for each in photographs[:MAX_TRIED]
+        )
+        if found > count:
+            best, count = name, found
+    return (
+        f"no photograph shows a marker of {board.dictionary}"
+        + (f"; there are {count} of {best} in the first {min(MAX_TRIED, len(photographs))}"
+           if best else "; check that the board is in focus and wholly lit")
+    )
+
+

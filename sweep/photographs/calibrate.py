@@ -1,0 +1,85 @@
+"""The camera from the photographs themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sweep.errors import ArgumentError
+from sweep.photographs.corners import FoundCorners
+from sweep.photographs.pose_fit import Lens
+
+MIN_PHOTOGRAPHS = 4
+"""Photographs with a board from which a camera is calibrated."""
+
+MIN_CORNERS = 12
+"""Corners of a board in a photograph that is used."""
+
+COUNT = 9
+"""Numbers that are estimated: fx, fy, cx, cy, k1, k2, p1, p2, k3."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibratedCamera:
+    """A camera that was calibrated.
+
+    Attributes
+    ----------
+    lens
+        Its numbers.
+    sd
+        Standard deviations of fx, fy, cx, cy (px) and of the five coefficients.
+    rms_px
+        Root mean square of the residuals' lengths.
+    photographs
+        How many were used.
+    """
+
+    lens: Lens
+    sd: tuple[float, ...]
+    rms_px: float
+    photographs: int
+
+
+def calibrate(size: tuple[int, int], found: Sequence[FoundCorners]) -> CalibratedCamera:
+    """Calibrate a camera with five lens coefficients (``cv2.calibrateCameraExtended``).
+
+    Parameters
+    ----------
+    size
+        Width and height in pixels.
+    found
+        The board's corners in each photograph.
+
+    Raises
+    ------
+    ArgumentError
+        If too few photographs show enough of the board.
+    """
+    used = [each for each in found if len(each.points) >= MIN_CORNERS]
+    if len(used) < MIN_PHOTOGRAPHS:
+        raise ArgumentError(
+            "camera", "calibrate",
+            f"expected {MIN_PHOTOGRAPHS} photographs with at least {MIN_CORNERS} corners of the "
+            f"board, from different sides; there are {len(used)}; take more, or give the file of a "
+            "calibration",
+        )
+    try:
+        rms, matrix, distortion, _, _, deviations, *_ = cv2.calibrateCameraExtended(
+            [(each.points * [1.0, -1.0, -1.0]).astype(np.float32) for each in used],
+            [each.pixels.astype(np.float32) for each in used], size, np.eye(3), np.zeros(5),
+        )
+    except cv2.error as error:
+        raise ArgumentError(
+            "camera", "calibrate", f"OpenCV cannot calibrate from these photographs: {error.err}"
+        ) from None
+    return CalibratedCamera(
+        Lens(
+            np.asarray(matrix, dtype=np.float64),
+            np.asarray(distortion, dtype=np.float64).ravel()[:5],
+        ),
+        tuple(np.asarray(deviations).ravel()[:COUNT].tolist()), float(rms), len(used),
+    )

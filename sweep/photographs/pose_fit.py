@@ -1,0 +1,157 @@
+"""The pose of a rigid target from many points: least squares, with its covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from sweep.model.pose import rotation_of_vector
+from sweep.typing import Floats, Masks
+
+MAX_STEPS = 20
+
+CONVERGED = 1e-9
+"""Step, in rad and in shares of the distance, below which the iteration ends."""
+
+OUTLIER = 4.0
+"""Residuals beyond this many robust standard deviations are left out."""
+
+MIN_OUTLIER_PX = 0.5
+
+MAD_TO_STD = 1.4826
+"""Standard deviation over the median absolute value, of a normal variable of mean 0."""
+
+
+class Lens(NamedTuple):
+    """A camera as OpenCV takes it: matrix (3, 3) and coefficients (0, 4, 5, 8, 12 or 14)."""
+
+    matrix: Floats
+    distortion: Floats
+
+    @staticmethod
+    def of(fx: float, fy: float, cx: float, cy: float, distortion: tuple[float, ...]) -> Lens:
+        """Return a camera from its numbers."""
+        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return Lens(matrix, np.array(distortion, dtype=np.float64))
+
+    def project(self, points: Floats, rotation: Floats, translation: Floats) -> Floats:
+        """Return the images (n, 2) of points (n, 3) of a target."""
+        return self.derivatives(points, rotation, translation)[0]
+
+    def derivatives(
+        self, points: Floats, rotation: Floats, translation: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return images (n, 2) and their derivatives (n, 2, 6) by the pose.
+
+        The pose changes by a rotation vector in the camera's frame, about the target's origin,
+        and by a translation. The derivative by a point in the camera's frame is OpenCV's by the
+        translation.
+        """
+        turned = points @ rotation.T
+        image, jacobian = cv2.projectPoints(
+            np.ascontiguousarray(turned + translation), np.zeros(3), np.zeros(3), self.matrix,
+            self.distortion if len(self.distortion) else None,
+        )
+        by_point = np.asarray(jacobian, dtype=np.float64)[:, 3:6].reshape(-1, 2, 3)
+        by_turn = np.cross(turned[:, None, :], by_point)
+        images = np.asarray(image, dtype=np.float64).reshape(-1, 2)
+        return images, np.concatenate([by_turn, by_point], axis=2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedPose:
+    """A fitted pose.
+
+    Attributes
+    ----------
+    rotation, translation
+        (3, 3) and (3,) m, target to camera.
+    covariance
+        (6, 6) rotation vector in the camera's frame (rad), position (m): from the residuals'
+        variance, as if they were independent.
+    residuals
+        (n, 2) px of all points.
+    used
+        (n,) which points are no outliers.
+    """
+
+    rotation: Floats
+    translation: Floats
+    covariance: Floats
+    residuals: Floats
+    used: Masks
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square of the used residuals' lengths."""
+        return float(np.sqrt((self.residuals[self.used] ** 2).sum(axis=1).mean()))
+
+
+def fit_pose(
+    lens: Lens, points: Floats, pixels: Floats, rotation: Floats, translation: Floats,
+    used: Masks | None = None,
+) -> FittedPose | None:
+    """Return the pose of least squares from a start; None without 4 points, or if it diverges.
+
+    Gauss-Newton. Without ``used`` outliers are left out: those beyond :data:`OUTLIER` robust
+    standard deviations, in two rounds.
+
+    Parameters
+    ----------
+    lens
+        The camera.
+    points, pixels
+        (n, 3) m and (n, 2) px.
+    rotation, translation
+        The start.
+    used
+        (n,) the points to use.
+    """
+    chosen = np.ones(len(points), dtype=bool) if used is None else used
+    for last in ((False, False, True) if used is None else (True,)):
+        if chosen.sum() < 4:
+            return None
+        solved = _gauss_newton(lens, points[chosen], pixels[chosen], rotation, translation)
+        if solved is None:
+            return None
+        rotation, translation, covariance = solved
+        residuals = lens.project(points, rotation, translation) - pixels
+        if not last:
+            length = np.linalg.norm(residuals, axis=1)
+            # The median length of a two-dimensional normal residual is 1.177 standard deviations.
+            spread = float(np.median(length)) / 1.177
+            chosen = length <= max(OUTLIER * spread, MIN_OUTLIER_PX)
+    return FittedPose(rotation, translation, covariance, residuals, chosen)
+
+
+def _gauss_newton(
+    lens: Lens, points: Floats, pixels: Floats, rotation: Floats, translation: Floats
+) -> tuple[Floats, Floats, Floats] | None:
+    for _ in range(MAX_STEPS):
+        image, derivatives = lens.derivatives(points, rotation, translation)
+        residual = (pixels - image).ravel()
+        design = derivatives.reshape(-1, 6)
+        try:
+            step = np.asarray(np.linalg.lstsq(design, residual, rcond=None)[0], dtype=np.float64)
+        except np.linalg.LinAlgError:
+            return None
+        if not np.isfinite(step).all():
+            return None
+        rotation = rotation_of_vector(step[None, :3])[0] @ rotation
+        translation = translation + step[3:]
+        if not translation[2] > 0:
+            return None
+        scale = float(np.linalg.norm(translation))
+        if np.linalg.norm(step[:3]) < CONVERGED and np.linalg.norm(step[3:]) < CONVERGED * scale:
+            break
+    else:
+        return None
+    freedom = max(len(residual) - 6, 1)
+    variance = float(residual @ residual) / freedom
+    normal = design.T @ design
+    if np.linalg.cond(normal) > 1e18:
+        return None
+    return rotation, translation, np.asarray(variance * np.linalg.inv(normal), np.float64)

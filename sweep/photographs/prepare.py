@@ -1,0 +1,344 @@
+"""Photographs made ready to be measured: a record of their truth, and a pipeline that names it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sweep.errors import ArgumentError, PipelineError
+from sweep.evaluation.opencv_threads import single_threaded
+from sweep.exchange.answers import read_answers
+from sweep.exchange.conventions import Conventions
+from sweep.measure.detectors import FindFunction
+from sweep.measure.flags import TruthSource
+from sweep.messages import plain
+from sweep.model.board import Board
+from sweep.model.photograph import Part
+from sweep.photographs.board_check import check_board
+from sweep.photographs.board_truth import board_poses
+from sweep.photographs.calibrate import CalibratedCamera, calibrate
+from sweep.photographs.cameras import camera_of_file, lens_of, stereo_of_file
+from sweep.photographs.corners import detect_markers, find_corners, reference_detector
+from sweep.photographs.folder import Folder, read_folder
+from sweep.photographs.poses import Poses
+from sweep.photographs.record_files import (
+    KnownCamera,
+    Prepared,
+    WantedMarkers,
+    name_of,
+    setting_name,
+    write_record,
+)
+from sweep.photographs.reference_pose import SeenMarkers, own_poses, partner_poses
+from sweep.plan.board_files import read_board
+from sweep.plan.experiment import Pipeline
+from sweep.typing import Floats
+
+PathName = str | os.PathLike[str]
+
+CALIBRATE = "calibrate"
+"""In the place of a camera's file: calibrated from the photographs."""
+
+
+def prepare(
+    folders: Sequence[PathName],
+    camera: PathName | None = None,
+    *,
+    board: PathName | None = None,
+    poses: PathName | None = None,
+    stereo: PathName | None = None,
+    settings: Sequence[str] = (),
+    home: str | Path = "runs",
+    name: str = "",
+    overwrite: bool = False,
+) -> Prepared:
+    """Find out the truth of photographs, record it, and return the experiment.
+
+    Parameters
+    ----------
+    folders
+        A folder of photographs; with ``stereo`` one of images with the left and the right camera's
+        halves side by side, or two of the same names.
+    camera
+        The file of a calibration, or "calibrate".
+    board, poses, stereo
+        Where truth comes from: a board's file, a file of poses as `sweep score` reads them, the
+        file of a stereo calibration. A board beside ``poses`` or ``stereo`` says which markers
+        there are; without one, ``settings`` give dictionary and size_m.
+    settings
+        "key=value" for the pipeline, as ``--set`` takes them.
+    home, name
+        Folder and name of the record (default: the first folder's name).
+    overwrite
+        Whether another record of that name is replaced.
+
+    Raises
+    ------
+    ArgumentError, PipelineError, StoreError
+        What has to be changed, in lines.
+    """
+    _check_arguments(folders, camera, poses, stereo)
+    with single_threaded():  # OpenCV's calibration is the same to the bit only then
+        return _prepare(
+            folders, camera, board, poses, stereo, list(settings), Path(home), name,
+            overwrite=overwrite,
+        )
+
+
+def _prepare(
+    folders: Sequence[PathName], camera: PathName | None, board: PathName | None,
+    poses: PathName | None, stereo: PathName | None, settings: list[str], home: Path,
+    name: str, *, overwrite: bool,
+) -> Prepared:
+    target = read_board(Path(board)) if board is not None else None
+    halves = [Part.whole]
+    if stereo is not None and len(folders) == 1:
+        halves = [Part.left, Part.right]
+    where = list(folders) * (2 if len(halves) == 2 else 1)
+    parts = halves if len(halves) == 2 else [Part.whole] * len(where)
+    found = [read_folder(Path(each), part) for each, part in zip(where, parts, strict=True)]
+    lines = list(dict.fromkeys(line for folder in found for line in folder.lines))
+    if stereo is not None:
+        _check_pairs(found)
+    find = reference_detector()
+    first = found[0]
+    seen_ids = [
+        [detect_markers(find, each.image, _dictionary(target, settings))
+         for each in folder.photographs]
+        for folder in found
+    ]
+    markers = _markers(target, settings, [ids for side in seen_ids for ids, _ in side])
+    if target is not None and board is not None:
+        check_board(Path(board), target, [each for side in seen_ids for each in side], find,
+                    first.photographs)
+    seen = [[_seen(markers, *each) for each in side] for side in seen_ids]
+    if stereo is not None:
+        rig, calibrations = stereo_of_file(str(stereo), first.size)
+        cameras = [KnownCamera(lens_of(each), each.sd) for each in calibrations]
+        truth = [
+            partner_poses(each, first.size, markers.sizes_m, own, partner)
+            for each, own, partner in (
+                (rig, seen[0], seen[1]), (rig.swapped(), seen[1], seen[0]),
+            )
+        ]
+    else:
+        one, poses_of_board, said = _with_one_camera(
+            first, camera, target, find, need_board=poses is None
+        )
+        lines += said
+        cameras = [one]
+        if poses is not None:
+            truth = [_poses_of_file(Path(poses), first, markers)]
+        elif poses_of_board is not None:
+            truth = [poses_of_board]
+        else:
+            truth = [own_poses(one.lens, markers.sizes_m, seen[0])]
+    lines += _summary(found, truth)
+    return write_record(
+        found, parts, cameras, markers, truth, settings, home,
+        name or name_of(Path(folders[0])), lines, overwrite=overwrite,
+    )
+
+
+def _check_arguments(
+    folders: Sequence[PathName], camera: PathName | None, poses: object, stereo: object
+) -> None:
+    if stereo is not None and poses is not None:
+        raise ArgumentError("poses", poses, "expected one truth; delete poses or stereo")
+    if stereo is not None and camera is not None:
+        raise ArgumentError(
+            "camera", camera, "expected none beside stereo, whose file has both cameras"
+        )
+    if stereo is None and camera is None:
+        raise ArgumentError(
+            "camera", "none", f"expected the file of a calibration, or {CALIBRATE}"
+        )
+    most = 1 if stereo is None else 2
+    if not 1 <= len(folders) <= most:
+        raise ArgumentError(
+            "folder", ", ".join(map(str, folders)),
+            "expected one folder" + ("" if most == 1 else ", or those of the left and the right "
+                                     "camera"),
+        )
+
+
+def _check_pairs(found: Sequence[Folder]) -> None:
+    """Demand photographs of the same names and sizes of both cameras."""
+    names = [[each.path.name for each in folder.photographs] for folder in found]
+    odd = sorted(set(names[0]) ^ set(names[1]))
+    if odd:
+        raise ArgumentError(
+            "folder", plain(odd[0]), "expected the same names of both cameras' photographs; it is "
+            "in one folder alone",
+        )
+    if found[0].size != found[1].size:
+        raise ArgumentError(
+            "folder", " and ".join("{} x {}".format(*folder.size) for folder in found),
+            "expected one size of both cameras' photographs",
+        )
+
+
+def _dictionary(board: Board | None, settings: Sequence[str]) -> str:
+    return board.dictionary if board is not None else str(_settled(settings).fixed["dictionary"])
+
+
+def _settled(settings: Sequence[str]) -> Pipeline:
+    """Return a pipeline with settings, for the values that they give."""
+    return Pipeline.from_dict({"pose": {"distance_m": 1.0}}, settings, source="--set")
+
+
+def _markers(
+    board: Board | None, settings: Sequence[str], found: Sequence[np.ndarray[Any, Any]]
+) -> WantedMarkers:
+    given = {setting_name(each) for each in settings}
+    if board is not None:
+        twice = given & {"dictionary", "size_m", "marker_id"}
+        if twice:
+            raise ArgumentError(
+                "settings", min(twice), "expected none beside a board, which says it"
+            )
+        sides = np.linalg.norm(board.corners_m[:, 1] - board.corners_m[:, 0], axis=1)
+        order = np.argsort(board.marker_ids)
+        ids = tuple(board.marker_ids[k] for k in order.tolist())
+        return WantedMarkers(board.dictionary, ids, np.round(sides[order], 12))
+    if not {"dictionary", "size_m"} <= given:
+        raise ArgumentError(
+            "board", "none", "expected the file of a board, or `--set dictionary=...` and "
+            "`--set size_m=...` of single markers",
+        )
+    settled = _settled(settings)
+    every = sorted({each for ids in found for each in ids.tolist()})
+    ids = tuple(every)
+    if not ids:
+        raise ArgumentError(
+            "folder", "no marker",
+            f"expected photographs of markers of {settled.fixed['dictionary']}",
+        )
+    return WantedMarkers(
+        str(settled.fixed["dictionary"]), ids, np.full(len(ids), float(settled.fixed["size_m"]))
+    )
+
+
+def _seen(markers: WantedMarkers, ids: Any, quads: Floats) -> SeenMarkers:
+    """Return the detected markers that are looked for."""
+    index = {each: k for k, each in enumerate(markers.ids)}
+    known = np.array([each in index for each in ids.tolist()], dtype=bool)
+    return SeenMarkers(
+        np.array([index[each] for each in ids[known].tolist()], dtype=np.int64), quads[known]
+    )
+
+
+def _with_one_camera(
+    folder: Folder, camera: PathName | None, board: Board | None, find: FindFunction, *,
+    need_board: bool,
+) -> tuple[KnownCamera, Poses | None, list[str]]:
+    """Return the camera, the poses of the board's markers if wanted, and lines."""
+    if str(camera) == CALIBRATE and board is None:
+        raise ArgumentError(
+            "camera", CALIBRATE, "expected a board beside it, from whose corners it is calibrated"
+        )
+    corners = None
+    if board is not None and (need_board or str(camera) == CALIBRATE):
+        corners = [find_corners(find, each.image, board) for each in folder.photographs]
+    if str(camera) == CALIBRATE:
+        if corners is None:
+            raise AssertionError(camera)
+        calibrated = calibrate(folder.size, corners)
+        known = KnownCamera(calibrated.lens, calibrated.sd, _camera_line(calibrated))
+    else:
+        calibration = camera_of_file(str(camera), folder.size)
+        known = KnownCamera(lens_of(calibration), calibration.sd)
+    lines = [known.line] if known.line else []
+    if board is None or corners is None or not need_board:
+        return known, None, lines
+    result = board_poses(board, known.lens, folder.size, corners)
+    fits = [each for each in result.boards if each is not None]
+    if fits:
+        rms = float(np.median([each.rms_px for each in fits]))
+        lines.append(
+            f"board: {rms:.2f} px RMS of its corners in the median photograph; the poses of halves "
+            f"of its corners differ by {result.halves_ratio:.2g} of what their residuals predict"
+        )
+    order = np.argsort(board.marker_ids)
+    poses = result.poses
+    return known, Poses(
+        poses.rotation[:, order], poses.translation[:, order], poses.std[:, order],
+        poses.source[:, order],
+    ), lines
+
+
+def _camera_line(camera: CalibratedCamera) -> str:
+    matrix, sd = camera.lens.matrix, camera.sd
+    return (
+        f"camera: calibrated from {camera.photographs} photographs, {camera.rms_px:.2f} px RMS: "
+        f"fx {matrix[0, 0]:.1f} ± {sd[0]:.1f}, fy {matrix[1, 1]:.1f} ± {sd[1]:.1f}, "
+        f"cx {matrix[0, 2]:.1f} ± {sd[2]:.1f}, cy {matrix[1, 2]:.1f} ± {sd[3]:.1f} px (standard "
+        "deviations; truth and estimates share them, and truth_std does not have them)"
+    )
+
+
+def _poses_of_file(path: Path, folder: Folder, markers: WantedMarkers) -> Poses:
+    """Return the poses that a file gives."""
+    names = {each.path.stem: k for k, each in enumerate(folder.photographs)}
+    answers = read_answers(path, names, Conventions())
+    index = {each: k for k, each in enumerate(markers.ids)}
+    poses = Poses.none(len(names), len(markers.ids))
+    unknown = sorted(set(answers.marker_id.tolist()) - index.keys())
+    if unknown:
+        raise PipelineError([
+            f"{plain(path)}: marker {unknown[0]}: expected one of the board or the photographs"
+        ])
+    if not np.isfinite(answers.translation).all() or not np.isfinite(answers.rotation).all():
+        raise PipelineError([f"{plain(path)}: expected a pose in each row: rx, ry, rz, tx, ty, tz"])
+    for k in range(len(answers.image)):
+        poses.put(
+            int(answers.image[k]), index[int(answers.marker_id[k])], answers.rotation[k],
+            answers.translation[k], np.full(6, np.nan), TruthSource.poses_file,
+        )
+    return poses
+
+
+def _summary(found: Sequence[Folder], truth: Sequence[Poses]) -> list[str]:
+    """Return lines on how many markers there are, and on photographs without any."""
+    lines = []
+    known = np.concatenate([each.known for each in truth])
+    if not known.any():
+        raise ArgumentError(
+            "folder", plain(found[0].photographs[0].path.parent, 300),
+            "no photograph shows a whole marker whose pose is known",
+        )
+    empty = [
+        each.path.name for folder, poses in zip(found, truth, strict=True)
+        for each, some in zip(
+            folder.photographs, np.asarray(poses.known.any(axis=1)).tolist(), strict=True
+        ) if not some
+    ]
+    if empty:
+        more = f" and {len(empty) - 3} more" if len(empty) > 3 else ""
+        lines.append(
+            f"no pose of a marker is known in {', '.join(map(plain, empty[:3]))}{more}: not counted"
+        )
+    if known.any(axis=1).sum() == 1:
+        lines.append(
+            "one photograph: errors and rates without intervals, which are those of other "
+            "photographs"
+        )
+    std = np.concatenate([each.std[each.known] for each in truth])
+    distance = np.concatenate([each.translation[each.known][:, 2] for each in truth])
+    source = TruthSource(int(truth[0].source[truth[0].known][0])).name.replace("_", " ")
+    spread = ""
+    if np.isfinite(std).any():
+        turn = np.degrees(np.linalg.norm(std[:, :3], axis=1))
+        spread = (
+            f"; median standard deviations {np.nanmedian(turn):.2g}° and "
+            f"{100 * np.nanmedian(std[:, 5] / distance):.2g} % of the range"
+        )
+    lines.append(
+        f"{int(known.sum()):,} markers in {int(known.any(axis=1).sum()):,} photographs; truth: "
+        f"{source}{spread}"
+    )
+    return lines

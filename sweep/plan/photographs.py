@@ -1,0 +1,200 @@
+"""The record of photographs: their files, and the pose of each marker in each of them.
+
+A pipeline names it by the parameter ``photographs``. Its scenes are then photographs, one a trial,
+and the poses are those of the record in the place of simulated ones.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import zipfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.errors import PluginError
+from sweep.messages import plain
+from sweep.model.photograph import Part, reference
+from sweep.model.renderers import PHOTOGRAPH
+from sweep.model.rotations import angles_of_rotation
+from sweep.plan.alternatives import PHOTOGRAPHS
+from sweep.plan.axes import TRIAL, Axis
+from sweep.typing import Floats, Integers, Masks
+
+SUFFIX = ".photographs.npz"
+"""End of the name of a record's file."""
+
+VERSION = 1
+
+POSE = 6
+
+_ARRAYS = ("paths", "digests", "part", "size", "marker_id", "rotation", "translation", "std",
+           "source")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotographRecord:
+    """P photographs of M markers, and their poses in the camera's frame.
+
+    Attributes
+    ----------
+    paths, digests
+        (P,) the photographs' files, relative to the record's folder, and their SHA-256.
+    part
+        The part of each image that is the photograph.
+    width_px, height_px
+        Of that part.
+    marker_id
+        (M,) IDs, increasing.
+    rotation, translation
+        (P, M, 3, 3) and (P, M, 3) in metres, marker to camera; NaN where a marker is not wholly
+        in the photograph.
+    std
+        (P, M, 6) standard deviations of the poses: rotation vector in rad, position in m, camera
+        frame; NaN where they are not known.
+    source
+        (P, M) :class:`~sweep.measure.flags.TruthSource`.
+    """
+
+    paths: tuple[str, ...]
+    digests: tuple[str, ...]
+    part: Part
+    width_px: int
+    height_px: int
+    marker_id: Integers
+    rotation: Floats
+    translation: Floats
+    std: Floats
+    source: NDArray[np.uint8]
+
+    @property
+    def shown(self) -> Masks:
+        """Which marker is in which photograph, (P, M)."""
+        return np.asarray(np.isfinite(self.translation).all(axis=2))
+
+    def index_of(self, marker_id: NDArray[np.int64]) -> NDArray[np.intp]:
+        """Return the index of each of some markers; -1 for those that the record lacks."""
+        at = np.minimum(np.searchsorted(self.marker_id, marker_id), len(self.marker_id) - 1)
+        return np.where(self.marker_id[at] == marker_id, at, -1)
+
+    def content(self) -> bytes:
+        """Return the content of its file: the same bytes for the same record."""
+        arrays: dict[str, Any] = {
+            name: getattr(self, name) for name in _ARRAYS if name != "size"
+        }
+        arrays["size"] = np.array([self.width_px, self.height_px])
+        file = io.BytesIO()
+        with zipfile.ZipFile(file, "w") as archive:
+            for name, values in {"version": VERSION, **arrays}.items():
+                member = io.BytesIO()
+                np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
+                info = zipfile.ZipInfo(f"{name}.npy")  # of a fixed date
+                info.compress_type = zipfile.ZIP_DEFLATED
+                archive.writestr(info, member.getvalue())
+        return file.getvalue()
+
+
+def read_record(path: str | Path) -> tuple[PhotographRecord, str]:
+    """Return a record and the SHA-256 of its file, which is read once in each process.
+
+    Raises
+    ------
+    PluginError
+        If it cannot be read, or is none; in words that follow "expected".
+    """
+    try:
+        state = Path(path).stat()
+        return _read(str(path), state.st_mtime_ns, state.st_size)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise PluginError(
+            f"a record of photographs that `sweep photos` writes ({plain(reason)})"
+        ) from None
+
+
+@lru_cache(maxsize=8)
+def _read(path: str, modified_ns: int, size: int) -> tuple[PhotographRecord, str]:  # noqa: ARG001
+    content = Path(path).read_bytes()
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            if int(archive["version"]) != VERSION:
+                raise ValueError("of another version")
+            arrays = {name: archive[name] for name in _ARRAYS}
+        record = PhotographRecord(
+            tuple(map(str, arrays["paths"])), tuple(map(str, arrays["digests"])),
+            Part(str(arrays["part"])), int(arrays["size"][0]), int(arrays["size"][1]),
+            arrays["marker_id"], arrays["rotation"], arrays["translation"], arrays["std"],
+            arrays["source"],
+        )
+    except (KeyError, IndexError, TypeError, EOFError, AttributeError, zipfile.BadZipFile):
+        raise ValueError("it is none") from None
+    grid = (len(record.paths), len(record.marker_id))
+    shapes = {
+        "digests": (grid[0],), "rotation": (*grid, 3, 3), "translation": (*grid, 3),
+        "std": (*grid, POSE), "source": grid,
+    }
+    for name, shape in shapes.items():
+        if np.shape(arrays[name]) != shape:
+            raise ValueError(f"damaged: {name}")
+    return record, hashlib.sha256(content).hexdigest()
+
+
+def along_photographs(axes: Iterable[Axis]) -> list[bool]:
+    """Return of each axis whether its values are other photographs."""
+    return [axis.name == TRIAL or PHOTOGRAPHS in axis.columns for axis in axes]
+
+
+def recorded_poses(
+    names: Sequence[str], folder: str, trials: NDArray[np.int64], marker_id: NDArray[np.int64]
+) -> dict[str, Any]:
+    """Return the parameters of N scenes that are photographs, by name.
+
+    They are the image, the pose (NaN where a photograph does not show the marker), and ``truth``
+    (N,) and ``truth_std`` (N, 6) as a record's ``source`` and ``std``.
+
+    Parameters
+    ----------
+    names, folder
+        The records' files (N,), and where relative paths start.
+    trials, marker_id
+        (N,) each: numbers of the photographs, and the markers.
+
+    Raises
+    ------
+    PluginError
+        If a record cannot be read, or has no such photograph or marker.
+    """
+    count = len(trials)
+    images: list[str] = [""] * count
+    rotation, translation = np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan)
+    std, source = np.full((count, POSE), np.nan), np.zeros(count, dtype=np.uint8)
+    for name in dict.fromkeys(names):
+        rows = np.flatnonzero([each == name for each in names])
+        home = Path(folder) / name
+        record, _ = read_record(home)
+        known = record.index_of(marker_id[rows])
+        if (known < 0).any() or (trials[rows] >= len(record.paths)).any():
+            raise PluginError(f"{plain(name)}: it lacks photographs or markers of the pipeline")
+        references = [
+            reference(home.parent / path, digest, record.part)
+            for path, digest in zip(record.paths, record.digests, strict=True)
+        ]
+        for row, trial in zip(rows.tolist(), trials[rows].tolist(), strict=True):
+            images[row] = references[trial]
+        at = trials[rows], known
+        rotation[rows], translation[rows] = record.rotation[at], record.translation[at]
+        std[rows], source[rows] = record.std[at], record.source[at]
+    with np.errstate(invalid="ignore"):
+        tilt, azimuth, roll = (np.degrees(each) for each in angles_of_rotation(rotation))
+    return {
+        "renderer": PHOTOGRAPH, "background": images,
+        "x_m": translation[:, 0], "y_m": translation[:, 1], "distance_m": translation[:, 2],
+        "resolved_tilt_deg": tilt, "resolved_azimuth_deg": azimuth, "resolved_roll_deg": roll,
+        "truth": source, "truth_std": std,
+    }

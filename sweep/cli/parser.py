@@ -23,6 +23,7 @@ from sweep.cli.require import REQUIRE
 from sweep.cli.run import RUN
 from sweep.cli.score import SCORE
 from sweep.cli.show import SHOW
+from sweep.cli.size import SIZE
 from sweep.cli.status import STATUS
 from sweep.cli.tradeoff import TRADEOFF
 from sweep.cli.verify import VERIFY
@@ -30,7 +31,7 @@ from sweep.messages import nearest
 from sweep.version import __version__
 
 COMMANDS = (
-    RUN, PLAN, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, ERROR_MODEL, VERIFY, STATUS, EXPORT,
+    RUN, PLAN, SIZE, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, ERROR_MODEL, VERIFY, STATUS, EXPORT,
     SCORE, PHOTOS, CHECK_DETECTOR, PLUGINS, ENVIRONMENTS, COMPLETION,
 )
 """Every command, in the order in which the help lists them."""

@@ -63,6 +63,8 @@ class Pipeline:
         section [require]. No part of an experiment's identity.
     stopping
         When sampling stops, as a section such as [precision] says; None if every trial is computed.
+    budget_ms
+        The most milliseconds of a frame, if [require] has a budget.
 
     Examples
     --------
@@ -89,6 +91,7 @@ class Pipeline:
     requirements: tuple[str, ...] = ()
     require_per: tuple[str, ...] = ()
     stopping: StoppingRule | None = None
+    budget_ms: float | None = None
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
@@ -355,4 +358,5 @@ def _checked(
         folder=str(folder.resolve()), plugins=reading.plugins,
         requirements=reading.requirements, require_per=reading.require_per,
         stopping=reading.stopping,
+        budget_ms=reading.budget_ms,
     )

@@ -63,7 +63,7 @@ class Reading:
         As :class:`sweep.plan.experiment.Pipeline` has them; ``axes`` by name.
     given
         Names of the parameters that the document has, even with a value that cannot be.
-    requirements, require_per, stopping
+    requirements, require_per, budget_ms, stopping
         As :class:`sweep.plan.experiment.Pipeline` has them.
     plugins, parameters
         The plug-ins that the document names, and every parameter by its name, theirs included.
@@ -93,6 +93,7 @@ class Reading:
     requirements: tuple[str, ...] = ()
     require_per: tuple[str, ...] = ()
     stopping: StoppingRule | None = None
+    budget_ms: float | None = None
     stated: dict[str, Any] = field(default_factory=dict)
     plugins: tuple[DeclaredPlugin, ...] = ()
     parameters: Mapping[str, Parameter] = field(default_factory=lambda: PARAMETERS)

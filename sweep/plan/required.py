@@ -7,17 +7,20 @@ the names.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from sweep.messages import shown
 from sweep.plan.axes import TRIAL
 from sweep.plan.parameters import Stage
 from sweep.plan.reader import REQUIRE, Reading
-from sweep.plan.requirement_text import read_requirement
+from sweep.plan.requirement_text import RequirementText, read_requirement
 
 KEYS = ("all", "per")
 """Texts that all must hold, and the axes whose values are conditions at which they must."""
+
+BUDGET = "budget_ms"
+"""What may be required beside quantities where a choice is made: the time of a frame."""
 
 
 def read_required(reading: Reading) -> None:
@@ -33,7 +36,7 @@ def read_required(reading: Reading) -> None:
     texts = _strings(reading, table, "all", 'texts, such as ["detection >= 0.99"]')
     for text in texts:
         try:
-            read_requirement(text)
+            _read_budget(reading, read_requirement(text))
         except ValueError as error:
             reading.faults.append(f"{reading.source}: {REQUIRE}.all = {shown(text)}: {error}")
     if "per" in table and "all" not in table:
@@ -42,7 +45,37 @@ def read_required(reading: Reading) -> None:
     for name in names:
         if problem := _no_condition(reading, name):
             reading.unknown(f"{REQUIRE}.per", f"{name}: {problem}", name, [*_conditions(reading)])
-    reading.requirements, reading.require_per = tuple(texts), tuple(dict.fromkeys(names))
+    reading.requirements = tuple(without_budget(texts))
+    reading.require_per = tuple(dict.fromkeys(names))
+
+
+def _read_budget(reading: Reading, given: RequirementText) -> None:
+    """Note the budget, if a requirement is one; ValueError says what is wrong with it."""
+    if given.name != BUDGET:
+        return
+    if "choose" not in reading.document:
+        raise ValueError("is the time of a choice: give [choose], or use `sweep tradeoff "
+                         "--budget-ms`")
+    if given.relation not in ("<=", "<") or given.limit <= 0.0 or given.unit:
+        raise ValueError(f"expected milliseconds of a frame: {BUDGET} <= 2")
+    if reading.budget_ms is not None:
+        raise ValueError("there is another budget; delete one")
+    reading.budget_ms = given.limit
+
+
+def without_budget(texts: Iterable[str]) -> list[str]:
+    """Return the texts of requirements that are no budget.
+
+    >>> without_budget(["detection >= 0.99", "budget_ms<=2"])
+    ['detection >= 0.99']
+    """
+    def is_budget(text: str) -> bool:
+        try:
+            return read_requirement(text).name == BUDGET
+        except ValueError:
+            return False
+
+    return [text for text in texts if not is_budget(text)]
 
 
 def _strings(reading: Reading, table: dict[str, Any], key: str, expected: str) -> list[str]:
@@ -77,4 +110,5 @@ def texts_in(document: Mapping[str, Any]) -> list[str]:
     """Return the requirements' texts of a document that may have faults elsewhere."""
     table = document.get(REQUIRE)
     listed = table.get("all") if isinstance(table, dict) else None
-    return [each for each in listed if isinstance(each, str)] if isinstance(listed, list) else []
+    return without_budget(
+        each for each in listed if isinstance(each, str)) if isinstance(listed, list) else []

@@ -13,6 +13,7 @@ from hashlib import sha256
 from typing import Any, ClassVar, Protocol
 
 from sweep.plan.axes import TRIAL, parse_trial
+from sweep.plan.choice_rule import read_choice
 from sweep.plan.draws import SAMPLINGS
 from sweep.plan.precision_rule import read_precision
 from sweep.plan.reader import Reading
@@ -52,6 +53,7 @@ class StoppingRule(Protocol):
 
 SECTIONS: Mapping[str, Callable[[Reading, dict[str, Any]], StoppingRule | None]] = {
     "precision": read_precision,
+    "choose": read_choice,
 }
 """Section -> the function that reads its table and notes faults: the one entry of a rule here.
 

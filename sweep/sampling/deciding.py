@@ -60,10 +60,11 @@ class Decision:
 
 @dataclass(slots=True)
 class _Held:
-    """Values of a group: those of the waves before the last of ``bases``."""
+    """Values of a group: those of the waves before the last of ``bases``, and what they decide."""
 
     bases: tuple[int, ...]
     values: dict[str, NDArray[Any]]
+    needed: Masks | None = None
 
     @property
     def bytes(self) -> int:
@@ -120,6 +121,9 @@ class Decider:
 
     def of_group(self, span: Block, decision: Decision) -> Masks:
         """Return for each scene of a group, along the condition axes, whether a wave needs it."""
+        held = self._held.get(span.starts)
+        if held is not None and held.bases == decision.bases and held.needed is not None:
+            return held.needed  # of another block of the wave
         values = self._values(span, decision)
         kept = [k for k in range(len(span.starts)) if k != self.waves.trial]
         results = GroupResults(
@@ -131,7 +135,10 @@ class Decider:
         mask = np.array(self.rule.needed(results), dtype=bool)
         if mask.shape != results.shape:
             raise ValueError(f"a rule gave {mask.shape} for scenes {results.shape}")
-        return mask & ~self._settled(values["detection"], kept)
+        mask &= ~self._settled(values["detection"], kept)
+        if span.starts in self._held:
+            self._held[span.starts].needed = mask
+        return mask
 
     def _settled(self, detection: NDArray[Any], kept: list[int]) -> Masks:
         """Return which scenes are settled: nothing along the coupled axes was needed before."""
@@ -161,7 +168,7 @@ class Decider:
                 raise StoreError(
                     f"{self.store.url}: trials below {last} of group {span} are not committed"
                 )
-        held.bases = decision.bases
+        held.bases, held.needed = decision.bases, None
         self._held[span.starts] = held
         while len(self._held) > 1 and sum(e.bytes for e in self._held.values()) > HELD_BYTES:
             self._held.popitem(last=False)

@@ -1,11 +1,12 @@
 """The exact image of a board: the sum over the edges of all that is printed on it.
 
 Each print is drawn in its own plane, as a marker alone is, into one accumulator; prints outside
-the frame cost nothing.
+the frame cost nothing. A board may be bent, and its image shifted, as those of markers alone.
 """
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -15,10 +16,21 @@ from numpy.typing import NDArray
 from sweep.compilation import compiled
 from sweep.model import lens as lens_model
 from sweep.model.board import Board
-from sweep.model.coverage import MarkerEdges, accumulate, sum_levels
+from sweep.model.coverage import MarkerEdges, accumulate, accumulate_curved, sum_levels
 from sweep.model.extent import CHORDS_PER_SIDE
 from sweep.model.point_spread import REACH
 from sweep.model.projection import Optics, Projection
+from sweep.model.sheet import (
+    FOLD_CELLS,
+    FOLD_RAD,
+    MAX_FOLD_CELLS,
+    NO_WAVES,
+    Shape,
+    Sheet,
+    folds_over,
+    sheet_of,
+    sheet_pixels,
+)
 from sweep.typing import Floats, Integers
 
 
@@ -27,6 +39,23 @@ class BoardPose(NamedTuple):
 
     rotation: Floats
     translation: Floats
+
+
+class Curvature(NamedTuple):
+    """How a board departs from its plane, and its image from the camera's.
+
+    Attributes
+    ----------
+    shape
+        The bent sheet, tangent at the board's origin.
+    waves, length_px
+        The shift of the image (:func:`sweep.model.image_shift.shift_waves`), and its correlation
+        length.
+    """
+
+    shape: Shape = Shape()
+    waves: Floats = NO_WAVES
+    length_px: float = math.inf
 
 
 class _Prints(NamedTuple):
@@ -70,6 +99,7 @@ def _prints(board: Board) -> _Prints:
 def render_board(
     board: Board, optics: Optics, frame: tuple[int, int], pose: BoardPose, *, black: float = 0.0,
     white: float = 255.0, background: float | Floats = 0.0, blur_px: float = 0.0,
+    curvature: Curvature | None = None,
 ) -> Floats:
     """Return the levels (height, width) of a frame with a board, before noise and quantisation.
 
@@ -81,19 +111,25 @@ def render_board(
         Grey levels; the background may also be an image (height, width) of the frame.
     blur_px
         Standard deviation of the lens' Gaussian point spread.
+    curvature
+        Of a bent board or a shifted image; None for neither.
 
     Raises
     ------
     ValueError
         If a part of the board is not before the camera, if the board shows its back, or if the
-        lens folds on it: then it has no image that could be computed.
+        lens, a bend or shifts fold it: then it has no image that could be computed.
     """
     planes = np.array([one.plane(*pose) for one in board.prints])
     pixels = _outlines_px(board, planes, optics, pose)
+    sheets = None
+    if curvature is not None:
+        sheets = _sheets(board, curvature)
+        pixels = _curved_outlines_px(board, planes, optics, pose, curvature, sheets)
     reach = REACH * blur_px + 1 if blur_px > 0 else 0.0
     low = pixels.min(axis=1) - reach
     high = pixels.max(axis=1) + reach
-    if optics.distorted:
+    if optics.distorted or curvature is not None:
         low, high = low - 2, high + 2
     limit = np.array(frame, dtype=np.float64)
     start = np.clip(np.floor(low + 0.5), 0, limit)
@@ -110,9 +146,19 @@ def render_board(
     def summed(levels: Floats) -> Floats:
         sums = np.empty((bottom - top, right - left))
         prints = _prints(board)
-        _accumulate_prints(
-            cover, prints.edges, prints.spans, planes, seen, levels, optics, left, top, blur_px
-        )
+        if sheets is None:
+            _accumulate_prints(
+                cover, prints.edges, prints.spans, planes, seen, levels, optics, left, top, blur_px
+            )
+        else:
+            for row in seen.tolist():
+                first, last = prints.spans[row]
+                accumulate_curved(
+                    cover, MarkerEdges(
+                        prints.edges.ends[first:last], prints.edges.sides[first:last]
+                    ), levels,
+                    Projection(planes[row], optics), left, top, blur_px, sheets[row],
+                )
         sum_levels(cover, levels[0], sums)
         return sums
 
@@ -142,6 +188,53 @@ def _outlines_px(board: Board, planes: Floats, optics: Optics, pose: BoardPose) 
             raise ValueError("the lens model folds on the board")
         points = lens_model.distort_points(np.ascontiguousarray(points), lenses)
     return np.asarray(points * optics.intrinsics[:2] + optics.intrinsics[2:])
+
+
+def _sheets(board: Board, curvature: Curvature) -> list[Sheet]:
+    """Return the board's sheet in the units of each print."""
+    sheets = []
+    for one in board.prints:
+        flat = one.plane(np.eye(3), np.zeros(3))[:2]
+        origin = np.linalg.solve(flat[:, :2], -flat[:, 2])
+        shape = curvature.shape._replace(
+            direction_rad=curvature.shape.direction_rad - one.roll_rad
+        )
+        sheets.append(sheet_of(
+            shape, one.unit_m, (origin[0], origin[1]), curvature.waves, curvature.length_px
+        ))
+    return sheets
+
+
+def _curved_outlines_px(
+    board: Board, planes: Floats, optics: Optics, pose: BoardPose, curvature: Curvature,
+    sheets: list[Sheet],
+) -> Floats:
+    """As :func:`_outlines_px`, of a board that is bent or shifted."""
+    outlines = _prints(board).outlines
+    on_board = np.concatenate([
+        points @ flat[:2, :2].T + flat[:2, 2]
+        for points, flat in zip(
+            outlines, (one.plane(np.eye(3), np.zeros(3)) for one in board.prints), strict=True
+        )
+    ]) * [1.0, -1.0]
+    low, high = on_board.min(axis=0), on_board.max(axis=0)
+    whole = Projection(
+        np.stack([pose.rotation[:, 0], -pose.rotation[:, 1], pose.translation], axis=1), optics
+    )
+    sheet = sheet_of(curvature.shape, 1.0, (0.0, 0.0), curvature.waves, curvature.length_px)
+    pixels = np.array([
+        sheet_pixels(points, Projection(plane, optics), each)
+        for points, plane, each in zip(outlines, planes, sheets, strict=True)
+    ])
+    extent = np.ptp(pixels.reshape(-1, 2), axis=0).max()
+    cells = max(
+        abs(sheet.curvature) * float((high - low).max()) / FOLD_RAD, 2 * extent / sheet.piece_px
+    )
+    if not np.isfinite(extent) or folds_over(
+        low, high, int(min(FOLD_CELLS + cells, MAX_FOLD_CELLS)), whole, sheet
+    ):
+        raise ValueError("the bent board hides a part of itself, or shifts fold its image")
+    return pixels
 
 
 @compiled

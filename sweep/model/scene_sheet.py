@@ -9,17 +9,18 @@ from numpy.typing import NDArray
 
 from sweep.model.image_shift import shift_waves
 from sweep.model.scene import Scenes
-from sweep.model.sheet import NO_WAVES, Shape, Sheet, folds_over, sheet_of, sheet_pixels
+from sweep.model.sheet import (
+    FOLD_CELLS,
+    FOLD_RAD,
+    MAX_FOLD_CELLS,
+    NO_WAVES,
+    Shape,
+    Sheet,
+    folds_over,
+    sheet_of,
+    sheet_pixels,
+)
 from sweep.typing import Floats
-
-FOLD_CELLS = 8
-"""Least number of cells along a marker's side whose images are checked for folds."""
-
-FOLD_RAD = 0.05
-"""Largest turn of a bent sheet from cell to cell; a fold between them covers 1/2,000 of the
-radius of curvature at most."""
-
-MAX_FOLD_CELLS = 256
 
 
 def curved_rows(scenes: Scenes) -> NDArray[np.intp]:

@@ -24,6 +24,15 @@ PIECE_LENGTHS = 0.5
 
 MAX_PIECES = 256
 
+FOLD_CELLS = 8
+"""Least number of cells along a marker's side whose images are checked for folds."""
+
+FOLD_RAD = 0.05
+"""Largest turn of a bent sheet from cell to cell; a fold between them covers 1/2,000 of the
+radius of curvature at most."""
+
+MAX_FOLD_CELLS = 256
+
 NO_WAVES = np.zeros((2, 0, 4))
 """Of an image that is not shifted."""
 

@@ -4,15 +4,19 @@ import cv2
 import numpy as np
 import pytest
 
+from support.bent_sheets import flat_points
 from support.exact_image import LENSES, add_clipped, values
-from sweep.model.board_image import BoardPose, render_board
+from sweep.model.board_image import BoardPose, Curvature, render_board
 from sweep.model.board_kinds import BoardMarker, Charuco, Grid, Markers
+from sweep.model.effects import NEUTRAL
 from sweep.model.extent import marker_boxes
+from sweep.model.image_shift import shift_waves
 from sweep.model.lens import pack
 from sweep.model.pose import rotation_of_angles
 from sweep.model.projection import Optics
 from sweep.model.renderers import quantise, render
 from sweep.model.scene import build_scenes
+from sweep.model.sheet import Shape
 
 OPENCV = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
 LEVELS = {"black": 20.0, "white": 230.0, "background": 90.0}
@@ -111,7 +115,7 @@ def before_lens(xd, yd, distortion):
     return np.where(np.abs(x - before)[:, None] < 1e-9, np.column_stack([x, y]), np.nan)
 
 
-def sampled(pose, distortion, blur_px, frame, focal_px):
+def sampled(pose, distortion, blur_px, frame, focal_px, bent=None):
     """The levels of a frame by 16 x 16 samples a pixel, each at random in its cell."""
     rng = np.random.default_rng(2)
     pad, fine = 5, 16  # pixels around the frame, for the blur
@@ -119,8 +123,12 @@ def sampled(pose, distortion, blur_px, frame, focal_px):
     v, u = (np.indices(shape) + rng.random((2, *shape))) / fine - 0.5 - pad
     centre = (np.array(frame) - 1) / 2
     flat = before_lens((u - centre[0]) / focal_px, (v - centre[1]) / focal_px, distortion)
+    rays = np.column_stack([flat, np.ones(len(flat))])
     plane = np.column_stack([pose.rotation[:, 0], pose.rotation[:, 1], pose.translation])
-    on_board = np.column_stack([flat, np.ones(len(flat))]) @ np.linalg.inv(plane).T
+    on_board = rays @ np.linalg.inv(plane).T
+    if bent is not None:
+        on_sheet = flat_points(rays, pose.rotation, pose.translation, *bent)
+        on_board = np.column_stack([on_sheet, np.ones(len(rays))])
     # All lines of the ChArUco board lie on a lattice of 4 mm.
     lattice = np.full((42, 52), LEVELS["background"])
     for cell in cells_of(CHARUCO):
@@ -155,6 +163,50 @@ def test_a_board_behind_a_lens_is_its_dense_samples(distortion, blur_px):
     assert np.abs(found - expected).max() < 8.5
     assert np.sqrt(np.mean((found - expected) ** 2)) < 1.2
     assert abs(np.mean(found - expected)) < 0.1
+
+
+@pytest.mark.parametrize(("bend", "curvature"), [
+    ("cylinder", 5.0), pytest.param("saddle", -4.0, marks=pytest.mark.long),
+])
+def test_a_bent_board_is_what_rays_meet(bend, curvature):
+    frame, focal_px = (32, 26), 40.0
+    optics = Optics(np.array([focal_px, focal_px, 15.5, 12.5]), pack(()), False)
+    pose = BoardPose(
+        rotation_of_angles(np.radians([25.0]), np.array([1.0]), np.array([0.3]))[0],
+        np.array([0.02, -0.01, 0.27]),
+    )
+    curved = Curvature(Shape(curvature, 0.4, bend == "saddle"))
+    found = render_board(CHARUCO.board(), optics, frame, pose, curvature=curved, **LEVELS)
+    expected = sampled(pose, (0, 0, 0, 0), 0, frame, focal_px, (bend, curvature, 0.4))
+    assert np.abs(found - expected).max() < 8.5  # as behind a lens
+    assert np.sqrt(np.mean((found - expected) ** 2)) < 1.2
+    assert abs(np.mean(found - expected)) < 0.1
+
+
+def test_a_bent_and_shifted_board_of_one_marker_is_that_marker():
+    value = values(**(NEUTRAL | {
+        "width_px": 160, "height_px": 120, "fx_px": 200.0, "dictionary": "DICT_4X4_250",
+        "size_m": 0.1, "side_px": 60.0, "tilt_deg": 30.0, "roll_deg": 200.0, "noise_key": 3,
+        "curvature_per_m": 5.0, "bend_deg": 30.0, "geometry_px": 0.8, "geometry_length_px": 40.0,
+    } | LEVELS))
+    scenes = build_scenes(value, 1)
+    reference = render(scenes, 0, marker_boxes(scenes)[0], (0, 0, 160, 120))
+    # Turned in its board by 70°: the board's own pose and its bend are turned back.
+    board = Markers(dictionary="DICT_4X4_250", markers=(
+        BoardMarker(marker_id=0, x_m=0, y_m=0, size_m=0.1, roll_deg=70.0),
+    )).board()
+    turn = np.radians(-70.0)
+    back = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    pose = BoardPose(scenes.rotation[0] @ back, scenes.translation[0])
+    curved = Curvature(
+        Shape(5.0, np.radians(30.0 + 70.0)), shift_waves(0.8, 40.0, np.uint64(3)), 40.0
+    )
+    found = render_board(
+        board, scenes.cameras.optics(0), (160, 120), pose, curvature=curved, **LEVELS
+    )
+    # Rounding apart: levels at a half may round either way.
+    differs = quantise(found) != reference
+    assert (np.abs(found % 1 - 0.5)[differs] < 1e-6).all()
 
 
 @pytest.mark.parametrize("distortion", [(), LENSES[1]])
@@ -205,6 +257,13 @@ def test_a_board_out_of_the_frame_is_its_background_and_one_without_image_is_ref
     ):
         with pytest.raises(ValueError, match=problem):
             render_board(board, optics, frame, pose)
+    ahead = BoardPose(facing, np.array([0.0, 0.0, 0.4]))
+    for curved in (
+        Curvature(Shape(30.0)),
+        Curvature(Shape(), shift_waves(50.0, 5.0, np.uint64(1)), 5.0),
+    ):
+        with pytest.raises(ValueError, match="hides a part of itself, or shifts fold"):
+            render_board(board, optics, frame, ahead, curvature=curved)
     folding = Optics(optics.intrinsics, pack((-2.0, 0.0, 0.0, 0.0)), True)
     with pytest.raises(ValueError, match="folds"):
         render_board(board, folding, frame, BoardPose(facing, np.array([0.0, 0.0, 0.15])))

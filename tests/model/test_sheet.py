@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
+from support.bent_sheets import flat_points
 from support.exact_image import LENSES, modules_of, plane_of, values
 from sweep.model.effects import NEUTRAL
 from sweep.model.exposure import marker_exposure
@@ -43,32 +44,10 @@ def on_bent_sheet(directions, value):
     right, up = plane[:, 0] / module, -plane[:, 1] / module
     frame = np.column_stack([right, up, np.cross(right, up)])
     centre = plane @ [n / 2, n / 2, 1]
-    turn = np.radians(value["bend_deg"])
-    along = np.array([[np.cos(turn), np.sin(turn), 0], [-np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
-    origin = along @ (frame.T @ -centre)
-    d = directions @ frame @ along.T
-    k = value["curvature_per_m"]
-    if value["bend"] == "cylinder":
-        # x² + (z + 1/k)² = 1/k²
-        a = d[:, 0] ** 2 + d[:, 2] ** 2
-        b = 2 * (origin[0] * d[:, 0] + (origin[2] + 1 / k) * d[:, 2])
-        c = origin[0] ** 2 + origin[2] ** 2 + 2 * origin[2] / k
-    else:
-        # z + k (x² - y²) / 2 = 0
-        a = k / 2 * (d[:, 0] ** 2 - d[:, 1] ** 2)
-        b = d[:, 2] + k * (origin[0] * d[:, 0] - origin[1] * d[:, 1])
-        c = origin[2] + k / 2 * (origin[0] ** 2 - origin[1] ** 2)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        root = np.sqrt(b * b - 4 * a * c)
-        if value["bend"] == "cylinder":
-            t = (-b - np.sign(k) * root) / (2 * a)
-        else:
-            # The root that stays finite as k goes to 0.
-            t = -2 * c / (b + np.sign(b) * root)
-    x, y, z = (origin + t[:, None] * d).T
-    if value["bend"] == "cylinder":
-        x = np.arctan2(k * x, k * z + 1) / k
-    flat = np.column_stack([x, y]) @ along[:2, :2]
+    flat = flat_points(
+        directions, frame, centre, value["bend"], value["curvature_per_m"],
+        np.radians(value["bend_deg"]),
+    )
     return flat[:, 0] / module + n / 2, n / 2 - flat[:, 1] / module
 
 

@@ -110,7 +110,7 @@ def search_windows(
     ndarray
         (N, 4) left, top, right, bottom in pixels of the frame, half-open.
     """
-    margin = margin_px(setting) + NOISE_MARGIN_PX * scenes.noisy[:, None].astype(np.int64)
+    margin = margin_px(setting) + NOISE_MARGIN_PX * scenes.noise_coarseness[:, None]
     cut = windows(boxes, scenes.frame, margin)
     whole = full | (full_frame_reason(setting) is not None)
     whole |= uneven_light_needs_frame(setting, scenes.uneven_gain)

@@ -185,7 +185,9 @@ NOISE_MARGIN_PX = 32
 """Added to the margin if there is noise: its candidates around the marker affect one another.
 
 Of 3,600 searches with noise of 1 to 32 grey levels 102 flags differed from the full frame's
-without it, 3 with 16 px, none from 32.
+without it, 3 with 16 px, none from 32. Coarse noise (correlated, or through JPEG) needs twice as
+much: of 300 searches with noise of 8 to 32, a correlation of 0.7 and quality 1, two flags differed
+with 16 px, one with 32, none with 64.
 """
 
 

@@ -81,8 +81,9 @@ class Effect:
     widens
         Whether more than the usual window must be searched: "noise" makes candidates around the
         marker that reach into one another, "uneven light" makes candidates of a plain background.
-    steepens
-        Whether it may make uneven light so steep that its whole frame must be searched.
+    worsens
+        What it makes worse for the search of windows, where another effect brings it: coarse noise
+        needs twice the margin of noise, steep uneven light the whole frame.
     apply
         Of a pointwise effect: a function of levels (h, w) and their :class:`Patch` that returns
         the levels after it. Applied at its ``step``, "light" or "signal", after the built-in
@@ -97,7 +98,7 @@ class Effect:
     random: bool = False
     in_bound: bool = False
     widens: Literal["nothing", "noise", "uneven light"] = "nothing"
-    steepens: bool = False
+    worsens: tuple[Literal["noise", "uneven light"], ...] = ()
     apply: Callable[[Floats, Patch], Floats] | None = None
 
     @property

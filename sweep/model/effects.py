@@ -193,7 +193,7 @@ EFFECTS: tuple[Effect, ...] = (
                 "white is lifted by bloom · s · (1 - s) of it", low=-1, high=1, drawable=True,
             ),
         },
-        steepens=True,
+        worsens=("uneven light",),
     ),
     Effect(
         "vignetting", "light",
@@ -248,7 +248,7 @@ EFFECTS: tuple[Effect, ...] = (
                 low=0, high=0.99, drawable=True,
             ),
         },
-        needs={"noise_correlation": ("noise_grey", "noise_table")},
+        needs={"noise_correlation": ("noise_grey", "noise_table")}, worsens=("noise",),
     ),
     Effect(
         "demosaicing", "signal",
@@ -280,7 +280,7 @@ EFFECTS: tuple[Effect, ...] = (
                 "below 1 dark areas are lifted", low=0.1, high=10, drawable=True,
             ),
         },
-        steepens=True,
+        worsens=("uneven light",),
     ),
     Effect(
         "toe", "signal",
@@ -290,7 +290,7 @@ EFFECTS: tuple[Effect, ...] = (
                 "the slope 1 - tone_toe at black", low=-1, high=1, drawable=True,
             ),
         },
-        steepens=True,
+        worsens=("uneven light",),
     ),
     Effect(
         "knee", "signal",
@@ -300,7 +300,7 @@ EFFECTS: tuple[Effect, ...] = (
                 "the slope 1 - tone_knee at white", low=-1, high=1, drawable=True,
             ),
         },
-        steepens=True,
+        worsens=("uneven light",),
     ),
     Effect(
         "noise by level", "signal",
@@ -331,7 +331,7 @@ EFFECTS: tuple[Effect, ...] = (
                 low=0, high=100,
             ),
         },
-        steepens=True,
+        worsens=("noise", "uneven light"),
     ),
 )
 """Every effect, in physical order."""

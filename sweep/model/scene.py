@@ -14,6 +14,7 @@ from sweep.declaration import parameter
 from sweep.model import lens as lens_model
 from sweep.model.camera import VIEW_PARAMETERS, Camera, Cameras, intrinsics
 from sweep.model.columns import Column, map_columns
+from sweep.model.effect import Effect
 from sweep.model.effects import CODED, NEUTRAL, PLAIN, VELOCITIES
 from sweep.model.marker import MarkerKey, marker_corners, module_count, overhang
 from sweep.model.plugged_scene import NO_PLUGINS, ScenePlugins
@@ -129,31 +130,36 @@ class Scenes:
         return len(self.frame)
 
     @property
-    def noisy(self) -> NDArray[np.bool_]:
-        """Whether a scene's pixels have noise, (N,)."""
-        return self._any_active("noise")
+    def noise_coarseness(self) -> NDArray[np.int64]:
+        """0 for scenes without noise of pixels, 1 with it, 2 with coarse noise, (N,)."""
+        return self._any_active("noise") * (1 + self._any_worse("noise").astype(np.int64))
 
     @property
     def uneven_gain(self) -> Floats:
         """Amplification of uneven light in each scene, at least 1; 0 if the light is even.
 
-        Infinite beside an effect that steepens it.
+        Infinite beside an effect that makes it steeper.
         """
         if self.effects is None:
             return np.zeros(len(self))
         uneven = self._any_active("uneven light")
-        steep = np.zeros(len(self), dtype=bool)
-        for effect in self.plugins.all_effects:
-            if effect.steepens:
-                steep |= effect.is_active(self.effects[effect.switch])
+        steep = self._any_worse("uneven light")
         gain = np.where(steep, np.inf, np.maximum(self.effects["gain"], 1.0))
         return np.where(uneven, gain, 0.0)
 
     def _any_active(self, widens: str) -> NDArray[np.bool_]:
         """Return whether an effect that widens the windows in this way is active, (N,)."""
+        return self._active(lambda effect: effect.widens == widens)
+
+    def _any_worse(self, worsened: str) -> NDArray[np.bool_]:
+        """Return whether an effect is active that makes noise or uneven light worse, (N,)."""
+        return self._active(lambda effect: worsened in effect.worsens)
+
+    def _active(self, concerned: Callable[[Effect], bool]) -> NDArray[np.bool_]:
+        """Return whether one of the effects that are concerned is active, (N,)."""
         active = np.zeros(len(self), dtype=bool)
         for effect in self.plugins.all_effects:
-            if effect.widens == widens and self.effects is not None:
+            if self.effects is not None and concerned(effect):
                 active |= effect.is_active(self.effects[effect.switch])
         return active
 

@@ -95,7 +95,7 @@ def parts(pipeline: Pipeline) -> list[Part]:
         if pipeline.any_value(effect.switch, effect.is_on)
         or effect.switch in pipeline.distributions
     ]
-    if any(effect.steepens for effect in on):
+    if any("uneven light" in effect.worsens for effect in on):
         gain = math.inf
     uneven = any(effect.widens == "uneven light" for effect in on)
     if uneven and any(uneven_light_needs_frame(setting, gain) for setting in settings):
@@ -105,7 +105,8 @@ def parts(pipeline: Pipeline) -> list[Part]:
     if asked:
         whole.append('window = "full"')
     noisy = any(effect.switch in draws for effect in effects if effect.widens == "noise")
-    noise = f", and {NOISE_MARGIN_PX} more for noise" if noisy else ""
+    coarse = any("noise" in effect.worsens for effect in on)
+    noise = f", and {NOISE_MARGIN_PX * (1 + coarse)} more for noise" if noisy else ""
     margins = sorted({margin_px(s) for s in settings if full_frame_reason(s) is None})
     windowed = bool(margins) and not (asked or image)
     guarded = pipeline.any_value("guarded", bool)

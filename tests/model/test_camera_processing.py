@@ -11,6 +11,8 @@ from support.lengths import lengths
 from support.small_scenes import SMALL, image_of, scenes_of
 from sweep.errors import PipelineError
 from sweep.evaluation.cells import run_cells
+from sweep.evaluation.search import search_windows
+from sweep.measure.detector import DetectorSetting
 from sweep.measure.flags import BoundStatus
 from sweep.model.extent import marker_boxes
 from sweep.model.jpeg import compressed
@@ -148,6 +150,10 @@ COMBINATIONS = {
     "tone and light": ["tone_gamma=2.2", "vignetting=4", "illumination_gradient=0.5", "bloom=1"],
     "fine bits": ["tone_knee=1", "bit_depth=12", "sharpening=0.5", "gain=1.4"],
     "defocus": ["aperture_mm=9", "focus_distance_m=0.5", "sharpening=1", "tone_toe=0.5"],
+    "bent sheet": [
+        "curvature_per_m=4", "geometry_px=0.5", "marker_scale=1.1", "sharpening=1", "bayer=RGGB",
+        "jpeg_quality=40",
+    ],
     "motion": ["exposure_s=0.01", "velocity_x_m_s=2", "row_time_s=1e-4", "sharpening=1"],
 }
 
@@ -298,3 +304,28 @@ def test_all_faults_of_effects_come_at_once():
     with pytest.raises(PipelineError) as raised:
         Pipeline.from_text(SMALL + lines)
     assert len(str(raised.value).splitlines()) == 4
+
+
+def test_coarse_noise_is_searched_in_wider_windows_and_steep_light_on_whole_frames():
+    setting = DetectorSetting()
+    wide = ["width_px=900", "height_px=700", "distance_m=0.9"]
+
+    def left_of(*settings):
+        scenes = scenes_of([*wide, *settings])
+        (window,) = search_windows(scenes, marker_boxes(scenes), setting, np.array([False]))
+        return int(window[0])
+
+    plain, noisy = left_of(), left_of("noise_grey=3")
+    assert plain - noisy == 32
+    assert plain - left_of("noise_grey=3", "noise_correlation=0.5") == 64
+    assert plain - left_of("noise_table=[0, 3]", "noise_correlation=0.5") == 64
+    # Without noise nothing is made coarse; blocks begin at multiples of 8.
+    assert 0 <= plain - left_of("jpeg_quality=50") <= 8
+    assert 64 <= plain - left_of("jpeg_quality=50", "noise_grey=3") <= 72
+    assert left_of("vignetting=4") == plain
+    for steep in ("tone_gamma=0.5", "tone_toe=0.5", "tone_knee=0.5", "bloom=0.5", "jpeg_quality=9"):
+        assert left_of("vignetting=4", steep) == 0
+    assert left_of("tone_gamma=0.5") == plain
+    text = SMALL + "noise_grey = 3\nnoise_correlation = 0.5\n"
+    reasons = {part.name: part.reason for part in parts(Pipeline.from_text(text))}
+    assert reasons["window"].endswith("and 64 more for noise")

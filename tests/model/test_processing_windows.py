@@ -26,7 +26,7 @@ SETTINGS
 [axes]
 background = [0, 128, 255]
 side_px = { geom = [10, 250, 12] }
-noise_grey = [2, 8, 24]
+noise_grey = [2, 8, 32]
 trial = 40
 """
 

@@ -28,6 +28,12 @@ from sweep.analysis.states import BlockState, Nothing, State
 from sweep.analysis.statistic import Output, SinglePass, Statistic, Variables, ViewT
 from sweep.analysis.stopped_sampling import as_stopped, common_trials
 
+MAX_AT_ONCE = 1 << 21
+"""Poses, times the lengths of inner dimensions, up to which what is in memory is one block.
+
+Dask's graph takes longer than the statistics of so few.
+"""
+
 
 def aggregate(
     results: xr.Dataset,
@@ -85,12 +91,21 @@ def aggregate(
         settings = math.prod(results.sizes[name] for name in layout.settings)
         layout = dataclasses.replace(layout, order=order)
         statistics = [replicated(statistic, settings) for statistic in statistics]
+    passes = Passes(layout, binning, tuple(statistics), view)
+    coordinates = {name: value.variable for name, value in results.coords.items()
+                   if set(value.dims) <= set(kept) and not is_fixed(value)}
+    dims = (*layout.kept, *binning.edges)
+    if not lazy and math.prod(dataset.sizes.values()) <= MAX_AT_ONCE:
+        sizes = {name: dataset.sizes.get(name, results.sizes[name]) for name in layout.dimensions}
+        values = passes.of_block(sizes, [each.values for each in dataset.values()])
+        shape = (*(sizes[name] for name in layout.kept), *binning.shape)
+        found = {output.name: (dims, _pick(output, shape, values), output.attributes())
+                 for statistic in statistics for output in statistic.outputs()}
+        return xr.Dataset(found, coordinates).assign_coords(binning.coordinates(results))
     chunked = layout.rechunk(dataset, lazy=lazy)
     lengths = {name: tuple(chunked.chunks[name]) if name in chunked.sizes
                else (results.sizes[name],) for name in layout.dimensions}
-    passes = Passes(layout, binning, tuple(statistics), view)
     layer, tables = _add_tasks(chunked, lengths, passes)
-    dims = (*layout.kept, *binning.edges)
     chunks = (*(lengths[name] for name in layout.kept), *((count,) for count in binning.shape))
     variables = {
         output.name: (dims, array_of_blocks(
@@ -98,8 +113,6 @@ def aggregate(
         ), output.attributes())
         for statistic in statistics for output in statistic.outputs()
     }
-    coordinates = {name: value.variable for name, value in results.coords.items()
-                   if set(value.dims) <= set(kept) and not is_fixed(value)}
     table = xr.Dataset(variables, coordinates).assign_coords(binning.coordinates(results))
     return table if lazy else table.compute(scheduler="synchronous")
 
@@ -147,6 +160,18 @@ class Passes(Generic[ViewT]):
         for statistic, *states in zip(self.statistics, known, second, strict=True):
             variables |= statistic.finish(*states)
         return variables
+
+    def of_block(
+        self, sizes: Mapping[str, int], arrays: Sequence[NDArray[Any]]
+    ) -> Variables:
+        """Return the variables of all statistics of a dataset that is one block."""
+        def read() -> list[NDArray[Any]]:
+            return list(arrays)
+
+        known = self.prepare_second(fold(self.first_pass(sizes, read)))
+        if self.single:
+            return self.finish(known)
+        return self.finish(known, fold(self.second_pass(sizes, read, known)))
 
     def _by_bin(
         self, sizes: Mapping[str, int], read: ReadBlock,

@@ -13,8 +13,9 @@ from sweep.analysis.dimensions import DRAWS, as_names, axes_of, configuration_ax
 from sweep.analysis.image_sides import image_sides
 from sweep.analysis.requirements import (
     Decision,
+    ErrorShares,
     Requirement,
-    check_requirements,
+    decide,
     parse_requirements,
 )
 from sweep.errors import ArgumentError, DatasetError
@@ -36,7 +37,7 @@ class Reach(Flag):
 @describes
 def farthest_met(
     results: xr.Dataset, requirements: Iterable[Requirement | str], along: str,
-    per: Sequence[str] = (), at_all: Sequence[str] = (),
+    per: Sequence[str] = (), at_all: Sequence[str] = (), shares: ErrorShares | None = None,
 ) -> xr.Dataset:
     """Return how far along an axis all requirements are met.
 
@@ -53,6 +54,9 @@ def farthest_met(
     at_all
         Dimensions at all of whose values the requirements must hold for a value of ``along`` to
         count, such as ``tilt_deg`` for "up to 2.25 m at tilts up to 45 degrees".
+    shares
+        Shares of the error probability that single decisions may spend, if not those of
+        `sweep.analysis.check_requirements`.
 
     Returns
     -------
@@ -108,7 +112,7 @@ def farthest_met(
     overlap = [name for name in together if name in names]
     if overlap:
         raise ArgumentError("at_all", ", ".join(overlap), "is in per, too; name it in one of them")
-    table = check_requirements(results, required, per=[*names, *together, along])
+    table = decide(results, required, [*names, *together, along], shares=shares)
     keeps = xr.zeros_like(table["value"], dtype=bool)
     for k, each in enumerate(required):
         keeps[{"requirement": k}] = each.holds(table["value"].isel(requirement=k))

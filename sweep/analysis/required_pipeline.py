@@ -10,7 +10,8 @@ from sweep.messages import MAX_LINE_LENGTH, plain, shown
 
 
 def check_required(
-    texts: Iterable[str], source: str, others: PipelineError | None = None
+    texts: Iterable[str], source: str, others: PipelineError | None = None,
+    key: str = "require.all",
 ) -> None:
     """Check the requirements of a pipeline, by what can be required (`requirables`).
 
@@ -22,6 +23,8 @@ def check_required(
         The name that lines begin with.
     others
         The faults that the pipeline has besides.
+    key
+        Where the pipeline has them.
 
     Raises
     ------
@@ -31,6 +34,6 @@ def check_required(
     known = () if others is None else others.faults
     faults = [*known, *(
         plain(line, MAX_LINE_LENGTH) for text, problem in read_requirements(texts)[1]
-        if (line := f"{source}: require.all = {shown(text)}: {problem}") not in known)]
+        if (line := f"{source}: {key} = {shown(text)}: {problem}") not in known)]
     if faults:
         raise PipelineError(faults)

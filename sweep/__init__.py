@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ArgumentError", "DatasetError", "Pipeline", "PipelineError", "Progress", "RunError",
     "StoreError", "SweepError", "__version__", "decode_flags",
-    "open", "photos", "run",
+    "limit", "open", "photos", "run",
 ]
 
 _IMPORTED_ON_USE = {"Pipeline": "sweep.plan.experiment", "Progress": "sweep.execution.progress",
@@ -172,6 +172,90 @@ def run(
         overwrite=overwrite, retry_failed=retry_failed, durable=durable, yes=yes,
         progress=progress, time_limit_s=time_limit_s,
     )
+
+
+def limit(
+    pipeline: Pipeline | Mapping[str, Any] | str | os.PathLike[str],
+    *,
+    require: Sequence[str] = (),
+    along: str = "",
+    per: Sequence[str] | None = None,
+    at_all: Sequence[str] | None = None,
+    max_trials: int | None = None,
+    coarse_trials: int | None = None,
+    store: str | os.PathLike[str] | None = None,
+    workers: int | None = None,
+    client: Client | Cluster | None = None,
+    scheduler: str | None = None,
+    reuse: Sequence[str | os.PathLike[str]] = (),
+    overwrite: bool = False,
+    yes: bool = False,
+    progress: bool | Callable[[Progress], None] | None = None,
+) -> xr.Dataset:
+    """Find how far along an axis requirements are met, and return the limits.
+
+    Trials come in waves where they decide; the store of a search is continued, or answers.
+
+    Parameters
+    ----------
+    pipeline
+        As `run` takes it; a store of equally many trials everywhere is analysed as it is.
+    require
+        What must hold, such as "detection >= 0.9", all together (default: that of the pipeline's
+        section [limit], else [require]).
+    along
+        The axis of the scene that is searched, such as ``distance_m``.
+    per
+        Axes of which each combination of values has its own limit (default: all others).
+    at_all
+        Axes at all of whose values the requirements must hold.
+    max_trials
+        The most trials of a cell (default: that of [limit], else 2,400).
+    coarse_trials
+        Trials of every cell in the coarse scan (default: as many as make 40 draws of a value).
+    store
+        Path or URL of the store (default: ``runs/NAME-limit-AXIS.zarr``).
+    workers, client, scheduler, reuse, overwrite, yes, progress
+        As in `run`.
+
+    Returns
+    -------
+    xarray.Dataset
+        As `sweep.analysis.requirement_limits`; the store is in its attributes.
+
+    Raises
+    ------
+    PipelineError, ArgumentError, StoreError, RunError
+        As `run`.
+
+    Examples
+    --------
+    >>> limits = sweep.limit(
+    ...     {"pose": {"jitter_px": 0.5}, "axes": {"side_px": [5, 40]}},
+    ...     require=["detection >= 0.5"], along="side_px", max_trials=40,
+    ...     store=folder / "limit.zarr", workers=1,
+    ... )
+    >>> limits["value"].item()
+    40.0
+    """
+    from sweep.execution import BLOCK_TASK  # noqa: PLC0415  (as the docstring of the package says)
+    from sweep.execution.progress import progress_report  # noqa: PLC0415
+    from sweep.isolation.child_process import Child  # noqa: PLC0415
+    from sweep.messages import notice  # noqa: PLC0415
+
+    # The child imports its packages while this process does.
+    with Child(BLOCK_TASK) as child, progress_report(progress) as report:
+        from sweep.execution.limit_search import search_limits  # noqa: PLC0415
+
+        source = _pipeline(pipeline) if isinstance(pipeline, Mapping) else pipeline
+        limits, summary = search_limits(
+            source, require=require, along=along, per=per, at_all=at_all, max_trials=max_trials,
+            coarse_trials=coarse_trials, store=store, workers=workers, client=client,
+            scheduler=scheduler, reuse=reuse, overwrite=overwrite, yes=yes, progress=report,
+            child=child)
+    for line in summary.warnings if summary is not None else ():
+        notice(line)
+    return limits
 
 
 def _run(

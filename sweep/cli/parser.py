@@ -13,6 +13,7 @@ from sweep.cli.completion import COMPLETION
 from sweep.cli.environments import ENVIRONMENTS
 from sweep.cli.error_model import ERROR_MODEL
 from sweep.cli.export import EXPORT
+from sweep.cli.limit import LIMIT
 from sweep.cli.output import flushed
 from sweep.cli.photos import PHOTOS
 from sweep.cli.plan import PLAN
@@ -31,8 +32,9 @@ from sweep.messages import nearest
 from sweep.version import __version__
 
 COMMANDS = (
-    RUN, PLAN, SIZE, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, ERROR_MODEL, VERIFY, STATUS, EXPORT,
-    SCORE, PHOTOS, CHECK_DETECTOR, PLUGINS, ENVIRONMENTS, COMPLETION,
+    RUN, PLAN, SIZE, LIMIT, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, ERROR_MODEL, VERIFY, STATUS,
+    EXPORT, SCORE, PHOTOS, CHECK_DETECTOR, PLUGINS, ENVIRONMENTS,
+    COMPLETION,
 )
 """Every command, in the order in which the help lists them."""
 

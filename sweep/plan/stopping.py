@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Protocol
 from sweep.plan.axes import TRIAL, parse_trial
 from sweep.plan.choice_rule import read_choice
 from sweep.plan.draws import SAMPLINGS
+from sweep.plan.limit_rule import read_limit
 from sweep.plan.precision_rule import read_precision
 from sweep.plan.reader import Reading
 
@@ -52,6 +53,7 @@ class StoppingRule(Protocol):
 
 
 SECTIONS: Mapping[str, Callable[[Reading, dict[str, Any]], StoppingRule | None]] = {
+    "limit": read_limit,
     "precision": read_precision,
     "choose": read_choice,
 }

@@ -8,11 +8,13 @@ from typing import cast
 
 from sweep.plan.choice_rule import ChoiceRule
 from sweep.plan.experiment import Pipeline
+from sweep.plan.limit_rule import LimitRule
 from sweep.plan.precision_rule import PrecisionRule
 from sweep.sampling.stopping import Stopping
 
 RULES: Mapping[type, str] = {
     ChoiceRule: "sweep.sampling.choice:choice_sampling",
+    LimitRule: "sweep.sampling.limit:limit_sampling",
     PrecisionRule: "sweep.sampling.precision:precision_sampling",
 }
 """Class of what a section says -> module and function that make its rule, of a pipeline and that.

@@ -21,31 +21,13 @@ from numpy.typing import NDArray
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
+from sweep.plan.wave_ends import wave_ends
 from sweep.typing import Masks
 
-GROWTH = 4
-"""A wave has about one trial for so many of those before it, at least one unit."""
+__all__ = ["GroupResults", "Stopping", "block_unit", "condition_axes", "unit_of", "wave_ends"]
 
 FIRST_DRAWS = 50
 """Draws of a condition in the first wave, about: all pooled cells together."""
-
-
-def wave_ends(max_trials: int, unit: int) -> tuple[int, ...]:
-    """Return the numbers of trials at which waves end: multiples of a unit, and ``max_trials``.
-
-    Examples
-    --------
-    >>> wave_ends(600, 50)
-    (50, 100, 150, 200, 250, 350, 450, 600)
-    >>> wave_ends(30, 50), wave_ends(120, 50)
-    ((30,), (50, 100, 120))
-    """
-    ends: list[int] = []
-    end = unit
-    while end < max_trials:
-        ends.append(end)
-        end += unit * max(1, math.ceil(end / unit / GROWTH))
-    return (*ends, max_trials)
 
 
 def unit_of(pooled: int) -> int:

@@ -1,0 +1,120 @@
+"""A search for limits: a run under the section [limit], or a store that has the answer."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from sweep.analysis.required_pipeline import check_required
+from sweep.analysis.searched_limits import requirement_limits
+from sweep.errors import ArgumentError, StoreError
+from sweep.execution.runner import execute
+from sweep.execution.summary import Summary
+from sweep.model.image_file import read_regular
+from sweep.plan.experiment import Pipeline
+from sweep.plan.limit_rule import SECTION, LimitRule, limit_settings
+from sweep.plan.required import texts_in
+from sweep.plan.toml_text import MAX_BYTES, read_document
+from sweep.store.lifecycle import open_dataset, open_store
+from sweep.store.stored_pipeline import names_store, read_pipeline
+from sweep.store.unfinished import unfinished_line
+
+MAX_TRIALS = 2400
+"""The most trials of a cell where nothing says how many."""
+
+
+def search_limits(
+    source: Pipeline | str | os.PathLike[str], *, require: Sequence[str] = (), along: str = "",
+    per: Sequence[str] | None = None, at_all: Sequence[str] | None = None,
+    max_trials: int | None = None, coarse_trials: int | None = None,
+    settings: Sequence[str] = (), store: str | os.PathLike[str] | None = None,
+    begin: Callable[[Pipeline], None] = lambda _: None, **options: Any,
+) -> tuple[xr.Dataset, Summary | None]:
+    """Run a search, and return its limits and what was run, None if nothing had to be.
+
+    Parameters
+    ----------
+    source
+        A pipeline, its file, or a store: one of a search is continued, and one of equally many
+        trials everywhere is analysed as it is.
+    require, along, per, at_all, max_trials, coarse_trials, store
+        As `sweep.limit` has them.
+    settings
+        As ``--set`` takes them.
+    begin
+        Is called with the pipeline before it is run.
+    options
+        Of `sweep.execution.runner.execute`.
+
+    Raises
+    ------
+    PipelineError, StoreError, RunError, ArgumentError
+        As `sweep.limit`.
+    """
+    chosen = limit_settings(require, along, per, at_all, coarse_trials, max_trials)
+    if not isinstance(source, Pipeline) and names_store(source):
+        stored = open_store(os.fspath(source))
+        if stored.pipeline.stopping is None and stored.pipeline.axis("trial") is not None:
+            if not stored.finished:
+                raise StoreError(unfinished_line(stored))
+            results = open_dataset(os.fspath(source))
+            limits = requirement_limits(results, require, along, per, at_all)
+            return limits.assign_attrs(store=os.fspath(source)), None
+        if store is None and not settings:
+            store = source
+    pipeline = _with_search(source, settings, chosen)
+    rule = pipeline.stopping
+    assert isinstance(rule, LimitRule)  # noqa: S101  (read from the section [limit])
+    begin(pipeline)
+    if store is None:
+        store = Path("runs") / f"{pipeline.name}-limit-{rule.along}.zarr"
+    summary = execute(pipeline, store, **options)
+    limits = requirement_limits(open_dataset(summary.store))
+    return limits.assign_attrs(store=summary.store), summary
+
+
+def _with_search(
+    source: Pipeline | str | os.PathLike[str], settings: Sequence[str], chosen: Sequence[str]
+) -> Pipeline:
+    """Return a pipeline with the section [limit] of its document and of what is chosen.
+
+    What the section does not require, [require] does.
+    """
+    document = _document(source)
+    own = document.get(SECTION, {})
+    given = {*(own if isinstance(own, dict) else ()), *(
+        each.partition("=")[0].partition(".")[2] for each in chosen)}
+    more = [] if "max_trials" in given else limit_settings(max_trials=MAX_TRIALS)
+    if "require" not in given:
+        if not (texts := texts_in(document)):
+            raise ArgumentError("require", "", "expected what must hold, such as "
+                                "'detection >= 0.9'")
+        more += limit_settings(texts)
+    if "along" not in given:
+        raise ArgumentError("along", "", "expected the axis that is searched, such as distance_m")
+    settings = [*settings, *chosen, *more]
+    if isinstance(source, Pipeline):
+        pipeline = Pipeline.from_text(
+            source.text, settings, name=source.name, folder=source.folder,
+            camera_files=source.files)
+    else:
+        pipeline = read_pipeline(source, settings)
+    if pipeline.requirements:
+        check_required(pipeline.requirements, pipeline.name)
+    return pipeline
+
+
+def _document(source: Pipeline | str | os.PathLike[str]) -> dict[str, Any]:
+    """Return the document of a pipeline, empty if it cannot be read, which is told elsewhere."""
+    try:
+        if isinstance(source, Pipeline):
+            return read_document(source.text)
+        if names_store(source):
+            return read_document(open_store(os.fspath(source)).pipeline.text)
+        return read_document(read_regular(os.fspath(source), MAX_BYTES).decode())
+    except (OSError, ValueError):
+        return {}

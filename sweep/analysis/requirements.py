@@ -259,7 +259,8 @@ def decide(
     results, required, per, bins
         As there.
     shares
-        Shares of the error probability that a decision may spend.
+        Shares of the error probability that a decision may spend, of all looks of a search: where
+        sampling was stopped, intervals are not widened for that again.
 
     Returns
     -------
@@ -283,7 +284,8 @@ def decide(
           for statistic in each.requirable.computed(
               prefix, 1.0 - (1.0 - each.requirable.level) * share)),
     ]
-    table = aggregate(results, inputs, kept, statistics, Poses, bins).compute()
+    stopped = None if shares is None else False
+    table = aggregate(results, inputs, kept, statistics, Poses, bins, stopped=stopped).compute()
     if shares is None:
         _require_numbers(table, required)
     replicated = is_replicated(results)

@@ -12,7 +12,7 @@ from __future__ import annotations
 FIRST, EACH = 0.35, 0.65
 
 
-def looks_factor(looks: int) -> float:
+def looks_factor(count: int) -> float:
     """Return by how much the error probability of a decision is divided for each of its looks.
 
     It is for samples that grow by a quarter or more from look to look; a single look has 1.
@@ -26,4 +26,4 @@ def looks_factor(looks: int) -> float:
     >>> looks_factor(1), round(looks_factor(14), 1)
     (1.0, 9.4)
     """
-    return FIRST + EACH * looks
+    return FIRST + EACH * count

@@ -17,17 +17,17 @@ from sweep.plan.attributes import describes
 from sweep.plan.limit_rule import LimitRule
 
 
-def error_shares(decisions: int, looks: int) -> ErrorShares:
+def error_shares(decisions: int, times: int) -> ErrorShares:
     """Return the shares of the error probability of each decision of a search.
 
     Parameters
     ----------
     decisions
         How many are made for one limit: a false "not met" of any shortens it.
-    looks
+    times
         How often each is made.
     """
-    factor = looks_factor(looks)
+    factor = looks_factor(times)
     return ErrorShares(met=1.0 / factor, not_met=1.0 / (factor * decisions))
 
 

@@ -11,6 +11,7 @@ from sweep.report.configuration_figures import COMPARED, CONFIGURATIONS
 from sweep.report.failure_figure import FAILURES
 from sweep.report.figure import FigureKind
 from sweep.report.frame_figure import FRAME
+from sweep.report.precision_figure import PRECISION
 from sweep.report.ranking_figure import RANKING
 from sweep.report.report_data import ReportData
 from sweep.report.scene_figures import BIAS, DETECTION, ERRORS_BY_SIZE, FLIPS, MAPS
@@ -18,7 +19,7 @@ from sweep.report.tradeoff_figure import TRADE
 
 KINDS: tuple[FigureKind, ...] = (
     DETECTION, ERRORS_BY_SIZE, BIAS, CONFIGURATIONS, COMPARED, TRADE, MAPS, FLIPS, AMBIGUITY,
-    FAILURES, FRAME, RANKING, BOUND,
+    FAILURES, FRAME, RANKING, BOUND, PRECISION,
 )
 """Add a kind of figure here; what no kind covers of axes and draws gets a figure of its effect."""
 

@@ -1,0 +1,42 @@
+"""The figure of the poses that a wanted precision needed."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from sweep.analysis.half_widths import Reached
+from sweep.report.precision_figure import PRECISION, _poses_of_conditions, _rows
+
+
+@pytest.fixture
+def table():
+    """Return what `precision_reached` gives of three conditions, two solvers and one quantity."""
+    reached = np.array([[[1], [2], [3]], [[1], [1], [4]]], dtype=np.uint8)
+    return xr.Dataset(
+        {"reached": (("solver", "side_px", "quantity"), reached),
+         "half_width": (("solver", "side_px", "quantity"), reached * 0.01),
+         "run": (("solver", "side_px"), np.array([[300, 50, 100]] * 2)),
+         "wanted": ("quantity", [0.02])},
+        {"solver": ["ippe", "sqpnp"], "side_px": [10, 20, 30], "quantity": ["detection_rate"]},
+        {"configuration_dims": ["solver"]})
+
+
+def test_each_configuration_has_the_number_of_conditions_by_flag(table):
+    rows = _rows(table.set_coords("wanted"))
+    assert [row[:2] for row in rows] == [
+        ["detection_rate", "ippe"], ["detection_rate", "sqpnp"]]
+    assert [row[4:] for row in rows] == [["0", "1", "1", "1", "0"], ["0", "2", "0", "0", "1"]]
+    assert len(rows[0]) == 4 + len(Reached)
+    assert [row[3] for row in rows] == ["0.0200", "0.0100"]  # the widest of those that are known
+
+
+def test_poses_of_conditions_are_in_increasing_order(table):
+    assert _poses_of_conditions(table).tolist() == [50, 100, 300]
+
+
+def test_stores_of_fixed_trials_have_no_such_figure():
+    class Data:
+        class pipeline:  # noqa: N801
+            stopping = None
+
+    assert not PRECISION.applies(Data)

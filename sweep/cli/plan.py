@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import shlex
+from typing import TYPE_CHECKING
 
 from sweep.cli.arguments import (
     add_json,
@@ -15,6 +16,11 @@ from sweep.cli.arguments import (
 )
 from sweep.cli.command import Command, Example
 from sweep.cli.output import print_json, say, say_next
+
+if TYPE_CHECKING:
+    from sweep.execution.forecast import Forecast
+    from sweep.plan.experiment import Pipeline
+    from sweep.plan.stopping import StoppingRule
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -77,6 +83,10 @@ def _execute(options: argparse.Namespace) -> int:
             say(f"  {text}")
         names = [name for name in pipeline.require_per if pipeline.axis(name) is not None]
         say(f"  at each {', '.join(names)}" if names else "  pooled over all axes of the scene")
+    if pipeline.stopping is not None:
+        say("\nTrials")
+        for line in _rule_lines(pipeline.stopping):
+            say(f"  {line}")
     say("\nParts")
     for part in listed:
         cost = ""
@@ -89,8 +99,9 @@ def _execute(options: argparse.Namespace) -> int:
     over, ended = ("over ", ", then the measurement was ended") if expected.over else ("", "")
     how = "in one process" if expected.small else f"with {expected.workers} workers"
     rows = {
-        "poses": f"{expected.poses:,}",
-        "results": f"{expected.results:,}",
+        "poses": _poses(pipeline, expected),
+        "results": f"{expected.results:,}" if pipeline.stopping is None else (
+            f"at most {expected.results:,}"),
         "blocks": f"{expected.blocks:,} of {' x '.join(map(str, expected.block)) or '1'} poses",
         "store": f"{byte_count(expected.bytes)} before compression, in {expected.files:,} files",
         "memory": f"{byte_count(expected.worker_bytes)} a worker",
@@ -99,6 +110,8 @@ def _execute(options: argparse.Namespace) -> int:
     }
     for name, text in rows.items():
         say(f"  {name:8} {text}")
+    for line in _pilot_lines(pipeline, expected):
+        say(f"  {line}")
     demand = Demand(expected.seconds, expected.workers, expected.bytes, expected.files)
     refused = objections(demand, free_disk(f"runs/{pipeline.name}.zarr"))
     for line in refused:
@@ -107,6 +120,45 @@ def _execute(options: argparse.Namespace) -> int:
     settings += ["--yes"] if refused else []
     say_next(shlex.join(["sweep", "run", options.pipeline, *settings]))
     return 0
+
+
+def _rule_lines(rule: StoppingRule) -> list[str]:
+    """Return what a section by which sampling stops says."""
+    from sweep.plan.precision_rule import PrecisionRule  # noqa: PLC0415
+
+    lines = [f"in waves until [{rule.section}] is fulfilled, at most {rule.max_trials:,}"]
+    if isinstance(rule, PrecisionRule):
+        lines += [f"{name} to {width:g}" for name, width in rule.wanted]
+        lines.append(f"at each {', '.join(rule.per)}" if rule.per else "of all poses together")
+    return lines
+
+
+def _poses(pipeline: Pipeline, expected: Forecast) -> str:
+    """Return how many poses a run computes; to a precision, about how many."""
+    if pipeline.stopping is None:
+        return f"{expected.poses:,}"
+    if expected.pilot is None:
+        return f"at most {expected.poses:,}"
+    about, low, high = (
+        f"{float(f'{share * expected.poses:.2g}'):,.0f}" for share in (
+            expected.pilot.share, expected.pilot.share_low, expected.pilot.share_high)
+    )
+    return f"about {about} ({low} to {high}) of at most {expected.poses:,}"
+
+
+def _pilot_lines(pipeline: Pipeline, expected: Forecast) -> list[str]:
+    """Return what a pilot says of a run to a precision, or why there is none."""
+    rule, pilot = pipeline.stopping, expected.pilot
+    if rule is None:
+        return []
+    if pilot is None:
+        return ["how many poses are needed was not tried, poses take too long"]
+    trials = pilot.share * rule.max_trials
+    lines = [f"about {trials:,.0f} trials a condition, by a pilot of {pilot.conditions} of them"]
+    if pilot.unsettled:
+        lines.append(f"about {100 * pilot.unsettled:.2g} % of the conditions need more than "
+                     f"{rule.max_trials:,} trials")
+    return lines
 
 
 PLAN = Command(

@@ -95,6 +95,9 @@ def _write_image(again: Reproduction, options: argparse.Namespace) -> None:
 
 def _print_verdict(again: Reproduction) -> int:
     """Print whether the values are the stored ones; return the exit status."""
+    if again.unneeded:
+        say("the store does not hold this cell: the run settled its condition with fewer trials")
+        return 0
     if again.stored is None:
         say("the store does not hold this cell yet")
         return 0

@@ -28,6 +28,7 @@ from sweep.execution.limits import (
     PLAN_SCENES_LIMIT_S,
     SMALL_RUN_S,
 )
+from sweep.execution.pilot import Pilot, pilot
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
 from sweep.isolation.watchdog import compilation_s
 from sweep.plan.experiment import Pipeline
@@ -44,6 +45,12 @@ EFFECT_S = 0.6
 
 MIN_PAIRS = 3
 """Pairs of measurements of an effect, of which the median is taken."""
+
+PILOT_SHARE = 0.6
+"""Share of the time that is left in which a pilot computes poses."""
+
+PILOT_LIMIT_S = 8.0
+"""Seconds after which it is ended: its rule may be slow to decide."""
 
 START_S = 3.0
 """Seconds of a run apart from its blocks: processes start and end, packages are imported."""
@@ -72,6 +79,9 @@ class Forecast:
         Number of workers, and how long they would take.
     small
         Whether the run is so small that one process computes it, without a cluster.
+    pilot
+        Of a run to a precision, what it is expected to need of the poses, after which ``seconds``
+        are estimated; None of a run of fixed trials, or if poses take too long for a pilot.
     """
 
     poses: int
@@ -87,6 +97,7 @@ class Forecast:
     workers: int
     seconds: float
     small: bool
+    pilot: Pilot | None = None
 
 
 def effect_cost(
@@ -174,12 +185,16 @@ def forecast(
     if workers < 1:
         raise ArgumentError("workers", workers, "expected at least 1")
     costs: dict[str, float] = {}
+    expected: Pilot | None = None
     try:
         with Child("sweep.execution.forecast") as child:
             started = time.monotonic()
             calibration = calibrate_in(child, pipeline, CALIBRATION_S, PLAN_SCENES_LIMIT_S)
             if not calibration.over:
                 left = PLAN_LIMIT_S - min(time.monotonic() - started, PLAN_SCENES_LIMIT_S)
+                if pipeline.stopping is not None:
+                    expected, used_s = _pilot(child, pipeline, calibration.scene_s, left)
+                    left -= used_s
                 costs = _effect_costs(child, pipeline, switches, calibration.scene_s, left)
     except (ChildDiedError, ChildRaisedError) as error:
         raise RunError(
@@ -187,7 +202,7 @@ def forecast(
             "and computes the others"
         ) from None
     poses = pipeline.size(Stage.scene)
-    work_s = poses * calibration.scene_s
+    work_s = poses * calibration.scene_s * (1.0 if expected is None else expected.share)
     small = not chosen and work_s < SMALL_RUN_S
     extents = block_extents(pipeline, calibration, 1 if small else workers)
     blocks = Blocks(tuple(len(axis) for axis in scene_axes(pipeline)), extents)
@@ -209,7 +224,26 @@ def forecast(
         workers=workers,
         seconds=(SMALL_START_S if small else START_S) + work_s / busy,
         small=small,
+        pilot=expected,
     ), costs
+
+
+def _pilot(
+    child: Child, pipeline: Pipeline, pose_s: float, left_s: float
+) -> tuple[Pilot | None, float]:
+    """Return what a run in waves is expected to need, and the seconds that this took."""
+    started = time.monotonic()
+    try:
+        found: Pilot | None = child.call(
+            pilot, pipeline, pose_s, PILOT_SHARE * left_s, limit_s=PILOT_LIMIT_S,
+            grace_s=COMPILATION_LIMIT_S,
+        )
+    except ChildDiedError as error:
+        if not error.timed_out:
+            raise
+        child.restart()
+        found = None
+    return found, time.monotonic() - started
 
 
 def _effect_costs(

@@ -152,8 +152,11 @@ def _settled(store: RunStore) -> int | None:
     rule, sampling = store.pipeline.stopping, make_rule(store.pipeline)
     if rule is None or sampling is None:
         return None
+    count = condition_count(store.pipeline)
+    if store.finished and (sampled := store.run_metadata["counts"].get("sampled")):
+        return count - int(sampled["unsettled"])
     waves = InWaves(store, rule, sampling)
-    return int(waves.settled / waves.cells * condition_count(store.pipeline))
+    return int(waves.settled / waves.cells * count)
 
 
 @dataclass(frozen=True, slots=True)

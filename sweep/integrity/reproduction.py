@@ -16,6 +16,7 @@ from sweep.integrity.stored_values import Values, current_pipeline, stored_cell
 from sweep.integrity.tolerances import compare
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.isolation.crash_isolation import run_cells_isolated
+from sweep.measure.flags import DetectionStatus
 from sweep.messages import nearest, plain, refusal
 from sweep.plan.cell_selection import cell, parse_selection, selection_text
 from sweep.plan.experiment import Pipeline
@@ -55,6 +56,8 @@ class Reproduction:
         The inspected scene; None if its inspection raises or ends its process.
     image
         (h, w) grey levels; None if rendering raises or ends its process.
+    unneeded
+        Whether the block is committed and the trial was not needed: nothing of it is stored.
     """
 
     at: str
@@ -70,6 +73,7 @@ class Reproduction:
     cell_pipeline: Pipeline
     inspection: SceneInspection | None
     image: NDArray[np.uint8] | None
+    unneeded: bool = False
 
 
 def reproduce(
@@ -118,6 +122,9 @@ def reproduce(
         for v in store.variables
     }
     stored = stored_cell(store, index)
+    unneeded = stored is not None and bool(
+        stored.values["detection"] == DetectionStatus.not_needed)
+    stored = None if unneeded else stored
     exact = stored is not None and stored.same_processor and not changes
     difference = "" if stored is None else compare(
         recomputed, stored.values, store.variables, same_processor=exact
@@ -130,7 +137,7 @@ def reproduce(
         difference, exact,
         {"scene": cells.seconds["scene"][0], "detection": cells.seconds["detection"][setting],
          "estimation": cells.seconds["estimation"][configuration[Stage.estimation]]},
-        cells.failures, changes, pipeline, cell_pipeline, inspected, image,
+        cells.failures, changes, pipeline, cell_pipeline, inspected, image, unneeded,
     )
 
 

@@ -181,15 +181,23 @@ class Decider:
         starts = tuple(first if k == trial else start for k, start in enumerate(span.starts))
         stops = tuple(last if k == trial else stop for k, stop in enumerate(span.stops))
         part = region(variable, pipeline, Block(starts, stops))
-        values = np.asarray(self.store.array(name)[part])
-        names = variable.dimensions(pipeline)
-        scene = [axis.name for axis in scene_axes(pipeline) if axis.name != TRIAL]
-        order = [
-            *scene, TRIAL,
-            *(axis.name for axis in pipeline.axes_of(Stage.detection)),
-            *(axis.name for axis in pipeline.axes_of(Stage.estimation)), *variable.inner,
-        ]
-        return values.transpose([names.index(each) for each in order if each in names])
+        return in_order_of_results(
+            pipeline, variable, np.asarray(self.store.array(name)[part])
+        )
+
+
+def in_order_of_results(
+    pipeline: Pipeline, variable: Variable, values: NDArray[Any]
+) -> NDArray[Any]:
+    """Return values in the dataset's dimensions in those of `GroupResults`."""
+    names = variable.dimensions(pipeline)
+    scene = [axis.name for axis in scene_axes(pipeline) if axis.name != TRIAL]
+    order = [
+        *scene, TRIAL,
+        *(axis.name for axis in pipeline.axes_of(Stage.detection)),
+        *(axis.name for axis in pipeline.axes_of(Stage.estimation)), *variable.inner,
+    ]
+    return values.transpose([names.index(each) for each in order if each in names])
 
 
 def by_scene(

@@ -136,10 +136,6 @@ def summary_of(
     )
 
 
-MAX_CONDITIONS = 3
-"""Conditions that are not settled of which a line each is printed."""
-
-
 def _unsettled_lines(store: RunStore, sampled: Mapping[str, Any]) -> list[str]:
     """Return lines on the conditions that would need more than ``max_trials``; often none."""
     count, rule = sampled.get("unsettled"), store.pipeline.stopping
@@ -147,7 +143,11 @@ def _unsettled_lines(store: RunStore, sampled: Mapping[str, Any]) -> list[str]:
         return []
     of = f"{count:,} of {sampled['conditions']:,}"
     lines = [f"warning: {of} conditions are not settled after all {rule.max_trials:,} trials"]
-    lines += [f"  {at or 'all poses together'}" for at in sampled["at"][:MAX_CONDITIONS]]
-    if count > MAX_CONDITIONS:
-        lines.append(f"  and {count - MAX_CONDITIONS:,} more")
+    reached = sampled["reached"]
+    lines += [
+        f"  {at or 'all poses together'}{': ' if text else ''}{text}"
+        for at, text in zip(sampled["at"], reached, strict=False)
+    ]
+    if count > len(reached):
+        lines.append(f"  and {count - len(reached):,} more")
     return lines

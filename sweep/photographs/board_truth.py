@@ -22,8 +22,11 @@ from sweep.photographs.pose_fit import FittedPose, Lens, fit_pose
 from sweep.photographs.poses import Poses
 from sweep.typing import Floats
 
-MIN_CORNERS = 8
+MIN_CORNERS = 6
 """Corners of a board from which its pose is taken for known, beside those of the marker."""
+
+MIN_HALF = 5
+"""Corners in each of two halves whose poses are compared."""
 
 Z_IN = np.diag([1.0, -1.0, -1.0])
 """Takes points of a board to a frame with z away from the viewer, where IPPE is stable."""
@@ -145,7 +148,7 @@ def _halves_ratio(
         halves = [
             fit_pose(lens, corners.points - centre, corners.pixels, pose.rotation,
                      pose.rotation @ centre + pose.translation, half & pose.used)
-            if (half & pose.used).sum() >= MIN_CORNERS else None
+            if (half & pose.used).sum() >= MIN_HALF else None
             for half in (first, ~first)
         ]
         one, other = halves

@@ -260,8 +260,10 @@ def _with_one_camera(
     if fits:
         rms = float(np.median([each.rms_px for each in fits]))
         lines.append(
-            f"board: {rms:.2f} px RMS of its corners in the median photograph; the poses of halves "
-            f"of its corners differ by {result.halves_ratio:.2g} of what their residuals predict"
+            f"board: {rms:.2f} px RMS of its corners in the median photograph"
+            + ("" if np.isnan(result.halves_ratio) else
+               "; the poses of halves of its corners differ by "
+               f"{result.halves_ratio:.2g} of what their residuals predict")
         )
     order = np.argsort(board.marker_ids)
     poses = result.poses

@@ -13,6 +13,7 @@ from sweep.plan.background_files import file_digest
 from sweep.plan.draws import SAMPLINGS
 from sweep.plan.photographs import PhotographRecord, read_record
 from sweep.plan.reader import Reading
+from sweep.plan.stopping import SECTIONS
 
 
 def photographs_alone(reading: Reading) -> None:
@@ -33,6 +34,9 @@ def photographs_alone(reading: Reading) -> None:
         reading.fault("estimator.believed", "calibration", "truth, for photographs")
     if reading.sampling != SAMPLINGS[0]:
         reading.fault("sampling", reading.sampling, f"{SAMPLINGS[0]}, for photographs")
+    for name in SECTIONS:
+        if name in reading.document:
+            reading.fault(name, reading.document[name], "no such section: photographs are given")
     if reading.known_files is not None:
         reading.files.update(reading.known_files)
         return

@@ -310,7 +310,7 @@ PHOTOGRAPH_SCHEMA: tuple[Variable, ...] = (
              since_format=5),
     Variable("truth_std", _S, "f4",
              "standard deviation of the true pose, as far as it is known; camera frame",
-             "radian, m", ("pose_parameter",), present_when=FlagRule("truth", "only"),
+             "radian, m", ("pose_parameter",),
              tolerance=Tolerance("relative", 1e-6), since_format=5),
 )
 """The variables that stores of photographs have besides."""

@@ -27,7 +27,7 @@ from sweep.plan.camera_facts import camera_facts, notes
 from sweep.plan.camera_values import stored_text
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
-from sweep.plan.schema import SCHEMA
+from sweep.plan.schema import PHOTOGRAPH_SCHEMA, SCHEMA
 from sweep.plugins.declared import RECORDED, recorded_plugins
 from sweep.store.checksums import DigestingStore
 from sweep.store.direct_reading import read_directly
@@ -325,5 +325,5 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
         ) from None
     # Text, as netCDF needs it.
     dataset.attrs["sweep"] = json.dumps(dataset.attrs["sweep"])
-    ordered = [variable.name for variable in SCHEMA if variable.name in dataset]
+    ordered = [each.name for each in (*SCHEMA, *PHOTOGRAPH_SCHEMA) if each.name in dataset.data_vars]
     return with_descriptions(dataset.assign_coords(texts)[ordered])

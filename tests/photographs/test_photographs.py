@@ -1,0 +1,146 @@
+"""Photographs of a board, from their files to a store: against exact poses and plain OpenCV."""
+
+import cv2
+import numpy as np
+import pytest
+
+import sweep
+from sweep.analysis import error_statistics
+from support.board_photographs import BOARD, POSES, SIZE, VIEW, board, marker_poses, write_set
+from support.here import calls_here
+from sweep.integrity.verification import verify
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, TruthSource
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A store of five photographs; a marker is covered in the first."""
+    folder = tmp_path_factory.mktemp("photographs")
+    shots = write_set(folder)
+    first = cv2.imread(str(shots / "shot0.png"), cv2.IMREAD_GRAYSCALE)
+    pixels = true_corners(0)[3]
+    cv2.fillConvexPoly(first, np.rint(pixels).astype(np.int32), 210)
+    cv2.imwrite(str(shots / "shot0.png"), first)
+    (shots / "notes.txt").write_text("not a photograph")
+    with calls_here():
+        results = sweep.photos(
+            shots, camera=folder / "camera.json", board=folder / "board.toml",
+            settings=['cornerRefinementMethod=["none", "subpix"]'], store=folder / "shots.zarr",
+        )
+    return folder, results.load()
+
+
+def true_corners(number):
+    """Return the images (M, 4, 2) of the markers' corners in a photograph."""
+    turn, shift = POSES[number]
+    points = board().corners_m @ turn.T + shift
+    return points[..., :2] / points[..., 2:] * VIEW[:2] + VIEW[2:]
+
+
+def test_the_truth_is_that_of_the_board_within_its_standard_deviation(made):
+    _, results = made
+    errors = []
+    for number, pose in enumerate(POSES):
+        _, position = marker_poses(pose)
+        shown = (results.detection[number, :, 0] != DetectionStatus.not_in_photograph).values
+        assert (results.truth[number].values[shown] == TruthSource.board_without_this_marker).all()
+        for k in np.flatnonzero(shown):
+            turn = cv2.Rodrigues(results.true_rvec[number, k].values)[0] @ pose[0].T
+            moved = results.true_tvec_m[number, k].values - position[k]
+            std = results.truth_std[number, k].values
+            errors.append(np.concatenate([cv2.Rodrigues(turn)[0].ravel(), moved]) / std)
+    # Errors of neighbouring markers are almost the same: about 30 independent numbers. Their root
+    # mean square is within a factor of 2.2 of 1 with error probability below 1e-6.
+    assert 1 / 2.2 < np.sqrt(np.mean(np.square(errors))) < 2.2
+
+
+def test_the_markers_wholly_in_the_frame_count_whether_found_or_not(made):
+    _, results = made
+    for number in range(len(POSES)):
+        pixels = true_corners(number)
+        inside = ((pixels >= -0.5) & (pixels <= np.array(SIZE) - 0.5)).all(axis=(1, 2))
+        flags = results.detection[number, :, 0].values
+        counted = flags != DetectionStatus.not_in_photograph
+        assert not (counted & ~inside).any()
+        # Of a board that is cut, the pose without a marker's corners may be unknown.
+        assert (counted == inside).all() or number == len(POSES) - 1
+    assert results.detection[0, 3, 0] == DetectionStatus.no_candidate
+    assert not inside.all()  # the last photograph is cut
+    assert np.isnan(results.true_tvec_m.values[-1][~inside]).all()
+
+
+def test_corners_and_poses_are_those_of_a_plain_loop_over_the_files(made):
+    folder, results = made
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, BOARD["dictionary"]))
+    matrix = np.array([[VIEW[0], 0, VIEW[2]], [0, VIEW[1], VIEW[3]], [0, 0, 1]])
+    half = BOARD["marker_m"] / 2
+    square = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
+    compared = 0
+    for number, name in enumerate(results.photograph.values):
+        grey = cv2.imread(str(folder / "shots" / name), cv2.IMREAD_GRAYSCALE)
+        for j, method in enumerate((cv2.aruco.CORNER_REFINE_NONE, cv2.aruco.CORNER_REFINE_SUBPIX)):
+            parameters = cv2.aruco.DetectorParameters()
+            parameters.cornerRefinementMethod = method
+            quads, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(grey)
+            for quad, marker in zip(quads, np.ravel(ids), strict=True):
+                each = results.isel(trial=number, cornerRefinementMethod=j).sel(marker_id=marker)
+                if each.detection == DetectionStatus.not_in_photograph:
+                    continue
+                truth = each.true_rvec.values, each.true_tvec_m.values
+                expected = cv2.projectPoints(square, *truth, matrix, None)[0].reshape(4, 2)
+                error = quad.reshape(4, 2) - expected
+                assert np.allclose(each.corner_error_px, error, atol=1e-3)
+                assert each.estimate == EstimateStatus.solved
+                _, _, shifts, _ = cv2.solvePnPGeneric(
+                    square, quad.reshape(4, 2).astype(float), matrix, None,
+                    flags=cv2.SOLVEPNP_IPPE_SQUARE,
+                )
+                found = each.translation_error_m.values + truth[1]
+                nearest = min(np.linalg.norm(found - shift.ravel()) for shift in shifts)
+                assert nearest < 1e-4 * found[2]
+                compared += 1
+    shown = int((results.detection != DetectionStatus.not_in_photograph).sum())
+    assert compared == shown - 2  # the covered marker
+
+
+def test_coordinates_are_those_of_the_true_pose(made):
+    _, results = made
+    _, position = marker_poses(POSES[1])
+    side = VIEW[0] * BOARD["marker_m"] / position[:, 2]
+    shown = np.isfinite(results.side_px.values[1])
+    assert np.allclose(results.side_px.values[1][shown], side[shown], rtol=0.005)
+    assert np.allclose(results.tilt_deg.values[1][shown],
+                       np.degrees(np.arccos(-POSES[1][0][2, 2])), atol=0.5)
+    centre = position[:, :2] / position[:, 2:] * VIEW[:2] + VIEW[2:]
+    assert np.allclose(results.image_x_px.values[1][shown], centre[shown, 0], atol=0.3)
+
+
+def test_a_photograph_is_the_draw_of_every_interval(made):
+    _, results = made
+    table = error_statistics(results, per="cornerRefinementMethod")
+    error = 100 * (results.translation_error_m / results.true_tvec_m).isel(xyz=2)
+    for j in range(2):
+        each = error.isel(cornerRefinementMethod=j).values
+        used = np.isfinite(each) & (results.flipped.values[..., j] == Flipped.not_flipped)
+        mean = each[used].mean()
+        # The ratio estimator: sums of deviations by photograph (Cochran, 1977, section 3.12).
+        sums = np.where(used, each - mean, 0.0).sum(axis=1)
+        m = len(sums)
+        half = 2.7764451 * np.sqrt(m / (m - 1) * (sums**2).sum()) / used.sum()
+        assert np.isclose(table.range_bias_percent[j], mean)
+        assert np.isclose(table.range_bias_percent_high[j] - mean, half, rtol=1e-6)
+
+
+def test_the_photographs_are_verified_by_their_digests(made, tmp_path):
+    folder, _ = made
+    store = str(folder / "shots.zarr")
+    report = verify(store, sample=2)
+    assert not report.damage and report.sampled == 2
+    name = folder / "shots" / "shot2.png"
+    content = name.read_bytes()
+    cv2.imwrite(str(name), np.full(SIZE[::-1], 128, np.uint8))
+    try:
+        changed = verify(store, sample=2)
+        assert "shot2.png" in changed.not_sampled
+    finally:
+        name.write_bytes(content)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -23,6 +24,12 @@ from sweep.typing import Floats, Integers
 
 MIN_FITTING = 0.8
 """Share of the detected markers that lie where the board has them."""
+
+DOUBTFUL = 0.98
+"""Share of fitting markers from which no other board is tried."""
+
+CLEARLY = 0.02
+"""By how much more of the markers another board must fit."""
 
 FITTING_SHARE = 0.2
 """Distance of a corner to that of the board's homography, as a share of the marker's side."""
@@ -59,23 +66,26 @@ def check_board(
             "first_id or ids",
         )
     share = fitting_share(board, seen)
-    if share < MIN_FITTING:
-        fits = next(
-            (words for words, other in _others(path)
-             if fitting_share(other, seen) >= max(MIN_FITTING, share + 0.1)), None,
-        )
-        raise ArgumentError(
-            "board", plain(path),
-            f"only {100 * share:.0f} % of the detected markers lie where it has them; "
-            + (f"{fits} fits" if fits else "correct its kind, its rows and columns, or its IDs"),
-        )
     ratio = measured_side(board, seen)
-    if abs(ratio - 1.0) > MAX_SIZE_ERROR:
+    centres = board.corners_m.mean(axis=1, keepdims=True)
+    scaled = dataclasses.replace(board, corners_m=centres + ratio * (board.corners_m - centres))
+    if abs(ratio - 1.0) > MAX_SIZE_ERROR and fitting_share(scaled, seen) >= MIN_FITTING:
         side = float(np.linalg.norm(board.corners_m[0, 1] - board.corners_m[0, 0]))
         raise ArgumentError(
             "board", plain(path),
             f"markers of {side:g} m do not fit its other lengths, beside which the photographs "
             f"show about {side * ratio:.3g} m; correct marker_m, or the squares or gaps",
+        )
+    better = "" if share > DOUBTFUL else next(
+        (words for words, other in _others(path)
+         if fitting_share(other, seen) >= max(MIN_FITTING, share + CLEARLY)), "",
+    )
+    if better or share < MIN_FITTING:
+        raise ArgumentError(
+            "board", plain(path),
+            f"only {100 * share:.0f} % of the detected markers lie where it has them; "
+            + (f"{better} fits" if better else "correct its kind, its rows and columns, or its "
+               "IDs"),
         )
 
 

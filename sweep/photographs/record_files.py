@@ -101,7 +101,8 @@ def write_record(
         home.mkdir(parents=True, exist_ok=True)
         for record, content in zip(names, contents, strict=True):
             path = home / record
-            if path.exists() and path.read_bytes() != content and not overwrite:
+            used = (home / f"{name}.zarr").exists() and path.exists()
+            if used and path.read_bytes() != content and not overwrite:
                 raise StoreError(
                     f"{plain(path, 300)}: holds other photographs or poses, which a store may "
                     "refer to; choose another store, or overwrite it"

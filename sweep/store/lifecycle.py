@@ -325,5 +325,7 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
         ) from None
     # Text, as netCDF needs it.
     dataset.attrs["sweep"] = json.dumps(dataset.attrs["sweep"])
-    ordered = [each.name for each in (*SCHEMA, *PHOTOGRAPH_SCHEMA) if each.name in dataset.data_vars]
+    ordered = [
+        each.name for each in (*SCHEMA, *PHOTOGRAPH_SCHEMA) if each.name in dataset.data_vars
+    ]
     return with_descriptions(dataset.assign_coords(texts)[ordered])

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 import sweep
-from sweep.analysis import error_statistics
 from support.board_photographs import BOARD, POSES, SIZE, VIEW, board, marker_poses, write_set
 from support.here import calls_here
+from sweep.analysis import error_statistics
 from sweep.integrity.verification import verify
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, TruthSource
 
@@ -131,11 +131,12 @@ def test_a_photograph_is_the_draw_of_every_interval(made):
         assert np.isclose(table.range_bias_percent_high[j] - mean, half, rtol=1e-6)
 
 
-def test_the_photographs_are_verified_by_their_digests(made, tmp_path):
+def test_the_photographs_are_verified_by_their_digests(made):
     folder, _ = made
     store = str(folder / "shots.zarr")
     report = verify(store, sample=2)
-    assert not report.damage and report.sampled == 2
+    assert not report.damage
+    assert report.sampled in (1, 2)  # drawn with replacement
     name = folder / "shots" / "shot2.png"
     content = name.read_bytes()
     cv2.imwrite(str(name), np.full(SIZE[::-1], 128, np.uint8))

@@ -1,0 +1,90 @@
+"""Photographs, boards and cameras that do not fit: a line each, which says what to change."""
+
+import cv2
+import numpy as np
+import pytest
+
+from support.board_photographs import POSES, camera, toml, write_set
+from sweep.errors import ArgumentError, SweepError
+from sweep.photographs.prepare import prepare
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    made = tmp_path_factory.mktemp("faults")
+    shots = write_set(made, POSES[:2])
+    grey = cv2.imread(str(shots / "shot1.png"), cv2.IMREAD_GRAYSCALE)
+    for name, images in {
+        "mixed": (grey, grey, grey[:200]), "without": (np.full_like(grey, 128),), "empty": (),
+    }.items():
+        (made / name).mkdir()
+        for number, image in enumerate(images):
+            cv2.imwrite(str(made / name / f"{number}.png"), image)
+    return made
+
+
+BOARDS = [
+    ({"legacy_pattern": True}, "legacy_pattern = false fits"),
+    ({"squares_x": 4, "squares_y": 5}, "squares_x = 5, squares_y = 4 fits"),
+    ({"marker_m": 0.015}, "the photographs show about 0.02"),
+    ({"first_id": 20}, "correct first_id or ids"),
+]
+
+
+@pytest.mark.parametrize(("changes", "expected"), BOARDS)
+def test_another_board_is_found_out(folder, tmp_path, changes, expected):
+    path = tmp_path / "other.toml"
+    path.write_text(toml(**changes))
+    with pytest.raises(ArgumentError, match=expected) as caught:
+        prepare([folder / "shots"], folder / "camera.json", board=path, home=tmp_path)
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.glob("*.npz"))
+
+
+@pytest.mark.parametrize(("name", "options", "expected"), [
+    ("mixed", {}, "expected photographs of one size: most are 360 x 270, not 2.png"),
+    ("without", {}, "no photograph shows a marker of DICT_4X4_50"),
+    ("empty", {}, "expected photographs"),
+    ("missing", {}, "No such file"),
+    ("shots", {"camera": "calibrate"}, "there are 2; take more"),
+    ("shots", {"camera": None}, "expected the file of a calibration"),
+    ("shots", {"board": None}, "expected the file of a board"),
+    ("shots", {"settings": ["noise_grey=3"]}, "nothing beside photographs"),
+    ("shots", {"settings": ["size_m=0.1"]}, "expected none beside a board"),
+    ("shots", {"camera": None, "stereo": "camera.json"}, "K1, D1, K2, D2, R and T"),
+])
+def test_a_fault_is_one_line(folder, tmp_path, name, options, expected):
+    given = {"camera": "camera.json", "board": "board.toml", **options}
+    paths = {
+        key: folder / value if isinstance(value, str) and "." in value else value
+        for key, value in given.items()
+    }
+    with pytest.raises(SweepError, match=expected) as caught:
+        prepare([folder / name], paths.pop("camera"), home=tmp_path, **paths)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_camera_of_another_resolution_is_refused(folder, tmp_path):
+    path = tmp_path / "large.json"
+    path.write_text(camera((720, 540), (840.0, 840.0, 360.0, 265.0)))
+    with pytest.raises(ArgumentError, match="holds for 720 x 540, but the photographs are 360"):
+        prepare([folder / "shots"], path, board=folder / "board.toml", home=tmp_path)
+
+
+def test_what_is_left_out_and_converted_is_said(folder, tmp_path):
+    shots = tmp_path / "shots"
+    shots.mkdir()
+    for number in range(2):
+        grey = cv2.imread(str(folder / "shots" / f"shot{number}.png"), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(shots / f"deep{number}.png"), grey.astype(np.uint16) * 257)
+    cv2.imwrite(str(shots / "colour.png"), cv2.merge([grey, grey // 2, grey]))
+    (shots / "cut.jpg").write_bytes(b"\xff\xd8\xff")
+    (shots / "notes.txt").write_text("no photograph")
+    made = prepare(
+        [shots], folder / "camera.json", board=folder / "board.toml", home=tmp_path
+    )
+    said = "\n".join(made.lines)
+    assert "left out notes.txt: no images" in said
+    assert "left out cut.jpg" in said
+    assert "2 of 3 photographs have 16 bits" in said
+    assert "1 of 3 photographs are in colour" in said

@@ -131,6 +131,7 @@ def test_a_photograph_is_the_draw_of_every_interval(made):
         assert np.isclose(table.range_bias_percent_high[j] - mean, half, rtol=1e-6)
 
 
+@pytest.mark.long
 def test_the_photographs_are_verified_by_their_digests(made):
     folder, _ = made
     store = str(folder / "shots.zarr")

@@ -43,7 +43,9 @@ def test_outcomes_are_where_a_pose_ends():
         "solved", "wrong_id", "rejected", "no_candidate", "solver_failed", "not_converged",
         "not_explained", "failed", "crashed",
     )
-    assert outcomes(counted=False) == ("not_visible", "not_modelled", "not_run")
+    assert outcomes(counted=False) == (
+        "not_visible", "not_modelled", "not_in_photograph", "not_run", "not_needed",
+    )
 
 
 def test_examples_in_the_docstrings():

@@ -1,0 +1,221 @@
+"""The search for a limit: its error by enumeration, its coverage by simulation, its faults.
+
+Simulated coverage is compared with the binomial quantile of the promised rate at a chance of 1e-6.
+"""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import special, stats
+
+from support.searches import flags_of, is_covered, pipeline_of, searched, true_limits
+from sweep.analysis.repeated_looks import looks_factor
+from sweep.analysis.searched_limits import requirement_limits
+from sweep.errors import PipelineError
+from sweep.measure.flags import DetectionStatus
+from sweep.plan.experiment import Pipeline
+from sweep.plan.wave_ends import wave_ends
+from sweep.sampling.group_dataset import group_dataset
+from sweep.sampling.limit import limit_sampling
+from sweep.sampling.limit_search import BEYOND, wanted_values
+from sweep.sampling.stopping import GroupResults
+
+CHANCE = 1e-6
+SIDES = np.geomspace(60, 8, 20)
+
+
+def ever_met(rate, tail, ends):
+    """Return the probability that any look says "at least ``rate``" where it is that exactly.
+
+    A look says it of k of n if P(X >= k) is at most ``tail``: Clopper and Pearson's lower end.
+    """
+    paths, seen, error = np.array([1.0]), 0, 0.0
+    for end in ends:
+        step = stats.binom.pmf(np.arange(end - seen + 1), end - seen, rate)
+        paths, seen = np.convolve(paths, step), end
+        least = int(stats.binom.isf(tail, end, rate)) + 1
+        error += paths[least:].sum()
+        paths[least:] = 0.0
+    return error
+
+
+def enumerated(units, most, errors, rates):
+    """Return the largest ratio of the error of several looks to that of one."""
+    ratios = []
+    for unit in units:
+        for trials in most:
+            ends = wave_ends(trials, unit)
+            for error in errors:
+                for rate in rates:
+                    tail = error / looks_factor(len(ends))
+                    ratios.append(ever_met(rate, tail, ends) / error)
+    return max(ratios)
+
+
+def test_several_looks_err_no_more_than_one():
+    assert 0.5 < enumerated([40], [40, 240, 600], [0.025, 1e-3], [0.5, 0.9]) <= 1.0
+    # Without the factor they err more.
+    assert ever_met(0.9, 0.025, wave_ends(600, 40)) > 2 * 0.025
+
+
+@pytest.mark.long
+def test_several_looks_err_no_more_than_one_at_all_lengths():
+    rates = [0.01, 0.1, 0.5, 0.8, 0.9, 0.95, 0.99]
+    ratio = enumerated([5, 40, 50, 100], [40, 80, 120, 200, 300, 500, 1000, 2400, 10000],
+                       [0.025, 0.025 / 20, 0.025 / 250], rates)
+    print(f"error of several looks, of that of one: at most {ratio:.3f}")
+    assert ratio <= 1.0
+
+
+def test_values_are_wanted_that_may_move_the_limit():
+    rng = np.random.default_rng(5)
+    for _ in range(300):
+        n = int(rng.integers(1, 12))
+        keeps = rng.random(n) < 0.6
+        decided = rng.random(n) < 0.5
+        judged = rng.random(n) < 0.9
+        met, not_met = keeps & decided, ~keeps & decided
+        wanted = wanted_values(keeps, met, not_met, judged)
+        assert not (wanted & (decided | ~judged)).any()
+        at = np.flatnonzero(judged)
+        if len(at) and keeps[at[0]]:  # the run begins at the easy end: plain loop over it
+            end = next((k for k in at if not_met[k]), n)
+            last = max(k for k in at if keeps[k] and k < end)
+            beyond = [k for k in at if last < k < end][:BEYOND]
+            expected = {k for k in at if (k <= last or k in beyond) and not decided[k]}
+            assert set(np.flatnonzero(wanted).tolist()) == expected
+
+
+def test_every_wanted_cell_is_of_the_condition_alone():
+    # A group of several conditions is decided as each of them would be by itself.
+    rng = np.random.default_rng(2)
+    curves = special.expit((SIDES - rng.uniform(10, 40, (4, 1))) / 3)
+    pipeline = pipeline_of(curves, SIDES, "detection >= 0.9", 200)
+    rule = limit_sampling(pipeline, pipeline.stopping)
+    hits = rng.random((*curves.shape, 80)) < curves[..., None]
+    detection = np.where(hits, DetectionStatus.detected, DetectionStatus.rejected).astype(np.uint8)
+    whole = rule.needed(GroupResults(
+        pipeline, (0, 0), curves.shape, 2, 80, flags_of(detection)))
+    assert whole.any()
+    assert not whole.all()
+    for k in range(len(curves)):
+        one = rule.needed(GroupResults(pipeline, (k, 0), (k + 1, len(SIDES)), 2, 80,
+                                       flags_of(detection[k : k + 1])))
+        np.testing.assert_array_equal(one[0], whole[k])
+
+
+def test_limits_are_those_of_plain_intervals():
+    rng = np.random.default_rng(3)
+    curves = special.expit((SIDES - rng.uniform(12, 35, (6, 1))) / 2)
+    curves[2, 3] = 0.5  # a dip
+    limits = searched(curves, SIDES, "detection >= 0.9", 400, seed=1)
+    pipeline = pipeline_of(curves, SIDES, "detection >= 0.9", 400)
+    assert (limits["poses"] < 0.5 * 400 * len(SIDES)).all()
+    assert limits.attrs["harder"] == "downwards"
+    looks = len(pipeline.stopping.ends)
+    tail = 0.025 / looks_factor(looks)
+    for k in range(len(curves)):
+        one = limits.isel(tilt_deg=k)
+        met = one["keeps"].values
+        count = len(SIDES) if met.all() else int(np.argmin(met))
+        assert one["value"].item() == SIDES[count - 1]
+        # The decisions beside the limit, from counts alone: the rule stopped where they are sure.
+        assert one["decision"].values[0] == 1
+        trials = one["trials"].values
+        assert trials.min() == 40
+        assert trials.max() <= 400
+    assert limits["met_beyond"].values[2] > 0
+    # 40 of 40 do not show 0.9 at this level, 80 of 80 do.
+    assert stats.beta.ppf(tail, 40, 1) < 0.9 < stats.beta.ppf(tail, 80, 1)
+    assert limits["trials"].values[:, 0].min() == 80
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("rate", [0.9, 0.99])
+@pytest.mark.parametrize("shape", ["steep", "slow", "dip", "at the limit"])
+def test_intervals_cover_the_limit(rate, shape):
+    rng = np.random.default_rng(11)
+    count = 600
+    width = {"steep": 1.0, "slow": 4.0}.get(shape, 2.0)
+    curves = 0.9995 * special.expit((SIDES - rng.uniform(14, 30, (count, 1))) / width)
+    if shape == "dip":
+        curves[np.arange(count), rng.integers(1, 6, count)] *= rng.uniform(0.8, 0.99, count)
+    if shape == "at the limit":  # where an error is most likely: the first failing one all but is
+        first = (curves < rate).argmax(axis=1)
+        curves[np.arange(count), first] = rate - 1e-9
+        curves[np.arange(count), np.minimum(first + 1, 19)] = 0.5 * rate
+    limits = searched(curves, SIDES, f"detection >= {rate}", 2400, seed=4)
+    covered = int(is_covered(limits, true_limits(curves, SIDES, rate)).sum())
+    poses = float(limits["poses"].mean())
+    print(f"{rate}, {shape}: covered {covered} of {count}, {poses:,.0f} poses of "
+          f"{len(SIDES) * 2400:,}, settled {float(limits['settled'].mean()):.2f}")
+    assert covered >= stats.binom.ppf(CHANCE, count, 0.95)
+    assert covered / count >= 0.95
+    assert poses < len(SIDES) * 2400 / 3
+
+
+def test_a_store_of_equal_trials_has_limits_too():
+    rng = np.random.default_rng(9)
+    rates = np.array([[0.999, 0.999, 0.7, 0.1]])
+    pipeline = Pipeline.from_dict({"pose": {"jitter_px": 0.5, "side_px": 30}, "axes": {
+        "tilt_deg": [0], "noise_grey": [0, 5, 10, 15], "trial": 300}})
+    hits = rng.random((1, 4, 300)) < rates[..., None]
+    detection = np.where(hits, DetectionStatus.detected, DetectionStatus.rejected).astype(np.uint8)
+    results = group_dataset(GroupResults(
+        pipeline, (0, 0), (1, 4), 1, 300, flags_of(detection))).assign_coords(side_px=30.0)
+    results.attrs["pipeline"] = pipeline.text
+    limits = requirement_limits(results, ["detection >= 0.9"], "noise_grey")
+    assert limits["value"].values.tolist() == [5.0]
+    assert limits["settled"].values.all()
+    assert limits["poses"].values.tolist() == [1200]
+
+
+AXES = {"side_px": [10, 20], "dictionary": ["DICT_4X4_50", "DICT_5X5_50"], "roll_deg": [0],
+        "solver": ["ippe", "iterative"], "tilt_deg": [0, 30]}
+GOOD = {"require": ["detection >= 0.9"], "along": "side_px", "max_trials": 80}
+
+
+@pytest.mark.parametrize(("changed", "words"), [
+    ({"along": "dictionary"}, "its values have no order"),
+    ({"along": "roll_deg"}, "it has one value"),
+    ({"along": "noise_grey"}, "it has one value"),
+    ({"along": "azimuth_deg"}, "it is drawn for each trial"),
+    ({"along": "solver"}, "each configuration has its own limit"),
+    ({"along": "trial"}, "trials are what is counted"),
+    ({"along": "sides"}, "no such axis"),
+    ({"along": 3}, "the axis that is searched"),
+    ({"require": []}, "a list of texts"),
+    ({"require": ["detection"]}, "NAME >= NUMBER"),
+    ({"require": ["budget_ms <= 2"]}, "the cost is that of a configuration"),
+    ({"per": ["side_px"]}, "other axes than side_px"),
+    ({"per": ["tilt_deg"], "at_all": ["tilt_deg"]}, "in per or in at_all"),
+    ({"at_all": ["nothing"]}, "no such axis of the scene"),
+    ({"max_trials": 1}, "at least 2"),
+    ({"coarse_trials": 1}, "a whole number from 2 on"),
+    ({"more": 1}, "unknown key"),
+])
+def test_faults_are_told_in_a_line(changed, words):
+    with pytest.raises(PipelineError) as raised:
+        Pipeline.from_dict({
+            "pose": {"jitter_px": 0.5, "azimuth_deg": {"uniform": [0, 90]}}, "axes": AXES,
+            "limit": {**GOOD, **changed}})
+    assert len(raised.value.faults) == 1
+    assert words in raised.value.faults[0]
+
+
+@pytest.mark.parametrize(("texts", "words"), [
+    (["detection >= 90"], "write 0.9 for 90 %"),
+    (["detection >= 0.9", "detection <= 0.5"], "contradicts"),
+    (["size_px >= 3"], "nothing of this name"),
+])
+def test_names_and_contradictions_are_told_when_the_rule_is_made(texts, words):
+    pipeline = Pipeline.from_dict({
+        "pose": {"jitter_px": 0.5}, "axes": AXES, "limit": {**GOOD, "require": texts}})
+    with pytest.raises(PipelineError, match=words):
+        limit_sampling(pipeline, pipeline.stopping)
+
+
+def test_waves_end_at_the_most_trials():
+    assert wave_ends(100, 40) == (40, 80, 100)
+    assert math.isclose(looks_factor(1), 1.0)

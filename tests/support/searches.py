@@ -1,0 +1,72 @@
+"""Searches for limits on curves of known rates: the rule of sampling, fed with binomial draws."""
+
+import numpy as np
+
+from sweep.analysis.searched_limits import requirement_limits
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.plan.experiment import Pipeline
+from sweep.sampling.group_dataset import group_dataset
+from sweep.sampling.limit import limit_sampling
+from sweep.sampling.stopping import GroupResults
+
+
+def pipeline_of(curves, values, text, most, coarse=40):
+    """Return a pipeline whose tilts stand for the conditions of curves (conditions, values)."""
+    return Pipeline.from_dict({
+        "pose": {"jitter_px": 0.5},
+        "axes": {"tilt_deg": np.linspace(0, 80, len(curves)).tolist(), "side_px": list(values)},
+        "limit": {"require": [text], "along": "side_px", "per": ["tilt_deg"], "max_trials": most,
+                  "coarse_trials": coarse},
+    })
+
+
+def flags_of(detection):
+    """Return the values of a group with these flags of detection."""
+    detected = detection == DetectionStatus.detected
+    unneeded = detection == DetectionStatus.not_needed
+    return {
+        "detection": detection,
+        "estimate": np.select([detected, unneeded],
+                              [EstimateStatus.solved, EstimateStatus.not_needed],
+                              EstimateStatus.no_detection).astype(np.uint8),
+        "flipped": np.select([detected, unneeded], [Flipped.not_flipped, Flipped.not_needed],
+                             Flipped.no_estimate).astype(np.uint8),
+    }
+
+
+def searched(curves, values, text, most, seed):
+    """Return the limits that a search finds on curves (conditions, values) of rates."""
+    pipeline = pipeline_of(curves, values, text, most)
+    rule = limit_sampling(pipeline, pipeline.stopping)
+    rng = np.random.default_rng(seed)
+    shape = curves.shape
+    detection = np.full((*shape, most), DetectionStatus.not_needed, dtype=np.uint8)
+    needed, first = np.ones(shape, dtype=bool), 0
+    for wave, end in enumerate(rule.ends, start=1):
+        hits = rng.random((*shape, end - first)) < curves[..., None]
+        found = np.where(hits, DetectionStatus.detected, DetectionStatus.no_candidate)
+        detection[..., first:end] = np.where(
+            needed[..., None], found, DetectionStatus.not_needed)
+        first = end
+        if end < most:
+            needed = rule.needed(GroupResults(
+                pipeline, (0, 0), shape, wave, end, flags_of(detection[..., :end].copy())))
+        if not needed.any():
+            break
+    results = group_dataset(GroupResults(
+        pipeline, (0, 0), shape, len(rule.ends), most, flags_of(detection)))
+    results.attrs["pipeline"] = pipeline.text
+    return requirement_limits(results)
+
+
+def true_limits(curves, values, rate):
+    """Return the limits (conditions,) of curves along falling sides; infinite for none."""
+    order = np.argsort(values)[::-1]
+    reached = np.logical_and.accumulate(curves[:, order] >= rate, axis=1).sum(axis=1)
+    return np.concatenate([[np.inf], np.asarray(values)[order]])[reached]
+
+
+def is_covered(limits, truth):
+    """Return where intervals cover limits (conditions,), read from large sides to small ones."""
+    low, high = limits["low"].values, limits["high"].values
+    return (low <= truth) & (truth <= high)

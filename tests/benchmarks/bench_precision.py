@@ -1,0 +1,95 @@
+"""How much of the time of a run to a precision is spent on deciding which trials are needed.
+
+Blocks are computed in this process, in the order of a run; processor seconds are measured, so that
+other load on the machine does not count.
+
+    python tests/benchmarks/bench_precision.py [--sides 24] [--max-trials 2400] [--width 0.02]
+"""
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+from sweep.execution.block_task import compute_block
+from sweep.execution.calibration import block_extents, calibrate
+from sweep.execution.waiting import InWaves
+from sweep.plan.experiment import Pipeline
+from sweep.sampling.deciding import Decider
+from sweep.sampling.rules import make_rule
+from sweep.store.lifecycle import create_store
+
+TEXT = """
+seed = 1
+pose = {{ jitter_px = 0.5 }}
+axes = {{ tilt_deg = [0, 45], side_px = {{ geom = [8, 40, {sides}] }} }}
+precision = {{ {wanted}, max_trials = {most} }}
+"""
+
+WANTED = {
+    "rate": "detection_rate = {width}",
+    "rate and spread": 'detection_rate = {width}, position_rmse_m = "10 %"',
+}
+
+
+def measure(wanted, options):
+    """Compute a store in waves; return poses that were needed, and seconds by what took them."""
+    pipeline = Pipeline.from_text(TEXT.format(
+        sides=options.sides, most=options.max_trials, wanted=wanted.format(width=options.width)))
+    rule = make_rule(pipeline)
+    extents = block_extents(pipeline, calibrate(pipeline, 0.6), 2)
+    spent = {"deciding": 0.0, "scheduling": 0.0}
+    decide = Decider.needed
+
+    def timed(self, block, decision):
+        start = time.process_time()
+        try:
+            return decide(self, block, decision)
+        finally:
+            spent["deciding"] += time.process_time() - start
+
+    Decider.needed = timed
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            store = create_store(str(Path(folder) / "run.zarr"), pipeline, extents)
+            waiting = InWaves(store, pipeline.stopping, rule)
+            begun, needed, empty_s = time.process_time(), 0, 0.0
+            while True:
+                start = time.process_time()
+                work = waiting.next()
+                spent["scheduling"] += time.process_time() - start
+                if work is None:
+                    break
+                for number in work.numbers:
+                    start = time.process_time()
+                    receipt = compute_block(
+                        store.url, store.run_id, store.blocks[number], decision=work.decision)
+                    if not receipt.any_needed:
+                        empty_s += time.process_time() - start
+                    needed += receipt.scenes_needed
+                    start = time.process_time()
+                    waiting.committed(number, receipt)
+                    spent["scheduling"] += time.process_time() - start
+            return len(store.blocks), needed, time.process_time() - begun, empty_s, spent
+    finally:
+        Decider.needed = decide
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sides", type=int, default=24)
+    parser.add_argument("--max-trials", type=int, default=2400)
+    parser.add_argument("--width", type=float, default=0.02)
+    options = parser.parse_args()
+    for name, wanted in WANTED.items():
+        blocks, needed, total_s, empty_s, spent = measure(wanted, options)
+        deciding = ", ".join(f"{what} {100 * s / total_s:.2g} %" for what, s in spent.items())
+        print(
+            f"{name}: {needed:,} of {2 * options.sides * options.max_trials:,} poses in {blocks:,} "
+            f"blocks, {total_s:.1f} s: {deciding}, blocks of which nothing was needed "
+            f"{100 * empty_s / total_s:.2g} %"
+        )
+
+
+if __name__ == "__main__":
+    main()

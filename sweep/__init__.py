@@ -38,11 +38,12 @@ if TYPE_CHECKING:
     from sweep.execution.cluster import Cluster
     from sweep.execution.progress import Progress
     from sweep.plan.experiment import Pipeline
+    from sweep.tradeoff.choice_search import Choice
 
 __all__ = [
     "ArgumentError", "DatasetError", "Pipeline", "PipelineError", "Progress", "RunError",
     "StoreError", "SweepError", "__version__", "decode_flags",
-    "limit", "open", "photos", "run",
+    "limit", "open", "photos", "run", "size",
 ]
 
 _IMPORTED_ON_USE = {"Pipeline": "sweep.plan.experiment", "Progress": "sweep.execution.progress",
@@ -397,3 +398,64 @@ def photos(
         prepared.pipeline, store=store or os.path.join(home, f"{prepared.pipeline.name}.zarr"),  # noqa: PTH118
         workers=workers, overwrite=overwrite, progress=progress,
     )
+
+
+def size(
+    pipeline: Pipeline | Mapping[str, Any] | str | os.PathLike[str],
+    *,
+    store: str | os.PathLike[str] | None = None,
+    workers: int | None = None,
+    reuse: Sequence[str | os.PathLike[str]] = (),
+    overwrite: bool = False,
+    yes: bool = False,
+    limit_s: float = 20.0,
+    progress: bool | Callable[[Progress], None] | None = None,
+) -> Choice:
+    """Search the smallest, or the cheapest, choice that meets requirements at all conditions.
+
+    Parameters
+    ----------
+    pipeline
+        As for :func:`run`, with the sections [require] and [choose].
+    store, workers, reuse, overwrite, yes, progress
+        As for :func:`run`.
+    limit_s
+        Seconds of the measurement of costs, where there are alternatives or a budget.
+
+    Returns
+    -------
+    Choice
+        The answer of each alternative (``answers``), the number of the chosen one (``best``, None
+        if none meets everything), costs, the front, and the poses that it took.
+
+    Raises
+    ------
+    ArgumentError, PipelineError, StoreError, RunError
+        As for :func:`run`; a choice that cannot be made is told in a line for each fault.
+
+    Examples
+    --------
+    >>> found = sweep.size({
+    ...     "pose": {"jitter_px": 0.5}, "axes": {"side_px": [4, 40]},
+    ...     "require": {"all": ["detection >= 0.5"]},
+    ...     "choose": {"smallest": "side_px", "max_trials": 60},
+    ... }, store=folder / "smallest.zarr", workers=1)
+    >>> found.answers[found.best].value, found.answers[found.best].next
+    (40.0, 4.0)
+    """
+    from sweep.execution import BLOCK_TASK  # noqa: PLC0415
+    from sweep.execution.progress import progress_report  # noqa: PLC0415
+    from sweep.isolation.child_process import Child  # noqa: PLC0415
+    from sweep.messages import notice  # noqa: PLC0415
+
+    if not 0.0 < limit_s < float("inf"):
+        raise ArgumentError("limit_s", limit_s, "expected a finite number above 0")
+    with Child(BLOCK_TASK) as child, progress_report(progress) as report:
+        from sweep.tradeoff.choice_search import search_choice  # noqa: PLC0415
+
+        found = search_choice(
+            _pipeline(pipeline), store, limit_s=limit_s, progress=report, child=child,
+            workers=workers, reuse=reuse, overwrite=overwrite, yes=yes)
+    for line in found.notes:
+        notice(line)
+    return found

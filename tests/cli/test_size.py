@@ -1,0 +1,129 @@
+"""`sweep size` ends in an answer, as text, JSON or Markdown, or in a line that says what to do."""
+
+import json
+
+import pytest
+
+import sweep
+from support.here import calls_here
+from sweep.cli import main
+
+FILE = """
+pose.jitter_px = 0.5
+[axes]
+side_px = [4, 30, 60]
+tilt_deg = [0, 40]
+solver = ["ippe", "iterative"]
+[require]
+all = ["detection >= 0.5"{more}]
+[choose]
+{choose}
+max_trials = {trials}
+"""
+
+
+def told(arguments, capsys):
+    with calls_here():
+        status = main(["size", *map(str, arguments)])
+    printed = capsys.readouterr()
+    return status, printed.out, printed.err
+
+
+def written(tmp_path, choose='smallest = "side_px"', more="", trials=100):
+    path = tmp_path / "marker.toml"
+    path.write_text(FILE.format(choose=choose, more=more, trials=trials))
+    return path
+
+
+@pytest.fixture
+def found(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path)
+    return told(["marker.toml", "--seconds", "0.2", "--json"], capsys)
+
+
+@pytest.mark.long
+def test_the_answer_is_the_smallest_side_and_names_what_the_next_fails_by(found, capsys):
+    status, out, _ = found
+    answer = json.loads(out)
+    assert (status, answer["decision"], answer["answer"]["side_px"]) == (0, "met", 30.0)
+    assert answer["alternatives"][0]["next"] == 4.0
+    assert answer["alternatives"][0]["next_cause"]["value"] == 0.0
+    assert answer["poses"] <= answer["grid_poses"] <= 600
+    status, out, _ = told(["runs/marker.zarr", "--seconds", "0.2", "--markdown"], capsys)
+    assert status == 0
+    assert out.startswith("**side_px=30, solver=")
+    assert "| solver | side_px | next | ms a frame | why not better |" in out
+    status, out, _ = told(["marker.toml", "--seconds", "0.2"], capsys)
+    assert "the next smaller, 4, is no choice: detection_rate >= 0.5 is not met: 0 (" in out
+    assert out.splitlines()[-1].startswith("next: sweep report runs/marker.zarr")
+
+
+@pytest.mark.long
+def test_a_budget_that_nothing_is_within_leaves_no_choice(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    path = written(tmp_path, more=', "budget_ms <= 0.0001"')
+    status, out, _ = told([path, "--seconds", "0.2"], capsys)
+    assert status == 1
+    assert out.startswith("no choice meets 1 requirement at 2 conditions, with 95 % confidence, wi")
+    assert "not within 0.0001 ms" in out
+
+
+@pytest.mark.long
+def test_no_choice_at_all_names_the_nearest(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    path = written(tmp_path, more=', "rotation_p95_deg <= 1e-6"')
+    status, out, _ = told([path, "--seconds", "0.2"], capsys)
+    assert status == 1
+    assert "nearest is side_px=60" in out
+    assert "rotation_p95_deg <= 1e-06 is not met" in out
+
+
+@pytest.mark.long
+def test_the_cheapest_is_found_where_nothing_has_an_order(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = written(tmp_path, choose='among = ["solver", "side_px"]')
+    with calls_here():
+        found = sweep.size(path, limit_s=0.5)
+    best = found.answers[found.best]
+    assert best.alternative["side_px"] > 4
+    assert found.costs[found.best].ms == min(
+        cost.ms for answer, cost in zip(found.answers, found.costs, strict=True) if answer.met)
+
+
+def test_a_pipeline_without_a_choice_is_told_what_to_write(tmp_path, capsys):
+    path = tmp_path / "plain.toml"
+    path.write_text("[pose]\njitter_px = 0.5\n[axes]\nside_px = [20, 40]\ntrial = 5\n")
+    status, _, err = told([path], capsys)
+    assert (status, err.count("\n")) == (2, 1)
+    assert 'expected what is chosen: [choose] smallest = "size_m", max_trials = 5000' in err
+
+
+@pytest.mark.parametrize(("choose", "more", "line"), [
+    ('smallest = "solver"', "", "choose.smallest"),
+    ('smallest = "side_px"', ', "budget_ms >= 2"', "expected milliseconds of a frame"),
+    ('smallest = "side_px"', ', "detection <= 0.2"', "no result can be both"),
+    ('smallest = "side_px"', ', "detektion >= 0.2"', "did you mean detection_rate"),
+    ("", "", "something to choose"),
+])
+def test_what_cannot_be_searched_is_a_line_and_status_2(choose, more, line, tmp_path, capsys):
+    path = written(tmp_path, choose, more)
+    if not choose:
+        path.write_text(path.read_text().replace('["ippe", "iterative"]', '["ippe"]'))
+    status, _, err = told([path], capsys)
+    assert status == 2
+    assert line in err
+    assert "Traceback" not in err
+
+
+def test_seconds_that_cannot_be_are_named_by_their_flag(tmp_path, capsys):
+    status, _, err = told([written(tmp_path), "--seconds", "0"], capsys)
+    assert (status, err) == (2, "--seconds 0.0: expected a finite number above 0\n")
+
+
+def test_too_few_trials_are_refused_before_anything_runs(tmp_path, capsys):
+    path = written(tmp_path, more=', "solved >= 0.999"')
+    status, _, err = told([path], capsys)
+    assert status == 2
+    assert "choose.max_trials = 100: expected at least" in err
+    assert not (tmp_path / "runs").exists()

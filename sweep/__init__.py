@@ -1,7 +1,7 @@
 """How well will I know the pose? Experiments with fiducial markers, against the truth.
 
 Importing this package is quick: NumPy, Numba, Dask and xarray are imported when a function needs
-them.
+them. It has more than 400 lines, for each public function stands here with all that it takes.
 """
 
 from __future__ import annotations

@@ -16,7 +16,8 @@ BROKEN = {
     "unknown section, nearest named": (
         "[pose]\ndistance_m = 1\n[camra]\nwidth_px = 640",
         ("camra: unknown; expected a section of title, seed, sampling, effects, camera, marker, "
-        "pose, scene, detector, estimator, axes, require, precision, choose; did you mean camera?"),
+        "pose, scene, detector, estimator, axes, require, limit, precision, choose; "
+        "did you mean camera?"),
     ),
     "a key without its section": (
         "tilt_deg = 3\n[pose]\ndistance_m = 1", "tilt_deg = 3: expected it under [pose]",

@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+import xarray as xr
 
+import sweep
 from sweep.analysis.choices import answers
 from sweep.analysis.requirements import Decision
 from sweep.errors import PipelineError
+from sweep.execution.runner import execute
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.experiment import Pipeline
 from sweep.sampling.choice import group_dataset, store_cells
@@ -124,6 +127,23 @@ def test_another_choice_does_not_continue_a_store():
     other = Pipeline.from_dict(changed(choose={"max_trials": 500})).stopping
     assert other.looser(rule) == "choose: max_trials: the store has 400, this run 500"
     assert not rule.looser(rule)
+
+
+@pytest.mark.long
+def test_a_search_is_the_same_with_one_or_two_workers_and_other_blocks(tmp_path):
+    """The stores of a search are equal value for value, and cost less than the whole grid."""
+    document = changed(axes={"size_m": [0.01, 0.02, 0.03, 0.06]}, choose={"max_trials": 200})
+    stores = []
+    for number, options in enumerate((
+            {"workers": 1}, {"workers": 2}, {"workers": 1, "block_s": 0.01})):
+        stores.append(tmp_path / f"{number}.zarr")
+        execute(Pipeline.from_dict(document), str(stores[-1]), **options)
+    first, *others = map(sweep.open, stores)
+    for other in others:
+        xr.testing.assert_identical(
+            first.load().drop_attrs(), other.load().drop_attrs())
+    needed = (first["detection"] != DetectionStatus.not_needed).mean()
+    assert 0.2 < float(needed) < 0.8
 
 
 def test_answers_name_the_next_size_and_what_it_fails_by():

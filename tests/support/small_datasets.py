@@ -128,13 +128,15 @@ def with_every_flag(rng, results, *, good=0.6):
     kinds = [
         kind
         for kind in EstimateStatus
-        if kind not in (EstimateStatus.not_run, EstimateStatus.no_detection)
+        if kind not in (EstimateStatus.not_run, EstimateStatus.no_detection,
+                        EstimateStatus.not_needed)
     ]
     estimate = np.where(rng.random(shape) < good, EstimateStatus.solved,
                         rng.choice(np.array(kinds, dtype=np.uint8), shape))
     estimate[seen != DetectionStatus.detected] = EstimateStatus.no_detection
     estimate[seen == DetectionStatus.not_run] = EstimateStatus.not_run
     estimate[seen == DetectionStatus.crashed] = EstimateStatus.crashed
+    estimate[seen == DetectionStatus.not_needed] = EstimateStatus.not_needed
     solved = estimate == EstimateStatus.solved
     out["estimate"].values[...] = estimate
     out["flipped"].values[...] = np.where(
@@ -193,12 +195,13 @@ def poses(results, of, per=(), bins=None):
 
 def looked_for(pose):
     return pose["detection"] not in {
-        DetectionStatus.not_run, DetectionStatus.not_visible, DetectionStatus.not_modelled
+        DetectionStatus.not_run, DetectionStatus.not_visible, DetectionStatus.not_modelled,
+        DetectionStatus.not_needed, DetectionStatus.not_in_photograph,
     }
 
 
 def is_run(pose):
-    return pose["detection"] != DetectionStatus.not_run
+    return pose["detection"] not in {DetectionStatus.not_run, DetectionStatus.not_needed}
 
 
 def is_detected(pose):

@@ -9,6 +9,9 @@ from sweep.plan.experiment import Pipeline
 COMPILATION_S = 8
 """Seconds that the renderer takes to compile, which every run needs."""
 
+PHOTOGRAPH_S = 12
+"""Seconds that `photometric_real` takes beyond that."""
+
 LIKELIHOOD_S = 10
 """Seconds that the bound and `photometric` take beyond that."""
 
@@ -20,5 +23,8 @@ def announce_compilation(pipeline: Pipeline) -> None:
     seconds = 0 if is_compiled("coverage.accumulate") else COMPILATION_S
     if fits and not is_compiled("likelihood.fit"):
         seconds += LIKELIHOOD_S
+    real = "photometric_real" in pipeline.values_of("solver")
+    if real and not is_compiled("photograph.locate_photograph"):
+        seconds += PHOTOGRAPH_S
     if seconds:
         notice(f"compiling, once for this version: about {seconds} s")

@@ -137,6 +137,7 @@ ESTIMATION: dict[str, Callable[[EstimationResults], NDArray[Any]]] = {
         results.error.rotation_rad, results.error.translation_m, results.estimates.covariance
     ),
     "residual_variance_ratio": lambda results: results.estimates.residual_ratio,
+    "misfit_px": lambda results: results.estimates.misfit_px,
     "flipped": _flipped,
 }
 """Variable of the estimation -> its values (n, ...) for the scenes with a detection."""

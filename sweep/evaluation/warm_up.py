@@ -11,7 +11,7 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
 from sweep.plan.parameters import Stage
 
-SOLVERS = ("ippe_square", "photometric")
+SOLVERS = ("ippe_square", "photometric", "photometric_real")
 """Solvers whose compiled code is loaded, if the pipeline has them; else that of the first."""
 
 TITLE = "A standard scene"

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.measure.flags import EstimateStatus
+from sweep.measure.surroundings import BoardMarker
 from sweep.model.camera import Cameras
 from sweep.model.marker import MarkerKey
 from sweep.typing import Floats
@@ -32,6 +33,8 @@ class Detections:
     images, origins
         The windows that were searched, and (N, 2) their first pixels in the frame; no images for
         estimators that do not need them.
+    on_board
+        The marker of a board that each is, None for one alone; None if all are alone.
     recorded_rotation, recorded_translation
         (N, 3, 3) and (N, 3) in metres: poses that came with recorded detections, NaN where none
         did; None where images were searched.
@@ -47,6 +50,7 @@ class Detections:
     origins: NDArray[np.int64]
     recorded_rotation: Floats | None = None
     recorded_translation: Floats | None = None
+    on_board: Sequence[BoardMarker | None] | None = None
 
     def take(self, rows: NDArray[np.intp]) -> Detections:
         """Return the detections of the given rows."""
@@ -56,6 +60,7 @@ class Detections:
             [self.images[row] for row in rows] if len(self.images) else [], self.origins[rows],
             None if self.recorded_rotation is None else self.recorded_rotation[rows],
             None if self.recorded_translation is None else self.recorded_translation[rows],
+            None if self.on_board is None else [self.on_board[row] for row in rows],
         )
 
 
@@ -84,11 +89,13 @@ class Estimates:
     radians, position along them in metres"""
     residual_ratio: Floats
     """(N,) variance of the pixels' residuals relative to that of noise and rounding"""
+    misfit_px: Floats
+    """(N,) standard deviation in px of the shifts of a marker's parts that the residuals show"""
 
     @staticmethod
     def none(count: int, status: EstimateStatus) -> Estimates:
         """Return ``count`` estimates without a pose, all with one status."""
-        shapes = ((3, 3), (3,), (), (3, 3), (), (6, 6), ())
+        shapes = ((3, 3), (3,), (), (3, 3), (), (6, 6), (), ())
         return Estimates(
             np.full(count, status, dtype=np.uint8),
             *(np.full((count, *shape), np.nan) for shape in shapes),

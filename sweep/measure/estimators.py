@@ -8,6 +8,7 @@ from functools import lru_cache, partial
 
 from sweep.declaration import parameter
 from sweep.measure.estimation import PoseEstimator
+from sweep.measure.photograph import PhotometricReal
 from sweep.measure.photometric import Photometric
 from sweep.measure.plugged_estimator import PluggedEstimator
 from sweep.measure.recorded_pose import RecordedPose
@@ -65,6 +66,15 @@ SOLVERS: dict[str, Solver] = {
         lambda setting: Photometric(setting.refined_starts, setting.estimate_blur),
         needs_images=True, planar_only=True,
     ),
+    "photometric_real": Solver(
+        "least squares on the pixels of photographs: what else is on the board, point spread, "
+        "light, tone and sharpening are in the model, noise is estimated",
+        lambda setting: PhotometricReal(
+            setting.refined_starts, setting.estimate_light, setting.estimate_tone,
+            setting.estimate_sharpening, setting.assumed_sharpening_px,
+        ),
+        needs_images=True, planar_only=True,
+    ),
     "recorded": Solver(
         "the poses that came with the detections which `sweep score` recorded",
         lambda setting: RecordedPose(setting.reprojection_limit), recorded=True,
@@ -106,11 +116,26 @@ class EstimatorSetting:
         low=1e-6, high=1e6,
     )
     refined_starts: bool = parameter(
-        False, "photometric also starts from the detector's corners after cv2.cornerSubPix: four "
-        "starts instead of two",
+        False, "photometric and photometric_real also start from the detector's corners after "
+        "cv2.cornerSubPix: four starts instead of two",
     )
     estimate_blur: bool = parameter(
-        False, "photometric also estimates the point spread, starting from believed_blur_px"
+        False, "photometric also estimates the point spread, starting from believed_blur_px; "
+        "photometric_real always does",
+    )
+    estimate_light: bool = parameter(
+        True, "photometric_real estimates light that varies linearly over the marker, on black and "
+        "on white",
+    )
+    estimate_tone: bool = parameter(
+        True, "photometric_real estimates a tone curve, a term in s (1 - s) of white's share s"
+    )
+    estimate_sharpening: bool = parameter(
+        True, "photometric_real estimates the amount of sharpening"
+    )
+    assumed_sharpening_px: float = parameter(
+        1.0, "radius of the sharpening that photometric_real estimates", unit="px", low=0.3,
+        high=20,
     )
     believed: str = parameter(
         "truth", "the camera that is assumed where no other belief says otherwise. truth: the true "

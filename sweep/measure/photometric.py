@@ -224,7 +224,7 @@ class Photometric:
         out = Estimates.none(count, EstimateStatus.solver_failed)
         sets = [detections.corners]
         if self.refined:
-            sets.append(_refined(detections))
+            sets.append(refined_corners(detections))
         poses = [
             both_planar_solutions(corners, detections.cameras, detections.size_m)
             for corners in sets
@@ -306,7 +306,7 @@ def _windows(detections: Detections) -> list[list[int]]:
     return windows
 
 
-def _refined(detections: Detections) -> Floats:
+def refined_corners(detections: Detections) -> Floats:
     """Return the corners (N, 4, 2) after ``cv2.cornerSubPix``, its window OpenCV's for markers."""
     refined = detections.corners.copy()
     for i, image in enumerate(detections.images):

@@ -120,6 +120,7 @@ def estimate(
         alternative_reprojection_px=reprojection[:, 1],
         covariance=np.broadcast_to(np.nan, (count, 6, 6)),
         residual_ratio=np.broadcast_to(np.nan, (count,)),
+        misfit_px=np.broadcast_to(np.nan, (count,)),
     )
 
 

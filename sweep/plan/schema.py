@@ -283,6 +283,10 @@ SCHEMA: tuple[Variable, ...] = (
     Variable("residual_variance_ratio", _E, "f4",
              "variance of the pixels' residuals over that of noise and rounding",
              present_when=_MAYBE_POSE),
+    Variable("misfit_px", _E, "f4",
+             "standard deviation of shifts of the marker's parts beside the fitted pose that the "
+             "residuals of photometric_real show", "px", present_when=_MAYBE_POSE,
+             since_format=5),
     Variable("flipped", _E, "u1", "whether the solution is nearer to the mirror of the truth",
              flags=Flipped),
 )

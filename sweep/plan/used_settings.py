@@ -10,7 +10,14 @@ from sweep.measure.estimators import SOLVERS
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import OPENCV_FIELDS
 
-PHOTOMETRIC_ALONE = frozenset({"refined_starts", "estimate_blur"})
+PIXEL_SETTINGS = {
+    "photometric": frozenset({"refined_starts", "estimate_blur"}),
+    "photometric_real": frozenset({
+        "refined_starts", "estimate_light", "estimate_tone", "estimate_sharpening",
+        "assumed_sharpening_px",
+    }),
+}
+"""Solver on pixels -> the settings that it has beside those of all solvers."""
 
 
 def used_settings(pipeline: Pipeline, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -83,4 +90,5 @@ def _unused_by_solver(pipeline: Pipeline, solver: str | None) -> set[str]:
     known = SOLVERS.get(solver)
     if known is None or not known.guarded:
         others.add("guarded")
-    return others if solver == "photometric" else {*others, *PHOTOMETRIC_ALONE}
+    every = frozenset().union(*PIXEL_SETTINGS.values())
+    return {*others, *(every - PIXEL_SETTINGS.get(solver, frozenset()))}

@@ -1,0 +1,286 @@
+"""Solver ``photometric_real`` against OpenCV's boards, dense sampling, and images of known pose."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.stats import chi2
+
+from sweep.measure.estimation import Detections
+from sweep.measure.flags import EstimateStatus
+from sweep.measure.photograph import PhotometricReal, photograph_view
+from sweep.measure.photograph_fit import STATE_LENGTH, Nuisances, draw, system
+from sweep.measure.surroundings import BoardMarker, clear_modules, surroundings
+from sweep.model.board_image import BoardPose, render_board
+from sweep.model.board_kinds import Charuco, Grid
+from sweep.model.camera import Cameras
+from sweep.model.lens import pack
+from sweep.model.marker import WHITE
+from sweep.model.projection import Optics
+
+ALARM = 1e-7
+CHARUCO = Charuco(
+    dictionary="DICT_4X4_50", squares_x=5, squares_y=5, square_m=0.04, marker_m=0.03,
+).board()
+GRID = Grid(
+    dictionary="DICT_APRILTAG_36h11", rows=3, columns=3, marker_m=0.03, gap_m=0.0075,
+    corner_squares=True,
+).board()
+VIEW = np.array([600.0, 610.0, 159.5, 119.5])
+LENS = (-0.2, 0.05, 0.001, -0.001)
+EVERYTHING = PhotometricReal(
+    refined=False, light=True, tone=True, sharpening=True, radius_px=1.0
+)
+PLAIN = PhotometricReal(refined=False, light=False, tone=False, sharpening=False, radius_px=1.0)
+
+
+def rotation(tilt, azimuth, roll):
+    """Return that of DESIGN's angles in degrees, by OpenCV."""
+    tilt, azimuth, roll = np.radians([tilt, azimuth, roll])
+    turn = cv2.Rodrigues(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0.0]))[0]
+    return turn @ cv2.Rodrigues(np.array([0.0, 0.0, roll]))[0] @ np.diag([1.0, -1.0, -1.0])
+
+
+def photograph(
+    board, pose, rng, *, blur=0.8, noise=2.0, light=0.0, tone=0.0, amount=0.0, correlation=0.0,
+    lens=(), shift=None,
+):
+    """Return an image of a board with what cameras do to levels, by plain NumPy and SciPy."""
+    share = render_board(
+        board, Optics(VIEW, pack(lens), bool(lens)), (320, 240), pose, black=0.0, white=1.0,
+        background=0.5, blur_px=blur,
+    )
+    if shift is not None:
+        share = cv2.remap(share.astype(np.float32), *shift, cv2.INTER_CUBIC).astype(np.float64)
+    level = 40 + 150 * (share + tone * share * (1 - share))
+    level += amount * (level - gaussian_filter(level, 1.0, truncate=6))
+    level *= 1 + light * np.linspace(-1, 1, 320)
+    white = rng.normal(size=(240, 320 + 50))
+    for column in range(1, white.shape[1]):
+        white[:, column] = (
+            correlation * white[:, column - 1]
+            + np.sqrt(1 - correlation**2) * white[:, column]
+        )
+    return np.clip(np.rint(level + noise * white[:, 50:]), 0, 255).astype(np.uint8)
+
+
+def pose_of(board, number, pose):
+    """Return the pose of one marker of a board, and its corners' pixels without a lens."""
+    corners = board.corners_m[number]
+    return pose.rotation, pose.rotation @ corners.mean(axis=0) + pose.translation
+
+
+def detections(board, numbers, image, pose, rng, *, lens=(), error_px=0.3, alone=False):
+    """Return detections of a board's markers whose corners are wrong by some noise."""
+    size = float(np.linalg.norm(board.corners_m[0, 1] - board.corners_m[0, 0]))
+    matrix = np.array([[VIEW[0], 0, VIEW[2]], [0, VIEW[1], VIEW[3]], [0, 0, 1]])
+    count = len(numbers)
+    corners = np.array([
+        cv2.projectPoints(
+            board.corners_m[k], cv2.Rodrigues(pose.rotation)[0], pose.translation, matrix,
+            np.array(lens or [0.0] * 4),
+        )[0].reshape(4, 2)
+        for k in numbers
+    ])
+    return Detections(
+        corners + rng.normal(0, error_px, corners.shape),
+        Cameras(
+            np.repeat(VIEW[None], count, axis=0), np.repeat(pack(lens)[None], count, axis=0),
+            np.full(count, bool(lens)),
+        ),
+        np.full(count, size), np.full(count, 2.0), np.zeros(count),
+        [(board.dictionary, board.marker_ids[k], 1.0) for k in numbers], [image] * count,
+        np.zeros((count, 2), dtype=np.int64),
+        on_board=None if alone else [BoardMarker(board, k) for k in numbers],
+    )
+
+
+def errors_of(board, numbers, estimates, pose):
+    """Return errors (n, 6) in radians and metres."""
+    rows = []
+    for k, number in enumerate(numbers):
+        turn, position = pose_of(board, number, pose)
+        vector = cv2.Rodrigues(estimates.rotation[k] @ turn.T)[0].ravel()
+        rows.append(np.concatenate([vector, estimates.translation[k] - position]))
+    return np.array(rows)
+
+
+def test_surroundings_are_what_opencv_draws_around_a_marker():
+    """Sampled at random: the colour by counting crossings, against OpenCV's picture."""
+    picture = cv2.aruco.CharucoBoard(
+        (5, 5), 0.04, 0.03, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    ).generateImage((1200, 1200))
+    rng = np.random.default_rng(1)
+    for number in (3, 5, 8):
+        ends, sides = surroundings(BoardMarker(CHARUCO, number), 1.75)
+        points = rng.uniform(-1.75, 6 + 1.75, (400, 2))
+        # Metres from the chessboard's top left corner, hence the picture's pixel.
+        corner = CHARUCO.corners_m[number, 0]
+        metres = np.array([corner[0] + 0.1, 0.1 - corner[1]]) + points * 0.005
+        expected = picture[tuple((metres[:, ::-1] * 6000).astype(int).T)] > 127
+        upright = ends[:, 0] == ends[:, 2]
+        jump = (sides[upright] == WHITE) @ np.array([-1, 1])
+        x, start, stop = ends[upright][:, [0, 1, 3]].T
+        inside = (np.minimum(start, stop) < points[:, 1, None]) & (
+            points[:, 1, None] < np.maximum(start, stop)
+        )
+        left = x < points[:, :1]
+        white = (inside & left) @ (jump * np.sign(stop - start))
+        np.testing.assert_array_equal(white, expected)
+
+
+def test_the_ring_around_a_marker_that_is_clear():
+    """A module, as (square - marker) / 2; a grid's gap; black squares touch their corners."""
+    plain = Grid(dictionary="DICT_APRILTAG_36h11", rows=3, columns=3, marker_m=0.03, gap_m=0.0075)
+    assert clear_modules(BoardMarker(CHARUCO, 5)) == pytest.approx(1.0, abs=1e-6)
+    assert clear_modules(BoardMarker(plain.board(), 4)) == pytest.approx(2.0, abs=1e-6)
+    assert clear_modules(BoardMarker(GRID, 4)) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("lens", [(), LENS])
+def test_image_and_slopes_are_those_of_dense_sampling(lens):
+    """Slopes against differences of images that are computed by the exact coverage."""
+    pose = BoardPose(rotation(35, 20, 10), np.array([0.0, 0.0, 0.45]))
+    rng = np.random.default_rng(2)
+    image = photograph(CHARUCO, pose, rng, lens=lens)
+    found = detections(CHARUCO, [5], image, pose, rng, lens=lens, error_px=0.0)
+    view = photograph_view(found, 0, 4.0)
+    turn, position = pose_of(CHARUCO, 5, pose)
+    work = system(*view.used.shape)
+    state = np.zeros(STATE_LENGTH)
+    state[:9], state[9:12], state[12] = turn.ravel(), position, 0.8
+    draw(view, state, Nuisances(False, False, False, False, 1.0), work)
+    shifts = found.cameras.view[0, 2:] - view.marker.optics.intrinsics[2:]
+    left, top = np.rint(shifts).astype(int)
+    height, width = view.used.shape
+
+    def exact(du=0.0, dv=0.0, blur=0.8):
+        optics = Optics(VIEW + np.array([0.0, 0.0, du, dv]), pack(lens), bool(lens))
+        whole = render_board(
+            CHARUCO, optics, (320, 240), pose, black=0.0, white=1.0, background=0.0, blur_px=blur
+        )
+        return whole[top : top + height, left : left + width][view.used]
+
+    # Panels of two standard deviations and a cut at four: 1e-3 of the contrast.
+    assert np.abs(work.images[0][view.used] - exact()).max() < 1e-3
+    step = 1e-3
+    slopes = [
+        (exact(-step) - exact(step)) / (2 * step), (exact(0, -step) - exact(0, step)) / (2 * step),
+        (exact(blur=np.sqrt(0.64 + step)) - exact(blur=np.sqrt(0.64 - step))) / (2 * step),
+    ]
+    for image_slope, expected in zip(work.images[2:5], slopes, strict=True):
+        # Slopes are for directions of steps, not for poses: 1e-2 of the contrast a pixel.
+        assert np.abs(image_slope[view.used] - expected).max() < 1e-2
+
+
+@pytest.mark.parametrize(
+    ("board", "numbers", "lens", "solver", "effects"),
+    [
+        (CHARUCO, [3, 5, 6, 8], (), PLAIN, {}),
+        (CHARUCO, [3, 5, 6, 8], LENS, EVERYTHING,
+         {"light": 0.2, "tone": 0.3, "amount": 0.8, "correlation": 0.5}),
+        (GRID, [1, 4, 5], (), EVERYTHING, {"light": -0.2, "tone": -0.2, "amount": 0.5}),
+    ],
+)
+def test_poses_on_boards_have_the_errors_that_they_expect(board, numbers, lens, solver, effects):
+    """NEES against chi-square: 3 or 4 markers, six degrees of freedom each, 1e-7 a side."""
+    rng = np.random.default_rng(3)
+    pose = BoardPose(rotation(35, 70, 25), np.array([0.003, -0.002, 0.42]))
+    image = photograph(board, pose, rng, lens=lens, **effects)
+    found = detections(board, numbers, image, pose, rng, lens=lens)
+    estimates = solver(found)
+    assert (estimates.status == EstimateStatus.solved).all()
+    errors = errors_of(board, numbers, estimates, pose)
+    squared = sum(
+        error @ np.linalg.solve(covariance, error)
+        for error, covariance in zip(errors, estimates.covariance, strict=True)
+    )
+    assert squared < chi2.isf(ALARM, 6 * len(numbers))
+    assert np.degrees(np.abs(errors[:, :3])).max() < 1.0
+    assert (estimates.misfit_px < 0.05).all()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("solver", "effects", "limits"),
+    [
+        (PLAIN, {}, (5.3, 6.5)),
+        (EVERYTHING, {"light": 0.2, "tone": 0.3, "amount": 0.8}, (5.3, 6.5)),
+        (EVERYTHING, {"light": 0.2, "tone": 0.3, "amount": 0.8, "correlation": 0.5}, (5.0, 7.0)),
+    ],
+)
+def test_nees_of_many_photographs(solver, effects, limits):
+    """Mean NEES of some 600 poses, standard error 0.14: no mean of 6 leaves the limits by chance.
+
+    Limits are five standard errors, or what the model of the correlation leaves.
+    """
+    rng = np.random.default_rng(4)
+    numbers = [3, 5, 6, 8]
+    squared = []
+    for _ in range(150):
+        pose = BoardPose(
+            rotation(rng.uniform(15, 60), rng.uniform(0, 360), rng.uniform(0, 360)),
+            np.array([0.0, 0.0, rng.uniform(0.35, 0.5)]),
+        )
+        image = photograph(CHARUCO, pose, rng, **effects)
+        found = detections(CHARUCO, numbers, image, pose, rng)
+        estimates = solver(found)
+        solved = estimates.status == EstimateStatus.solved
+        assert solved.mean() >= 0.75
+        errors = errors_of(CHARUCO, numbers, estimates, pose)
+        squared += [
+            error @ np.linalg.solve(covariance, error)
+            for error, covariance in zip(errors[solved], estimates.covariance[solved], strict=True)
+        ]
+    print(f"NEES {np.mean(squared):.2f} of {len(squared)} poses")
+    assert limits[0] < np.mean(squared) < limits[1]
+
+
+def test_misfit_is_the_shift_of_the_markers_parts():
+    """Shifts that vary over a third of the marker: a quarter to twice their standard deviation.
+
+    Part of a field of shifts is a shift, a turn or a tilt of the whole, which nothing tells.
+    """
+    rng = np.random.default_rng(5)
+    pose = BoardPose(rotation(30, 70, 25), np.array([0.003, -0.002, 0.25]))
+    columns, rows = np.meshgrid(np.arange(320.0), np.arange(240.0))
+    for std in (0.15, 1.0):
+        fields = rng.normal(size=(2, 240, 320))
+        fields = np.array([gaussian_filter(field, 12, mode="wrap") for field in fields])
+        fields *= std / fields.std(axis=(1, 2), keepdims=True)
+        moved = ((columns + fields[0]).astype(np.float32), (rows + fields[1]).astype(np.float32))
+        image = photograph(CHARUCO, pose, rng, shift=moved)
+        estimates = EVERYTHING(detections(CHARUCO, [5, 6], image, pose, rng))
+        assert (estimates.misfit_px > 0.25 * std).all()
+        assert (estimates.misfit_px < 2 * std).all()
+    assert (estimates.status == EstimateStatus.not_explained).any()
+
+
+def test_images_without_a_marker_have_no_pose_that_passes():
+    """Uniform, black, saturated and random pixels: no exception, nothing not finite is solved."""
+    rng = np.random.default_rng(6)
+    pose = BoardPose(rotation(30, 70, 25), np.array([0.003, -0.002, 0.42]))
+    images = [np.full((240, 320), level, dtype=np.uint8) for level in (0, 128, 255)]
+    images.append(rng.integers(0, 256, (240, 320)).astype(np.uint8))
+    for image in images:
+        for alone in (False, True):
+            found = detections(CHARUCO, [5], image, pose, rng, alone=alone)
+            estimates = EVERYTHING(found)
+            if estimates.status[0] == EstimateStatus.solved:
+                assert np.isfinite(estimates.rotation[0]).all()
+                assert np.isfinite(estimates.covariance[0]).all()
+                assert image.std() > 0
+
+
+@pytest.mark.parametrize(("distance", "tilt"), [(1.8, 10), (0.5, 80), (0.25, 0)])
+def test_extreme_sizes_and_angles_give_a_pose_or_say_why_not(distance, tilt):
+    """Sides of 10 px, tilts of 80 degrees, and markers that the frame cuts."""
+    rng = np.random.default_rng(7)
+    pose = BoardPose(rotation(tilt, 70, 25), np.array([0.0, 0.0, distance]))
+    image = photograph(CHARUCO, pose, rng)
+    estimates = PLAIN(detections(CHARUCO, [5, 6], image, pose, rng, error_px=0.1))
+    known = np.isin(estimates.status, (EstimateStatus.solved, EstimateStatus.not_explained))
+    assert np.isfinite(estimates.translation[known]).all()
+    near = np.abs(np.linalg.norm(estimates.translation, axis=1) / distance - 1) < 0.1
+    assert near[known].all()
+    assert known.any()

@@ -27,12 +27,12 @@ from sweep.measure.likelihood import (
     rotation_of,
     turn_between,
 )
-from sweep.measure.photograph_fit import (
+from sweep.measure.photograph_fit import fit_photograph
+from sweep.measure.photograph_model import (
     STATE_LENGTH,
     Nuisances,
     PhotographView,
     counts,
-    fit_photograph,
     rays_of,
     system,
 )

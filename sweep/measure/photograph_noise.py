@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.measure.likelihood import DEPTH
-from sweep.measure.photograph_fit import (
+from sweep.measure.photograph_fit import normal_equations
+from sweep.measure.photograph_model import (
     CONTRAST,
     Nuisances,
     PhotographView,
@@ -32,7 +33,6 @@ from sweep.measure.photograph_fit import (
     columns_at,
     counts,
     draw,
-    normal_equations,
 )
 from sweep.measure.positive_definite import solve_positive
 from sweep.model.derivatives import POSE

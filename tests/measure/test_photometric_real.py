@@ -9,7 +9,12 @@ from scipy.stats import chi2
 from sweep.measure.estimation import Detections
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.photograph import PhotometricReal, photograph_view
-from sweep.measure.photograph_fit import STATE_LENGTH, Nuisances, draw, system
+from sweep.measure.photograph_model import (
+    STATE_LENGTH,
+    Nuisances,
+    draw,
+    system,
+)
 from sweep.measure.surroundings import BoardMarker, clear_modules, surroundings
 from sweep.model.board_image import BoardPose, render_board
 from sweep.model.board_kinds import Charuco, Grid

@@ -13,7 +13,7 @@ from sweep.plan.parameters import PARAMETERS
 OPENCV = {
     "cornerRefinementMethod": {f"CORNER_REFINE_{name.upper()}": name for name in REFINEMENTS},
     "solver": {f"SOLVEPNP_{name.upper()}": name for name in SOLVERS
-               if name not in ("photometric", "recorded")},
+               if name not in ("photometric", "photometric_real", "recorded")},
     "dictionary": {name: name for name in dir(cv2.aruco) if name.startswith("DICT_")},
 }
 

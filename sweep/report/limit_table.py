@@ -110,8 +110,9 @@ def summary_lines(limits: xr.Dataset) -> list[str]:
         lines.append(f"{plural(dips, 'condition')} with a dip: beyond it all is met again, which "
                      "the limit does not count")
     if wide := int((~settled).sum()):
-        lines.append(f"{wide:,} of {plural(count, 'limit')} are not known to one value of the "
-                     "grid: see the intervals; more --max-trials or a finer axis tells more")
+        lines.append(f"{plural(wide, 'limit')} of {count:,} {'is' if wide == 1 else 'are'} not "
+                     "known to one value of the grid: see the intervals; more --max-trials tell "
+                     "more, unless a rate is all but the limit")
     easy = "small" if upwards else "large"
     lines.append(f"limits are read from {easy} to {'large' if upwards else 'small'} values of "
                  f"{along}")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import socket
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,7 @@ from sweep.store.locations import exists
 from sweep.store.provenance import changes, fingerprint
 from sweep.store.receipt import Receipt
 from sweep.store.run_store import RunStore
+from sweep.store.unneeded import write_unneeded
 
 FAILURE_QUOTA: Mapping[str, int] = {"failed": MAX_ROWS, "crashed": MAX_ROWS}
 """Rows of failures that a receipt may hold of each kind."""
@@ -115,11 +117,43 @@ def compute_blocks(
     quota: Mapping[str, int] = FAILURE_QUOTA,
     durable: bool = False,
 ) -> list[Receipt]:
-    """Compute blocks one after another, as :func:`compute_block` does; return their receipts."""
+    """Compute blocks as :func:`compute_block` does; return their receipts.
+
+    Those of which nothing is needed are written together, and then the others one after another.
+    """
+    settled = {} if decision is None else _settled(url, run_id, blocks, decision, durable)
     return [
-        compute_block(url, run_id, block, reuse, time_limit_s, quota, durable, decision)
+        settled.get(block)
+        or compute_block(url, run_id, block, reuse, time_limit_s, quota, durable, decision)
         for block in blocks
     ]
+
+
+def _settled(
+    url: str, run_id: str, blocks: Sequence[Block], decision: Decision, durable: bool
+) -> dict[Block, Receipt]:
+    """Commit those blocks of which nothing is needed, unless they were committed before."""
+    with _local_faults(url):
+        store = _opened(url, run_id, durable)
+        decider = _decider(url, run_id, durable, decision.rule)
+        unneeded = [
+            block for block in blocks
+            if not decider.needed(block, decision).any() and receipt_of(store, block) is None
+        ]
+        return dict(zip(
+            unneeded, write_unneeded(store, unneeded, decision.basis, processor()), strict=True))
+
+
+@contextlib.contextmanager
+def _local_faults(url: str) -> Iterator[None]:
+    """Raise what this machine cannot do with a store as MachineFaultError."""
+    try:
+        with machine_faults_raised():
+            yield
+    except StoreReplacedError:
+        raise
+    except StoreError as error:
+        raise local_fault(str(error).removeprefix(f"{url}: ")) from None
 
 
 def compute_block(
@@ -163,30 +197,25 @@ def compute_block(
         If this machine cannot compute the block, or cannot read or write the store; nothing of the
         block is committed. Another machine may be able to.
     """
-    try:
-        with machine_faults_raised():
-            store = _opened(url, run_id, durable)
-            needed, before = np.ones(len(block), dtype=bool), None
-            if decision is not None:
-                before = receipt_of(store, block)
-                if before is not None and before.basis == decision.basis:
-                    return before
-                needed = _decider(url, run_id, durable, decision.rule).needed(block, decision)
-            begun_before = begin_block(store, block)
-            try:
-                return _compute_begun(
-                    store, url, block, reuse, time_limit_s, quota, isolated=begun_before,
-                    needed=needed, basis=None if decision is None else decision.basis,
-                    before=before,
-                )
-            except Exception:
-                if not begun_before:  # it did not end this process
-                    withdraw_block(store, block)
-                raise
-    except StoreReplacedError:
-        raise
-    except StoreError as error:
-        raise local_fault(str(error).removeprefix(f"{url}: ")) from None
+    with _local_faults(url):
+        store = _opened(url, run_id, durable)
+        needed, before = np.ones(len(block), dtype=bool), None
+        if decision is not None:
+            before = receipt_of(store, block)
+            if before is not None and before.basis == decision.basis:
+                return before
+            needed = _decider(url, run_id, durable, decision.rule).needed(block, decision)
+        begun_before = begin_block(store, block)
+        try:
+            return _compute_begun(
+                store, url, block, reuse, time_limit_s, quota, isolated=begun_before,
+                needed=needed, basis=None if decision is None else decision.basis,
+                before=before,
+            )
+        except Exception:
+            if not begun_before:  # it did not end this process
+                withdraw_block(store, block)
+            raise
 
 
 def _compute_begun(

@@ -23,6 +23,7 @@ from sweep.sampling.rules import make_rule
 from sweep.sampling.stopping import GroupResults, Stopping
 from sweep.sampling.waves import Waves
 from sweep.store.blocks import region
+from sweep.store.chunk_reading import read_part
 from sweep.store.run_store import RunStore
 from sweep.typing import Masks
 
@@ -181,9 +182,7 @@ class Decider:
         starts = tuple(first if k == trial else start for k, start in enumerate(span.starts))
         stops = tuple(last if k == trial else stop for k, stop in enumerate(span.stops))
         part = region(variable, pipeline, Block(starts, stops))
-        return in_order_of_results(
-            pipeline, variable, np.asarray(self.store.array(name)[part])
-        )
+        return in_order_of_results(pipeline, variable, read_part(self.store, name, part))
 
 
 def in_order_of_results(

@@ -50,6 +50,9 @@ DECODING_ATTRIBUTES = {
 
 COORDINATE_CHUNK = 1 << 20
 
+ZSTD_LEVEL = 3
+"""Level of the compression of every chunk."""
+
 
 @dataclass(frozen=True, slots=True)
 class PlannedArray:
@@ -174,7 +177,7 @@ def _equal(a: Any, b: Any) -> bool:
 
 def _codecs() -> list[Any]:
     """Return the codecs of every array; a damaged chunk fails its checksum when it is read."""
-    return [ZstdCodec(level=3), Crc32cCodec()]
+    return [ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()]
 
 
 def decoded_chunk(content: bytes, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
@@ -193,6 +196,14 @@ def decoded_chunk(content: bytes, dtype: np.dtype[Any], shape: tuple[int, ...]) 
     if numcodecs.zstd.decompress(body, values.reshape(-1)).nbytes != values.nbytes:
         raise ValueError("size")
     return values
+
+
+def encoded_chunk(values: NDArray[Any]) -> bytes:
+    """Return the content of a chunk of numbers, the same bytes as Zarr writes."""
+    little = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
+    body = bytes(numcodecs.zstd.compress(little.reshape(-1), ZSTD_LEVEL))
+    checksum: int = google_crc32c.value(body)
+    return body + checksum.to_bytes(4, "little")
 
 
 def planned_arrays(

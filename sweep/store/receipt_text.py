@@ -1,4 +1,4 @@
-"""The text of a receipt from the bytes of its chunk.
+"""The text of a receipt from the bytes of its chunk, and back.
 
 Zarr decodes each chunk in a thread of its own: for 10^5 receipts that takes half a minute of
 processor time, four times what the same codecs take when they are called one after another.
@@ -9,9 +9,12 @@ from __future__ import annotations
 from typing import Any
 
 import google_crc32c
+import numpy as np
 import zarr
 from numcodecs.vlen import VLenUTF8
 from numcodecs.zstd import Zstd
+
+from sweep.store.layout import ZSTD_LEVEL
 
 CODECS = ("VLenUTF8Codec", "ZstdCodec", "Crc32cCodec")
 """The codecs of receipts, as this package writes them."""
@@ -35,3 +38,10 @@ def decoded(content: bytes) -> str:
     except RuntimeError as error:
         raise ValueError(str(error)) from None
     return str(text)
+
+
+def encoded(text: str) -> bytes:
+    """Return the content of a chunk that holds a text, the same bytes as Zarr writes."""
+    body = bytes(Zstd(ZSTD_LEVEL).encode(VLenUTF8().encode(np.array([text], dtype=object))))
+    checksum: int = google_crc32c.value(body)
+    return body + checksum.to_bytes(CHECKSUM_BYTES, "little")

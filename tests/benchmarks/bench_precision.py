@@ -11,7 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from sweep.execution.block_task import compute_block
+from sweep.execution.block_task import compute_blocks
 from sweep.execution.calibration import block_extents, calibrate
 from sweep.execution.waiting import InWaves
 from sweep.plan.experiment import Pipeline
@@ -60,16 +60,16 @@ def measure(wanted, options):
                 spent["scheduling"] += time.process_time() - start
                 if work is None:
                     break
-                for number in work.numbers:
-                    start = time.process_time()
-                    receipt = compute_block(
-                        store.url, store.run_id, store.blocks[number], decision=work.decision)
-                    if not receipt.any_needed:
-                        empty_s += time.process_time() - start
+                blocks = [store.blocks[number] for number in work.numbers]
+                start, before = time.process_time(), spent["deciding"]
+                done = compute_blocks(store.url, store.run_id, blocks, work.decision)
+                if not any(receipt.any_needed for receipt in done):
+                    empty_s += time.process_time() - start - (spent["deciding"] - before)
+                start = time.process_time()
+                for number, receipt in zip(work.numbers, done, strict=True):
                     needed += receipt.scenes_needed
-                    start = time.process_time()
                     waiting.committed(number, receipt)
-                    spent["scheduling"] += time.process_time() - start
+                spent["scheduling"] += time.process_time() - start
             return len(store.blocks), needed, time.process_time() - begun, empty_s, spent
     finally:
         Decider.needed = decide

@@ -2,7 +2,7 @@
 
 import xarray as xr
 
-from sweep.execution.block_task import compute_block
+from sweep.execution.block_task import compute_block, compute_blocks
 from sweep.execution.waiting import InWaves
 from sweep.plan.axes import TRIAL
 from sweep.plan.grid import scene_axes
@@ -34,9 +34,11 @@ def in_waves(store, pipeline, most=None):
     """Compute blocks of a store in this process by the pipeline's rule; return how many."""
     waiting, count = InWaves(store, pipeline.stopping, make_rule(pipeline)), 0
     while (work := waiting.next()) is not None and (most is None or count < most):
-        for number in work.numbers:
-            waiting.committed(number, compute_block(
-                store.url, store.run_id, store.blocks[number], decision=work.decision))
+        found = compute_blocks(
+            store.url, store.run_id, [store.blocks[number] for number in work.numbers],
+            work.decision)
+        for number, receipt in zip(work.numbers, found, strict=True):
+            waiting.committed(number, receipt)
             count += 1
     return count
 

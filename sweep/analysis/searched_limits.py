@@ -11,8 +11,8 @@ from sweep.analysis.dimensions import DRAWS, axes_of, configuration_axes, stored
 from sweep.analysis.farthest import farthest_met
 from sweep.analysis.repeated_looks import looks_factor
 from sweep.analysis.requirements import ErrorShares
+from sweep.analysis.stopped_sampling import computed_scenes
 from sweep.errors import ArgumentError, SweepError
-from sweep.measure.flags import DetectionStatus
 from sweep.plan.attributes import describes
 from sweep.plan.limit_rule import LimitRule
 
@@ -91,7 +91,7 @@ def requirement_limits(
         results, require, along, per, at_all, error_shares(count, len(rule.ends) if rule else 1))
     found["settled"] = (found["low"] == found["high"]).assign_attrs(
         long_name="whether the interval is a single value of the grid", units="1")
-    computed = _computed(results)
+    computed = computed_scenes(results)
     cells = [name for name in computed.dims if name not in (*per, along)]
     found["trials"] = computed.sum(DRAWS).max(
         [name for name in cells if name != DRAWS]).compute().assign_attrs(
@@ -108,11 +108,3 @@ def _searched(results: xr.Dataset) -> LimitRule | None:
     except (KeyError, SweepError):
         return None
     return rule if isinstance(rule, LimitRule) else None
-
-
-def _computed(results: xr.Dataset) -> xr.DataArray:
-    """Return which scenes were computed, over the axes of the scene."""
-    flags = results["detection"]
-    first = {name: 0 for name in configuration_axes(results) if name in flags.dims}
-    return ~flags.isel(first, drop=True).isin(
-        [DetectionStatus.not_run, DetectionStatus.not_needed])

@@ -23,7 +23,12 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis.counts import Rate
-from sweep.analysis.dimensions import DRAWS, axes_of, is_sampling_stopped
+from sweep.analysis.dimensions import (
+    DRAWS,
+    axes_of,
+    configuration_axes,
+    is_sampling_stopped,
+)
 from sweep.analysis.flip_mixture import FlipMixture
 from sweep.analysis.means import RootMeanSquare
 from sweep.analysis.pose_view import NOT_LOOKED_FOR
@@ -115,3 +120,12 @@ def with_common_trials(results: xr.Dataset, kept: Sequence[str]) -> xr.Dataset:
             array.attrs)
         for name, array in flags.items()})
 
+
+def computed_scenes(results: xr.Dataset) -> xr.DataArray:
+    """Return which scenes are computed (bool, over the axes of the scene).
+
+    All configurations of a scene are computed, or none.
+    """
+    flags = results["detection"]
+    first = {name: 0 for name in configuration_axes(results) if name in flags.dims}
+    return ~flags.isel(first, drop=True).isin(NOT_AVAILABLE)

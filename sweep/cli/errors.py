@@ -39,7 +39,8 @@ def print_error(error: SweepError, options: argparse.Namespace) -> int:
     """
     text = str(error)
     if isinstance(error, ArgumentError):
-        text = f"{flag_of(error.argument, options)} {error.value}: {error.problem}"
+        given = f" {error.value}" if str(error.value) else ""
+        text = f"{flag_of(error.argument, options)}{given}: {error.problem}"
     for line in text.splitlines():
         print(plain(line, MAX_LINE_LENGTH), file=sys.stderr)
     return 2 if isinstance(error, REFUSALS) else 1

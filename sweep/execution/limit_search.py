@@ -85,6 +85,9 @@ def _with_search(
     What the section does not require, [require] does.
     """
     document = _document(source)
+    if document is None and not isinstance(source, Pipeline):
+        return read_pipeline(source, settings)  # it says why
+    document = document or {}
     own = document.get(SECTION, {})
     given = {*(own if isinstance(own, dict) else ()), *(
         each.partition("=")[0].partition(".")[2] for each in chosen)}
@@ -108,8 +111,8 @@ def _with_search(
     return pipeline
 
 
-def _document(source: Pipeline | str | os.PathLike[str]) -> dict[str, Any]:
-    """Return the document of a pipeline, empty if it cannot be read, which is told elsewhere."""
+def _document(source: Pipeline | str | os.PathLike[str]) -> dict[str, Any] | None:
+    """Return the document of a pipeline, None if it cannot be read."""
     try:
         if isinstance(source, Pipeline):
             return read_document(source.text)
@@ -117,4 +120,4 @@ def _document(source: Pipeline | str | os.PathLike[str]) -> dict[str, Any]:
             return read_document(open_store(os.fspath(source)).pipeline.text)
         return read_document(read_regular(os.fspath(source), MAX_BYTES).decode())
     except (OSError, ValueError):
-        return {}
+        return None

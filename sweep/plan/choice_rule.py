@@ -152,6 +152,8 @@ def _axis(reading: Reading, path: str, name: Any) -> Axis | None:
         reading.fault(path, name, f"an axis; {name} is drawn: give it values under [axes]")
     elif (other := reading.axis_of(name)) is not None:
         reading.fault(path, name, f"{other.name}, the axis along which {name} goes with others")
+    elif reading.names_axis(name):
+        return None  # its own fault says why it is none
     elif name in reading.parameters:
         reading.fault(path, name, f"an axis; list the values of {name} under [axes]")
     else:

@@ -94,6 +94,9 @@ def read_limit(reading: Reading, table: Mapping[str, Any]) -> LimitRule | None:
     if TRIAL in reading.axes and len(reading.axes[TRIAL]) < 2:
         reading.fault(f"{SECTION}.max_trials", len(reading.axes[TRIAL]),
                       "at least 2: intervals are over the draws")
+    elif TRIAL in reading.axes and "coarse_trials" in table and coarse > len(reading.axes[TRIAL]):
+        reading.fault(f"{SECTION}.coarse_trials", coarse,
+                      f"at most max_trials, {len(reading.axes[TRIAL]):,}")
     if TRIAL not in reading.axes or len(reading.faults) > known:
         return None
     count = len(reading.axes[TRIAL])

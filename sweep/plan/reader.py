@@ -120,6 +120,11 @@ class Reading:
         """Return the axis along which a parameter varies, alone or together with others."""
         return next((axis for axis in self.axes.values() if name in axis.columns), None)
 
+    def names_axis(self, name: str) -> bool:
+        """Return whether the table [axes] has a key, be it an axis or a fault."""
+        table = self.document.get("axes")
+        return isinstance(table, dict) and name in table
+
     def together(self, a: str, b: str) -> Iterator[tuple[Sequence[Any], Sequence[Any]]]:
         """Yield values of two parameters of which each of the one meets each of the other."""
         axis = self.axis_of(a)

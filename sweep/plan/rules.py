@@ -247,7 +247,7 @@ def something_random_to_repeat(reading: Reading) -> None:
 
 def trials_fill_replicates(reading: Reading) -> None:
     """Demand trials, and draws, that are the replicates of Sobol's points as a whole."""
-    if reading.sampling != "sobol" or TRIAL not in reading.axes:
+    if reading.sampling != "sobol" or TRIAL not in reading.axes or reading.stopping is not None:
         return
     trials = len(reading.axes[TRIAL])
     if trials % REPLICATES or trials < 2 * REPLICATES:

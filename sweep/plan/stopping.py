@@ -92,7 +92,7 @@ def _read_trials(reading: Reading, name: str, table: Mapping[str, Any]) -> None:
     """Make the axis of trials from ``max_trials``, or take the one that is given."""
     given = reading.axes.get(TRIAL)
     if MAX_TRIALS not in table:
-        if given is None and TRIAL not in (reading.document.get("axes") or {}):
+        if given is None and not reading.names_axis(TRIAL):
             reading.fault(name, dict(table), f"{MAX_TRIALS}, too: the most trials of a condition")
         return
     try:

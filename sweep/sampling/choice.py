@@ -10,14 +10,13 @@ import xarray as xr
 
 from sweep.analysis.choice_faults import choice_faults
 from sweep.analysis.choices import ChoiceCells, choice_cells, choice_shares
-from sweep.analysis.dimensions import DRAWS
-from sweep.analysis.pose_view import ESTIMATE_INPUTS, REQUIRED_VARIABLES
+from sweep.analysis.pose_view import ESTIMATE_INPUTS
 from sweep.analysis.requirements import ErrorShares, parse_requirements
 from sweep.messages import refusal
 from sweep.plan.choice_rule import ChoiceRule
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
-from sweep.plan.schema import LABELS, VARIABLES
+from sweep.sampling.group_dataset import group_dataset
 from sweep.sampling.stopping import GroupResults, condition_axes, unit_of, wave_ends
 from sweep.typing import Masks
 
@@ -84,37 +83,3 @@ def store_cells(results: xr.Dataset, pipeline: Pipeline, rule: ChoiceRule) -> Ch
     """Return the decisions of a store's whole dataset, as the search made the last ones."""
     ends = choice_ends(pipeline, rule)
     return choice_cells(results, rule, choice_shares(pipeline, rule, len(ends)))
-
-
-def group_dataset(results: GroupResults) -> xr.Dataset:
-    """Return a group's results as a dataset; variables that nothing reads have no memory."""
-    pipeline = results.pipeline
-    axes = condition_axes(pipeline)
-    scene = [axis.name for axis in axes]
-    after = {stage: [axis.name for axis in pipeline.axes_of(stage)]
-             for stage in (Stage.detection, Stage.estimation)}
-    dims = {Stage.scene: [*scene, DRAWS]}
-    dims[Stage.detection] = [*dims[Stage.scene], *after[Stage.detection]]
-    dims[Stage.estimation] = [*dims[Stage.detection], *after[Stage.estimation]]
-    sizes = dict(zip(scene, results.shape, strict=True)) | {DRAWS: results.trials}
-    sizes |= {axis.name: len(axis) for names in after.values() for name in names
-              if (axis := pipeline.axis(name)) is not None}
-    sizes |= {name: len(labels) for name, labels in LABELS.items()}
-    variables = {}
-    for name in dict.fromkeys((*results.values, *REQUIRED_VARIABLES)):
-        variable = VARIABLES[name]
-        along = [*dims[variable.stage], *variable.inner]
-        given = results.values.get(name)
-        variables[name] = (along, np.broadcast_to(
-            np.zeros((), variable.dtype), [sizes[each] for each in along])
-            if given is None else given)
-    coordinates = {
-        axis.name: (axis.name, axis.values[start:stop],
-                    {"zip": " ".join(axis.columns)} if axis.zipped else {})
-        for axis, start, stop in zip(axes, results.starts, results.stops, strict=True)}
-    coordinates |= {
-        name: (name, axis.values, {}) for names in after.values() for name in names
-        if (axis := pipeline.axis(name)) is not None}
-    return xr.Dataset(variables, {
-        name: (dim, np.asarray(values), attributes)
-        for name, (dim, values, attributes) in coordinates.items()})

@@ -14,10 +14,10 @@ import xarray as xr
 from sweep.analysis.choices import Answer, answers
 from sweep.analysis.dimensions import DRAWS
 from sweep.analysis.requirements import Decision
+from sweep.analysis.stopped_sampling import computed_scenes
 from sweep.execution.progress import ProgressReport, StageReport
 from sweep.execution.runner import execute
 from sweep.isolation.child_process import Child
-from sweep.measure.flags import DetectionStatus
 from sweep.messages import refusal
 from sweep.plan.choice_rule import SECTION, ChoiceRule
 from sweep.plan.experiment import Pipeline
@@ -180,9 +180,5 @@ def _front(
 
 def _poses(results: xr.Dataset) -> tuple[int, int, int]:
     """Return the poses that were computed, the scenes without trials, and the most trials."""
-    scene = [dim for dim in results["true_tvec_m"].dims if dim != "xyz"]
-    detection = results["detection"]
-    first = detection.isel({dim: 0 for dim in detection.dims if dim not in scene})
-    trials = (~first.isin([DetectionStatus.not_needed, DetectionStatus.not_run])).sum(DRAWS)
-    trials = trials.compute()
+    trials = computed_scenes(results).sum(DRAWS).compute()
     return int(trials.sum()), trials.size, int(trials.max())

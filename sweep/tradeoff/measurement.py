@@ -15,6 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.analysis import covariance_trust, efficiency, error_statistics, renderer_bias
+from sweep.analysis.stopped_sampling import computed_scenes
 from sweep.errors import ArgumentError, StoreError
 from sweep.execution.progress import StageReport
 from sweep.isolation.interrupts import Interrupts
@@ -212,7 +213,7 @@ def _trade(
     trade = trade.isel(treatment=distinct(pipeline, _settings(axes)))
     trade.attrs = {
         "title": pipeline.heading,
-        "poses": pipeline.size(Stage.scene),
+        "poses": int(computed_scenes(results).sum()),
         "window": "full" if all(whole) else "auto" if not any(whole) else "mixed",
         "baseline": str(trade["treatment"].values[0]),
         "rounds": len(total),

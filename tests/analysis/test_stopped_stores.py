@@ -16,6 +16,7 @@ from sweep.analysis import (
     precision_reached,
 )
 from sweep.analysis.half_widths import Reached
+from sweep.analysis.stopped_sampling import computed_scenes
 from sweep.errors import ArgumentError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
@@ -73,6 +74,11 @@ def stopped(full):
         name: full[name].where(run, flags[name].not_needed).astype(np.uint8)
         if name in flags else full[name].where(run) for name in full.data_vars
     }).assign_attrs(pipeline=PIPELINE)
+
+
+def test_scenes_that_were_not_needed_are_not_counted_as_computed(full, stopped):
+    assert int(computed_scenes(full).sum()) == 3 * TRIALS
+    assert computed_scenes(stopped).sum("trial").values.tolist() == STOPPED_AT.tolist()
 
 
 def test_conditions_have_all_their_trials_and_clopper_and_pearsons_interval(stopped, full):

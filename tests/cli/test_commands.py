@@ -151,6 +151,8 @@ def test_an_argument_is_named_by_its_flag(capsys):
     error = ArgumentError("time_limit_s", 0, "expected seconds above 0")
     assert print_error(error, options) == 2
     assert capsys.readouterr().err == "--time-limit 0: expected seconds above 0\n"
+    assert print_error(ArgumentError("workers", "", "expected a number"), options) == 2
+    assert capsys.readouterr().err == "--workers: expected a number\n"
     flags = {
         ("run", "workers"): "--workers", ("run", "scheduler"): "--scheduler",
         ("run", "settings"): "--set", ("tradeoff", "limit_s"): "--seconds",

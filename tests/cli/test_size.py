@@ -127,3 +127,19 @@ def test_too_few_trials_are_refused_before_anything_runs(tmp_path, capsys):
     assert status == 2
     assert "choose.max_trials = 100: expected at least" in err
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(("name", "text", "words"), [
+    ("missing.toml", None, "missing.toml: cannot be read: No such file"),
+    ("broken.toml", "axes = [", "broken.toml: "),
+])
+def test_limit_says_that_its_file_cannot_be_read_before_it_asks_for_more(
+    name, text, words, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    with calls_here():
+        assert main(["limit", name]) == 2
+    line, = capsys.readouterr().err.splitlines()
+    assert line.startswith(words)

@@ -11,7 +11,8 @@ from sweep.errors import PipelineError
 from sweep.execution.runner import execute
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.experiment import Pipeline
-from sweep.sampling.choice import group_dataset, store_cells
+from sweep.sampling.choice import store_cells
+from sweep.sampling.group_dataset import group_dataset
 from sweep.sampling.rules import make_rule
 from sweep.sampling.stopping import GroupResults
 
@@ -70,6 +71,30 @@ def test_a_choice_that_cannot_be_made_is_a_line(change, line):
     with pytest.raises(PipelineError) as caught:
         make_rule(Pipeline.from_dict(changed(**change)))
     assert any(line in fault for fault in caught.value.faults), caught.value.faults
+
+
+def test_sobol_points_are_refused_in_one_line_that_names_no_other_number_of_trials():
+    with pytest.raises(PipelineError) as caught:
+        Pipeline.from_dict({**DOCUMENT, "sampling": "sobol"})
+    line, = caught.value.faults
+    assert "expected independent beside [choose]" in line
+
+
+def test_values_that_are_no_axis_are_one_fault():
+    with pytest.raises(PipelineError) as caught:
+        Pipeline.from_dict(changed(axes={"size_m": [0.08, 0.08]}))
+    line, = caught.value.faults
+    assert "expected each value once" in line
+
+
+@pytest.mark.parametrize("section", [
+    {"choose": DOCUMENT["choose"], "require": DOCUMENT["require"]},
+    {"precision": {"detection_rate": 0.1}},
+    {"limit": {"along": "size_m", "require": ["detection >= 0.9"]}},
+])
+def test_axes_that_are_no_table_are_a_fault_beside_every_rule(section):
+    with pytest.raises(PipelineError, match=r"axes = 3: expected a table: \[axes\]"):
+        Pipeline.from_dict({**section, "axes": 3})
 
 
 def test_a_budget_needs_a_choice():

@@ -193,6 +193,7 @@ GOOD = {"require": ["detection >= 0.9"], "along": "side_px", "max_trials": 80}
     ({"at_all": ["nothing"]}, "no such axis of the scene"),
     ({"max_trials": 1}, "at least 2"),
     ({"coarse_trials": 1}, "a whole number from 2 on"),
+    ({"coarse_trials": 81}, "coarse_trials = 81: expected at most max_trials, 80"),
     ({"more": 1}, "unknown key"),
 ])
 def test_faults_are_told_in_a_line(changed, words):

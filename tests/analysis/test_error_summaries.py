@@ -60,14 +60,20 @@ def measured(
     )
 
 
+def _of_fixed_trials(flags):
+    """Return the flags but that of trials which a precision did not need."""
+    return [each for each in flags if each.name != "not_needed"]
+
+
 def with_flags_of_every_kind(rng, results):
     """Return the dataset with poses that went wrong in every way, mostly detected and solved."""
     out = results.copy(deep=True)
-    kinds = [DetectionStatus.detected] * 12 + list(DetectionStatus)
+    kinds = [DetectionStatus.detected] * 12 + _of_fixed_trials(DetectionStatus)
     out["detection"].values[...] = rng.choice(kinds, results["detection"].shape)
     seen, _ = xr.broadcast(out["detection"], out["estimate"])
     seen = seen.transpose(*out["estimate"].dims).values
-    solved = rng.choice([EstimateStatus.solved] * 8 + list(EstimateStatus), seen.shape)
+    solved = rng.choice(
+        [EstimateStatus.solved] * 8 + _of_fixed_trials(EstimateStatus), seen.shape)
     estimate = np.where(seen == DetectionStatus.detected, solved, EstimateStatus.no_detection)
     estimate[seen == DetectionStatus.not_run] = EstimateStatus.not_run
     out["estimate"].values[...] = estimate
@@ -102,7 +108,8 @@ def poses(results, **kept):
 
 def looked_for(pose):
     return pose["detection"] not in {
-        DetectionStatus.not_run, DetectionStatus.not_visible, DetectionStatus.not_modelled
+        DetectionStatus.not_run, DetectionStatus.not_visible, DetectionStatus.not_modelled,
+        DetectionStatus.not_in_photograph,
     }
 
 

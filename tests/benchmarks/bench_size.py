@@ -64,9 +64,11 @@ def compared(name, folder):
         one = table.sel(answer.alternative)
         label = ", ".join(map(str, answer.alternative.values())) or "answer"
         if rule.along:
-            values = one[rule.along].values
-            safe = values <= answer.value if rule.largest else values >= answer.value
-            good = one.isel({rule.along: np.flatnonzero(safe)}) if answer.met else None
+            good = None
+            if answer.value is not None:
+                values = one[rule.along].values
+                safe = values <= answer.value if rule.largest else values >= answer.value
+                good = one.isel({rule.along: np.flatnonzero(safe)})
             after = None if answer.next is None else one.sel({rule.along: answer.next})
         else:
             good, after = (one, None) if answer.met else (None, one)

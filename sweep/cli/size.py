@@ -96,7 +96,7 @@ def _execute_beside(child: Child, options: argparse.Namespace) -> int:
 
 
 SIZE = Command(
-    "size", "search the smallest or cheapest choice that meets requirements",
+    "size", "find the smallest or cheapest choice that will do",
     "pipelines/sizes/README.md",
     (
         Example(

@@ -150,7 +150,7 @@ def _checked_output(name: str | None) -> Path | None:
 
 
 LIMIT = Command(
-    "limit", "find how far along an axis requirements are met, per condition",
+    "limit", "find how far along an axis requirements are met",
     "pipelines/limits/README.md",
     (
         Example(

@@ -93,7 +93,7 @@ def _execute(options: argparse.Namespace) -> int:
 
 
 PHOTOS = Command(
-    "photos", "measure detectors and estimators on photographs of known markers",
+    "photos", "measure detectors and estimators on photographs of markers",
     "pipelines/photographs/README.md",
     (
         Example(

@@ -178,6 +178,7 @@ def test_image_and_slopes_are_those_of_dense_sampling(lens):
         assert np.abs(image_slope[view.used] - expected).max() < 1e-2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("board", "numbers", "lens", "solver", "effects"),
     [
@@ -241,6 +242,7 @@ def test_nees_of_many_photographs(solver, effects, limits):
     assert limits[0] < np.mean(squared) < limits[1]
 
 
+@pytest.mark.long
 def test_misfit_is_the_shift_of_the_markers_parts():
     """Shifts that vary over a third of the marker: a quarter to twice their standard deviation.
 
@@ -261,6 +263,7 @@ def test_misfit_is_the_shift_of_the_markers_parts():
     assert (estimates.status == EstimateStatus.not_explained).any()
 
 
+@pytest.mark.long
 def test_images_without_a_marker_have_no_pose_that_passes():
     """Uniform, black, saturated and random pixels: no exception, nothing not finite is solved."""
     rng = np.random.default_rng(6)
@@ -277,6 +280,7 @@ def test_images_without_a_marker_have_no_pose_that_passes():
                 assert image.std() > 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("distance", "tilt"), [(1.8, 10), (0.5, 80), (0.25, 0)])
 def test_extreme_sizes_and_angles_give_a_pose_or_say_why_not(distance, tilt):
     """Sides of 10 px, tilts of 80 degrees, and markers that the frame cuts."""

@@ -232,6 +232,7 @@ def test_shifted_image_is_that_of_shifted_samples(geometry_px, length_px):
     assert_sampled(exact_frame(scenes, value), sampled_frame(value, 8, shifted), 8)
 
 
+@pytest.mark.long
 def test_shifts_are_normal_and_correlated_as_said():
     # 4,000 frames; means of squares have a standard error of 1.41/sqrt(8,000) = 1.6 %, products
     # of points at a distance less than that: 5.5 % are beyond an error probability of 1e-6.
@@ -247,6 +248,7 @@ def test_shifts_are_normal_and_correlated_as_said():
     assert abs(np.mean(np.abs(drawn) < 2) - 0.6827) < 0.02
 
 
+@pytest.mark.long
 def test_image_with_shifts_and_bends_does_not_depend_on_the_window():
     rng = np.random.default_rng(2)
     for given in (
@@ -279,6 +281,7 @@ def test_shifts_that_fold_the_image_are_not_modelled():
     assert not not_modelled(scenes)[0]
 
 
+@pytest.mark.long
 def test_a_moving_bent_marker_is_the_mean_of_resting_ones():
     count = 200
     value, scenes = scenes_of(

@@ -65,6 +65,7 @@ def test_without_effects_a_photograph_is_the_exact_image():
     assert np.array_equal(image, quantise(exact))
 
 
+@pytest.mark.long
 def test_equal_seeds_give_equal_photographs_and_each_effect_changes_them():
     effects = WEBCAM | {
         "curvature_per_m": 0.5, "bend": "saddle", "bayer": "RGGB", "jpeg_quality": 80,

@@ -37,6 +37,7 @@ def true_corners(number):
     return points[..., :2] / points[..., 2:] * VIEW[:2] + VIEW[2:]
 
 
+@pytest.mark.long
 def test_the_truth_is_that_of_the_board_within_its_standard_deviation(made):
     _, results = made
     errors = []
@@ -103,6 +104,7 @@ def test_corners_and_poses_are_those_of_a_plain_loop_over_the_files(made):
     assert compared == shown - 2  # the covered marker
 
 
+@pytest.mark.long
 def test_coordinates_are_those_of_the_true_pose(made):
     _, results = made
     _, position = marker_poses(POSES[1])
@@ -115,6 +117,7 @@ def test_coordinates_are_those_of_the_true_pose(made):
     assert np.allclose(results.image_x_px.values[1][shown], centre[shown, 0], atol=0.3)
 
 
+@pytest.mark.long
 def test_a_photograph_is_the_draw_of_every_interval(made):
     _, results = made
     table = error_statistics(results, per="cornerRefinementMethod")

@@ -105,6 +105,7 @@ def test_every_wanted_cell_is_of_the_condition_alone():
         np.testing.assert_array_equal(one[0], whole[k])
 
 
+@pytest.mark.long
 def test_limits_are_those_of_plain_intervals():
     rng = np.random.default_rng(3)
     curves = special.expit((SIDES - rng.uniform(12, 35, (6, 1))) / 2)

@@ -19,6 +19,7 @@ import pytest
 from support.here import calls_here
 from support.room_picture import PICTURE, drawn
 from sweep.cli import main
+from sweep.plan.board_files import read_board
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import PARAMETERS, SECTIONS, Stage
 from sweep.plan.reference import TABLES, outdated_tables
@@ -96,7 +97,10 @@ def commands_run():
 def test_blocks_of_a_guide_run_in_their_order(name, workspace, commands_run, monkeypatch, capsys):
     monkeypatch.chdir(workspace)
     for block in blocks_of(TOP / name):
-        if block.language == "toml":
+        if block.comment == "file: board.toml":
+            Path("board.toml").write_text(block.text)
+            assert len(read_board("board.toml").marker_ids)
+        elif block.language == "toml":
             assert Pipeline.from_text(block.text).size(*Stage) > 1
         if block.comment.startswith("file: "):
             few = re.sub(r"^trial = \d+", "trial = 10", block.text, flags=re.MULTILINE)

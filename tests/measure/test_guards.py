@@ -62,11 +62,14 @@ def cameras(count, lens=()):
 
 PLACES = {
     "solvePnP": {"measure/solver.py"},
-    "solvePnPGeneric": {"measure/solver.py"},
+    "solvePnPGeneric": {"measure/solver.py", "photographs/board_truth.py"},  # starts a fit
     "Rodrigues": set(),
-    "projectPoints": set(),
+    "projectPoints": {"photographs/pose_fit.py"},  # of boards before the camera
     "undistortPoints": set(),
-    "cornerSubPix": {"measure/photometric.py"},  # one start of several: the pixels decide
+    "cornerSubPix": {
+        "measure/photometric.py",  # one start of several: the pixels decide
+        "photographs/corners.py",  # chessboard corners, of the truth
+    },
     "drawFrameAxes": set(),  # projects
     "solvePnPRansac": set(),
     "estimatePoseSingleMarkers": set(),

@@ -142,6 +142,7 @@ def test_the_ring_around_a_marker_that_is_clear():
     assert clear_modules(BoardMarker(GRID, 4)) == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("lens", [(), LENS])
 def test_image_and_slopes_are_those_of_dense_sampling(lens):
     """Slopes against differences of images that are computed by the exact coverage."""

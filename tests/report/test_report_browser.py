@@ -80,7 +80,8 @@ def check(page, folder, schemes=tuple(SCHEMES)):
             assert told["unread"] == 0
 
 
-@pytest.mark.parametrize("scheme", ["dark", pytest.param("light", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("scheme", ["dark", "light"])
 def test_the_report_is_right_wide_and_narrow_light_and_dark(scheme, tmp_path):
     page = tmp_path / "report.html"
     assert command("report", made(tmp_path, FULL, "full"), "-o", page)[0] == 0

@@ -76,15 +76,15 @@ def detections_for(
             ("noise_grey", estimator.believed_noise_grey), ("blur_px", estimator.believed_blur_px)
         )
     )
+    on_board = values["on_board"].values if "on_board" in values else None
     return Detections(
         result.corners[rows], cameras.take(rows), size[rows], noise[rows], blur[rows],
         [scenes.markers[k] for k in scenes.marker[rows]],
         [result.images[row] for row in rows.tolist()] if result.images else [],
         result.origins[rows],
-        *(
-            (None, None) if result.poses is None
-            else (result.poses.rotation[rows], result.poses.translation[rows])
-        ),
+        None if result.poses is None else result.poses.rotation[rows],
+        None if result.poses is None else result.poses.translation[rows],
+        None if on_board is None else [on_board[row] for row in rows.tolist()],
     )
 
 

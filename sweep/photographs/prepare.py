@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -34,7 +36,7 @@ from sweep.photographs.record_files import (
     write_record,
 )
 from sweep.photographs.reference_pose import SeenMarkers, own_poses, partner_poses
-from sweep.plan.board_files import read_board
+from sweep.plan.board_files import board_document, board_of
 from sweep.plan.experiment import Pipeline
 from sweep.typing import Floats
 
@@ -94,7 +96,8 @@ def _prepare(
     poses: PathName | None, stereo: PathName | None, settings: list[str], home: Path,
     name: str, *, overwrite: bool,
 ) -> Prepared:
-    target = read_board(Path(board)) if board is not None else None
+    document = None if board is None else board_document(Path(board))
+    target = None if document is None else board_of(document, plain(board))
     halves = [Part.whole]
     if stereo is not None and len(folders) == 1:
         halves = [Part.left, Part.right]
@@ -112,6 +115,9 @@ def _prepare(
         for folder in found
     ]
     markers = _markers(target, settings, [ids for side in seen_ids for ids, _ in side])
+    if document is not None:
+        written = json.dumps(document, sort_keys=True)
+        markers = dataclasses.replace(markers, board=written)
     if target is not None and board is not None:
         check_board(Path(board), target, [each for side in seen_ids for each in side], find,
                     first.photographs)

@@ -58,11 +58,15 @@ def record_home(store: str | os.PathLike[str] | None) -> tuple[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class WantedMarkers:
-    """The markers that are looked for: dictionary, IDs (M,) and sides (M,) in m."""
+    """The markers that are looked for: dictionary, IDs (M,) and sides (M,) in m.
+
+    ``board`` is the document of the board's file as JSON; empty without one.
+    """
 
     dictionary: str
     ids: tuple[int, ...]
     sizes_m: Floats
+    board: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +131,7 @@ def _content(
         tuple(os.path.relpath(each.path.resolve(), start) for each in folder.photographs),
         tuple(each.digest for each in folder.photographs), part, width, height,
         np.array(markers.ids, dtype=np.int64), poses.rotation, poses.translation, poses.std,
-        poses.source,
+        poses.source, markers.board,
     )
 
 

@@ -42,17 +42,21 @@ def read_board(path: str | Path) -> Board:
     ...     read_board(path).marker_ids
     (0, 1, 2, 3, 4, 5)
     """
+    return board_of(board_document(path), plain(path))
+
+
+def board_document(path: str | Path) -> dict[str, Any]:
+    """Return the tables and values of a board's file, unchecked; as :func:`read_board`."""
     source = plain(path)
     try:
         content = read_regular(Path(path), MAX_BYTES)
-        document = read_document(content.decode())
+        return read_document(content.decode())
     except OSError as error:
         raise refusal([f"{source}: cannot be read: {error.strerror}"]) from None
     except UnicodeDecodeError:
         raise refusal([f"{source}: expected a TOML file: not UTF-8"]) from None
     except ValueError as error:
         raise refusal([f"{source}: {error}"]) from None
-    return board_of(document, source)
 
 
 def board_of(document: Mapping[str, Any], source: str) -> Board:

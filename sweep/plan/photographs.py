@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import zipfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -18,24 +19,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.errors import PluginError
+from sweep.errors import PluginError, SweepError
+from sweep.measure.surroundings import BoardMarker
 from sweep.messages import plain
+from sweep.model.board import Board
 from sweep.model.photograph import Part, reference
 from sweep.model.renderers import PHOTOGRAPH
 from sweep.model.rotations import angles_of_rotation
 from sweep.plan.alternatives import PHOTOGRAPHS
 from sweep.plan.axes import TRIAL, Axis
+from sweep.plan.board_files import board_of
 from sweep.typing import Floats, Integers, Masks
 
 SUFFIX = ".photographs.npz"
 """End of the name of a record's file."""
 
-VERSION = 1
+VERSION = 2
+"""Since 2 a record has the board."""
 
 POSE = 6
 
 _ARRAYS = ("paths", "digests", "part", "size", "marker_id", "rotation", "translation", "std",
-           "source")
+           "source", "board")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,6 +65,8 @@ class PhotographRecord:
         frame; NaN where they are not known.
     source
         (P, M) :class:`~sweep.measure.flags.TruthSource`.
+    board
+        The document of the board's file as JSON; empty if the markers are single ones.
     """
 
     paths: tuple[str, ...]
@@ -72,6 +79,7 @@ class PhotographRecord:
     translation: Floats
     std: Floats
     source: NDArray[np.uint8]
+    board: str = ""
 
     @property
     def shown(self) -> Masks:
@@ -82,6 +90,14 @@ class PhotographRecord:
         """Return the index of each of some markers; -1 for those that the record lacks."""
         at = np.minimum(np.searchsorted(self.marker_id, marker_id), len(self.marker_id) - 1)
         return np.where(self.marker_id[at] == marker_id, at, -1)
+
+    def on_board(self, marker_id: NDArray[np.int64]) -> list[BoardMarker | None]:
+        """Return the marker of the board that each of some markers is; None without a board."""
+        if not self.board:
+            return [None] * len(marker_id)
+        board = _board(self.board)
+        numbers = {each: number for number, each in enumerate(board.marker_ids)}
+        return [BoardMarker(board, numbers[each]) for each in marker_id.tolist()]
 
     def content(self) -> bytes:
         """Return the content of its file: the same bytes for the same record."""
@@ -123,14 +139,15 @@ def _read(path: str, modified_ns: int, size: int) -> tuple[PhotographRecord, str
     content = Path(path).read_bytes()
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            if int(archive["version"]) != VERSION:
+            version = int(archive["version"])
+            if not 1 <= version <= VERSION:
                 raise ValueError("of another version")
-            arrays = {name: archive[name] for name in _ARRAYS}
+            arrays = {name: archive[name] for name in _ARRAYS if version > 1 or name != "board"}
         record = PhotographRecord(
             tuple(map(str, arrays["paths"])), tuple(map(str, arrays["digests"])),
             Part(str(arrays["part"])), int(arrays["size"][0]), int(arrays["size"][1]),
             arrays["marker_id"], arrays["rotation"], arrays["translation"], arrays["std"],
-            arrays["source"],
+            arrays["source"], str(arrays.get("board", "")),
         )
     except (KeyError, IndexError, TypeError, EOFError, AttributeError, zipfile.BadZipFile):
         raise ValueError("it is none") from None
@@ -142,7 +159,17 @@ def _read(path: str, modified_ns: int, size: int) -> tuple[PhotographRecord, str
     for name, shape in shapes.items():
         if np.shape(arrays[name]) != shape:
             raise ValueError(f"damaged: {name}")
+    try:
+        record.on_board(record.marker_id)
+    except (SweepError, AttributeError, KeyError, TypeError, ValueError):
+        raise ValueError("damaged: board") from None
     return record, hashlib.sha256(content).hexdigest()
+
+
+@lru_cache(maxsize=8)
+def _board(document: str) -> Board:
+    """Return the board of a record, the same object for the same document."""
+    return board_of(json.loads(document), "board")
 
 
 def along_photographs(axes: Iterable[Axis]) -> list[bool]:
@@ -155,8 +182,9 @@ def recorded_poses(
 ) -> dict[str, Any]:
     """Return the parameters of N scenes that are photographs, by name.
 
-    They are the image, the pose (NaN where a photograph does not show the marker), and ``truth``
-    (N,) and ``truth_std`` (N, 6) as a record's ``source`` and ``std``.
+    They are the image, the pose (NaN where a photograph does not show the marker), ``truth`` (N,)
+    and ``truth_std`` (N, 6) as a record's ``source`` and ``std``, and ``on_board``: the marker of
+    a board that each is, or None.
 
     Parameters
     ----------
@@ -174,6 +202,7 @@ def recorded_poses(
     images: list[str] = [""] * count
     rotation, translation = np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan)
     std, source = np.full((count, POSE), np.nan), np.zeros(count, dtype=np.uint8)
+    on_board: list[BoardMarker | None] = [None] * count
     for name in dict.fromkeys(names):
         rows = np.flatnonzero([each == name for each in names])
         home = Path(folder) / name
@@ -185,8 +214,9 @@ def recorded_poses(
             reference(home.parent / path, digest, record.part)
             for path, digest in zip(record.paths, record.digests, strict=True)
         ]
-        for row, trial in zip(rows.tolist(), trials[rows].tolist(), strict=True):
-            images[row] = references[trial]
+        printed = record.on_board(marker_id[rows])
+        for row, trial, each in zip(rows.tolist(), trials[rows].tolist(), printed, strict=True):
+            images[row], on_board[row] = references[trial], each
         at = trials[rows], known
         rotation[rows], translation[rows] = record.rotation[at], record.translation[at]
         std[rows], source[rows] = record.std[at], record.source[at]
@@ -196,5 +226,5 @@ def recorded_poses(
         "renderer": PHOTOGRAPH, "background": images,
         "x_m": translation[:, 0], "y_m": translation[:, 1], "distance_m": translation[:, 2],
         "resolved_tilt_deg": tilt, "resolved_azimuth_deg": azimuth, "resolved_roll_deg": roll,
-        "truth": source, "truth_std": std,
+        "truth": source, "truth_std": std, "on_board": on_board,
     }

@@ -1,0 +1,90 @@
+"""Solver ``photometric_real`` on photographs of a board: its neighbours' edges are in the model."""
+
+import dataclasses
+import io
+import zipfile
+
+import cv2
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import sweep
+from support.board_photographs import POSES, board, marker_poses, write_set
+from support.here import calls_here
+from sweep.errors import PluginError
+from sweep.measure.flags import EstimateStatus
+from sweep.plan.photographs import read_record
+
+ALARM = 1e-7
+NUMBERS = (1, 2)
+"""The poses of the photographs."""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pixels")
+    shots = write_set(folder, [POSES[number] for number in NUMBERS])
+    with calls_here():
+        results = sweep.photos(
+            shots, camera=folder / "camera.json", board=folder / "board.toml",
+            settings=['solver="photometric_real"', 'cornerRefinementMethod="subpix"'],
+            store=folder / "shots.zarr",
+        )
+    return folder, results.load()
+
+
+def squared_errors(results):
+    """Return the squared errors from the exact poses, in units of the covariance's diagonal."""
+    rows = []
+    for number, pose in enumerate(POSES[k] for k in NUMBERS):
+        rotations, positions = marker_poses(pose)
+        each = results.isel(trial=number)
+        for k in np.flatnonzero((each.estimate == EstimateStatus.solved).values):
+            cell = each.isel(marker_id=k)
+            # Estimate from error and truth of the store, and its error from the exact pose.
+            turn = (
+                cv2.Rodrigues(cell.rotation_error_rad.values.astype(float))[0]
+                @ cv2.Rodrigues(cell.true_rvec.values)[0] @ rotations[k].T
+            )
+            moved = cell.translation_error_m.values + cell.true_tvec_m.values - positions[k]
+            error = np.concatenate([cv2.Rodrigues(turn)[0].ravel(), moved])
+            rows.append((error / cell.predicted_std.values) ** 2)
+    return np.array(rows)
+
+
+def test_poses_of_a_board_have_the_errors_that_their_store_predicts(made):
+    """Each of the six components, whose squares are those of a normal distribution."""
+    _, results = made
+    solved = (results.estimate == EstimateStatus.solved).values
+    assert solved.sum() >= 18  # all but markers whose own truth is unknown
+    assert (results.misfit_px.values[solved] < 0.1).all()
+    squares = squared_errors(results)
+    assert (squares.sum(axis=0) < chi2.isf(ALARM / 6, len(squares))).all()
+    assert (squares.sum(axis=0) > chi2.ppf(ALARM / 6, len(squares))).all()
+
+
+def test_the_board_is_in_the_record_and_older_records_are_read_without(made, tmp_path):
+    folder, _ = made
+    path = folder / "shots.photographs.npz"
+    record, _ = read_record(path)
+    ids = np.array([9, 0])
+    on_board = record.on_board(ids)
+    assert [each.board.marker_ids[each.number] for each in on_board] == [9, 0]
+    np.testing.assert_array_equal(on_board[0].board.corners_m, board().corners_m)
+    older = tmp_path / "older.photographs.npz"
+    with zipfile.ZipFile(path) as source, zipfile.ZipFile(older, "w") as target:
+        for name in source.namelist():
+            if name != "board.npy":
+                target.writestr(name, source.read(name) if name != "version.npy" else saved(1))
+    assert read_record(older)[0].on_board(ids) == [None, None]
+    for damaged in ("[]", "{}", "no JSON", record.board.replace("5", "2")):
+        older.write_bytes(dataclasses.replace(record, board=damaged).content())
+        with pytest.raises(PluginError, match="damaged: board"):
+            read_record(older)
+
+
+def saved(value):
+    file = io.BytesIO()
+    np.lib.format.write_array(file, np.asarray(value))
+    return file.getvalue()

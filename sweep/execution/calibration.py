@@ -28,12 +28,11 @@ from sweep.execution.limits import (
 )
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.isolation.watchdog import compilation_s
-from sweep.plan.alternatives import PHOTOGRAPHS
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.parameters import Stage
-from sweep.plan.photographs import along_photographs
+from sweep.plan.photographs import along_photographs, shows_photographs
 from sweep.plan.schema import bytes_per_block
 from sweep.sampling.rules import make_rule
 from sweep.sampling.stopping import Stopping, block_unit
@@ -245,7 +244,7 @@ def sample(
 def _sample(pipeline: Pipeline, generator: np.random.Generator, count: int) -> Indices:
     """Return the indices of a random sample of scenes: of photographs all markers of one."""
     axes = scene_axes(pipeline)
-    if PHOTOGRAPHS not in pipeline.given:
+    if not shows_photographs(pipeline):
         return sample(axes, generator, count)
     each = [
         generator.integers(0, len(axis), 1) if along else np.arange(len(axis))
@@ -302,7 +301,7 @@ def block_extents(
         Block timeout in seconds, if the user gave one.
     """
     axes = scene_axes(pipeline)
-    if PHOTOGRAPHS in pipeline.given:  # each is searched once, for all its markers
+    if shows_photographs(pipeline):  # each is searched once, for all its markers
         return tuple(
             1 if along else len(axis)
             for axis, along in zip(axes, along_photographs(axes), strict=True)

@@ -60,6 +60,11 @@ class Scene:
         "`sweep photos` writes (path relative to the pipeline file); trial is then the "
         "photograph's number",
     )
+    simulated: bool = parameter(
+        False,
+        "true: of the photographs the poses alone are taken, and each marker is simulated by "
+        "itself; trial k has the poses of photograph k modulo their number",
+    )
 
 
 @dataclass(frozen=True, slots=True)

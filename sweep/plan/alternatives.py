@@ -32,6 +32,9 @@ frame: one of them, not two."""
 PHOTOGRAPHS = "photographs"
 """The parameter that takes poses and images from a record of photographs."""
 
+SIMULATED = "simulated"
+"""The parameter that takes from such a record the poses alone."""
+
 RIVALS: dict[str, frozenset[str]] = {
     name: frozenset(
         other for ways in CHOICES for way in ways

@@ -25,8 +25,8 @@ from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.beliefs import CALIBRATED, believed_calibration, calibrated_columns
 from sweep.plan.draws import bits, even_uniform, geometry_keys, jointly_drawn, uniform
 from sweep.plan.experiment import Pipeline
-from sweep.plan.parameters import Stage
-from sweep.plan.photographs import recorded_poses
+from sweep.plan.parameters import PARAMETERS, Stage
+from sweep.plan.photographs import is_simulated, recorded_poses, shows_photographs
 from sweep.plan.pose_values import resolve_pose
 from sweep.plan.scene_plugins import effects_of
 from sweep.plugins.declared import DeclaredPlugin, PluginSetting
@@ -152,20 +152,23 @@ def scene_values(
         effect.switch in drawn or values[effect.switch].differs_from(effect.off)
         for effect in effects_of(pipeline.plugins) if effect.random
     )
-    if not values["photographs"].missing:
-        return values | _photographed(pipeline, values, trials)
+    poses = {} if values["photographs"].missing else _photographed(pipeline, values, trials)
+    if shows_photographs(pipeline):
+        return values | poses
     calibration = believed_calibration(pipeline.fixed, pipeline.values_of("believed"))
     if not drawn and not noisy and not (jitter > 0).any() and calibration is None:
         resolve_pose(values)
-        return values
+        return values | poses
     keys = geometry_keys(values, drawn, count)
     draw: Callable[..., Floats] = uniform
     if pipeline.sampling == "sobol":
         calibrated = () if calibration is None else calibration.names
         quantities = jointly_drawn(drawn, [CALIBRATED + name for name in calibrated])
         draw = partial(even_uniform, quantities=quantities)
+    # What is drawn for a photograph is the same for all its markers; their noise is not.
+    shared = geometry_keys(values | ANY_MARKER, drawn, count) if poses else keys
     for name, distribution in drawn.items():
-        number = draw(pipeline.seed, name, keys=keys, trials=trials)
+        number = draw(pipeline.seed, name, keys=shared, trials=trials)
         values[name] = Column.of(distribution.at(number))
     if (jitter > 0).any():
         for name in ("shift_u_px", "shift_v_px"):
@@ -179,16 +182,24 @@ def scene_values(
     if noisy:
         values["noise_key"] = Column.of(bits(pipeline.seed, "noise", keys, trials))
     resolve_pose(values)
-    return values
+    return values | poses
+
+
+ANY_MARKER = {
+    name: Column(PARAMETERS[name].default, constant=True) for name in ("marker_id", "size_m")
+}
+"""Values of what differs from marker to marker in a photograph, as if it did not."""
 
 
 def _photographed(
     pipeline: Pipeline, values: Mapping[str, Column], trials: NDArray[np.int64]
 ) -> dict[str, Column]:
-    """Return the parameters of scenes that are photographs, numbered by ``trials`` (N,)."""
+    """Return the parameters of scenes at the poses of photographs of numbers ``trials`` (N,)."""
     names = values["photographs"].listed(len(trials))
     ids = values["marker_id"].broadcast(len(trials), np.int64)
-    poses = recorded_poses(names, pipeline.folder, trials, ids)
+    poses = recorded_poses(
+        names, pipeline.folder, trials, ids, simulated=is_simulated(pipeline)
+    )
     return {name: Column.of(column) for name, column in poses.items()}
 
 

@@ -1,7 +1,7 @@
 """The record of photographs: their files, and the pose of each marker in each of them.
 
 A pipeline names it by the parameter ``photographs``. Its scenes are then photographs, one a trial,
-and the poses are those of the record in the place of simulated ones.
+and the poses are those of the record; with ``simulated`` the images are not the photographs.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +26,13 @@ from sweep.model.board import Board
 from sweep.model.photograph import Part, reference
 from sweep.model.renderers import PHOTOGRAPH
 from sweep.model.rotations import angles_of_rotation
-from sweep.plan.alternatives import PHOTOGRAPHS
+from sweep.plan.alternatives import PHOTOGRAPHS, SIMULATED
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.board_files import board_of
 from sweep.typing import Floats, Integers, Masks
+
+if TYPE_CHECKING:
+    from sweep.plan.experiment import Pipeline
 
 SUFFIX = ".photographs.npz"
 """End of the name of a record's file."""
@@ -177,8 +180,19 @@ def along_photographs(axes: Iterable[Axis]) -> list[bool]:
     return [axis.name == TRIAL or PHOTOGRAPHS in axis.columns for axis in axes]
 
 
+def shows_photographs(pipeline: Pipeline) -> bool:
+    """Return whether the images of a pipeline are photographs, not simulated at their poses."""
+    return PHOTOGRAPHS in pipeline.given and not is_simulated(pipeline)
+
+
+def is_simulated(pipeline: Pipeline) -> bool:
+    """Return whether a pipeline's images are simulated at the poses of photographs."""
+    return pipeline.fixed.get(SIMULATED) is True
+
+
 def recorded_poses(
-    names: Sequence[str], folder: str, trials: NDArray[np.int64], marker_id: NDArray[np.int64]
+    names: Sequence[str], folder: str, trials: NDArray[np.int64], marker_id: NDArray[np.int64],
+    *, simulated: bool = False,
 ) -> dict[str, Any]:
     """Return the parameters of N scenes that are photographs, by name.
 
@@ -192,6 +206,9 @@ def recorded_poses(
         The records' files (N,), and where relative paths start.
     trials, marker_id
         (N,) each: numbers of the photographs, and the markers.
+    simulated
+        Whether the images are simulated, each marker by itself: image and ``on_board`` are then
+        left out, and trials beyond the photographs begin again with the first.
 
     Raises
     ------
@@ -208,23 +225,24 @@ def recorded_poses(
         home = Path(folder) / name
         record, _ = read_record(home)
         known = record.index_of(marker_id[rows])
-        if (known < 0).any() or (trials[rows] >= len(record.paths)).any():
+        numbers = trials[rows] % len(record.paths) if simulated else trials[rows]
+        if (known < 0).any() or (numbers >= len(record.paths)).any():
             raise PluginError(f"{plain(name)}: it lacks photographs or markers of the pipeline")
         references = [
             reference(home.parent / path, digest, record.part)
             for path, digest in zip(record.paths, record.digests, strict=True)
         ]
         printed = record.on_board(marker_id[rows])
-        for row, trial, each in zip(rows.tolist(), trials[rows].tolist(), printed, strict=True):
-            images[row], on_board[row] = references[trial], each
-        at = trials[rows], known
+        for row, number, each in zip(rows.tolist(), numbers.tolist(), printed, strict=True):
+            images[row], on_board[row] = references[number], each
+        at = numbers, known
         rotation[rows], translation[rows] = record.rotation[at], record.translation[at]
         std[rows], source[rows] = record.std[at], record.source[at]
     with np.errstate(invalid="ignore"):
         tilt, azimuth, roll = (np.degrees(each) for each in angles_of_rotation(rotation))
-    return {
-        "renderer": PHOTOGRAPH, "background": images,
+    photograph = {"renderer": PHOTOGRAPH, "background": images, "on_board": on_board}
+    return ({} if simulated else photograph) | {
         "x_m": translation[:, 0], "y_m": translation[:, 1], "distance_m": translation[:, 2],
         "resolved_tilt_deg": tilt, "resolved_azimuth_deg": azimuth, "resolved_roll_deg": roll,
-        "truth": source, "truth_std": std, "on_board": on_board,
+        "truth": source, "truth_std": std,
     }

@@ -25,6 +25,7 @@ from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.coordinates import FixedValue, fixed_values
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
+from sweep.plan.photographs import is_simulated
 from sweep.plan.pose_values import DISTANCE_PARAMETERS, distance_of_side
 from sweep.plan.schema import DRAWN_FORMAT, LABELS, VARIABLES, Variable, variables_of
 from sweep.store.zarr_sync import sync
@@ -329,9 +330,13 @@ def _photographs(pipeline: Pipeline) -> list[PlannedArray]:
     files = sorted(
         (name, digest) for name, digest in pipeline.files.items()
         if name.lower().endswith(IMAGE_SUFFIXES)
-    )[: len(trials)]
+    )
+    if is_simulated(pipeline):  # two cameras' photographs have the same names
+        files = files[: len({name.rpartition("/")[2] for name, _ in files})]
+        files *= -(-len(trials) // max(len(files), 1))
     if len(files) < len(trials):
         return []
+    files = files[: len(trials)]
     columns = {
         "photograph": ([name.rpartition("/")[2] for name, _ in files], "file of the photograph"),
         "sha256": ([digest for _, digest in files], "SHA-256 of the photograph's file"),

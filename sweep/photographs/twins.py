@@ -1,0 +1,114 @@
+"""Twins of photographs: images of their markers, simulated at the same poses."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sweep.errors import ArgumentError, PluginError
+from sweep.messages import plain
+from sweep.model.image_file import read_regular
+from sweep.plan.alternatives import PHOTOGRAPHS, SIMULATED
+from sweep.plan.axes import TRIAL, parse_distribution
+from sweep.plan.experiment import Pipeline
+from sweep.plan.parameters import PARAMETERS
+from sweep.plan.photographs import read_record, shows_photographs
+from sweep.plan.toml_text import MAX_BYTES, read_document
+
+NAME = "{}-twins"
+"""Name of the twins of photographs of a name."""
+
+
+def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1) -> Pipeline:
+    """Return the pipeline that simulates the markers of photographs at their true poses.
+
+    Each image has one marker with its quiet zone on a plain ground. Camera, detectors, estimators,
+    rows and flags are those of the photographs, so that results pair: trial k has the poses of
+    photograph k modulo their number. What is drawn of the scene is drawn for each photograph and
+    repeat, and is the same for all its markers; noise and shifts are each marker's own.
+
+    Parameters
+    ----------
+    pipeline
+        That of a store of photographs.
+    scene
+        Parameters of the section [scene] by name, as a document has them: values, or
+        distributions such as ``{"normal": [0.8, 0.1]}``. The ``background`` has the median level of
+        ``black`` unless it is given.
+    repeats
+        How often each photograph is simulated.
+
+    Raises
+    ------
+    ArgumentError, PipelineError
+        If the pipeline is not one of photographs, or the scene is not valid.
+    """
+    if not shows_photographs(pipeline):
+        raise ArgumentError("pipeline", plain(pipeline.name), "expected that of photographs")
+    if repeats < 1:
+        raise ArgumentError("repeats", repeats, "expected at least 1")
+    axis = pipeline.axis(TRIAL)
+    trials = 1 if axis is None else len(axis)
+    if repeats > 1 and trials != photograph_count(pipeline):
+        raise ArgumentError(
+            "repeats", repeats,
+            f"expected 1, for the {trials} first of {photograph_count(pipeline)} photographs",
+        )
+    document = read_document(pipeline.to_toml())
+    document["title"] = plain(f"Twins of {pipeline.heading}", 200)
+    document["scene"] = {
+        **document.get("scene", {}), SIMULATED: True, **_ground(scene.get("black")), **scene,
+    }
+    document.setdefault("axes", {})[TRIAL] = trials * repeats
+    return Pipeline.from_dict(
+        document, name=NAME.format(pipeline.name), source="scene", folder=pipeline.folder
+    )
+
+
+def _ground(black: Any) -> dict[str, float]:
+    """Return the background of the median level of black; nothing if black is not given."""
+    try:
+        if isinstance(black, dict):
+            drawn = parse_distribution(PARAMETERS["black"], black)
+            return {"background": float(drawn.at(np.array([0.5]))[0])}
+        return {} if black is None else {"background": float(black)}
+    except (TypeError, ValueError):
+        return {}  # the pipeline's check says what is wrong with it
+
+
+def photograph_count(pipeline: Pipeline) -> int:
+    """Return the number of photographs in the record of a pipeline.
+
+    Raises
+    ------
+    ArgumentError
+        If the record cannot be read.
+    """
+    name = str(pipeline.values_of(PHOTOGRAPHS)[0])
+    try:
+        return len(read_record(Path(pipeline.folder) / name)[0].paths)
+    except PluginError as error:
+        raise ArgumentError(PHOTOGRAPHS, plain(name), f"expected {error}") from None
+
+
+def read_scene(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return the section [scene] of a TOML file, such as `sweep fit` writes.
+
+    Raises
+    ------
+    ArgumentError
+        If it cannot be read, or has no such section.
+    """
+    try:
+        document = read_document(read_regular(os.fspath(path), MAX_BYTES).decode())
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ArgumentError("scene", plain(path, 300), f"cannot be read: {reason}") from None
+    scene = document.get("scene")
+    if not isinstance(scene, dict):
+        raise ArgumentError("scene", plain(path, 300), "expected a section [scene]")
+    return scene

@@ -1,0 +1,124 @@
+"""Twins of photographs: the markers of photographs, simulated at the same poses."""
+
+import cv2
+import numpy as np
+import pytest
+import xarray as xr
+
+from support.board_photographs import POSES, write_set
+from support.here import calls_here
+from sweep.errors import SweepError
+from sweep.evaluation.cells import run_cells
+from sweep.execution.runner import execute
+from sweep.measure.flags import DetectionStatus
+from sweep.photographs.prepare import prepare
+from sweep.photographs.twins import read_scene, twin_pipeline
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
+from sweep.plan.photographs import read_record
+from sweep.store.lifecycle import open_dataset
+
+SCENE = {
+    "black": 35, "white": 210, "blur_px": {"normal": [0.6, 0.05]}, "noise_grey": 2.0,
+    "geometry_px": 0.1, "geometry_length_px": 60.0,
+}
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory):
+    """The pipeline of three photographs; the last shows a part of the board."""
+    folder = tmp_path_factory.mktemp("twins")
+    shots = write_set(folder, [POSES[0], POSES[1], POSES[-1]])
+    return prepare(
+        [shots], folder / "camera.json", board=folder / "board.toml", home=folder,
+        settings=["cornerRefinementMethod=subpix"],
+    ).pipeline
+
+
+def all_indices(pipeline):
+    lengths = tuple(len(axis) for axis in scene_axes(pipeline))
+    return block_indices(Block((0,) * len(lengths), lengths))
+
+
+def test_rows_are_those_of_the_photographs_with_their_poses(prepared):
+    record, _ = read_record(f"{prepared.folder}/{prepared.name}.photographs.npz")
+    twins = twin_pipeline(prepared, SCENE, repeats=2)
+    columns = run_cells(twins, all_indices(twins)).columns
+    shown = record.shown
+    assert not shown.all()
+    flags = columns["detection"][0].reshape(2, *shown.shape)
+    for repeat in flags:
+        assert np.array_equal(repeat == DetectionStatus.not_in_photograph, ~shown)
+        assert (repeat[shown] == DetectionStatus.detected).all()
+    truth = columns["true_tvec_m"][0].reshape(2, *shown.shape, 3)
+    assert np.array_equal(truth[0], truth[1], equal_nan=True)
+    assert np.allclose(truth[0][shown], record.translation[shown], rtol=1e-12)
+    turn = columns["true_rvec"][0].reshape(2, *shown.shape, 3)[0][shown]
+    for vector, rotation in zip(turn, record.rotation[shown], strict=True):
+        assert np.allclose(cv2.Rodrigues(vector)[0], rotation, atol=1e-9)
+    error = columns["corner_error_px"][0].reshape(2, *shown.shape, 4, 2)[:, shown]
+    assert np.abs(error).max() < 2
+    std = columns["truth_std"][0].reshape(2, *shown.shape, 6)
+    assert np.allclose(std[0], record.std, rtol=1e-6, equal_nan=True)
+
+
+def test_what_is_drawn_of_a_photograph_is_the_same_for_all_its_markers(prepared):
+    twins = twin_pipeline(prepared, SCENE, repeats=2)
+    indices = all_indices(twins)
+    values = scene_values(twins, indices)
+    blur = values["blur_px"].values.reshape(6, -1)
+    assert (blur == blur[:, :1]).all()
+    assert len(set(blur[:, 0].tolist())) == 6  # other repeats, other draws
+    assert len(set(values["noise_key"].values.tolist())) == len(indices[0])
+    some = [index[3:9] for index in indices]
+    assert np.array_equal(scene_values(twins, some)["blur_px"].values, blur.ravel()[3:9])
+
+
+def test_the_ground_has_the_median_level_of_black(prepared):
+    assert twin_pipeline(prepared, {"black": 35}).fixed["background"] == 35
+    assert twin_pipeline(prepared, {"black": {"uniform": [20, 40]}}).fixed["background"] == 30
+    assert twin_pipeline(prepared, {"black": 35, "background": 9}).fixed["background"] == 9
+
+
+@pytest.mark.long
+def test_blocks_of_any_size_give_the_same_store_without_the_photographs(prepared, tmp_path):
+    twins = twin_pipeline(prepared, SCENE)
+    with calls_here():
+        stores = [tmp_path / "small.zarr", tmp_path / "large.zarr"]
+        for store, block_s in zip(stores, (0.01, None), strict=True):
+            execute(twins, str(store), workers=1, block_s=block_s)
+    small, large = (open_dataset(str(store)).load() for store in stores)
+    xr.testing.assert_identical(small.drop_attrs(), large.drop_attrs())
+    assert small.photograph.values.tolist() == ["shot0.png", "shot1.png", "shot2.png"]
+
+
+@pytest.mark.parametrize(("scene", "repeats", "expected"), [
+    ({"blur": 1.0}, 1, "scene.blur: unknown key.*blur_px"),
+    ({"distance_m": 1.0}, 1, "it belongs under .pose."),
+    ({"blur_px": -1.0}, 1, "blur_px = -1.0: expected"),
+    ({"black": {"normal": [1]}}, 1, "black"),
+    ({}, 0, "repeats = 0: expected at least 1"),
+])
+def test_a_scene_that_cannot_be_is_one_line(prepared, scene, repeats, expected):
+    with pytest.raises(SweepError, match=expected) as caught:
+        twin_pipeline(prepared, scene, repeats)
+    assert "\n" not in str(caught.value)
+
+
+def test_only_photographs_have_twins(prepared, tmp_path):
+    with pytest.raises(SweepError, match="expected that of photographs"):
+        twin_pipeline(Pipeline.from_dict({"pose": {"distance_m": 1}}), {})
+    with pytest.raises(SweepError, match="expected that of photographs"):
+        twin_pipeline(twin_pipeline(prepared, {}), {})
+    with pytest.raises(SweepError, match="simulated = true: expected photographs beside it"):
+        Pipeline.from_dict({"pose": {"distance_m": 1}, "scene": {"simulated": True}})
+    with pytest.raises(SweepError, match="nothing beside photographs, which have their own poses"):
+        Pipeline.from_text(
+            twin_pipeline(prepared, {}).to_toml() + "\n[pose]\ndistance_m = 1\n",
+            folder=prepared.folder,
+        )
+    (tmp_path / "none.toml").write_text("seed = 1\n")
+    with pytest.raises(SweepError, match=r"expected a section \[scene\]"):
+        read_scene(tmp_path / "none.toml")
+    with pytest.raises(SweepError, match="cannot be read"):
+        read_scene(tmp_path / "missing.toml")

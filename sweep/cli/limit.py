@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sweep.cli.arguments import add_json, add_pipeline, add_workers
@@ -13,8 +12,6 @@ from sweep.cli.output import print_json, quiet_matplotlib, say, say_next
 
 if TYPE_CHECKING:
     from sweep.isolation.child_process import Child
-
-FIGURE_SUFFIXES = (".png", ".svg")
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -84,8 +81,9 @@ def _execute_beside(child: Child, options: argparse.Namespace) -> int:
     from sweep.execution.limit_search import search_limits  # noqa: PLC0415
     from sweep.execution.progress import progress_display  # noqa: PLC0415
     from sweep.messages import notice  # noqa: PLC0415
+    from sweep.report.output_file import figure_file, write_output_file  # noqa: PLC0415
 
-    output = _checked_output(options.output)
+    output = figure_file(options.output)
     options.stopped = CONTINUES
     with progress_display() as display:
         limits, summary = search_limits(
@@ -107,7 +105,6 @@ def _execute_beside(child: Child, options: argparse.Namespace) -> int:
 
     if output is not None:
         from sweep.report.limit_figure import figure_bytes  # noqa: PLC0415
-        from sweep.report.output_file import write_output_file  # noqa: PLC0415
 
         write_output_file(output, figure_bytes(limits, output.suffix.lower()))
     if options.json:
@@ -133,20 +130,6 @@ def _names(text: str | None) -> list[str] | None:
     if text is None:
         return None
     return [name for part in text.split(",") if (name := part.strip())]
-
-
-def _checked_output(name: str | None) -> Path | None:
-    """Return the path of the figure, checked before the run."""
-    if name is None:
-        return None
-    from sweep.errors import StoreError  # noqa: PLC0415
-    from sweep.report.output_file import check_output_file  # noqa: PLC0415
-
-    output = Path(name)
-    if output.suffix.lower() not in FIGURE_SUFFIXES:
-        raise StoreError(f"{output}: expected a file that ends in .png or .svg")
-    check_output_file(output)
-    return output
 
 
 LIMIT = Command(

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from pathlib import Path
 
 from sweep.cli.arguments import add_json
 from sweep.cli.command import CONTINUES, Command, Example
 from sweep.cli.output import print_json, quiet_matplotlib, say, say_next
-
-FIGURE_SUFFIXES = (".png", ".svg")
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,11 +42,12 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 def _execute(options: argparse.Namespace) -> int:
     quiet_matplotlib()
     from sweep.execution.progress import stage_display  # noqa: PLC0415
+    from sweep.report.output_file import figure_file, write_output_file  # noqa: PLC0415
     from sweep.tradeoff.advice import advice, budget_advice  # noqa: PLC0415
     from sweep.tradeoff.measurement import measure_trade  # noqa: PLC0415
 
     _check(options)
-    output = _checked_output(options.output)
+    output = figure_file(options.output)
     store = options.source
     if store.lower().endswith(".toml"):
         from sweep.execution.progress import progress_display  # noqa: PLC0415
@@ -74,7 +72,6 @@ def _execute(options: argparse.Namespace) -> int:
     if output is not None:
         import io  # noqa: PLC0415
 
-        from sweep.report.output_file import write_output_file  # noqa: PLC0415
         from sweep.report.tradeoff_chart import draw_trade  # noqa: PLC0415
 
         figure = io.BytesIO()
@@ -124,26 +121,6 @@ def _check(options: argparse.Namespace) -> None:
         raise ArgumentError("budget_ms", options.budget_ms, "expected a finite number above 0")
     if not 0 < options.limit_s < math.inf:
         raise ArgumentError("limit_s", options.limit_s, "expected a finite number above 0")
-
-
-def _checked_output(name: str | None) -> Path | None:
-    """Return the path of the figure, checked before the long measurement.
-
-    Raises
-    ------
-    StoreError
-        If the suffix names no format, or the file cannot be written.
-    """
-    if name is None:
-        return None
-    from sweep.errors import StoreError  # noqa: PLC0415
-    from sweep.report.output_file import check_output_file  # noqa: PLC0415
-
-    output = Path(name)
-    if output.suffix.lower() not in FIGURE_SUFFIXES:
-        raise StoreError(f"{output}: expected a file that ends in .png or .svg")
-    check_output_file(output)
-    return output
 
 
 TRADEOFF = Command(

@@ -21,12 +21,10 @@ from sweep.model.extent import CHORDS_PER_SIDE
 from sweep.model.point_spread import REACH
 from sweep.model.projection import Optics, Projection
 from sweep.model.sheet import (
-    FOLD_CELLS,
-    FOLD_RAD,
-    MAX_FOLD_CELLS,
     NO_WAVES,
     Shape,
     Sheet,
+    fold_cells,
     folds_over,
     sheet_of,
     sheet_pixels,
@@ -227,11 +225,9 @@ def _curved_outlines_px(
         for points, plane, each in zip(outlines, planes, sheets, strict=True)
     ])
     extent = np.ptp(pixels.reshape(-1, 2), axis=0).max()
-    cells = max(
-        abs(sheet.curvature) * float((high - low).max()) / FOLD_RAD, 2 * extent / sheet.piece_px
-    )
+    side = float((high - low).max())
     if not np.isfinite(extent) or folds_over(
-        low, high, int(min(FOLD_CELLS + cells, MAX_FOLD_CELLS)), whole, sheet
+        low, high, fold_cells(sheet, side, extent), whole, sheet
     ):
         raise ValueError("the bent board hides a part of itself, or shifts fold its image")
     return pixels

@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 from sweep.model.image_shift import shift_waves
 from sweep.model.scene import Scenes
 from sweep.model.sheet import (
-    FOLD_CELLS,
-    FOLD_RAD,
-    MAX_FOLD_CELLS,
     NO_WAVES,
     Shape,
     Sheet,
+    fold_cells,
     folds_over,
     sheet_of,
     sheet_pixels,
@@ -70,12 +68,9 @@ def sheet_folds(scenes: Scenes, row: int) -> bool:
         return False
     modules, margin = float(scenes.modules[row]), float(scenes.margin[row])
     side = modules + 2 * margin
-    cells = FOLD_CELLS + abs(sheet.curvature) * side / FOLD_RAD
-    if sheet.waves.shape[1]:
-        corners = scenes.outline_px[row]
-        extent = float((corners.max(axis=0) - corners.min(axis=0)).max())
-        cells = max(cells, FOLD_CELLS + 2 * extent / sheet.piece_px)
+    shifted = sheet.waves.shape[1] > 0
+    extent = float(np.ptp(scenes.outline_px[row], axis=0).max()) if shifted else 0.0
     return bool(folds_over(
-        np.full(2, -margin), np.full(2, modules + margin), int(min(cells, MAX_FOLD_CELLS)),
+        np.full(2, -margin), np.full(2, modules + margin), fold_cells(sheet, side, extent),
         scenes.projection(row), sheet,
     ))

@@ -186,6 +186,12 @@ def piece_count(edge: ModuleEdge, projection: Projection, sheet: Sheet) -> int:
     return min(max(math.ceil(pieces), 1), MAX_PIECES)
 
 
+def fold_cells(sheet: Sheet, side: float, extent_px: float) -> int:
+    """Return the cells in which folds of a rectangle are searched, of a side in units and in px."""
+    cells = max(abs(sheet.curvature) * side / FOLD_RAD, 2 * extent_px / sheet.piece_px)
+    return int(min(FOLD_CELLS + cells, MAX_FOLD_CELLS))
+
+
 @compiled
 def folds_over(low: Floats, high: Floats, cells: int, projection: Projection, sheet: Sheet) -> bool:
     """Return whether the image of a rectangle of the sheet folds over, or lies behind the camera.

@@ -18,6 +18,25 @@ from sweep.errors import StoreError
 from sweep.messages import plain
 from sweep.store.locations import reason_of
 
+FIGURE_SUFFIXES = (".png", ".svg")
+
+
+def figure_file(name: str | None) -> Path | None:
+    """Return the path of a figure, checked before there is one; None without a name.
+
+    Raises
+    ------
+    StoreError
+        If the suffix names no format, or as :func:`check_output_file`.
+    """
+    if name is None:
+        return None
+    path = Path(name)
+    if path.suffix.lower() not in FIGURE_SUFFIXES:
+        raise StoreError(f"{path}: expected a file that ends in .png or .svg")
+    check_output_file(path)
+    return path
+
 
 def check_output_file(path: Path) -> None:
     """Check that a file can be written, before there is anything to write.

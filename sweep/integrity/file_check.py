@@ -110,6 +110,9 @@ class FileCheck:
         Optional ones of which no file is ``known`` are not there.
         """
         consolidated = self._consolidated_metadata()
+        # Another version of sweep may word the attributes otherwise.
+        recorded = self._store.run_metadata["environment"].get("sweep")
+        same_version = self._store.format == FORMAT and recorded == environment()["sweep"]
         for planned in self._planned:
             document = f"{planned.path}/zarr.json"
             own = {document, *planned.value_keys()}
@@ -118,7 +121,7 @@ class FileCheck:
             self._findings.keys |= own
             if self._wrong & {planned.path, *own}:
                 continue
-            if fault := self._value_fault(planned):
+            if fault := self._value_fault(planned, same_version):
                 self._findings.damage.append(ArrayDamage(planned.path, fault))
                 continue
             if consolidated is not None and consolidated.get(planned.path) != parsed(
@@ -141,12 +144,9 @@ class FileCheck:
         except (KeyError, TypeError, ValueError):
             return None
 
-    def _value_fault(self, planned: PlannedArray) -> str:
+    def _value_fault(self, planned: PlannedArray, same_version: bool) -> str:
         """Return how an array's attributes or coordinates differ from the pipeline's."""
         array = self._store.array(planned.path)
-        # Another version of sweep may word the attributes otherwise.
-        recorded = self._store.run_metadata["environment"].get("sweep")
-        same_version = self._store.format == FORMAT and recorded == environment()["sweep"]
         attributes = with_description(planned.path, array.attrs)
         if same_version and attributes != planned.attributes:
             return "its attributes differ from the schema's"

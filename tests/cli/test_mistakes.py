@@ -102,17 +102,27 @@ def test_a_mistake_is_refused_with_what_to_change(line, hint, capsys):
     ("line", "command"),
     [
         ("run small.toml", "sweep report runs/small.zarr"),
-        ("run runs/small.zarr", "sweep report runs/small.zarr"),
-        ("plan small.toml --set trial=1", "sweep run small.toml --set trial=1"),
+        pytest.param("run runs/small.zarr", "sweep report runs/small.zarr", marks=pytest.mark.long),
+        pytest.param(
+            "plan small.toml --set trial=1", "sweep run small.toml --set trial=1",
+            marks=pytest.mark.long,
+        ),
         ("show runs/small.zarr", "sweep plan runs/small.zarr"),
         ("repro runs/small.zarr --at trial=1",
          "sweep repro runs/small.zarr --at side_px=30.0,solver=ippe_square,trial=1 -o scene.png"),
         ("status runs/small.zarr", "sweep report runs/small.zarr"),
         ("status runs/unfinished.zarr", "sweep run runs/unfinished.zarr"),
         ("verify runs/small.zarr --sample 0", "sweep report runs/small.zarr"),
-        ("verify runs/unfinished.zarr --sample 0", "sweep run runs/unfinished.zarr"),
-        ("report runs/small.zarr", "sweep tradeoff runs/small.zarr"),
-        ("tradeoff runs/small.zarr --seconds 0.1", "sweep report runs/small.zarr"),
+        pytest.param(
+            "verify runs/unfinished.zarr --sample 0", "sweep run runs/unfinished.zarr",
+            marks=pytest.mark.long,
+        ),
+        pytest.param(
+            "report runs/small.zarr", "sweep tradeoff runs/small.zarr", marks=pytest.mark.long),
+        pytest.param(
+            "tradeoff runs/small.zarr --seconds 0.1", "sweep report runs/small.zarr",
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_every_command_ends_with_what_to_do_next(line, command, capsys):

@@ -81,6 +81,7 @@ def test_pooled_axes_are_named(require):
     assert "pooled over side_px" in out
 
 
+@pytest.mark.long
 def test_without_conditions_each_size_is_one_as_in_the_report(folder, require):
     code, out, _ = require("bare.zarr", "detection >= 0.45")
     assert code == 1

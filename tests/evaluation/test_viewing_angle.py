@@ -51,6 +51,7 @@ def test_all_scenes_have_it_also_those_that_cannot_be_seen(results):
     assert (results.detection == 5).any()
 
 
+@pytest.mark.long
 def test_tiny_and_straight_angles_keep_their_digits():
     tilt = np.array([1e-14, 1e-9, 1e-4, np.pi - 1e-9, np.pi])
     rotation = rotation_of_angles(tilt, 0.3, 0.0)

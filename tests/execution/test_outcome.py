@@ -103,6 +103,7 @@ def test_few_reasons_are_listed_and_the_others_counted():
     assert found.advice.count("--at") == 5
 
 
+@pytest.mark.long
 def test_solver_that_raises_on_every_scene_ends_with_status_1_and_one_command(tmp_path, capsys):
     path, url = tmp_path / "bad.toml", str(tmp_path / "bad.zarr")
     path.write_text(TEXT.replace('["ippe_square", "iterative"]', '["iterative"]').replace(

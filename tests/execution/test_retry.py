@@ -96,6 +96,7 @@ def test_what_fails_again_stays_as_it_was(pipeline, failed, copied, tmp_path, mo
         assert table.sizes["failure"] == 1
 
 
+@pytest.mark.long
 def test_retry_that_is_refused_leaves_the_store_as_it_was(pipeline, failed, copied, monkeypatch):
     free = FreeDisk(bytes=1, files=None)
     monkeypatch.setattr("sweep.execution.affordability.free_disk", lambda _: free)

@@ -220,6 +220,7 @@ def test_grown_grid_reuses_what_there_is_bit_for_bit(settings, undisturbed, tmp_
     assert sum(part["estimates"] for part in computed) == total - shared
 
 
+@pytest.mark.long
 def test_bound_is_reused_with_its_flag(tmp_path):
     text = """
         pose = { side_px = 30, jitter_px = 0.5 }
@@ -335,6 +336,7 @@ def test_silent_scheduler_is_given_up(pipeline, tmp_path, monkeypatch):
     assert not (tmp_path / "none.zarr").exists()
 
 
+@pytest.mark.long
 def test_json_is_one_object_and_progress_goes_elsewhere(tmp_path, monkeypatch, capsys):
     path = tmp_path / "small.toml"
     path.write_text(TEXT)
@@ -474,6 +476,7 @@ def test_task_of_a_replaced_store_writes_nothing(pipeline, tmp_path):
     assert committed(new) == set()
 
 
+@pytest.mark.long
 def test_damaged_receipts_are_told(pipeline, tmp_path):
     url = tmp_path / "damaged.zarr"
     by_hand(str(url), pipeline, (2, 4, 2, 3))
@@ -502,6 +505,7 @@ def test_cells_of_a_grid_without_scene_axes_are_reused(tmp_path):
     assert receipt.computed["estimates"] == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "text",
     [

@@ -64,6 +64,7 @@ def cells(zipped, apart):
             )
 
 
+@pytest.mark.long
 def test_cells_are_the_same_as_on_axes_of_their_own(zipped, apart):
     for ours, theirs in cells(zipped, apart):
         for name in ours.variables:

@@ -366,6 +366,7 @@ DOCUMENTS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("content", some(DOCUMENTS, {"deep list", "5 MB", "null"}))
 @pytest.mark.parametrize("key", ["zarr.json", "detection/zarr.json", MANIFEST, "cost/zarr.json"])
 def test_documents_of_something_else_are_borne(key, content, copied):
@@ -399,6 +400,7 @@ MANIFESTS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("content", MANIFESTS.values(), ids=MANIFESTS)
 def test_manifests_of_wrong_types_are_borne(content, copied):
     for key in (MANIFEST, COPY):
@@ -429,6 +431,7 @@ def test_manifest_names_no_file_outside(copied, tmp_path):
 WRONG = (None, "x", -1, [], 1 << 80, [None], {}, 1.5, [[[]]], {"scene": "x"}, [{}])
 
 
+@pytest.mark.long
 @lengths(1, len(WRONG))
 @pytest.mark.parametrize(
     "name",
@@ -496,6 +499,7 @@ LOCKS = (
 )
 
 
+@pytest.mark.long
 def test_locks_of_garbage_lock_nothing(copied, capsys):
     for content in LOCKS:
         (copied / "commits/receipt/lock.json").write_text(content)
@@ -572,6 +576,7 @@ def test_nothing_outside_is_deleted_when_a_store_is_closed(tmp_path):
     assert kept(outside) == before
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("here")
 def test_store_that_is_a_link_is_a_store(sound, copied, tmp_path):
     link = tmp_path / "link.zarr"
@@ -612,6 +617,7 @@ def fifo(path):
         path.unlink()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "key",
     ["zarr.json", MANIFEST, "detection/zarr.json", "detection/c/0/0", "trial/c/0",

@@ -323,6 +323,7 @@ def test_many_damages_at_once_are_named_and_mended(manner, sound, copied, here):
     see_repaired(copied, sound, wanted, here)
 
 
+@pytest.mark.long
 def test_both_manifests_can_be_lost_or_the_root_but_not_all_three(sound, copied, here):
     (copied / MANIFEST).unlink()
     (copied / COPY).write_bytes(b"{}")
@@ -373,6 +374,7 @@ def test_sound_chunks_in_wrong_places_and_edited_ones_are_named(sound, copied, h
     see_repaired(copied, sound, wanted, here)
 
 
+@pytest.mark.long
 def test_receipt_of_another_block_tells_of_that_block_alone(sound, copied, here):
     shutil.copy(copied / RECEIPT / "0", copied / RECEIPT / "1")
     found = named(verify(str(copied), 0))
@@ -382,6 +384,7 @@ def test_receipt_of_another_block_tells_of_that_block_alone(sound, copied, here)
     see_repaired(copied, sound, found, here)
 
 
+@pytest.mark.long
 def test_what_is_no_part_of_the_store_is_told_and_deleted(sound, copied, here):
     extra = [
         f"{RECEIPT}/6", f"{RECEIPT}/4000", f"{RECEIPT}/00", f"{RECEIPT}/x",
@@ -440,6 +443,7 @@ def test_forged_block_is_computed_again_and_no_other(sound, copied, here):
     see_repaired(copied, sound, {(damage.where, 0)}, here)
 
 
+@pytest.mark.long
 def test_attributes_and_coordinates_that_were_changed_are_named_and_mended(
     sound, copied, here
 ):
@@ -463,6 +467,7 @@ def test_attributes_and_coordinates_that_were_changed_are_named_and_mended(
         assert json.loads((copied / key).read_text()) == json.loads((sound / key).read_text())
 
 
+@pytest.mark.long
 def test_coordinates_and_attributes_are_checked_though_the_manifest_fits(sound, copied, here):
     zarr.open_array(f"{copied}/side_px", mode="r+")[1] = 61.0
     zarr.open_array(f"{copied}/xyz", mode="r+")[:] = np.array(["x", "z", "y"], dtype=object)
@@ -513,6 +518,7 @@ def test_unfinished_store_is_sound_and_goes_on_after_a_repair(pipeline, sound, t
     see_same(url, sound)
 
 
+@pytest.mark.long
 def test_deleted_receipt_of_an_unfinished_store_is_a_block_to_be_computed(pipeline, tmp_path):
     url = tmp_path / "begun.zarr"
     by_hand(str(url), pipeline, EXTENTS)

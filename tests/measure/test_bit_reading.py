@@ -371,6 +371,7 @@ def test_rates_below_two_pixels_a_module_are_predicted_within_a_tenth(
         assert measured[3] > 0.9
 
 
+@pytest.mark.long
 def test_predictions_that_were_written_down_are_the_models(page):
     sweeps, _ = page
     written = sweeps.written_down()

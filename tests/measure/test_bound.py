@@ -299,6 +299,7 @@ WHOLE_FRAME = {True: 0.01, False: 0.02}
 frame and for those cut by it. Measured over the long form: 0.0098 and 0.0131."""
 
 
+@pytest.mark.long
 @lengths(6, 300)
 def test_bound_lies_above_that_of_the_whole_frame_by_what_the_background_beyond_it_knows(count):
     worst = {True: 0.0, False: 0.0}
@@ -525,6 +526,7 @@ def test_mirror_distance_of_drawn_poses_is_that_of_independent_optima(count):
     assert near > count / 2
 
 
+@pytest.mark.long
 def test_mirror_distance_with_an_unknown_blur_is_that_of_an_independent_optimum():
     drawing = Drawing(scene(
         width_px=80, height_px=60, side_px=14.0, tilt_deg=45.0, azimuth_deg=35.0, roll_deg=17.0,

@@ -249,6 +249,7 @@ def test_facts_of_parameters_that_go_together_are_those_of_each_row():
     assert facts.hfov_deg == pytest.approx((2 * math.degrees(math.atan(0.64)),) * 2)
 
 
+@pytest.mark.long
 def test_run_report_and_dataset_name_the_camera(tmp_path, capsys):
     file, store = tmp_path / "p.toml", tmp_path / "p.zarr"
     file.write_text(

@@ -352,6 +352,7 @@ def test_the_numbers_are_those_of_one_configuration_by_plain_arithmetic(full, pa
     assert f'<span class="value">{number(medians[best])}\u00b0</span>' in page
 
 
+@pytest.mark.long
 def test_the_first_sentence_is_how_far_each_detector_detects(full, odd):
     results = open_dataset(full).load()
     detected = results["detection"] == DetectionStatus.detected
@@ -408,6 +409,7 @@ def test_the_best_configuration_is_named_with_those_that_are_indistinguishable_f
     assert unknown.endswith("indistinguishable from a.")
 
 
+@pytest.mark.long
 def test_long_axes_are_put_in_bins_that_hold_every_pose(tmp_path):
     data = opened(made(tmp_path, ODD["long axes"], "long"))
     grouping = data.along("side_px", 10)
@@ -420,6 +422,7 @@ def test_long_axes_are_put_in_bins_that_hold_every_pose(tmp_path):
     assert data.analysed(detection_rate, thinned)["marker_id"].values.tolist() == [0, 6, 12, 19, 25]
 
 
+@pytest.mark.long
 def test_bins_are_the_same_whether_a_store_is_loaded_or_read_in_pieces(full, monkeypatch):
     data, loaded = opened(full), opened(full).in_memory()
     assert loaded.results["estimate"].chunks is None
@@ -432,6 +435,7 @@ def test_bins_are_the_same_whether_a_store_is_loaded_or_read_in_pieces(full, mon
 
 # Scenes.
 
+@pytest.mark.long
 def test_scenes_are_those_with_the_smallest_and_largest_errors(full, monkeypatch):
     data = opened(full)
     results = data.results.load()
@@ -474,6 +478,7 @@ def test_a_scene_s_command_shows_it(full, tmp_path):
     assert out.splitlines()[0].endswith(": detected, solved")
 
 
+@pytest.mark.long
 def test_a_scene_that_differs_from_the_store_is_reported(full):
     data = opened(full)
     results = data.results.load()
@@ -565,6 +570,7 @@ def test_markdown_has_its_figures_beside_it_and_figures_go_where_they_are_asked(
             assert re.sub(r"\\.", "", line).count("|") >= 3
 
 
+@pytest.mark.long
 def test_the_figures_of_an_earlier_markdown_go_but_nothing_else_does(tmp_path):
     url = made(tmp_path, f"title = ' '\n{ODD['single pose']}", "one")
     output, folder = tmp_path / "answer.md", tmp_path / "answer_figures"

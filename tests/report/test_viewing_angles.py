@@ -1,5 +1,7 @@
 """A report groups by the viewing angle as it does by the tilt, and areas in the world vary."""
 
+import pytest
+
 import sweep
 from sweep.analysis import detection_limit
 from sweep.report.question import course_of
@@ -15,6 +17,7 @@ def made(tmp_path, pose, axes):
     return read_report_data(url)
 
 
+@pytest.mark.long
 def test_a_viewing_angle_is_an_angle_as_the_tilt_is(tmp_path):
     data = made(tmp_path, {"bearing_x_deg": 15},
                 {"view_angle_deg": [0, 60], "distance_m": [0.3, 0.6], "trial": 1})

@@ -122,6 +122,7 @@ def test_store_without_scene_axes_has_its_chunks(tmp_path):
     assert missing_chunks(store, [0]) == {0: "true_rvec/c/0"}
 
 
+@pytest.mark.long
 def test_store_that_is_moved_while_it_is_written_is_told_in_a_line(
     pipeline, finished, tmp_path
 ):

@@ -121,6 +121,7 @@ def test_nothing_committed_is_lost_and_the_same_store_comes_about(
     print(f"seed {SEED}: {len(instants)} instants of {total}; committed blocks: {sorted(seen)}")
 
 
+@pytest.mark.long
 def test_every_receipt_is_preceded_by_flushes_of_all_that_it_speaks_of(recorded):
     events = recorded[True].events
     for at in receipts_of(recorded[True]):

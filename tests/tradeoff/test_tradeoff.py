@@ -389,6 +389,7 @@ def test_what_is_no_finished_store_is_told_in_one_line(renderer_store, tmp_path)
     assert err.startswith("--per renderer: ")
 
 
+@pytest.mark.long
 def test_without_exact_images_renderers_are_not_compared(tmp_path):
     text = RENDERERS.replace('"exact", ', "").replace("trial = 12", "trial = 2")
     url = made(tmp_path, text, "inexact")

@@ -471,6 +471,7 @@ def test_credentials_in_a_store_name_are_refused_and_not_repeated(
 # --- schedulers that refuse ---
 
 
+@pytest.mark.long
 def test_tls_scheduler_that_refuses_is_told_in_a_line(certificates, tmp_path):
     ours, theirs = certificates["ours"], certificates["theirs"]
     pipeline = Pipeline.from_text(SMALL)

@@ -107,6 +107,7 @@ def test_retry_that_is_refused_leaves_the_store_as_it_was(pipeline, failed, copi
     assert len(status(copied).failures) == 2
 
 
+@pytest.mark.long
 def test_cells_that_failed_are_not_reused(pipeline, clean, failed, tmp_path):
     url = str(tmp_path / "grown.zarr")
     with calls_here():

@@ -19,7 +19,7 @@ import pytest
 import zarr
 
 import sweep
-from support.lengths import lengths
+from support.lengths import first_of, lengths
 from support.store_files import COPY, MANIFEST, arrays, edit_receipt, files, reseal, see_same
 from support.stores import by_hand
 from sweep.cli import main
@@ -472,8 +472,9 @@ def test_failures_of_wrong_kinds_are_borne_and_steer_no_terminal(wrong, copied, 
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", "7", "null", "[" * 100_000, '{"a":' * 100_000, "x" * 5_000_000],
-    ids=["empty", "torn", "7", "null", "deep list", "deep object", "5 MB"],
+    "text",
+    first_of(["{", "[" * 100_000, "", "7", "null", '{"a":' * 100_000, "x" * 5_000_000], 2),
+    ids=["torn", "deep list", "empty", "7", "null", "deep object", "5 MB"],
 )
 def test_receipts_of_something_else_are_told(text, copied, capsys):
     edit_receipt(copied, 0, lambda _: text)
@@ -642,7 +643,7 @@ HUGE = {
 """File -> what `sweep.open` says if it is larger than it can be; None: it opens."""
 
 
-@pytest.mark.parametrize("key", HUGE)
+@pytest.mark.parametrize("key", first_of(HUGE, 3))
 def test_file_that_is_larger_than_it_can_be_is_damaged_and_not_read(key, copied, tmp_path, capsys):
     (copied / key).touch()
     os.truncate(copied / key, HUGE_BYTES)

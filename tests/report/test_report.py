@@ -537,6 +537,7 @@ def small_trade():
                       {"side_px": [14.0, 40.0], "treatment": np.array(names, dtype=object)})
 
 
+@pytest.mark.long
 def test_a_trade_is_shown_where_the_store_has_one(odd, tmp_path):
     url = shutil.copytree(odd("no draws"), str(tmp_path / "trade.zarr"))
     write_group(open_store(url, "r+"), "cost/tradeoff", small_trade())

@@ -10,3 +10,11 @@ def lengths(short, full):
         [pytest.param(short, id=str(short)),
          pytest.param(full, id=str(full), marks=pytest.mark.long)],
     )
+
+
+def first_of(cases, count):
+    """Return cases for parametrisation, of which the first ``count`` are tried by default."""
+    return [
+        pytest.param(case, marks=() if number < count else pytest.mark.long)
+        for number, case in enumerate(cases)
+    ]

@@ -23,10 +23,12 @@ from sweep.analysis.rates import detection_rate, failure_composition, flip_rate
 from sweep.analysis.renderers import renderer_bias
 from sweep.analysis.requirements import check_requirements
 from sweep.analysis.searched_limits import requirement_limits
+from sweep.analysis.simulation_gaps import simulation_gap
 
 __all__ = [
     "ambiguity", "check_requirements", "compare", "covariance_trust", "detection_limit",
     "detection_rate", "efficiency", "environment_differences", "error_models", "error_statistics",
     "failure_composition", "farthest_met", "flip_rate", "marker_ranking", "model_covariance",
     "model_errors", "precision_reached", "renderer_bias", "requirement_limits",
+    "simulation_gap",
 ]

@@ -21,7 +21,7 @@ from sweep.analysis.binning import Binning, Bins, read_bins
 from sweep.analysis.dimensions import is_fixed, is_sampling_stopped, of_photographs
 from sweep.analysis.graph import ChunkReader, ReadBlock, TaskLayer, add_pass, array_of_blocks
 from sweep.analysis.layout import Arrays, Layout, Lengths
-from sweep.analysis.photograph_rates import by_photograph
+from sweep.analysis.photograph_statistics import by_photograph
 from sweep.analysis.pose_view import COMMON
 from sweep.analysis.replicates import replicate_order, replicated
 from sweep.analysis.states import BlockState, Nothing, State

@@ -6,38 +6,21 @@ draws: that of which a rate would vary as it does between photographs.
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import NamedTuple
 
 import numpy as np
 from scipy import special
 
 from sweep.analysis.counts import BlockRateState, Rate, RateState
-from sweep.analysis.flip_mixture import FlipMixture
 from sweep.analysis.groups import sum_of_settings
+from sweep.analysis.intervals import LEVEL
 from sweep.analysis.states import BlockSample
-from sweep.analysis.statistic import OVER_ALL, Statistic, ViewT
+from sweep.analysis.statistic import OVER_ALL, ViewT
 from sweep.typing import Floats, Integers
 
 MIN_SPREAD = 5
 """Photographs with the rarer outcome from which the spread between photographs is estimated."""
-
-
-def by_photograph(statistic: Statistic[ViewT, Any, Any, Any]) -> Statistic[ViewT, Any, Any, Any]:
-    """Return a statistic as it is computed of photographs."""
-    if isinstance(statistic, Rate):
-        return _rate(statistic)
-    if isinstance(statistic, FlipMixture):
-        mixture = dataclasses.replace(statistic, flips=_rate(statistic.flips))
-        return cast("Statistic[ViewT, Any, Any, Any]", mixture)
-    return statistic
-
-
-def _rate(rate: Rate[ViewT]) -> PhotographRate[ViewT]:
-    return PhotographRate(**{
-        field.name: getattr(rate, field.name) for field in dataclasses.fields(Rate)
-    })
 
 
 @dataclass(frozen=True)
@@ -105,16 +88,53 @@ class PhotographRate(Rate[ViewT]):
         """Return the number of independent draws that the rate is worth."""
         if not isinstance(state, PhotographRateState):
             raise TypeError(state)
-        n, hits = state.sample.n.astype(np.float64), state.hits.astype(np.float64)
-        m = state.with_any.astype(np.float64)
-        tail = (1.0 - self.level) / 2.0
+        sums = PhotographSums(
+            state.sample.n, state.hits, state.hits_hits, state.hits_used, state.used_used,
+            state.with_any, state.with_hits, state.with_misses, state.sample.draws,
+        )
+        return np.asarray(np.floor(sums.worth(self.level) * (1.0 + 1e-12)), dtype=np.int64)
+
+
+class PhotographSums(NamedTuple):
+    """Sums over photographs, each (groups,), as of :class:`PhotographRateState`.
+
+    ``used`` is the number of markers, ``draws`` Kish's effective number of photographs
+    (`sweep.analysis.states.Sample.draws`).
+    """
+
+    used: Integers
+    hits: Integers
+    hits_hits: Floats
+    hits_used: Floats
+    used_used: Floats
+    with_any: Integers
+    with_hits: Integers
+    with_misses: Integers
+    draws: Integers
+
+    @staticmethod
+    def of(hits: Integers, used: Integers) -> PhotographSums:
+        """Return the sums of successes and markers of photographs (groups, photographs)."""
+        h, n = hits.astype(np.float64), used.astype(np.float64)
+        squares = (n * n).sum(axis=1)
+        return PhotographSums(
+            used.sum(axis=1), hits.sum(axis=1), (h * h).sum(axis=1), (h * n).sum(axis=1), squares,
+            (used > 0).sum(axis=1), (hits > 0).sum(axis=1), (used > hits).sum(axis=1),
+            np.floor(n.sum(axis=1) ** 2 / np.maximum(squares, 1.0)).astype(np.int64),
+        )
+
+    def worth(self, level: float = LEVEL) -> Floats:
+        """Return the number of independent draws that a rate is worth, (groups,)."""
+        n, hits, m = (
+            each.astype(np.float64) for each in (self.used, self.hits, self.with_any)
+        )
+        tail = (1.0 - level) / 2.0
         with np.errstate(all="ignore"):
             shrink = (special.ndtri(tail) / special.stdtrit(np.maximum(m - 1, 1), tail)) ** 2
             rate = hits / n
-            squares = state.hits_hits - 2.0 * rate * state.hits_used + rate**2 * state.used_used
+            squares = self.hits_hits - 2.0 * rate * self.hits_used + rate**2 * self.used_used
             variance = squares * m / (m - 1.0) / n**2
             worth = np.fmin(shrink * rate * (1.0 - rate) / variance, n)
-            few = np.minimum(state.with_hits, state.with_misses) < MIN_SPREAD
-            worth = np.where(few, np.fmin(worth, state.sample.draws), worth)
-        worth = np.where(n > 0, np.maximum(np.nan_to_num(worth, nan=1.0), 1.0), 0.0)
-        return np.asarray(np.floor(worth * (1.0 + 1e-12)), dtype=np.int64)
+            few = np.minimum(self.with_hits, self.with_misses) < MIN_SPREAD
+            worth = np.where(few, np.fmin(worth, self.draws), worth)
+        return np.where(n > 0, np.maximum(np.nan_to_num(worth, nan=1.0), 1.0), 0.0)

@@ -1,0 +1,274 @@
+"""Photographs against simulations: NumPy's and SciPy's numbers, pairing, coverage of intervals."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy import stats
+
+from sweep.analysis import detection_rate, error_statistics, flip_rate, simulation_gap
+from sweep.analysis.photograph_quantiles import quantile_ends, quantile_of
+from sweep.analysis.resampling import percentile_interval, resampled_quantiles, unit_counts
+from sweep.errors import ArgumentError, DatasetError
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+
+PHOTOGRAPHS, MARKERS = 12, 9
+REFINEMENTS = ["none", "subpix"]
+
+
+def dataset(rng, trials=PHOTOGRAPHS, *, simulated=None, files=None, scale=1.0, spread=0.5):
+    """Return results of photographs, of their twins, or of a simulation (``files`` is False)."""
+    shape = (trials, MARKERS, len(REFINEMENTS))
+    dims = ("trial", "marker_id", "cornerRefinementMethod")
+    own = np.exp(rng.normal(0.0, spread, (trials, 1, 1)))
+    angle = scale * own * rng.chisquare(3, shape) / 100
+    depth = scale * (own - 0.5 + rng.normal(0.0, 1.0, shape)) / 100
+    flags = np.where(rng.random(shape) < 0.15, DetectionStatus.no_candidate,
+                     DetectionStatus.detected)
+    flags[:, 0] = DetectionStatus.not_in_photograph
+    detected = flags == DetectionStatus.detected
+    solved = np.where(detected, EstimateStatus.solved, EstimateStatus.no_detection)
+    flipped = np.where(rng.random(shape) < 0.2, Flipped.flipped, Flipped.not_flipped)
+    zero = np.zeros(shape)
+    position = np.zeros((trials, MARKERS, 3))
+    position[..., 2] = 2.0
+    sides = np.broadcast_to(20.0 + 5 * np.arange(MARKERS), shape[:2])
+    found = xr.Dataset(
+        {
+            "detection": (dims, flags.astype(np.uint8)),
+            "estimate": (dims, solved.astype(np.uint8)),
+            "flipped": (dims, np.where(detected, flipped, Flipped.no_estimate).astype(np.uint8)),
+            "rotation_error_rad": (
+                (*dims, "xyz"),
+                np.where(detected[..., None], np.stack([zero, angle, zero], axis=-1), np.nan),
+            ),
+            "translation_error_m": (
+                (*dims, "xyz"),
+                np.where(detected[..., None], np.stack([zero, zero, 2 * depth], axis=-1), np.nan),
+            ),
+            "true_tvec_m": (("trial", "marker_id", "xyz"), position),
+            "true_rvec": (("trial", "marker_id", "xyz"), position),
+            "side_px": (("trial", "marker_id"), sides),
+        },
+        {"trial": range(trials), "marker_id": range(MARKERS),
+         "cornerRefinementMethod": REFINEMENTS},
+    )
+    if files is False:
+        return found
+    names = files or [f"{k}.png" for k in range(trials)]
+    found = found.assign_coords(
+        photographs="shots.photographs.npz", photograph=("trial", names),
+        sha256=("trial", [f"digest of {name}" for name in names]),
+    )
+    return found if simulated is None else found.assign_coords(simulated=simulated)
+
+
+def twins(rng, repeats=1, **options):
+    names = [f"{k}.png" for k in range(PHOTOGRAPHS)] * repeats
+    return dataset(rng, PHOTOGRAPHS * repeats, simulated=True, files=names, **options)
+
+
+def errors(results, name, refinement):
+    """Return the errors of the solved poses as NumPy has them: rotation in deg, depth in %."""
+    each = results.sel(cornerRefinementMethod=refinement)
+    solved = each.estimate.values == EstimateStatus.solved
+    if name.startswith("rotation"):
+        return np.degrees(np.linalg.norm(each.rotation_error_rad.values, axis=-1))[solved]
+    depth = 100 * (each.translation_error_m / each.true_tvec_m).values[..., 2][solved]
+    return depth if "bias" in name else np.abs(depth)
+
+
+def test_values_are_numpys_and_gaps_their_differences_and_ratios():
+    rng = np.random.default_rng(1)
+    first, second = dataset(rng), twins(rng, repeats=2, scale=0.7)
+    gap = simulation_gap(first, second)
+    assert gap.attrs["paired"] == 1
+    for refinement in REFINEMENTS:
+        at = gap.sel(cornerRefinementMethod=refinement)
+        for name, share, ratio in (
+            ("range_bias_percent", 0.5, False), ("rotation_median_deg", 0.5, True),
+            ("rotation_p90_deg", 0.9, True), ("range_median_percent", 0.5, True),
+            ("range_p90_percent", 0.9, True),
+        ):
+            real, simulated = (
+                np.quantile(errors(each, name, refinement), share, method="inverted_cdf")
+                for each in (first, second)
+            )
+            assert at[name].values == pytest.approx([real, simulated])
+            expected = simulated / real if ratio else simulated - real
+            assert at[f"{name}_gap"].item() == pytest.approx(expected)
+            assert at[f"{name}_gap_low"] < expected < at[f"{name}_gap_high"]
+    for k, results in enumerate((first, second)):
+        looked_for = (results.detection != DetectionStatus.not_in_photograph)
+        assert (gap.looked_for[k] == looked_for.sum(["trial", "marker_id"])).all()
+    assert (gap.units == PHOTOGRAPHS).all()
+
+
+def test_rates_are_those_of_the_photographs_alone_and_their_difference_newcombes():
+    rng = np.random.default_rng(2)
+    first, second = dataset(rng), twins(rng)
+    gap = simulation_gap(first, second)
+    tables = [detection_rate(each, per="cornerRefinementMethod") for each in (first, second)]
+    tables = [
+        table.merge(flip_rate(each, per="cornerRefinementMethod"), compat="override")
+        for table, each in zip(tables, (first, second), strict=True)
+    ]
+    for name in ("detection_rate", "flip_rate"):
+        for end in ("", "_low", "_high"):
+            both = np.stack([table[f"{name}{end}"].values for table in tables])
+            assert np.array_equal(gap[f"{name}{end}"].values, both)
+        rate, low, high = (
+            np.stack([table[f"{name}{end}"].values for table in tables])
+            for end in ("", "_low", "_high")
+        )
+        reach = np.sqrt((rate[1] - low[1]) ** 2 + (high[0] - rate[0]) ** 2)
+        assert np.allclose(gap[f"{name}_gap_low"], rate[1] - rate[0] - reach)
+
+
+def test_twins_are_paired_by_their_photographs():
+    rng = np.random.default_rng(3)
+    first = dataset(rng)
+    same = first.assign_coords(simulated=True)
+    shuffled = same.isel(trial=rng.permutation(PHOTOGRAPHS))
+    for second in (same, shuffled.assign_coords(trial=range(PHOTOGRAPHS))):
+        gap = simulation_gap(first, second)
+        for name in ("rotation_median_deg", "range_p90_percent"):
+            for end in ("", "_low", "_high"):
+                assert (gap[f"{name}_gap{end}"] == 1).all()
+        assert (gap.range_bias_percent_gap_high == 0).all()
+    # Of half of the photographs, the other half is not compared.
+    half = simulation_gap(first, same.isel(trial=range(0, PHOTOGRAPHS, 2)))
+    assert (half.units == PHOTOGRAPHS // 2).all()
+    assert (half.looked_for[0] == half.looked_for[1]).all()
+
+
+def test_another_simulation_is_compared_in_bins():
+    rng = np.random.default_rng(4)
+    first = dataset(rng)
+    scenes = dataset(rng, 40, files=False).isel(cornerRefinementMethod=1)
+    edges = [20, 35, 50]
+    gap = simulation_gap(first, scenes, bins={"side_px": edges})
+    assert gap.attrs["paired"] == 0
+    assert gap.rotation_median_deg.dims == ("source", "cornerRefinementMethod", "side_px")
+    assert gap.cornerRefinementMethod.values.tolist() == ["subpix"]
+    inside = (first.side_px >= 35) & (first.side_px < 50)
+    expected = np.median(errors(first.where(inside), "rotation", "subpix"))
+    found = gap.rotation_median_deg.sel(source="photographs")[0, 1].item()
+    assert found == pytest.approx(expected, rel=0.1)
+    assert simulation_gap(first, scenes).side_px_low.values[0] <= 20
+
+
+def test_axes_that_twins_alone_have_are_kept():
+    rng = np.random.default_rng(5)
+    first = dataset(rng)
+    second = xr.concat([twins(rng, scale=s) for s in (0.3, 1.0)], dim="blur_px").assign_coords(
+        blur_px=("blur_px", [0.3, 1.0], {"units": "px"}))
+    gap = simulation_gap(first, second)
+    assert gap.rotation_median_deg.dims == ("source", "cornerRefinementMethod", "blur_px")
+    real, simulated = gap.rotation_median_deg
+    assert (real[:, 0] == real[:, 1]).all()
+    assert (simulated[:, 0] < simulated[:, 1]).all()
+
+
+def test_faults_are_one_line():
+    rng = np.random.default_rng(6)
+    first, second = dataset(rng), twins(rng)
+    simulation = dataset(rng, files=False)
+    with pytest.raises(DatasetError, match="expected photographs"):
+        simulation_gap(simulation, first)
+    with pytest.raises(DatasetError, match="expected photographs"):
+        simulation_gap(second, first)
+    other = twins(rng).assign_coords(sha256=("trial", ["another"] * PHOTOGRAPHS))
+    with pytest.raises(DatasetError, match="twin of other photographs"):
+        simulation_gap(first, other)
+    unlike = second.assign_coords(cornerRefinementMethod=["contour", "apriltag"])
+    with pytest.raises(DatasetError, match="no common cornerRefinementMethod"):
+        simulation_gap(first, unlike)
+    with pytest.raises(ArgumentError, match="increasing edges"):
+        simulation_gap(first, simulation, bins={"side_px": [3]})
+    with pytest.raises(DatasetError, match="both datasets need it"):
+        simulation_gap(first.assign(sharpness=first.side_px), simulation,
+                       bins={"sharpness": [1, 2]})
+
+
+def test_few_photographs_have_values_without_intervals():
+    rng = np.random.default_rng(7)
+    first, second = dataset(rng, 3), twins(rng)
+    gap = simulation_gap(first, second)
+    assert np.isfinite(gap.rotation_median_deg).all()
+    assert np.isnan(gap.rotation_median_deg_gap_low).all()
+
+
+def test_resampled_quantiles_are_scipys():
+    rng = np.random.default_rng(8)
+    values = rng.normal(size=200)
+    scipys = stats.bootstrap(
+        (values,), lambda x, axis: np.quantile(x, 0.9, axis=axis, method="inverted_cdf"),
+        n_resamples=20_000, method="percentile", rng=rng,
+    ).bootstrap_distribution
+    used = np.ones((200, 1), dtype=bool)
+    for counts in (unit_counts(200), None):
+        ours = resampled_quantiles(values[:, None], used, counts, 0.9)
+        # Of 1,000 and 20,000 replicates: the critical value at an error probability of 1e-4.
+        assert stats.ks_2samp(ours, scipys).pvalue > 1e-4
+    assert quantile_of(np.sort(values), 0.9) == np.quantile(values, 0.9, method="inverted_cdf")
+
+
+def test_intervals_of_independent_values_are_clopper_and_pearsons_order_statistics():
+    rng = np.random.default_rng(10)
+    values = rng.normal(size=400)
+    low, high = quantile_ends(values, np.arange(400), 0.9)
+    # 400 photographs of one marker each: Student's quantile in the place of the normal one.
+    draws = 400 * (stats.norm.ppf(0.975) / stats.t.ppf(0.975, 399)) ** 2 * 399 / 400
+    shares = (stats.beta.ppf(0.025, 0.9 * draws, 0.1 * draws + 1),
+              stats.beta.ppf(0.975, 0.9 * draws + 1, 0.1 * draws))
+    ascending = np.sort(values)
+    assert low == ascending[int(np.ceil(shares[0] * 400)) - 1]
+    assert high == ascending[int(np.floor(shares[1] * 400))]
+
+
+@pytest.mark.parametrize("chunks", [None, 1, 5])
+def test_quantiles_by_photograph_do_not_depend_on_chunks(chunks):
+    rng = np.random.default_rng(11)
+    results = dataset(rng, 20)
+    lazy = results if chunks is None else results.chunk(trial=chunks)
+    table = error_statistics(lazy, per="cornerRefinementMethod", quantities=["rotation"]).compute()
+    for k, refinement in enumerate(REFINEMENTS):
+        flags = results.detection.sel(cornerRefinementMethod=refinement).values
+        each = results.rotation_error_rad.sel(cornerRefinementMethod=refinement).values
+        error = np.nan_to_num(np.degrees(np.linalg.norm(each, axis=-1)), nan=np.inf)
+        counted = flags != DetectionStatus.not_in_photograph
+        numbers = np.nonzero(counted)[0]
+        for name, share in (("median", 0.5), ("p95", 0.95)):
+            value = table[f"rotation_{name}_deg"][k].item()
+            assert value == np.quantile(error[counted], share, method="inverted_cdf")
+            ends = quantile_ends(error[counted], numbers, share)
+            assert table[f"rotation_{name}_deg_low"][k].item() == ends[0]
+            assert table[f"rotation_{name}_deg_high"][k].item() == pytest.approx(ends[1])
+    binned = error_statistics(lazy, bins={"side_px": [20, 40, 70]}, quantities=["rotation"])
+    whole = error_statistics(results, bins={"side_px": [20, 40, 70]}, quantities=["rotation"])
+    assert np.array_equal(binned.rotation_p95_deg_low, whole.rotation_p95_deg_low, equal_nan=True)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("photographs", [13, 22])
+@pytest.mark.parametrize(("share", "correlation"), [(0.5, 0.1), (0.5, 0.5), (0.9, 0.1), (0.9, 0.5)])
+def test_intervals_hold_what_is_true(photographs, share, correlation):
+    """Values of one photograph are correlated, as those of real ones; twins are like them."""
+    rng = np.random.default_rng(9)
+    draws, rows = 1000, 25
+    own, other = np.sqrt(correlation), np.sqrt(1 - correlation)
+    true = stats.norm.ppf(share)
+    counts, used = unit_counts(photographs), np.ones((photographs, rows), dtype=bool)
+    numbers = np.nonzero(used)[0]
+    covered = np.zeros(2)
+    for _ in range(draws):
+        common = own * rng.normal(size=(photographs, 1))
+        real, twin = (common + other * rng.normal(size=(photographs, rows)) for _ in range(2))
+        low, high = quantile_ends(real.ravel(), numbers, share)
+        covered[0] += low <= true <= high
+        gaps = [resampled_quantiles(values, used, counts, share) for values in (real, twin)]
+        low, high = percentile_interval(gaps[1] - gaps[0], photographs)
+        covered[1] += low <= 0 <= high
+    print(f"{photographs} photographs, correlation {correlation}, quantile {share}: coverage "
+          f"{covered[0] / draws:.3f}, of the difference to twins {covered[1] / draws:.3f}")
+    assert (covered / draws > (0.90, 0.93)).all()

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from sweep.analysis.aggregate import aggregate
 from sweep.analysis.binning import Bins
 from sweep.analysis.counts import Count, Rate, scaled_to_draws
+from sweep.analysis.described import describes
 from sweep.analysis.dimensions import (
     as_names,
     configuration_axes,
@@ -31,7 +32,6 @@ from sweep.analysis.statistic import Statistic
 from sweep.analysis.stopped_sampling import TAIL_SHARE
 from sweep.errors import ArgumentError
 from sweep.measure.flags import Flag, flag
-from sweep.plan.attributes import describes
 from sweep.plan.schema import cf_attributes
 from sweep.typing import Floats, Integers, Masks
 

@@ -10,12 +10,12 @@ import xarray as xr
 
 from sweep.analysis.aggregate import aggregate
 from sweep.analysis.binning import Bins
+from sweep.analysis.described import describes
 from sweep.analysis.dimensions import kept_dimensions
 from sweep.analysis.means import RootMeanSquare
 from sweep.analysis.pose_view import DEPTH, ERROR_INPUTS, Poses, norm_squared, pose_arrays, relative
 from sweep.analysis.quantities import QUANTITIES, Quantity
 from sweep.analysis.statistic import Output
-from sweep.plan.attributes import describes
 from sweep.plan.schema import XYZ
 from sweep.typing import Floats, Masks
 

@@ -11,6 +11,7 @@ import xarray as xr
 from sweep.analysis.aggregate import aggregate
 from sweep.analysis.binning import Bins
 from sweep.analysis.counts import Count, CountOfDraws
+from sweep.analysis.described import describes
 from sweep.analysis.dimensions import DRAWS, is_sampling_stopped, kept_dimensions
 from sweep.analysis.intervals import LEVEL
 from sweep.analysis.means import Mean, RootMeanSquareRatio
@@ -20,7 +21,6 @@ from sweep.analysis.pose_view import ERROR_INPUTS, Poses, norm_squared, pose_arr
 from sweep.analysis.quantities import QUANTITIES, Quantity
 from sweep.analysis.statistic import Statistic
 from sweep.analysis.stopped_sampling import stopped_level
-from sweep.plan.attributes import describes
 from sweep.typing import Floats, Masks
 
 PairStatistic = Statistic[Pair, Any, Any, Any]

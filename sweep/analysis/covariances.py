@@ -11,6 +11,7 @@ from scipy import special
 
 from sweep.analysis.aggregate import aggregate
 from sweep.analysis.counts import Rate
+from sweep.analysis.described import describes
 from sweep.analysis.dimensions import axes_of, kept_dimensions
 from sweep.analysis.intervals import LEVEL
 from sweep.analysis.means import PositiveMean
@@ -18,7 +19,6 @@ from sweep.analysis.pose_view import ESTIMATE_INPUTS, Poses, pose_arrays
 from sweep.analysis.registry import PoseStatistic
 from sweep.analysis.statistic import Statistic
 from sweep.errors import ArgumentError
-from sweep.plan.attributes import describes
 from sweep.plan.schema import POSE_PARAMETERS
 from sweep.typing import Floats, Masks
 

@@ -11,6 +11,7 @@ import xarray as xr
 
 from sweep.analysis.binning import Bins
 from sweep.analysis.counts import scaled_to_draws
+from sweep.analysis.described import describes
 from sweep.analysis.dimensions import (
     DRAWS,
     as_names,
@@ -27,7 +28,6 @@ from sweep.analysis.stored_parameters import parameter_value
 from sweep.errors import ArgumentError
 from sweep.measure.flags import Flag, flag
 from sweep.model.marker import module_count
-from sweep.plan.attributes import describes
 from sweep.plan.schema import cf_attributes
 from sweep.typing import Floats, Integers, Masks
 

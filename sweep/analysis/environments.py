@@ -10,13 +10,13 @@ import xarray as xr
 
 from sweep.analysis.aggregate import aggregate
 from sweep.analysis.counts import Count, Rate
+from sweep.analysis.described import describes
 from sweep.analysis.dimensions import axes_of, require_dimension
 from sweep.analysis.pose_pairs import Pair, paired_arrays
 from sweep.analysis.pose_shifts import CORNERS, corner_shift, pose_shifts
 from sweep.analysis.pose_view import DETECTION_INPUTS, ERROR_INPUTS, pose_arrays
 from sweep.errors import ArgumentError
 from sweep.measure.flags import DetectionStatus
-from sweep.plan.attributes import describes
 from sweep.plan.parameters import Stage
 from sweep.typing import Masks
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from sweep.analysis.described import with_sampling
 from sweep.analysis.dimensions import DRAWS, axes_of, is_grid_axis, kept_dimensions
 from sweep.analysis.error_model_bins import PREDICTORS, bins_and_cells, focal_size_of, knot_values
 from sweep.analysis.error_model_fit import (
@@ -178,10 +179,10 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
             coordinates[f"cell_{name}_{ending}"] = (f"cell_{name}", ends, {
                 "units": UNITS[name], "long_name": f"{ending} end of cells of {WORDS[name]}"})
     focal = focal_size.astype(np.float64)
-    return xr.Dataset(table, coordinates, attrs={
+    return with_sampling(xr.Dataset(table, coordinates, attrs={
         "focal_size_px_m": float(focal.mean()),
         "focal_size_varies": int(float(focal.max()) > float(focal.min()) * (1 + 1e-9)),
-    } | _extent(results))
+    } | _extent(results)), results)
 
 
 UNITS = {"distance_m": "m", "side_px": "px", "viewing_angle_deg": "degree"}

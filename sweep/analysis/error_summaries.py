@@ -9,10 +9,10 @@ import xarray as xr
 from sweep.analysis import registry
 from sweep.analysis.aggregate import aggregate
 from sweep.analysis.binning import Bins
+from sweep.analysis.described import describes
 from sweep.analysis.dimensions import kept_dimensions
 from sweep.analysis.pose_view import Poses, pose_arrays
 from sweep.analysis.quantities import chosen_quantities
-from sweep.plan.attributes import describes
 
 
 @describes

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from sweep.analysis.described import describes
 from sweep.analysis.dimensions import DRAWS, as_names, axes_of, configuration_axes
 from sweep.analysis.image_sides import image_sides
 from sweep.analysis.requirements import (
@@ -20,7 +21,6 @@ from sweep.analysis.requirements import (
 )
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import Flag, flag
-from sweep.plan.attributes import describes
 from sweep.plan.schema import cf_attributes
 
 

@@ -10,6 +10,7 @@ import xarray as xr
 
 from sweep.analysis.aggregate import aggregate
 from sweep.analysis.counts import Count
+from sweep.analysis.described import describes
 from sweep.analysis.dimensions import (
     as_names,
     configuration_axes,
@@ -25,7 +26,6 @@ from sweep.analysis.half_widths import (
 from sweep.analysis.pose_view import Poses
 from sweep.analysis.requirable import requirable_arrays
 from sweep.errors import ArgumentError, SweepError
-from sweep.plan.attributes import describes
 from sweep.plan.precision_rule import PrecisionRule
 from sweep.plan.schema import cf_attributes
 

@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 from scipy import special, stats
 
+from sweep.analysis.described import describes
 from sweep.analysis.dimensions import (
     DRAWS,
     as_names,
@@ -20,7 +21,6 @@ from sweep.analysis.rates import detection_rate
 from sweep.analysis.replicates import is_replicated
 from sweep.analysis.stopped_sampling import with_common_trials
 from sweep.errors import ArgumentError
-from sweep.plan.attributes import describes
 from sweep.typing import Floats
 
 SIGNIFICANCE = 0.05

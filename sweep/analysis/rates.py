@@ -12,10 +12,10 @@ import xarray as xr
 from sweep.analysis.aggregate import aggregate
 from sweep.analysis.binning import Bins
 from sweep.analysis.counts import Rate
+from sweep.analysis.described import describes
 from sweep.analysis.dimensions import kept_dimensions
 from sweep.analysis.pose_view import DETECTION_INPUTS, ESTIMATE_INPUTS, Poses, pose_arrays
 from sweep.measure.flags import DetectionStatus, EstimateStatus, outcomes
-from sweep.plan.attributes import describes
 from sweep.typing import Masks
 
 

@@ -25,6 +25,7 @@ import xarray as xr
 from sweep.analysis.aggregate import aggregate
 from sweep.analysis.binning import Bins
 from sweep.analysis.counts import Count
+from sweep.analysis.described import describes
 from sweep.analysis.dimensions import DRAWS, as_names, configuration_axes, kept_dimensions
 from sweep.analysis.draws_needed import draws_needed
 from sweep.analysis.pose_view import Poses
@@ -34,7 +35,6 @@ from sweep.analysis.requirement_faults import Side, contradictions, fault_of, na
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import Flag, flag
 from sweep.messages import plain
-from sweep.plan.attributes import describes
 from sweep.plan.requirement_text import read_requirement
 from sweep.plan.schema import cf_attributes
 

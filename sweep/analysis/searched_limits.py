@@ -7,13 +7,13 @@ from collections.abc import Sequence
 
 import xarray as xr
 
+from sweep.analysis.described import describes
 from sweep.analysis.dimensions import DRAWS, axes_of, configuration_axes, stored_pipeline
 from sweep.analysis.farthest import farthest_met
 from sweep.analysis.repeated_looks import looks_factor
 from sweep.analysis.requirements import ErrorShares
 from sweep.analysis.stopped_sampling import computed_scenes
 from sweep.errors import ArgumentError, SweepError
-from sweep.plan.attributes import describes
 from sweep.plan.limit_rule import LimitRule
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis.binning import Bins
+from sweep.analysis.described import describes
 from sweep.analysis.paired_units import PairedUnits, Units, paired_units
 from sweep.analysis.photograph_quantiles import quantile_ends, quantile_of
 from sweep.analysis.photograph_rates import PhotographRate
@@ -19,7 +20,6 @@ from sweep.analysis.resampling import (
     resampled_quantiles,
     unit_counts,
 )
-from sweep.plan.attributes import describes
 from sweep.plan.schema import cf_attributes
 from sweep.typing import Floats, Masks
 

@@ -6,15 +6,12 @@ So ``long_name`` is the variable's name in words, and ``description`` says what 
 
 from __future__ import annotations
 
-import functools
 import re
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, ParamSpec
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import xarray as xr
-
-P = ParamSpec("P")
 
 UNIT = re.compile(r"_(m_s|deg_s|deg|rad|percent|px|mm|um|ms|m|s|e|grey|modules)$")
 """The unit at the end of a name."""
@@ -72,13 +69,4 @@ def with_descriptions(dataset: xr.Dataset) -> xr.Dataset:
     described = dataset.copy(deep=False)
     for name, variable in described.variables.items():
         variable.attrs = with_description(str(name), variable.attrs)
-    return described
-
-
-def describes(analysis: Callable[P, xr.Dataset]) -> Callable[P, xr.Dataset]:
-    """Return an analysis whose result has short names, by `with_descriptions`."""
-    @functools.wraps(analysis)
-    def described(*args: P.args, **kwargs: P.kwargs) -> xr.Dataset:
-        return with_descriptions(analysis(*args, **kwargs))
-
     return described

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from sweep.analysis.described import sampling_text
 from sweep.messages import label
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.camera_facts import camera_facts, notes
@@ -62,6 +63,7 @@ def provenance(data: ReportData, output: str) -> Provenance:
         "Store": data.store,
         "Camera": "; ".join([camera_facts(data.pipeline).line(), *notes(data.pipeline)]),
         "Run": _dates(data.run_metadata),
+        **({"Sampling": sampling} if (sampling := sampling_text(data.results)) else {}),
         "Versions": versions,
         **({"Environments": "; ".join(
             f"{name}: {what}" for name, what in fingerprint["environments"].items()

@@ -108,6 +108,15 @@ def test_what_is_pooled_is_pooled_over_the_trials_that_all_have(stopped, full):
     assert abs(plain - detection_rate(stopped).detection_rate) > 0.05  # the trap
 
 
+def test_tables_say_which_rule_stopped_the_sampling(stopped, full):
+    expected = "stopped by [precision]: detection_rate = 0.08, max_trials = 200"
+    for table in (detection_rate(stopped, ["side_px"]), error_statistics(stopped),
+                  precision_reached(stopped), compare(full, stopped), marker_ranking(
+                      stopped.expand_dims(marker_id=[1, 2]))):
+        assert table.attrs["sampling"] == expected
+    assert "sampling" not in detection_rate(full).attrs
+
+
 def test_poses_that_are_left_out_are_not_needed(stopped):
     counts = failure_composition(stopped)["count"]
     assert counts.sel(outcome="not_run") == 0

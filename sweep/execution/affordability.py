@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,9 +46,14 @@ class FreeDisk:
     files: int | None
 
 
-def files_per_block(pipeline: Pipeline) -> int:
-    """Return how many files a block makes: a chunk of each variable, and the receipt."""
-    return len(variables_of(pipeline)) + 1
+def files_of(pipeline: Pipeline, blocks: int, share: float = 1.0) -> int:
+    """Return how many files some blocks make: a chunk of each variable, and the receipt.
+
+    Those of which nothing is needed, all but a ``share``, have no chunks but those of flags.
+    """
+    variables = variables_of(pipeline)
+    flags = sum(variable.flags is not None for variable in variables)
+    return blocks * (flags + 1) + math.ceil(share * blocks) * (len(variables) - flags)
 
 
 def free_disk(url: str) -> FreeDisk | None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from sweep.errors import ArgumentError, RunError
 from sweep.evaluation.cells import run_cells
-from sweep.execution.affordability import files_per_block
+from sweep.execution.affordability import files_of
 from sweep.execution.calibration import (
     COMPILATION_LIMIT_S,
     block_extents,
@@ -28,7 +28,7 @@ from sweep.execution.limits import (
     PLAN_SCENES_LIMIT_S,
     SMALL_RUN_S,
 )
-from sweep.execution.pilot import Pilot, pilot
+from sweep.execution.pilot import Pilot, pilot_in
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
 from sweep.isolation.watchdog import compilation_s
 from sweep.plan.experiment import Pipeline
@@ -49,9 +49,6 @@ MIN_PAIRS = 3
 PILOT_SHARE = 0.6
 """Share of the time that is left in which a pilot computes poses."""
 
-PILOT_LIMIT_S = 8.0
-"""Seconds after which it is ended: its rule may be slow to decide."""
-
 START_S = 3.0
 """Seconds of a run apart from its blocks: processes start and end, packages are imported."""
 
@@ -70,7 +67,8 @@ class Forecast:
     block, blocks, files
         Scenes of a block along each scene axis; number of blocks, and of the files that they make.
     bytes, worker_bytes
-        Size of the store before compression; memory of a worker.
+        Size of the store before compression; memory of a worker. Of a run to a precision, files and
+        bytes are those of the poses that a pilot expects to be needed.
     pose_s, sampled
         Mean seconds a pose, all configurations included; scenes that were measured.
     over
@@ -193,8 +191,10 @@ def forecast(
             if not calibration.over:
                 left = PLAN_LIMIT_S - min(time.monotonic() - started, PLAN_SCENES_LIMIT_S)
                 if pipeline.stopping is not None:
-                    expected, used_s = _pilot(child, pipeline, calibration.scene_s, left)
-                    left -= used_s
+                    begun = time.monotonic()
+                    expected = pilot_in(
+                        child, pipeline, calibration.scene_s, PILOT_SHARE * left)
+                    left -= time.monotonic() - begun
                 costs = _effect_costs(child, pipeline, switches, calibration.scene_s, left)
     except (ChildDiedError, ChildRaisedError) as error:
         raise RunError(
@@ -202,7 +202,8 @@ def forecast(
             "and computes the others"
         ) from None
     poses = pipeline.size(Stage.scene)
-    work_s = poses * calibration.scene_s * (1.0 if expected is None else expected.share)
+    share = 1.0 if expected is None else expected.share
+    work_s = share * poses * calibration.scene_s
     small = not chosen and work_s < SMALL_RUN_S
     extents = block_extents(pipeline, calibration, 1 if small else workers)
     blocks = Blocks(tuple(len(axis) for axis in scene_axes(pipeline)), extents)
@@ -214,9 +215,8 @@ def forecast(
         results=pipeline.size(*Stage),
         block=extents,
         blocks=len(blocks),
-        # A chunk of each variable, and the receipt.
-        files=len(blocks) * files_per_block(pipeline),
-        bytes=bytes_per_block(pipeline, poses),
+        files=files_of(pipeline, len(blocks), share),
+        bytes=bytes_per_block(pipeline, math.ceil(share * poses)),
         worker_bytes=process + 3 * bytes_per_block(pipeline, math.prod(extents)),
         pose_s=calibration.scene_s,
         sampled=calibration.sampled,
@@ -226,24 +226,6 @@ def forecast(
         small=small,
         pilot=expected,
     ), costs
-
-
-def _pilot(
-    child: Child, pipeline: Pipeline, pose_s: float, left_s: float
-) -> tuple[Pilot | None, float]:
-    """Return what a run in waves is expected to need, and the seconds that this took."""
-    started = time.monotonic()
-    try:
-        found: Pilot | None = child.call(
-            pilot, pipeline, pose_s, PILOT_SHARE * left_s, limit_s=PILOT_LIMIT_S,
-            grace_s=COMPILATION_LIMIT_S,
-        )
-    except ChildDiedError as error:
-        if not error.timed_out:
-            raise
-        child.restart()
-        found = None
-    return found, time.monotonic() - started
 
 
 def _effect_costs(

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 from sweep.evaluation.cells import run_cells
 from sweep.evaluation.results import to_dataset_layout
+from sweep.execution.calibration import COMPILATION_LIMIT_S
+from sweep.isolation.child_process import Child, ChildDiedError
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices, scene_axes
@@ -29,6 +31,9 @@ from sweep.typing import Floats, Masks
 
 MAX_CONDITIONS = 40
 """Conditions of the pilot; pooled cells are a condition together."""
+
+LIMIT_S = 8.0
+"""Seconds after which a pilot is ended: its rule may be slow to decide."""
 
 REPETITIONS, REPETITIONS_S = 8, 1.0
 """How often the trials are drawn for the range, unless that takes so many seconds."""
@@ -111,6 +116,25 @@ def pilot(pipeline: Pipeline, scene_s: float, budget_s: float) -> Pilot | None:
     mean = float(shares.mean())
     low = max(mean - error, rule.ends[0] / rule.ends[-1])
     return Pilot(sampled, mean, low, min(mean + error, 1.0), unsettled)
+
+
+def pilot_in(child: Child, pipeline: Pipeline, scene_s: float, budget_s: float) -> Pilot | None:
+    """Return a pilot that is made in a child process; None also if its rule takes too long.
+
+    Raises
+    ------
+    ChildDiedError, ChildRaisedError
+        If a scene crashes the process, or raises.
+    """
+    try:
+        found: Pilot | None = child.call(
+            pilot, pipeline, scene_s, budget_s, limit_s=LIMIT_S, grace_s=COMPILATION_LIMIT_S)
+    except ChildDiedError as error:
+        if not error.timed_out:
+            raise
+        child.restart()
+        return None
+    return found
 
 
 def _part(pipeline: Pipeline, rule: Stopping, most: int) -> Pipeline:

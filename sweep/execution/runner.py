@@ -20,7 +20,6 @@ from sweep.errors import (
     StoreReplacedError,
 )
 from sweep.execution import BLOCK_TASK
-from sweep.execution.affordability import check_affordable
 from sweep.execution.calibration import (
     Calibration,
     block_extents,
@@ -43,7 +42,7 @@ from sweep.execution.summary import Summary, summary_of, summary_of_complete
 from sweep.execution.tally import Tally
 from sweep.execution.tightening import tighten
 from sweep.execution.waiting import AnyOrder, InWaves, Waiting
-from sweep.execution.work_left import block_s_of, demand_left, demand_of, thread_count_of, work_s
+from sweep.execution.work_left import block_s_of, check_new, check_rest, thread_count_of, work_s
 from sweep.isolation.child_process import Child
 from sweep.isolation.interrupts import Interrupts
 from sweep.isolation.plugin_check import check_plugins
@@ -191,10 +190,10 @@ def execute(
                 raise AssertionError(url)
             unfinished = _new_store(
                 url, pipeline, calibration, connection, block_s, time_limit_s, overwrite,
-                durable=durable, yes=yes or bool(sources),
+                durable=durable, yes=yes or bool(sources), child=child,
             )
         elif not (yes or sources):
-            check_affordable(url, demand_left(unfinished, done, calibration, connection))
+            check_rest(unfinished, done, calibration, connection, child)
         retry = Retry()
         if stricter:
             unfinished = tighten(unfinished, pipeline)
@@ -291,13 +290,13 @@ def _matching_sources(
 def _new_store(
     url: str, pipeline: Pipeline, calibration: Calibration, client: Client | None,
     block_s: float | None, time_limit_s: float | None, overwrite: bool, *, durable: bool = False,
-    yes: bool = False,
+    yes: bool = False, child: Child | None = None,
 ) -> RunStore:
     """Create an empty store whose blocks suit the calibration and the cluster, if there is one."""
     threads = thread_count_of(client)
     extents = block_extents(pipeline, calibration, threads, block_s, time_limit_s)
     if not yes:
-        check_affordable(url, demand_of(pipeline, calibration, threads, extents))
+        check_new(url, pipeline, calibration, threads, extents, child)
     if overwrite and exists(url):
         remove_store(url)
     return create_store(url, pipeline, extents, durable=durable)

@@ -7,9 +7,17 @@ import statistics
 from collections.abc import Set as AbstractSet
 from typing import TYPE_CHECKING
 
-from sweep.execution.affordability import Demand, files_per_block
+from sweep.execution.affordability import (
+    Demand,
+    check_affordable,
+    files_of,
+    free_disk,
+    objections,
+)
 from sweep.execution.calibration import Calibration
 from sweep.execution.limits import BLOCK_S
+from sweep.execution.pilot import pilot_in
+from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.parameters import Stage
@@ -20,6 +28,9 @@ from sweep.store.run_store import RunStore
 
 if TYPE_CHECKING:
     from distributed import Client
+
+PILOT_S = 3.0
+"""Seconds in which a pilot computes poses, where all poses would be too many."""
 
 SAMPLED_RECEIPTS = 100
 """Committed blocks from which the work that is left is estimated."""
@@ -52,30 +63,72 @@ def thread_count_of(client: Client | None) -> int:
 
 
 def demand_of(
-    pipeline: Pipeline, calibration: Calibration, threads: int, extents: tuple[int, ...]
+    pipeline: Pipeline, calibration: Calibration, threads: int, extents: tuple[int, ...],
+    share: float = 1.0,
 ) -> Demand:
-    """Return what a whole run takes, in blocks of ``extents``."""
-    poses = pipeline.size(Stage.scene)
+    """Return what a whole run takes, in blocks of ``extents``, if it needs a share of the poses."""
+    poses = math.ceil(share * pipeline.size(Stage.scene))
     blocks = len(Blocks(tuple(len(axis) for axis in scene_axes(pipeline)), extents))
     return Demand(
         poses * calibration.scene_s / threads, threads, bytes_per_block(pipeline, poses),
-        blocks * files_per_block(pipeline),
+        files_of(pipeline, blocks, share),
     )
 
 
-def demand_left(
+def check_new(
+    url: str, pipeline: Pipeline, calibration: Calibration, threads: int,
+    extents: tuple[int, ...], child: Child | None,
+) -> None:
+    """Raise StoreError if a run into a new store has to be confirmed.
+
+    One whose sampling stops is judged by a pilot, if all its poses were too many.
+    """
+    demand = demand_of(pipeline, calibration, threads, extents)
+    share = _needed_share(url, demand, pipeline, calibration.scene_s, child)
+    check_affordable(url, demand if share is None else demand_of(
+        pipeline, calibration, threads, extents, share))
+
+
+def check_rest(
     store: RunStore, done: AbstractSet[int], calibration: Calibration | None,
-    client: Client | None,
-) -> Demand:
-    """Return what the blocks take that are not committed, those ``done``."""
-    threads = thread_count_of(client)
+    client: Client | None, child: Child | None,
+) -> None:
+    """Raise StoreError if the blocks that are not committed, those ``done``, are too many."""
+    threads, pipeline = thread_count_of(client), store.pipeline
     left = len(store.blocks) - len(done)
-    poses = store.pipeline.size(Stage.scene) * left // max(len(store.blocks), 1)
-    return Demand(
-        left * block_s_of(store, done, calibration) / threads if done or calibration else 0.0,
-        threads,
-        bytes_per_block(store.pipeline, poses), left * files_per_block(store.pipeline),
-    )
+    poses = pipeline.size(Stage.scene) * left // max(len(store.blocks), 1)
+    each_s = block_s_of(store, done, calibration) if done or calibration else 0.0
+    demand = Demand(
+        left * each_s / threads, threads, bytes_per_block(pipeline, poses),
+        files_of(pipeline, left))
+    scene_s = each_s / len(store.blocks[0])
+    share = _needed_share(store.url, demand, pipeline, scene_s, child)
+    if share is not None:
+        needed = sum(receipt.scenes_needed for _, receipt in receipts(store, done))
+        poses = max(math.ceil(share * pipeline.size(Stage.scene)) - needed, 0)
+        demand = Demand(
+            poses * scene_s / threads, threads, bytes_per_block(pipeline, poses),
+            files_of(pipeline, left, share))
+    check_affordable(store.url, demand)
+
+
+def _needed_share(
+    url: str, whole: Demand, pipeline: Pipeline, scene_s: float, child: Child | None
+) -> float | None:
+    """Return the share of the poses that a run in waves needs, by a pilot.
+
+    None without waves, where even all poses are affordable, or if a pilot takes too long.
+    """
+    if child is None or pipeline.stopping is None or not objections(whole, free_disk(url)):
+        return None
+    try:
+        found = pilot_in(child, pipeline, scene_s, PILOT_S)
+    except ChildRaisedError:
+        return None
+    except ChildDiedError:
+        child.restart()
+        return None
+    return None if found is None else found.share
 
 
 def block_s_of(

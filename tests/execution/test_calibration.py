@@ -9,7 +9,7 @@ import pytest
 
 from support.reports import command
 from sweep.execution import forecast as forecast_module
-from sweep.execution.affordability import files_per_block
+from sweep.execution.affordability import files_of
 from sweep.execution.calibration import (
     MIN_LIMIT_S,
     BatchCost,
@@ -167,5 +167,5 @@ def test_no_grid_of_a_billion_poses_makes_more_blocks_and_files_than_a_disk_can_
     extents = block_extents(pipeline, measured, 64)
     blocks = len(Blocks(lengths, extents))
     assert blocks <= MAX_BLOCKS
-    assert blocks * files_per_block(pipeline) <= 3_000_000
+    assert files_of(pipeline, blocks) <= 3_000_000
     assert math.prod(extents) * scene_s < 2.5 * math.prod(lengths) * scene_s / MAX_BLOCKS

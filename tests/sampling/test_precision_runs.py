@@ -5,13 +5,15 @@ import itertools
 import numpy as np
 import pytest
 
-from support.here import calls_here
+from support.here import Here, calls_here
 from support.stores import by_hand, in_waves, same
-from sweep.errors import OtherExperimentError
+from sweep.errors import OtherExperimentError, StoreError
+from sweep.execution.calibration import Calibration
 from sweep.execution.finalize import close
 from sweep.execution.runner import execute
 from sweep.execution.status import status
 from sweep.execution.tightening import tighten
+from sweep.execution.work_left import check_new
 from sweep.integrity.repair import repair
 from sweep.integrity.verification import verify
 from sweep.measure.flags import DetectionStatus
@@ -123,9 +125,18 @@ def test_workers_and_blocks_and_tightening_change_no_bit(tmp_path):
         assert verify(url, 5).damage == []
 
 
+def test_a_run_in_waves_is_refused_for_what_it_needs_and_not_for_all_its_trials():
+    """Two conditions of rates 0 and 1: a few hundred of three million poses."""
+    pipeline = precise("0.02", ["side_px = [8, 30]", "precision.max_trials = 1_500_000"])
+    measured = Calibration(0.04, 0.0, 1, (0.04,))
+    with pytest.raises(StoreError, match="takes about 33"):
+        check_new("none.zarr", pipeline, measured, 1, (2, 50), None)
+    check_new("none.zarr", pipeline, measured, 1, (2, 50), Here())
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(("settings", "needed"), [
-    (["precision.max_trials = 1"], 3),
+    (["precision.max_trials = 19"], 3 * 19),
     (["precision.per = []"], None),
     (["side_px = 30"], None),
     (["side_px = 30", "bearing_x_deg = 80", "precision.max_trials = 5000"], 50),

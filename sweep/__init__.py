@@ -305,7 +305,7 @@ def _pipeline(given: Pipeline | Mapping[str, Any] | str | os.PathLike[str]) -> P
     if pipeline.requirements:
         from sweep.analysis.required_pipeline import check_required  # noqa: PLC0415
 
-        check_required(pipeline.requirements, "pipeline")
+        check_required(pipeline.requirements, pipeline.source)
     return pipeline
 
 

@@ -8,6 +8,7 @@ was stopped (`sweep.analysis.stopped_sampling`).
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
@@ -113,6 +114,17 @@ class WantedPrecision:
         while not _has_ends(n, percent, stopped_level(LEVEL)):
             n += 1
         return n
+
+    @property
+    def fewest_draws(self) -> int:
+        """Draws below which no interval is narrow enough, whatever the results are."""
+        if not self.requirable.is_rate:
+            return self.least_draws
+        if self.half_width >= 0.5:
+            return 1
+        # Without a success, Clopper and Pearson's end is 1 - tail^(1/n).
+        tail = (1.0 - stopped_level(LEVEL)) / 2.0
+        return math.ceil(math.log(tail) / math.log(1.0 - 2.0 * self.half_width))
 
     def judge(
         self, table: Mapping[str, Any], prefix: str, looked_for: Any, run: Any, total: Any

@@ -79,7 +79,8 @@ def read_pipeline(options: argparse.Namespace) -> Pipeline:
     StoreError
         If it is given as a folder that is no store.
     """
-    from sweep.errors import PipelineError  # noqa: PLC0415
+    from sweep.errors import ArgumentError, PipelineError  # noqa: PLC0415
+    from sweep.plan.stopping import NO_TRIALS  # noqa: PLC0415
     from sweep.store.stored_pipeline import read_pipeline as read  # noqa: PLC0415
     from sweep.store.stored_pipeline import texts_required  # noqa: PLC0415
 
@@ -89,6 +90,11 @@ def read_pipeline(options: argparse.Namespace) -> Pipeline:
     try:
         pipeline = read(options.pipeline, options.settings)
     except PipelineError as error:
+        if options.settings and any(line.endswith(NO_TRIALS) for line in error.faults) and (
+                getattr(options, "precision", ())):
+            raise ArgumentError(
+                "max_trials", "", f"expected {NO_TRIALS}, such as 2400; beside --precision"
+            ) from None
         if texts := texts_required(options.pipeline, options.settings):
             from sweep.analysis.required_pipeline import check_required  # noqa: PLC0415
 

@@ -4,9 +4,19 @@ from __future__ import annotations
 
 import argparse
 import errno
+import itertools
+import shlex
 import sys
+from collections.abc import Sequence
 
-from sweep.errors import ArgumentError, PipelineError, PluginError, StoreError, SweepError
+from sweep.errors import (
+    ArgumentError,
+    OtherExperimentError,
+    PipelineError,
+    PluginError,
+    StoreError,
+    SweepError,
+)
 from sweep.messages import plain
 
 MAX_LINE_LENGTH = 2000
@@ -41,9 +51,27 @@ def print_error(error: SweepError, options: argparse.Namespace) -> int:
     if isinstance(error, ArgumentError):
         given = f" {error.value}" if str(error.value) else ""
         text = f"{flag_of(error.argument, options)}{given}: {error.problem}"
+    if isinstance(error, OtherExperimentError) and error.reusable and "reuse" in options:
+        command = _reusing_command(options.given, error.url)
+        text = "\n".join([
+            f"{error.url}: holds another experiment; reuse its cells in a new store: {command}",
+            *(f"  {line}" for line in error.differences)])
     for line in text.splitlines():
         print(plain(line, MAX_LINE_LENGTH), file=sys.stderr)
     return 2 if isinstance(error, REFUSALS) else 1
+
+
+def _reusing_command(given: Sequence[str], url: str) -> str:
+    """Return the command that runs the same into a new store, and reuses the cells of another."""
+    from sweep.store.locations import exists  # noqa: PLC0415
+
+    stem = url.removesuffix(".zarr")
+    new = next(name for name in (f"{stem}-{number}.zarr" for number in itertools.count(2))
+               if not exists(name))
+    at = [k for k, word in enumerate(given) if word.partition("=")[0] == "--store"]
+    left_out = {*at, *(k + 1 for k in at if "=" not in given[k])}
+    words = [word for k, word in enumerate(given) if k not in left_out]
+    return shlex.join(["sweep", *words, "--store", new, "--reuse", url])
 
 
 def print_import_error(error: ImportError) -> int:

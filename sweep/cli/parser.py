@@ -65,10 +65,12 @@ def _meant(word: str) -> str:
     if word in ("--dry-run", "--dryrun", "-n"):
         return "; `sweep plan PIPELINE` shows what would run"
     if word.startswith("-"):
-        flags = {
-            flag for command in COMMANDS for flag in _options(command) if flag.startswith("--")
-        }
-        return nearest(word.partition("=")[0], sorted(flags))
+        flags = {flag: [each.name for each in COMMANDS if flag in _options(each)]
+                 for command in COMMANDS for flag in _options(command) if flag.startswith("--")}
+        name = word.partition("=")[0]
+        if name in flags:
+            return f"; {name} is a flag of {', '.join(f'sweep {each}' for each in flags[name])}"
+        return nearest(name, sorted(flags))
     if "=" in word:
         return f"; did you mean --set {word}?"
     return "; values are set by --set KEY=VALUE, in quotes if there are spaces in it"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import itertools
 import shlex
 import sys
 from typing import TYPE_CHECKING
@@ -71,7 +70,6 @@ def _execute(options: argparse.Namespace) -> int:
 def _execute_beside(child: Child, options: argparse.Namespace) -> int:
     pipeline = read_pipeline(options)
     from sweep.cli.first_use import announce_compilation  # noqa: PLC0415
-    from sweep.errors import OtherExperimentError, StoreError  # noqa: PLC0415
     from sweep.execution.progress import progress_display  # noqa: PLC0415
     from sweep.execution.runner import execute  # noqa: PLC0415
     from sweep.plan.camera_facts import camera_facts  # noqa: PLC0415
@@ -91,22 +89,13 @@ def _execute_beside(child: Child, options: argparse.Namespace) -> int:
             say(camera.pop())
         display(progress)
 
-    try:
-        with progress_display() as display:
-            summary = execute(
-                pipeline, store, workers=options.workers, scheduler=options.scheduler,
-                reuse=options.reuse, overwrite=options.overwrite, retry_failed=options.retry_failed,
-                durable=options.durable, yes=options.yes, time_limit_s=options.time_limit_s,
-                progress=report, child=child,
-            )
-    except OtherExperimentError as error:
-        if not error.reusable:
-            raise
-        listed = "\n".join(f"  {line}" for line in error.differences)
-        raise StoreError(
-            f"{error.url}: holds another experiment; reuse its cells in a new store: "
-            f"{_growing_command(options, error.url)}\n{listed}"
-        ) from None
+    with progress_display() as display:
+        summary = execute(
+            pipeline, store, workers=options.workers, scheduler=options.scheduler,
+            reuse=options.reuse, overwrite=options.overwrite, retry_failed=options.retry_failed,
+            durable=options.durable, yes=options.yes, time_limit_s=options.time_limit_s,
+            progress=report, child=child,
+        )
     if options.json:
         print_json(dataclasses.asdict(summary))
         return int(summary.nothing_computed)
@@ -136,13 +125,13 @@ def _execute_beside(child: Child, options: argparse.Namespace) -> int:
 
 
 def _poses(summary: Summary) -> str:
-    """Return how many poses and results there are; of a run to a precision, how many it needed."""
+    """Return how many poses and results there are; of a run in waves, how many it needed."""
     if summary.needed is None:
         return f"{summary.poses:,} poses, {summary.results:,} results"
     settled = (summary.conditions or 0) - (summary.unsettled or 0)
     return (
-        f"{settled:,} of {summary.conditions:,} conditions settled with {summary.needed:,} of at "
-        f"most {summary.poses:,} poses"
+        f"{settled:,} of {summary.conditions:,} conditions settled with {summary.needed:,} poses "
+        f"({summary.poses:,} with all trials)"
     )
 
 
@@ -160,26 +149,6 @@ def _requiring_command(pipeline: Pipeline, url: str) -> str:
     per = [name for name in pipeline.require_per if pipeline.axis(name) is not None]
     return shlex.join(["sweep", "require", url, *pipeline.requirements,
                        *(["--per", ",".join(per)] if per else [])])
-
-
-def _growing_command(options: argparse.Namespace, url: str) -> str:
-    """Return the command that runs the same into a new store, and reuses the cells of another."""
-    from sweep.store.locations import exists  # noqa: PLC0415
-
-    stem = url.removesuffix(".zarr")
-    grown = next(
-        name for name in (f"{stem}-{number}.zarr" for number in itertools.count(2))
-        if not exists(name)
-    )
-    words = ["sweep", "run", options.pipeline]
-    for setting in options.settings:
-        words += ["--set", setting]
-    words += ["--store", grown]
-    for source in (url, *options.reuse):
-        words += ["--reuse", source]
-    for flag, value in (("--workers", options.workers), ("--scheduler", options.scheduler)):
-        words += [flag, str(value)] if value is not None else []
-    return shlex.join(words)
 
 
 RUN = Command(

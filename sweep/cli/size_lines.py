@@ -32,6 +32,8 @@ def sentences(choice: Choice) -> list[str]:
     elif choice.best is not None and choice.rule.along:
         out.append(f"all values of {choice.rule.along} on the grid meet them: a "
                    f"{_comparative(choice)} one may do, too")
+    elif choice.best is not None:
+        out.append("it is the cheapest of all alternatives: there is no cheaper one that fails")
     out += [line for answer in choice.answers for line in _isolated(choice, answer)]
     out += list(_over_budget(choice))
     return out

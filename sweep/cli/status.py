@@ -36,8 +36,9 @@ def _execute(options: argparse.Namespace) -> int:
     if state.conditions is None:
         say(f"  poses       {state.poses_done:,} of {state.poses:,}")
     else:
-        say(f"  conditions  {state.settled:,} of {state.conditions:,} settled")
-        say(f"  poses       {state.needed:,} needed so far, of at most {state.poses:,}")
+        how = "settled" if state.finished else "done"
+        say(f"  conditions  {state.settled:,} of {state.conditions:,} {how}")
+        say(f"  poses       {state.needed:,}, of {state.poses:,} with all trials")
     for name, counts in (("detection", state.detection), ("estimate", state.estimate)):
         listed = ", ".join(f"{flag} {count:,}" for flag, count in counts.items())
         say(f"  {name:11} {listed or 'nothing yet'}")

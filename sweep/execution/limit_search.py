@@ -102,12 +102,12 @@ def _with_search(
     settings = [*settings, *chosen, *more]
     if isinstance(source, Pipeline):
         pipeline = Pipeline.from_text(
-            source.text, settings, name=source.name, folder=source.folder,
-            camera_files=source.files)
+            source.text, settings, name=source.name, source=source.source,
+            folder=source.folder, camera_files=source.files)
     else:
         pipeline = read_pipeline(source, settings)
     if pipeline.requirements:
-        check_required(pipeline.requirements, pipeline.name)
+        check_required(pipeline.requirements, pipeline.source)
     return pipeline
 
 

@@ -29,8 +29,8 @@ class Progress:
     detected
         Detections among those that are committed, over all detector settings.
     needed, settled, conditions
-        Of a run to a precision, how many of ``done`` were needed, and how many of the conditions
-        need no more trials; None of a run of fixed trials.
+        Of a run in waves, how many of ``done`` were needed, and how many of the conditions are
+        settled, or have all their trials; None of a run of fixed trials.
     """
 
     done: int
@@ -148,9 +148,9 @@ def _bar() -> Iterator[ProgressReport]:
 
 
 def _of_conditions(progress: Progress) -> str:
-    """Return how far a run to a precision is."""
+    """Return how far a run in waves is: how many poses it will need is not known."""
     return (
-        f"{progress.settled:,} of {progress.conditions:,} conditions settled, "
+        f"{progress.settled:,} of {progress.conditions:,} conditions done, "
         f"{progress.needed:,} poses"
     )
 

@@ -13,6 +13,7 @@ from sweep.execution.finalize import lost
 from sweep.execution.retry import Retry
 from sweep.measure.flags import DetectionStatus
 from sweep.plan.parameters import Stage
+from sweep.plan.precision_rule import PrecisionRule
 from sweep.store.blocks import committed
 from sweep.store.outcome import FailureGroup, outcome_of_finished
 from sweep.store.run_store import RunStore
@@ -54,8 +55,8 @@ class Summary:
     advice
         The command that recomputes a cell for each reason; empty without warnings.
     needed, conditions, unsettled
-        Of a run to a precision, the poses that were needed, the conditions, and those of them that
-        would need more than ``max_trials``; None of a run of fixed trials.
+        Of a run in waves, the poses that were needed, the conditions, and those of them that would
+        need more than ``max_trials``; None of a run of fixed trials.
     retried, recovered
         Failed and crashed cells that were tried again, and those that did not fail again.
     """
@@ -137,9 +138,12 @@ def summary_of(
 
 
 def _unsettled_lines(store: RunStore, sampled: Mapping[str, Any]) -> list[str]:
-    """Return lines on the conditions that would need more than ``max_trials``; often none."""
+    """Return lines on the conditions that would need more than ``max_trials``; often none.
+
+    A search says itself what it does not know.
+    """
     count, rule = sampled.get("unsettled"), store.pipeline.stopping
-    if not count or rule is None:
+    if not count or not isinstance(rule, PrecisionRule):
         return []
     of = f"{count:,} of {sampled['conditions']:,}"
     lines = [f"warning: {of} conditions are not settled after all {rule.max_trials:,} trials"]

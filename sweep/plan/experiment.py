@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +65,8 @@ class Pipeline:
         When sampling stops, as a section such as [precision] says; None if every trial is computed.
     budget_ms
         The most milliseconds of a frame, if [require] has a budget.
+    source
+        What lines on faults begin with: the file, if there is one. It is not compared.
 
     Examples
     --------
@@ -92,6 +94,7 @@ class Pipeline:
     require_per: tuple[str, ...] = ()
     stopping: StoppingRule | None = None
     budget_ms: float | None = None
+    source: str = field(default="pipeline", compare=False)
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
@@ -358,5 +361,5 @@ def _checked(
         folder=str(folder.resolve()), plugins=reading.plugins,
         requirements=reading.requirements, require_per=reading.require_per,
         stopping=reading.stopping,
-        budget_ms=reading.budget_ms,
+        budget_ms=reading.budget_ms, source=source,
     )

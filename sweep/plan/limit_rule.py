@@ -91,10 +91,7 @@ def read_limit(reading: Reading, table: Mapping[str, Any]) -> LimitRule | None:
     pooled = math.prod(len(axis) for axis in _scene_axes(reading)
                        if axis.name not in (along, *per, *at_all))
     coarse = _coarse_trials(reading, table, pooled)
-    if TRIAL in reading.axes and len(reading.axes[TRIAL]) < 2:
-        reading.fault(f"{SECTION}.max_trials", len(reading.axes[TRIAL]),
-                      "at least 2: intervals are over the draws")
-    elif TRIAL in reading.axes and "coarse_trials" in table and coarse > len(reading.axes[TRIAL]):
+    if TRIAL in reading.axes and "coarse_trials" in table and 1 < len(reading.axes[TRIAL]) < coarse:
         reading.fault(f"{SECTION}.coarse_trials", coarse,
                       f"at most max_trials, {len(reading.axes[TRIAL]):,}")
     if TRIAL not in reading.axes or len(reading.faults) > known:

@@ -22,6 +22,12 @@ from sweep.plan.reader import Reading
 MAX_TRIALS = "max_trials"
 """The key of every section: the most trials, the length of the axis ``trial``."""
 
+MIN_TRIALS = 2
+"""The fewest that make an interval."""
+
+NO_TRIALS = f"{MAX_TRIALS}, too: the most trials of a condition"
+"""What is expected where nothing says how many trials there are at most."""
+
 
 class StoppingRule(Protocol):
     """What a section says: a frozen dataclass of plain values.
@@ -85,6 +91,9 @@ def read_stopping(reading: Reading) -> None:
             f"{SAMPLINGS[0]} beside [{name}]: points that are spread evenly over all trials say "
             "nothing of the first ones",
         )
+    if TRIAL in reading.axes and len(reading.axes[TRIAL]) < MIN_TRIALS:
+        reading.fault(f"{name}.{MAX_TRIALS}", len(reading.axes[TRIAL]),
+                      f"at least {MIN_TRIALS}: intervals are over the draws")
     reading.stopping = SECTIONS[name](reading, table)
 
 
@@ -93,7 +102,7 @@ def _read_trials(reading: Reading, name: str, table: Mapping[str, Any]) -> None:
     given = reading.axes.get(TRIAL)
     if MAX_TRIALS not in table:
         if given is None and not reading.names_axis(TRIAL):
-            reading.fault(name, dict(table), f"{MAX_TRIALS}, too: the most trials of a condition")
+            reading.fault(name, dict(table), NO_TRIALS)
         return
     try:
         axis = parse_trial(table[MAX_TRIALS])

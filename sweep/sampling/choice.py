@@ -63,7 +63,7 @@ def choice_sampling(pipeline: Pipeline, rule: ChoiceRule) -> ChoiceSampling:
     ends = choice_ends(pipeline, rule)
     shares = choice_shares(pipeline, rule, len(ends))
     if faults := choice_faults(pipeline, rule, shares):
-        raise refusal([f"{pipeline.name}: {line}" for line in faults])
+        raise refusal([f"{pipeline.source}: {line}" for line in faults])
     read = [name for each in parse_requirements(rule.requirements)
             for name in each.requirable.variables]
     coupled = tuple(axis.name for axis in condition_axes(pipeline) if axis.name not in rule.among)

@@ -107,7 +107,7 @@ def limit_sampling(pipeline: Pipeline, rule: LimitRule) -> LimitSampling:
     PipelineError
         One line for each requirement that is none, and for those that contradict each other.
     """
-    check_required(rule.require, pipeline.name, key="limit.require")
+    check_required(rule.require, pipeline.source, key="limit.require")
     required = parse_requirements(rule.require)
     axes = condition_axes(pipeline)
     count = len(required) * math.prod(

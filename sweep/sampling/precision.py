@@ -111,16 +111,24 @@ def precision_sampling(pipeline: Pipeline, rule: PrecisionRule) -> PrecisionSamp
     Raises
     ------
     PipelineError
-        One line for each name that no quantity has.
+        One line for each name that no quantity has, or each whose interval cannot be as narrow
+        within ``max_trials``.
     """
     try:
         wanted = wanted_precisions(dict(rule.wanted))
     except ValueError as error:
-        raise refusal([f"{pipeline.name}: precision.{line}"
+        raise refusal([f"{pipeline.source}: precision.{line}"
                        for line in str(error).splitlines()]) from None
     axes = condition_axes(pipeline)
     coupled = tuple(axis.name for axis in axes if axis.name not in rule.per)
     pooled = math.prod(len(axis) for axis in axes if axis.name in coupled)
+    if too_few := [
+        f"{pipeline.source}: precision.max_trials = {rule.max_trials}: expected at least "
+        f"{least:,}: with fewer no interval of {each.name} has a half-width of {each.half_width:g}"
+        for each in wanted
+        if rule.max_trials < (least := math.ceil(each.fewest_draws / pooled))
+    ]:
+        raise refusal(too_few)
     variables = dict.fromkeys(
         name for each in wanted for name in ("detection", "estimate", "flipped", *each.variables))
     return PrecisionSampling(

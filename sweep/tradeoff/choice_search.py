@@ -143,7 +143,7 @@ def chosen_by(pipeline: Pipeline) -> ChoiceRule:
     if isinstance(rule, ChoiceRule):
         return rule
     example = 'smallest = "size_m", max_trials = 5000'
-    raise refusal([f"{pipeline.name}: expected what is chosen: [{SECTION}] {example}"])
+    raise refusal([f"{pipeline.source}: expected what is chosen: [{SECTION}] {example}"])
 
 
 def _rank(answer: Answer, cost: Cost | None, rule: ChoiceRule) -> tuple[float, float]:

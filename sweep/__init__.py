@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ArgumentError", "DatasetError", "Pipeline", "PipelineError", "Progress", "RunError",
     "StoreError", "SweepError", "__version__", "decode_flags",
-    "limit", "open", "photos", "run", "size",
+    "limit", "open", "photos", "run", "size", "twins",
 ]
 
 _IMPORTED_ON_USE = {"Pipeline": "sweep.plan.experiment", "Progress": "sweep.execution.progress",
@@ -396,6 +396,54 @@ def photos(
         notice(line)
     return _run(
         prepared.pipeline, store=store or os.path.join(home, f"{prepared.pipeline.name}.zarr"),  # noqa: PTH118
+        workers=workers, overwrite=overwrite, progress=progress,
+    )
+
+
+def twins(
+    photographs: str | os.PathLike[str],
+    scene: Mapping[str, Any] | str | os.PathLike[str],
+    *,
+    repeats: int = 1,
+    store: str | os.PathLike[str] | None = None,
+    workers: int | None = None,
+    overwrite: bool = False,
+    progress: bool | Callable[[Progress], None] | None = None,
+) -> xr.Dataset:
+    """Simulate the markers of photographs at their poses.
+
+    Parameters
+    ----------
+    photographs
+        Path or URL of their store, as :func:`photos` makes it.
+    scene
+        Parameters of the section [scene], values or distributions; or a TOML file that has it.
+    repeats
+        How often each photograph is simulated: trial k has the poses of photograph k modulo their
+        number.
+    store
+        Path or URL of the twins' store (default: beside the photographs', with the scene's name).
+    workers, overwrite, progress
+        As for :func:`run`.
+
+    Returns
+    -------
+    xarray.Dataset
+        The results, with the photographs' rows: `sweep.analysis.simulation_gap` compares both.
+
+    Raises
+    ------
+    ArgumentError, PipelineError, StoreError, RunError
+        As for :func:`run`; also if the store is not of photographs.
+    """
+    from sweep.photographs.twins import read_scene, twin_pipeline, twin_store  # noqa: PLC0415
+    from sweep.store.stored_pipeline import read_pipeline  # noqa: PLC0415
+
+    named = "twins" if isinstance(scene, Mapping) else scene
+    parameters = scene if isinstance(scene, Mapping) else read_scene(scene)
+    return _run(
+        twin_pipeline(read_pipeline(photographs), parameters, repeats),
+        store=store or twin_store(photographs, named),
         workers=workers, overwrite=overwrite, progress=progress,
     )
 

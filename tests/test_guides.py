@@ -19,6 +19,7 @@ import pytest
 from support.here import calls_here
 from support.room_picture import PICTURE, drawn
 from sweep.cli import main
+from sweep.photographs.twins import read_scene
 from sweep.plan.board_files import read_board
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import PARAMETERS, SECTIONS, Stage
@@ -100,6 +101,10 @@ def test_blocks_of_a_guide_run_in_their_order(name, workspace, commands_run, mon
         if block.comment == "file: board.toml":
             Path("board.toml").write_text(block.text)
             assert len(read_board("board.toml").marker_ids)
+        elif block.comment == "file: scene.toml":
+            Path("scene.toml").write_text(block.text)
+            document = {"pose": {"distance_m": 1}, "scene": read_scene("scene.toml")}
+            assert Pipeline.from_dict(document)
         elif block.language == "toml":
             assert Pipeline.from_text(block.text).size(*Stage) > 1
         if block.comment.startswith("file: "):

@@ -9,6 +9,7 @@ from typing import NoReturn
 
 from sweep.cli.check_detector import CHECK_DETECTOR
 from sweep.cli.command import Command
+from sweep.cli.compare import COMPARE
 from sweep.cli.completion import COMPLETION
 from sweep.cli.environments import ENVIRONMENTS
 from sweep.cli.error_model import ERROR_MODEL
@@ -33,7 +34,7 @@ from sweep.version import __version__
 
 COMMANDS = (
     RUN, PLAN, SIZE, LIMIT, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, ERROR_MODEL, VERIFY, STATUS,
-    EXPORT, SCORE, PHOTOS, CHECK_DETECTOR, PLUGINS, ENVIRONMENTS,
+    EXPORT, SCORE, PHOTOS, COMPARE, CHECK_DETECTOR, PLUGINS, ENVIRONMENTS,
     COMPLETION,
 )
 """Every command, in the order in which the help lists them."""

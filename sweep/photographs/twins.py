@@ -95,6 +95,15 @@ def photograph_count(pipeline: Pipeline) -> int:
         raise ArgumentError(PHOTOGRAPHS, plain(name), f"expected {error}") from None
 
 
+def twin_store(photographs: str | os.PathLike[str], scene: str | os.PathLike[str]) -> str:
+    """Return the store of the twins of a store of photographs with a file's scene.
+
+    >>> twin_store("runs/shots.zarr", "fitted/webcam.toml")
+    'runs/shots-webcam.zarr'
+    """
+    return f"{os.fspath(photographs).rstrip('/').removesuffix('.zarr')}-{Path(scene).stem}.zarr"
+
+
 def read_scene(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Return the section [scene] of a TOML file, such as `sweep fit` writes.
 

@@ -5,66 +5,12 @@ import pytest
 import xarray as xr
 from scipy import stats
 
+from support.photograph_results import PHOTOGRAPHS, REFINEMENTS, results_of, twins
 from sweep.analysis import detection_rate, error_statistics, flip_rate, simulation_gap
 from sweep.analysis.photograph_quantiles import quantile_ends, quantile_of
 from sweep.analysis.resampling import percentile_interval, resampled_quantiles, unit_counts
 from sweep.errors import ArgumentError, DatasetError
-from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-
-PHOTOGRAPHS, MARKERS = 12, 9
-REFINEMENTS = ["none", "subpix"]
-
-
-def dataset(rng, trials=PHOTOGRAPHS, *, simulated=None, files=None, scale=1.0, spread=0.5):
-    """Return results of photographs, of their twins, or of a simulation (``files`` is False)."""
-    shape = (trials, MARKERS, len(REFINEMENTS))
-    dims = ("trial", "marker_id", "cornerRefinementMethod")
-    own = np.exp(rng.normal(0.0, spread, (trials, 1, 1)))
-    angle = scale * own * rng.chisquare(3, shape) / 100
-    depth = scale * (own - 0.5 + rng.normal(0.0, 1.0, shape)) / 100
-    flags = np.where(rng.random(shape) < 0.15, DetectionStatus.no_candidate,
-                     DetectionStatus.detected)
-    flags[:, 0] = DetectionStatus.not_in_photograph
-    detected = flags == DetectionStatus.detected
-    solved = np.where(detected, EstimateStatus.solved, EstimateStatus.no_detection)
-    flipped = np.where(rng.random(shape) < 0.2, Flipped.flipped, Flipped.not_flipped)
-    zero = np.zeros(shape)
-    position = np.zeros((trials, MARKERS, 3))
-    position[..., 2] = 2.0
-    sides = np.broadcast_to(20.0 + 5 * np.arange(MARKERS), shape[:2])
-    found = xr.Dataset(
-        {
-            "detection": (dims, flags.astype(np.uint8)),
-            "estimate": (dims, solved.astype(np.uint8)),
-            "flipped": (dims, np.where(detected, flipped, Flipped.no_estimate).astype(np.uint8)),
-            "rotation_error_rad": (
-                (*dims, "xyz"),
-                np.where(detected[..., None], np.stack([zero, angle, zero], axis=-1), np.nan),
-            ),
-            "translation_error_m": (
-                (*dims, "xyz"),
-                np.where(detected[..., None], np.stack([zero, zero, 2 * depth], axis=-1), np.nan),
-            ),
-            "true_tvec_m": (("trial", "marker_id", "xyz"), position),
-            "true_rvec": (("trial", "marker_id", "xyz"), position),
-            "side_px": (("trial", "marker_id"), sides),
-        },
-        {"trial": range(trials), "marker_id": range(MARKERS),
-         "cornerRefinementMethod": REFINEMENTS},
-    )
-    if files is False:
-        return found
-    names = files or [f"{k}.png" for k in range(trials)]
-    found = found.assign_coords(
-        photographs="shots.photographs.npz", photograph=("trial", names),
-        sha256=("trial", [f"digest of {name}" for name in names]),
-    )
-    return found if simulated is None else found.assign_coords(simulated=simulated)
-
-
-def twins(rng, repeats=1, **options):
-    names = [f"{k}.png" for k in range(PHOTOGRAPHS)] * repeats
-    return dataset(rng, PHOTOGRAPHS * repeats, simulated=True, files=names, **options)
+from sweep.measure.flags import DetectionStatus, EstimateStatus
 
 
 def errors(results, name, refinement):
@@ -79,7 +25,7 @@ def errors(results, name, refinement):
 
 def test_values_are_numpys_and_gaps_their_differences_and_ratios():
     rng = np.random.default_rng(1)
-    first, second = dataset(rng), twins(rng, repeats=2, scale=0.7)
+    first, second = results_of(rng), twins(rng, repeats=2, scale=0.7)
     gap = simulation_gap(first, second)
     assert gap.attrs["paired"] == 1
     for refinement in REFINEMENTS:
@@ -105,7 +51,7 @@ def test_values_are_numpys_and_gaps_their_differences_and_ratios():
 
 def test_rates_are_those_of_the_photographs_alone_and_their_difference_newcombes():
     rng = np.random.default_rng(2)
-    first, second = dataset(rng), twins(rng)
+    first, second = results_of(rng), twins(rng)
     gap = simulation_gap(first, second)
     tables = [detection_rate(each, per="cornerRefinementMethod") for each in (first, second)]
     tables = [
@@ -126,7 +72,7 @@ def test_rates_are_those_of_the_photographs_alone_and_their_difference_newcombes
 
 def test_twins_are_paired_by_their_photographs():
     rng = np.random.default_rng(3)
-    first = dataset(rng)
+    first = results_of(rng)
     same = first.assign_coords(simulated=True)
     shuffled = same.isel(trial=rng.permutation(PHOTOGRAPHS))
     for second in (same, shuffled.assign_coords(trial=range(PHOTOGRAPHS))):
@@ -143,8 +89,8 @@ def test_twins_are_paired_by_their_photographs():
 
 def test_another_simulation_is_compared_in_bins():
     rng = np.random.default_rng(4)
-    first = dataset(rng)
-    scenes = dataset(rng, 40, files=False).isel(cornerRefinementMethod=1)
+    first = results_of(rng)
+    scenes = results_of(rng, 40, files=False).isel(cornerRefinementMethod=1)
     edges = [20, 35, 50]
     gap = simulation_gap(first, scenes, bins={"side_px": edges})
     assert gap.attrs["paired"] == 0
@@ -159,7 +105,7 @@ def test_another_simulation_is_compared_in_bins():
 
 def test_axes_that_twins_alone_have_are_kept():
     rng = np.random.default_rng(5)
-    first = dataset(rng)
+    first = results_of(rng)
     second = xr.concat([twins(rng, scale=s) for s in (0.3, 1.0)], dim="blur_px").assign_coords(
         blur_px=("blur_px", [0.3, 1.0], {"units": "px"}))
     gap = simulation_gap(first, second)
@@ -171,8 +117,8 @@ def test_axes_that_twins_alone_have_are_kept():
 
 def test_faults_are_one_line():
     rng = np.random.default_rng(6)
-    first, second = dataset(rng), twins(rng)
-    simulation = dataset(rng, files=False)
+    first, second = results_of(rng), twins(rng)
+    simulation = results_of(rng, files=False)
     with pytest.raises(DatasetError, match="expected photographs"):
         simulation_gap(simulation, first)
     with pytest.raises(DatasetError, match="expected photographs"):
@@ -192,7 +138,7 @@ def test_faults_are_one_line():
 
 def test_few_photographs_have_values_without_intervals():
     rng = np.random.default_rng(7)
-    first, second = dataset(rng, 3), twins(rng)
+    first, second = results_of(rng, 3), twins(rng)
     gap = simulation_gap(first, second)
     assert np.isfinite(gap.rotation_median_deg).all()
     assert np.isnan(gap.rotation_median_deg_gap_low).all()
@@ -229,7 +175,7 @@ def test_intervals_of_independent_values_are_clopper_and_pearsons_order_statisti
 @pytest.mark.parametrize("chunks", [None, 1, 5])
 def test_quantiles_by_photograph_do_not_depend_on_chunks(chunks):
     rng = np.random.default_rng(11)
-    results = dataset(rng, 20)
+    results = results_of(rng, 20)
     lazy = results if chunks is None else results.chunk(trial=chunks)
     table = error_statistics(lazy, per="cornerRefinementMethod", quantities=["rotation"]).compute()
     for k, refinement in enumerate(REFINEMENTS):

@@ -1,0 +1,99 @@
+"""``sweep compare``: its table, its JSON, and what it refuses."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import sweep
+from support.board_photographs import POSES, write_set
+from support.here import calls_here
+from support.photograph_results import results_of, twins
+from sweep import cli
+from sweep.analysis import simulation_gap
+from sweep.report.gap_table import gap_lines, gap_records, gap_table
+
+
+def told(capsys, *arguments):
+    code = cli.main(list(map(str, arguments)))
+    return code, *capsys.readouterr()
+
+
+def test_the_table_has_a_row_for_each_statistic_configuration_and_bin():
+    rng = np.random.default_rng(1)
+    first, second = results_of(rng), twins(rng)
+    gap = simulation_gap(first, second, bins={"side_px": [20, 40, 70]})
+    table = gap_table(gap)
+    assert list(table.headings) == [
+        "", "cornerRefinementMethod", "side_px", "photographs", "simulated", "gap"]
+    assert len(table.rows) == 7 * 2 * 2
+    row = next(row for row in table.rows if row[:3] == ["range bias, %", "subpix", "20\u201340"])
+    at = gap.sel(cornerRefinementMethod="subpix").isel(side_px=0)
+    assert float(row[3].replace("\u2212", "-")) == pytest.approx(
+        at.range_bias_percent.values[0], rel=0.01)
+    assert "to" in row[5]
+    ratio = next(row for row in table.rows if row[0].startswith("rotation error, 90 %"))
+    assert ratio[5].startswith("\u00d7")
+    assert gap_lines(gap) == ["12 photographs and their twins, pairs of markers"]
+
+
+def test_json_has_the_same_numbers_and_null_where_there_is_none():
+    rng = np.random.default_rng(2)
+    gap = simulation_gap(results_of(rng, 3), twins(rng))
+    records = gap_records(gap)
+    assert json.loads(json.dumps(records, allow_nan=False)) == records
+    median = next(each for each in records if each["statistic"] == "rotation_median_deg")
+    assert median["compared_by"] == "ratio"
+    assert median["cornerRefinementMethod"] == "none"
+    assert median["gap"][1:] == [None, None]
+    assert math.isfinite(median["gap"][0])
+    assert gap_lines(gap)[-1] == "fewer than 5 photographs: errors without intervals"
+
+
+@pytest.mark.parametrize(("arguments", "expected"), [
+    (["--bins", "side_px"], "--bins side_px: expected a variable and increasing edges"),
+    (["--bins", "side_px=a,b"], "--bins side_px=a,b: expected"),
+    (["--json", "--markdown"], "expected one of --markdown and --json"),
+    ([], "runs/none.zarr"),
+])
+def test_a_fault_is_one_line(arguments, expected, capsys):
+    code, out, err = told(capsys, "compare", "runs/none.zarr", "scene.toml", *arguments)
+    assert (code, out) == (2, "")
+    assert expected in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.long
+def test_photographs_are_simulated_and_compared_in_one_command(tmp_path, capsys):
+    shots = write_set(tmp_path, POSES)
+    given = ["--camera", tmp_path / "camera.json", "--board", tmp_path / "board.toml"]
+    scene = tmp_path / "same.toml"
+    scene.write_text("[scene]\nblack = 35\nwhite = 210\nblur_px = 0.6\nnoise_grey = 2\n")
+    with calls_here():
+        code, *_ = told(
+            capsys, "photos", shots, *given, "--store", tmp_path / "shots.zarr",
+            "--set", 'cornerRefinementMethod=["none", "subpix"]',
+        )
+        assert code == 0
+        code, out, _ = told(capsys, "compare", tmp_path / "shots.zarr", scene)
+        assert code == 0
+        assert "5 photographs and their twins" in out
+        assert (tmp_path / "shots-same.zarr").is_dir()
+        code, out, _ = told(
+            capsys, "compare", tmp_path / "shots.zarr", tmp_path / "shots-same.zarr", "--json")
+        (median,) = (each for each in json.loads(out)["rows"]
+                     if each["statistic"] == "rotation_median_deg"
+                     and each["cornerRefinementMethod"] == "subpix")
+        # The photographs were rendered with this scene, but for the board around each marker.
+        assert 0.5 < median["gap"][0] < 2
+        simulated = sweep.twins(tmp_path / "shots.zarr", scene)  # finished already
+        assert simulated.sizes["trial"] == len(POSES)
+        scene.write_text("[scene]\nblur_px = 3\n")
+        code, _, err = told(capsys, "compare", tmp_path / "shots.zarr", scene)
+        assert code == 2
+        assert "holds another experiment" in err
+    empty = tmp_path / "empty.toml"
+    empty.write_text("seed = 3\n")
+    assert "expected a section [scene]" in told(
+        capsys, "compare", tmp_path / "shots.zarr", empty)[2]

@@ -37,13 +37,14 @@ if TYPE_CHECKING:
     from sweep.analysis.flag_labels import decode_flags
     from sweep.execution.cluster import Cluster
     from sweep.execution.progress import Progress
+    from sweep.fitting.folders import FittedScene
     from sweep.plan.experiment import Pipeline
     from sweep.tradeoff.choice_search import Choice
 
 __all__ = [
     "ArgumentError", "DatasetError", "Pipeline", "PipelineError", "Progress", "RunError",
     "StoreError", "SweepError", "__version__", "decode_flags",
-    "limit", "open", "photos", "run", "size", "twins",
+    "fit", "limit", "open", "photos", "run", "size", "twins",
 ]
 
 _IMPORTED_ON_USE = {"Pipeline": "sweep.plan.experiment", "Progress": "sweep.execution.progress",
@@ -446,6 +447,49 @@ def twins(
         store=store or twin_store(photographs, named),
         workers=workers, overwrite=overwrite, progress=progress,
     )
+
+
+def fit(
+    *folders: str | os.PathLike[str],
+    camera: str | os.PathLike[str] | None = None,
+    board: str | os.PathLike[str] | None = None,
+    poses: str | os.PathLike[str] | None = None,
+    stereo: str | os.PathLike[str] | None = None,
+    settings: Sequence[str] = (),
+    markers: int = 12,
+) -> FittedScene:
+    """Estimate a camera's scene, its blur, sharpening, tone, light, noise and geometry.
+
+    Parameters
+    ----------
+    folders, camera, board, poses, stereo
+        As for :func:`photos`; of a stereo camera the left one's scene is fitted.
+    settings
+        "key=value" for the dictionary and size_m of single markers.
+    markers
+        The most markers of a photograph that are fitted, well spread over the frame.
+
+    Returns
+    -------
+    FittedScene
+        The terms with their intervals (``found.terms``), what the section [scene] has
+        (``found.scene``), a pipeline of this camera (``pipeline``) and its file (``text``).
+
+    Raises
+    ------
+    ArgumentError, PipelineError, StoreError
+        As for :func:`photos`; photographs to which nothing can be fitted are told in a line.
+    """
+    from sweep.fitting.folders import fit_folder  # noqa: PLC0415
+    from sweep.messages import notice  # noqa: PLC0415
+
+    fitted = fit_folder(
+        folders, camera, board=board, poses=poses, stereo=stereo, settings=settings,
+        markers=markers,
+    )
+    for line in fitted.lines:
+        notice(line)
+    return fitted
 
 
 def size(

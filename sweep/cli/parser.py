@@ -14,6 +14,7 @@ from sweep.cli.completion import COMPLETION
 from sweep.cli.environments import ENVIRONMENTS
 from sweep.cli.error_model import ERROR_MODEL
 from sweep.cli.export import EXPORT
+from sweep.cli.fit import FIT
 from sweep.cli.limit import LIMIT
 from sweep.cli.output import flushed
 from sweep.cli.photos import PHOTOS
@@ -34,7 +35,7 @@ from sweep.version import __version__
 
 COMMANDS = (
     RUN, PLAN, SIZE, LIMIT, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, ERROR_MODEL, VERIFY, STATUS,
-    EXPORT, SCORE, PHOTOS, COMPARE, CHECK_DETECTOR, PLUGINS, ENVIRONMENTS,
+    EXPORT, SCORE, PHOTOS, FIT, COMPARE, CHECK_DETECTOR, PLUGINS, ENVIRONMENTS,
     COMPLETION,
 )
 """Every command, in the order in which the help lists them."""

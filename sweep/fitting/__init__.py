@@ -1,0 +1,1 @@
+"""The scene of a user's camera, estimated from photographs of known markers."""

@@ -1,0 +1,293 @@
+"""A camera's scene from photographs of known markers: every term with its interval."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sweep.errors import ArgumentError
+from sweep.fitting.camera_fit import CameraFit, fit_camera
+from sweep.fitting.estimates import MIN_PHOTOGRAPHS, Estimate, estimate, jackknife
+from sweep.fitting.geometry import residuals_of, shifts_of
+from sweep.fitting.light import (
+    gradient_direction,
+    gradient_size,
+    gradient_square,
+    photograph_light,
+)
+from sweep.fitting.marker_state import AMOUNT, BLOOM, RADIUS, VARIANCE
+from sweep.fitting.noise import PhotographNoise, photograph_noise
+from sweep.fitting.photograph_fit import PhotographFit
+from sweep.fitting.scenes import PhotographScenes
+from sweep.fitting.terms import Term, judged, shortened
+from sweep.fitting.views import is_saturated, photograph_views
+from sweep.measure.flags import TruthSource
+from sweep.model.board import Board
+from sweep.model.derivatives import POSE
+from sweep.photographs.board_truth import marker_frames
+from sweep.photographs.pose_fit import fit_pose
+from sweep.typing import Floats
+
+MARKERS = 12
+"""Markers of a photograph that are fitted: more of them narrow the intervals little, since
+photographs differ by more than the estimates of one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneFit:
+    """A camera's scene.
+
+    Attributes
+    ----------
+    terms
+        Every parameter with its interval, kept or left out.
+    photographs, markers
+        How many of them were fitted.
+    lines
+        What is to be said beside the terms.
+    """
+
+    terms: tuple[Term, ...]
+    photographs: int
+    markers: int
+    lines: tuple[str, ...]
+
+    @property
+    def scene(self) -> dict[str, Any]:
+        """Parameters of the section [scene] with the terms that are kept."""
+        return {each.parameter: each.value for each in self.terms if each.kept}
+
+
+def fit_scene(
+    taken: PhotographScenes, board: Board | None, markers: int = MARKERS
+) -> SceneFit:
+    """Return the scene of a camera from its photographs.
+
+    Parameters
+    ----------
+    taken
+        The photographs.
+    board
+        The board that is in them; None for single markers.
+    markers
+        The most markers of a photograph that are fitted, well spread over the frame.
+
+    Raises
+    ------
+    ArgumentError
+        If nothing can be fitted, in a line.
+    """
+    views = photograph_views(taken, board, markers)
+    if not views:
+        raise ArgumentError(
+            "folders", "no marker", "expected photographs of markers of at least 12 px a side"
+        )
+    good = [each for each in views if not is_saturated(each)]
+    if not good:
+        raise ArgumentError(
+            "folders", "white at level 255",
+            "white is saturated in all photographs: expose less, so that levels are seen",
+        )
+    camera = fit_camera(good)
+    if not camera.fits:
+        raise ArgumentError(
+            "folders", "no marker fits",
+            "expected markers whose pixels are black and white at their true poses; check the "
+            "board, the camera and the poses",
+        )
+    noises = [photograph_noise(fit.states) for fit in camera.fits]
+    terms = [
+        *_levels(camera, taken), *_optics(camera), *_light(camera, taken), *_noise(camera, noises),
+        *_geometry(camera, noises, taken, board),
+    ]
+    lines = _lines(camera, noises)
+    if len(good) < len(views):
+        lines.insert(
+            0, f"left out {len(views) - len(good)} of {len(views)} photographs, in which white is "
+            "saturated: expose less"
+        )
+    return SceneFit(
+        tuple(terms), len(camera.fits), sum(len(fit.states) for fit in camera.fits), tuple(lines)
+    )
+
+
+def _levels(camera: CameraFit, taken: PhotographScenes) -> list[Term]:
+    lights = [photograph_light(fit.states, taken.frame) for fit in camera.fits]
+    own = np.array([each.variances for each in lights])
+    grounds = np.array([
+        np.median([state.marker.ground for state in fit.states]) for fit in camera.fits
+    ])
+    return [
+        Term("black", "black", estimate(np.array([each.black for each in lights]), own[:, 0])),
+        Term("white", "white", estimate(np.array([each.white for each in lights]), own[:, 1])),
+        Term("around the marker", "background", estimate(grounds)),
+    ]
+
+
+def _optics(camera: CameraFit) -> list[Term]:
+    none = Estimate(math.nan)
+    variance, amount, bloom = (
+        camera.estimates.get(k, test)
+        for k, test in zip((VARIANCE, AMOUNT, BLOOM), camera.tested, strict=True)
+    )
+    blur = judged("blur", "blur_px", variance, 0.0, camera.tested[0], lambda v: v.mapped(_root))
+    sharpening = judged("sharpening", "sharpening", amount, 0.0, camera.tested[1])
+    radius = camera.estimates.get(RADIUS, none)
+    return [
+        blur, sharpening,
+        Term("radius of sharpening", "sharpening_px", radius, sharpening.kept,
+             "one for all photographs" if sharpening.kept else "no sharpening", of="sharpening"),
+        judged("bloom (tone)", "bloom", bloom, 0.0, camera.tested[2]),
+    ]
+
+
+def _root(square: float) -> float:
+    return math.sqrt(square) if square > 0 else (math.nan if math.isnan(square) else 0.0)
+
+
+def _light(camera: CameraFit, taken: PhotographScenes) -> list[Term]:
+    lights = [photograph_light(fit.states, taken.frame) for fit in camera.fits]
+    gradient = judged(
+        "light gradient", "illumination_gradient", gradient_size(lights), 0.0,
+        gradient_square(lights),
+    )
+    direction = gradient_direction(lights)
+    name, parameter = "direction of light", "illumination_deg"
+    if direction is None:
+        return [gradient, Term(
+            name, parameter, Estimate(math.nan), gradient.kept, "any", of="illumination_gradient",
+            setting={"uniform": [0.0, 360.0]},
+        )]
+    return [gradient, Term(name, parameter, direction, gradient.kept,
+                           "" if gradient.kept else "no gradient", of="illumination_gradient")]
+
+
+def _noise(camera: CameraFit, noises: Sequence[PhotographNoise]) -> list[Term]:
+    """Return the noise as a table of two levels, and its correlation."""
+    level = [
+        estimate(np.array([
+            np.mean([state.levels[0] + share * state.levels[1] for state in fit.states])
+            for fit in camera.fits
+        ])).value for share in (0.0, 1.0)
+    ]
+    variances = [
+        estimate(np.array([getattr(each, name) for each in noises]))
+        for name in ("black_variance", "white_variance")
+    ]
+    deviations = [each.mapped(_root) for each in variances]
+    table: list[float] = []
+    for at, each in sorted(zip(level, deviations, strict=True), key=lambda pair: pair[0]):
+        if math.isfinite(each.value):
+            table += [shortened(at), shortened(each.value)]
+    terms = [
+        judged(f"noise on {colour}", "noise_table", each, 0.0)
+        for colour, each in zip(("black", "white"), variances, strict=True)
+    ]
+    kept = any(each.kept and each.estimate.value > 0 for each in terms)
+    terms = [
+        Term(each.name, "noise_table", deviation, kept, each.reason, 0.0, setting=table)
+        for each, deviation in zip(terms, deviations, strict=True)
+    ]
+    correlation = judged(
+        "correlation of noise", "noise_correlation",
+        estimate(np.array([each.correlation for each in noises])), 0.0,
+    )
+    if correlation.kept and not kept:
+        correlation = correlation.left_out("no noise")
+    elif correlation.kept and correlation.estimate.value < 0:
+        correlation = correlation.left_out("negative, which no scene has")
+    return [*terms, correlation]
+
+
+def _geometry(
+    camera: CameraFit, noises: Sequence[PhotographNoise], taken: PhotographScenes,
+    board: Board | None,
+) -> list[Term]:
+    sources = set(taken.source[taken.shown].tolist())
+    names = ("geometry", "geometry_px"), ("reach of geometry", "geometry_length_px")
+    known = {TruthSource.board_without_this_marker, TruthSource.poses_file}
+    if not sources <= known or not np.isfinite(noises[0].edge_ratio):
+        return [
+            Term(*name, Estimate(math.nan), False, "only beside a board or exact poses", 0.0)
+            for name in names
+        ]
+    residuals = []
+    for fit, noise in zip(camera.fits, noises, strict=True):
+        fixed = TruthSource.poses_file in sources
+        compared = _beside_truth(fit) if fixed else _beside_board(fit, taken, board)
+        one = None if compared is None else residuals_of(fit.states, noise, *compared)
+        if one is not None:
+            residuals.append(one)
+    if len(residuals) < MIN_PHOTOGRAPHS:
+        return [
+            Term(*name, Estimate(math.nan), False, "too few photographs or markers", 0.0)
+            for name in names
+        ]
+    shifts = shifts_of(residuals)
+    size, length = (
+        estimate(jackknife(math.log(full), np.log(without))).mapped(math.exp)
+        for full, without in (
+            (shifts.size_px, shifts.without_size_px), (shifts.length_px, shifts.without_length_px)
+        )
+    )
+    term = judged("geometry", "geometry_px", size, 0.0, estimate(shifts.squares))
+    if term.kept and estimate(shifts.squares).value < 0:
+        term = term.left_out("smaller than the noise")
+    return [term, Term(
+        "reach of geometry", "geometry_length_px", length, term.kept,
+        "" if term.kept else "no geometry", of="geometry_px",
+    )]
+
+
+def _beside_truth(fit: PhotographFit) -> tuple[Floats, Floats]:
+    """Return the shifts (n, 2) of centres beside poses that are exact."""
+    shifts = [(each.corners_px - each.marker.corners_px).mean(axis=0) for each in fit.states]
+    return np.array(shifts), np.empty((2 * len(shifts), 0))
+
+
+def _beside_board(
+    fit: PhotographFit, taken: PhotographScenes, board: Board | None
+) -> tuple[Floats, Floats] | None:
+    """Return the shifts (n, 2) of centres beside one pose of the board, fitted to all of them.
+
+    And how the centres change with that pose, (2 n, 6). None without such a pose.
+    """
+    if board is None:
+        return None
+    scenes = taken.scenes
+    rows = [state.marker.row for state in fit.states]
+    numbers = [board.marker_ids.index(scenes.marker_id[row]) for row in rows]
+    points = board.corners_m[numbers]
+    pixels = np.array([state.corners_px + state.marker.frame_px for state in fit.states])
+    axes, centre = marker_frames(board)[numbers[0]]
+    rotation = scenes.rotation[rows[0]] @ axes.T
+    camera = taken.lens(rows[0])
+    pose = fit_pose(
+        camera, points.reshape(-1, 3), pixels.reshape(-1, 2), rotation,
+        scenes.translation[rows[0]] - rotation @ centre, np.ones(4 * len(points), dtype=bool),
+    )
+    if pose is None:
+        return None
+    shifts = -pose.residuals.reshape(-1, 4, 2).mean(axis=1)
+    middle = points.mean(axis=1)
+    explained = camera.derivatives(middle, pose.rotation, pose.translation)[1]
+    return shifts, np.asarray(explained.reshape(-1, POSE))
+
+
+def _lines(camera: CameraFit, noises: Sequence[PhotographNoise]) -> list[str]:
+    lines = []
+    if len(camera.fits) < MIN_PHOTOGRAPHS:
+        lines.append(
+            f"photographs that could be fitted: {len(camera.fits)}; from {MIN_PHOTOGRAPHS} on "
+            "values have intervals, and effects that are not there are left out"
+        )
+    ratios = [each.edge_ratio for each in noises if math.isfinite(each.edge_ratio)]
+    if ratios:
+        lines.append(
+            f"residuals of all pixels are {np.median(ratios):.2g} times those far from edges"
+        )
+    return lines

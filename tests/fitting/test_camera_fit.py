@@ -1,0 +1,131 @@
+"""Scenes that are fitted to photographs with known effects: rendered, saved, and fitted."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import sweep
+from support.photographs import photographs, save
+from sweep import cli
+from sweep.errors import ArgumentError
+from sweep.fitting.estimates import estimate, jackknife
+from sweep.plan.board_files import board_of
+
+BOARD = {
+    "kind": "charuco", "dictionary": "DICT_4X4_50", "squares_x": 5, "squares_y": 4,
+    "square_m": 0.03, "marker_m": 0.022,
+}
+CAMERA = {"width_px": 360, "height_px": 270, "fx_px": 390.0}
+LEVELS = {"black": 60.0, "white": 175.0, "background": 100.0}
+TRUTH = {
+    "blur_px": 0.6, "sharpening": 0.6, "sharpening_px": 1.5, "bloom": 0.15,
+    "illumination_gradient": 0.2, "illumination_deg": 30.0, "noise_correlation": 0.5,
+    "geometry_px": 0.15, "geometry_length_px": 60.0, **LEVELS,
+}
+EFFECTS = TRUTH | {"noise_grey": 2.0}
+PLAIN = LEVELS | {"blur_px": 0.5, "noise_grey": 1.0}
+
+
+def taken(folder, effects, seed, count):
+    """Write photographs, the camera's file and the board's; return `sweep.fit`'s arguments."""
+    shots = photographs(board_of(BOARD, "board"), CAMERA, count, seed, effects, 0.9)
+    camera = save(folder / "shots", shots, CAMERA)
+    camera = camera.rename(folder / "camera.yml")
+    (folder / "shots" / "truth.json").unlink()
+    (folder / "board.toml").write_text(
+        "".join(f"{key} = {json.dumps(value)}\n" for key, value in BOARD.items()))
+    return (folder / "shots",), {"camera": camera, "board": folder / "board.toml"}
+
+
+def fitted(folder, effects, seed, count, markers=6):
+    folders, options = taken(folder, effects, seed, count)
+    return sweep.fit(*folders, **options, markers=markers)
+
+
+def terms_of(found):
+    return {each.parameter: each for each in found.found.terms}
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    return fitted(tmp_path_factory.mktemp("fit"), EFFECTS, 7, 6)
+
+
+def test_every_effect_is_found_and_its_interval_holds_the_truth(found):
+    terms = terms_of(found)
+    for name, value in TRUTH.items():
+        if name == "background":  # of photographs it is the board's squares beside the marker
+            continue
+        one = terms[name].estimate
+        assert terms[name].kept, name
+        # One in twenty 95 % intervals misses; with five degrees of freedom, twice as wide ones
+        # hold the truth with a probability of 0.9965.
+        half = (one.high - one.low) / 2
+        assert abs(one.value - value) < 2 * half + 1e-9, name
+    deviations = terms["noise_table"].setting
+    assert np.allclose(deviations[1::2], 2.0, rtol=0.1)
+
+
+def test_the_scene_is_a_pipeline_that_runs(found, tmp_path, capsys):
+    path = tmp_path / "scene.toml"
+    path.write_text(found.text)
+    assert cli.main(["plan", str(path)]) == 0
+    assert "sharpening" in capsys.readouterr().out
+    pipeline = sweep.Pipeline.from_toml(path)
+    assert pipeline.fixed["blur_px"] == pytest.approx(0.6, rel=0.03)
+    assert "# Fitted to 36 markers in 6 photographs" in found.text
+
+
+def test_effects_that_are_not_there_are_left_out_and_the_file_says_why(tmp_path):
+    plain = fitted(tmp_path, PLAIN, 8, 4, 4)
+    terms = terms_of(plain)
+    assert terms["blur_px"].kept
+    assert terms["blur_px"].estimate.value == pytest.approx(0.5, abs=0.02)
+    absent = [name for name in ("sharpening", "bloom", "geometry_px") if not terms[name].kept]
+    assert len(absent) >= 2  # a false alarm of each has a probability of 5 %
+    for name in absent:
+        assert f"#   left out: {terms[name].name}: {terms[name].reason}\n" in plain.text
+        assert name not in plain.found.scene
+
+
+def test_one_photograph_gives_values_without_intervals(tmp_path):
+    one = fitted(tmp_path, EFFECTS, 9, 1, 4)
+    terms = terms_of(one)
+    assert terms["white"].estimate.value == pytest.approx(175.0, abs=2.0)
+    assert np.isnan(terms["white"].estimate.low)
+    assert terms["sharpening"].reason == "too few photographs to judge"
+    assert not terms["geometry_px"].kept
+    assert "from 4 on" in one.found.lines[0]
+
+
+def test_saturated_white_is_one_line(tmp_path):
+    folders, options = taken(tmp_path, PLAIN | {"white": 255.0, "black": 120.0}, 3, 1)
+    with pytest.raises(ArgumentError, match="saturated in all photographs: expose less"):
+        sweep.fit(*folders, **options)
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"markers": 0}, "markers = 0: expected a whole number from 1 to 1000"),
+    ({"settings": ["solver=ippe"]}, "scene is fitted to pixels"),
+])
+def test_bad_arguments_are_one_line(change, message, tmp_path):
+    with pytest.raises(ArgumentError, match=message):
+        sweep.fit(tmp_path, camera="calibrate", **change)
+
+
+def test_the_interval_of_a_mean_is_students():
+    values = np.random.default_rng(1).normal(3.0, 0.5, 9)
+    one = estimate(values, np.full(9, 0.04))
+    low, high = stats.t.interval(0.95, 8, values.mean(), stats.sem(values))
+    assert np.allclose([one.value, one.low, one.high], [values.mean(), low, high])
+    assert one.spread == pytest.approx(np.sqrt(values.var(ddof=1) - 0.04))
+    assert estimate(values, np.full(9, 0.5)).spread == 0.0
+    assert np.isnan(estimate(values[:3]).low)
+
+
+def test_the_jackknife_of_a_mean_is_that_mean():
+    values = np.random.default_rng(2).normal(size=7)
+    without = np.array([np.delete(values, k).mean() for k in range(7)])
+    assert np.allclose(jackknife(values.mean(), without), values)

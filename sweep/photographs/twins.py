@@ -10,23 +10,30 @@ from typing import Any
 import numpy as np
 
 from sweep.errors import ArgumentError, PluginError
+from sweep.measure.surroundings import clear_modules
 from sweep.messages import plain
 from sweep.model.image_file import read_regular
 from sweep.plan.alternatives import PHOTOGRAPHS, SIMULATED
 from sweep.plan.axes import TRIAL, parse_distribution
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import PARAMETERS
-from sweep.plan.photographs import read_record, shows_photographs
+from sweep.plan.photographs import PhotographRecord, read_record, shows_photographs
 from sweep.plan.toml_text import MAX_BYTES, read_document
 
 NAME = "{}-twins"
 """Name of the twins of photographs of a name."""
 
+QUIET_ZONE = "quiet_zone_modules"
+
+MAX_QUIET_ZONE = 4.0
+"""The widest that a board makes it, in modules: nothing beyond influences the marker's corners."""
+
 
 def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1) -> Pipeline:
     """Return the pipeline that simulates the markers of photographs at their true poses.
 
-    Each image has one marker with its quiet zone on a plain ground. Camera, detectors, estimators,
+    Each image has one marker on a plain ground, with a quiet zone as wide as the board leaves clear
+    (unless the pipeline of the photographs has one). Camera, detectors, estimators,
     rows and flags are those of the photographs, so that results pair: trial k has the poses of
     photograph k modulo their number. What is drawn of the scene is drawn for each photograph and
     repeat, and is the same for all its markers; noise and shifts are each marker's own.
@@ -53,16 +60,18 @@ def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1
         raise ArgumentError("repeats", repeats, "expected at least 1")
     axis = pipeline.axis(TRIAL)
     trials = 1 if axis is None else len(axis)
-    if repeats > 1 and trials != photograph_count(pipeline):
+    photographs = len(_record(pipeline).paths)
+    if repeats > 1 and trials != photographs:
         raise ArgumentError(
-            "repeats", repeats,
-            f"expected 1, for the {trials} first of {photograph_count(pipeline)} photographs",
+            "repeats", repeats, f"expected 1, for the {trials} first of {photographs} photographs"
         )
     document = read_document(pipeline.to_toml())
     document["title"] = plain(f"Twins of {pipeline.heading}", 200)
     document["scene"] = {
         **document.get("scene", {}), SIMULATED: True, **_ground(scene.get("black")), **scene,
     }
+    if QUIET_ZONE not in pipeline.given:
+        document["marker"] |= _quiet_zone(_record(pipeline))
     document.setdefault("axes", {})[TRIAL] = trials * repeats
     return Pipeline.from_dict(
         document, name=NAME.format(pipeline.name), source="scene", folder=pipeline.folder
@@ -80,17 +89,23 @@ def _ground(black: Any) -> dict[str, float]:
         return {}  # the pipeline's check says what is wrong with it
 
 
-def photograph_count(pipeline: Pipeline) -> int:
-    """Return the number of photographs in the record of a pipeline.
+def _quiet_zone(record: PhotographRecord) -> dict[str, float]:
+    """Return what a board leaves clear around its markers; nothing without a board."""
+    clear = [clear_modules(each) for each in record.on_board(record.marker_id) if each is not None]
+    return {QUIET_ZONE: round(min(*clear, MAX_QUIET_ZONE), 6)} if clear else {}
+
+
+def _record(pipeline: Pipeline) -> PhotographRecord:
+    """Return the record of photographs of a pipeline; of two cameras the left one's.
 
     Raises
     ------
     ArgumentError
-        If the record cannot be read.
+        If it cannot be read.
     """
     name = str(pipeline.values_of(PHOTOGRAPHS)[0])
     try:
-        return len(read_record(Path(pipeline.folder) / name)[0].paths)
+        return read_record(Path(pipeline.folder) / name)[0]
     except PluginError as error:
         raise ArgumentError(PHOTOGRAPHS, plain(name), f"expected {error}") from None
 

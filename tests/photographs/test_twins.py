@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from support.board_photographs import POSES, write_set
+from support.board_photographs import BOARD, POSES, write_set
 from support.here import calls_here
 from sweep.errors import SweepError
 from sweep.evaluation.cells import run_cells
@@ -78,6 +78,16 @@ def test_the_ground_has_the_median_level_of_black(prepared):
     assert twin_pipeline(prepared, {"black": 35}).fixed["background"] == 35
     assert twin_pipeline(prepared, {"black": {"uniform": [20, 40]}}).fixed["background"] == 30
     assert twin_pipeline(prepared, {"black": 35, "background": 9}).fixed["background"] == 9
+
+
+def test_the_quiet_zone_is_as_wide_as_the_board_leaves_clear(prepared):
+    twins = twin_pipeline(prepared, {})
+    clear = (BOARD["square_m"] - BOARD["marker_m"]) / 2 / (BOARD["marker_m"] / 6)
+    assert twins.fixed["quiet_zone_modules"] == pytest.approx(clear, abs=1e-6)
+    given = Pipeline.from_text(
+        prepared.to_toml(), ["quiet_zone_modules=2.5"], folder=prepared.folder
+    )
+    assert twin_pipeline(given, {}).fixed["quiet_zone_modules"] == 2.5
 
 
 @pytest.mark.long

@@ -35,6 +35,10 @@ QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 SIDE = "side_px"
 
+TRUTH_STD = "truth_std"
+
+SEED = 21
+
 
 @dataclass(frozen=True)
 class Units:
@@ -150,6 +154,8 @@ def paired_units(
         arrays = pose_arrays(side, ERROR_INPUTS) | {
             f"{PREFIX}{name}": _binned(side, name) for name in binning.edges
         }
+        if paired and side is second and TRUTH_STD in side:
+            arrays[TRUTH_STD] = side[TRUTH_STD]
         single = not of_photographs(side)
         sides.append((_in_units(side, arrays, names, single=single), single))
     if paired:
@@ -158,6 +164,7 @@ def paired_units(
         sides[0] = ({name: array[:, kept] for name, array in sides[0][0].items()}, False)
         sides[1] = ({name: _gathered(array, trials[kept]) for name, array in sides[1][0].items()},
                     False)
+        _blur_truth(sides[1][0])
     values = [
         {name: arrays.pop(f"{PREFIX}{name}")[0] for name in binning.edges} for arrays, _ in sides
     ]
@@ -271,6 +278,21 @@ def _in_units(
         shape = tuple(values.sizes[dim] for dim in inner)
         laid_out[name] = np.asarray(values).reshape(count, units, -1, *shape)
     return laid_out
+
+
+def _blur_truth(arrays: dict[str, NDArray[Any]]) -> None:
+    """Add the truth's random error, as far as it is known, to errors of twins.
+
+    The photographs' errors are differences to a truth that has such an error, the twins' to an
+    exact one. A draw is of a marker, the same for all its configurations.
+    """
+    std = arrays.pop(TRUTH_STD, None)
+    if std is None:
+        return
+    drawn = np.random.default_rng(SEED).normal(size=std.shape[1:]) * np.nan_to_num(std)
+    for name, part in (("rotation_error_rad", drawn[..., :3]),
+                       ("translation_error_m", drawn[..., 3:])):
+        arrays[name] = arrays[name] + part
 
 
 def _gathered(array: NDArray[Any], trials: Integers) -> NDArray[Any]:

@@ -123,6 +123,9 @@ def simulation_gap(
 
     Notes
     -----
+    The photographs' errors have the random error of their truth in them. To those of twins as much
+    is added: a draw for each marker, of ``truth_std`` where it is known.
+
     95 % intervals in which a photograph with all its markers is the draw; NaN of errors in fewer
     than five photographs. Of rates and quantiles they are as in `sweep.analysis.error_statistics`;
     of differences of rates Newcombe's (Statistics in Medicine 17, 1998, method 10), which does not

@@ -90,9 +90,14 @@ def _ground(black: Any) -> dict[str, float]:
 
 
 def _quiet_zone(record: PhotographRecord) -> dict[str, float]:
-    """Return what a board leaves clear around its markers; nothing without a board."""
+    """Return what a board leaves clear around its markers.
+
+    Nothing, which is the default, without a board, or where prints touch the markers' corners, as
+    those of Kalibr's boards do.
+    """
     clear = [clear_modules(each) for each in record.on_board(record.marker_id) if each is not None]
-    return {QUIET_ZONE: round(min(*clear, MAX_QUIET_ZONE), 6)} if clear else {}
+    width = round(min([*clear, MAX_QUIET_ZONE]), 6)
+    return {QUIET_ZONE: width} if clear and width > 0 else {}
 
 
 def _record(pipeline: Pipeline) -> PhotographRecord:

@@ -1,8 +1,8 @@
 """The fit of a printed plane to a photograph: pose, point spread, and what cameras do to levels.
 
 The linear parameters of the model (:mod:`sweep.measure.photograph_model`) are solved for at each
-step, as in :mod:`sweep.measure.likelihood`; the pose, the point spread's variance and the amount of
-sharpening are moved by Levenberg-Marquardt.
+step, as in :mod:`sweep.measure.likelihood`; the pose and the point spread's variance are moved by
+Levenberg-Marquardt.
 """
 
 from __future__ import annotations
@@ -16,14 +16,16 @@ from sweep.measure.likelihood import SPREAD, is_before_camera, moved_state, over
 from sweep.measure.photograph_model import (
     AMOUNT,
     CONTRAST,
+    MOVED,
     OUTSIDE_VALUE,
     TONE,
     Nuisances,
     PhotographView,
     System,
-    columns_at,
-    counts,
     draw,
+    linear_count,
+    pixel_count,
+    write_columns,
 )
 from sweep.measure.positive_definite import solve_positive
 from sweep.model.derivatives import POSE
@@ -32,15 +34,21 @@ from sweep.typing import Floats
 MIN_SPREAD_PX = 0.2
 """Smallest point spread that is estimated."""
 
-MIN_AMOUNT, MAX_AMOUNT = -0.9, 5.0
-"""Range of the amount of sharpening."""
+MIN_OUTSIDE_PX = 1.0
+"""Pixels of the area outside, by squares of its shares, below which its level stays as it is."""
 
-GROUP, TILE = 64, 4
+MAX_OUTSIDE = 2.0
+"""Largest level outside, from black, as a share of the contrast."""
+
+GROUP, TILE = 128, 4
 """Pixels whose columns are multiplied at once, and the side of the tiles of their products."""
 
-SLACK = 0.5
-"""Rise of chi-square that a step may bring: its direction is not exactly that of descent."""
+NEARLY_SETTLED = 0.1
+"""Squared standard deviations of the last undamped step, if no other lowers the squares."""
 
+SLACK = 0.03
+"""Rise of the squares that a step may bring, as a share: tone and sharpening are multiplied in the
+model, and each evaluation takes one of the factors from the evaluation before."""
 
 
 @compiled
@@ -51,24 +59,27 @@ def normal_equations(
     size = matrix.shape[0]
     tiles = (size + TILE - 1) // TILE
     columns, sums = np.zeros((GROUP, TILE * tiles)), np.zeros((TILE * tiles, TILE * tiles))
-    height, width = view.used.shape
     filled = 0
-    for i in range(height):
-        for j in range(width):
-            if view.used[i, j]:
-                columns_at(view, state, nuisances, work.images, i, j, columns[filled])
-                filled += 1
-                if filled == GROUP:
-                    _add_group(columns, filled, sums)
-                    filled = 0
-    _add_group(columns, filled, sums)
+    for i in range(len(view.spans)):
+        first, last = view.spans[i]
+        while first < last:
+            count = min(last - first, GROUP - filled)
+            write_columns(
+                view, state, nuisances, work.images, i, first, columns[filled : filled + count]
+            )
+            filled += count
+            first += count
+            if filled == GROUP:
+                add_products(columns, filled, sums)
+                filled = 0
+    add_products(columns, filled, sums)
     for k in range(size):
         for m in range(k + 1):
             matrix[k, m] = matrix[m, k] = sums[k, m]
 
 
 @compiled
-def _add_group(columns: Floats, count: int, sums: Floats) -> None:
+def add_products(columns: Floats, count: int, sums: Floats) -> None:
     """Add the products of the columns of ``count`` pixels to the tiles of the lower triangle."""
     for k in range(0, sums.shape[0], TILE):
         for m in range(0, k + 1, TILE):
@@ -122,6 +133,11 @@ def evaluate(
             right[k, m] = matrix[free + k, m]
         # What covers no pixel is 0, and what cannot be told from the rest stays small.
         inner[k, k] = inner[k, k] * (1.0 + 1e-9) if inner[k, k] > 0.0 else 1.0
+    if nuisances.outside and inner[2, 2] < MIN_OUTSIDE_PX:
+        inner[2] = 0.0
+        inner[:, 2] = 0.0
+        inner[2, 2] = 1.0
+        right[2] = 0.0
     if not solve_positive(inner, right):
         return math.inf
     squares = matrix[end, end]
@@ -137,24 +153,13 @@ def evaluate(
             for k in range(count):
                 information[i, j] -= matrix[i, free + k] * right[k, j]
     if state[SPREAD] <= MIN_SPREAD_PX and gradient[POSE] < 0.0:
-        _hold(information, gradient, POSE)
-    if nuisances.sharpening:
-        pull = gradient[POSE + 1]
-        if (state[AMOUNT] <= MIN_AMOUNT and pull < 0.0) or (
-            state[AMOUNT] >= MAX_AMOUNT and pull > 0.0
-        ):
-            _hold(information, gradient, POSE + 1)
+        # The squares fall beyond the limit.
+        information[POSE] = 0.0
+        information[:, POSE] = 0.0
+        information[POSE, POSE] = 1.0
+        gradient[POSE] = 0.0
     keep_linear(state, nuisances, linear)
     return max(float(squares), 0.0)
-
-
-@compiled
-def _hold(information: Floats, gradient: Floats, k: int) -> None:
-    """Keep a parameter where it is: it is at its limit, and the squares fall beyond."""
-    information[k] = 0.0
-    information[:, k] = 0.0
-    information[k, k] = 1.0
-    gradient[k] = 0.0
 
 
 @compiled
@@ -166,23 +171,24 @@ def keep_linear(state: Floats, nuisances: Nuisances, linear: Floats) -> None:
     kept[0], kept[1], kept[2] = contrast, 0.0, 0.0
     k = 2
     if nuisances.outside:
-        state[OUTSIDE_VALUE] += min(max(linear[k] / divisor, -1.0), 1.0)
+        change = min(max(linear[k] / divisor, -1.0), 1.0)
+        state[OUTSIDE_VALUE] = min(max(state[OUTSIDE_VALUE] + change, -1.0), MAX_OUTSIDE)
         k += 1
     if nuisances.tone:
         state[TONE] = linear[k] / divisor
+        k += 1
+    if nuisances.sharpening:
+        state[AMOUNT] = linear[k] / divisor
         k += 1
     if nuisances.light:
         kept[1], kept[2] = linear[k + 2], linear[k + 3]
 
 
 @compiled
-def stepped(state: Floats, step: Floats, nuisances: Nuisances) -> Floats:
+def stepped(state: Floats, step: Floats) -> Floats:
     """Return the state after a step of the moved parameters."""
-    moved = moved_state(state, step[: POSE + 1], 1.0)
+    moved = moved_state(state, step, 1.0)
     moved[SPREAD] = max(moved[SPREAD], MIN_SPREAD_PX)
-    if nuisances.sharpening:
-        change = min(max(step[POSE + 1], -1.0), 1.0)
-        moved[AMOUNT] = min(max(state[AMOUNT] + change, MIN_AMOUNT), MAX_AMOUNT)
     return moved
 
 
@@ -196,17 +202,11 @@ def fit_photograph(
     Returns that sum, and whether the minimum was reached: the undamped Newton step is shorter than
     ``settled`` squared standard deviations (of residuals as noise), and is taken.
     """
-    free, count = counts(nuisances)
-    pixels = 0
-    for used in view.used.flat:
-        pixels += int(used)
-    freedom = max(pixels - free - count, 1)
+    free, count = MOVED, linear_count(nuisances)
+    freedom = max(pixel_count(view) - free - count, 1)
     gradient = np.empty(free)
     trial_information, trial_gradient = np.empty((free, free)), np.empty(free)
     trial_linear = np.empty(count)
-    if state[CONTRAST] == 0.0:
-        # Slopes are for the levels of the evaluation before.
-        evaluate(view, state, nuisances, work, information, gradient, linear)
     squares = evaluate(view, state, nuisances, work, information, gradient, linear)
     damping = 1e-3
     decrement = math.inf
@@ -222,7 +222,7 @@ def fit_photograph(
             for k in range(free):
                 decrement += gradient[k] * newton[k, 0]
             if decrement < settled * (squares / freedom):
-                moved = stepped(state, newton[:, 0], nuisances)
+                moved = stepped(state, newton[:, 0])
                 if is_before_camera(moved, view.marker):
                     overwrite(state, moved)
                 return squares, True
@@ -235,12 +235,12 @@ def fit_photograph(
             if not solve_positive(damped, step):
                 damping = max(10.0 * damping, 1e-3)
                 continue
-            trial = stepped(state, step[:, 0], nuisances)
+            trial = stepped(state, step[:, 0])
             if is_before_camera(trial, view.marker):
                 trial_squares = evaluate(
                     view, trial, nuisances, work, trial_information, trial_gradient, trial_linear
                 )
-                if trial_squares < squares + SLACK * (squares / freedom):
+                if trial_squares < squares * (1.0 + SLACK):
                     accepted = True
                     break
             damping = max(8.0 * damping, 1e-3)
@@ -253,4 +253,4 @@ def fit_photograph(
         for k in range(free):
             overwrite(information[k], trial_information[k])
         damping *= 0.1
-    return squares, decrement < 1e-2 * (squares / freedom)
+    return squares, decrement < NEARLY_SETTLED * (squares / freedom)

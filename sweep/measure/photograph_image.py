@@ -28,8 +28,8 @@ from sweep.model.projection import (
 )
 from sweep.typing import Floats
 
-REACH = 4.0
-"""Standard deviations at which the point spread is cut off; 6e-5 of it lies beyond."""
+REACH = 3.5
+"""Standard deviations at which the point spread is cut off; 5e-4 of it lies beyond."""
 
 PANEL, PANEL_PX = 2.0, 0.4
 """Length of one panel of the quadrature: standard deviations of the point spread (4e-4 of the

@@ -2,7 +2,9 @@
 
 Its covariance is that of least squares with the residuals' variance, and is raised where the
 poses of two halves of the corners differ by more than it says: neighbouring residuals are not
-independent. What all corners share is in neither: an error of the camera's numbers, a bent board.
+independent. An error of the camera's numbers is in it as far as the marker's own corners do not
+lead to the same change of the pose: what truth and estimates share is no error of either against
+the other. A bent board is not in it.
 """
 
 from __future__ import annotations
@@ -53,9 +55,22 @@ class BoardPoses:
 
 
 def board_poses(
-    board: Board, lens: Lens, size: tuple[int, int], found: Sequence[FoundCorners]
+    board: Board, lens: Lens, size: tuple[int, int], found: Sequence[FoundCorners],
+    camera_covariance: Floats | None = None,
 ) -> BoardPoses:
-    """Return the poses of a board's markers in photographs of a size (width, height) in px."""
+    """Return the poses of a board's markers in photographs.
+
+    Parameters
+    ----------
+    board, lens
+        The board and the camera.
+    size
+        Width and height of the photographs in px.
+    found
+        The board's corners in each photograph.
+    camera_covariance
+        (c, c) of fx, fy, cx, cy and the coefficients; None if it is not known.
+    """
     boards = tuple(fitted_board(lens, each) for each in found)
     ratio = _halves_ratio(lens, boards, found)
     raised = max(1.0, ratio) if np.isfinite(ratio) else 1.0
@@ -74,11 +89,32 @@ def board_poses(
                 lens, (corners.points - centre) @ axes, corners.pixels, pose.rotation @ axes,
                 pose.rotation @ centre + pose.translation, without,
             )
-            if fitted is not None:
-                poses.put(photograph, k, fitted.rotation, fitted.translation,
-                          raised * np.sqrt(np.diag(fitted.covariance)),
-                          TruthSource.board_without_this_marker)
+            if fitted is None:
+                continue
+            variance = raised**2 * np.diag(fitted.covariance)
+            if camera_covariance is not None:
+                variance = variance + unshared_variance(
+                    lens, camera_covariance, fitted, (corners.points[without] - centre) @ axes,
+                    (board.corners_m[k] - centre) @ axes,
+                )
+            poses.put(photograph, k, fitted.rotation, fitted.translation, np.sqrt(variance),
+                      TruthSource.board_without_this_marker)
     return BoardPoses(poses, boards, ratio)
+
+
+def unshared_variance(
+    lens: Lens, camera_covariance: Floats, pose: FittedPose, points: Floats, own: Floats
+) -> Floats:
+    """Return the variances (6,) of a pose by errors of the camera that the estimates do not share.
+
+    To first order a pose by least squares from the marker's ``own`` corners (4, 3) changes by
+    another amount than that from the board's ``points`` (n, 3): the difference counts.
+    """
+    change = (
+        lens.by_camera(own, pose.rotation, pose.translation)
+        - lens.by_camera(points, pose.rotation, pose.translation)
+    )
+    return np.asarray(np.diag(change @ camera_covariance @ change.T))
 
 
 def fitted_board(lens: Lens, found: FoundCorners) -> FittedPose | None:

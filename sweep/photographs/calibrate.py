@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from sweep.errors import ArgumentError
 from sweep.photographs.corners import FoundCorners
 from sweep.photographs.pose_fit import Lens
+from sweep.typing import Floats
 
 MIN_PHOTOGRAPHS = 4
 """Photographs with a board from which a camera is calibrated."""
@@ -32,6 +34,8 @@ class CalibratedCamera:
         Its numbers.
     sd
         Standard deviations of fx, fy, cx, cy (px) and of the five coefficients.
+    covariance
+        Their covariance (9, 9).
     rms_px
         Root mean square of the residuals' lengths.
     photographs
@@ -40,6 +44,7 @@ class CalibratedCamera:
 
     lens: Lens
     sd: tuple[float, ...]
+    covariance: Floats
     rms_px: float
     photographs: int
 
@@ -68,7 +73,7 @@ def calibrate(size: tuple[int, int], found: Sequence[FoundCorners]) -> Calibrate
             "calibration",
         )
     try:
-        rms, matrix, distortion, _, _, deviations, *_ = cv2.calibrateCameraExtended(
+        rms, matrix, distortion, turns, shifts, deviations, *_ = cv2.calibrateCameraExtended(
             [(each.points * [1.0, -1.0, -1.0]).astype(np.float32) for each in used],
             [each.pixels.astype(np.float32) for each in used], size, np.eye(3), np.zeros(5),
         )
@@ -76,10 +81,35 @@ def calibrate(size: tuple[int, int], found: Sequence[FoundCorners]) -> Calibrate
         raise ArgumentError(
             "camera", "calibrate", f"OpenCV cannot calibrate from these photographs: {error.err}"
         ) from None
-    return CalibratedCamera(
-        Lens(
-            np.asarray(matrix, dtype=np.float64),
-            np.asarray(distortion, dtype=np.float64).ravel()[:5],
-        ),
-        tuple(np.asarray(deviations).ravel()[:COUNT].tolist()), float(rms), len(used),
+    lens = Lens(
+        np.asarray(matrix, dtype=np.float64), np.asarray(distortion, dtype=np.float64).ravel()[:5]
     )
+    covariance = _covariance(lens, used, turns, shifts)
+    return CalibratedCamera(
+        lens, tuple(np.asarray(deviations).ravel()[:COUNT].tolist()), covariance, float(rms),
+        len(used),
+    )
+
+
+def _covariance(
+    lens: Lens, used: Sequence[FoundCorners], turns: Sequence[Any], shifts: Sequence[Any]
+) -> Floats:
+    """Return the covariance (9, 9) of the camera's numbers beside the photographs' poses.
+
+    That of least squares with the residuals' variance: the inverse of the Schur complement of the
+    poses in the normal equations, as of a bundle adjustment (Triggs et al., 2000, section 6.1).
+    """
+    information = np.zeros((COUNT, COUNT))
+    squares, count = 0.0, 0
+    for found, turn, shift in zip(used, turns, shifts, strict=True):
+        image, jacobian = cv2.projectPoints(
+            found.points * [1.0, -1.0, -1.0], turn, shift, lens.matrix, lens.distortion
+        )
+        pose, camera = jacobian[:, :6], jacobian[:, 6 : 6 + COUNT]
+        cross = pose.T @ camera
+        information += camera.T @ camera - cross.T @ np.linalg.solve(pose.T @ pose, cross)
+        squares += float(((np.asarray(image).reshape(-1, 2) - found.pixels) ** 2).sum())
+        count += 2 * len(found.points) - 6
+    scale = np.sqrt(np.diag(information))  # the numbers' units differ by many powers of ten
+    scaled = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)
+    return np.asarray(squares / max(count - COUNT, 1) * scaled / np.outer(scale, scale))

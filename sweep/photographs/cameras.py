@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from sweep.model.calibration import Calibration, calibration_of
 from sweep.model.image_file import read_regular
 from sweep.model.structured_text import MAX_BYTES, read_tree
 from sweep.photographs.pose_fit import Lens
+from sweep.photographs.record_files import KnownCamera
 from sweep.photographs.reference_pose import StereoCamera
 from sweep.plan.camera_files import file_and_camera
 from sweep.typing import Floats
@@ -64,6 +66,15 @@ def lens_of(calibration: Calibration) -> Lens:
     )
 
 
+def known_camera(calibration: Calibration) -> KnownCamera:
+    """Return the camera of a calibration, with the errors of its numbers as far as it has them."""
+    covariance = None
+    if calibration.covariance:
+        count = math.isqrt(len(calibration.covariance))
+        covariance = np.reshape(np.array(calibration.covariance), (count, count))
+    return KnownCamera(lens_of(calibration), calibration.sd, covariance=covariance)
+
+
 def _tree(argument: str, path: str) -> Any:
     try:
         return read_tree(read_regular(path, MAX_BYTES))
@@ -90,10 +101,11 @@ def _check_size(
 ) -> None:
     own = calibration.width_px, calibration.height_px
     if None not in own and own != size:
+        turned = "; they are turned, perhaps by their EXIF tags" if own == size[::-1] else ""
         raise ArgumentError(
             argument, plain(written),
-            f"it holds for {own[0]} x {own[1]}, but the photographs are {size[0]} x {size[1]}; "
-            "give the calibration of their size",
+            f"it holds for {own[0]} x {own[1]}, but the photographs are {size[0]} x {size[1]}"
+            f"{turned}; give the calibration of their size",
         )
     cx, cy = calibration.cx_px, calibration.cy_px
     if not (0 < cx < size[0] and 0 < cy < size[1]):

@@ -56,7 +56,7 @@ def read_folder(folder: str | Path, part: Part = Part.whole) -> Folder:
     try:
         files = sorted(path for path in home.iterdir() if not path.name.startswith("."))
     except OSError as error:
-        raise ArgumentError("folder", plain(home, 300), error.strerror or "unreadable") from None
+        raise ArgumentError("folders", plain(home, 300), error.strerror or "unreadable") from None
     photographs: list[Photograph] = []
     other = [
         path.name for path in files
@@ -84,14 +84,14 @@ def read_folder(folder: str | Path, part: Part = Part.whole) -> Folder:
               for note, count in sorted(notes.items())]
     if not photographs:
         raise ArgumentError(
-            "folder", plain(home, 300),
+            "folders", plain(home, 300),
             f"expected photographs ({', '.join(each[1:].upper() for each in IMAGE_SUFFIXES)})"
             + (f"; {'; '.join(lines)}" if lines else ""),
         )
     _check_sizes(home, photographs)
     if part is not Part.whole and (width := decode_width(photographs[0])) % 2:
         raise ArgumentError(
-            "folder", plain(home, 300), f"expected images of two halves; they are {width} px wide"
+            "folders", plain(home, 300), f"expected images of two halves; they are {width} px wide"
         )
     return Folder(tuple(photographs), tuple(lines))
 
@@ -112,7 +112,7 @@ def _check_sizes(home: Path, photographs: Sequence[Photograph]) -> None:
         for each in photographs if each.image.shape != (height, width)
     ]
     raise ArgumentError(
-        "folder", plain(home, 300),
+        "folders", plain(home, 300),
         f"expected photographs of one size: most are {width} x {height}, not {_named(odd)}; move "
         "those of another camera or size elsewhere",
     )

@@ -60,6 +60,22 @@ class Lens(NamedTuple):
         images = np.asarray(image, dtype=np.float64).reshape(-1, 2)
         return images, np.concatenate([by_turn, by_point], axis=2)
 
+    def by_camera(self, points: Floats, rotation: Floats, translation: Floats) -> Floats:
+        """Return the change (6, c) of a fitted pose by the camera's numbers.
+
+        They are fx, fy, cx, cy and the coefficients. The pose is that of least squares from the
+        images of points (n, 3): it gives way to an error of the camera as far as it can.
+        """
+        turned = points @ rotation.T
+        _, jacobian = cv2.projectPoints(
+            np.ascontiguousarray(turned + translation), np.zeros(3), np.zeros(3), self.matrix,
+            self.distortion if len(self.distortion) else None,
+        )
+        by_numbers = np.asarray(jacobian, dtype=np.float64)[:, 6 : 10 + len(self.distortion)]
+        design = self.derivatives(points, rotation, translation)[1].reshape(-1, 6)
+        solved = np.linalg.lstsq(design, by_numbers, rcond=None)[0]
+        return -np.asarray(solved, dtype=np.float64)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedPose:

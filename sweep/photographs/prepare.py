@@ -23,7 +23,7 @@ from sweep.model.photograph import Part
 from sweep.photographs.board_check import check_board
 from sweep.photographs.board_truth import board_poses
 from sweep.photographs.calibrate import CalibratedCamera, calibrate
-from sweep.photographs.cameras import camera_of_file, lens_of, stereo_of_file
+from sweep.photographs.cameras import camera_of_file, known_camera, stereo_of_file
 from sweep.photographs.corners import detect_markers, find_corners, reference_detector
 from sweep.photographs.folder import Folder, read_folder
 from sweep.photographs.poses import Poses
@@ -124,7 +124,7 @@ def _prepare(
     seen = [[_seen(markers, *each) for each in side] for side in seen_ids]
     if stereo is not None:
         rig, calibrations = stereo_of_file(str(stereo), first.size)
-        cameras = [KnownCamera(lens_of(each), each.sd) for each in calibrations]
+        cameras = [known_camera(each) for each in calibrations]
         truth = [
             partner_poses(each, first.size, markers.sizes_m, own, partner)
             for each, own, partner in (
@@ -166,7 +166,7 @@ def _check_arguments(
     most = 1 if stereo is None else 2
     if not 1 <= len(folders) <= most:
         raise ArgumentError(
-            "folder", ", ".join(map(str, folders)),
+            "folders", ", ".join(map(str, folders)),
             "expected one folder" + ("" if most == 1 else ", or those of the left and the right "
                                      "camera"),
         )
@@ -178,12 +178,12 @@ def _check_pairs(found: Sequence[Folder]) -> None:
     odd = sorted(set(names[0]) ^ set(names[1]))
     if odd:
         raise ArgumentError(
-            "folder", plain(odd[0]), "expected the same names of both cameras' photographs; it is "
+            "folders", plain(odd[0]), "expected the same names of both cameras' photographs; it is "
             "in one folder alone",
         )
     if found[0].size != found[1].size:
         raise ArgumentError(
-            "folder", " and ".join("{} x {}".format(*folder.size) for folder in found),
+            "folders", " and ".join("{} x {}".format(*folder.size) for folder in found),
             "expected one size of both cameras' photographs",
         )
 
@@ -221,7 +221,7 @@ def _markers(
     ids = tuple(every)
     if not ids:
         raise ArgumentError(
-            "folder", "no marker",
+            "folders", "no marker",
             f"expected photographs of markers of {settled.fixed['dictionary']}",
         )
     return WantedMarkers(
@@ -254,14 +254,16 @@ def _with_one_camera(
         if corners is None:
             raise AssertionError(camera)
         calibrated = calibrate(folder.size, corners)
-        known = KnownCamera(calibrated.lens, calibrated.sd, _camera_line(calibrated))
+        known = KnownCamera(
+            calibrated.lens, calibrated.sd, _camera_line(calibrated), calibrated.covariance
+        )
     else:
         calibration = camera_of_file(str(camera), folder.size)
-        known = KnownCamera(lens_of(calibration), calibration.sd)
+        known = known_camera(calibration)
     lines = [known.line] if known.line else []
     if board is None or corners is None or not need_board:
         return known, None, lines
-    result = board_poses(board, known.lens, folder.size, corners)
+    result = board_poses(board, known.lens, folder.size, corners, known.covariance)
     fits = [each for each in result.boards if each is not None]
     if fits:
         rms = float(np.median([each.rms_px for each in fits]))
@@ -285,7 +287,7 @@ def _camera_line(camera: CalibratedCamera) -> str:
         f"camera: calibrated from {camera.photographs} photographs, {camera.rms_px:.2f} px RMS: "
         f"fx {matrix[0, 0]:.1f} ± {sd[0]:.1f}, fy {matrix[1, 1]:.1f} ± {sd[1]:.1f}, "
         f"cx {matrix[0, 2]:.1f} ± {sd[2]:.1f}, cy {matrix[1, 2]:.1f} ± {sd[3]:.1f} px (standard "
-        "deviations; truth and estimates share them, and truth_std does not have them)"
+        "deviations; truth_std has of them what truth and estimates do not share)"
     )
 
 
@@ -316,7 +318,7 @@ def _summary(found: Sequence[Folder], truth: Sequence[Poses]) -> list[str]:
     known = np.concatenate([each.known for each in truth])
     if not known.any():
         raise ArgumentError(
-            "folder", plain(found[0].photographs[0].path.parent, 300),
+            "folders", plain(found[0].photographs[0].path.parent, 300),
             "no photograph shows a whole marker whose pose is known",
         )
     empty = [

@@ -69,13 +69,17 @@ class WantedMarkers:
     board: str = ""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class KnownCamera:
-    """A camera: its lens, the standard deviations of its numbers, and a line on it."""
+    """A camera: its lens, what is known of its numbers' errors, and a line on it.
+
+    ``sd`` are their standard deviations, ``covariance`` (c, c) is None if it is not known.
+    """
 
     lens: Lens
     sd: tuple[float, ...] = ()
     line: str = ""
+    covariance: Floats | None = None
 
 
 def setting_name(setting: str) -> str:

@@ -57,6 +57,7 @@ def _execute(options: argparse.Namespace) -> int:
     from sweep.messages import notice  # noqa: PLC0415
     from sweep.photographs.prepare import prepare  # noqa: PLC0415
     from sweep.photographs.record_files import record_home  # noqa: PLC0415
+    from sweep.plan.parameters import Stage  # noqa: PLC0415
 
     options.stopped = "stopped before anything was computed"
     home, name = record_home(options.store)
@@ -80,9 +81,10 @@ def _execute(options: argparse.Namespace) -> int:
         return int(summary.nothing_computed)
     if summary.computed_blocks == 0:
         say(f"{summary.store} is already finished; --overwrite measures it again")
+    configurations = prepared.pipeline.size(Stage.detection, Stage.estimation)
     say(
-        f"{prepared.markers:,} markers in {prepared.photographs:,} photographs, "
-        f"{summary.detected:,} detected in {summary.results:,} results"
+        f"{prepared.markers:,} markers in {prepared.photographs:,} photographs: "
+        f"{summary.detected:,} of {prepared.markers * configurations:,} detected"
     )
     say(f'xarray.open_zarr("{summary.data}")')
     for line in summary.warnings:

@@ -76,10 +76,11 @@ def check_board(
             f"markers of {side:g} m do not fit its other lengths, beside which the photographs "
             f"show about {side * ratio:.3g} m; correct marker_m, or the squares or gaps",
         )
-    better = "" if share > DOUBTFUL else next(
-        (words for words, other in _others(path)
-         if fitting_share(other, seen) >= max(MIN_FITTING, share + CLEARLY)), "",
-    )
+    found, better = max(
+        ((fitting_share(other, seen), words) for words, other in _others(path)), default=(0.0, ""),
+        key=lambda each: each[0],  # of those that fit as well, the first
+    ) if share <= DOUBTFUL else (0.0, "")
+    better = better if found >= max(MIN_FITTING, share + CLEARLY) else ""
     if better or share < MIN_FITTING:
         raise ArgumentError(
             "board", plain(path),

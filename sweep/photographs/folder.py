@@ -63,6 +63,8 @@ def read_folder(folder: str | Path, part: Part = Part.whole) -> Folder:
         if path.suffix.lower() not in IMAGE_SUFFIXES or path.is_dir()
     ]
     unreadable: list[str] = []
+    repeated: list[str] = []
+    digests: dict[str, str] = {}
     notes: Counter[str] = Counter()
     for path in files:
         if path.name in other:
@@ -73,13 +75,18 @@ def read_folder(folder: str | Path, part: Part = Part.whole) -> Folder:
         except ValueError as error:
             unreadable.append(f"{plain(path.name)} ({error})")
             continue
+        digest = hashlib.sha256(content).hexdigest()
+        if digest in digests:
+            repeated.append(f"{plain(path.name)} (= {plain(digests[digest])})")
+            continue
+        digests[digest] = path.name
         notes.update(_conversions(content))
-        photographs.append(
-            Photograph(path, hashlib.sha256(content).hexdigest(), part.of(image))
-        )
+        photographs.append(Photograph(path, digest, part.of(image)))
     lines = [f"{home.name}: left out {_named(other)}: no images"] if other else []
     if unreadable:
         lines.append(f"{home.name}: left out {_named(unreadable)}")
+    if repeated:
+        lines.append(f"{home.name}: left out {_named(repeated)}: the same photographs again")
     lines += [f"{home.name}: {count} of {len(photographs)} photographs {note}"
               for note, count in sorted(notes.items())]
     if not photographs:

@@ -11,10 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from sweep.errors import ArgumentError, PipelineError
+from sweep.errors import ArgumentError
 from sweep.evaluation.opencv_threads import single_threaded
-from sweep.exchange.answers import read_answers
-from sweep.exchange.conventions import Conventions
 from sweep.measure.detectors import FindFunction
 from sweep.measure.flags import TruthSource
 from sweep.messages import plain
@@ -23,10 +21,12 @@ from sweep.model.photograph import Part
 from sweep.photographs.board_check import check_board
 from sweep.photographs.board_truth import board_poses
 from sweep.photographs.calibrate import CalibratedCamera, calibrate
+from sweep.photographs.camera_check import check_resolution
 from sweep.photographs.cameras import camera_of_file, known_camera, stereo_of_file
 from sweep.photographs.corners import detect_markers, find_corners, reference_detector
 from sweep.photographs.folder import Folder, read_folder
 from sweep.photographs.poses import Poses
+from sweep.photographs.poses_file import poses_of_file
 from sweep.photographs.record_files import (
     KnownCamera,
     Prepared,
@@ -138,7 +138,8 @@ def _prepare(
         lines += said
         cameras = [one]
         if poses is not None:
-            truth = [_poses_of_file(Path(poses), first, markers)]
+            given, said = poses_of_file(Path(poses), first, markers, one.lens, seen[0])
+            truth, lines = [given], lines + said
         elif poses_of_board is not None:
             truth = [poses_of_board]
         else:
@@ -221,8 +222,8 @@ def _markers(
     ids = tuple(every)
     if not ids:
         raise ArgumentError(
-            "folders", "no marker",
-            f"expected photographs of markers of {settled.fixed['dictionary']}",
+            "settings", f"dictionary={settled.fixed['dictionary']}",
+            "no photograph shows a marker of it; give the dictionary of the markers",
         )
     return WantedMarkers(
         str(settled.fixed["dictionary"]), ids, np.full(len(ids), float(settled.fixed["size_m"]))
@@ -267,6 +268,8 @@ def _with_one_camera(
     fits = [each for each in result.boards if each is not None]
     if fits:
         rms = float(np.median([each.rms_px for each in fits]))
+        if str(camera) != CALIBRATE:
+            check_resolution(str(camera), known.lens, folder.size, corners, rms)
         lines.append(
             f"board: {rms:.2f} px RMS of its corners in the median photograph"
             + ("" if np.isnan(result.halves_ratio) else
@@ -291,27 +294,6 @@ def _camera_line(camera: CalibratedCamera) -> str:
     )
 
 
-def _poses_of_file(path: Path, folder: Folder, markers: WantedMarkers) -> Poses:
-    """Return the poses that a file gives."""
-    names = {each.path.stem: k for k, each in enumerate(folder.photographs)}
-    answers = read_answers(path, names, Conventions())
-    index = {each: k for k, each in enumerate(markers.ids)}
-    poses = Poses.none(len(names), len(markers.ids))
-    unknown = sorted(set(answers.marker_id.tolist()) - index.keys())
-    if unknown:
-        raise PipelineError([
-            f"{plain(path)}: marker {unknown[0]}: expected one of the board or the photographs"
-        ])
-    if not np.isfinite(answers.translation).all() or not np.isfinite(answers.rotation).all():
-        raise PipelineError([f"{plain(path)}: expected a pose in each row: rx, ry, rz, tx, ty, tz"])
-    for k in range(len(answers.image)):
-        poses.put(
-            int(answers.image[k]), index[int(answers.marker_id[k])], answers.rotation[k],
-            answers.translation[k], np.full(6, np.nan), TruthSource.poses_file,
-        )
-    return poses
-
-
 def _summary(found: Sequence[Folder], truth: Sequence[Poses]) -> list[str]:
     """Return lines on how many markers there are, and on photographs without any."""
     lines = []
@@ -332,7 +314,7 @@ def _summary(found: Sequence[Folder], truth: Sequence[Poses]) -> list[str]:
         lines.append(
             f"no pose of a marker is known in {', '.join(map(plain, empty[:3]))}{more}: not counted"
         )
-    if known.any(axis=1).sum() == 1:
+    if np.any([each.known.any(axis=1) for each in truth], axis=0).sum() == 1:
         lines.append(
             "one photograph: errors and rates without intervals, which are those of other "
             "photographs"
@@ -347,8 +329,9 @@ def _summary(found: Sequence[Folder], truth: Sequence[Poses]) -> list[str]:
             f"; median standard deviations {np.nanmedian(turn):.2g}° and "
             f"{100 * np.nanmedian(std[:, 5] / distance):.2g} % of the range"
         )
+    count = int(np.any([each.known.any(axis=1) for each in truth], axis=0).sum())
     lines.append(
-        f"{int(known.sum()):,} markers in {int(known.any(axis=1).sum()):,} photographs; truth: "
-        f"{source}{spread}"
+        f"{int(known.sum()):,} markers in {count:,} "
+        f"{'photographs' if len(truth) == 1 else 'pairs of photographs'}; truth: {source}{spread}"
     )
     return lines

@@ -123,7 +123,7 @@ def partner_poses(
                 continue
             best = int(np.nanargmin(total))
             pose = rotation[k, best], translation[k, best]
-            if not _within(stereo.left, size, sides[k], *pose):
+            if not is_within(stereo.left, size, sides[k], *pose):
                 continue
             poses.put(photograph, marker, *pose, np.full(6, np.nan), TruthSource.stereo_partner)
             if marker in index:
@@ -159,7 +159,7 @@ def _difference(
     return np.concatenate([turns[best], shift[0, best] - translation])
 
 
-def _within(
+def is_within(
     lens: Lens, size: tuple[int, int], side: float, rotation: Floats, translation: Floats
 ) -> bool:
     """Return whether a marker is wholly in the frame."""

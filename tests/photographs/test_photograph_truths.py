@@ -1,0 +1,203 @@
+"""Truth of photographs by a file of poses, by the other camera, or none; images as users have."""
+
+import csv
+import struct
+
+import cv2
+import numpy as np
+import pytest
+
+from support.board_photographs import (
+    POSES,
+    SIZE,
+    VIEW,
+    camera,
+    image,
+    marker_poses,
+    toml,
+    write_set,
+)
+from sweep.errors import ArgumentError, PipelineError
+from sweep.measure.flags import TruthSource
+from sweep.photographs.prepare import prepare
+from sweep.plan.photographs import read_record
+
+SINGLE = ["dictionary=DICT_4X4_50", "size_m=0.022"]
+RIG = (cv2.Rodrigues(np.radians([1.0, -4.0, 2.0]))[0], np.array([-0.04, 0.001, 0.002]))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    made = tmp_path_factory.mktemp("truths")
+    write_set(made, POSES[:2])
+    return made
+
+
+def record_of(prepared, name=None):
+    return read_record(f"{prepared.pipeline.folder}/{name or prepared.pipeline.name}"
+                       ".photographs.npz")[0]
+
+
+def write_poses(path, scale=1.0, suffix="", sign=1.0):
+    """Write the exact poses of all markers, also of those that are cut by the frame."""
+    with path.open("w") as file:
+        writer = csv.writer(file)
+        writer.writerow(["image", "id", "rx", "ry", "rz", "tx", "ty", "tz"])
+        for number, pose in enumerate(POSES[:2]):
+            for marker, (turn, shift) in enumerate(zip(*marker_poses(pose), strict=True)):
+                x, y, z = np.asarray(shift) * scale
+                writer.writerow([f"shot{number}{suffix}", marker,
+                                 *cv2.Rodrigues(turn)[0].ravel(), x, y, sign * z])
+    return path
+
+
+def test_a_file_of_poses_is_the_truth(folder, tmp_path):
+    made = prepare([folder / "shots"], folder / "camera.json", settings=SINGLE,
+                   poses=write_poses(tmp_path / "poses.csv", suffix=".png"), home=tmp_path)
+    record = record_of(made)
+    for number, pose in enumerate(POSES[:2]):
+        turn, shift = marker_poses(pose)
+        shown = record.shown[number]
+        assert shown.any()
+        assert np.allclose(record.rotation[number][shown], turn[shown], atol=1e-9)
+        assert np.allclose(record.translation[number][shown], shift[shown], atol=1e-12)
+        assert (record.source[number][shown] == TruthSource.poses_file).all()
+    assert np.isnan(record.std).all()
+
+
+@pytest.mark.parametrize(("changes", "expected"), [
+    ({"scale": 1000.0}, "positions are .* times those of the detected markers; expected metres"),
+    ({"sign": -1.0}, "most markers are not where its poses have them"),
+    ({"suffix": "_a"}, "image shot0_a is none of the photographs"),
+])
+def test_poses_of_another_unit_frame_or_image_are_refused(folder, tmp_path, changes, expected):
+    with pytest.raises(PipelineError, match=expected):
+        prepare([folder / "shots"], folder / "camera.json", settings=SINGLE,
+                poses=write_poses(tmp_path / "poses.csv", **changes), home=tmp_path)
+
+
+def test_poses_of_markers_that_are_cut_do_not_count(folder, tmp_path):
+    shots = tmp_path / "cut"
+    shots.mkdir()
+    for number in range(2):
+        whole = cv2.imread(str(folder / "shots" / f"shot{number}.png"), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(shots / f"shot{number}.png"), whole[:, :240])
+    (tmp_path / "camera.json").write_text(camera((240, SIZE[1])))
+    made = prepare([shots], tmp_path / "camera.json", board=folder / "board.toml",
+                   poses=write_poses(tmp_path / "poses.csv"), home=tmp_path)
+    assert any("not wholly in the frame: not counted" in line for line in made.lines)
+    turn, shift = marker_poses(POSES[0])
+    side = 0.011
+    corners = np.array([[-side, side, 0], [side, side, 0], [side, -side, 0], [-side, -side, 0]])
+    points = corners @ turn[0].T + np.asarray(shift)[:, None]
+    pixels = points[..., :2] / points[..., 2:] * VIEW[:2] + VIEW[2:]
+    inside = (pixels[..., 0] <= 239.5).all(axis=1)
+    assert np.array_equal(record_of(made).shown[0], inside)
+    assert 0 < inside.sum() < len(inside)
+
+
+@pytest.fixture(scope="module")
+def stereo(tmp_path_factory):
+    """Photographs of two cameras in two folders, side by side, and their calibration."""
+    made = tmp_path_factory.mktemp("stereo")
+    turn, shift = RIG
+    for name in ("left", "right", "both"):
+        (made / name).mkdir()
+    for number, pose in enumerate(POSES[:3]):
+        left = image(pose, number)
+        right = image((turn @ pose[0], turn @ np.asarray(pose[1]) + shift), 100 + number)
+        for name, pixels in (("left", left), ("right", right), ("both", np.hstack([left, right]))):
+            cv2.imwrite(str(made / name / f"{number}.png"), pixels)
+    fx, fy, cx, cy = VIEW
+    storage = cv2.FileStorage(str(made / "rig.yml"), cv2.FILE_STORAGE_WRITE)
+    for each in ("1", "2"):
+        storage.write(f"K{each}", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+        storage.write(f"D{each}", np.zeros((1, 5)))
+    storage.write("R", turn)
+    storage.write("T", shift)
+    storage.release()
+    (made / "board.toml").write_text(toml())
+    return made
+
+
+def test_the_other_camera_is_the_truth_in_two_folders_and_side_by_side(stereo, tmp_path):
+    records = {}
+    for name, folders in (("two", ["left", "right"]), ("one", ["both"])):
+        made = prepare([stereo / each for each in folders], stereo=stereo / "rig.yml",
+                       board=stereo / "board.toml", home=tmp_path, name=name)
+        records[name] = [record_of(made, f"{name}-{side}") for side in ("left", "right")]
+        assert made.photographs == 3
+        assert "in 3 pairs of photographs; truth: stereo partner" in made.lines[-1]
+    for two, one in zip(records["two"], records["one"], strict=True):
+        assert np.array_equal(two.translation, one.translation, equal_nan=True)
+        assert np.array_equal(two.rotation, one.rotation, equal_nan=True)
+    left, right = records["two"]
+    for number, pose in enumerate(POSES[:3]):
+        centres = np.asarray(marker_poses(pose)[1])
+        mapped = centres @ RIG[0].T + RIG[1]
+        for record, expected in ((left, centres), (right, mapped)):
+            shown = record.shown[number]
+            error = np.linalg.norm(record.translation[number][shown] - expected[shown], axis=1)
+            assert shown.sum() > 5
+            assert np.median(error) < 0.01  # of 0.3 m; poses by four corners of 25 px
+
+
+def test_without_truth_poses_are_the_markers_own(folder, tmp_path):
+    made = prepare([folder / "shots"], folder / "camera.json", settings=SINGLE, home=tmp_path)
+    record = record_of(made)
+    assert made.lines[-1].endswith("truth: none")
+    error = np.linalg.norm(record.translation[0] - marker_poses(POSES[0])[1], axis=1)
+    assert np.nanmedian(error) < 0.01
+
+
+def test_one_photograph_is_measured_without_intervals(folder, tmp_path):
+    shots = tmp_path / "one"
+    shots.mkdir()
+    for name in ("a.png", "b.png"):
+        (shots / name).write_bytes((folder / "shots" / "shot0.png").read_bytes())
+    made = prepare([shots], folder / "camera.json", board=folder / "board.toml", home=tmp_path)
+    assert made.photographs == 1
+    said = "\n".join(made.lines)
+    assert "left out b.png (= a.png): the same photographs again" in said
+    assert "one photograph: errors and rates without intervals" in said
+
+
+def exif(jpeg, orientation):
+    """Return a JPEG file with the tag by which viewers turn it."""
+    entry = struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0)
+    segment = b"Exif\0\0II*\0\x08\0\0\0" + struct.pack("<H", 1) + entry + b"\0\0\0\0"
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + jpeg[2:]
+
+
+def test_turned_deep_and_coloured_photographs_have_the_poses_of_plain_ones(folder, tmp_path):
+    grey = cv2.imread(str(folder / "shots" / "shot1.png"), cv2.IMREAD_GRAYSCALE)
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 100]
+    turned = cv2.imencode(".jpg", cv2.rotate(grey, cv2.ROTATE_90_COUNTERCLOCKWISE), quality)[1]
+    files = {
+        "turned": exif(turned.tobytes(), 6),  # to be turned clockwise
+        "deep": cv2.imencode(".png", grey.astype(np.uint16) * 257)[1].tobytes(),
+        "colour": cv2.imencode(".png", cv2.cvtColor(grey, cv2.COLOR_GRAY2BGRA))[1].tobytes(),
+    }
+    plain = None
+    for name, content in {"plain": (folder / "shots" / "shot1.png").read_bytes(), **files}.items():
+        shots = tmp_path / name
+        shots.mkdir()
+        (shots / f"a.{'jpg' if name == 'turned' else 'png'}").write_bytes(content)
+        made = prepare([shots], folder / "camera.json", board=folder / "board.toml", home=tmp_path)
+        found = record_of(made).translation
+        plain = found if plain is None else plain
+        # The JPEG of best quality has other pixels by up to two grey levels.
+        assert np.allclose(found, plain, atol=3e-4 if name == "turned" else 0, equal_nan=True)
+    (tmp_path / "upright.json").write_text(camera(SIZE[::-1]))
+    with pytest.raises(ArgumentError, match="they are turned, perhaps by their EXIF tags"):
+        prepare([tmp_path / "turned"], tmp_path / "upright.json", board=folder / "board.toml",
+                home=tmp_path)
+
+
+def test_a_camera_of_another_resolution_is_found_out_by_the_board(folder, tmp_path):
+    fx, fy, cx, cy = VIEW
+    text = camera(SIZE, (fx / 2, fy / 2, cx / 2, cy / 2))
+    path = tmp_path / "half.json"
+    path.write_text(text.replace('"image_width": 360, "image_height": 270, ', ""))
+    with pytest.raises(ArgumentError, match="if its numbers are times 2: it is of another"):
+        prepare([folder / "shots"], path, board=folder / "board.toml", home=tmp_path)

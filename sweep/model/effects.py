@@ -193,7 +193,6 @@ EFFECTS: tuple[Effect, ...] = (
                 "white is lifted by bloom · s · (1 - s) of it", low=-1, high=1, drawable=True,
             ),
         },
-        worsens=("uneven light",),
     ),
     Effect(
         "vignetting", "light",

@@ -323,8 +323,10 @@ def test_coarse_noise_is_searched_in_wider_windows_and_steep_light_on_whole_fram
     assert 0 <= plain - left_of("jpeg_quality=50") <= 8
     assert 64 <= plain - left_of("jpeg_quality=50", "noise_grey=3") <= 72
     assert left_of("vignetting=4") == plain
-    for steep in ("tone_gamma=0.5", "tone_toe=0.5", "tone_knee=0.5", "bloom=0.5", "jpeg_quality=9"):
+    for steep in ("tone_gamma=0.5", "tone_toe=0.5", "tone_knee=0.5", "jpeg_quality=9"):
         assert left_of("vignetting=4", steep) == 0
+    # Bloom acts before the light's slope, on a background of one level.
+    assert left_of("vignetting=4", "bloom=0.5") == plain
     assert left_of("tone_gamma=0.5") == plain
     text = SMALL + "noise_grey = 3\nnoise_correlation = 0.5\n"
     reasons = {part.name: part.reason for part in parts(Pipeline.from_text(text))}

@@ -38,6 +38,7 @@ PROCESSING = {
     "demosaiced": 'bayer = "RGGB"\nbayer_red = 0.8\ndemosaic = "edge_aware"',
     "sharpened": "sharpening = 2\nsharpening_px = 3",
     "toned": "tone_gamma = 0.45\ntone_knee = 0.5\nbloom = 0.5",
+    "bloom on a slope of light": "bloom = 1\nillumination_gradient = 2\nillumination_deg = 30",
     "noise by level": "noise_table = [0, 20, 255, 2]\nsharpening = 1\nsharpening_px = 20",
 }
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from sweep.errors import ArgumentError
 from sweep.fitting.camera_fit import CameraFit, fit_camera
-from sweep.fitting.estimates import MIN_PHOTOGRAPHS, Estimate, estimate, jackknife
+from sweep.fitting.estimates import MIN_PHOTOGRAPHS, Estimate, estimate
 from sweep.fitting.geometry import residuals_of, shifts_of
 from sweep.fitting.light import (
     gradient_direction,
@@ -219,7 +219,9 @@ def _geometry(
     for fit, noise in zip(camera.fits, noises, strict=True):
         fixed = TruthSource.poses_file in sources
         compared = _beside_truth(fit) if fixed else _beside_board(fit, taken, board)
-        one = None if compared is None else residuals_of(fit.states, noise, *compared)
+        one = None if compared is None else residuals_of(
+            fit.states, noise, *compared, float(taken.frame[0])
+        )
         if one is not None:
             residuals.append(one)
     if len(residuals) < MIN_PHOTOGRAPHS:
@@ -227,18 +229,12 @@ def _geometry(
             Term(*name, Estimate(math.nan), False, "too few photographs or markers", 0.0)
             for name in names
         ]
-    shifts = shifts_of(residuals)
-    size, length = (
-        estimate(jackknife(math.log(full), np.log(without))).mapped(math.exp)
-        for full, without in (
-            (shifts.size_px, shifts.without_size_px), (shifts.length_px, shifts.without_length_px)
-        )
-    )
-    term = judged("geometry", "geometry_px", size, 0.0, estimate(shifts.squares))
+    shifts = shifts_of(residuals, float(taken.frame[0]))
+    term = judged("geometry", "geometry_px", shifts.size_px, 0.0, estimate(shifts.squares))
     if term.kept and estimate(shifts.squares).value < 0:
         term = term.left_out("smaller than the noise")
     return [term, Term(
-        "reach of geometry", "geometry_length_px", length, term.kept,
+        "reach of geometry", "geometry_length_px", shifts.length_px, term.kept,
         "" if term.kept else "no geometry", of="geometry_px",
     )]
 

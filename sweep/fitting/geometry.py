@@ -9,20 +9,25 @@ Thompson, "Recovery of inter-block information when block sizes are unequal", Bi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import special
 
+from sweep.analysis.intervals import TAIL
+from sweep.fitting.estimates import Estimate
 from sweep.fitting.marker_state import CORNERS, MarkerState, products
 from sweep.fitting.noise import PhotographNoise, kernel, smoothed
 from sweep.measure.likelihood import QUANTISATION_VARIANCE
 from sweep.typing import Floats
 
-LENGTHS_PX = np.geomspace(8.0, 800.0, 24)
-"""Correlation lengths that are compared."""
+LENGTHS = np.geomspace(0.01, 0.4, 32)
+"""Correlation lengths that are compared, as shares of the frame's width. A pose takes up most of
+longer ones: their size cannot be said."""
 
-SIZES_PX = np.geomspace(0.005, 2.0, 49)
+SIZES_PX = np.geomspace(0.003, 3.0, 281)
 """Standard deviations that are compared."""
 
 CELLS = 5
@@ -44,7 +49,7 @@ class Residuals:
         (k, k) their covariance by the pixels' noise.
     fields
         (lengths, k, k) their covariance by a field of standard deviation 1, for each of
-        :data:`LENGTHS_PX`.
+        :data:`LENGTHS`.
     """
 
     values: Floats
@@ -54,7 +59,7 @@ class Residuals:
     @property
     def log_likelihoods(self) -> Floats:
         """Logarithms of the likelihood (lengths, sizes)."""
-        out = np.empty((len(LENGTHS_PX), len(SIZES_PX)))
+        out = np.empty((len(LENGTHS), len(SIZES_PX)))
         for k, field in enumerate(self.fields):
             inverse = np.linalg.inv(np.linalg.cholesky(self.noise))
             shares, vectors = np.linalg.eigh(inverse @ field @ inverse.T)
@@ -104,7 +109,7 @@ def _centre(state: MarkerState, noise: PhotographNoise) -> _Centre:
     fields = np.zeros((2, *used.shape))
     fields[:, used] = influence.T * np.sqrt(variance) * max(noise.edge_ratio, 1.0)
     correlated = smoothed(fields, kernel(np.nan_to_num(noise.correlation)))
-    cells = np.clip((marker.across[:, used] + 1) / 2 * CELLS, 0, CELLS - 1).astype(np.int64)
+    cells = np.clip(marker.modules_at[:, used] * CELLS, 0, CELLS - 1).astype(np.int64)
     number = cells[1] * CELLS + cells[0]
     moved = (state.scale * state.slope)[:, used]
     weights = np.array([
@@ -125,7 +130,8 @@ def _centre(state: MarkerState, noise: PhotographNoise) -> _Centre:
 
 
 def residuals_of(
-    states: Sequence[MarkerState], noise: PhotographNoise, shifts: Floats, explained: Floats
+    states: Sequence[MarkerState], noise: PhotographNoise, shifts: Floats, explained: Floats,
+    width_px: float,
 ) -> Residuals | None:
     """Return the residuals of a photograph's n markers; None if they say nothing.
 
@@ -138,6 +144,8 @@ def residuals_of(
     explained
         (2 n, m) how the centres, x and y in turn, change with what the truth was fitted to; (2 n,
         0) if it was not fitted to the photograph.
+    width_px
+        Of the frame.
     """
     count = len(states)
     # The left null space of what is explained.
@@ -156,7 +164,7 @@ def residuals_of(
     points = np.concatenate([each.points for each in centres])
     squares = ((points[:, None] - points[None]) ** 2).sum(axis=2)
     fields = []
-    for length in LENGTHS_PX:
+    for length in LENGTHS * width_px:
         covariance = np.exp(-0.5 * squares / length**2)
         fields.append(sum(each @ covariance @ each.T for each in linear))
     return Residuals(
@@ -167,53 +175,44 @@ def residuals_of(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shifts:
-    """Shifts of all photographs: values of each without one of them, as the jackknife needs them.
+    """Shifts of all photographs.
 
     Attributes
     ----------
     size_px, length_px
         Standard deviation and correlation length.
-    without_size_px, without_length_px
-        (n,) the same without each photograph.
     squares
         (n,) unbiased estimates of the squared standard deviation by each photograph.
     """
 
-    size_px: float
-    length_px: float
-    without_size_px: Floats
-    without_length_px: Floats
+    size_px: Estimate
+    length_px: Estimate
     squares: Floats
 
 
-def shifts_of(residuals: Sequence[Residuals]) -> Shifts:
-    """Return the field of shifts that fits the residuals of n photographs best."""
-    each = np.array([one.log_likelihoods for one in residuals])
-    total = each.sum(axis=0)
-    size, length = _highest(total)
-    without = np.array([_highest(total - one) for one in each])
-    nearest = int(np.argmin(np.abs(np.log(LENGTHS_PX / length))))
-    squares = np.array([one.mean_square(nearest) for one in residuals])
-    return Shifts(size, length, without[:, 0], without[:, 1], squares)
+def shifts_of(residuals: Sequence[Residuals], width_px: float) -> Shifts:
+    """Return the field of shifts that fits the residuals of n photographs best.
 
-
-def _highest(surface: Floats) -> tuple[float, float]:
-    """Return size and length at the maximum of (lengths, sizes), between the points."""
-    i, j = divmod(int(np.argmax(surface)), surface.shape[1])
-    i = min(max(i, 1), surface.shape[0] - 2)
-    j = min(max(j, 1), surface.shape[1] - 2)
-    near = surface[i - 1 : i + 2, j - 1 : j + 2]
-    slope = np.array([near[2, 1] - near[0, 1], near[1, 2] - near[1, 0]]) / 2
-    cross = (near[2, 2] - near[2, 0] - near[0, 2] + near[0, 0]) / 4
-    curvature = np.array([
-        [near[2, 1] - 2 * near[1, 1] + near[0, 1], cross],
-        [cross, near[1, 2] - 2 * near[1, 1] + near[1, 0]],
-    ])
-    step = np.zeros(2)
-    if np.linalg.det(curvature) > 0 > curvature[0, 0]:
-        step = np.clip(-np.linalg.solve(curvature, slope), -1.0, 1.0)
-    by_length, by_size = np.log(LENGTHS_PX[1] / LENGTHS_PX[0]), np.log(SIZES_PX[1] / SIZES_PX[0])
-    return (
-        float(SIZES_PX[j] * np.exp(step[1] * by_size)),
-        float(LENGTHS_PX[i] * np.exp(step[0] * by_length)),
+    The intervals are those of the profile likelihood, the other parameter at its best for each
+    value; with Student's quantile for n photographs in the place of the normal distribution's.
+    """
+    surface = np.array([one.log_likelihoods for one in residuals]).sum(axis=0)
+    fall = 0.5 * float(special.stdtrit(len(residuals) - 1, 1 - TAIL)) ** 2
+    best = int(np.argmax(surface.max(axis=1)))
+    squares = np.array([one.mean_square(best) for one in residuals])
+    return Shifts(
+        _profile(SIZES_PX, surface.max(axis=0), fall),
+        _profile(LENGTHS * width_px, surface.max(axis=1), fall), squares,
     )
+
+
+def _profile(values: Floats, likelihood: Floats, fall: float) -> Estimate:
+    """Return the best of increasing values, and where the likelihood has fallen on both sides."""
+    best = int(np.argmax(likelihood))
+    limit = likelihood[best] - fall
+    below, above = np.flatnonzero(likelihood[:best] < limit), np.flatnonzero(
+        likelihood[best:] < limit
+    )
+    low = values[below[-1]] if len(below) else 0.0
+    high = values[best + above[0]] if len(above) else math.inf
+    return Estimate(float(values[best]), float(low), float(high))

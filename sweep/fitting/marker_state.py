@@ -61,6 +61,9 @@ class MarkerState:
         (2, h, w) slopes of F(s) when it is moved right and down, per px.
     own, shared
         (n, OWN) and (n, 4) derivatives of the n fitted pixels.
+    uneven
+        (n, 4) derivatives by shifts that grow with the square of the position on the marker, which
+        corners cannot take up.
     """
 
     marker: FittedMarker
@@ -73,6 +76,7 @@ class MarkerState:
     slope: Floats
     own: Floats
     shared: Floats
+    uneven: Floats
 
     @property
     def squares(self) -> float:
@@ -144,7 +148,7 @@ def state_at(
     scale = np.where((level > 0.0) & (level < 255.0), scale, 0.0)
     none = np.empty(0)
     return MarkerState(
-        marker, corners_px, levels, residuals, images, share, scale, none, none, none
+        marker, corners_px, levels, residuals, images, share, scale, none, none, none, none
     )
 
 
@@ -165,6 +169,10 @@ def differentiate(state: MarkerState, parameters: Floats) -> None:
     moved = [
         (state.scale * along[axis] * marker.shape[k])[used] for k in range(4) for axis in range(2)
     ]
+    x, y = marker.modules_at
+    state.uneven = np.stack([
+        (state.scale * along[axis] * at * (1 - at))[used] for at in (x, y) for axis in range(2)
+    ], axis=1)
     levels = _level_columns(marker, state.share) * inside
     state.own = np.hstack([np.stack(moved, axis=1), levels])
     share, wide = state.images

@@ -59,7 +59,8 @@ class PhotographFit:
         The photograph's.
     parameters
         (4,) its parameters. Of those that were moved they are the minimum of the quadratic
-        approximation, so that a variance of 0 may be below 0.
+        approximation, so that a variance of 0 may be below 0; shifts of parts of markers are
+        eliminated in it, which would be taken for bloom.
     moved
         (4,) which ones were moved.
     information
@@ -95,14 +96,19 @@ class _Reduced:
         return np.asarray(self.gradients.sum(axis=0))
 
 
-def _reduced(states: Sequence[MarkerState], moved: Masks) -> _Reduced:
+def _reduced(
+    states: Sequence[MarkerState], moved: Masks, *, uneven: bool = False
+) -> _Reduced:
+    """Return the normal equations; ``uneven`` shifts of parts of markers are eliminated, too."""
     size = int(moved.sum())
     information, gradients, own = np.zeros((size, size)), [], []
     for state in states:
         residual = state.residuals[state.marker.used]
-        sums = products(np.hstack([state.own, state.shared[:, moved], residual[:, None]]))
-        inner, outer = sums[:OWN, OWN:], sums[OWN:, OWN:]
-        solved = solved_normal(sums[:OWN, :OWN], inner)
+        local = np.hstack([state.own, state.uneven]) if uneven else state.own
+        count = local.shape[1]
+        sums = products(np.hstack([local, state.shared[:, moved], residual[:, None]]))
+        inner, outer = sums[:count, count:], sums[count:, count:]
+        solved = solved_normal(sums[:count, :count], inner)
         rest = outer - inner.T @ solved
         information += rest[:-1, :-1]
         gradients.append(rest[:-1, -1])
@@ -227,7 +233,7 @@ def _finished(
 ) -> PhotographFit:
     """Return the fit with the information of all parameters."""
     every = np.ones(4, dtype=bool)
-    reduced = _reduced(states, every)
+    reduced = _reduced(states, every, uneven=True)
     freedom = max(sum(int(each.marker.used.sum()) - OWN for each in states), 1)
     variance = max(sum(each.squares for each in states) / freedom, 1e-6)
     information = reduced.information / variance

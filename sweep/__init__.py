@@ -457,6 +457,7 @@ def fit(
     stereo: str | os.PathLike[str] | None = None,
     settings: Sequence[str] = (),
     markers: int = 12,
+    check: bool = True,
 ) -> FittedScene:
     """Estimate a camera's scene, its blur, sharpening, tone, light, noise and geometry.
 
@@ -465,9 +466,13 @@ def fit(
     folders, camera, board, poses, stereo
         As for :func:`photos`; of a stereo camera the left one's scene is fitted.
     settings
-        "key=value" for the dictionary and size_m of single markers.
+        "key=value" for the dictionary and size_m of single markers, and for the detectors and
+        estimators whose errors are compared.
     markers
         The most markers of a photograph that are fitted, well spread over the frame.
+    check
+        Whether half of the photographs are held out: effects that move none of their errors are
+        left out, and the gap that is left is in ``gap``.
 
     Returns
     -------
@@ -485,7 +490,7 @@ def fit(
 
     fitted = fit_folder(
         folders, camera, board=board, poses=poses, stereo=stereo, settings=settings,
-        markers=markers,
+        markers=markers, check=check,
     )
     for line in fitted.lines:
         notice(line)

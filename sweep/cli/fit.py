@@ -31,12 +31,17 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
-        help="dictionary and size_m of single markers",
+        help="dictionary and size_m of single markers; detectors and estimators whose errors are "
+        "compared (default: two refinements)",
     )
     parser.add_argument(
         "--markers", type=int, default=12, metavar="N",
         help="the most markers of a photograph that are fitted, well spread over the frame "
         "(default: 12)",
+    )
+    parser.add_argument(
+        "--no-check", dest="check", action="store_false",
+        help="do not hold half of the photographs out, to see which effects move their errors",
     )
     parser.add_argument(
         "-o", "--output", default="scene.toml", metavar="FILE",
@@ -50,6 +55,7 @@ def _execute(options: argparse.Namespace) -> int:
     from sweep.messages import notice  # noqa: PLC0415
     from sweep.report.error_model_table import plain_table  # noqa: PLC0415
     from sweep.report.formatting import interval_text, number  # noqa: PLC0415
+    from sweep.report.gap_table import gap_records, gap_table  # noqa: PLC0415
     from sweep.report.output_file import check_output_file, write_output_file  # noqa: PLC0415
     from sweep.report.table import Table  # noqa: PLC0415
 
@@ -58,6 +64,7 @@ def _execute(options: argparse.Namespace) -> int:
     fitted = fit_folder(
         options.folders, options.camera, board=options.board, poses=options.poses,
         stereo=options.stereo, settings=options.settings, markers=options.markers,
+        check=options.check,
     )
     for line in fitted.lines:
         notice(line)
@@ -67,6 +74,7 @@ def _execute(options: argparse.Namespace) -> int:
         print_json({
             "scene": found.scene, "photographs": found.photographs, "markers": found.markers,
             "terms": [each.as_json() for each in found.terms], "lines": list(found.lines),
+            "check": [] if fitted.gap is None else gap_records(fitted.gap),
             "output": str(output),
         })
         return 0
@@ -88,6 +96,11 @@ def _execute(options: argparse.Namespace) -> int:
     say()
     for line in found.lines:
         say(f"- {line}")
+    if fitted.gap is not None:
+        say()
+        say("Half of the photographs, simulated with the scene of the others:")
+        say(plain_table(gap_table(fitted.gap)))
+        say()
     say_next(f"sweep run {shlex.quote(str(output))}", "simulates this camera")
     return 0
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,29 +34,47 @@ class CameraFit:
         was not: what is absent is judged by these.
     estimates
         Of the parameters that are kept: their number -> estimate.
+    tested_fits
+        The fits of which ``tested`` is.
     """
 
     fits: tuple[PhotographFit, ...]
     tested: tuple[Estimate, ...]
     estimates: dict[int, Estimate]
+    tested_fits: tuple[PhotographFit, ...] = ()
 
 
-def fit_camera(photographs: Sequence[FittedPhotograph]) -> CameraFit:
-    """Return the fit of a camera's photographs."""
+def fit_camera(
+    photographs: Sequence[FittedPhotograph], without: Collection[int] = (),
+    known: Sequence[PhotographFit] = (),
+) -> CameraFit:
+    """Return the fit of a camera's photographs.
+
+    Parameters
+    ----------
+    photographs
+        What is fitted.
+    without
+        Parameters that are left out whatever their intervals: of AMOUNT and BLOOM.
+    known
+        Fits of all effects of these photographs, which are then not made again.
+    """
     moved = np.array([True, True, True, False])
-    fits = _fitted(photographs, moved, START)
+    fits = list(known) or _fitted(photographs, moved, START)
     if not fits:
         return CameraFit((), (), {})
     tested = tuple(_estimates(fits, moved)[k] for k in (VARIANCE, AMOUNT, BLOOM))
     kept = np.array([*(each.excludes(0.0) or not each.judged for each in tested), False])
+    kept[list(without)] = False
     start = START.copy()
     if not (kept[VARIANCE] and tested[VARIANCE].value > 0):
         kept[VARIANCE], start[VARIANCE] = False, 0.0
     if kept[AMOUNT]:
-        return _with_radius(photographs, fits, kept, tested)
-    if not np.array_equal(kept, moved):
-        fits = _fitted(photographs, kept, start)
-    return CameraFit(tuple(fits), tested, _estimates(fits, kept))
+        chosen, estimates = _with_radius(photographs, fits, kept)
+    else:
+        chosen = fits if np.array_equal(kept, moved) else _fitted(photographs, kept, start)
+        estimates = _estimates(chosen, kept)
+    return CameraFit(tuple(chosen), tested, estimates, tuple(fits))
 
 
 def _fitted(
@@ -79,9 +97,8 @@ def _fitted(
 
 def _with_radius(
     photographs: Sequence[FittedPhotograph], fits: list[PhotographFit], kept: Masks,
-    tested: tuple[Estimate, ...],
-) -> CameraFit:
-    """Return the fit with sharpening, of the one radius that fits all photographs best."""
+) -> tuple[list[PhotographFit], dict[int, Estimate]]:
+    """Return fits with sharpening, of the one radius that fits all photographs best."""
     start = np.where(kept, START, 0.0)
     radius, change = float(START[RADIUS]), 0.0
     for _ in range(RADIUS_ROUNDS):
@@ -96,10 +113,8 @@ def _with_radius(
             break
         radius = moved
     if len(fits) < MIN_PHOTOGRAPHS or start[RADIUS] in (LOW[RADIUS], HIGH[RADIUS]):
-        estimates = _estimates(fits, kept) | {RADIUS: Estimate(float(start[RADIUS]))}
-    else:
-        estimates = _estimates(fits, kept, change)
-    return CameraFit(tuple(fits), tested, estimates)
+        return fits, _estimates(fits, kept) | {RADIUS: Estimate(float(start[RADIUS]))}
+    return fits, _estimates(fits, kept, change)
 
 
 def _radius_pulls(fits: Sequence[PhotographFit], kept: Masks) -> tuple[Floats, Floats]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +24,7 @@ from sweep.fitting.noise import PhotographNoise, photograph_noise
 from sweep.fitting.photograph_fit import PhotographFit
 from sweep.fitting.scenes import PhotographScenes
 from sweep.fitting.terms import Term, judged, shortened
-from sweep.fitting.views import is_saturated, photograph_views
+from sweep.fitting.views import FittedPhotograph, is_saturated, photograph_views
 from sweep.measure.flags import TruthSource
 from sweep.model.board import Board
 from sweep.model.derivatives import POSE
@@ -35,6 +35,10 @@ from sweep.typing import Floats
 MARKERS = 12
 """Markers of a photograph that are fitted: more of them narrow the intervals little, since
 photographs differ by more than the estimates of one."""
+
+
+FITTED = {"sharpening": AMOUNT, "bloom": BLOOM}
+"""Effects that are absent unless needed -> their parameter of a photograph's fit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,12 +53,15 @@ class SceneFit:
         How many of them were fitted.
     lines
         What is to be said beside the terms.
+    tested_fits
+        The fits of the photographs with all effects.
     """
 
     terms: tuple[Term, ...]
     photographs: int
     markers: int
     lines: tuple[str, ...]
+    tested_fits: tuple[PhotographFit, ...] = ()
 
     @property
     def scene(self) -> dict[str, Any]:
@@ -62,10 +69,10 @@ class SceneFit:
         return {each.parameter: each.value for each in self.terms if each.kept}
 
 
-def fit_scene(
+def scene_views(
     taken: PhotographScenes, board: Board | None, markers: int = MARKERS
-) -> SceneFit:
-    """Return the scene of a camera from its photographs.
+) -> tuple[list[FittedPhotograph], list[str]]:
+    """Return what is fitted of photographs, and lines on what is not.
 
     Parameters
     ----------
@@ -92,7 +99,40 @@ def fit_scene(
             "folders", "white at level 255",
             "white is saturated in all photographs: expose less, so that levels are seen",
         )
-    camera = fit_camera(good)
+    cut = len(views) - len(good)
+    return good, [
+        f"left out {cut} of {len(views)} photographs, in which white is saturated: expose less"
+    ] if cut else []
+
+
+def fit_scene(
+    views: Sequence[FittedPhotograph], taken: PhotographScenes, board: Board | None,
+    without: Mapping[str, str] | None = None, known: Sequence[PhotographFit] = (),
+) -> SceneFit:
+    """Return the scene of a camera from its photographs.
+
+    Parameters
+    ----------
+    views
+        What is fitted.
+    taken, board
+        As for :func:`scene_views`.
+    without
+        Switches of effects that are left out, and why.
+    known
+        Fits of all effects, of an earlier scene's (:attr:`SceneFit.tested_fits`).
+
+    Raises
+    ------
+    ArgumentError
+        If nothing can be fitted, in a line.
+    """
+    refused = without or {}
+    numbers = {each.number for each in views}
+    camera = fit_camera(
+        views, [number for name, number in FITTED.items() if name in refused],
+        [each for each in known if each.number in numbers],
+    )
     if not camera.fits:
         raise ArgumentError(
             "folders", "no marker fits",
@@ -104,14 +144,14 @@ def fit_scene(
         *_levels(camera, taken), *_optics(camera), *_light(camera, taken), *_noise(camera, noises),
         *_geometry(camera, noises, taken, board),
     ]
-    lines = _lines(camera, noises)
-    if len(good) < len(views):
-        lines.insert(
-            0, f"left out {len(views) - len(good)} of {len(views)} photographs, in which white is "
-            "saturated: expose less"
-        )
+    terms = [
+        each.left_out(refused[switch])
+        if each.kept and (switch := each.of or each.parameter) in refused else each
+        for each in terms
+    ]
     return SceneFit(
-        tuple(terms), len(camera.fits), sum(len(fit.states) for fit in camera.fits), tuple(lines)
+        tuple(terms), len(camera.fits), sum(len(fit.states) for fit in camera.fits),
+        tuple(_lines(camera, noises)), camera.tested_fits,
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -83,7 +84,8 @@ def _camera(pipeline: Pipeline) -> dict[str, Any]:
 
 
 def scene_text(
-    document: dict[str, Any], found: SceneFit, record: PhotographRecord, name: str
+    document: dict[str, Any], found: SceneFit, record: PhotographRecord, name: str,
+    lines: Sequence[str] = (),
 ) -> str:
     """Return the content of the file: what it follows from, the terms, and the pipeline."""
     digest = hashlib.sha256("".join(record.digests).encode()).hexdigest()
@@ -93,7 +95,7 @@ def scene_text(
         "photograph. Value, 95 % interval by photograph, spread:",
         *(f"  {each.parameter}: {numbers_text(each)}" for each in found.terms if each.kept),
         *(f"  left out: {each.name}: {each.reason}" for each in found.terms if not each.kept),
-        *found.lines,
+        *lines, *found.lines,
     ]
     return "".join(f"# {plain(line, 200)}\n" for line in head) + "\n" + document_text(document)
 

@@ -14,10 +14,10 @@ import tempfile
 from collections import defaultdict
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[1] / "fitting")]
+import numpy as np
 
-import numpy as np  # noqa: E402
-from test_camera_fit import EFFECTS, PLAIN, TRUTH, fitted, terms_of  # noqa: E402
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from support.fitted_photographs import EFFECTS, PLAIN, TRUTH, fitted, terms_of
 
 ABSENT = ("sharpening", "bloom", "illumination_gradient", "noise_correlation", "geometry_px")
 

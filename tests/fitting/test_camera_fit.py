@@ -1,51 +1,14 @@
 """Scenes that are fitted to photographs with known effects: rendered, saved, and fitted."""
 
-import json
-
 import numpy as np
 import pytest
 from scipy import stats
 
 import sweep
-from support.photographs import photographs, save
+from support.fitted_photographs import EFFECTS, PLAIN, TRUTH, fitted, taken, terms_of
 from sweep import cli
 from sweep.errors import ArgumentError
 from sweep.fitting.estimates import estimate, jackknife
-from sweep.plan.board_files import board_of
-
-BOARD = {
-    "kind": "charuco", "dictionary": "DICT_4X4_50", "squares_x": 5, "squares_y": 4,
-    "square_m": 0.03, "marker_m": 0.022,
-}
-CAMERA = {"width_px": 360, "height_px": 270, "fx_px": 390.0}
-LEVELS = {"black": 60.0, "white": 175.0, "background": 100.0}
-TRUTH = {
-    "blur_px": 0.6, "sharpening": 0.6, "sharpening_px": 1.5, "bloom": 0.15,
-    "illumination_gradient": 0.2, "illumination_deg": 30.0, "noise_correlation": 0.5,
-    "geometry_px": 0.15, "geometry_length_px": 60.0, **LEVELS,
-}
-EFFECTS = TRUTH | {"noise_grey": 2.0}
-PLAIN = LEVELS | {"blur_px": 0.5, "noise_grey": 1.0}
-
-
-def taken(folder, effects, seed, count):
-    """Write photographs, the camera's file and the board's; return `sweep.fit`'s arguments."""
-    shots = photographs(board_of(BOARD, "board"), CAMERA, count, seed, effects, 0.9)
-    camera = save(folder / "shots", shots, CAMERA)
-    camera = camera.rename(folder / "camera.yml")
-    (folder / "shots" / "truth.json").unlink()
-    (folder / "board.toml").write_text(
-        "".join(f"{key} = {json.dumps(value)}\n" for key, value in BOARD.items()))
-    return (folder / "shots",), {"camera": camera, "board": folder / "board.toml"}
-
-
-def fitted(folder, effects, seed, count, markers=6):
-    folders, options = taken(folder, effects, seed, count)
-    return sweep.fit(*folders, **options, markers=markers)
-
-
-def terms_of(found):
-    return {each.parameter: each for each in found.found.terms}
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +71,7 @@ def test_saturated_white_is_one_line(tmp_path):
 
 @pytest.mark.parametrize(("change", "message"), [
     ({"markers": 0}, "markers = 0: expected a whole number from 1 to 1000"),
-    ({"settings": ["solver=ippe"]}, "scene is fitted to pixels"),
+    ({}, "expected photographs"),
 ])
 def test_bad_arguments_are_one_line(change, message, tmp_path):
     with pytest.raises(ArgumentError, match=message):

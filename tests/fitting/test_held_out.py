@@ -1,0 +1,56 @@
+"""Effects that are kept where they move errors of photographs that were not fitted."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import sweep
+from support.fitted_photographs import EFFECTS, taken, terms_of
+from sweep.analysis.simulation_gaps import QUANTILES, RATES
+from sweep.fitting.held_out import gap_size, is_moved
+
+
+def gap(value, shift=0.1):
+    """A gap whose simulated statistics are ``value``, with intervals of ± 0.5.
+
+    Differences are ``shift`` ± 0.2, ratios exp(``shift`` ± 0.2).
+    """
+    variables = {}
+    for end, change in (("", 0.0), ("_low", -1.0), ("_high", 1.0)):
+        for each in (*RATES, *QUANTILES):
+            variables[each.name + end] = (
+                ("source", "solver"), np.full((2, 2), value + change / 2))
+            size = shift + change / 5
+            variables[f"{each.name}_gap{end}"] = (
+                "solver", np.full(2, np.exp(size) if each.ratio else size))
+    return xr.Dataset(variables, coords={"source": ["photographs", "simulated"]})
+
+
+def test_an_effect_moves_errors_if_one_statistic_leaves_its_interval():
+    full = gap(1.0)
+    assert not is_moved(full, gap(1.4))
+    other = gap(1.4)
+    other[QUANTILES[0].name][1, 1] = 1.6
+    assert is_moved(full, other)
+    assert not is_moved(gap(np.nan), gap(1.0))  # statistics that do not exist say nothing
+
+
+def test_the_size_of_a_gap_is_in_half_widths_of_its_intervals():
+    full = gap(1.0)
+    assert gap_size(full, full) == pytest.approx(0.5)
+    assert gap_size(gap(1.0, -0.3), full) == pytest.approx(1.5)
+    assert np.isnan(gap_size(full, gap(1.0, np.nan)))
+
+
+@pytest.mark.long
+def test_a_scene_is_checked_against_photographs_that_were_not_fitted(tmp_path):
+    effects = EFFECTS | {"sharpening": 1.2, "bloom": 0.4}
+    folders, options = taken(tmp_path, effects, 31, 10)
+    fitted = sweep.fit(*folders, **options, markers=6)
+    assert {"blur_px", "sharpening", "bloom", "geometry_px"} <= set(fitted.found.scene)
+    assert terms_of(fitted)["geometry_px"].kept
+    simulated = fitted.gap.sel(source="simulated", cornerRefinementMethod="subpix")
+    real = fitted.gap.sel(source="photographs", cornerRefinementMethod="subpix")
+    assert real.looked_for == simulated.looked_for
+    ratio = float(simulated.rotation_median_deg / real.rotation_median_deg)
+    assert 1 / 1.6 < ratio < 1.6

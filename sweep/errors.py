@@ -46,7 +46,8 @@ class ArgumentError(SweepError, ValueError):
     """
 
     def __init__(self, argument: str, value: object, problem: str) -> None:
-        super().__init__(f"{argument} = {value}: {problem}")
+        given = f" = {value}" if str(value) else ""
+        super().__init__(f"{argument}{given}: {problem}")
         self.argument, self.value, self.problem = argument, value, problem
 
     def __reduce__(self) -> tuple[type[ArgumentError], tuple[str, object, str]]:

@@ -8,7 +8,13 @@ from collections.abc import Sequence
 import xarray as xr
 
 from sweep.analysis.described import describes
-from sweep.analysis.dimensions import DRAWS, axes_of, configuration_axes, stored_pipeline
+from sweep.analysis.dimensions import (
+    DRAWS,
+    as_names,
+    axes_of,
+    configuration_axes,
+    stored_pipeline,
+)
 from sweep.analysis.farthest import farthest_met
 from sweep.analysis.repeated_looks import looks_factor
 from sweep.analysis.requirements import ErrorShares
@@ -74,6 +80,7 @@ def requirement_limits(
     (20.0, 20.0, 40.0)
     """
     rule = _searched(results)
+    require = [require] if isinstance(require, str) and require else require
     if not require or not along:
         if rule is None:
             raise ArgumentError("require" if not require else "along", along,
@@ -83,9 +90,10 @@ def requirement_limits(
         per = rule.per if per is None else per
         at_all = rule.at_all if at_all is None else at_all
     scene = [name for name in axes_of(results) if name not in configuration_axes(results)]
-    at_all = [name for name in at_all or () if name != along]
+    at_all = [name for name in as_names(at_all or ()) if name != along]
     if per is None:
         per = [name for name in scene if name not in (DRAWS, along, *at_all)]
+    per = as_names(per)
     count = len([*require]) * math.prod(results.sizes.get(name, 1) for name in (along, *at_all))
     found = farthest_met(
         results, require, along, per, at_all, error_shares(count, len(rule.ends) if rule else 1))

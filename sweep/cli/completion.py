@@ -11,8 +11,10 @@ from dataclasses import dataclass
 
 from sweep.cli.command import Command, Example
 
-NAMES, FILES, NOTHING = "names", "files", "nothing"
-"""What follows an option: names of parameters, a file, or what cannot be completed."""
+NAMES, AXES, FILES, NOTHING = "names", "axes", "files", "nothing"
+"""What follows an option: names of parameters with "=" or without, a file, or nothing known."""
+
+AXIS_METAVARS = ("AXIS", "AXES")
 
 FILE_METAVARS = ("STORE", "PNG", "FILE", "FIGURE", "DIR")
 
@@ -56,6 +58,8 @@ def completions(commands: Sequence[Command]) -> list[Completion]:
                 follows = ""
             elif action.dest in ("settings", "at"):
                 follows = NAMES
+            elif action.metavar in AXIS_METAVARS:
+                follows = AXES
             else:
                 follows = choices or (FILES if action.metavar in FILE_METAVARS else NOTHING)
             for option in action.option_strings:
@@ -115,6 +119,11 @@ def _bash_reply(follows: str) -> str:
             'candidates=$(printf "%s " ${names// / }); '
             'candidates=" $candidates"; candidates=${candidates// / $part}'
         )
+    if follows == AXES:
+        return (
+            'part=${token%"${token##*,}"}; candidates=$(printf "%s " ${names//=/}); '
+            'candidates=" $candidates"; candidates=${candidates// / $part}'
+        )
     if follows == FILES:
         return "compopt -o default"
     return ":" if follows == NOTHING else f'candidates="{follows}"'
@@ -155,6 +164,8 @@ def zsh(commands: Sequence[Completion], names: Sequence[str]) -> str:
 def _zsh_reply(follows: str) -> str:
     if follows == NAMES:
         return "compset -P '*,'; compadd -S '' -- $names"
+    if follows == AXES:
+        return "compset -P '*,'; compadd -- ${names%=}"
     if follows == FILES:
         return "_files"
     return ":" if follows == NOTHING else f"compadd -- {follows}"
@@ -178,7 +189,8 @@ def fish(commands: Sequence[Completion], names: Sequence[str]) -> str:
         for option, (meaning, follows) in each.options.items():
             flag = f"-l {option[2:]}" if option.startswith("--") else f"-s {option[1:]}"
             reply = {
-                "": "", NAMES: f" -x -a {_quoted(written)}", FILES: " -r -F", NOTHING: " -x",
+                "": "", NAMES: f" -x -a {_quoted(written)}",
+                AXES: f" -x -a {_quoted(' '.join(names))}", FILES: " -r -F", NOTHING: " -x",
             }.get(follows, f" -x -a {_quoted(follows)}")
             lines.append(f"{behind} {flag}{reply} -d {_quoted(meaning)}")
     return "\n".join([*lines, ""])

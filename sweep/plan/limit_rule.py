@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -206,10 +207,19 @@ def limit_settings(
     ['limit.require=["detection >= 0.9"]', 'limit.along="distance_m"', 'limit.max_trials=600']
     """
     given = {
-        "require": list(require) or None, "along": along or None,
-        "per": None if per is None else list(per),
-        "at_all": None if at_all is None else list(at_all),
+        "require": _listed(require) or None, "along": along or None,
+        "per": None if per is None else _listed(per),
+        "at_all": None if at_all is None else _listed(at_all),
         "coarse_trials": coarse_trials, "max_trials": max_trials,
     }
-    return [f"{SECTION}.{key}={json.dumps(value, ensure_ascii=False)}"
+    return [f"{SECTION}.{key}={json.dumps(value, ensure_ascii=False, default=_whole)}"
             for key, value in given.items() if value is not None]
+
+
+def _listed(texts: Sequence[str]) -> list[str]:
+    return [texts] if isinstance(texts, str) else list(texts)
+
+
+def _whole(value: Any) -> int | str:
+    """Return a whole number of NumPy's; of anything else its text, which is refused as such."""
+    return operator.index(value) if hasattr(value, "__index__") else str(value)

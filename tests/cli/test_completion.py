@@ -59,6 +59,9 @@ def test_each_script_is_one_of_its_shell(shell, check, capsys, tmp_path):
         ("sweep show small.toml --at tilt_deg=3,roll", ["3,roll_deg="]),
         ("sweep report runs/small.zarr --format ", ["html", "md"]),
         ("sweep run small.toml --workers ", []),
+        ("sweep limit small.toml --along distan", ["distance_m"]),
+        ("sweep limit small.toml --per tilt_deg,roll", ["tilt_deg,roll_deg"]),
+        ("sweep run small.toml --prec", ["--precision"]),
         ("sweep completion ", ["bash", "zsh", "fish"]),
     ],
 )

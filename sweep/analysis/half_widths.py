@@ -28,7 +28,7 @@ from sweep.typing import Floats, Masks
 
 PoseStatistic = Statistic[Poses, Any, Any, Any]
 
-MIN_DRAWS = 300
+MIN_DRAWS = 450
 """Draws below which no interval of a mean or a root mean square is narrow enough.
 
 Their formulas need draws to tell how the errors spread: the interval of a lucky start is narrow.

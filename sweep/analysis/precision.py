@@ -70,7 +70,7 @@ def precision_reached(
 
     Notes
     -----
-    The intervals are those by which sampling stops: at 97 % for 95 %, and 99 % for root mean
+    The intervals are those by which sampling stops: at 97 % for 95 %, and 98 % for root mean
     squares and standard deviations (`sweep.analysis.stopped_sampling`), also of a store whose
     sampling was not stopped.
 

@@ -44,8 +44,8 @@ The interval of 95 % is one of 97 %. The least coverage of a rate, over all rate
 0.005 to 0.25, waves of 5 to 99 draws at first and any largest number of trials, is then 0.954.
 """
 
-SPREAD_TAIL_SHARE = 0.2
-"""The same of root mean squares and standard deviations: the interval of 95 % is one of 99 %."""
+SPREAD_TAIL_SHARE = 0.4
+"""The same of root mean squares and standard deviations: the interval of 95 % is one of 98 %."""
 
 NOT_AVAILABLE = (DetectionStatus.not_run, DetectionStatus.not_needed)
 """Flags of the trials that a cell does not have."""

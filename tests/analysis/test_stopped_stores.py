@@ -139,7 +139,7 @@ def test_chunks_do_not_matter(stopped):
 def test_intervals_of_errors_are_wider_than_those_of_fixed_trials(stopped, full):
     ours = error_statistics(stopped, ["side_px", "solver"]).isel(side_px=1)
     fixed = error_statistics(full, ["side_px", "solver"]).isel(side_px=1)
-    for name, level in (("range_bias_percent", 0.97), ("position_rmse_unflipped_m", 0.99)):
+    for name, level in (("range_bias_percent", 0.97), ("position_rmse_unflipped_m", 0.98)):
         assert (ours[name] == fixed[name]).all()
         ends = (np.log(each[f"{name}_high"] / each[name]) if "rmse" in name
                 else each[f"{name}_high"] - each[name] for each in (ours, fixed))

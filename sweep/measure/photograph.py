@@ -57,9 +57,9 @@ FIRST_SPREAD_PX = 0.7
 SAME_TURN_RAD = 1e-3
 """Poses whose rotations differ by less than this are the same."""
 
-CONTEST = 500.0
-"""Excess of chi-square over the best coarse fit's above which a mirrored pose is given up. Five
-times that of ``photometric``, since residuals of photographs are correlated."""
+CONTEST = 50.0
+"""Excess of chi-square over the best coarse fit's above which a mirrored pose is given up. Of poses
+on photographs of boards, fits of all pixels chose the mirror at an excess of at most 44."""
 
 MIN_CONTRAST = 1.0
 """Difference of white and black in grey levels below which there is no marker in the pixels."""
@@ -79,6 +79,8 @@ class Located(NamedTuple):
         Sum of squared residuals; infinite without a pose.
     reached
         Whether the minimum was.
+    freedom
+        Fitted pixels less parameters.
     contrast
         White minus black in grey levels.
     judgement
@@ -89,6 +91,7 @@ class Located(NamedTuple):
     other: Floats
     squares: float
     reached: bool
+    freedom: int
     contrast: float
     judgement: Judgement
 
@@ -102,40 +105,58 @@ def locate_photograph(
     ``starts`` (K, STATE_LENGTH) are states: the first ``tried`` are, the others if none of those
     comes to a minimum.
     """
+    best, other = np.full(STATE_LENGTH, math.nan), np.full(STATE_LENGTH, math.nan)
+    judgement = Judgement(False, math.nan, math.nan, math.nan, math.nan)
+    freedom = pixel_count(view) - MOVED - linear_count(nuisances)
+    if freedom < 1:
+        return Located(best, other, math.inf, False, freedom, 0.0, judgement)
     coarse = binned_photograph(view)
     coarse_work = system(coarse.levels.shape[0], coarse.levels.shape[1])
     work = system(view.levels.shape[0], view.levels.shape[1])
     simple = Nuisances(nuisances.outside, False, nuisances.tone, nuisances.sharpening,
                        0.5 * nuisances.radius_px)
     information = np.empty((MOVED, MOVED))
-    coarse_linear = np.empty(linear_count(simple))
+    plain = Nuisances(nuisances.outside, False, False, False, 1.0)
+    coarse_linear, plain_linear = np.empty(linear_count(simple)), np.empty(linear_count(plain))
     linear, trial_linear = np.empty(linear_count(nuisances)), np.empty(linear_count(nuisances))
 
     def coarse_fit(state: Floats) -> tuple[float, bool]:
         """Fit a state to the means of 2 x 2 pixels, whose point spread is half as wide."""
         state[SPREAD] *= 0.5
+        start = state.copy()
         level, settled = fit_photograph(
             coarse, state, simple, coarse_work, COARSE_STEPS, COARSELY_SETTLED, information,
             coarse_linear,
         )
+        if not settled:
+            # Far from the pose, sharpening and tone lead astray.
+            overwrite(state, start)
+            fit_photograph(
+                coarse, state, plain, coarse_work, COARSE_STEPS, COARSELY_SETTLED, information,
+                plain_linear,
+            )
+            level, settled = fit_photograph(
+                coarse, state, simple, coarse_work, COARSE_STEPS, COARSELY_SETTLED, information,
+                coarse_linear,
+            )
         state[SPREAD] *= 2.0
         return level, settled
 
-    best, other = np.full(STATE_LENGTH, math.nan), np.full(STATE_LENGTH, math.nan)
-    judgement = Judgement(False, math.nan, math.nan, math.nan, math.nan)
     first, lowest, any_settled = best.copy(), math.inf, False
+    contrast = _first_contrast(view)
     for k in range(len(starts)):
         if k >= tried and any_settled:
             break
         if is_before_camera(starts[k], view.marker):
             state = starts[k].copy()
+            state[CONTRAST] = contrast
             level, settled = coarse_fit(state)
             any_settled = any_settled or settled
             if level < lowest:
                 lowest = level
                 overwrite(first, state)
     if not lowest < math.inf:
-        return Located(best, other, math.inf, False, 0.0, judgement)
+        return Located(best, other, math.inf, False, freedom, 0.0, judgement)
     rival = mirrored_state(first)
     excess = math.inf
     if is_before_camera(rival, view.marker):
@@ -170,7 +191,7 @@ def locate_photograph(
                 draw(view, best, nuisances, work)
     if reached:
         judgement = judge(view, best, nuisances, work, covariance)
-    return Located(best, other, squares, reached, linear[1], judgement)
+    return Located(best, other, squares, reached, freedom, linear[1], judgement)
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,10 +262,6 @@ class PhotometricReal:
             return
         outside = bool((view.marker.edges.sides == OUTSIDE).any())
         nuisances = Nuisances(outside, self.light, self.tone, self.sharpening, self.radius_px)
-        free, pixels = MOVED + linear_count(nuisances), pixel_count(view)
-        if pixels <= free:
-            return
-        starts[:, CONTRAST] = _first_contrast(view)
         covariance = np.empty((6, 6))
         found = locate_photograph(view, starts, tried, nuisances, covariance)
         if not math.isfinite(found.squares):
@@ -266,7 +283,7 @@ class PhotometricReal:
         out.covariance[i] = covariance
         out.misfit_px[i] = judgement.misfit_px
         out.residual_ratio[i] = found.squares / (
-            noise_variance(float(detections.noise_grey[i])) * (pixels - free)
+            noise_variance(float(detections.noise_grey[i])) * found.freedom
         )
 
 

@@ -34,6 +34,12 @@ from sweep.typing import Floats
 MIN_SPREAD_PX = 0.2
 """Smallest point spread that is estimated."""
 
+MAX_SPREAD_RATIO = 1.5
+"""Largest ratio of the point spreads before and after a step."""
+
+MAX_AMOUNT_CHANGE = 0.25
+"""Change of the amount of sharpening above which slopes are computed with the new one at once."""
+
 MIN_OUTSIDE_PX = 1.0
 """Pixels of the area outside, by squares of its shares, below which its level stays as it is."""
 
@@ -43,10 +49,12 @@ MAX_OUTSIDE = 2.0
 GROUP, TILE = 128, 4
 """Pixels whose columns are multiplied at once, and the side of the tiles of their products."""
 
-NEARLY_SETTLED = 0.1
-"""Squared standard deviations of the last undamped step, if no other lowers the squares."""
+NEARLY_SETTLED = 0.25
+"""Squared standard deviations of the pose's part of the last undamped step, if no step is found
+that lowers the squares, or after all steps: the point spread and the amount of sharpening may be
+almost the same."""
 
-SLACK = 0.03
+SLACK = 0.02
 """Rise of the squares that a step may bring, as a share: tone and sharpening are multiplied in the
 model, and each evaluation takes one of the factors from the evaluation before."""
 
@@ -119,6 +127,19 @@ def evaluate(
     linear ones eliminated; ``linear`` gets the solution, from which ``state`` gets its last
     entries. Returns infinity if the linear parameters cannot be solved for.
     """
+    amount = state[AMOUNT]
+    squares = _evaluate(view, state, nuisances, work, information, gradient, linear)
+    if nuisances.sharpening and abs(state[AMOUNT] - amount) > MAX_AMOUNT_CHANGE:
+        squares = _evaluate(view, state, nuisances, work, information, gradient, linear)
+    return squares
+
+
+@compiled
+def _evaluate(
+    view: PhotographView, state: Floats, nuisances: Nuisances, work: System,
+    information: Floats, gradient: Floats, linear: Floats,
+) -> float:
+    """Evaluate a state, as :func:`evaluate`, with the slopes of the amount that it has."""
     free, count = information.shape[0], linear.shape[0]
     matrix = np.empty((free + count + 1, free + count + 1))
     draw(view, state, nuisances, work)
@@ -188,7 +209,8 @@ def keep_linear(state: Floats, nuisances: Nuisances, linear: Floats) -> None:
 def stepped(state: Floats, step: Floats) -> Floats:
     """Return the state after a step of the moved parameters."""
     moved = moved_state(state, step, 1.0)
-    moved[SPREAD] = max(moved[SPREAD], MIN_SPREAD_PX)
+    least, most = state[SPREAD] / MAX_SPREAD_RATIO, state[SPREAD] * MAX_SPREAD_RATIO
+    moved[SPREAD] = max(min(max(moved[SPREAD], least), most), MIN_SPREAD_PX)
     return moved
 
 
@@ -209,7 +231,8 @@ def fit_photograph(
     trial_linear = np.empty(count)
     squares = evaluate(view, state, nuisances, work, information, gradient, linear)
     damping = 1e-3
-    decrement = math.inf
+    of_pose = math.inf
+    last_change = 0.0
     for _ in range(most_steps):
         if not squares < math.inf:
             break
@@ -217,10 +240,13 @@ def fit_photograph(
         regular = information.copy()
         for k in range(free):
             regular[k, k] = regular[k, k] * (1.0 + 1e-9) + 1e-300
+        regular_spread = regular[POSE, POSE]
         if solve_positive(regular, newton):
             decrement = 0.0
             for k in range(free):
                 decrement += gradient[k] * newton[k, 0]
+            # The rest is the step of the point spread at the pose that it is best for.
+            of_pose = decrement - gradient[POSE] ** 2 / regular_spread
             if decrement < settled * (squares / freedom):
                 moved = stepped(state, newton[:, 0])
                 if is_before_camera(moved, view.marker):
@@ -235,6 +261,9 @@ def fit_photograph(
             if not solve_positive(damped, step):
                 damping = max(10.0 * damping, 1e-3)
                 continue
+            if step[POSE, 0] * last_change < 0.0 and abs(step[POSE, 0]) > 0.5 * abs(last_change):
+                # Sharpening and point spread are almost the same: the step may be twice too long.
+                step[POSE, 0] *= 0.5
             trial = stepped(state, step[:, 0])
             if is_before_camera(trial, view.marker):
                 trial_squares = evaluate(
@@ -246,11 +275,11 @@ def fit_photograph(
             damping = max(8.0 * damping, 1e-3)
         if not accepted:
             break
-        squares = trial_squares
+        squares, last_change = trial_squares, trial[SPREAD] ** 2 - state[SPREAD] ** 2
         overwrite(state, trial)
         overwrite(gradient, trial_gradient)
         overwrite(linear, trial_linear)
         for k in range(free):
             overwrite(information[k], trial_information[k])
         damping *= 0.1
-    return squares, decrement < NEARLY_SETTLED * (squares / freedom)
+    return squares, of_pose < NEARLY_SETTLED * (squares / freedom)

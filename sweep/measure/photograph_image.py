@@ -38,12 +38,12 @@ jump), at least this many pixels."""
 MAX_PANELS = 4096
 """Most panels of one straight segment."""
 
-_STEPS = 256
+_STEPS = 64
 _AT = np.arange(-6 * _STEPS, 6 * _STEPS + 2) / _STEPS
 _DENSITY = np.exp(-0.5 * _AT**2) / math.sqrt(2.0 * math.pi)
 _BELOW = np.array([0.5 * math.erfc(-at / math.sqrt(2.0)) for at in _AT.tolist()])
 _BELOW_SUM = _AT * _BELOW + _DENSITY
-"""The normal distribution, its integral, and the integral of that, in steps of 1/256 standard
+"""The normal distribution, its integral, and the integral of that, in steps of 1/64 standard
 deviations."""
 
 
@@ -94,7 +94,7 @@ def _add_segment(
     )
     dx, dy = (xb - xa) / panels, (yb - ya) / panels
     most = int(2.0 * reach) + 3
-    basis, along_y, steps = np.empty(4 * most), np.empty(most), np.empty(most)
+    basis, along_y, steps = np.empty(4 * most), np.zeros(4 * most), np.empty(most)
     scale = _STEPS / sigma
     for panel in range(panels):
         for node in range(3):
@@ -135,14 +135,14 @@ def _add_segment(
                     basis[4 * m + 1] = weight_x * near
                     basis[4 * m + 2] = -weight_y * near
                     basis[4 * m + 3] = 0.5 * weight_x * (high_density - low_density) / sigma
-                    along_y[m] = 0.5 * weight_y * near / sigma
+                    along_y[4 * m + 3] = 0.5 * weight_y * near / sigma
                 before, low, low_sum, low_density = share, high, high_sum, high_density
             at = (top - y) * scale + 6.0 * _STEPS
             low, low_density = 0.0, 0.0
             if at > 0.0:
                 k = int(at)
                 low, low_density = _BELOW[k], _DENSITY[k]
-            count = max(end - begin + 1, 0)
+            count, start = max(end - begin + 1, 0), 4 * begin
             for i in range(top, bottom + 1):
                 at = (i + 1.0 - y) * scale + 6.0 * _STEPS
                 if at >= 12.0 * _STEPS:
@@ -156,12 +156,9 @@ def _add_segment(
                     high_density = _DENSITY[k] + part * (_DENSITY[k + 1] - _DENSITY[k])
                 share, change = high - low, low_density - high_density
                 low, low_density = high, high_density
-                row = rates[i, 4 * begin : 4 * (begin + count)]
+                row = rates[i]
                 for m in range(4 * count):
-                    row[m] += share * basis[m]
-                curved_row = curved[i, begin : begin + count]
-                for m in range(count):
-                    curved_row[m] += change * along_y[m]
+                    row[start + m] += share * basis[m] + change * along_y[m]
                 if passed != 0.0:
                     rates[i, 0] += share * weight_x * passed
                 if outside != 0.0:

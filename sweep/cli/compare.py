@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from sweep.cli.arguments import add_json, add_workers
 from sweep.cli.command import CONTINUES, Command, Example
-from sweep.cli.output import print_json, say, say_next
+from sweep.cli.output import print_json, quiet_matplotlib, say, say_next
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -42,6 +42,10 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--overwrite", action="store_true", help="replace an existing store of the simulation"
     )
+    parser.add_argument(
+        "-o", "--output", metavar="FIGURE",
+        help="draw the distributions of the errors into this PNG or SVG file",
+    )
     parser.add_argument("--markdown", action="store_true", help="print a Markdown table")
     add_json(parser)
 
@@ -51,15 +55,24 @@ def _execute(options: argparse.Namespace) -> int:
     from sweep.errors import ArgumentError  # noqa: PLC0415
     from sweep.report.error_model_table import plain_table  # noqa: PLC0415
     from sweep.report.gap_table import gap_lines, gap_records, gap_table  # noqa: PLC0415
+    from sweep.report.output_file import figure_file, write_output_file  # noqa: PLC0415
 
     if options.markdown and options.json:
         raise ArgumentError("markdown", "", "expected one of --markdown and --json")
-    bins = dict(_edges(each) for each in options.bins)
+    output = figure_file(options.output)
+    bins = dict(_edges(each) for each in options.bins) or None
     photographs = _opened(options.photographs)
     store = options.simulated
     if store.endswith(".toml"):
         store = _simulated(options)
-    gap = simulation_gap(photographs, _opened(store), bins or None).load()
+    simulated = _opened(store)
+    gap = simulation_gap(photographs, simulated, bins).load()
+    if output is not None:
+        quiet_matplotlib()
+        from sweep.report.gap_figure import figure_bytes, gap_panels  # noqa: PLC0415
+
+        panels = gap_panels(photographs, simulated, bins)
+        write_output_file(output, figure_bytes(panels, output.suffix.lower()))
     if options.json:
         print_json({
             "photographs": options.photographs, "simulated": store,

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import sweep
 from support.board_photographs import POSES, write_set
@@ -12,6 +13,7 @@ from support.here import calls_here
 from support.photograph_results import results_of, twins
 from sweep import cli
 from sweep.analysis import simulation_gap
+from sweep.report.gap_figure import figure_bytes, gap_panels
 from sweep.report.gap_table import gap_lines, gap_records, gap_table
 
 
@@ -51,7 +53,26 @@ def test_json_has_the_same_numbers_and_null_where_there_is_none():
     assert gap_lines(gap)[-1] == "fewer than 5 photographs: errors without intervals"
 
 
+def test_the_figure_has_the_distributions_of_both_sources():
+    rng = np.random.default_rng(3)
+    first, second = results_of(rng), twins(rng, scale=0.5)
+    panels = gap_panels(first, second)
+    assert [panel.title for panel in panels] == [
+        "cornerRefinementMethod none", "cornerRefinementMethod none",
+        "cornerRefinementMethod subpix", "cornerRefinementMethod subpix"]
+    axes = Figure().add_subplot()
+    panels[0].draw(axes)
+    solved = first.sel(cornerRefinementMethod="none").rotation_error_rad.values.reshape(-1, 3)
+    angles = np.sort(np.degrees(np.linalg.norm(solved[~np.isnan(solved[:, 0])], axis=1)))
+    real, simulated = axes.lines
+    assert np.allclose(real.get_xdata(), angles)
+    assert np.allclose(real.get_ydata()[[0, -1]], [100 / len(angles), 100])
+    assert np.median(simulated.get_xdata()) < np.median(angles)
+    assert b"<svg" in figure_bytes(panels[:1], ".svg")
+
+
 @pytest.mark.parametrize(("arguments", "expected"), [
+    (["-o", "gap.gif"], "expected a file that ends in .png or .svg"),
     (["--bins", "side_px"], "--bins side_px: expected a variable and increasing edges"),
     (["--bins", "side_px=a,b"], "--bins side_px=a,b: expected"),
     (["--json", "--markdown"], "expected one of --markdown and --json"),

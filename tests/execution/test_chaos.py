@@ -48,11 +48,24 @@ trial = %d
 """
 SHORT_TRIALS, LONG_TRIALS = 250, 1500
 
-IN_WAVES = """
+IN_WAVES = {
+    "precision": """
 [precision]
 detection_rate = 0.03
 per = ["distance_m", "tilt_deg"]
-"""
+""",
+    "limit": """
+[limit]
+require = ["detection >= 0.9"]
+along = "distance_m"
+""",
+    "choose": """
+[require]
+all = ["detection >= 0.9"]
+[choose]
+largest = "distance_m"
+""",
+}
 
 CLIENT = """
 import sys
@@ -304,9 +317,9 @@ def test_kills_at_random_instants_change_no_bit_and_lose_no_block(count, tmp_pat
 
 
 @pytest.mark.long
-@lengths(5, 20)
-def test_kills_of_a_run_to_a_precision_change_no_bit(count, tmp_path):
-    text = (GRID % 2000).replace("[0.2, 0.3, 0.4]", "[0.2, 1.1, 1.2, 1.3, 1.4]") + IN_WAVES
+@pytest.mark.parametrize(("rule", "count"), [("precision", 20), ("limit", 3), ("choose", 3)])
+def test_kills_of_a_run_in_waves_change_no_bit(rule, count, tmp_path):
+    text = (GRID % 2000).replace("[0.2, 0.3, 0.4]", "[0.2, 1.1, 1.2, 1.3, 1.4]") + IN_WAVES[rule]
     pipeline, path, reference = prepared(tmp_path, text, "undisturbed")
     chaos = Chaos(tmp_path, pipeline, path, reference, SEED)
     chaos.run(count)

@@ -381,6 +381,20 @@ def test_remote_store_is_left_alone_overwritten_and_reused(bucket, small):
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("bucket")
+def test_remote_run_in_waves_is_tightened_to_what_a_local_one_holds(tmp_path):
+    path = tmp_path / "waves.toml"
+    path.write_text("[pose]\njitter_px = 0.5\n[axes]\nside_px = [8, 13, 30]\n")
+    local, remote = str(tmp_path / "local.zarr"), "s3://bucket/waves.zarr"
+    for store, width in ((remote, 0.2), (remote, 0.1), (local, 0.1)):
+        ran = sweep_command("run", path, "--store", store, "--max-trials", "150",
+                            "--precision", f"detection_rate = {width}", "--json")
+        assert ran.returncode == 0, ran.stderr
+        assert json.loads(ran.stdout)["needed"] < 450
+    assert digests(remote) == digests(local)
+
+
+@pytest.mark.long
 def test_killed_remote_run_is_told_and_continues(bucket, many, tmp_path):
     url = "s3://bucket/killed.zarr"
     with started(tmp_path / "run.log", tmp_path / "run.py", many, url, "") as running:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from sweep.errors import ArgumentError
+from sweep.model.pose import rotation_of_vector
 from sweep.photographs.corners import FoundCorners
 from sweep.photographs.pose_fit import Lens
 from sweep.typing import Floats
@@ -102,13 +103,16 @@ def _covariance(
     information = np.zeros((COUNT, COUNT))
     squares, count = 0.0, 0
     for found, turn, shift in zip(used, turns, shifts, strict=True):
-        image, jacobian = cv2.projectPoints(
-            found.points * [1.0, -1.0, -1.0], turn, shift, lens.matrix, lens.distortion
+        at = (
+            found.points * [1.0, -1.0, -1.0],
+            rotation_of_vector(np.asarray(turn, dtype=np.float64).reshape(1, 3))[0],
+            np.asarray(shift, dtype=np.float64).ravel(),
         )
-        pose, camera = jacobian[:, :6], jacobian[:, 6 : 6 + COUNT]
+        image, by_pose = lens.derivatives(*at)
+        pose, camera = by_pose.reshape(-1, 6), lens.camera_derivatives(*at)
         cross = pose.T @ camera
         information += camera.T @ camera - cross.T @ np.linalg.solve(pose.T @ pose, cross)
-        squares += float(((np.asarray(image).reshape(-1, 2) - found.pixels) ** 2).sum())
+        squares += float(((image - found.pixels) ** 2).sum())
         count += 2 * len(found.points) - 6
     scale = np.sqrt(np.diag(information))  # the numbers' units differ by many powers of ten
     scaled = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)

@@ -60,21 +60,25 @@ class Lens(NamedTuple):
         images = np.asarray(image, dtype=np.float64).reshape(-1, 2)
         return images, np.concatenate([by_turn, by_point], axis=2)
 
+    def camera_derivatives(
+        self, points: Floats, rotation: Floats, translation: Floats
+    ) -> Floats:
+        """Return the derivatives (2 n, c) of images (n, 2) by fx, fy, cx, cy and coefficients."""
+        _, jacobian = cv2.projectPoints(
+            np.ascontiguousarray(points @ rotation.T + translation), np.zeros(3), np.zeros(3),
+            self.matrix, self.distortion if len(self.distortion) else None,
+        )
+        return np.asarray(jacobian, dtype=np.float64)[:, 6 : 10 + len(self.distortion)]
+
     def by_camera(self, points: Floats, rotation: Floats, translation: Floats) -> Floats:
         """Return the change (6, c) of a fitted pose by the camera's numbers.
 
-        They are fx, fy, cx, cy and the coefficients. The pose is that of least squares from the
-        images of points (n, 3): it gives way to an error of the camera as far as it can.
+        The pose is that of least squares from the images of points (n, 3): it gives way to an
+        error of the camera as far as it can.
         """
-        turned = points @ rotation.T
-        _, jacobian = cv2.projectPoints(
-            np.ascontiguousarray(turned + translation), np.zeros(3), np.zeros(3), self.matrix,
-            self.distortion if len(self.distortion) else None,
-        )
-        by_numbers = np.asarray(jacobian, dtype=np.float64)[:, 6 : 10 + len(self.distortion)]
         design = self.derivatives(points, rotation, translation)[1].reshape(-1, 6)
-        solved = np.linalg.lstsq(design, by_numbers, rcond=None)[0]
-        return -np.asarray(solved, dtype=np.float64)
+        numbers = self.camera_derivatives(points, rotation, translation)
+        return -np.asarray(np.linalg.lstsq(design, numbers, rcond=None)[0], dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,7 +19,7 @@ from sweep.fitting.light import (
     gradient_square,
     photograph_light,
 )
-from sweep.fitting.marker_state import AMOUNT, BLOOM, RADIUS, VARIANCE
+from sweep.fitting.marker_state import AMOUNT, BLOOM, CORNERS, RADIUS, VARIANCE
 from sweep.fitting.noise import PhotographNoise, photograph_noise
 from sweep.fitting.photograph_fit import PhotographFit
 from sweep.fitting.scenes import PhotographScenes
@@ -280,17 +280,17 @@ def _geometry(
 
 
 def _beside_truth(fit: PhotographFit) -> tuple[Floats, Floats]:
-    """Return the shifts (n, 2) of centres beside poses that are exact."""
-    shifts = [(each.corners_px - each.marker.corners_px).mean(axis=0) for each in fit.states]
-    return np.array(shifts), np.empty((2 * len(shifts), 0))
+    """Return the shifts (n, 4, 2) of corners beside poses that are exact."""
+    shifts = [each.corners_px - each.marker.corners_px for each in fit.states]
+    return np.array(shifts), np.empty((CORNERS * len(shifts), 0))
 
 
 def _beside_board(
     fit: PhotographFit, taken: PhotographScenes, board: Board | None
 ) -> tuple[Floats, Floats] | None:
-    """Return the shifts (n, 2) of centres beside one pose of the board, fitted to all of them.
+    """Return the shifts (n, 4, 2) of corners beside one pose of the board, fitted to all of them.
 
-    And how the centres change with that pose, (2 n, 6). None without such a pose.
+    And how the corners change with that pose, (8 n, 6). None without such a pose.
     """
     if board is None:
         return None
@@ -308,10 +308,8 @@ def _beside_board(
     )
     if pose is None:
         return None
-    shifts = -pose.residuals.reshape(-1, 4, 2).mean(axis=1)
-    middle = points.mean(axis=1)
-    explained = camera.derivatives(middle, pose.rotation, pose.translation)[1]
-    return shifts, np.asarray(explained.reshape(-1, POSE))
+    explained = camera.derivatives(points.reshape(-1, 3), pose.rotation, pose.translation)[1]
+    return -pose.residuals.reshape(-1, 4, 2), np.asarray(explained.reshape(-1, POSE))
 
 
 def _lines(camera: CameraFit, noises: Sequence[PhotographNoise]) -> list[str]:

@@ -20,7 +20,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         "photographs", metavar="STORE", help="store of photographs, as `sweep photos` makes it",
     )
     parser.add_argument(
-        "simulated", metavar="SIMULATION",
+        "scene", metavar="SIMULATION",
         help="store of a simulation, or a TOML file with a section [scene], such as `sweep fit` "
         "writes: the photographs' markers are then simulated with it, at the same poses",
     )
@@ -62,7 +62,7 @@ def _execute(options: argparse.Namespace) -> int:
     output = figure_file(options.output)
     bins = dict(_edges(each) for each in options.bins) or None
     photographs = _opened(options.photographs)
-    store = options.simulated
+    store = options.scene
     if store.endswith(".toml"):
         store = _simulated(options)
     simulated = _opened(store)
@@ -108,9 +108,9 @@ def _simulated(options: argparse.Namespace) -> str:
     from sweep.photographs.twins import read_scene, twin_pipeline, twin_store  # noqa: PLC0415
     from sweep.store.stored_pipeline import read_pipeline  # noqa: PLC0415
 
-    scene = read_scene(options.simulated)
+    scene = read_scene(options.scene)
     pipeline = twin_pipeline(read_pipeline(options.photographs), scene, options.repeats)
-    store: str = os.fspath(options.store or twin_store(options.photographs, options.simulated))
+    store: str = os.fspath(options.store or twin_store(options.photographs, options.scene))
     announce_compilation(pipeline)
     options.stopped = CONTINUES
     with progress_display() as display:

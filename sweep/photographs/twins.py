@@ -55,7 +55,10 @@ def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1
         If the pipeline is not one of photographs, or the scene is not valid.
     """
     if not shows_photographs(pipeline):
-        raise ArgumentError("pipeline", plain(pipeline.name), "expected that of photographs")
+        raise ArgumentError(
+            "photographs", plain(pipeline.name),
+            "expected a store of photographs, as `sweep photos` makes it",
+        )
     if repeats < 1:
         raise ArgumentError("repeats", repeats, "expected at least 1")
     axis = pipeline.axis(TRIAL)

@@ -116,5 +116,10 @@ def test_photographs_are_simulated_and_compared_in_one_command(tmp_path, capsys)
         assert "holds another experiment" in err
     empty = tmp_path / "empty.toml"
     empty.write_text("seed = 3\n")
-    assert "expected a section [scene]" in told(
-        capsys, "compare", tmp_path / "shots.zarr", empty)[2]
+    for name, expected in (("empty.toml", "expected a section [scene]"),
+                           ("missing.toml", "cannot be read: No such file")):
+        err = told(capsys, "compare", tmp_path / "shots.zarr", tmp_path / name)[2]
+        assert err.startswith("SIMULATION ")
+        assert expected in err
+    assert "expected a store of photographs" in told(
+        capsys, "compare", tmp_path / "shots-same.zarr", scene)[2]

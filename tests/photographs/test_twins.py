@@ -116,9 +116,9 @@ def test_a_scene_that_cannot_be_is_one_line(prepared, scene, repeats, expected):
 
 
 def test_only_photographs_have_twins(prepared, tmp_path):
-    with pytest.raises(SweepError, match="expected that of photographs"):
+    with pytest.raises(SweepError, match="expected a store of photographs"):
         twin_pipeline(Pipeline.from_dict({"pose": {"distance_m": 1}}), {})
-    with pytest.raises(SweepError, match="expected that of photographs"):
+    with pytest.raises(SweepError, match="expected a store of photographs"):
         twin_pipeline(twin_pipeline(prepared, {}), {})
     with pytest.raises(SweepError, match="simulated = true: expected photographs beside it"):
         Pipeline.from_dict({"pose": {"distance_m": 1}, "scene": {"simulated": True}})

@@ -21,6 +21,10 @@ RING_MODULES = 1.5
 PADDING_PX = 2.0
 """Pixels around the fitted ones in the box, beside the reach of the sharpening."""
 
+PANEL_PX, COARSE_PANEL_PX = 0.4, 0.8
+"""Least length of the pieces in which edges are integrated, in px: of the photograph, and of means
+of 2 x 2 pixels, whose fit is a start."""
+
 MODELLED_PX = 5.0
 """Pixels around the fitted ones within which print is in the model: what blur carries inwards."""
 
@@ -80,7 +84,7 @@ def photograph_view(detections: Detections, i: int, reach: float) -> PhotographV
     at, spans = _fitted_pixels(
         to_modules, float(modules), ring, height, width, np.array([left, top, right, bottom])
     )
-    return PhotographView(marker, levels, spans, rays_of(optics, height, width), at)
+    return PhotographView(marker, levels, spans, rays_of(optics, height, width), at, PANEL_PX)
 
 
 @compiled
@@ -164,7 +168,7 @@ def binned_photograph(view: PhotographView) -> PhotographView:
         view.marker.edges, view.marker.extent, view.marker.modules, view.marker.size_m, optics,
         view.marker.variance,
     )
-    return PhotographView(marker, levels, spans, rays, at)
+    return PhotographView(marker, levels, spans, rays, at, COARSE_PANEL_PX)
 
 
 @compiled

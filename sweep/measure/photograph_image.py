@@ -31,9 +31,9 @@ from sweep.typing import Floats
 REACH = 3.5
 """Standard deviations at which the point spread is cut off; 5e-4 of it lies beyond."""
 
-PANEL, PANEL_PX = 2.0, 0.4
-"""Length of one panel of the quadrature: standard deviations of the point spread (4e-4 of the
-jump), at least this many pixels."""
+PANEL = 2.0
+"""Length of one panel of the quadrature in standard deviations of the point spread: 4e-4 of the
+jump."""
 
 MAX_PANELS = 4096
 """Most panels of one straight segment."""
@@ -77,7 +77,7 @@ def slope_space(height: int, width: int) -> Slopes:
 
 @compiled
 def _add_segment(
-    out: Slopes, jump: float, outside: float, sigma: float,
+    out: Slopes, jump: float, outside: float, sigma: float, shortest: float,
     xa: float, ya: float, xb: float, yb: float,
 ) -> None:
     """Add a straight segment from (xa, ya) to (xb, yb) px of the box.
@@ -90,7 +90,7 @@ def _add_segment(
     if min(xa, xb) > width + reach or min(ya, yb) > height + reach or max(ya, yb) < -reach:
         return
     panels = min(
-        max(math.ceil(math.hypot(xb - xa, yb - ya) / max(PANEL * sigma, PANEL_PX)), 1), MAX_PANELS
+        max(math.ceil(math.hypot(xb - xa, yb - ya) / max(PANEL * sigma, shortest)), 1), MAX_PANELS
     )
     dx, dy = (xb - xa) / panels, (yb - ya) / panels
     most = int(2.0 * reach) + 3
@@ -170,7 +170,8 @@ def _add_segment(
 
 @compiled
 def add_plane(
-    out: Slopes, edges: MarkerEdges, values: Floats, projection: Projection, sigma: float
+    out: Slopes, edges: MarkerEdges, values: Floats, projection: Projection, sigma: float,
+    shortest: float,
 ) -> None:
     """Add the edges of a printed plane to ``out``.
 
@@ -186,6 +187,8 @@ def add_plane(
         The plane, and the camera.
     sigma
         The point spread's standard deviation in px, positive.
+    shortest
+        Least length of a panel of the quadrature in px.
     """
     intrinsics = projection.optics.intrinsics
     shift_x, shift_y = intrinsics[2] + 0.5, intrinsics[3] + 0.5
@@ -201,11 +204,15 @@ def add_plane(
             x1, y1, z1 = homogeneous_pixel(
                 projection, shift_x, shift_y, edge.to_column, edge.to_row
             )
-            _add_segment(out, jump, outside, sigma, x0 / z0, y0 / z0, x1 / z1, y1 / z1)
+            _add_segment(
+                out, jump, outside, sigma, shortest, x0 / z0, y0 / z0, x1 / z1, y1 / z1
+            )
             continue
         chords = chord_count(projection, edge)
         x, y = distorted_point(0.0, projection, edge)
         for chord in range(1, chords + 1):
             u, v = distorted_point(chord / chords, projection, edge)
-            _add_segment(out, jump, outside, sigma, x + 0.5, y + 0.5, u + 0.5, v + 0.5)
+            _add_segment(
+                out, jump, outside, sigma, shortest, x + 0.5, y + 0.5, u + 0.5, v + 0.5
+            )
             x, y = u, v

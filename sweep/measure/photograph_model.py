@@ -81,6 +81,8 @@ class PhotographView(NamedTuple):
         its u and v by them, row by row, in px.
     at
         (2, height, width) x and y relative to the marker's centre, in halves of its extent.
+    panel_px
+        Least length of the pieces in which edges are integrated.
     """
 
     marker: MarkerView
@@ -88,6 +90,7 @@ class PhotographView(NamedTuple):
     spans: Integers
     rays: Floats
     at: Floats
+    panel_px: float
 
 
 class System(NamedTuple):
@@ -215,6 +218,7 @@ def draw(view: PhotographView, state: Floats, nuisances: Nuisances, work: System
     add_plane(
         work.slopes, view.marker.edges, values,
         Projection(plane_of(state, view.marker), view.marker.optics), state[SPREAD],
+        view.panel_px,
     )
     tone = min(max(state[TONE], -MAX_TONE), MAX_TONE)
     for i in range(height):

@@ -6,6 +6,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.stats import chi2
 
+from sweep.evaluation.cells import run_cells
 from sweep.measure.estimation import Detections
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.photograph import PhotometricReal
@@ -23,6 +24,7 @@ from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.marker import WHITE
 from sweep.model.projection import Optics
+from sweep.plan.experiment import Pipeline
 
 ALARM = 1e-7
 CHARUCO = Charuco(
@@ -245,6 +247,32 @@ def test_nees_of_many_photographs(solver, effects, limits):
         ]
     print(f"NEES {np.mean(squared):.2f} of {len(squared)} poses")
     assert limits[0] < np.mean(squared) < limits[1]
+
+
+@pytest.mark.long
+def test_the_bound_is_attained_with_levels_and_blur():
+    """300 images: a root mean square of 1 leaves [0.8, 1.2] with error probability below 1e-5."""
+    pipeline = Pipeline.from_dict({
+        "camera": {"width_px": 320, "height_px": 240},
+        "pose": {"side_px": 50, "azimuth_deg": {"uniform": [0, 360]},
+                 "tilt_deg": {"uniform": [20, 60]}, "jitter_px": 0.5},
+        "scene": {"bound": "unknown_blur", "noise_grey": 2, "blur_px": 0.7, "black": 40,
+                  "white": 200, "background": 200},
+        "detector": {"cornerRefinementMethod": "subpix"},
+        "estimator": {"solver": "photometric_real", "estimate_light": False,
+                      "estimate_tone": False, "estimate_sharpening": False},
+        "axes": {"trial": 300},
+    })
+    cells = run_cells(pipeline, [np.arange(300)])
+    solved = cells.columns["estimate"][0] == EstimateStatus.solved
+    assert solved.mean() > 0.95
+    errors = np.concatenate([
+        cells.columns[name][0] for name in ("rotation_error_rad", "translation_error_m")
+    ], axis=1)
+    ratio = np.sqrt(((errors / cells.columns["bound_std"][0])[solved] ** 2).mean(axis=0))
+    print(f"root mean square errors over the bound {np.round(ratio, 3)}")
+    assert (ratio > 0.8).all()
+    assert (ratio < 1.2).all()
 
 
 @pytest.mark.long

@@ -9,7 +9,7 @@ from sweep.plan.experiment import Pipeline
 COMPILATION_S = 8
 """Seconds that the renderer takes to compile, which every run needs."""
 
-PHOTOGRAPH_S = 12
+PHOTOGRAPH_S = 20
 """Seconds that `photometric_real` takes beyond that."""
 
 LIKELIHOOD_S = 10

@@ -100,5 +100,5 @@ def check_affordable(url: str, demand: Demand) -> None:
     if found:
         raise StoreError(
             f"{url}: the run {' and '.join(found)}; make it smaller, or confirm it with "
-            "`sweep run --yes` (in Python, yes=True)"
+            "`--yes` (in Python, yes=True)"
         )

@@ -228,7 +228,7 @@ def test_a_run_that_is_too_large_is_refused_in_a_line_unless_it_is_confirmed(
     code, out, err = told(capsys, "run small.toml")
     assert (code, out) == (2, "")
     assert ("before compression, and 100 bytes are free; make it smaller, or confirm it with "
-            "`sweep run --yes`") in err.splitlines()[-1]
+            "`--yes`") in err.splitlines()[-1]
     assert not (tmp_path / "runs/small.zarr").exists()
     with calls_here(), pytest.raises(SweepError, match="yes=True"):
         sweep.run("small.toml")

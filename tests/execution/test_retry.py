@@ -100,7 +100,7 @@ def test_what_fails_again_stays_as_it_was(pipeline, failed, copied, tmp_path, mo
 def test_retry_that_is_refused_leaves_the_store_as_it_was(pipeline, failed, copied, monkeypatch):
     free = FreeDisk(bytes=1, files=None)
     monkeypatch.setattr("sweep.execution.affordability.free_disk", lambda _: free)
-    with calls_here(), pytest.raises(StoreError, match="confirm it with `sweep run --yes`"):
+    with calls_here(), pytest.raises(StoreError, match="confirm it with `--yes`"):
         execute(pipeline, copied, retry_failed=True)
     assert open_store(copied).finished
     assert same(copied, failed)

@@ -57,7 +57,7 @@ def test_sharpening_is_the_image_plus_its_difference_from_a_blurred_one(
         print(f"\n| sharpening {amount} {radius} | gaussian_filter | {worst:.3g} |")
         assert worst <= ROUNDING + TOLERANCE
         # The effect is there: it moves levels by far more than the tolerance.
-        assert np.abs(image - plain).max() > 5
+        assert np.abs(image - plain).max() > 4
 
 
 @pytest.mark.parametrize("radius", [0.3, 2.0, 20.0])

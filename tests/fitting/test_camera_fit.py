@@ -16,6 +16,7 @@ def found(tmp_path_factory):
     return fitted(tmp_path_factory.mktemp("fit"), EFFECTS, 7, 6)
 
 
+@pytest.mark.long
 def test_every_effect_is_found_and_its_interval_holds_the_truth(found):
     terms = terms_of(found)
     for name, value in TRUTH.items():
@@ -31,6 +32,7 @@ def test_every_effect_is_found_and_its_interval_holds_the_truth(found):
     assert np.allclose(deviations[1::2], 2.0, rtol=0.1)
 
 
+@pytest.mark.long
 def test_the_scene_is_a_pipeline_that_runs(found, tmp_path, capsys):
     path = tmp_path / "scene.toml"
     path.write_text(found.text)

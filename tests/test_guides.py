@@ -33,6 +33,10 @@ NAMES = [str(path.relative_to(TOP)) for path in GUIDES]
 ROOMS_WITH_A_GUIDE = ("analysis", "execution", "integrity", "measure", "tradeoff")
 BLOCK = re.compile(r"(?:<!-- ([^\n]*?) -->\n)?```(\w*)\n(.*?)```", re.DOTALL)
 
+FIRST_READ = ("README.md", "pipelines/README.md", "pipelines/photographs/README.md",
+              "sweep/analysis/README.md")
+"""Guides whose blocks are run by default; those of all guides are run by the long tests."""
+
 SHOWN = {
     "analysis": ["tilt_deg", "distance_m"],
     "answers": ["detection_rate_low", "rotation_p95_deg", "per_module", "p_adjusted"],
@@ -94,7 +98,8 @@ def commands_run():
 
 
 @pytest.mark.usefixtures("no_child")
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=() if name in FIRST_READ else pytest.mark.long) for name in NAMES])
 def test_blocks_of_a_guide_run_in_their_order(name, workspace, commands_run, monkeypatch, capsys):
     monkeypatch.chdir(workspace)
     for block in blocks_of(TOP / name):

@@ -46,6 +46,7 @@ def test_it_is_the_angle_between_normal_and_line_of_sight(results):
         np.testing.assert_allclose(parallel, start + sign * away, atol=EXACT_DEG)
 
 
+@pytest.mark.long
 def test_all_scenes_have_it_also_those_that_cannot_be_seen(results):
     assert np.isfinite(results.viewing_angle_deg).all()
     assert (results.detection == 5).any()

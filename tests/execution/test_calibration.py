@@ -84,6 +84,7 @@ def test_scenes_that_never_return_leave_what_was_measured_before():
     assert calibrate(grid(1000), 0.6, simulated(1.0, endless=0)[0]).scene_s == 1.0
 
 
+@pytest.mark.long
 def test_a_scene_that_takes_too_long_ends_the_measurement_and_makes_blocks_of_single_scenes():
     pipeline = Pipeline.from_text(HUGE)
     with Child("sweep.execution.calibration") as child:

@@ -452,6 +452,7 @@ def test_server_that_refuses_is_told_in_a_line(case, bucket, small):
     assert not bucket.told_in(ran.stderr)
 
 
+@pytest.mark.long
 def test_missing_package_for_remote_stores_is_told_in_a_line(small):
     ran = python(
         "-c", "import sys; sys.modules['s3fs'] = None; from sweep.cli import main;"

@@ -173,6 +173,7 @@ def test_retry_that_is_stopped_at_any_write_is_continued(pipeline, clean, copied
     assert same(copied, clean)
 
 
+@pytest.mark.long
 def test_retry_and_reuse_exclude_each_other(pipeline, copied, clean):
     with pytest.raises(ArgumentError, match="expected no retry_failed beside it"):
         execute(pipeline, copied, retry_failed=True, reuse=[clean])

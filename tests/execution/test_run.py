@@ -185,8 +185,8 @@ GROWN = {
     "new axis": ["background=[128, 60]"],
 }
 
-GROWN_SHORT = ("front", "trial", "solver", "new axis")
-"""One of each kind: an axis that is cut into blocks, draws, configurations, another axis."""
+GROWN_SHORT = ("trial", "new axis")
+"""Draws, and another axis."""
 
 GROWN_EXTENTS = {"dictionary": 2, "background": 1, "distance_m": 3, "tilt_deg": 2, "trial": 2}
 """Extents of blocks that cut each axis that grows."""

@@ -53,6 +53,7 @@ def client(cluster):
         yield connected
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_cluster")
 def test_small_run_and_small_repair_start_no_cluster(pipeline, undisturbed, tmp_path):
     url = str(tmp_path / "small.zarr")

@@ -55,6 +55,7 @@ def test_effects_that_are_not_there_are_left_out_and_the_file_says_why(tmp_path)
         assert name not in plain.found.scene
 
 
+@pytest.mark.long
 def test_one_photograph_gives_values_without_intervals(tmp_path):
     one = fitted(tmp_path, EFFECTS, 9, 1, 4)
     terms = terms_of(one)

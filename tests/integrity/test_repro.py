@@ -101,6 +101,7 @@ def see_refused(arguments, capsys):
     return told.err
 
 
+@pytest.mark.long
 def test_scene_gives_what_the_store_holds_and_its_image(finished, tmp_path, capsys):
     out, pipeline = tmp_path / "scene.png", tmp_path / "seen.toml"
     pipeline.write_text(TEXT)
@@ -144,6 +145,7 @@ def test_number_that_was_changed_is_named(copied, tmp_path, capsys):
     assert drawn.ndim == 3  # what was found is drawn on it, in colour
 
 
+@pytest.mark.long
 def test_what_cannot_be_asked_for_is_told_in_a_line(finished, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     told = see_refused([finished, "--at", "distance_m=0.3"], capsys)
@@ -160,8 +162,8 @@ def test_what_cannot_be_asked_for_is_told_in_a_line(finished, tmp_path, capsys, 
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("output", [
-    "no/scene.png", pytest.param(".", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("output", ["no/scene.png", "."])
 def test_unwritable_image_is_told_in_a_line(output, finished, tmp_path, capsys):
     assert main(["repro", str(finished), "--at", NEAR, "-o", str(tmp_path / output)]) == 2
     told = capsys.readouterr().err
@@ -228,6 +230,7 @@ def test_scene_that_crashed_and_no_longer_does_differs(finished, tmp_path, capsy
     assert re.search(r"^ +estimate +solved.*\(stored: crashed\)$", told, re.MULTILINE)
 
 
+@pytest.mark.long
 def test_table_of_failures_tells_where_what_and_why(finished):
     with xr.open_zarr(finished, group="failures") as table:
         rows = {
@@ -264,6 +267,7 @@ def test_table_of_failures_tells_where_what_and_why(finished):
             assert attributes[f"{kind}_cells"] == count == {"failed": 3, "crashed": 2}[kind]
 
 
+@pytest.mark.long
 def test_table_of_failures_is_bounded_and_all_are_counted(copied, monkeypatch):
     # Twenty rows in each receipt, of both kinds; the bound is made small.
     monkeypatch.setattr("sweep.execution.finalize.MAX_ROWS", 25)

@@ -254,6 +254,7 @@ def test_recomputed_sample_of_a_sound_store_agrees_to_the_bit(sound, tmp_path):
     assert 8 <= found.sampled <= 15
 
 
+@pytest.mark.long
 def test_scene_that_failed_and_succeeds_now_is_damage_of_its_block_and_repaired(
     copied, tmp_path, monkeypatch
 ):

@@ -388,16 +388,23 @@ def test_blur_that_is_not_believed_is_always_flagged(side, noise):
 @pytest.mark.parametrize(
     "effect",
     [
-        ("occlusion=0.02", "occluder=220"),
-        ("exposure_s=0.01", "velocity_x_m_s=0.2"),  # 2 mm: 2 px
-        ("row_time_s=1e-3", "velocity_x_m_s=0.2"),
-        ("illumination_gradient=0.5",),
-        ("vignetting=8", "bearing_x_deg=25"),
-        ("full_well_e=5000",),
-        ("renderer=warp",),
-        ("background=ground.png",),
+        pytest.param(effect, id=effect[0].split("=")[0], marks=marks)
+        for marks, effects in (
+            ((), [
+                ("occlusion=0.02", "occluder=220"),
+                ("illumination_gradient=0.5",),
+                ("background=ground.png",),
+            ]),
+            (pytest.mark.long, [
+                ("exposure_s=0.01", "velocity_x_m_s=0.2"),  # 2 mm: 2 px
+                ("row_time_s=1e-3", "velocity_x_m_s=0.2"),
+                ("vignetting=8", "bearing_x_deg=25"),
+                ("full_well_e=5000",),
+                ("renderer=warp",),
+            ]),
+        )
+        for effect in effects
     ],
-    ids=lambda effect: effect[0].split("=")[0],
 )
 def test_what_is_not_in_the_model_is_flagged_and_keeps_its_pose(effect, tmp_path):
     ground = np.random.default_rng(0).integers(0, 256, (480, 640)).astype(np.uint8)

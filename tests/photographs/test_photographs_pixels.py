@@ -53,6 +53,7 @@ def squared_errors(results):
     return np.array(rows)
 
 
+@pytest.mark.long
 def test_poses_of_a_board_have_the_errors_that_their_store_predicts(made):
     """Each of the six components, whose squares are those of a normal distribution."""
     _, results = made
@@ -64,6 +65,7 @@ def test_poses_of_a_board_have_the_errors_that_their_store_predicts(made):
     assert (squares.sum(axis=0) > chi2.ppf(ALARM / 6, len(squares))).all()
 
 
+@pytest.mark.long
 def test_the_board_is_in_the_record_and_older_records_are_read_without(made, tmp_path):
     folder, _ = made
     path = folder / "shots.photographs.npz"

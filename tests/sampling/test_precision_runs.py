@@ -62,6 +62,7 @@ def test_tightened_twice_and_interrupted_is_as_asked_for_at_once(at_once, tmp_pa
     assert in_waves(store, precise(WIDTHS[-1])) == 0
 
 
+@pytest.mark.long
 def test_verify_finds_flags_that_the_results_contradict(at_once, tmp_path):
     url = str(tmp_path / "wrong.zarr")
     assert verify(at_once, 1).damage == []

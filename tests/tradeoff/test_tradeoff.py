@@ -170,6 +170,7 @@ def values(content, name):
 
 # From a store to what is printed.
 
+@pytest.mark.long
 def test_json_has_every_treatment_with_its_intervals(trade):
     assert trade["coords"]["treatment"]["data"] == TREATMENTS
     assert trade["coords"]["side_px"]["data"] == [18, 60]
@@ -372,6 +373,7 @@ def test_a_figure_that_cannot_be_written_is_told_before_anything_is_measured(
     assert not measured
 
 
+@pytest.mark.long
 def test_what_is_no_finished_store_is_told_in_one_line(renderer_store, tmp_path):
     made(tmp_path, UNSEEN, "unfinished", finished=False)
     (tmp_path / "text.zarr").write_text("hello")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from sweep.typing import Floats
 
@@ -17,6 +16,8 @@ def first_overlap(centres: Floats, sides: Floats, rolls_rad: Floats) -> tuple[in
     ``centres`` (n, 2), ``sides`` and ``rolls_rad`` (n,). Two convex shapes are disjoint if and only
     if a line parallel to a side of one of them separates them (separating axis theorem).
     """
+    from scipy.spatial import cKDTree  # noqa: PLC0415  (slow to import, and boards alone need it)
+
     pairs = cKDTree(centres).query_pairs(float(sides.max()) * np.sqrt(2), output_type="ndarray")
     if not len(pairs):
         return None

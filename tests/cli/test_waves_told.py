@@ -35,6 +35,7 @@ def told(capsys, *words):
     return status, printed.out, printed.err
 
 
+@pytest.mark.long
 def test_a_search_says_what_it_knows_once_and_names_the_command_that_goes_on(capsys):
     search = ["limit", "folder/marker.toml", *SEARCH]
     status, out, err = told(capsys, *search, "--max-trials", "12")

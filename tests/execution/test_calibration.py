@@ -100,6 +100,7 @@ def test_a_scene_that_takes_too_long_ends_the_measurement_and_makes_blocks_of_si
     assert (unmeasured.sampled, unmeasured.over) == (0, False)
 
 
+@pytest.mark.long
 def test_plan_answers_whatever_a_scene_costs(tmp_path, monkeypatch):
     monkeypatch.setattr(forecast_module, "PLAN_SCENES_LIMIT_S", 0.2)
     (tmp_path / "huge.toml").write_text(HUGE)

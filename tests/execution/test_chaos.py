@@ -376,6 +376,7 @@ def small(tmp_path_factory):
     return prepared(tmp_path_factory.mktemp("small"), SMALL, "small")
 
 
+@pytest.mark.long
 @lengths(2, ALL)
 def test_kill_between_any_two_writes_of_a_block_loses_that_block_alone(
     count, small, tmp_path

@@ -282,6 +282,7 @@ def test_run_that_has_lost_its_workers_says_whether_they_died(dying, line, monke
     assert str(raised.value).replace("-1 s", "0 s").startswith(line)
 
 
+@pytest.mark.long
 def test_run_whose_workers_are_all_paused_ends_in_a_line(monkeypatch, tmp_path):
     monkeypatch.setattr(stall, "STALL_S", 1.0)
     monkeypatch.setattr(stall, "STATES_INTERVAL_S", 0.1)

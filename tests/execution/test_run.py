@@ -81,7 +81,8 @@ def test_block_size_changes_no_bit(extents, pipeline, undisturbed, tmp_path):
     assert same(url, undisturbed)
 
 
-@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.long), 2])
+@pytest.mark.long
+@pytest.mark.parametrize("workers", [1, 2])
 def test_number_of_workers_changes_no_bit(workers, pipeline, undisturbed, tmp_path):
     url = str(tmp_path / "run.zarr")
     summary = execute(pipeline, url, workers=workers, block_s=0.02)

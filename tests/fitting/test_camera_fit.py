@@ -43,6 +43,7 @@ def test_the_scene_is_a_pipeline_that_runs(found, tmp_path, capsys):
     assert "# Fitted to 36 markers in 6 photographs" in found.text
 
 
+@pytest.mark.long
 def test_effects_that_are_not_there_are_left_out_and_the_file_says_why(tmp_path):
     plain = fitted(tmp_path, PLAIN, 8, 4, 4)
     terms = terms_of(plain)

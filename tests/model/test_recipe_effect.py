@@ -107,6 +107,7 @@ def result(tmp_path_factory):
     return printed_by(added(tmp_path_factory.mktemp("recipe"), *changes), SCRIPT)
 
 
+@pytest.mark.long
 def test_pixels_are_those_of_plain_numpy(result):
     x0, y0, x1, y1 = result["box"]
     frame = np.full((120, 160), 90.0)

@@ -326,6 +326,7 @@ def test_a_file_whose_name_forges_a_line_is_told_in_one(tmp_path):
     faults_of(Pipeline.from_toml, "a\0b")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("command", "name"), [("plan", "deep.toml"), ("run", "bomb.toml"), ("run", "pipe.toml")]
 )

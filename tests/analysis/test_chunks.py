@@ -212,6 +212,7 @@ class Cache(Callback):
         self.most = max(self.most, kept)
 
 
+@pytest.mark.long
 @EVERY_FUNCTION
 def test_what_was_looked_at_is_not_kept_in_memory(function, tmp_path):
     results = mixed({"marker_id": 2, "trial": 120}, 21).drop_vars("xyz")

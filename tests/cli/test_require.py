@@ -51,6 +51,7 @@ def require(folder, monkeypatch, capsys):
     return run
 
 
+@pytest.mark.long
 def test_what_the_pipeline_requires_is_decided(require):
     code, out, err = require("two.zarr")
     assert (code, err) == (1, "")

@@ -110,6 +110,7 @@ FRONTAL = {
 }
 
 
+@pytest.mark.long
 def test_a_believed_calibration_is_what_each_trial_s_numbers_give_on_their_own(tmp_path):
     chosen = pipeline({"calibration_sd": SD}, trials=4, **FRONTAL, settings=[
         'believed=["truth", "calibration"]', "tilt_deg=30", "jitter_px=0.5"])

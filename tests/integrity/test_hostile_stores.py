@@ -471,6 +471,7 @@ def test_failures_of_wrong_kinds_are_borne_and_steer_no_terminal(wrong, copied, 
     assert all(line.isprintable() for line in (said.out + said.err).splitlines())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "text",
     first_of(["{", "[" * 100_000, "", "7", "null", '{"a":' * 100_000, "x" * 5_000_000], 2),

@@ -437,6 +437,7 @@ def test_flags_and_numbers_that_disagree_are_named_though_every_checksum_fits(
     assert any(word in damage[0].what for word in (name, "detection", "estimate"))
 
 
+@pytest.mark.long
 def test_forged_block_is_computed_again_and_no_other(sound, copied, here):
     name, change, _ = FORGED["a number is gone"]
     edit_values(copied, name, change, digests_too=True)

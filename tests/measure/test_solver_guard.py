@@ -140,6 +140,7 @@ class FarView:
                         guarded=True, limit=0.25)
 
 
+@pytest.mark.long
 @lengths(200, 10_000)
 @pytest.mark.parametrize("focal_px", [3e2, 1e4, 1e5, 1e6, 1e7, 1e8])
 def test_guarded_solvers_are_right_at_any_focal_length(count, focal_px):

@@ -282,6 +282,7 @@ def worst_under_lens(value, rng):
     return worst, edges
 
 
+@pytest.mark.long
 @lengths(5, 100)
 def test_lens_image_is_within_a_grey_level_of_dense_samples(count):
     # Measured 0.19 over the long form: 199 x 199 jittered samples of an edge have a standard

@@ -609,6 +609,7 @@ def test_numbers_of_axes_are_short_and_distinct():
 
 # What cannot be.
 
+@pytest.mark.long
 def test_what_cannot_be_reported_is_told_in_one_line(full, tmp_path):
     unfinished = made(tmp_path, ODD["no draws"], "unfinished", finished=False)
     folder, file = tmp_path / "folder", tmp_path / "file"

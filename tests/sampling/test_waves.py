@@ -63,6 +63,7 @@ def test_each_block_is_in_one_wave_of_one_group(extents, pipeline):
         assert group == block.starts[1] // extents[1]  # tilt_deg is pooled
 
 
+@pytest.mark.long
 def test_needed_trials_are_those_of_the_rule_whatever_the_blocks(pipeline, tmp_path):
     url, other = str(tmp_path / "a.zarr"), str(tmp_path / "b.zarr")
     by_hand(url, pipeline, (2, 3, 25))

@@ -440,6 +440,7 @@ trial = 2
 
 # Ctrl-C.
 
+@pytest.mark.long
 def test_ctrl_c_while_costs_are_measured_leaves_the_store_as_it_was(
     store, trade, monkeypatch
 ):

@@ -74,14 +74,10 @@ class PhotographRate(Rate[ViewT]):
         """Count, by photograph."""
         used = self.used(poses)
         hit = self.successes(poses) & used
-        hits, counts = (
-            sum_of_settings(each).sum(axis=1).astype(np.float64) for each in (hit, used)
-        )
-        products = [(a * b).sum(axis=1) for a, b in
-                    ((hits, hits), (hits, counts), (counts, counts))]
-        photographs = [(each > 0).sum(axis=1) for each in (counts, hits, counts - hits)]
+        sums = PhotographSums.of(*(sum_of_settings(each).sum(axis=1) for each in (hit, used)))
         return BlockPhotographRateState(
-            BlockSample.of(used), np.asarray(hit.sum(axis=OVER_ALL)), *products, *photographs
+            BlockSample.of(used), np.asarray(hit.sum(axis=OVER_ALL)), sums.hits_hits,
+            sums.hits_used, sums.used_used, sums.with_any, sums.with_hits, sums.with_misses,
         )
 
     def draws_of(self, state: RateState) -> Integers:

@@ -63,7 +63,8 @@ def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1
         raise ArgumentError("repeats", repeats, "expected at least 1")
     axis = pipeline.axis(TRIAL)
     trials = 1 if axis is None else len(axis)
-    photographs = len(_record(pipeline).paths)
+    record = _record(pipeline)
+    photographs = len(record.paths)
     if repeats > 1 and trials != photographs:
         raise ArgumentError(
             "repeats", repeats, f"expected 1, for the {trials} first of {photographs} photographs"
@@ -74,7 +75,7 @@ def twin_pipeline(pipeline: Pipeline, scene: Mapping[str, Any], repeats: int = 1
         **document.get("scene", {}), SIMULATED: True, **_ground(scene.get("black")), **scene,
     }
     if QUIET_ZONE not in pipeline.given:
-        document["marker"] |= _quiet_zone(_record(pipeline))
+        document["marker"] |= _quiet_zone(record)
     document.setdefault("axes", {})[TRIAL] = trials * repeats
     return Pipeline.from_dict(
         document, name=NAME.format(pipeline.name), source="scene", folder=pipeline.folder

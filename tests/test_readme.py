@@ -60,7 +60,7 @@ def test_a_close_look_is_that_of_the_run():
     assert framed.image.shape == (480, 640)
     left, top, right, bottom = windowed.window
     np.testing.assert_array_equal(framed.image[top:bottom, left:right], windowed.image)
-    np.testing.assert_array_equal(framed.corners, windowed.corners)
+    np.testing.assert_array_equal(framed.markers, windowed.markers)
     assert windowed.errors["rotation_error_deg"] > 0
 
 

@@ -32,7 +32,7 @@ from sweep.analysis.statistic import Statistic
 from sweep.analysis.stopped_sampling import TAIL_SHARE
 from sweep.errors import ArgumentError
 from sweep.measure.flags import Flag, flag
-from sweep.plan.schema import cf_attributes
+from sweep.plan.variable import cf_attributes
 from sweep.typing import Floats, Integers, Masks
 
 THRESHOLDS = (

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sweep.analysis.layout import Arrays
 from sweep.analysis.pose_view import INSIDE
 from sweep.errors import ArgumentError
-from sweep.plan.schema import LABELS
+from sweep.plan.variable import LABELS
 from sweep.typing import Floats, Masks
 
 Bins = Mapping[str, Sequence[float]]

@@ -16,7 +16,7 @@ from sweep.analysis.means import RootMeanSquare
 from sweep.analysis.pose_view import DEPTH, ERROR_INPUTS, Poses, norm_squared, pose_arrays, relative
 from sweep.analysis.quantities import QUANTITIES, Quantity
 from sweep.analysis.statistic import Output
-from sweep.plan.schema import XYZ
+from sweep.plan.variable import XYZ
 from sweep.typing import Floats, Masks
 
 

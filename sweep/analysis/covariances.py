@@ -19,7 +19,7 @@ from sweep.analysis.pose_view import ESTIMATE_INPUTS, Poses, pose_arrays
 from sweep.analysis.registry import PoseStatistic
 from sweep.analysis.statistic import Statistic
 from sweep.errors import ArgumentError
-from sweep.plan.schema import POSE_PARAMETERS
+from sweep.plan.variable import POSE_PARAMETERS
 from sweep.typing import Floats, Masks
 
 TOLERANCE = 0.02

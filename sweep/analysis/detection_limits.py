@@ -28,7 +28,7 @@ from sweep.analysis.stored_parameters import parameter_value
 from sweep.errors import ArgumentError
 from sweep.measure.flags import Flag, flag
 from sweep.model.marker import module_count
-from sweep.plan.schema import cf_attributes
+from sweep.plan.variable import cf_attributes
 from sweep.typing import Floats, Integers, Masks
 
 SIZE_AXES = ("side_px", "distance_m")

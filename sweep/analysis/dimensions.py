@@ -16,8 +16,9 @@ from sweep.plan.camera_values import SQUARE_FORMAT, stored_text
 from sweep.plan.coordinates import FIXED
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS, Stage
-from sweep.plan.schema import LABELS, SCHEMA
+from sweep.plan.schema import SCHEMA
 from sweep.plan.stopping import SECTIONS
+from sweep.plan.variable import LABELS
 from sweep.plugins.declared import recorded_plugins
 
 DRAWS = "trial"

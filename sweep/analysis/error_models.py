@@ -37,7 +37,7 @@ from sweep.analysis.error_model_sums import (
 from sweep.analysis.pose_view import SIGNED_INPUTS, pose_arrays
 from sweep.errors import DatasetError
 from sweep.measure.flags import Flag, flag
-from sweep.plan.schema import cf_attributes
+from sweep.plan.variable import cf_attributes
 from sweep.typing import Floats, Integers
 
 NOMINAL = 0.9545

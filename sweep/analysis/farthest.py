@@ -21,7 +21,7 @@ from sweep.analysis.requirements import (
 )
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import Flag, flag
-from sweep.plan.schema import cf_attributes
+from sweep.plan.variable import cf_attributes
 
 
 class Reach(Flag):

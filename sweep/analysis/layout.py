@@ -19,8 +19,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.analysis.dimensions import DRAWS, is_grid_axis
-from sweep.plan.schema import LABELS
 from sweep.plan.sobol import REPLICATES
+from sweep.plan.variable import LABELS
 
 MAX_BLOCK = 1 << 18
 """Poses in a block of a dataset that is in memory."""

@@ -27,7 +27,7 @@ from sweep.errors import DatasetError
 from sweep.messages import label, shown
 from sweep.plan.alternatives import SIMULATED
 from sweep.plan.parameters import PARAMETERS, Stage
-from sweep.plan.schema import LABELS
+from sweep.plan.variable import LABELS
 from sweep.typing import Floats, Integers, Masks
 
 QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from sweep.analysis.signed_errors import SignedErrors
 from sweep.errors import DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, uncounted_values
-from sweep.plan.schema import VARIABLES, XYZ
+from sweep.plan.schema import VARIABLES
+from sweep.plan.variable import XYZ
 from sweep.typing import Floats, Masks
 
 NOT_LOOKED_FOR = tuple(uncounted_values(DetectionStatus))

@@ -27,7 +27,7 @@ from sweep.analysis.pose_view import Poses
 from sweep.analysis.requirable import requirable_arrays
 from sweep.errors import ArgumentError, SweepError
 from sweep.plan.precision_rule import PrecisionRule
-from sweep.plan.schema import cf_attributes
+from sweep.plan.variable import cf_attributes
 
 
 @describes

@@ -11,7 +11,7 @@ import numpy as np
 from sweep.analysis.pose_view import ERROR_INPUTS, SIGNED_INPUTS, Poses, norm_squared
 from sweep.errors import ArgumentError
 from sweep.messages import nearest
-from sweep.plan.schema import XYZ
+from sweep.plan.variable import XYZ
 from sweep.typing import Floats
 
 

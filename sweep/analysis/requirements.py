@@ -36,7 +36,7 @@ from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import Flag, flag
 from sweep.messages import plain
 from sweep.plan.requirement_text import read_requirement
-from sweep.plan.schema import cf_attributes
+from sweep.plan.variable import cf_attributes
 
 ERROR_PROBABILITY = 0.05
 """Probability below which a decision is wrong: a false "met", or any false "not met"."""

@@ -20,7 +20,7 @@ from sweep.analysis.resampling import (
     resampled_quantiles,
     unit_counts,
 )
-from sweep.plan.schema import cf_attributes
+from sweep.plan.variable import cf_attributes
 from sweep.typing import Floats, Masks
 
 SOURCES = ("photographs", "simulated")

@@ -19,7 +19,7 @@ from typing import Any, Generic, TypeVar
 from numpy.typing import NDArray
 
 from sweep.analysis.states import BlockState, Nothing, State
-from sweep.plan.schema import cf_attributes
+from sweep.plan.variable import cf_attributes
 
 ViewT = TypeVar("ViewT")
 FirstT = TypeVar("FirstT", bound=State)

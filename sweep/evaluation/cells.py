@@ -18,15 +18,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.evaluation.estimation import detections_for, estimate_poses
+from sweep.evaluation.board_search import board_scenes
+from sweep.evaluation.estimation import board_detections_for, detections_for, estimate_poses
 from sweep.evaluation.machine_faults import machine_faults_raised
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.recorded_search import any_recorded
 from sweep.evaluation.results import CellsResult, Failure, concatenate
 from sweep.evaluation.search import search, visibility_flags, whole_frames
 from sweep.evaluation.variables import (
+    BOARD_DETECTION,
+    BOARD_SCENE,
     DETECTION,
     SCENE,
+    BoardResults,
     DetectionResults,
     EstimationResults,
     SceneResults,
@@ -35,17 +39,19 @@ from sweep.evaluation.variables import (
     photograph_variables,
 )
 from sweep.measure.accuracy import pose_error
+from sweep.measure.board_solver import BoardDetections
 from sweep.measure.bound import Bounds, bounds
 from sweep.measure.estimation import Detections, Estimates
-from sweep.measure.estimators import EstimatorSetting, build
+from sweep.measure.estimators import EstimatorSetting, build, build_for_boards
 from sweep.measure.flags import BoundStatus, DetectionStatus
 from sweep.model.columns import Column
 from sweep.model.derivatives import POSE
 from sweep.model.extent import marker_boxes
 from sweep.model.scene import Scenes, build_scenes
 from sweep.plan.alternatives import PHOTOGRAPHS
+from sweep.plan.boards import largest_board
 from sweep.plan.experiment import Pipeline
-from sweep.plan.grid import detector_settings, estimators, scene_values
+from sweep.plan.grid import board_settings, detector_settings, estimators, scene_values
 from sweep.plan.image_keys import image_keys
 from sweep.plan.scene_plugins import scene_plugins
 from sweep.plan.schema import drawn_variables, variables_of
@@ -125,14 +131,23 @@ def _run_batch(
     values = scene_values(pipeline, indices)
     scenes = build_scenes(values, count, scene_plugins(pipeline))
     visibility = visibility_flags(scenes)
+    boards = None
+    if "board" in values:
+        boards = board_scenes(
+            scenes, values["board"].listed(count), visibility, largest_board(pipeline)
+        )
     to_search = searched & (visibility == DetectionStatus.not_run)[:, None]
     geometry_s = time.perf_counter() - start
 
-    builds = [build(estimator) for estimator in estimating]
+    builds = [
+        build(estimator) if boards is None else build_for_boards(estimator)
+        for estimator in estimating
+    ]
     keep = any(each.needs_images for each in builds)
     results, render_s, row_s = search(
         scenes, to_search, settings, whole_frames(values, count), failures, keep=keep,
         keys=image_keys(pipeline, indices) if any_recorded(settings) else None,
+        boards=boards, board_settings=() if boards is None else board_settings(pipeline),
     )
     columns: dict[str, list[NDArray[Any]]] = {
         variable.name: [] for variable in variables_of(pipeline)
@@ -143,7 +158,8 @@ def _run_batch(
             columns[name].append(column)
 
     start = time.perf_counter()
-    add(compute(SCENE, SceneResults(scenes, _bounds(values, scenes, visibility))))
+    of_scene = compute(SCENE, SceneResults(scenes, _bounds(values, scenes, visibility)))
+    add(of_scene if boards is None else of_scene | compute(BOARD_SCENE, boards))
     add({
         variable.name: values[variable.drawn_as].broadcast(count)
         for variable in drawn_variables(pipeline)
@@ -158,30 +174,37 @@ def _run_batch(
     for k, result in enumerate(results):
         flags = np.where(visibility == DetectionStatus.not_run, result.flags, visibility)
         flags[~searched[:, k]] = DetectionStatus.not_run
-        add(compute(DETECTION, DetectionResults(scenes, flags.astype(np.uint8), result.corners)))
+        flags = flags.astype(np.uint8)
+        if result.boards is None or boards is None:
+            add(compute(DETECTION, DetectionResults(scenes, flags, result.corners)))
+        else:
+            add(compute(BOARD_DETECTION, BoardResults(boards, result.boards, flags)))
         for j, estimator in enumerate(estimating):
             rows = np.flatnonzero((flags == DetectionStatus.detected) & need[:, k, j])
             start = time.perf_counter()
-            detections = detections_for(estimator, values, scenes, result, rows)
+            detections: Detections | BoardDetections = (
+                detections_for(estimator, values, scenes, result, rows) if boards is None
+                else board_detections_for(estimator, values, scenes, boards, result, rows)
+            )
             known = len(failures)
             estimates = estimate_poses(detections, builds[j], rows, failures)
             failures[known:] = [
                 dataclasses.replace(failure, setting=k, estimator=j)
                 for failure in failures[known:]
             ]
-            compared = _compare(detections, estimates, scenes, rows)
-            add(compute_estimation(compared, rows, need[:, k, j]))
+            compared = _compare(estimates, scenes, rows)
+            add(compute_estimation(compared, rows, need[:, k, j], on_boards=boards is not None))
             seconds["estimation"].append(time.perf_counter() - start)
     return CellsResult(columns, seconds, row_s, failures)
 
 
 def _compare(
-    detections: Detections, estimates: Estimates, scenes: Scenes, rows: NDArray[np.intp]
+    estimates: Estimates, scenes: Scenes, rows: NDArray[np.intp]
 ) -> EstimationResults:
     """Return the estimates (n,) of the scenes ``rows`` beside the truth and their errors."""
     rotation, translation = scenes.rotation[rows], scenes.translation[rows]
     error = pose_error(estimates.rotation, estimates.translation, rotation, translation)
-    return EstimationResults(detections, estimates, error, rotation, translation)
+    return EstimationResults(estimates, error, rotation, translation)
 
 
 def _bounds(

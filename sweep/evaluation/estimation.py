@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.evaluation.board_search import BoardScenes
 from sweep.evaluation.machine_faults import raise_machine_fault
 from sweep.evaluation.results import Failure, exception_text
 from sweep.evaluation.search import SearchResult
-from sweep.measure.estimation import Detections, Estimates, PoseEstimator
+from sweep.measure.board_solver import BoardDetections
+from sweep.measure.estimation import Detections, Estimates
 from sweep.measure.estimators import EstimatorSetting
 from sweep.measure.flags import EstimateStatus
 from sweep.model.calibration_error import COEFFICIENTS, VIEW
@@ -63,12 +65,10 @@ def assumed_cameras(
     return Cameras(view, lenses, distorted), size
 
 
-def detections_for(
-    estimator: EstimatorSetting, values: Mapping[str, Column], scenes: Scenes,
-    result: SearchResult, rows: NDArray[np.intp],
-) -> Detections:
-    """Return the detections of the scenes ``rows`` (n,), with what an estimator assumes of them."""
-    cameras, size = assumed_cameras(estimator, values, scenes)
+def _assumed_noise_and_blur(
+    estimator: EstimatorSetting, scenes: Scenes
+) -> tuple[Floats, Floats]:
+    """Return the noise of a pixel in grey levels and the point spread in px, (N,) each."""
     truth = {"noise_grey": 0.0, "blur_px": 0.0} if scenes.effects is None else scenes.effects
     noise, blur = (
         np.broadcast_to(truth[name] if assumed is None else assumed, len(scenes))
@@ -76,6 +76,16 @@ def detections_for(
             ("noise_grey", estimator.believed_noise_grey), ("blur_px", estimator.believed_blur_px)
         )
     )
+    return noise, blur
+
+
+def detections_for(
+    estimator: EstimatorSetting, values: Mapping[str, Column], scenes: Scenes,
+    result: SearchResult, rows: NDArray[np.intp],
+) -> Detections:
+    """Return the detections of the scenes ``rows`` (n,), with what an estimator assumes of them."""
+    cameras, size = assumed_cameras(estimator, values, scenes)
+    noise, blur = _assumed_noise_and_blur(estimator, scenes)
     on_board = values["on_board"].values if "on_board" in values else None
     return Detections(
         result.corners[rows], cameras.take(rows), size[rows], noise[rows], blur[rows],
@@ -88,8 +98,24 @@ def detections_for(
     )
 
 
+def board_detections_for(
+    estimator: EstimatorSetting, values: Mapping[str, Column], scenes: Scenes,
+    boards: BoardScenes, result: SearchResult, rows: NDArray[np.intp],
+) -> BoardDetections:
+    """Return what was found of the boards of scenes ``rows`` (n,), and what is assumed of them."""
+    if result.boards is None:
+        raise TypeError("no boards were searched")
+    cameras, size = assumed_cameras(estimator, values, scenes)
+    noise, blur = _assumed_noise_and_blur(estimator, scenes)
+    return BoardDetections(
+        [boards.boards[row] for row in rows.tolist()],
+        [result.boards.points[row] for row in rows.tolist()],
+        cameras.take(rows), noise[rows], blur[rows], (size / scenes.size_m)[rows],
+    )
+
+
 def estimate_poses(
-    detections: Detections, estimator: PoseEstimator, rows: NDArray[np.intp],
+    detections: Any, estimator: Callable[[Any], Estimates], rows: NDArray[np.intp],
     failures: list[Failure],
 ) -> Estimates:
     """Return estimates (n,) of the scenes ``rows``; one by one if the batch raises.

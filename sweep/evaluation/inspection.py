@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import RunError
+from sweep.evaluation.board_search import board_scenes
 from sweep.evaluation.cells import run_cells
 from sweep.evaluation.estimation import assumed_cameras
 from sweep.evaluation.opencv_threads import single_threaded
@@ -21,12 +22,13 @@ from sweep.model.extent import marker_boxes
 from sweep.model.pose import rotation_of_vector, transform_points
 from sweep.model.renderers import render
 from sweep.model.scene import Scenes, build_scenes
+from sweep.plan.boards import largest_board
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings, estimators, scene_values
 from sweep.plan.image_keys import image_keys
 from sweep.plan.parameters import Stage
 from sweep.plan.scene_plugins import scene_plugins
-from sweep.plan.schema import SCHEMA, variables_of
+from sweep.plan.schema import variables_of
 from sweep.typing import Floats, Grey, Integers, Masks
 
 
@@ -39,16 +41,18 @@ class SceneInspection:
     image
         (h, w) grey levels of ``window``: left, top, right, bottom in the frame.
     true_corners
-        (4, 2) px.
+        (4, 2) px of the marker, or of a board's black rectangle.
+    true_markers, markers
+        (M, 4, 2) px: the true corners of each marker, and those that were detected, or NaN.
+    chessboard
+        (C, 2) px of the corners of a chessboard that were found, or NaN.
     decoded, rejected
         The detector's quadrilaterals: (ID, corners (4, 2)) and corners (4, 2), px.
     detection, estimate
         The flags.
-    corners
-        (4, 2) px of the detected marker; NaN if it was not detected.
     axes_px
-        (4, 2) images of the origin and of the ends of x, y and z (half a side long) of the
-        estimated pose; NaN if there is none.
+        (4, 2) images of the origin and of the ends of x, y and z (half a side long, of a board
+        half its smaller side) of the estimated pose; NaN if there is none.
     errors
         Name -> value (or norm) of the estimation's error variables.
     values
@@ -58,12 +62,14 @@ class SceneInspection:
     image: Grey
     window: tuple[int, int, int, int]
     true_corners: Floats
+    true_markers: Floats
+    markers: Floats
+    chessboard: Floats
     area_px: float
     decoded: list[tuple[int, Floats]]
     rejected: list[Floats]
     detection: DetectionStatus
     estimate: EstimateStatus
-    corners: Floats
     axes_px: Floats
     errors: dict[str, float]
     values: dict[str, NDArray[Any]]
@@ -144,19 +150,35 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
         quads, ids, rejected = found[0][1:] if found else ((), None, ())
         origin = np.zeros(2)
     columns = {name: parts[0][0] for name, parts in result.columns.items()}
-    corners = scenes.corners_px[0] + columns["corner_error_px"]
+    true_markers = scenes.corners_px
+    chessboard, length = np.zeros((0, 2)), float(scenes.size_m[0])
+    if "board" in values:
+        (board,) = values["board"].listed(1)
+        boards = board_scenes(
+            scenes, [board], visibility_flags(scenes), largest_board(pipeline)
+        )
+        true_markers = boards.corners_px[0]
+        markers = true_markers + columns["marker_corner_error_px"]
+        if "chessboard_corner_error_px" in columns:
+            chessboard = boards.chessboard_px[0] + columns["chessboard_corner_error_px"]
+        length = float(np.ptp(board.corners_m.reshape(-1, 3), axis=0)[:2].min())
+    else:
+        markers = true_markers + columns["corner_error_px"]
     axes_px = np.full((4, 2), np.nan)
     if columns["estimate"] == EstimateStatus.solved:
-        cameras, size = assumed_cameras(estimator, values, scenes)
+        cameras, _ = assumed_cameras(estimator, values, scenes)
         vector = columns["rotation_error_rad"]
         rotation = rotation_of_vector(vector) @ scenes.rotation[0]
         position = scenes.translation[0] + columns["translation_error_m"]
-        ends = np.concatenate([np.zeros((1, 3)), np.eye(3)]) * size[0] / 2
+        ends = np.concatenate([np.zeros((1, 3)), np.eye(3)]) * length / 2
         axes_px = cameras.project(transform_points(ends[None], rotation[None], position[None]))[0]
     return SceneInspection(
         image=image,
         window=rendered.window,
         true_corners=scenes.corners_px[0],
+        true_markers=true_markers,
+        markers=markers,
+        chessboard=chessboard,
         area_px=float(columns["marker_area_px"]),
         decoded=[
             (int(marker_id), quad[0] + origin)
@@ -165,11 +187,10 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
         rejected=[quad[0] + origin for quad in rejected],
         detection=DetectionStatus(int(columns["detection"])),
         estimate=EstimateStatus(int(columns["estimate"])),
-        corners=corners,
         axes_px=axes_px,
         errors={
             v.name: float(np.linalg.norm(columns[v.name]))
-            for v in SCHEMA
+            for v in variables_of(pipeline)
             if v.flags is None and v.inner in ((), ("xyz",)) and v.stage is Stage.estimation
         },
         values={

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.evaluation.board_search import BoardFindings, BoardScenes, findings
 from sweep.evaluation.foreign_search import ForeignSearch
 from sweep.evaluation.machine_faults import raise_machine_fault
 from sweep.evaluation.recorded_search import (
@@ -18,6 +19,7 @@ from sweep.evaluation.recorded_search import (
     recording_of,
 )
 from sweep.evaluation.results import Failure, exception_text
+from sweep.measure.board_detector import BoardDetectorSetting, BoardOutput, complete
 from sweep.measure.classify import classify
 from sweep.measure.detector import NOISE_MARGIN_PX, DetectorOutput, windows
 from sweep.measure.detectors import (
@@ -55,6 +57,8 @@ class SearchResult:
         (N, 2) the first pixel of each searched image in the frame.
     poses
         Those that recorded detections have; None where images are searched.
+    boards
+        What was found of the boards; None for scenes of single markers, whose corners are NaN.
     """
 
     flags: NDArray[np.uint8]
@@ -63,6 +67,7 @@ class SearchResult:
     images: dict[int, Grey]
     origins: Integers
     poses: RecordedPoses | None = None
+    boards: BoardFindings | None = None
 
 
 def whole_frames(values: Mapping[str, Column], count: int) -> Masks:
@@ -127,6 +132,8 @@ def search(
     *,
     keep: bool = False,
     keys: NDArray[np.uint64] | None = None,
+    boards: BoardScenes | None = None,
+    board_settings: Sequence[BoardDetectorSetting] = (),
 ) -> tuple[list[SearchResult], float, Floats]:
     """Render each scene once and search it with detector settings.
 
@@ -146,6 +153,8 @@ def search(
         Whether the results keep the images.
     keys
         (N,) keys of the images, by which recorded detections are found.
+    boards, board_settings
+        The scenes' boards, and what each detector setting does with them; None for single markers.
 
     Returns
     -------
@@ -219,7 +228,13 @@ def search(
                     note((row, *setting_pass.candidates[-1][1:]))  # another marker of a photograph
                     continue
                 try:
-                    note((row, *find(searched, dictionary[row], sides[row])))
+                    output = find(searched, dictionary[row], sides[row])
+                    if boards is not None:
+                        completed = complete(
+                            searched, boards.boards[row], output, board_settings[k]
+                        )
+                        setting_pass.completed[row], output = completed, completed.markers
+                    note((row, *output))
                     setting_pass.searched, setting_pass.sought = searched, dictionary[row]
                 except Exception as error:
                     raise_machine_fault(error)
@@ -251,7 +266,14 @@ def search(
             )
             setting_pass.failed += unknown
             origin = np.zeros_like(origin)  # they are in pixels of the frame
-        flags, corners = classify(scenes.corners_px, marker_id, setting_pass.candidates, origin)
+        found = None
+        if boards is None:
+            flags, corners = classify(
+                scenes.corners_px, marker_id, setting_pass.candidates, origin
+            )
+        else:
+            found = findings(boards, setting_pass.candidates, setting_pass.completed, origin)
+            flags, corners = found.flags, np.full_like(scenes.corners_px, np.nan)
         flags[setting_pass.failed] = DetectionStatus.failed
         flags[setting_pass.crashed] = DetectionStatus.crashed
         poses = None
@@ -261,7 +283,7 @@ def search(
         results.append(
             SearchResult(
                 flags, corners, setting_pass.seconds + clock() - start, setting_pass.images,
-                window[:, :2], poses,
+                window[:, :2], poses, found,
             )
         )
     return results, render_s, np.array(row_s)
@@ -272,7 +294,8 @@ class _Pass:
     """The search with one setting: its candidates by row, and the rows for which it raised.
 
     ``searched`` is the image of the last of the candidates, ``sought`` its dictionary: what was
-    found in a photograph counts for all its markers.
+    found in a photograph counts for all its markers. ``completed`` is what was found by means of a
+    board.
     """
 
     find: FindFunction
@@ -280,6 +303,7 @@ class _Pass:
     images: dict[int, Grey] = field(default_factory=dict)
     failed: list[int] = field(default_factory=list)
     crashed: list[int] = field(default_factory=list)
+    completed: dict[int, BoardOutput] = field(default_factory=dict)
     seconds: float = 0.0
     searched: Grey | None = None
     sought: str = ""

@@ -13,13 +13,14 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sweep.evaluation.board_search import BoardFindings, BoardScenes
 from sweep.measure.accuracy import PoseError, rotation_difference
 from sweep.measure.bound import Bounds
 from sweep.measure.covariance import squared_deviations
-from sweep.measure.estimation import Detections, Estimates
-from sweep.measure.flags import EstimateStatus, Flipped
+from sweep.measure.estimation import Estimates
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.model.columns import Column
-from sweep.model.extent import areas_px
+from sweep.model.extent import areas_px, marker_areas_px
 from sweep.model.pose import vector_of_rotation, viewing_angle
 from sweep.model.scene import Scenes
 from sweep.plan.parameters import Stage
@@ -45,18 +46,39 @@ class DetectionResults:
 
 
 @dataclass(frozen=True, slots=True)
+class BoardResults:
+    """Detections of N boards with one detector setting.
+
+    Attributes
+    ----------
+    boards, found
+        The boards, and what was found of each.
+    flags
+        (N,) those of the boards as a whole.
+    """
+
+    boards: BoardScenes
+    found: BoardFindings
+    flags: NDArray[np.uint8]
+
+    @property
+    def searched(self) -> Masks:
+        """(N,) which scenes were searched without a fault."""
+        return np.asarray(self.flags == self.found.flags)
+
+
+@dataclass(frozen=True, slots=True)
 class EstimationResults:
     """Estimates of one configuration for n scenes, those in which the marker was detected.
 
     Attributes
     ----------
-    detections, estimates, error
-        What the estimator got, what it returned, and its errors: n of each.
+    estimates, error
+        What the estimator returned, and its errors: n of each.
     true_rotation, true_translation
         (n, 3, 3) and (n, 3) in metres, marker to camera.
     """
 
-    detections: Detections
     estimates: Estimates
     error: PoseError
     true_rotation: Floats
@@ -78,6 +100,26 @@ def _flipped(results: EstimationResults) -> NDArray[np.uint8]:
 def _alternative_angle_deg(results: EstimationResults) -> Floats:
     other = rotation_difference(results.estimates.alternative_rotation, results.true_rotation)
     return np.asarray(np.degrees(np.linalg.norm(other, axis=1)))
+
+
+def _marker_flags(results: BoardResults) -> NDArray[np.uint8]:
+    """Return the flags of the markers (N, M): the board's where it was not searched."""
+    known = results.searched[:, None] | (
+        results.boards.flags == DetectionStatus.not_on_board
+    )
+    return np.where(known, results.found.marker_flags, results.flags[:, None])
+
+
+def _marker_errors_px(results: BoardResults) -> Floats:
+    errors = results.found.marker_corners - results.boards.corners_px
+    errors[_marker_flags(results) != DetectionStatus.detected] = np.nan
+    return errors
+
+
+def _chessboard_errors_px(results: BoardResults) -> Floats:
+    errors = results.found.chessboard_px - results.boards.chessboard_px
+    errors[results.flags != DetectionStatus.detected] = np.nan
+    return errors
 
 
 GEOMETRY: dict[str, Callable[[Scenes], NDArray[Any]]] = {
@@ -119,6 +161,20 @@ DETECTION: dict[str, Callable[[DetectionResults], NDArray[Any]]] = {
 }
 """Variable of the detection -> its values (N, ...)."""
 
+BOARD_SCENE: dict[str, Callable[[BoardScenes], NDArray[Any]]] = {
+    "marker_area_px": lambda boards: marker_areas_px(boards.corners_px),
+    "board_marker_id": lambda boards: np.where(boards.marker_id < 0, np.nan, boards.marker_id),
+}
+"""Variable of the scene that boards have, or have otherwise -> its values (N, ...)."""
+
+BOARD_DETECTION: dict[str, Callable[[BoardResults], NDArray[Any]]] = {
+    "detection": lambda results: results.flags,
+    "marker_detection": _marker_flags,
+    "marker_corner_error_px": _marker_errors_px,
+    "chessboard_corner_error_px": _chessboard_errors_px,
+}
+"""Variable of the detection of boards -> its values (N, ...)."""
+
 ESTIMATION: dict[str, Callable[[EstimationResults], NDArray[Any]]] = {
     "estimate": lambda results: results.estimates.status,
     "translation_error_m": lambda results: results.error.translation_m,
@@ -141,6 +197,11 @@ ESTIMATION: dict[str, Callable[[EstimationResults], NDArray[Any]]] = {
     "flipped": _flipped,
 }
 """Variable of the estimation -> its values (n, ...) for the scenes with a detection."""
+
+BOARD_ESTIMATION: dict[str, Callable[[EstimationResults], NDArray[Any]]] = {
+    "point_count": lambda results: results.estimates.point_count,
+}
+"""Variable of the estimation that boards alone have -> its values (n, ...)."""
 
 WITHOUT_DETECTION: dict[str, int] = {
     "estimate": EstimateStatus.no_detection, "flipped": Flipped.no_estimate,
@@ -170,7 +231,7 @@ def compute(
 
 
 def compute_estimation(
-    results: EstimationResults, rows: NDArray[np.intp], needed: Masks
+    results: EstimationResults, rows: NDArray[np.intp], needed: Masks, *, on_boards: bool = False
 ) -> dict[str, NDArray[Any]]:
     """Return the estimation variables (N, ...) over all scenes.
 
@@ -182,9 +243,12 @@ def compute_estimation(
         (n,) their numbers among the N scenes.
     needed
         (N,) scenes whose estimate was asked for; the flags of the others are ``not_run``.
+    on_boards
+        Whether the variables of boards belong to it.
     """
     columns = {}
-    for name, values in compute(ESTIMATION, results).items():
+    table = ESTIMATION | BOARD_ESTIMATION if on_boards else ESTIMATION
+    for name, values in compute(table, results).items():
         variable = VARIABLES[name]
         fill = WITHOUT_DETECTION.get(name, variable.fill)
         column = np.full((len(needed), *values.shape[1:]), fill, dtype=values.dtype)

@@ -23,7 +23,8 @@ from sweep.model.pose import vector_of_rotation
 from sweep.plan.coordinates import drawn_quantities
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
-from sweep.plan.schema import LABELS, VARIABLES
+from sweep.plan.schema import VARIABLES
+from sweep.plan.variable import LABELS
 
 if TYPE_CHECKING:
     import xarray as xr

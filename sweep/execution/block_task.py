@@ -31,8 +31,8 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices
 from sweep.plan.parameters import Stage
 from sweep.plan.plugins import lacking_plugins
-from sweep.plan.schema import Variable
 from sweep.plan.stopping import StoppingRule
+from sweep.plan.variable import Variable
 from sweep.sampling.deciding import Decider, Decision
 from sweep.store.blocks import (
     begin_block,

@@ -13,7 +13,7 @@ from sweep.execution.reuse import LOST
 from sweep.measure.flags import DetectionStatus
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
-from sweep.plan.schema import Variable
+from sweep.plan.variable import Variable
 from sweep.sampling.deciding import by_scene
 from sweep.store.blocks import region
 from sweep.store.run_store import RunStore

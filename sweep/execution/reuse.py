@@ -34,7 +34,8 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes, scene_values
 from sweep.plan.parameters import Stage
 from sweep.plan.same_meaning import alike
-from sweep.plan.schema import VARIABLES, Variable, variables_of
+from sweep.plan.schema import VARIABLES, variables_of
+from sweep.plan.variable import Variable
 from sweep.store.blocks import committed
 from sweep.store.provenance import changes, fingerprint
 from sweep.store.run_store import RunStore

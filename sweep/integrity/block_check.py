@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sweep.integrity.consistency import contradiction
 from sweep.integrity.damage import BlockDamage, Damage, FileDamage
 from sweep.plan.grid import Block, scene_axes
-from sweep.plan.schema import Variable
+from sweep.plan.variable import Variable
 from sweep.store.blocks import names_written, parsed_receipt, receipt_key, region
 from sweep.store.checksums import digest
 from sweep.store.layout import RECEIPTS, decoded_chunk

@@ -20,7 +20,8 @@ from sweep.measure.flags import (
     present_values,
 )
 from sweep.plan.experiment import Pipeline
-from sweep.plan.schema import LOST, UNSEEN, VARIABLES, Variable
+from sweep.plan.schema import VARIABLES
+from sweep.plan.variable import LOST, UNSEEN, Variable
 from sweep.store.receipt import Receipt
 from sweep.typing import Masks
 

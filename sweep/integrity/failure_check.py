@@ -21,7 +21,7 @@ from sweep.plan.cell_selection import selection_text
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices, scene_axes
 from sweep.plan.parameters import Stage
-from sweep.plan.schema import Variable
+from sweep.plan.variable import Variable
 from sweep.processes import OUTSIDE_SIGNALS
 from sweep.store.blocks import receipts, region
 from sweep.store.receipt import Receipt

@@ -22,7 +22,7 @@ from sweep.plan.cell_selection import cell, parse_selection, selection_text
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
 from sweep.plan.parameters import Stage
-from sweep.plan.schema import Variable
+from sweep.plan.variable import Variable
 from sweep.store.lifecycle import open_store
 
 

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from sweep.model.pose import rotation_of_vector
 from sweep.plan.parameters import Stage
-from sweep.plan.schema import SCHEMA, Tolerance, Variable
+from sweep.plan.schema import SCHEMA
+from sweep.plan.variable import Tolerance, Variable
 
 Values = Mapping[str, NDArray[Any]]
 """Variable -> values of one scene, of its inner dimensions last."""

@@ -34,18 +34,29 @@ def corner_covariance(
     )
 
 
+def point_covariance(
+    rotation: Floats, translation: Floats, points: Floats, cameras: Cameras, noise_px: float
+) -> Floats:
+    """As :func:`corner_covariance`, (6, 6) of one pose (3, 3), (3,) from points (k, 3)."""
+    moved = transform_points(points[None], rotation[None], translation[None])
+    return np.asarray(_corner_covariance(
+        moved, np.ascontiguousarray(translation[None]), cameras.view, cameras.lenses,
+        cameras.distorted, float(noise_px),
+    )[0])
+
+
 @compiled
 def _corner_covariance(
     points: Floats, translation: Floats, view: Floats, lenses: Floats,
     distorted: NDArray[np.bool_], noise_px: float,
 ) -> Floats:
-    """As :func:`corner_covariance`, for corners (N, 4, 3) in the camera frame."""
+    """As :func:`corner_covariance`, for points (N, k, 3) in the camera frame."""
     covariance = np.full((points.shape[0], POSE, POSE), np.nan)
     rates = np.empty((2, POSE))
     for n in range(points.shape[0]):
         distance = abs(translation[n, 2])
         information = np.zeros((POSE, POSE))
-        for corner in range(4):
+        for corner in range(points.shape[1]):
             x, y, z = points[n, corner, 0], points[n, corner, 1], points[n, corner, 2]
             velocity(x, y, z, translation[n], Optics(view[n], lenses[n], distorted[n]), rates)
             # Shifts as shares of the distance, so that all numbers are of one size.

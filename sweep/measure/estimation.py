@@ -91,11 +91,13 @@ class Estimates:
     """(N,) variance of the pixels' residuals relative to that of noise and rounding"""
     misfit_px: Floats
     """(N,) standard deviation in px of the shifts of a marker's parts that the residuals show"""
+    point_count: Floats
+    """(N,) points of a board that the pose was estimated from; NaN for single markers"""
 
     @staticmethod
     def none(count: int, status: EstimateStatus) -> Estimates:
         """Return ``count`` estimates without a pose, all with one status."""
-        shapes = ((3, 3), (3,), (), (3, 3), (), (6, 6), (), ())
+        shapes = ((3, 3), (3,), (), (3, 3), (), (6, 6), (), (), ())
         return Estimates(
             np.full(count, status, dtype=np.uint8),
             *(np.full((count, *shape), np.nan) for shape in shapes),

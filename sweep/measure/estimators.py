@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 
 from sweep.declaration import parameter
+from sweep.measure.board_solver import BOARD_METHODS, BoardEstimator, BoardSolver
 from sweep.measure.estimation import PoseEstimator
 from sweep.measure.photograph import PhotometricReal
 from sweep.measure.photometric import Photometric
@@ -36,6 +37,10 @@ class Solver:
         Whether it works for coplanar points alone.
     recorded
         Whether it estimates nothing, and takes poses of recorded detections.
+    of_boards
+        Whether it estimates the pose of a board from all its points.
+    corners_alone
+        Whether it estimates the pose of a marker from its corners alone.
     """
 
     meaning: str
@@ -44,6 +49,8 @@ class Solver:
     guarded: bool = False
     planar_only: bool = False
     recorded: bool = False
+    of_boards: bool = False
+    corners_alone: bool = False
 
 
 def _corner_solver(name: str, setting: EstimatorSetting) -> PoseEstimator:
@@ -55,7 +62,7 @@ def _corner_solver(name: str, setting: EstimatorSetting) -> PoseEstimator:
 def _of_opencv(name: str, each: OpenCVSolver) -> Solver:
     return Solver(
         each.meaning, partial(_corner_solver, name), guarded=each.guarded,
-        planar_only=each.planar_only,
+        planar_only=each.planar_only, of_boards=name in BOARD_METHODS, corners_alone=True,
     )
 
 
@@ -118,6 +125,18 @@ class EstimatorSetting:
     refined_starts: bool = parameter(
         False, "photometric and photometric_real also start from the detector's corners after "
         "cv2.cornerSubPix: four starts instead of two",
+    )
+    points: str = parameter(
+        "markers", "boards: the points that the pose is estimated from. markers: the corners of "
+        "all detected markers; chessboard: the interpolated corners of a charuco's squares; "
+        "largest_marker: the corners of the largest detected marker; each_marker: both planar "
+        "solutions of each marker, of which the one counts that fits all corners best",
+        choices=("markers", "chessboard", "largest_marker", "each_marker"),
+    )
+    refine: str = parameter(
+        "none", "boards: refinement of the solver's pose on all its points. lm: "
+        "cv2.solvePnPRefineLM; vvs: cv2.solvePnPRefineVVS",
+        choices=("none", "lm", "vvs"),
     )
     estimate_blur: bool = parameter(
         False, "photometric also estimates the point spread, starting from believed_blur_px; "
@@ -192,6 +211,14 @@ def build(setting: EstimatorSetting) -> PoseEstimator:
     if isinstance(setting, PluggedEstimatorSetting):
         return _kept_plugin(setting)
     return SOLVERS[setting.solver].build(setting)
+
+
+def build_for_boards(setting: EstimatorSetting) -> BoardEstimator:
+    """Return the estimator of boards' poses that a setting describes."""
+    return BoardSolver(
+        setting.solver, setting.points, setting.refine, setting.guarded,
+        setting.reprojection_limit, setting.corner_noise_px,
+    )
 
 
 @lru_cache(maxsize=1024)

@@ -92,6 +92,7 @@ class DetectionStatus(Flag):
         10, "The photograph does not show the whole marker, or its pose is not known.",
         counted=False,
     )
+    not_on_board = flag(11, "The scene's board has fewer markers than another.", counted=False)
 
 
 class TruthSource(Flag):
@@ -130,6 +131,7 @@ class EstimateStatus(Flag):
         present=True,
     )
     not_needed = flag(8, "The precision that was asked for did not need the trial.", counted=False)
+    too_few_points = flag(9, "Fewer than four points of the board were found.")
 
 
 class BoundStatus(Flag):
@@ -176,7 +178,7 @@ def uncounted_values(flags: Iterable[Flag]) -> list[int]:
     Examples
     --------
     >>> uncounted_values(DetectionStatus)
-    [0, 5, 6, 9, 10]
+    [0, 5, 6, 9, 10, 11]
     """
     return [int(member) for member in flags if not member.counted]
 
@@ -190,7 +192,7 @@ def outcomes(counted: bool) -> tuple[str, ...]:
     Examples
     --------
     >>> outcomes(counted=False)
-    ('not_visible', 'not_modelled', 'not_in_photograph', 'not_run', 'not_needed')
+    ('not_visible', 'not_modelled', 'not_in_photograph', 'not_on_board', 'not_run', 'not_needed')
     """
     detection, estimation = (
         [member.name for member in flags if member.ends and member.counted == counted]

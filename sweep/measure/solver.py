@@ -121,6 +121,7 @@ def estimate(
         covariance=np.broadcast_to(np.nan, (count, 6, 6)),
         residual_ratio=np.broadcast_to(np.nan, (count,)),
         misfit_px=np.broadcast_to(np.nan, (count,)),
+        point_count=np.broadcast_to(np.nan, (count,)),
     )
 
 

@@ -65,6 +65,16 @@ class Print(NamedTuple):
         )
 
 
+class Chessboard(NamedTuple):
+    """The squares of a ChArUco board, as ``cv2.aruco.CharucoBoard`` takes them."""
+
+    squares_x: int
+    squares_y: int
+    square_m: float
+    marker_m: float
+    legacy_pattern: bool
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Board:
     """A planar target.
@@ -83,6 +93,8 @@ class Board:
     chessboard_m
         (m, 3) the inner corners of a ChArUco board's squares in the board's frame, by rows from
         the top left as ``cv2.aruco.CharucoBoard`` counts them; (0, 3) of other boards.
+    chessboard
+        A ChArUco board's squares; None of other boards.
     """
 
     dictionary: str
@@ -90,9 +102,18 @@ class Board:
     corners_m: Floats
     prints: tuple[Print, ...]
     chessboard_m: Floats
+    chessboard: Chessboard | None = None
 
     def __len__(self) -> int:
         return len(self.marker_ids)
+
+    @property
+    def is_single(self) -> bool:
+        """Whether it is one marker on its own sheet, upright at the origin."""
+        if len(self.prints) > 1 or len(self) != 1:
+            return False
+        only = self.prints[0]
+        return only.x_m == only.y_m == only.roll_rad == 0.0
 
     def edges(self, leave_out: Sequence[int] = ()) -> MarkerEdges:
         """Return the edges of all prints in metres, right and *down* from the board's origin.

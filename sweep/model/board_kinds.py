@@ -17,6 +17,7 @@ import numpy as np
 from sweep.declaration import parameter
 from sweep.model.board import (
     Board,
+    Chessboard,
     Print,
     cells_print,
     corners_of,
@@ -130,10 +131,13 @@ class Charuco:
         centres = (np.stack([columns, rows], axis=1) + 0.5) * self.square_m - middle
         inner = np.indices((self.squares_y - 1, self.squares_x - 1)).reshape(2, -1)[::-1].T + 1
         chessboard = (inner * self.square_m - middle) * [1.0, -1.0]
-        return _on_sheet(
+        board = _on_sheet(
             self.dictionary, _ids_of(self, len(rows)), centres * [1.0, -1.0], self.marker_m,
             [cells_print(codes, self.square_m)], middle, self.margin_m, chessboard,
         )
+        return dataclasses.replace(board, chessboard=Chessboard(
+            self.squares_x, self.squares_y, self.square_m, self.marker_m, self.legacy_pattern
+        ))
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,9 +10,9 @@ import numpy as np
 from sweep.compilation import compiled
 from sweep.model import coverage
 from sweep.model.extent import corner_depths, moving_marker, path_px, spread_px
-from sweep.model.marker import edges, occluded_edges
 from sweep.model.motion import MovingMarker, moved_plane, outline_extent
 from sweep.model.point_spread import NODES, REACH, WEIGHTS
+from sweep.model.printed import edges_of, occluded_edges
 from sweep.model.projection import Projection
 from sweep.model.scene import Box, Scenes
 from sweep.model.scene_sheet import scene_sheet
@@ -68,7 +68,7 @@ def marker_exposure(
     key = scenes.markers[scenes.marker[row]]
     outlines = (
         occluded_edges(key, effect["occlusion"], effect["occlusion_deg"])
-        if effect["occlusion"] > 0 else edges(*key)
+        if effect["occlusion"] > 0 else edges_of(key)
     )
     motion = scenes.motion(row)
     wanted = defocus_px(scenes, row, box, added_px)

@@ -11,49 +11,51 @@ from numpy.typing import NDArray
 from sweep.model import lens as lens_model
 from sweep.model.demosaic import REACH_PX
 from sweep.model.jpeg import BLOCK_PX
-from sweep.model.marker import marker_corners
 from sweep.model.motion import BEHIND, MEANINGLESS, Motion, MovingMarker, row_times, track
 from sweep.model.point_spread import REACH
 from sweep.model.pose import transform_points
 from sweep.model.scene import Box, Scenes
 from sweep.model.scene_sheet import curved_rows, scene_sheet, sheet_folds, sheet_outline_px
 from sweep.model.sheet import bent_point
-from sweep.typing import Floats
+from sweep.typing import Floats, Masks
 
 WARP_PX_PER_MODULE = 10
 """Resolution of the bitmap that the ``warp`` renderer maps (the paper's)."""
 
 
-def _square(low: Floats, high: Floats, per_side: int) -> Floats:
-    """Return points (n, 4 · per_side, 2) along squares from ``low`` to ``high`` (n,) in modules."""
+def _rectangle(boxes: Floats, per_side: int) -> Floats:
+    """Return points (n, 4 · per_side, 2) along boxes (n, 4): left, top, right, bottom."""
     t = np.arange(per_side) / per_side
-    ends = np.repeat(low[:, None], per_side, 1), np.repeat(high[:, None], per_side, 1)
-    ahead = ends[0] + t * (ends[1] - ends[0])
-    back = ends[1] - t * (ends[1] - ends[0])
-    columns = np.concatenate([ahead, ends[1], back, ends[0]], axis=1)
-    lines = np.concatenate([ends[0], ahead, ends[1], back], axis=1)
+    left, top, right, bottom = (np.repeat(side[:, None], per_side, 1) for side in boxes.T)
+    columns = np.concatenate(
+        [left + t * (right - left), right, right - t * (right - left), left], axis=1
+    )
+    lines = np.concatenate(
+        [top, top + t * (bottom - top), bottom, bottom - t * (bottom - top)], axis=1
+    )
     return np.stack([columns, lines], axis=2)
 
 
 def _outline(scenes: Scenes, rows: NDArray[np.intp], quiet: bool, per_side: int) -> Floats:
     """Return points (n, 4 · per_side, 2) along the images of the outline or the black square.
 
-    The outline is that of the printed marker, the black square that of ``size_m``.
+    The outline is that of all that is printed, the black square that of ``size_m``.
     """
-    modules = scenes.modules[rows]
-    margin = scenes.margin[rows] if quiet else _beyond_print(scenes, rows)
-    square = _square(-margin, modules + margin, per_side)
-    flat = np.concatenate([square, np.ones_like(square[..., :1])], axis=2)
+    boxes = scenes.sheet[rows] if quiet else _unscaled(scenes, rows)
+    rectangle = _rectangle(boxes, per_side)
+    flat = np.concatenate([rectangle, np.ones_like(rectangle[..., :1])], axis=2)
     return scenes.cameras.take(rows).project(
         np.ascontiguousarray(flat @ np.swapaxes(scenes.plane[rows], 1, 2))
     )
 
 
-def _beyond_print(scenes: Scenes, rows: NDArray[np.intp]) -> Floats:
-    """Return how far the square of ``size_m`` extends beyond the printed one, (n,) in modules."""
+def _unscaled(scenes: Scenes, rows: NDArray[np.intp]) -> Floats:
+    """Return what is black (n, 4) as large as ``size_m`` says, in modules of the printed one."""
+    ink = scenes.ink[rows]
     if scenes.effects is None:
-        return np.zeros(len(rows))
-    return np.asarray(scenes.modules[rows] / 2 * (1 / scenes.effects["marker_scale"][rows] - 1))
+        return ink
+    larger = 1 / scenes.effects["marker_scale"][rows] - 1
+    return np.asarray(ink + (ink - np.tile(scenes.origin[rows], 2)) * larger[:, None])
 
 
 CHORDS_PER_SIDE = 32
@@ -106,12 +108,11 @@ def _warp_extent(scenes: Scenes, rows: NDArray[np.intp]) -> tuple[Floats, Floats
         corners = scenes.corners_px[row]
         if not np.isfinite(corners).all():
             continue
-        n = scenes.modules[row]
-        margin = scenes.margin[row] + 0.5 / WARP_PX_PER_MODULE
-        square = np.array([[0, 0], [n, 0], [n, n], [0, n]], dtype=np.float32)
+        square = _rectangle(scenes.ink[row : row + 1], 1)[0].astype(np.float32)
         transform = cv2.getPerspectiveTransform(square, corners.astype(np.float32))
-        outline = square + np.sign(square - n / 2) * margin
-        points = np.column_stack([outline, np.ones(4)]) @ np.asarray(transform).T
+        half_px = 0.5 / WARP_PX_PER_MODULE * np.array([-1.0, -1.0, 1.0, 1.0])
+        outline = _rectangle(scenes.sheet[row : row + 1] + half_px, 1)
+        points = np.column_stack([outline[0], np.ones(4)]) @ np.asarray(transform).T
         if (points[:, 2] > 0).all():
             flat = points[:, :2] / points[:, 2:]
             low[i], high[i] = flat.min(axis=0) - 1, flat.max(axis=0) + 1
@@ -129,8 +130,7 @@ _COARSE_TURN = math.pi / 8
 
 def _outline_on_sheet(scenes: Scenes, row: int, per_side: int) -> Floats:
     """Return points (M, 2) of a marker's outline in modules, before its sheet is bent."""
-    margin = scenes.margin[row : row + 1]
-    return np.asarray(_square(-margin, scenes.modules[row : row + 1] + margin, per_side)[0])
+    return np.asarray(_rectangle(scenes.sheet[row : row + 1], per_side)[0])
 
 
 def outline_modules(scenes: Scenes, row: int) -> Floats:
@@ -239,8 +239,7 @@ def spread_px(
 
 def corner_depths(scenes: Scenes, row: int) -> Floats:
     """Return the depths (4,) in metres of the quiet zone's corners."""
-    margin = scenes.margin[row : row + 1]
-    (corners,) = _square(-margin, scenes.modules[row : row + 1] + margin, 1)
+    (corners,) = _rectangle(scenes.sheet[row : row + 1], 1)
     depth = scenes.plane[row][2]
     return np.asarray(corners @ depth[:2] + depth[2])
 
@@ -278,6 +277,12 @@ def areas_px(scenes: Scenes) -> Floats:
     return np.abs(area)
 
 
+def marker_areas_px(corners_px: Floats) -> Floats:
+    """Return the total area (N,) in px² of quadrilaterals (N, M, 4, 2); NaN counts as none."""
+    areas = np.abs(_shoelace(corners_px.reshape(-1, 4, 2))).reshape(corners_px.shape[:2])
+    return np.where(np.isnan(areas).all(axis=1), np.nan, np.nansum(areas, axis=1))
+
+
 def _shoelace(points: Floats) -> Floats:
     """Return the signed areas (N,) of polygons (N, M, 2)."""
     local = points - points[:, :1]
@@ -312,6 +317,29 @@ def outside_frame(scenes: Scenes, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
         if scenes.cameras.distorted[rows[i]]:
             polygon = _outline(scenes, rows[i : i + 1], False, CHORDS_PER_SIDE)[0]
         outside[i] = not _meets_frame(polygon, limit[i])
+    return outside
+
+
+def outside_of_frame(scenes: Scenes, row: int, corners_m: Floats, corners_px: Floats) -> Masks:
+    """Return (M,) which squares of the board of one scene lie wholly outside the frame.
+
+    ``corners_m`` (M, 4, 3) are their corners on the board, ``corners_px`` (M, 4, 2) the images.
+    """
+    limit = scenes.frame[row] - 0.5
+    outside = np.zeros(len(corners_m), dtype=bool)
+    cut = ((corners_px < -0.5) | (corners_px > limit)).any(axis=(1, 2))
+    t = np.arange(CHORDS_PER_SIDE)[:, None, None] / CHORDS_PER_SIDE
+    camera = scenes.cameras.take(np.array([row]))
+    for i in np.flatnonzero(cut):
+        polygon = corners_px[i]
+        if scenes.cameras.distorted[row]:
+            corners = corners_m[i]
+            sides = corners + t * (np.roll(corners, -1, axis=0) - corners)
+            points = np.ascontiguousarray(np.swapaxes(sides, 0, 1)).reshape(1, -1, 3)
+            polygon = camera.project(transform_points(
+                points, scenes.rotation[row : row + 1], scenes.translation[row : row + 1]
+            ))[0]
+        outside[i] = not _meets_frame(polygon, limit)
     return outside
 
 
@@ -359,12 +387,7 @@ def not_modelled(scenes: Scenes) -> NDArray[np.bool_]:
             folded[row] |= not np.isfinite(_exposed_extent(scenes, row, low, high)).all()
     rows = np.flatnonzero(scenes.cameras.distorted & np.isfinite(scenes.outline_px).all((1, 2)))
     if len(rows):
-        widened = 1 + 2 * scenes.margin[rows] / scenes.modules[rows]
-        printed = scenes.size_m[rows]
-        if scenes.effects is not None:
-            printed = printed * scenes.effects["marker_scale"][rows]
-        outline = marker_corners(printed * widened)
-        points = transform_points(outline, scenes.rotation[rows], scenes.translation[rows])
+        points = scenes.outline_m[rows]
         folded[rows] |= lens_model.folds(
             np.ascontiguousarray(points[..., :2] / points[..., 2:]),
             scenes.cameras.lenses[rows],

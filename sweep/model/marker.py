@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -214,66 +211,3 @@ def _stag_edges(dictionary: str, marker_id: int, margin: float) -> MarkerEdges:
 
 MarkerKey = tuple[str, int, float]
 """Dictionary, ID and margin (overhang and quiet zone) in modules: they determine its edges."""
-
-
-@lru_cache(maxsize=64)
-def edge_table(markers: tuple[MarkerKey, ...]) -> tuple[MarkerEdges, NDArray[np.int64]]:
-    """Return the edges of K markers in one table, and (K, 2) first and last + 1 row of each."""
-    each = [edges(*marker) for marker in markers]
-    stops = np.cumsum([len(outline.ends) for outline in each])
-    starts = np.concatenate([[0], stops[:-1]])
-    table = MarkerEdges(
-        np.concatenate([outline.ends for outline in each]),
-        np.concatenate([outline.sides for outline in each]),
-    )
-    return table, np.stack([starts, stops], axis=1).astype(np.int64)
-
-
-@lru_cache(maxsize=8192)
-def occluded_edges(marker: MarkerKey, occlusion: float, occlusion_deg: float) -> MarkerEdges:
-    """Return the edges of a marker under a sheet that hides everything beyond a straight line.
-
-    Parts of edges under the sheet are projected onto its edge at a right angle: they then enclose
-    the visible part of their area, since the projection moves nothing else. The sheet ends with
-    the quiet zone.
-    """
-    n, margin = module_count(marker[0]), marker[2]
-    angle = math.radians(occlusion_deg)
-    towards = np.array([math.cos(angle), -math.sin(angle)])
-    # Rows count downwards; the sheet's edge lies where towards · (column, row) = limit.
-    extent = (n + 2 * overhang(marker[0])) * float(np.abs(towards).sum())
-    limit = float(towards @ [n / 2, n / 2]) + extent * (0.5 - occlusion)
-
-    def split(edge: Sequence[float], hidden: bool) -> list[list[float]]:
-        """Return the parts of an edge beside the sheet, and those under it projected (or not)."""
-        a, b = np.array(edge[:2], dtype=np.float64), np.array(edge[2:], dtype=np.float64)
-        deep = float(towards @ a - limit), float(towards @ b - limit)
-        cuts = [a, b]
-        if min(deep) < 0 < max(deep):
-            cuts = [a, a + deep[0] / (deep[0] - deep[1]) * (b - a), b]
-        parts = []
-        for start, stop in itertools.pairwise(cuts):
-            inside = float(towards @ (start + stop) / 2 - limit) * (-1 if hidden else 1)
-            ends = [
-                point - max(sign * float(towards @ point - limit), 0.0) * sign * towards
-                if inside > 0 else point
-                for point in (start, stop) for sign in (-1.0 if hidden else 1.0,)
-            ]
-            parts.append([*ends[0], *ends[1]])
-        return parts
-
-    ends: list[list[float]] = []
-    sides: list[tuple[int, int]] = []
-    plain = edges(*marker)
-    for edge, codes in zip(plain.ends.tolist(), plain.sides.tolist(), strict=True):
-        parts = split(edge, hidden=False)
-        ends += parts
-        sides += [tuple(codes)] * len(parts)
-    low, high = -margin, n + margin
-    # Down, right, up, left: the sheet is at greater x of the edge that goes down.
-    around = ((low, low), (low, high), (high, high), (high, low), (low, low))
-    for start, stop in itertools.pairwise(around):
-        parts = split([*start, *stop], hidden=True)
-        ends += parts
-        sides += [(OUTSIDE, OCCLUDER)] * len(parts)
-    return MarkerEdges(np.array(ends, dtype=np.float64), np.array(sides, dtype=np.int64))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import threading
 from collections.abc import Sequence
@@ -11,17 +12,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.model import coverage, drawing
+from sweep.model import coverage, drawing, lens
+from sweep.model.board import Board
 from sweep.model.exposure import marker_exposure
 from sweep.model.extent import WARP_PX_PER_MODULE
 from sweep.model.image_file import decode_grey
-from sweep.model.marker import edge_table, edges, modules, overhang
+from sweep.model.marker import modules, overhang
 from sweep.model.photograph import photograph_image
 from sweep.model.plugged_scene import MarkerView
+from sweep.model.printed import PrintKey, edge_table, edges_of, extent_of, unit_m
+from sweep.model.projection import Optics, Projection
 from sweep.model.scene import Box, Scenes
 from sweep.model.sensing import sensed, sensed_window
 from sweep.model.supersampling import SampledMarker, supersample
 from sweep.model.tone import bloomed
+from sweep.typing import Floats
 
 Grey = NDArray[np.uint8]
 
@@ -207,18 +212,44 @@ def marker_levels(
         match = SUPERSAMPLE.fullmatch(renderer)
         if match is None:
             raise ValueError(f"renderer = {renderer!r}: expected {renderer_fault(renderer)}")
-        beyond = overhang(scenes.dictionary[row])
-        inverse = np.linalg.inv(scenes.plane[row])
-        inverse[:2] += beyond * inverse[2]
-        marker = SampledMarker(
-            modules(scenes.dictionary[row], scenes.marker_id[row]),
-            float(scenes.margin[row] - beyond), scenes.levels[row], inverse,
-            scenes.cameras.optics(row),
-        )
         supersample(
-            mean, share, marker, int(match[1]), match[2] is not None, box[0], box[1]
+            mean, share, _sampled_marker(scenes, row), int(match[1]), match[2] is not None,
+            box[0], box[1],
         )
     return mean, share
+
+
+_NO_MODULES = np.empty((0, 0), dtype=bool)
+_NO_EDGES = np.empty((0, 6))
+
+
+def _sampled_marker(scenes: Scenes, row: int) -> SampledMarker:
+    """Return the marker or the board of a scene as samples see it."""
+    key = scenes.markers[scenes.marker[row]]
+    inverse = np.linalg.inv(scenes.plane[row])
+    levels, optics = scenes.levels[row], scenes.cameras.optics(row)
+    if isinstance(key, Board):
+        return SampledMarker(_NO_MODULES, 0.0, *_board_table(key), levels, inverse, optics)
+    beyond = overhang(key[0])
+    inverse[:2] += beyond * inverse[2]
+    return SampledMarker(
+        modules(*key[:2]), float(scenes.margin[row] - beyond), _NO_EDGES, _NO_EDGES, levels,
+        inverse, optics,
+    )
+
+
+@lru_cache(maxsize=16)
+def _board_table(board: Board) -> tuple[Floats, Floats]:
+    """Return the edges (E, 6) and the prints (P, 6) of a board, as `SampledMarker` has them."""
+    tables, prints, first = [], [], 0
+    for number in range(len(board.prints)):
+        outline = board.edges([k for k in range(len(board.prints)) if k != number])
+        ends = outline.ends / unit_m(board)
+        points = ends.reshape(-1, 2)
+        tables.append(np.hstack([ends, outline.sides]))
+        prints.append([first, first + len(ends), *points.min(axis=0), *points.max(axis=0)])
+        first += len(ends)
+    return np.concatenate(tables), np.array(prints, dtype=np.float64)
 
 
 def _marker_view(scenes: Scenes, row: int, box: Box) -> MarkerView:
@@ -240,7 +271,7 @@ def _cover(
 ) -> NDArray[np.float64]:
     """Return the accumulated edges of a scene's marker, (height, width + 2) of ``box``."""
     cover = np.zeros((box[3] - box[1], box[2] - box[0] + 2))
-    outlines = edges(scenes.dictionary[row], scenes.marker_id[row], float(scenes.margin[row]))
+    outlines = edges_of(scenes.markers[scenes.marker[row]])
     coverage.accumulate(
         cover, outlines, levels, scenes.projection(row), box[0], box[1], 0.0
     )
@@ -249,13 +280,16 @@ def _cover(
 
 @lru_cache(maxsize=1024)
 def _bitmap(
-    dictionary: str, marker_id: int, margin: float, black: float, white: float
+    key: PrintKey, black: float, white: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return a marker's bitmap (side, side) at 10 px a module, and its square's corners.
+    """Return a print's bitmap (height, width) at 10 px a module, and its black square's corners.
 
     The corners (4, 2) are TL, TR, BR, BL in pixels of the bitmap, whose pixels' edges lie at
-    halves.
+    halves; of a board they are those of what is black.
     """
+    if isinstance(key, Board):
+        return _board_bitmap(key, black, white)
+    dictionary, marker_id, margin = key
     beyond = overhang(dictionary)
     pad = round(WARP_PX_PER_MODULE * (margin - beyond))
     cells = np.kron(
@@ -269,12 +303,35 @@ def _bitmap(
     return bitmap.astype(np.float32), corners
 
 
+def _board_bitmap(
+    board: Board, black: float, white: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """As :func:`_bitmap`, of a board: pixels on edges have the mean of their area."""
+    extent = extent_of(board)
+    scale = float(WARP_PX_PER_MODULE)
+    left, top, right, bottom = extent.sheet.tolist()
+    plane = np.array([
+        [scale, 0.0, -left * scale - 0.5], [0.0, scale, -top * scale - 0.5], [0.0, 0.0, 1.0]
+    ])
+    width, height = math.ceil((right - left) * scale), math.ceil((bottom - top) * scale)
+    cover, bitmap = np.zeros((height, width + 2)), np.empty((height, width))
+    level = np.array([white, black, white])
+    coverage.accumulate(
+        cover, edges_of(board), level,
+        Projection(plane, Optics(np.array([1.0, 1.0, 0.0, 0.0]), lens.pack(()), False)), 0, 0, 0.0,
+    )
+    coverage.sum_levels(cover, white, bitmap)
+    x0, y0, x1, y1 = ((extent.ink - np.tile(extent.sheet[:2], 2)) * scale - 0.5).tolist()
+    corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], dtype=np.float32)
+    return bitmap.astype(np.float32), corners
+
+
 @lru_cache(maxsize=1024)
 def _grey_bitmap(
-    dictionary: str, marker_id: int, margin: float, black: float, white: float
+    key: PrintKey, black: float, white: float
 ) -> tuple[Grey, NDArray[np.float32]]:
     """As :func:`_bitmap`, in 8 bits."""
-    bitmap, corners = _bitmap(dictionary, marker_id, margin, black, white)
+    bitmap, corners = _bitmap(key, black, white)
     return quantise(bitmap.astype(np.float64)), corners
 
 
@@ -289,9 +346,7 @@ def _perspective(
 def _warp_grey(scenes: Scenes, row: int, box: Box, view: Grey) -> None:
     """Take the paper's steps 5-8: only the corners are projected, and OpenCV warps the bitmap."""
     background, black, white = scenes.levels[row].tolist()
-    bitmap, corners = _grey_bitmap(
-        scenes.dictionary[row], scenes.marker_id[row], float(scenes.margin[row]), black, white
-    )
+    bitmap, corners = _grey_bitmap(scenes.markers[scenes.marker[row]], black, white)
     transform = _perspective(scenes, row, box, corners)
     size = (box[2] - box[0], box[3] - box[1])
     level = int(background + (0.5 + coverage.ROUNDING_SNAP))
@@ -305,8 +360,7 @@ def _warp_levels(
 ) -> None:
     """As :func:`_warp_grey`, not quantised, with the marker's share as the warp of ones."""
     bitmap, corners = _bitmap(
-        scenes.dictionary[row], scenes.marker_id[row], float(scenes.margin[row]),
-        *scenes.levels[row, 1:].tolist(),
+        scenes.markers[scenes.marker[row]], *scenes.levels[row, 1:].tolist()
     )
     transform = _perspective(scenes, row, box, corners)
     size = (box[2] - box[0], box[3] - box[1])

@@ -12,13 +12,15 @@ from numpy.typing import NDArray
 
 from sweep.declaration import parameter
 from sweep.model import lens as lens_model
+from sweep.model.board import Board
 from sweep.model.camera import VIEW_PARAMETERS, Camera, Cameras, intrinsics
 from sweep.model.columns import Column, map_columns
 from sweep.model.effect import Effect
 from sweep.model.effects import CODED, NEUTRAL, PLAIN, VELOCITIES
-from sweep.model.marker import MarkerKey, marker_corners, module_count, overhang
+from sweep.model.marker import marker_corners, overhang
 from sweep.model.plugged_scene import NO_PLUGINS, ScenePlugins
 from sweep.model.pose import rotation_of_angles, transform_points
+from sweep.model.printed import PrintKey, box_corners, extent_of
 from sweep.model.projection import Projection
 from sweep.typing import Floats
 
@@ -79,16 +81,19 @@ class Scenes:
         One value for each scene. The margin is how far the marker extends beyond the square, in
         modules: data outside it, and the quiet zone unless the background has its level.
     markers, marker
-        The distinct markers (dictionary, ID, margin), and (N,) the index of each scene's.
+        The distinct markers (dictionary, ID, margin) and boards, and (N,) the index of each
+        scene's.
     modules
         (N,) modules along the black square's side.
+    sheet, ink, origin
+        (N, 4) and (N, 2) in modules, as :class:`sweep.model.printed.Extent` has them.
     size_m
-        (N,) side of the black square.
+        (N,) side of the black square; of a board, of its first marker's.
     rotation, translation
         (N, 3, 3) and (N, 3): the true pose, metres, camera frame.
     plane
-        (N, 3, 3) takes module coordinates (column, row, 1) of the printed marker to the camera
-        frame; of a bent one those of its tangent plane at the centre.
+        (N, 3, 3) takes module coordinates (column, row, 1) of the printed marker, or a board's, to
+        the camera frame; of a bent one those of its tangent plane at the centre.
     levels
         (N, 3) grey levels of the background (0 if it is an image), black and white.
     plain
@@ -102,8 +107,10 @@ class Scenes:
     plugins, plugin_values
         The plug-ins' effects and renderers, and (N,) each setting of the renderers.
     corners_px, outline_px
-        (N, 4, 2) images of the corners of the black square of ``size_m`` and of the printed quiet
-        zone, both flat; NaN at z <= 0.
+        (N, 4, 2) images of the corners of the black square of ``size_m`` (of a board, of what is
+        black) and of the printed quiet zone, both flat; NaN at z <= 0.
+    outline_m
+        (N, 4, 3) the latter's corners in the camera frame.
     """
 
     cameras: Cameras
@@ -111,9 +118,12 @@ class Scenes:
     dictionary: Sequence[str]
     marker_id: Sequence[int]
     margin: Floats
-    markers: tuple[MarkerKey, ...]
+    markers: tuple[PrintKey, ...]
     marker: NDArray[np.int64]
     modules: Floats
+    sheet: Floats
+    ink: Floats
+    origin: Floats
     size_m: Floats
     rotation: Floats
     translation: Floats
@@ -121,6 +131,7 @@ class Scenes:
     levels: Floats
     corners_px: Floats
     outline_px: Floats
+    outline_m: Floats
     renderer: Sequence[str]
     background: Sequence[float | str]
     plain: NDArray[np.bool_]
@@ -215,11 +226,13 @@ def build_scenes(
     ``values`` has every parameter of camera, marker and scene (``distortion`` canonical);
     ``distance_m``, and ``x_m``, ``y_m`` or, without these, the bearings; ``tilt_deg``,
     ``azimuth_deg``, ``roll_deg``, instead of which ``resolved_tilt_deg`` and so on count if they
-    are there; and ``shift_u_px``, ``shift_v_px``: the drawn jitter. Each is a :class:`Column`, or
-    a value that :meth:`Column.of` takes. ``plugins`` are needed if the scenes are to be rendered.
+    are there; and ``shift_u_px``, ``shift_v_px``: the drawn jitter. ``board`` is the board that a
+    scene shows in place of a marker, or None. Each is a :class:`Column`, or a value that
+    :meth:`Column.of` takes. ``plugins`` are needed if the scenes are to be rendered.
     """
     values = {
-        **_NEUTRAL_COLUMNS, **_DEFAULT_CAMERA, "noise_key": 0, "x_m": None, "y_m": None, **values,
+        **_NEUTRAL_COLUMNS, **_DEFAULT_CAMERA, "noise_key": 0, "x_m": None, "y_m": None,
+        "board": None, **values,
     }
 
     def column(name: str) -> Column:
@@ -259,30 +272,41 @@ def build_scenes(
     size = numbers("size_m")
     # A quiet zone on a background of its own level is invisible, unless a sheet hides a part of
     # it: it is not modelled.
-    keys = mapped(
-        lambda dictionary, marker_id, width, white, background, occlusion: (
-            dictionary, int(marker_id),
-            overhang(dictionary)
-            + (0.0 if background == white and occlusion == 0 else float(width)),
+    keys: list[PrintKey] = mapped(
+        lambda board, dictionary, marker_id, width, white, background, occlusion: (
+            (dictionary, int(marker_id),
+             overhang(dictionary)
+             + (0.0 if background == white and occlusion == 0 else float(width)))
+            if board is None or board.is_single else board
         ),
-        "dictionary", "marker_id", "quiet_zone_modules", "white", "background", "occlusion",
+        "board", "dictionary", "marker_id", "quiet_zone_modules", "white", "background",
+        "occlusion",
     )
     markers, marker = distinct(keys)
-    modules = np.array([module_count(key[0]) for key in markers], dtype=np.float64)[marker]
-    margin = np.array([key[2] for key in markers])[marker]
+    extents = [extent_of(key) for key in markers]
+    modules = np.array([each.modules for each in extents])[marker]
+    margin = np.array([-each.sheet[0] for each in extents])[marker]
+    sheet, ink, origin = (
+        np.array([getattr(each, name) for each in extents])[marker]
+        for name in ("sheet", "ink", "origin")
+    )
     printed = size * numbers("marker_scale")
     half, module = printed / 2, printed / modules
+    on_board = np.array([isinstance(key, Board) for key in markers])[marker]
+    half[on_board] = margin[on_board] = 0.0
     plane = np.empty((count, 3, 3))
     plane[:, :, 0] = rotation[:, :, 0] * module[:, None]
     plane[:, :, 1] = -rotation[:, :, 1] * module[:, None]
     plane[:, :, 2] = (
         translation - (rotation[:, :, 0] - rotation[:, :, 1]) * half[:, None]
     )
-    outline_size = printed * (1 + 2 * margin / modules)
-    corners_px, outline_px = (
-        cameras.project(transform_points(marker_corners(side), rotation, translation))
-        for side in (size, outline_size)
-    )
+    square_m = marker_corners(size)
+    around_m = marker_corners(printed * (1 + 2 * margin / modules))
+    square_m[on_board] = box_corners(ink[on_board]) * (size / modules)[on_board, None, None]
+    around_m[on_board] = box_corners(sheet[on_board]) * module[on_board, None, None]
+    outline_m = transform_points(around_m, rotation, translation)
+    corners_px = cameras.project(transform_points(square_m, rotation, translation))
+    outline_px = cameras.project(outline_m)
 
     levels = np.stack(
         [
@@ -310,12 +334,15 @@ def build_scenes(
     return Scenes(
         cameras=cameras,
         frame=np.stack([numbers("width_px"), numbers("height_px")], axis=1).astype(np.int64),
-        dictionary=[key[0] for key in keys],
-        marker_id=[key[1] for key in keys],
+        dictionary=[key.dictionary if isinstance(key, Board) else key[0] for key in keys],
+        marker_id=[key.marker_ids[0] if isinstance(key, Board) else key[1] for key in keys],
         margin=margin,
         markers=markers,
         marker=marker,
         modules=modules,
+        sheet=sheet,
+        ink=ink,
+        origin=origin,
         size_m=size,
         rotation=rotation,
         translation=translation,
@@ -323,6 +350,7 @@ def build_scenes(
         levels=levels,
         corners_px=corners_px,
         outline_px=outline_px,
+        outline_m=outline_m,
         renderer=mapped(str, "renderer"),
         background=column("background").listed(count),
         plain=plain & ~affected,

@@ -43,8 +43,8 @@ def scene_sheet(scenes: Scenes, row: int) -> Sheet | None:
         scenes.meaning("bend", effect) == "saddle",
     )
     module_m = float(np.linalg.norm(scenes.plane[row][:, 0]))
-    middle = float(scenes.modules[row]) / 2
-    return sheet_of(shape, module_m, (middle, middle), waves, length_px)
+    x, y = scenes.origin[row].tolist()
+    return sheet_of(shape, module_m, (x, y), waves, length_px)
 
 
 def sheet_outline_px(scenes: Scenes, row: int, points: Floats) -> Floats:
@@ -66,11 +66,11 @@ def sheet_folds(scenes: Scenes, row: int) -> bool:
     sheet = scene_sheet(scenes, row)
     if sheet is None:
         return False
-    modules, margin = float(scenes.modules[row]), float(scenes.margin[row])
-    side = modules + 2 * margin
+    low, high = scenes.sheet[row, :2], scenes.sheet[row, 2:]
+    side = float((high - low).max())
     shifted = sheet.waves.shape[1] > 0
     extent = float(np.ptp(scenes.outline_px[row], axis=0).max()) if shifted else 0.0
     return bool(folds_over(
-        np.full(2, -margin), np.full(2, modules + margin), fold_cells(sheet, side, extent),
+        low, high, fold_cells(sheet, side, extent),
         scenes.projection(row), sheet,
     ))

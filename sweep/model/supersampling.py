@@ -15,14 +15,19 @@ from sweep.typing import Floats
 
 
 class SampledMarker(NamedTuple):
-    """A marker as its samples see it.
+    """A marker or a board as its samples see it.
 
     Attributes
     ----------
     modules
-        (n, n) True for white.
+        (n, n) True for white; (0, 0) of a board.
     quiet
         Width of the quiet zone in modules.
+    outlines
+        (E, 6) of a board: ends of its edges, and the code of the areas on their two sides.
+    prints
+        (P, 6) of a board: first and past-the-end row of each print's edges, and left, top, right,
+        bottom of the print.
     levels
         (3,) grey levels of outside, black and white.
     inverse
@@ -33,6 +38,8 @@ class SampledMarker(NamedTuple):
 
     modules: NDArray[np.bool_]
     quiet: float
+    outlines: Floats
+    prints: Floats
     levels: Floats
     inverse: Floats
     optics: Optics
@@ -43,6 +50,29 @@ def _unit(key: int) -> float:
     """Return a number in [0, 1) that depends on ``key`` alone."""
     bits = mixed(np.uint64(key) * np.uint64(0x9E3779B97F4A7C15))
     return np.float64(bits >> np.uint64(11)) * 2.0**-53
+
+
+@compiled
+def _on_board(column: float, line: float, marker: SampledMarker) -> tuple[float, float]:
+    """Return the level of a board's point, beside the board 0, and whether the board has it.
+
+    The sum of the jumps at the edges to the left of the point, of the prints around it.
+    """
+    levels = marker.levels
+    level, inside = 0.0, 0.0
+    for each in marker.prints:
+        if not (each[2] <= column < each[4] and each[3] <= line < each[5]):
+            continue
+        for k in range(int(each[0]), int(each[1])):
+            x0, y0, x1, y1 = marker.outlines[k, :4]
+            if not min(y0, y1) <= line < max(y0, y1):
+                continue
+            if x0 + (x1 - x0) * (line - y0) / (y1 - y0) <= column:
+                down = 1.0 if y1 > y0 else -1.0
+                a, b = int(marker.outlines[k, 4]), int(marker.outlines[k, 5])
+                level += down * ((levels[b] if b > 0 else 0.0) - (levels[a] if a > 0 else 0.0))
+                inside += down * (min(b, 1) - min(a, 1))
+    return level, inside
 
 
 @compiled
@@ -57,13 +87,13 @@ def supersample(
     ``mean + (1 - share) * background``. Samples lie in the middle of N x N cells of the pixel or,
     if ``jittered``, at random within them.
     """
-    modules, quiet, levels, inverse, optics = marker
+    modules, quiet, _, _, levels, inverse, optics = marker
     intrinsics, lens = optics.intrinsics, optics.lens
     n = modules.shape[0]
     total = per_side * per_side
     for i in range(mean.shape[0]):
         for j in range(mean.shape[1]):
-            level, hits = 0.0, 0
+            level, hits = 0.0, 0.0
             for k in range(total):
                 offset_x, offset_y = 0.5, 0.5
                 if jittered:
@@ -81,6 +111,10 @@ def supersample(
                     continue
                 column = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) / w
                 line = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) / w
+                if n == 0:
+                    seen, inside = _on_board(column, line, marker)
+                    level, hits = level + seen, hits + inside
+                    continue
                 if not (-quiet <= column < n + quiet and -quiet <= line < n + quiet):
                     continue
                 hits += 1

@@ -15,7 +15,7 @@ from sweep.measure.accuracy import pose_error
 from sweep.measure.flags import EstimateStatus
 from sweep.model.pose import rotation_of_vector
 from sweep.photographs.cameras import stereo_of_file
-from sweep.plan.schema import XYZ, cf_attributes
+from sweep.plan.variable import XYZ, cf_attributes
 from sweep.typing import Floats
 
 CAMERA = "stereo_camera"

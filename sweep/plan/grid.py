@@ -15,14 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.environments.interpreters import INSTALLED
+from sweep.measure.board_detector import BoardDetectorSetting
 from sweep.measure.detector import DetectorSetting
 from sweep.measure.detectors import AnyDetectorSetting
 from sweep.measure.estimators import EstimatorSetting, PluggedEstimatorSetting
 from sweep.measure.foreign_detector import ForeignSetting
+from sweep.model.board_values import ARRANGING, arranged_board
 from sweep.model.camera import canonical_distortion
-from sweep.model.columns import Column
+from sweep.model.columns import Column, map_columns
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.beliefs import CALIBRATED, believed_calibration, calibrated_columns
+from sweep.plan.boards import shows_boards
 from sweep.plan.draws import bits, even_uniform, geometry_keys, jointly_drawn, uniform
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import PARAMETERS, Stage
@@ -143,6 +146,8 @@ def scene_values(
             values[name] = _column(along, index)
     trials = values.pop(TRIAL, Column(0, constant=True)).broadcast(count, np.int64)
     values["distortion"] = values["distortion"].map(canonical_distortion)
+    if shows_boards(pipeline):
+        values["board"] = map_columns(arranged_board, [values[name] for name in ARRANGING])
     drawn = pipeline.distributions
     if "background" not in drawn:
         values["background"] = values["background"].map(partial(_absolute, pipeline.folder))
@@ -261,6 +266,16 @@ def _plugin_setting(
 
 
 OPENCV_FIELDS = tuple(field.name for field in dataclasses.fields(DetectorSetting))
+
+
+def board_settings(pipeline: Pipeline) -> list[BoardDetectorSetting]:
+    """Return what the detector settings of the grid do with boards, in their order."""
+    fixed = _fixed(pipeline, "detector")
+    names = [field.name for field in dataclasses.fields(BoardDetectorSetting)]
+    return [
+        BoardDetectorSetting(**{name: {**fixed, **chosen}[name] for name in names})
+        for chosen in combinations(pipeline.axes_of(Stage.detection))
+    ]
 
 
 def estimators(pipeline: Pipeline) -> list[EstimatorSetting]:

@@ -10,11 +10,13 @@ from enum import IntEnum
 from typing import Any
 
 from sweep.declaration import Declaration, plain_types
+from sweep.measure.board_detector import BoardDetectorSetting
 from sweep.measure.bound import BoundSetting
 from sweep.measure.detector import DetectorSetting
 from sweep.measure.detectors import DetectorChoice
 from sweep.measure.estimators import EstimatorSetting
 from sweep.messages import nearest
+from sweep.model.board_values import BoardValues, listed_markers
 from sweep.model.camera import Camera
 from sweep.model.effects import Effects
 from sweep.model.marker import Marker
@@ -35,9 +37,10 @@ class Stage(IntEnum):
 SECTIONS: dict[str, tuple[tuple[type, ...], Stage]] = {
     "camera": ((Camera,), Stage.scene),
     "marker": ((Marker,), Stage.scene),
+    "board": ((BoardValues,), Stage.scene),
     "pose": ((Pose, WorldPose), Stage.scene),
     "scene": ((Scene, Effects, BoundSetting), Stage.scene),
-    "detector": ((DetectorChoice, DetectorSetting), Stage.detection),
+    "detector": ((DetectorChoice, DetectorSetting, BoardDetectorSetting), Stage.detection),
     "estimator": ((EstimatorSetting,), Stage.estimation),
 }
 """Section of a pipeline file -> the dataclasses that declare its parameters, and its stage."""
@@ -78,6 +81,8 @@ class Parameter:
 
     def check(self, value: Any) -> Any:
         """Return ``value`` in the parameter's type; ValueError(expectation) if not allowed."""
+        if self.name == "markers":
+            return listed_markers(value)
         if tuple in self.types and isinstance(value, (list, tuple)):
             numbers = all(_is_number(item) and abs(item) < 1e300 for item in value)
             if numbers and len(value) in self.declaration.lengths:

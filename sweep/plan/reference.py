@@ -18,7 +18,8 @@ from sweep.measure.flags import Flag
 from sweep.messages import label, nearest
 from sweep.model.effects import EFFECTS
 from sweep.plan.parameters import PARAMETERS, SECTIONS, Parameter
-from sweep.plan.schema import SCHEMA, Variable
+from sweep.plan.schema import VARIABLES
+from sweep.plan.variable import Variable
 
 _MARKED = re.compile(r"(<!-- table: (\S+) -->\n)(.*?)(<!-- /table -->)", re.DOTALL)
 _OPENING = re.compile(r"<!-- table: \S+ -->")
@@ -78,7 +79,7 @@ def variable_table() -> str:
         ["variable", "stage", "dimensions beside the axes", "unit", "meaning", "number"],
         [
             [f"`{v.name}`", v.stage.name, ", ".join(v.inner), v.units, v.meaning, _presence(v)]
-            for v in SCHEMA
+            for v in VARIABLES.values()
         ],
     )
 
@@ -99,7 +100,7 @@ def _presence(variable: Variable) -> str:
 
 def _flags() -> dict[str, type[Flag]]:
     """Return the flags of each flag variable."""
-    return {v.name: v.flags for v in SCHEMA if v.flags is not None}
+    return {v.name: v.flags for v in VARIABLES.values() if v.flags is not None}
 
 
 def flag_table(variable: str) -> str:

@@ -30,13 +30,15 @@ from sweep.plan.alternatives import IN_CAMERA, PHOTOGRAPHS, WORLD, contradiction
 from sweep.plan.axes import TRIAL
 from sweep.plan.background_files import check_backgrounds
 from sweep.plan.beliefs import beliefs_in_one_way
+from sweep.plan.board_rules import boards_are_searched_and_solved, boards_can_be_printed
 from sweep.plan.camera_values import one_camera
 from sweep.plan.effect_values import mosaics_have_room, noise_tables_ascend
 from sweep.plan.parameters import PARAMETERS, SECTIONS, Stage
 from sweep.plan.photograph_rules import photographs_alone
 from sweep.plan.reader import HEADER, Reading
-from sweep.plan.schema import LABELS, VARIABLES
+from sweep.plan.schema import VARIABLES
 from sweep.plan.sobol import REPLICATES
+from sweep.plan.variable import LABELS
 
 MAX_POSES = 10**12
 """The largest grid."""
@@ -337,6 +339,8 @@ RULES: tuple[Callable[[Reading], None], ...] = (
     beliefs_in_one_way,
     ids_in_dictionary,
     dictionaries_can_be_drawn,
+    boards_can_be_printed,
+    boards_are_searched_and_solved,
     effects_need_partners,
     effects_need_the_exact_renderer,
     noise_tables_ascend,

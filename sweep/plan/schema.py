@@ -6,10 +6,9 @@ it, analysis and report read by it.
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from dataclasses import dataclass
-from enum import IntEnum
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,204 +16,26 @@ from sweep.measure.flags import (
     BoundStatus,
     DetectionStatus,
     EstimateStatus,
-    Flag,
     Flipped,
     TruthSource,
 )
 from sweep.plan.alternatives import PHOTOGRAPHS
-from sweep.plan.axes import Axis
+from sweep.plan.boards import largest_board, shows_boards
 from sweep.plan.coordinates import drawn_quantities
 from sweep.plan.parameters import Stage
+from sweep.plan.variable import (
+    BOUND_RTOL,
+    CORNER_ATOL_PX,
+    ROTATION_ATOL_RAD,
+    TRANSLATION_RTOL,
+    TRUTH_RTOL,
+    FlagRule,
+    Tolerance,
+    Variable,
+)
 
 if TYPE_CHECKING:
     from sweep.plan.experiment import Pipeline
-
-XYZ = ("x", "y", "z")
-CORNERS = ("top_left", "top_right", "bottom_right", "bottom_left")
-
-POSE_PARAMETERS = tuple(f"{part}_{axis}" for part in ("rotation", "translation") for axis in XYZ)
-
-LABELS: dict[str, tuple[str, ...]] = {
-    "corner": CORNERS, "xy": ("x", "y"), "xyz": XYZ, "pose_parameter": POSE_PARAMETERS,
-}
-"""Coordinates of the dimensions that are no axes."""
-
-
-def cf_attributes(
-    meaning: str, units: str = "", flags: type[IntEnum] | None = None
-) -> dict[str, Any]:
-    """Return the attributes of a variable, after the CF conventions.
-
-    `sweep.plan.attributes.with_description` gives it a short ``long_name`` for readers.
-    """
-    attributes: dict[str, Any] = {"long_name": meaning}
-    if units:
-        attributes["units"] = units
-    if flags is not None:
-        attributes["flag_values"] = [int(flag) for flag in flags]
-        attributes["flag_meanings"] = " ".join(flag.name for flag in flags)
-    return attributes
-
-
-@dataclass(frozen=True, slots=True)
-class FlagRule:
-    """Where a flag variable demands or forbids the numbers of another variable.
-
-    Attributes
-    ----------
-    flag
-        Name of the flag variable. "Present" below means that its flag says that the numbers of
-        its stage exist.
-    number
-        "always": a number wherever the flag is present, NaN elsewhere; "only": NaN wherever the
-        flag is not present; "unless_lost": a number unless every flag of the scene is in
-        :data:`LOST`; "if_seen": a number unless every flag of the scene is in :data:`UNSEEN`.
-    """
-
-    flag: str
-    number: Literal["always", "only", "unless_lost", "if_seen"]
-
-
-@dataclass(frozen=True, slots=True)
-class Tolerance:
-    """How far a recomputation on another processor may lie from a stored value.
-
-    On a processor with the same features every bit agrees. The limits were measured on 9,000
-    scenes with AVX-512, AVX2 and all of AVX switched off in turn.
-
-    Attributes
-    ----------
-    kind
-        "equal": no difference; "absolute": of each number; "relative": of each number;
-        "length": of each component, relative to the stored vector's norm; "distance": norm of
-        the difference, relative to the marker's true distance; "rotation": angle in radians
-        between the two rotation vectors' rotations.
-    limit
-        The largest difference, in the variable's unit where ``kind`` is "absolute".
-    """
-
-    kind: Literal["equal", "absolute", "relative", "length", "distance", "rotation"]
-    limit: float = 0.0
-
-
-LOST = (
-    DetectionStatus.failed, DetectionStatus.crashed, DetectionStatus.not_needed,
-    DetectionStatus.not_in_photograph,
-)
-"""Detections of a scene for which not even the truth may be known."""
-
-UNSEEN = (*LOST, DetectionStatus.not_visible)
-"""Detections of a scene in which a corner may be behind the camera: the marker has no image."""
-
-TRUTH_RTOL = 1e-12
-"""Of the true pose (relative to its length) and of the marker's area."""
-
-BOUND_RTOL = 1e-6
-"""Of the accuracy bound's numbers: they pass through the inverse of a 6 x 6 matrix."""
-
-CORNER_ATOL_PX = 1e-2
-"""Of corners and of the reprojection error."""
-
-ROTATION_ATOL_RAD = 1e-4
-"""Also, in degrees, of the angles that follow from the rotation: they change by no more."""
-
-TRANSLATION_RTOL = 1e-4
-"""Relative to the marker's distance."""
-
-
-@dataclass(frozen=True, slots=True)
-class Variable:
-    """One variable of the dataset: the record from which everything else about it follows.
-
-    Attributes
-    ----------
-    name
-        Its name in the dataset.
-    stage
-        The stage that makes it. It has the axes of this stage and of those before.
-    dtype
-        NumPy's type string, as stored.
-    meaning, units
-        What it means (``description``), and its ``units``.
-    inner
-        Names of its dimensions beside the axes: keys of :data:`LABELS`.
-    flags
-        The flags that it takes its values from; None for a number.
-    present_when
-        The flag variable that says where its number exists; None where none does.
-    tolerance
-        How far another processor may lie from its stored value; None if it is not compared there.
-        No scene may lie outside the tolerance of a scene's variable, few may outside the others'.
-    since_format
-        The store format that introduced it: stores of an older format do not have it.
-    drawn_as
-        Name among the scene's values of the drawn quantity that it holds; such a variable is a
-        coordinate of the dataset. Empty for what is computed.
-
-    Examples
-    --------
-    >>> variable = VARIABLES["corner_error_px"]
-    >>> variable.stage.name, variable.inner_shape, variable.units
-    ('detection', (4, 2), 'px')
-    """
-
-    name: str
-    stage: Stage
-    dtype: str
-    meaning: str
-    units: str = ""
-    inner: tuple[str, ...] = ()
-    flags: type[Flag] | None = None
-    present_when: FlagRule | None = None
-    tolerance: Tolerance | None = None
-    since_format: int = 2
-    drawn_as: str = ""
-
-    @property
-    def fill(self) -> float | int:
-        """The value of cells that were not computed: NaN, or the flag ``not_run``."""
-        return 0 if self.flags is not None else float("nan")
-
-    @property
-    def not_needed(self) -> float | int:
-        """The value of cells that were not needed: NaN, or the flag ``not_needed``."""
-        if self.flags is None:
-            return self.fill
-        return int(getattr(self.flags, "not_needed", self.fill))
-
-    @property
-    def inner_shape(self) -> tuple[int, ...]:
-        """Lengths of the inner dimensions."""
-        return tuple(len(LABELS[name]) for name in self.inner)
-
-    def configuration_axes(self, pipeline: Pipeline) -> tuple[Axis, ...]:
-        """Return the axes of detection and estimation that it has, stage by stage.
-
-        They span its configurations, the last axis fastest; a scene's variable has none.
-        """
-        stages = [stage for stage in Stage if Stage.scene < stage <= self.stage]
-        return tuple(axis for stage in stages for axis in pipeline.axes_of(stage))
-
-    def configurations(self, pipeline: Pipeline) -> int:
-        """Return the number of its configurations: one for a scene's variable."""
-        return math.prod(len(axis) for axis in self.configuration_axes(pipeline))
-
-    def axes(self, pipeline: Pipeline) -> tuple[Axis, ...]:
-        """Return its axes in the pipeline's order: those of its stage and of the stages before."""
-        return pipeline.axes_of(*(stage for stage in Stage if stage <= self.stage))
-
-    def dimensions(self, pipeline: Pipeline) -> tuple[str, ...]:
-        """Return the names of its dimensions: its axes, then ``inner``."""
-        return tuple(axis.name for axis in self.axes(pipeline)) + self.inner
-
-    def shape(self, pipeline: Pipeline) -> tuple[int, ...]:
-        """Return the lengths of its dimensions."""
-        return tuple(len(axis) for axis in self.axes(pipeline)) + self.inner_shape
-
-    def attributes(self) -> dict[str, Any]:
-        """Return its attributes, after the CF conventions."""
-        return cf_attributes(self.meaning, self.units, self.flags)
-
 
 _S, _D, _E = Stage.scene, Stage.detection, Stage.estimation
 _TRUTH = FlagRule("detection", "unless_lost")
@@ -292,8 +113,31 @@ SCHEMA: tuple[Variable, ...] = (
 )
 """Every variable, in the order in which the stages make them."""
 
-VARIABLES: dict[str, Variable] = {variable.name: variable for variable in SCHEMA}
-"""Every variable by its name."""
+_BOARD_MARKER = FlagRule("marker_detection", "always")
+
+BOARD_SCHEMA: tuple[Variable, ...] = (
+    Variable("board_marker_id", _S, "f4", "ID of each marker of the board", inner=("marker",),
+             since_format=5),
+    Variable("marker_detection", _D, "u1", "what became of each marker of the board",
+             inner=("marker",), flags=DetectionStatus, tolerance=_EQUAL, since_format=5),
+    Variable("marker_corner_error_px", _D, "f4", "found corner minus true corner, of each marker",
+             "px", ("marker", "corner", "xy"), present_when=_BOARD_MARKER,
+             tolerance=Tolerance("absolute", CORNER_ATOL_PX), since_format=5),
+    Variable("chessboard_corner_error_px", _D, "f4",
+             "interpolated corner of the chessboard minus true corner; NaN: not found", "px",
+             ("chessboard_corner", "xy"), present_when=FlagRule("detection", "only"),
+             tolerance=Tolerance("absolute", CORNER_ATOL_PX), since_format=5),
+    Variable("point_count", _E, "f4", "points that the pose was estimated from",
+             present_when=_POSE, since_format=5),
+)
+"""The variables that stores of boards have besides; those of :data:`NOT_OF_BOARDS` they lack."""
+
+NOT_OF_BOARDS = frozenset({"corner_error_px"})
+
+VARIABLES: dict[str, Variable] = {
+    variable.name: variable for variable in (*SCHEMA, *BOARD_SCHEMA)
+}
+"""Every variable by its name, those of boards included."""
 
 
 PHOTOGRAPH_SCHEMA: tuple[Variable, ...] = (
@@ -357,7 +201,21 @@ def variables_of(pipeline: Pipeline, store_format: float = math.inf) -> tuple[Va
     """
     drawn = drawn_variables(pipeline) if store_format >= DRAWN_FORMAT else ()
     photographed = PHOTOGRAPH_SCHEMA if PHOTOGRAPHS in pipeline.given else ()
-    return schema_of(store_format) + drawn + photographed
+    common = schema_of(store_format)
+    if shows_boards(pipeline):
+        common = tuple(each for each in common if each.name not in NOT_OF_BOARDS)
+        common += _board_variables(pipeline)
+    return common + drawn + photographed
+
+
+def _board_variables(pipeline: Pipeline) -> tuple[Variable, ...]:
+    """Return the variables of a pipeline's boards, as long as its largest board."""
+    markers, corners = largest_board(pipeline)
+    lengths = (("marker", markers), ("chessboard_corner", corners))
+    return tuple(
+        dataclasses.replace(variable, lengths=lengths) for variable in BOARD_SCHEMA
+        if corners or "chessboard_corner" not in variable.inner
+    )
 
 
 def bytes_per_block(pipeline: Pipeline, scenes: int) -> int:

@@ -19,6 +19,7 @@ TRUTH: Colour = (115, 158, 0)
 DETECTED: Colour = (0, 94, 213)
 OTHER: Colour = (167, 121, 204)
 REJECTED: Colour = (66, 228, 240)
+CHESSBOARD: Colour = (178, 114, 0)
 AXES: tuple[Colour, Colour, Colour] = ((0, 0, 230), (0, 170, 0), (230, 80, 0))
 PAPER: Colour = (255, 255, 255)
 INK: Colour = (40, 40, 40)
@@ -160,17 +161,21 @@ def draw_outlines(
 
     for quad in scene.rejected:
         outline(quad, REJECTED, 1)
-    for _, quad in scene.decoded:
-        if not np.allclose(quad, scene.corners, atol=0.01):
-            outline(quad, OTHER, weight)
-    outline(scene.true_corners, TRUTH, weight + 3)
-    outline(scene.corners, DETECTED, weight)
-    if np.isfinite(scene.corners).all():
-        for k, corner in enumerate(at(scene.corners).tolist()):
-            filled = cv2.FILLED if k == 0 else weight
+    for quad in other_quadrilaterals(scene):
+        outline(quad, OTHER, weight)
+    several = len(scene.true_markers) > 1
+    for quad in scene.true_markers:
+        outline(quad, TRUTH, weight + (1 if several else 3))
+    radius = 3 if several else 6
+    for quad in scene.markers[np.isfinite(scene.markers).all(axis=(1, 2))]:
+        outline(quad, DETECTED, 1 if several else weight)
+        for k, corner in enumerate(at(quad).tolist()):
+            filled = cv2.FILLED if k == 0 else 1 if several else weight
             cv2.circle(
-                canvas, corner, 6 << SHIFT, DETECTED, filled, cv2.LINE_AA, SHIFT
+                canvas, corner, radius << SHIFT, DETECTED, filled, cv2.LINE_AA, SHIFT
             )
+    for corner in at(scene.chessboard[np.isfinite(scene.chessboard).all(axis=1)]).tolist():
+        cv2.circle(canvas, corner, radius << SHIFT, CHESSBOARD, weight, cv2.LINE_AA, SHIFT)
     if np.isfinite(scene.axes_px).all():
         ends = at(scene.axes_px).tolist()
         for colour, end in zip(AXES, ends[1:], strict=True):
@@ -178,12 +183,22 @@ def draw_outlines(
     return canvas
 
 
+def other_quadrilaterals(scene: SceneInspection) -> list[NDArray[np.float64]]:
+    """Return the decoded quadrilaterals that are not the scene's markers."""
+    return [
+        quad for _, quad in scene.decoded
+        if not np.isclose(quad, scene.markers, atol=0.01).all(axis=(1, 2)).any()
+    ]
+
+
 def _captioned(canvas: NDArray[np.uint8], scene: SceneInspection, title: str) -> NDArray[np.uint8]:
     """Return the picture with title, draws, result and legend below it."""
     legend = [LEGEND[0]]
-    if np.isfinite(scene.corners).all():
+    if np.isfinite(scene.markers).all(axis=(1, 2)).any():
         legend.append(LEGEND[1])
-    if len(scene.decoded) > int(np.isfinite(scene.corners).all()):
+    if np.isfinite(scene.chessboard).any():
+        legend.append(("corners of the chessboard", CHESSBOARD))
+    if other_quadrilaterals(scene):
         legend.append(LEGEND[2])
     if scene.rejected:
         legend.append((f"rejected candidates: {len(scene.rejected)}", REJECTED))

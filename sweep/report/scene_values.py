@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.plan.schema import Variable
+from sweep.plan.variable import Variable
 from sweep.report.formatting import coordinate
 
 NAME_WIDTH, VALUE_WIDTH = 34, 44

@@ -17,8 +17,9 @@ from sweep.plan.axes import TRIAL
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
 from sweep.plan.parameters import Stage
-from sweep.plan.schema import VARIABLES, Variable
+from sweep.plan.schema import VARIABLES
 from sweep.plan.stopping import StoppingRule
+from sweep.plan.variable import Variable
 from sweep.sampling.rules import make_rule
 from sweep.sampling.stopping import GroupResults, Stopping
 from sweep.sampling.waves import Waves

@@ -12,7 +12,8 @@ from sweep.analysis.pose_view import REQUIRED_VARIABLES
 from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
-from sweep.plan.schema import LABELS, VARIABLES, Variable
+from sweep.plan.schema import VARIABLES
+from sweep.plan.variable import LABELS, Variable
 from sweep.sampling.stopping import GroupResults, condition_axes
 
 

@@ -30,7 +30,8 @@ from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import GEOMETRY_SECTIONS, Stage
 from sweep.plan.precision_rule import PrecisionRule
-from sweep.plan.schema import LABELS, VARIABLES
+from sweep.plan.schema import VARIABLES
+from sweep.plan.variable import LABELS
 from sweep.sampling.stopping import GroupResults, condition_axes, unit_of, wave_ends
 from sweep.typing import Masks
 

@@ -21,7 +21,8 @@ from zarr.storage import LocalStore
 from sweep.errors import StoreError, StoreReplacedError
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
-from sweep.plan.schema import SCHEMA, Variable
+from sweep.plan.schema import VARIABLES
+from sweep.plan.variable import Variable
 from sweep.store.checksums import DigestingStore
 from sweep.store.durability import DurableStore
 from sweep.store.layout import RECEIPTS
@@ -35,7 +36,7 @@ from sweep.store.zarr_sync import sync
 BEGUN = f"{RECEIPTS}/begun"
 """Folder of a mark for each block that was begun and is not committed."""
 
-GOVERNING = {variable.present_when.flag for variable in SCHEMA if variable.present_when}
+GOVERNING = {each.present_when.flag for each in VARIABLES.values() if each.present_when}
 """The flag variables that say where numbers exist."""
 
 RECEIPTS_AT_ONCE = 1000

@@ -27,7 +27,8 @@ from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.photographs import is_simulated
 from sweep.plan.pose_values import DISTANCE_PARAMETERS, distance_of_side
-from sweep.plan.schema import DRAWN_FORMAT, LABELS, VARIABLES, Variable, variables_of
+from sweep.plan.schema import DRAWN_FORMAT, VARIABLES, variables_of
+from sweep.plan.variable import LABELS, Variable
 from sweep.store.zarr_sync import sync
 
 FORMAT = 5
@@ -214,8 +215,14 @@ def planned_arrays(
     variables = variables_of(pipeline, store_format)
     scene_extent = dict(zip((axis.name for axis in scene_axes(pipeline)), extents, strict=True))
     planned = [each for axis in pipeline.axes for each in _axis(axis)]
-    used = {name for variable in variables for name in variable.inner}
-    planned += [_labels(name, LABELS[name], {}) for name in sorted(used)]
+    used = {
+        name: length for variable in variables
+        for name, length in zip(variable.inner, variable.inner_shape, strict=True)
+    }
+    planned += [
+        _labels(name, LABELS[name], {}) if LABELS[name] else _numbers(name, used[name])
+        for name in sorted(used)
+    ]
     planned += _distance(pipeline)
     planned += _photographs(pipeline)
     if store_format >= DRAWN_FORMAT:
@@ -291,6 +298,14 @@ def _labels(name: str, labels: Any, attributes: dict[str, Any]) -> PlannedArray:
     return PlannedArray(
         name, values.shape, values.shape, "string", (name,), None, attributes,
         lambda start, stop: values[start:stop],
+    )
+
+
+def _numbers(name: str, length: int) -> PlannedArray:
+    """Return the coordinate of a dimension that is counted from 0 on."""
+    return PlannedArray(
+        name, (length,), (length,), "int64", (name,), None, {},
+        lambda start, stop: np.arange(start, stop, dtype=np.int64),
     )
 
 

@@ -27,7 +27,7 @@ from sweep.plan.camera_facts import camera_facts, notes
 from sweep.plan.camera_values import stored_text
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
-from sweep.plan.schema import PHOTOGRAPH_SCHEMA, SCHEMA
+from sweep.plan.schema import PHOTOGRAPH_SCHEMA, VARIABLES
 from sweep.plugins.declared import RECORDED, recorded_plugins
 from sweep.store.checksums import DigestingStore
 from sweep.store.direct_reading import read_directly
@@ -326,6 +326,7 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
     # Text, as netCDF needs it.
     dataset.attrs["sweep"] = json.dumps(dataset.attrs["sweep"])
     ordered = [
-        each.name for each in (*SCHEMA, *PHOTOGRAPH_SCHEMA) if each.name in dataset.data_vars
+        each.name for each in (*VARIABLES.values(), *PHOTOGRAPH_SCHEMA)
+        if each.name in dataset.data_vars
     ]
     return with_descriptions(dataset.assign_coords(texts)[ordered])

@@ -14,7 +14,8 @@ from zarr.buffer import default_buffer_prototype
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks
 from sweep.plan.parameters import Stage
-from sweep.plan.schema import Variable, variables_of
+from sweep.plan.schema import variables_of
+from sweep.plan.variable import Variable
 from sweep.store.checksums import DigestingStore
 from sweep.store.durability import DurableStore
 from sweep.store.locations import is_remote

@@ -12,7 +12,8 @@ import numpy as np
 from zarr.buffer import cpu
 
 from sweep.plan.grid import Block
-from sweep.plan.schema import VARIABLES, Variable
+from sweep.plan.schema import VARIABLES
+from sweep.plan.variable import Variable
 from sweep.store.blocks import (
     BEGUN,
     check_not_replaced,

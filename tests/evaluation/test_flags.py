@@ -92,6 +92,7 @@ def test_every_flag_of_detection_has_a_scene():
     of_no_scene = {
         DetectionStatus.not_run, DetectionStatus.failed, DetectionStatus.crashed,
         DetectionStatus.not_needed, DetectionStatus.not_in_photograph,
+        DetectionStatus.not_on_board,
     }
     assert {*SCENES} | of_no_scene == {*DetectionStatus}
 

@@ -132,7 +132,7 @@ def test_a_scored_store_is_a_store(scored, capsys):
     scene = inspect_scene(cell(open_store(str(scored)).pipeline, "tilt_deg=50,trial=2"))
     assert scene.detection is DetectionStatus.detected
     assert [marker for marker, _ in scene.decoded] == [0]
-    assert (scene.decoded[0][1] == scene.corners).all()
+    assert (scene.decoded[0][1] == scene.markers[0]).all()
 
 
 @pytest.mark.long

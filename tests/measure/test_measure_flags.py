@@ -41,10 +41,11 @@ def test_every_flag_says_in_one_sentence_what_it_means(kind):
 def test_outcomes_are_where_a_pose_ends():
     assert outcomes(counted=True) == (
         "solved", "wrong_id", "rejected", "no_candidate", "solver_failed", "not_converged",
-        "not_explained", "failed", "crashed",
+        "not_explained", "too_few_points", "failed", "crashed",
     )
     assert outcomes(counted=False) == (
-        "not_visible", "not_modelled", "not_in_photograph", "not_run", "not_needed",
+        "not_visible", "not_modelled", "not_in_photograph", "not_on_board", "not_run",
+        "not_needed",
     )
 
 

@@ -16,7 +16,7 @@ BROKEN = {
     "unknown section, nearest named": (
         "[pose]\ndistance_m = 1\n[camra]\nwidth_px = 640",
         ("camra: unknown; expected a section of title, seed, sampling, effects, camera, marker, "
-        "pose, scene, detector, estimator, axes, require, limit, precision, choose; "
+        "board, pose, scene, detector, estimator, axes, require, limit, precision, choose; "
         "did you mean camera?"),
     ),
     "a key without its section": (

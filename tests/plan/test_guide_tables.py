@@ -7,7 +7,7 @@ import pytest
 
 from sweep.plan.parameters import PARAMETERS, SECTIONS
 from sweep.plan.reference import TABLES, main, outdated_tables, updated
-from sweep.plan.schema import SCHEMA
+from sweep.plan.schema import VARIABLES
 
 GUIDE = """# A guide
 
@@ -34,8 +34,8 @@ def test_every_parameter_variable_and_flag_has_a_row():
     for section in SECTIONS:
         assert TABLES[f"parameters.{section}"]() in TABLES["parameters"]()
     variables = rows(TABLES["variables"]())[1:]
-    assert [row.split("`")[1] for row in variables] == [variable.name for variable in SCHEMA]
-    for variable in SCHEMA:
+    assert [row.split("`")[1] for row in variables] == [*VARIABLES]
+    for variable in VARIABLES.values():
         if variable.flags is not None:
             table = TABLES[f"flags.{variable.name}"]()
             assert [row.split("`")[1] for row in rows(table)[1:]] == [

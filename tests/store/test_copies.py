@@ -15,7 +15,6 @@ from sweep.execution.finalize import close
 from sweep.execution.runner import execute
 from sweep.integrity.verification import verify
 from sweep.plan.experiment import Pipeline
-from sweep.plan.schema import VARIABLES
 from sweep.store.blocks import chunk_key, committed
 from sweep.store.lifecycle import create_store, open_store
 from sweep.store.snapshot import missing_chunks
@@ -62,10 +61,11 @@ def copy_of(url, to, draw):
     """Copy a store as one that was written meanwhile: receipts without some of their chunks."""
     shutil.copytree(url, to)
     store = open_store(str(to))
+    variables = {variable.name: variable for variable in store.variables}
     lost = set()
     for number in draw.sample(range(12), draw.randint(1, 4)):
-        for name in draw.sample(sorted(VARIABLES), draw.randint(1, len(VARIABLES))):
-            path = to / chunk_key(store, VARIABLES[name], store.blocks[number])
+        for name in draw.sample(sorted(variables), draw.randint(1, len(variables))):
+            path = to / chunk_key(store, variables[name], store.blocks[number])
             path.write_bytes(b"") if draw.random() < 0.2 else path.unlink()
         lost.add(number)
     return lost

@@ -123,7 +123,7 @@ def test_blocks_that_were_swapped_with_their_receipts_are_found(pipeline, tmp_pa
     url = tmp_path / "read.zarr"
     close(by_hand(str(url), pipeline, (2,)))
     assert [r.block for _, r in receipts(open_store(str(url)), [0, 1])] == [0, 1]
-    for name in ("commits/receipt", *VARIABLES):
+    for name in ("commits/receipt", *(variable.name for variable in SCHEMA)):
         swap(url, name)
     found = verify(str(url), 0)
     assert {damage.block for damage in found.damage} == {0, 1}

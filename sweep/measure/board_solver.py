@@ -1,0 +1,336 @@
+"""The pose of a board from its points: OpenCV's solvers, guarded or as plain calls."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.measure.covariance import point_covariance
+from sweep.measure.estimation import Estimates
+from sweep.measure.flags import EstimateStatus
+from sweep.measure.solver import both_planar_solutions, estimate
+from sweep.model.board import Board
+from sweep.model.camera import Cameras
+from sweep.model.pose import rotation_of_vector, transform_points
+from sweep.typing import Floats, Integers
+
+BOARD_METHODS: dict[str, int] = {
+    "iterative": cv2.SOLVEPNP_ITERATIVE,
+    "sqpnp": cv2.SOLVEPNP_SQPNP,
+    "ippe": cv2.SOLVEPNP_IPPE,
+    "epnp": cv2.SOLVEPNP_EPNP,
+}
+"""Solvers for any number of points in a plane -> OpenCV's constant."""
+
+MIN_POINTS = 4
+"""The fewest points that a pose is estimated from."""
+
+
+class BoardPoints(NamedTuple):
+    """What was found of one board.
+
+    Attributes
+    ----------
+    marker
+        (K,) indices on the board of the decoded markers whose ID it has.
+    corners_px
+        (K, 4, 2) their corners in pixels of the frame: TL, TR, BR, BL.
+    chessboard, chessboard_px
+        (C,) and (C, 2) indices and pixels of the chessboard's corners that were found.
+    """
+
+    marker: Integers
+    corners_px: Floats
+    chessboard: Integers
+    chessboard_px: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class BoardDetections:
+    """N boards, and the camera, noise and blur that the estimator assumes.
+
+    Attributes
+    ----------
+    boards, points
+        The boards, and what was found of each.
+    cameras, noise_grey, blur_px
+        N cameras, and (N,) as :class:`sweep.measure.estimation.Detections` has them.
+    scale
+        (N,) believed size of the board relative to the true one.
+    """
+
+    boards: Sequence[Board]
+    points: Sequence[BoardPoints]
+    cameras: Cameras
+    noise_grey: Floats
+    blur_px: Floats
+    scale: Floats
+
+    def take(self, rows: NDArray[np.intp]) -> BoardDetections:
+        """Return the detections of the given rows."""
+        return BoardDetections(
+            [self.boards[row] for row in rows], [self.points[row] for row in rows],
+            self.cameras.take(rows), self.noise_grey[rows], self.blur_px[rows], self.scale[rows],
+        )
+
+
+class BoardEstimator(Protocol):
+    """A function from what was found of boards to their poses."""
+
+    @property
+    def needs_images(self) -> bool:
+        """Whether the searched images must be kept."""
+        ...
+
+    def __call__(self, detections: BoardDetections, /) -> Estimates:
+        """Return one estimate for each board; its status says why a pose is missing."""
+        ...
+
+
+class _Solution(NamedTuple):
+    """A pose (3, 3), (3,) in metres, and its RMS reprojection error; all NaN if there is none."""
+
+    rotation: Floats
+    translation: Floats
+    error_px: float
+
+
+_NONE = _Solution(np.full((3, 3), np.nan), np.full(3, np.nan), math.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class BoardSolver:
+    """An OpenCV solver as an estimator of boards' poses.
+
+    Attributes
+    ----------
+    solver, points, refine, guarded, reprojection_limit, corner_noise_px
+        As :class:`sweep.measure.estimators.EstimatorSetting` has them.
+    """
+
+    solver: str
+    points: str
+    refine: str
+    guarded: bool
+    reprojection_limit: float
+    corner_noise_px: float | None
+
+    @property
+    def needs_images(self) -> bool:
+        """Whether the searched images must be kept: no."""
+        return False
+
+    def __call__(self, detections: BoardDetections) -> Estimates:
+        """Return the poses, with covariances if the corners' noise is given."""
+        count = len(detections.boards)
+        out = Estimates.none(count, EstimateStatus.solver_failed)
+        for i in range(count):
+            self._estimate(detections.take(np.array([i])), i, out)
+        return out
+
+    def _estimate(self, one: BoardDetections, i: int, out: Estimates) -> None:
+        """Write the estimate of a single board as number ``i``."""
+        found, board, scale = one.points[0], one.boards[0], float(one.scale[0])
+        objects, pixels = self._points(board, found)
+        objects = objects * scale
+        if len(pixels) < MIN_POINTS:
+            out.status[i] = EstimateStatus.too_few_points
+            return
+        solutions = self._solutions(one, objects, pixels)
+        side = float(np.linalg.norm(
+            np.roll(found.corners_px, -1, axis=1) - found.corners_px, axis=2
+        ).mean())
+        kept = [each for each in solutions if each.error_px <= self.reprojection_limit * side]
+        if not kept or kept[0] is not solutions[0]:
+            return
+        best, other = kept[0], (*kept[1:], _NONE)[0]
+        out.status[i], out.point_count[i] = EstimateStatus.solved, len(pixels)
+        out.rotation[i], out.translation[i], out.reprojection_px[i] = best
+        out.alternative_rotation[i], _, out.alternative_reprojection_px[i] = other
+        if self.corner_noise_px is not None:
+            out.covariance[i] = point_covariance(
+                best.rotation, best.translation, objects, one.cameras, self.corner_noise_px
+            )
+
+    def _points(self, board: Board, found: BoardPoints) -> tuple[Floats, Floats]:
+        """Return the points (k, 3) in the board's frame and their pixels (k, 2)."""
+        if self.points == "chessboard":
+            return board.chessboard_m[found.chessboard], found.chessboard_px
+        marker, corners = found.marker, found.corners_px
+        if self.points == "largest_marker" and len(marker):
+            largest = np.argmax(_areas(corners))
+            marker, corners = marker[[largest]], corners[[largest]]
+        return board.corners_m[marker].reshape(-1, 3), corners.reshape(-1, 2)
+
+    def _solutions(
+        self, one: BoardDetections, objects: Floats, pixels: Floats
+    ) -> list[_Solution]:
+        """Return the poses by their reprojection error, the best first."""
+        if self.points == "largest_marker":
+            poses = self._of_marker(one, objects, pixels)
+        elif self.points == "each_marker":
+            poses = _of_each_marker(one, objects, pixels)
+        else:
+            method = BOARD_METHODS[self.solver]
+            solve = _guarded if self.guarded else _plain
+            poses = solve(objects, pixels, one.cameras, method)
+        found = [
+            _Solution(rotation, translation, reprojection_px(
+                rotation, translation, objects, pixels, one.cameras
+            ))
+            for rotation, translation in poses
+        ]
+        ordered = sorted((each for each in found if math.isfinite(each.error_px)),
+                         key=lambda each: each.error_px)
+        if self.refine != "none" and ordered:
+            ordered[0] = self._refined(ordered[0], objects, pixels, one.cameras)
+        return ordered[:2]
+
+    def _of_marker(
+        self, one: BoardDetections, objects: Floats, pixels: Floats
+    ) -> list[tuple[Floats, Floats]]:
+        """Return the board's poses from the corners (4, 3) and (4, 2) of a single marker."""
+        size, to_board = _marker_frame(objects)
+        solved = estimate(
+            pixels[None], one.cameras, np.array([size]), self.solver, self.guarded,
+            self.reprojection_limit,
+        )
+        poses = [(solved.rotation[0], solved.translation[0])]
+        if np.isfinite(solved.alternative_rotation[0]).all():
+            both, positions = both_planar_solutions(pixels[None], one.cameras, np.array([size]))
+            poses.append((both[0, 1], positions[0, 1]))
+        return [_of_board(*pose, to_board) for pose in poses]
+
+    def _refined(
+        self, start: _Solution, objects: Floats, pixels: Floats, cameras: Cameras
+    ) -> _Solution:
+        """Return a pose after OpenCV's refinement on all points; the start if it fails."""
+        refine: Any = cv2.solvePnPRefineLM if self.refine == "lm" else cv2.solvePnPRefineVVS
+        vector, _ = cv2.Rodrigues(start.rotation)
+        try:
+            r, t = refine(
+                objects, pixels, cameras.matrix(0), _lens(cameras), vector,
+                start.translation[:, None].copy(),
+            )
+        except cv2.error:
+            return start
+        rotation, translation = rotation_of_vector(r.reshape(1, 3))[0], t.ravel()
+        error = reprojection_px(rotation, translation, objects, pixels, cameras)
+        return _Solution(rotation, translation, error) if math.isfinite(error) else start
+
+
+def _areas(corners: Floats) -> Floats:
+    """Return the areas (K,) of quadrilaterals (K, 4, 2) in px²."""
+    diagonals = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
+    return np.asarray(0.5 * np.abs(
+        diagonals[0][:, 0] * diagonals[1][:, 1] - diagonals[0][:, 1] * diagonals[1][:, 0]
+    ))
+
+
+def _lens(cameras: Cameras) -> Floats | None:
+    return cameras.lenses[0, :14] if cameras.distorted[0] else None
+
+
+def reprojection_px(
+    rotation: Floats, translation: Floats, objects: Floats, pixels: Floats, cameras: Cameras
+) -> float:
+    """Return the RMS reprojection error of points (k, 3); NaN if one is behind the camera."""
+    projected = cameras.project(
+        transform_points(objects[None], rotation[None], translation[None])
+    )[0]
+    return float(np.sqrt(((projected - pixels) ** 2).sum(axis=1).mean()))
+
+
+def _marker_frame(corners_m: Floats) -> tuple[float, tuple[Floats, Floats]]:
+    """Return a marker's side, and the pose (3, 3), (3,) of its frame on the board."""
+    right = corners_m[1] - corners_m[0]
+    up = corners_m[0] - corners_m[3]
+    size = float(np.linalg.norm(right))
+    x, y = right / size, up / np.linalg.norm(up)
+    return size, (np.stack([x, y, np.cross(x, y)], axis=1), corners_m.mean(axis=0))
+
+
+def _of_board(
+    rotation: Floats, translation: Floats, to_board: tuple[Floats, Floats]
+) -> tuple[Floats, Floats]:
+    """Return the board's pose from that of a marker whose frame is ``to_board`` on it."""
+    turned = rotation @ to_board[0].T
+    return turned, translation - turned @ to_board[1]
+
+
+def _of_each_marker(
+    one: BoardDetections, objects: Floats, pixels: Floats
+) -> list[tuple[Floats, Floats]]:
+    """Return the board's poses from both planar solutions of each marker."""
+    corners_m, corners = objects.reshape(-1, 4, 3), pixels.reshape(-1, 4, 2)
+    frames = [_marker_frame(each) for each in corners_m]
+    cameras = one.cameras.take(np.zeros(len(corners), dtype=np.intp))
+    rotation, translation = both_planar_solutions(
+        corners, cameras, np.array([size for size, _ in frames])
+    )
+    return [
+        _of_board(rotation[k, solution], translation[k, solution], frames[k][1])
+        for k in range(len(corners)) for solution in range(2)
+    ]
+
+
+def _plain(
+    objects: Floats, pixels: Floats, cameras: Cameras, method: int
+) -> list[tuple[Floats, Floats]]:
+    """Call ``cv2.solvePnPGeneric`` plainly: the board's frame, metres, OpenCV's lens inverse."""
+    return _called(objects, pixels, cameras.matrix(0), _lens(cameras), method)
+
+
+def _called(
+    objects: Floats, pixels: Floats, matrix: Floats, lens: Floats | None, method: int
+) -> list[tuple[Floats, Floats]]:
+    try:
+        success, vectors, positions, _ = cv2.solvePnPGeneric(
+            np.ascontiguousarray(objects), np.ascontiguousarray(pixels), matrix, lens, flags=method
+        )
+    except cv2.error:
+        return []
+    if not success:
+        return []
+    return [
+        (rotation_of_vector(np.asarray(r, dtype=np.float64).reshape(1, 3))[0],
+         np.asarray(t, dtype=np.float64).ravel())
+        for r, t in zip(vectors, positions, strict=True)
+    ]
+
+
+_Z_IN = np.diag([1.0, -1.0, -1.0])
+
+
+def _guarded(
+    objects: Floats, pixels: Floats, cameras: Cameras, method: int
+) -> list[tuple[Floats, Floats]]:
+    """Solve in a stable frame: undistorted pixels, points of unit size, z in, roll within 45°.
+
+    For the reasons that the guard of a single marker has (:mod:`sweep.measure.solver`).
+    """
+    flat = pixels
+    if cameras.distorted[0]:
+        view = cameras.view[0]
+        flat = cameras.normalise(pixels[None])[0] * view[:2] + view[2:]
+    middle = objects.mean(axis=0)
+    size = float(np.sqrt(((objects - middle) ** 2).sum(axis=1).mean()))
+    if not size > 0 or not np.isfinite(flat).all():
+        return []
+    unit = (objects - middle) / size @ _Z_IN
+    planar = np.column_stack([unit[:, :2], np.ones(len(unit))])
+    (right, _, _), *_ = np.linalg.lstsq(planar, flat, rcond=None)
+    turn = round(math.atan2(right[1], right[0]) / (math.pi / 2)) % 4
+    cosine, sine = (1.0, 0.0, -1.0, 0.0)[turn], (0.0, 1.0, 0.0, -1.0)[turn]
+    back = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    poses = []
+    for rotation, position in _called(unit @ back.T, flat, cameras.matrix(0), None, method):
+        turned = rotation @ back @ _Z_IN
+        poses.append((turned, position * size - turned @ middle))
+    return poses

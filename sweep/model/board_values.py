@@ -1,0 +1,156 @@
+"""A board as a pipeline declares it: how the markers of [marker] are arranged."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+from sweep.declaration import parameter
+from sweep.model.board import Board
+from sweep.model.board_kinds import BoardMarker, Charuco, Fault, Grid, Markers
+from sweep.model.marker import module_count
+
+SINGLE = "none"
+"""The kind of a marker without a board."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoardValues:
+    """The board's parameters, beside those of [marker]: dictionary, first ID, size, quiet zone."""
+
+    kind: str = parameter(
+        SINGLE, "none: one marker; grid: rows and columns of markers (GridBoard, AprilGrid); "
+        "charuco: a chessboard with markers in its white squares; diamond: a ChArUco diamond of "
+        "3 x 3 squares; markers: those that [[board.markers]] lists",
+        choices=(SINGLE, "grid", "charuco", "diamond", "markers"),
+    )
+    rows: int | None = parameter(None, "rows of markers of a grid", low=1, high=1000)
+    columns: int | None = parameter(None, "markers in a row of a grid", low=1, high=1000)
+    gap_m: float | None = parameter(
+        None, "distance between the black squares of a grid's neighbours", unit="m", low=0,
+        high=1e6,
+    )
+    corner_squares: bool = parameter(
+        False, "black squares of the gap's size at the corners of a grid's markers, as an "
+        "AprilGrid has them",
+    )
+    squares_x: int | None = parameter(None, "squares in a row of a charuco", low=2, high=1000)
+    squares_y: int | None = parameter(None, "squares in a column of a charuco", low=2, high=1000)
+    square_m: float | None = parameter(
+        None, "side of a square of a charuco or diamond", unit="m", low=0, high=1e6, open_low=True
+    )
+    legacy_pattern: bool = parameter(
+        False, "charuco: the pattern before OpenCV 4.6; with an even number of squares_y it begins "
+        "with white at the top left",
+    )
+    markers: tuple[tuple[float, ...], ...] | None = parameter(
+        None, "the markers of kind = markers, each marker_id, x_m, y_m and, if wanted, size_m and "
+        "roll_deg", list_text="tables [[board.markers]]",
+    )
+
+
+NEEDED: dict[str, tuple[str, ...]] = {
+    SINGLE: (),
+    "grid": ("rows", "columns", "gap_m"),
+    "charuco": ("squares_x", "squares_y", "square_m"),
+    "diamond": ("square_m",),
+    "markers": ("markers",),
+}
+"""Kind -> the parameters that it must have."""
+
+FROM_MARKER = ("dictionary", "marker_id", "size_m", "quiet_zone_modules")
+"""Parameters of [marker] that a board takes."""
+
+PIPELINE_NAMES = {
+    "marker_m": "size_m", "first_id": "marker_id", "margin_m": "quiet_zone_modules",
+}
+"""Key of a board's file -> the parameter of a pipeline that says the same."""
+
+
+def arranged(values: Sequence[Any]) -> Charuco | Grid | Markers:
+    """Return the board that values of :data:`ARRANGING` declare, unchecked."""
+    (kind, dictionary, marker_id, size_m, quiet, rows, columns, gap_m, corner_squares, squares_x,
+     squares_y, square_m, legacy_pattern, markers) = values
+    margin_m = quiet * size_m / module_count(dictionary)
+    if kind == "grid" and (rows, columns, corner_squares) != (1, 1, False):
+        return Grid(
+            dictionary=dictionary, rows=rows, columns=columns, marker_m=size_m, gap_m=gap_m,
+            first_id=marker_id, corner_squares=corner_squares, margin_m=margin_m,
+        )
+    if kind in ("charuco", "diamond"):
+        across, down = (3, 3) if kind == "diamond" else (squares_x, squares_y)
+        return Charuco(
+            dictionary=dictionary, squares_x=across, squares_y=down, square_m=square_m,
+            marker_m=size_m, first_id=marker_id, legacy_pattern=legacy_pattern, margin_m=margin_m,
+        )
+    listed = markers if kind == "markers" else ((marker_id, 0.0, 0.0, size_m, 0.0),)
+    return Markers(
+        dictionary=dictionary, quiet_zone_modules=quiet,
+        markers=tuple(
+            BoardMarker(
+                marker_id=int(number), x_m=x, y_m=y, size_m=size_m if side is None else side,
+                roll_deg=roll,
+            )
+            for number, x, y, side, roll in listed
+        ),
+    )
+
+
+ARRANGING = ("kind", *FROM_MARKER, "rows", "columns", "gap_m", "corner_squares", "squares_x",
+             "squares_y", "square_m", "legacy_pattern", "markers")
+"""The parameters that :func:`arranged` takes, in its order."""
+
+
+def arrangement_faults(values: Sequence[Any]) -> list[Fault]:
+    """Return what keeps values of :data:`ARRANGING` from being a board, by pipelines' names."""
+    return [
+        Fault(PIPELINE_NAMES.get(fault.key, fault.key), fault.value, fault.expected)
+        for fault in arranged(values).faults()
+    ]
+
+
+@lru_cache(maxsize=1024)
+def arranged_board(*values: Any) -> Board:
+    """Return the board that values of :data:`ARRANGING` declare, the same for the same values."""
+    return arranged(values).board()
+
+
+MARKER_KEYS = {"marker_id": True, "x_m": True, "y_m": True, "size_m": False, "roll_deg": False}
+"""Key of a table [[board.markers]] -> whether it must be there."""
+
+
+def listed_markers(value: Any) -> tuple[tuple[Any, ...], ...]:
+    """Return tables [[board.markers]] as tuples of ID, x, y, size or None, and turn.
+
+    Raises
+    ------
+    ValueError
+        The expectation, if they are not such tables.
+    """
+    expected = f"tables [[board.markers]] with {', '.join(MARKER_KEYS)}"
+    if not isinstance(value, (list, tuple)) or not value:
+        raise ValueError(expected)
+    rows = []
+    for table in value:
+        if not isinstance(table, Mapping):
+            raise ValueError(expected)  # noqa: TRY004  (a fault of the file)
+        row: dict[str, Any] = {key: table.get(key) for key in MARKER_KEYS}
+        unknown = sorted(map(str, table.keys() - MARKER_KEYS.keys()))
+        missing = [key for key, needed in MARKER_KEYS.items() if needed and key not in table]
+        if unknown or missing:
+            raise ValueError(f"{expected}; {(unknown or missing)[0]} is "
+                             f"{'unknown' if unknown else 'missing'} in one")
+        numbers = [each for key, each in row.items() if key in table]
+        if any(isinstance(each, bool) or not isinstance(each, (int, float)) or abs(each) > 1e6
+               for each in numbers) or not isinstance(row["marker_id"], int):
+            raise ValueError(f"{expected}, all finite numbers up to 10^6")
+        if row["marker_id"] < 0 or (row["size_m"] is not None and row["size_m"] <= 0):
+            raise ValueError(f"{expected}; IDs from 0 on and sizes above 0")
+        size = None if row["size_m"] is None else float(row["size_m"])
+        rows.append((
+            row["marker_id"], float(row["x_m"]), float(row["y_m"]), size,
+            float(row["roll_deg"] or 0.0),
+        ))
+    return tuple(rows)

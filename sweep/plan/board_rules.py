@@ -1,0 +1,122 @@
+"""Rules of pipelines that show boards."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from typing import Any
+
+from sweep.environments.interpreters import INSTALLED
+from sweep.measure.estimators import SOLVERS
+from sweep.messages import shown
+from sweep.model.board_values import ARRANGING, NEEDED, SINGLE, arrangement_faults
+from sweep.plan.alternatives import PHOTOGRAPHS
+from sweep.plan.parameters import Parameter
+from sweep.plan.reader import Reading
+from sweep.plugins.recording import is_recording
+
+MAX_BOARDS = 10_000
+"""The most boards of a grid: all are checked before anything is computed."""
+
+
+def boards_can_be_printed(reading: Reading) -> None:
+    """Demand what each kind of board needs, and boards whose parts do not overlap."""
+    kinds = reading.values("kind")
+    given = [name for name, parameter in reading.parameters.items()
+             if parameter.section == "board" and name in reading.given and name != "kind"]
+    needed = [name for kind in kinds for name in NEEDED[kind] if name not in reading.given]
+    for name in dict.fromkeys(needed):
+        kind = next(kind for kind in kinds if name in NEEDED[kind])
+        reading.faults.append(
+            f"{reading.source}: board.{name}: missing; kind = {shown(kind)} needs it: "
+            f"{reading.parameters[name].declaration.meaning}"
+        )
+    if kinds and all(kind == SINGLE for kind in kinds):
+        for name in given:
+            reading.fault(f"board.{name}", reading.written(name), "a kind beside it, such as grid")
+        return
+    if not kinds or needed or not all(reading.values(name) for name in ARRANGING):
+        return
+    if reading.axis_of("markers") is not None:
+        reading.fault("axes.markers", "...", "markers under [board]: they cannot be an axis")
+        return
+    seen = set()
+    for values in _arrangements(reading):
+        for name, value, expected in arrangement_faults(values):
+            if (name, expected) not in seen:
+                seen.add((name, expected))
+                reading.fault(_path(reading.parameters, name), value, expected)
+        if len(seen) > MAX_FAULTS:
+            return
+
+
+MAX_FAULTS = 10
+"""Faults of boards after which no other board is checked."""
+
+
+def _path(parameters: Any, name: str) -> str:
+    parameter: Parameter | None = parameters.get(name)
+    return name if parameter is None else f"{parameter.section}.{name}"
+
+
+def _arrangements(reading: Reading) -> Iterator[tuple[Any, ...]]:
+    """Yield the values of every board of the grid; note a fault if there are too many."""
+    axes = [axis for axis in reading.axes.values() if not set(axis.columns).isdisjoint(ARRANGING)]
+    count = math.prod(len(axis) for axis in axes)
+    if count > MAX_BOARDS:
+        reading.faults.append(
+            f"{reading.source}: axes: {count:,} different boards: expected at most {MAX_BOARDS:,}"
+        )
+        return
+    for index in itertools.product(*(range(len(axis)) for axis in axes)):
+        chosen = {name: reading.fixed.get(name) for name in ARRANGING}
+        for axis, number in zip(axes, index, strict=True):
+            chosen |= axis.at(number)
+        yield tuple(chosen[name] for name in ARRANGING)
+
+
+def boards_are_searched_and_solved(reading: Reading) -> None:
+    """Demand detectors, solvers and renderers that can do boards."""
+    kinds = reading.values("kind")
+    on_boards = ("points", "refine", "refineDetectedMarkers", "minMarkers")
+    if not kinds or all(kind == SINGLE for kind in kinds):
+        for name in on_boards:
+            if name in reading.given:
+                reading.fault(
+                    f"{reading.parameters[name].section}.{name}", reading.written(name),
+                    "a board: give kind under [board]",
+                )
+        return
+    if PHOTOGRAPHS in reading.given:
+        reading.fault("board.kind", reading.written("kind"), "no board beside photographs, whose "
+                      "board `sweep photos` knows; delete it")
+    for name in reading.values("environment"):
+        if name != INSTALLED:
+            reading.fault("detector.environment", name, f"{INSTALLED}, for boards")
+    for name in reading.values("detector"):
+        if is_recording(name):
+            reading.fault("detector.detector", name, "a detector that searches images, for boards")
+    if "solver" not in reading.given:
+        reading.faults.append(
+            f"{reading.source}: estimator.solver: missing; a board needs one of "
+            f"{', '.join(name for name, each in SOLVERS.items() if each.of_boards)}"
+        )
+    wrong = set()
+    for all_points, solvers in reading.together("points", "solver"):
+        for points, solver in itertools.product(all_points, solvers):
+            one = points == "largest_marker"
+            known = SOLVERS.get(solver)
+            if known is None or not (known.of_boards or (one and known.corners_alone)):
+                wrong.add(solver)
+    for solver in sorted(wrong):
+        reading.fault(
+            "estimator.solver", solver, "one of "
+            f"{', '.join(name for name, each in SOLVERS.items() if each.of_boards)} for boards"
+            + ("" if solver not in SOLVERS else "; others with points = largest_marker"
+               if SOLVERS[solver].corners_alone else ""),
+        )
+    if "chessboard" in reading.values("points") and not {"charuco", "diamond"} & set(kinds):
+        reading.fault(
+            "estimator.points", "chessboard", "kind = charuco or diamond, which have a chessboard"
+        )

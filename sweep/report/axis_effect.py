@@ -32,7 +32,7 @@ def _render(data: ReportData, name: str) -> RenderedFigure:
         sentences(
             "Detection rate, median and 95 % quantile (p95) of rotation and range error, and "
             f"signed mean of the range error (bias), by {name} ({meaning}).",
-            interval_sentence(curves.summary, "detection_rate", marks="Bars and bands"),
+            interval_sentence(data, curves.summary, "detection_rate", marks="Bars and bands"),
             INFINITE_ERRORS, curves.remarks(),
         ),
         curves.table(f"By {name}, with 95 % intervals", RATES | ERRORS),

@@ -67,7 +67,7 @@ def _render(data: ReportData) -> RenderedFigure:
         sentences(
             "RMSE divided by the Cram\u00e9r-Rao bound, over the solved poses that are not "
             "flipped and have a bound: 1 is the best that an unbiased estimator can reach.",
-            interval_sentence(summary, "rotation_over_bound", marks="In the table there"),
+            interval_sentence(data, summary, "rotation_over_bound", marks="In the table there"),
             *grouping.notes, *sizes.notes, data.pooled(*per),
         ),
         Table("RMSE over the bound, with 95 % intervals",

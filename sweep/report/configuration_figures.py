@@ -75,7 +75,7 @@ def _configurations(data: ReportData) -> RenderedFigure:
             FLOOR_NOTE.replace("lower", "left") if any(
                 below_floor(summary[name].values) for name in (
                     "rotation_median_deg", "range_median_percent")) else "",
-            interval_sentence(summary, "solved_rate"), denominators(summary), *notes,
+            interval_sentence(data, summary, "solved_rate"), denominators(summary), *notes,
             data.pooled(),
         ),
         _table("Configurations, with 95 % intervals", names, summary,
@@ -144,7 +144,7 @@ def _paired(data: ReportData) -> RenderedFigure:
             "points (to the right: detected more often), and the ratio of the RMSE of rotation "
             "(where neither is flipped) and range over the scenes that both solve (below 1: "
             "smaller errors).",
-            interval_sentence(others, "detection_difference"),
+            interval_sentence(data, others, "detection_difference"),
             denominators(others, "compared", "pairs"), *grouping.notes,
             data.pooled(),
         ),

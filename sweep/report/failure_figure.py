@@ -146,7 +146,7 @@ def _render(data: ReportData) -> RenderedFigure:
             + (" and by viewing angle (normal to line of sight)" if view.dims else "")
             + ": solved, or the flag that says why not.",
             f"Not counted in the shares: {excluded}." if excluded else "",
-            interval_sentence(along.summary, "share", marks="In the table there"),
+            interval_sentence(data, along.summary, "share", marks="In the table there"),
             *along.notes,
         ),
         along.table(), panels,

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from markupsafe import Markup
 
+from sweep.analysis.dimensions import of_photographs
 from sweep.analysis.quantiles import IntervalOf
 from sweep.report.grouping import group_labels
 from sweep.report.report_data import ReportData
@@ -120,12 +121,21 @@ def lines_of(
     return lines
 
 
-def interval_sentence(summary: xr.Dataset, *names: str, marks: str = "Bars") -> str:
+def interval_sentence(
+    data: ReportData, summary: xr.Dataset, *names: str, marks: str = "Bars"
+) -> str:
     """Return a sentence that says what the drawn intervals are, or why there are none."""
     ends = [summary[f"{name}_{end}"] for name in names for end in ("low", "high")
             if f"{name}_{end}" in summary]
+    photographs = of_photographs(data.results)
     if any(bool(np.isfinite(end).any()) for end in ends):
-        return f"{marks} are 95 % intervals over the random draws, conditional on the grid."
+        drawn = (
+            "photographs, each with all its markers one draw" if photographs
+            else "random draws, conditional on the grid"
+        )
+        return f"{marks} are 95 % intervals over the {drawn}."
+    if photographs:
+        return "No intervals: too few photographs."
     few = "median_interval" in summary and bool(
         (summary["median_interval"] == IntervalOf.too_few_draws).any())
     return "No intervals: too few draws." if few else (

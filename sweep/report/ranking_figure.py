@@ -43,7 +43,7 @@ def _render(data: ReportData) -> RenderedFigure:
             f"{count:,} of {len(names):,} IDs are weak (diamonds): below the expected rate, "
             "with an adjusted p-value under 0.05." if count else
             f"None of {len(names):,} IDs is weak (adjusted p-value under 0.05).",
-            interval_sentence(summary, "detection_rate"), denominators(summary),
+            interval_sentence(data, summary, "detection_rate"), denominators(summary),
             data.pooled(*dims),
         ),
         Table(

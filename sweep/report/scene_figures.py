@@ -81,8 +81,9 @@ def _detection(data: ReportData) -> RenderedFigure:
         sentences(
             f"Share of the poses looked for in which the marker is detected, against its "
             f"{long_name(along)}{_by_angle(data)}.",
-            interval_sentence(curves.summary, "detection_rate", marks="Bands and bars").replace(
-                "intervals over", "intervals (Wilson's) over"),
+            interval_sentence(
+                data, curves.summary, "detection_rate", marks="Bands and bars"
+            ).replace("intervals over", "intervals (Wilson's) over"),
             curves.remarks(),
         ),
         curves.table("Detection rate, with 95 % intervals", RATES | {"draws": ("draws", 1)}),
@@ -103,7 +104,7 @@ def _errors(data: ReportData) -> RenderedFigure:
             "range error (depth, relative to the true depth).",
             FLOOR_NOTE if any(below_floor(curves.summary[each.variable].values)
                               for each in ERROR_CURVES) else "",
-            interval_sentence(curves.summary, "rotation_median_deg", "range_p95_percent",
+            interval_sentence(data, curves.summary, "rotation_median_deg", "range_p95_percent",
                               marks="Bars and bands"), INFINITE_ERRORS, curves.remarks(),
         ),
         curves.table("Errors, with 95 % intervals", LOOKED_FOR | ERRORS),
@@ -136,7 +137,9 @@ def _signed(data: ReportData) -> RenderedFigure:
             f"the {long_name(along)}: the range in percent of the true depth; x (right), y (down) "
             "and z (forward) of the marker's position in the camera's frame; yaw. The table also "
             "has the standard deviations, and pitch and roll.",
-            interval_sentence(curves.summary, "z_bias_m", "yaw_bias_deg", marks="Bars and bands"),
+            interval_sentence(
+                data, curves.summary, "z_bias_m", "yaw_bias_deg", marks="Bars and bands"
+            ),
             curves.remarks("solved", "solved poses"),
         ),
         curves.table("Bias and standard deviation, with 95 % intervals", SIGNED),

@@ -3,15 +3,17 @@
 import html
 import re
 from importlib.resources import files
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import xarray as xr
 from matplotlib.figure import Figure
 
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.report.answer import Answer
 from sweep.report.charts import OUTCOME_COLOURS, draw_lines, draw_stack
-from sweep.report.figure import RenderedFigure
+from sweep.report.figure import RenderedFigure, interval_sentence
 from sweep.report.gallery import Scene
 from sweep.report.page import page
 from sweep.report.provenance_facts import Provenance
@@ -126,3 +128,15 @@ def test_errors_of_rounding_do_not_compress_the_others():
     assert 1e-3 < low < 0.02
     assert 3 < high < 10
     assert not value_scale([Series("", np.arange(4.0), y, none, none)], share=False, level=0.0)[0]
+
+
+def test_intervals_are_said_to_be_over_what_was_drawn():
+    summary = xr.Dataset({"rate_low": 0.1, "rate_high": 0.9})
+    for coordinates, words in (
+        ({}, "over the random draws, conditional on the grid."),
+        ({"photographs": "shots"}, "over the photographs, each with all its markers one draw."),
+    ):
+        data = SimpleNamespace(results=xr.Dataset(coords=coordinates))
+        assert interval_sentence(data, summary, "rate") == f"Bars are 95 % intervals {words}"
+        none = interval_sentence(data, summary + np.nan, "rate")
+        assert ("photographs" in none) == bool(coordinates)

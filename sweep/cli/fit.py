@@ -58,6 +58,7 @@ def _execute(options: argparse.Namespace) -> int:
     from sweep.report.gap_table import gap_records, gap_table  # noqa: PLC0415
     from sweep.report.output_file import check_output_file, write_output_file  # noqa: PLC0415
     from sweep.report.table import Table  # noqa: PLC0415
+    from sweep.store.locations import exists  # noqa: PLC0415
 
     output = Path(options.output)
     check_output_file(output)
@@ -102,7 +103,24 @@ def _execute(options: argparse.Namespace) -> int:
         say(plain_table(gap_table(fitted.gap)))
         say()
     say_next(f"sweep run {shlex.quote(str(output))}", "simulates this camera")
+    store = f"runs/{fitted.pipeline.name}.zarr"
+    compare = shlex.join(["sweep", "compare", store, str(output)])
+    if exists(store):
+        say_next(compare, "the photographs beside their simulation")
+    else:
+        say_next(_measuring_command(options), f"measures the photographs, for {compare}")
     return 0
+
+
+def _measuring_command(options: argparse.Namespace) -> str:
+    """Return the command that measures the photographs of `sweep fit`."""
+    words = ["sweep", "photos", *options.folders]
+    for name in ("camera", "board", "poses", "stereo"):
+        if (value := getattr(options, name)) is not None:
+            words += [f"--{name}", value]
+    for setting in options.settings:
+        words += ["--set", setting]
+    return shlex.join(words)
 
 
 FIT = Command(

@@ -158,6 +158,7 @@ def test_an_argument_is_named_by_its_flag(capsys):
         ("run", "settings"): "--set", ("tradeoff", "limit_s"): "--seconds",
         ("report", "form"): "--format", ("report", "output"): "--output",
         ("report", "store"): "STORE", ("verify", "sample"): "--sample",
+        ("fit", "folders"): "FOLDER", ("photos", "folders"): "FOLDER",
         ("verify", "some_other"): "--some-other",
     }
     for (command, argument), flag in flags.items():

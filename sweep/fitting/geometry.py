@@ -3,9 +3,14 @@
 The fitted corners of a photograph's markers minus those of the board's pose, fitted to the same
 corners, are (1 - P) (shifts + noise), P being the projection on what a pose explains. The shifts
 are a Gaussian field of covariance s² exp(-d² / (2 l²)), as :mod:`sweep.model.image_shift` draws it.
-Two mean squares say s and l (the method of moments): that of the markers' centres, and that of
+Two sums of squares say s and l (the method of moments): that of the markers' centres, and that of
 their corners beside the centres, which turn a pose. The farther the field reaches, the smaller is
 the second one beside the first.
+
+Their covariance follows from the field, too: that of xᵀAx and xᵀBx is 2 tr(AVBV) for normal x of
+covariance V (Searle, "Linear Models", 1971, section 2.5). Size and length that the sums do not
+refuse are the interval. So it is as wide as at the values in it: a small sum has itself a small
+spread, and an interval from the spread would end too early.
 """
 
 from __future__ import annotations
@@ -15,8 +20,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import interpolate, special
 
-from sweep.fitting.estimates import Estimate, estimate, jackknife
+from sweep.analysis.intervals import LEVEL
+from sweep.fitting.estimates import Estimate
 from sweep.fitting.marker_state import CORNERS, MarkerState, products
 from sweep.fitting.noise import PhotographNoise, kernel, smoothed
 from sweep.measure.likelihood import QUANTISATION_VARIANCE
@@ -25,6 +32,10 @@ from sweep.typing import Floats
 LENGTHS = np.geomspace(0.01, 0.4, 24)
 """Correlation lengths that are compared, as shares of the frame's width. A pose takes up most of
 longer ones: their size cannot be said."""
+
+SIZES_PX, FINER = np.geomspace(3e-3, 10.0, 400), 8
+"""Sizes that are tried for the interval, and how many lengths from one of :data:`LENGTHS` to the
+next."""
 
 CELLS = 6
 """Cells along each side of a marker in which the field is taken as constant."""
@@ -43,10 +54,13 @@ class Residuals:
         (2,) px², without those that the pixels' noise is expected to add.
     fields
         (2, lengths) what a field of standard deviation 1 px adds, for each of :data:`LENGTHS`.
+    covariance
+        (3, lengths, 2, 2) of both sums: of the noise alone, and the factors of s² and s⁴.
     """
 
     squares: Floats
     fields: Floats
+    covariance: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,16 +151,29 @@ def residuals_of(
     added, moved = noises.reshape(size, size), weights.reshape(2, size, -1)
     points = np.concatenate([each.points for each in corners])
     distances = ((points[:, None] - points[None]) ** 2).sum(axis=2)
-    linear = [part @ moved for part in parts]
-    fields = np.empty((2, len(LENGTHS)))
+    forms = [part.T @ part for part in parts]
+    by_noise = [form @ added for form in forms]
+    fields, covariance = np.empty((2, len(LENGTHS))), np.empty((3, len(LENGTHS), 2, 2))
     for k, length in enumerate(LENGTHS * width_px):
-        covariance = np.exp(-0.5 * distances / length**2)
-        fields[:, k] = [float(((part @ covariance) * part).sum()) for part in linear]
+        field = np.exp(-0.5 * distances / length**2)
+        shifted = sum(each @ field @ each.T for each in moved)
+        by_field = [form @ shifted for form in forms]
+        fields[:, k] = [np.trace(each) for each in by_field]
+        mixed = _traces(by_noise, by_field)
+        covariance[:, k] = (
+            _traces(by_noise, by_noise), mixed + mixed.T, _traces(by_field, by_field)
+        )
+    flat = shifts.ravel()
     squares = [
-        float(((part @ shifts.ravel()) ** 2).sum() - ((part @ added) * part).sum())
-        for part in parts
+        float(flat @ form @ flat - np.trace(each))
+        for form, each in zip(forms, by_noise, strict=True)
     ]
-    return Residuals(np.array(squares), fields)
+    return Residuals(np.array(squares), fields, covariance)
+
+
+def _traces(first: Sequence[Floats], second: Sequence[Floats]) -> Floats:
+    """Return twice the traces (2, 2) of the products of two matrices with two others."""
+    return np.array([[2.0 * float((one * other.T).sum()) for other in second] for one in first])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,8 +183,7 @@ class Shifts:
     Attributes
     ----------
     size_px, length_px
-        Standard deviation and correlation length; their intervals are the jackknife's, of
-        logarithms.
+        Standard deviation and correlation length.
     squares
         (n,) unbiased estimates of the squared standard deviation by each photograph.
     """
@@ -168,24 +194,81 @@ class Shifts:
 
 
 def shifts_of(residuals: Sequence[Residuals], width_px: float) -> Shifts:
-    """Return the field of shifts that has the mean squares of n photographs' residuals."""
+    """Return the field of shifts that has the sums of squares of n photographs' residuals."""
     squares = np.array([each.squares for each in residuals])
     fields = np.array([each.fields for each in residuals])
+    covariance = np.array([each.covariance for each in residuals])
     size, length = _matched(squares.sum(axis=0), fields.sum(axis=0))
-    without = np.array([
-        _matched(squares.sum(axis=0) - one, fields.sum(axis=0) - other)
-        for one, other in zip(squares, fields, strict=True)
-    ])
-    sizes, lengths = (
-        estimate(jackknife(full, each)).mapped(math.exp)
-        for full, each in zip((size, length), without.T, strict=True)
+    first, last = np.log(LENGTHS[[0, -1]]).tolist()
+    finer = np.linspace(first, last, FINER * (len(LENGTHS) - 1) + 1)
+    distance = _distances(
+        squares.sum(axis=0), _at_lengths(fields.sum(axis=0), finer, 1),
+        _at_lengths(covariance.sum(axis=0), finer, 1), SIZES_PX[:, None],
     )
-    own = np.array([
-        np.interp(length, np.log(LENGTHS), each.sum(axis=0)) for each in fields
-    ])
+    limit = float(special.chdtri(1, 1 - LEVEL)) * _excess(
+        squares, fields, covariance, math.exp(size), length
+    )
+    sizes, lengths = (
+        Estimate(value, *_ends(grid, distance.min(axis=axis), limit)).mapped(math.exp)
+        for value, grid, axis in ((size, np.log(SIZES_PX), 1), (length, finer, 0))
+    )
+    own = _at_lengths(fields.sum(axis=1), length, 1)
     return Shifts(
         sizes, lengths.mapped(lambda share: share * width_px), squares.sum(axis=1) / own
     )
+
+
+def _at_lengths(values: Floats, length: Floats | float, axis: int) -> Floats:
+    """Return values at logarithms of lengths, in the place of those at LENGTHS."""
+    return np.asarray(interpolate.interp1d(np.log(LENGTHS), values, axis=axis)(length))
+
+
+def _distances(squares: Floats, fields: Floats, covariance: Floats, size_px: Floats) -> Floats:
+    """Return the squared standard deviations of sums from what sizes and lengths lead to.
+
+    Sums are (..., 2), fields (2, lengths), covariances (3, lengths, 2, 2), sizes (sizes, 1).
+    """
+    size = size_px**2
+    first, second = (squares[k] - size * fields[k] for k in range(2))
+    one, both, other = (
+        covariance[0, :, i, j] + size * covariance[1, :, i, j] + size**2 * covariance[2, :, i, j]
+        for i, j in ((0, 0), (0, 1), (1, 1))
+    )
+    return np.asarray(
+        (first**2 * other - 2 * first * second * both + second**2 * one) / (one * other - both**2)
+    )
+
+
+def _excess(
+    squares: Floats, fields: Floats, covariance: Floats, size_px: float, length: float
+) -> float:
+    """Return how many times as much photographs vary as photographs with one field do; 1 or more.
+
+    It is 1 if chance does it with more than 5 %.
+    """
+    at = np.array([length])
+    total = sum(
+        float(_distances(one, _at_lengths(field, at, 1), _at_lengths(each, at, 1),
+                         np.array([[size_px]]))[0, 0])
+        for one, field, each in zip(squares, fields, covariance, strict=True)
+    )
+    freedom = squares.size - 2
+    return total / freedom if total > special.chdtri(freedom, 1 - LEVEL) else 1.0
+
+
+def _ends(grid: Floats, distance: Floats, limit: float) -> tuple[float, float]:
+    """Return the first and the last point of a grid within the limit; where lines cross it."""
+    inside = np.flatnonzero(distance <= limit)
+    if not len(inside):
+        return math.nan, math.nan
+    ends = []
+    for k, step in ((int(inside[0]), -1), (int(inside[-1]), 1)):
+        if not 0 <= k + step < len(grid):
+            ends.append(float(grid[k]))
+            continue
+        share = (limit - distance[k]) / (distance[k + step] - distance[k])
+        ends.append(float(grid[k] + share * (grid[k + step] - grid[k])))
+    return ends[0], ends[1]
 
 
 def _matched(squares: Floats, fields: Floats) -> tuple[float, float]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from sweep.analysis.ambiguities import ambiguity
 from sweep.analysis.bound_ratios import efficiency
+from sweep.analysis.camera_calibration import calibration_summary, camera_calibrations
 from sweep.analysis.comparisons import compare
 from sweep.analysis.covariances import covariance_trust
 from sweep.analysis.detection_limits import detection_limit
@@ -26,8 +27,9 @@ from sweep.analysis.searched_limits import requirement_limits
 from sweep.analysis.simulation_gaps import simulation_gap
 
 __all__ = [
-    "ambiguity", "check_requirements", "compare", "covariance_trust", "detection_limit",
-    "detection_rate", "efficiency", "environment_differences", "error_models", "error_statistics",
+    "ambiguity", "calibration_summary", "camera_calibrations", "check_requirements", "compare",
+    "covariance_trust", "detection_limit", "detection_rate", "efficiency",
+    "environment_differences", "error_models", "error_statistics",
     "failure_composition", "farthest_met", "flip_rate", "marker_ranking", "model_covariance",
     "model_errors", "precision_reached", "renderer_bias", "requirement_limits",
     "simulation_gap",

@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from typing import NoReturn
 
+from sweep.cli.calibration import CALIBRATION
 from sweep.cli.check_detector import CHECK_DETECTOR
 from sweep.cli.command import Command
 from sweep.cli.compare import COMPARE
@@ -34,8 +35,8 @@ from sweep.messages import nearest
 from sweep.version import __version__
 
 COMMANDS = (
-    RUN, PLAN, SIZE, LIMIT, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, ERROR_MODEL, VERIFY, STATUS,
-    EXPORT, SCORE, PHOTOS, FIT, COMPARE, CHECK_DETECTOR, PLUGINS, ENVIRONMENTS,
+    RUN, PLAN, SIZE, LIMIT, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, ERROR_MODEL, CALIBRATION,
+    VERIFY, STATUS, EXPORT, SCORE, PHOTOS, FIT, COMPARE, CHECK_DETECTOR, PLUGINS, ENVIRONMENTS,
     COMPLETION,
 )
 """Every command, in the order in which the help lists them."""

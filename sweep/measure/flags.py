@@ -151,6 +151,15 @@ class BoundStatus(Flag):
     not_needed = flag(7, "The precision that was asked for did not need the trial.", counted=False)
 
 
+class CalibrationStatus(Flag):
+    """Result of a camera's calibration from a set of views."""
+
+    not_run = flag(0, "There are too few trials for another set of as many views.", counted=False)
+    calibrated = flag(1, "OpenCV returned a camera.", present=True)
+    too_few_views = flag(2, "The board was found in too few views.")
+    failed = flag(3, "OpenCV raised, or returned what is not finite.")
+
+
 class Flipped(Flag):
     """Whether the solution is nearer to the mirror of the truth than to the truth."""
 

@@ -1,0 +1,351 @@
+"""Camera calibration as an experiment: sets of a board's views through OpenCV's calibration.
+
+The views are the trials of a store whose scenes show boards. Their poses are drawn, so that sets
+of views that have none in common are independent calibrations.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import xarray as xr
+
+from sweep.analysis.described import describes
+from sweep.analysis.dimensions import DRAWS, axes_of, stored_pipeline
+from sweep.analysis.intervals import wilson
+from sweep.errors import ArgumentError, DatasetError, SweepError
+from sweep.measure.flags import CalibrationStatus
+from sweep.measure.intrinsics import (
+    FREE_COEFFICIENTS,
+    INTRINSICS,
+    MIN_VIEWS,
+    Intrinsics,
+    calibrate,
+)
+from sweep.model.board import Board
+from sweep.model.camera import Cameras
+from sweep.model.pose import rotation_of_vector, transform_points
+from sweep.model.scene import build_cameras
+from sweep.plan.boards import shows_boards
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import scene_axes, scene_values
+from sweep.plan.parameters import Stage
+from sweep.plan.variable import cf_attributes
+from sweep.typing import Floats
+
+DIRECTIONS = ("centre", "corner")
+"""Where in the frame the target is whose position is estimated with the calibrated camera."""
+
+POINTS = {"chessboard": "chessboard_corner_error_px", "markers": "marker_corner_error_px"}
+"""The points of a calibration -> the variable that has their errors."""
+
+_SIGMA = 1.959963984540054
+"""Standard deviations of a 95 % interval."""
+
+_AT_CORNER = 0.8
+"""Share of the way from the principal point to the frame's corner."""
+
+
+class _Views(NamedTuple):
+    """The views of one condition: points (k, 3) of the board in metres, and their pixels (k, 2)."""
+
+    objects: list[Floats]
+    pixels: list[Floats]
+
+
+@describes
+def camera_calibrations(
+    results: xr.Dataset, views: Sequence[int], *, points: str | None = None, coefficients: int = 5,
+    target_m: float = 3.0, offset_px: float = 0.0,
+) -> xr.Dataset:
+    """Return camera calibrations from sets of a board's views, and their errors.
+
+    Parameters
+    ----------
+    results
+        Results of a pipeline whose scenes show a board, with trials.
+    views
+        Numbers of views in a set. The trials are cut into sets of the largest number; smaller sets
+        are the first views of those, so that numbers of views are compared on the same images.
+    points
+        "chessboard" or "markers": the points that are used; by default the chessboard's if there
+        is one.
+    coefficients
+        Lens coefficients that are estimated: 0, 1 (k1), 2 (k2), 4 (p1, p2) or 5 (k3). The others
+        are taken for 0.
+    target_m
+        Distance of a target whose position is estimated with each calibrated camera, m.
+
+    offset_px
+        Added to all pixels: 0.5 is the error of a program that takes the first pixel's corner for
+        the origin, where OpenCV has its centre.
+
+    Returns
+    -------
+    xr.Dataset
+        Dimensions: the axes of scene and detector, without ``trial``; ``views``, ``set``.
+
+        - ``calibration``: :class:`~sweep.measure.flags.CalibrationStatus`, and ``used_views``.
+        - ``intrinsic_error``, ``intrinsic_std`` (..., intrinsic): estimated minus true, and the
+          standard deviation that OpenCV reports; fx to cy in px, the coefficients as they are.
+        - ``rms_px``: OpenCV's residual.
+        - ``position_error_m`` (..., direction, xyz): of a target of 0.2 m, parallel to the image plane
+          at ``target_m``, in the frame's centre and most of the way to its corner, from points
+          without noise: what the calibration alone does to a pose, camera frame.
+
+    Raises
+    ------
+    ArgumentError
+        If an argument is not as expected.
+    DatasetError
+        If the results are not those of boards, or have too few trials.
+
+    Notes
+    -----
+    ``cv2.calibrateCameraExtended`` (Zhang, "A flexible new technique for camera calibration",
+    2000), started from OpenCV's own first guess. Its standard deviations are those of least
+    squares with the residuals' variance: they know nothing of errors that all views share, such as
+    a board that is bent or corners that are biased.
+
+    Examples
+    --------
+    >>> from sweep.errors import DatasetError
+    >>> try:
+    ...     camera_calibrations(results, [20])
+    ... except DatasetError as error:
+    ...     print(error)
+    no pipeline in the dataset's attributes: expected results as sweep.open returns them
+    """
+    pipeline = _pipeline_of(results)
+    counts = sorted({int(count) for count in views})
+    if not counts or counts[0] < MIN_VIEWS:
+        raise ArgumentError("views", list(views), f"expected numbers of at least {MIN_VIEWS}")
+    if coefficients not in FREE_COEFFICIENTS:
+        raise ArgumentError(
+            "coefficients", coefficients,
+            f"expected one of {', '.join(map(str, FREE_COEFFICIENTS))}",
+        )
+    if not 0 < target_m < float("inf"):
+        raise ArgumentError("target_m", target_m, "expected a distance above 0 m")
+    name = _points_of(results, points)
+    trials = results.sizes.get(DRAWS, 1)
+    sets = trials // counts[-1]
+    if sets == 0:
+        raise DatasetError(
+            f"{trials} trials: expected at least {counts[-1]}, the views of a set; run the "
+            "pipeline with a longer axis trial"
+        )
+    dims = [dim for dim in axes_of(results, Stage.scene, Stage.detection) if dim != DRAWS]
+    shape = [results.sizes[dim] for dim in dims]
+    grid = (*shape, len(counts), sets)
+    flags = np.zeros(grid, dtype=np.uint8)
+    used = np.zeros(grid, dtype=np.int64)
+    rms = np.full(grid, np.nan)
+    errors, std = (np.full((*grid, len(INTRINSICS)), np.nan) for _ in range(2))
+    position = np.full((*grid, len(DIRECTIONS), 3), np.nan)
+    for index in itertools.product(*map(range, shape)):
+        at = dict(zip(dims, index, strict=True))
+        seen, camera, frame = _views(results, pipeline, at, name)
+        truth = _numbers(camera)
+        for k, count in enumerate(counts):
+            for number in range(sets):
+                chosen = slice(number * counts[-1], number * counts[-1] + count)
+                one = calibrate(
+                    seen.objects[chosen], [each + offset_px for each in seen.pixels[chosen]],
+                    frame, coefficients,
+                )
+                cell = (*index, k, number)
+                flags[cell], used[cell], rms[cell] = one.status, one.views, one.rms_px
+                errors[cell], std[cell] = one.values - truth, one.std
+                if one.status == CalibrationStatus.calibrated:
+                    position[cell] = _position_errors(one, camera, frame, target_m)
+    inner = (*dims, "views", "set")
+    return xr.Dataset(
+        {
+            "calibration": (inner, flags, cf_attributes(
+                "what became of the calibration", flags=CalibrationStatus)),
+            "used_views": (inner, used, cf_attributes("views with enough of the board")),
+            "intrinsic_error": ((*inner, "intrinsic"), errors, cf_attributes(
+                "estimated minus true", "px, 1")),
+            "intrinsic_std": ((*inner, "intrinsic"), std, cf_attributes(
+                "standard deviation that OpenCV reports", "px, 1")),
+            "rms_px": (inner, rms, cf_attributes("root mean square of the residuals", "px")),
+            "position_error_m": ((*inner, "direction", "xyz"), position, cf_attributes(
+                f"error of the position of a target at {target_m:g} m, camera frame", "m")),
+        },
+        coords={
+            **{dim: results[dim] for dim in dims if dim in results.coords},
+            "views": counts, "set": np.arange(sets), "intrinsic": list(INTRINSICS),
+            "direction": list(DIRECTIONS), "xyz": ["x", "y", "z"],
+        },
+        attrs={"points": name, "coefficients": coefficients, "target_m": target_m},
+    )
+
+
+@describes
+def calibration_summary(calibrated: xr.Dataset) -> xr.Dataset:
+    """Return how good calibrations are, over their sets.
+
+    Parameters
+    ----------
+    calibrated
+        As :func:`camera_calibrations` returns them.
+
+    Returns
+    -------
+    xr.Dataset
+        Without ``set``; of the n sets with a camera, ``calibrated`` of ``tried``:
+
+        - ``bias``, ``rmse``, ``mean_std`` (..., intrinsic): mean error and root mean square error,
+          and the root mean square of the reported standard deviations.
+        - ``coverage`` (..., intrinsic): share of the 95 % intervals, the estimate plus or minus
+          1.96 reported standard deviations, that hold the truth; ``coverage_low``,
+          ``coverage_high``: its 95 % interval (Wilson). NaN for what is not estimated.
+        - ``position_rmse_m`` (..., direction, xyz).
+
+    Raises
+    ------
+    KeyError
+        If a variable is missing.
+
+    Notes
+    -----
+    A coverage far below 0.95 says that OpenCV's standard deviations are too small: of a bias that
+    is the same in all views, or of a camera that the views do not determine.
+
+    Examples
+    --------
+    >>> one = xr.Dataset({
+    ...     "calibration": ("set", [1, 1]), "intrinsic_error": (("set", "intrinsic"), [[1.], [3.]]),
+    ...     "intrinsic_std": (("set", "intrinsic"), [[1.], [1.]]),
+    ...     "position_error_m": ("set", [0.01, 0.02]),
+    ... })
+    >>> float(calibration_summary(one)["coverage"][0])
+    0.5
+    """
+    solved = calibrated["calibration"] == CalibrationStatus.calibrated
+    tried = calibrated["calibration"] != CalibrationStatus.not_run
+    error = calibrated["intrinsic_error"].where(solved)
+    std = calibrated["intrinsic_std"].where(solved)
+    free = (std > 0).any("set")
+    held = ((abs(error) <= _SIGMA * std) & solved).sum("set")
+    count = solved.sum("set")
+    low, high = xr.apply_ufunc(wilson, held, count, output_core_dims=[[], []])
+    with_sets = count.where(count > 0)
+    return xr.Dataset({
+        "tried": tried.sum("set"),
+        "calibrated": count,
+        "bias": error.mean("set").assign_attrs(cf_attributes("mean error", "px, 1")),
+        "rmse": ((error**2).mean("set") ** 0.5).assign_attrs(
+            cf_attributes("root mean square error", "px, 1")),
+        "mean_std": ((std**2).mean("set") ** 0.5).assign_attrs(cf_attributes(
+            "root mean square of the reported standard deviations", "px, 1")),
+        "coverage": (held / with_sets).where(free).assign_attrs(cf_attributes(
+            "share of reported 95 % intervals that hold the truth", "1")),
+        "coverage_low": low.where(free & (count > 0)),
+        "coverage_high": high.where(free & (count > 0)),
+        "position_rmse_m": ((calibrated["position_error_m"] ** 2).mean("set") ** 0.5).assign_attrs(
+            cf_attributes("root mean square error of a target's position", "m")),
+    }, attrs=calibrated.attrs)
+
+
+def _pipeline_of(results: xr.Dataset) -> Pipeline:
+    try:
+        pipeline = stored_pipeline(results)
+    except (KeyError, SweepError):
+        raise DatasetError(
+            "no pipeline in the dataset's attributes: expected results as sweep.open returns them"
+        ) from None
+    if not shows_boards(pipeline):
+        raise DatasetError("the scenes show no board: give kind = charuco or grid under [board]")
+    return pipeline
+
+
+def _points_of(results: xr.Dataset, points: str | None) -> str:
+    """Return the points that are used, a key of :data:`POINTS`."""
+    if points is None:
+        return "chessboard" if POINTS["chessboard"] in results else "markers"
+    if points not in POINTS:
+        raise ArgumentError("points", points, f"expected one of {', '.join(POINTS)}")
+    if POINTS[points] not in results:
+        raise ArgumentError("points", points, "expected markers: the board has no chessboard")
+    return points
+
+
+def _views(
+    results: xr.Dataset, pipeline: Pipeline, at: dict[str, int], name: str
+) -> tuple[_Views, Cameras, tuple[int, int]]:
+    """Return the views of a condition, its camera, and the frame's width and height."""
+    axes = scene_axes(pipeline)
+    trials = np.arange(results.sizes.get(DRAWS, 1), dtype=np.intp)
+    indices = [
+        trials if axis.name == DRAWS else np.full(len(trials), at[axis.name], dtype=np.intp)
+        for axis in axes
+    ]
+    values = scene_values(pipeline, indices)
+    cameras = build_cameras(values, len(trials))
+    frame = tuple(
+        int(values[key].broadcast(len(trials))[0]) for key in ("width_px", "height_px")
+    )
+    boards: list[Board] = values["board"].listed(len(trials))
+    cell = results.isel({dim: k for dim, k in at.items() if dim in results.dims})
+    rotation = rotation_of_vector(_by_trial(cell["true_rvec"], ("xyz",)))
+    translation = _by_trial(cell["true_tvec_m"], ("xyz",))
+    variable = POINTS[name]
+    inner = ("chessboard_corner", "xy") if name == "chessboard" else ("marker", "corner", "xy")
+    error = _by_trial(cell[variable], inner).reshape(len(trials), -1, 2).astype(np.float64)
+    seen = _Views([], [])
+    for k, board in enumerate(boards):
+        known = board.chessboard_m if name == "chessboard" else board.corners_m.reshape(-1, 3)
+        found = np.flatnonzero(np.isfinite(error[k, : len(known)]).all(axis=1))
+        truth = cameras.take(np.array([k])).project(
+            transform_points(known[None], rotation[k : k + 1], translation[k : k + 1])
+        )[0]
+        seen.objects.append(known[found])
+        seen.pixels.append(truth[found] + error[k, found])
+    return seen, cameras.take(np.array([0])), (frame[0], frame[1])
+
+
+def _by_trial(array: xr.DataArray, inner: tuple[str, ...]) -> Any:
+    """Return an array's values, by trial first."""
+    if DRAWS not in array.dims:
+        array = array.expand_dims(DRAWS)
+    return array.transpose(DRAWS, *inner).values
+
+
+def _numbers(camera: Cameras) -> Floats:
+    """Return the true numbers (9,) of a camera, as :data:`INTRINSICS` orders them."""
+    return np.concatenate([camera.view[0], camera.lenses[0, :5]])
+
+
+def _position_errors(
+    one: Intrinsics, camera: Cameras, frame: tuple[int, int], distance_m: float
+) -> Floats:
+    """Return the errors (2, 3) in m of the position of a target of 0.2 m at :data:`DIRECTIONS`."""
+    side = 0.2
+    grid = np.stack(np.meshgrid(*[np.linspace(-side / 2, side / 2, 5)] * 2), axis=-1)
+    target = np.column_stack([grid.reshape(-1, 2), np.zeros(25)])
+    rotation = np.diag([1.0, -1.0, -1.0])[None]
+    fx, fy, cx, cy = camera.view[0]
+    corner = np.array([
+        _AT_CORNER * (frame[0] - 1 - cx) / fx, _AT_CORNER * (frame[1] - 1 - cy) / fy
+    ])
+    matrix = np.array([
+        [one.values[0], 0.0, one.values[2]], [0.0, one.values[1], one.values[3]], [0.0, 0.0, 1.0]
+    ])
+    errors = np.full((len(DIRECTIONS), 3), np.nan)
+    for k, bearing in enumerate((np.zeros(2), corner)):
+        position = np.array([*(bearing * distance_m), distance_m])
+        pixels = camera.project(transform_points(target[None], rotation, position[None]))[0]
+        if not np.isfinite(pixels).all():
+            continue
+        success, _, found = cv2.solvePnP(
+            target * [1.0, -1.0, -1.0], pixels, matrix, one.values[4:], flags=cv2.SOLVEPNP_IPPE
+        )
+        if success:
+            errors[k] = np.ravel(found) - position
+    return errors

@@ -1,5 +1,6 @@
 """Which tests run and in which order, what they take, and the cluster that they share."""
 
+import gc
 import os
 import resource
 import sys
@@ -63,6 +64,12 @@ def pytest_collection_modifyitems(config, items):
         skipped = [item for item in items if item.get_closest_marker("long")]
         items[:] = [item for item in items if item not in skipped]
         config.hook.pytest_deselected(items=skipped)
+
+
+def pytest_collection_finish():
+    """Keep the collector of garbage from what was imported and collected, which stays."""
+    gc.collect()
+    gc.freeze()
 
 
 def processor_s():

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.declaration import parameter
+from sweep.measure.covariance import covariance_elsewhere
 from sweep.measure.flags import BoundStatus
 from sweep.measure.likelihood import (
     BACKGROUND_MARGIN_PX,
@@ -23,6 +24,7 @@ from sweep.measure.likelihood import (
     curvature,
     fit,
     marker_view,
+    middle_m,
     mirrored_state,
     noise_variance,
     plane_of,
@@ -32,6 +34,7 @@ from sweep.measure.likelihood import (
 )
 from sweep.measure.positive_definite import pose_covariance
 from sweep.model import coverage
+from sweep.model.board import Board
 from sweep.model.derivatives import POSE, work_space
 from sweep.model.effects import IN_BOUND, NEUTRAL
 from sweep.model.projection import Projection
@@ -143,7 +146,7 @@ def bound_of_scene(
 def bounds(
     scenes: Scenes, rows: NDArray[np.intp], boxes: NDArray[np.int64], unknown_blur: bool
 ) -> Bounds:
-    """Return the bounds of visible scenes ``rows`` (n,) with the marker's ``boxes`` (n, 4).
+    """Return the bounds of visible scenes ``rows`` (n,) with the prints' ``boxes`` (n, 4).
 
     The bound is that of the exact image, after its gain, whichever renderer draws it: of the pixels
     in ``boxes`` and of up to :data:`~sweep.measure.likelihood.BACKGROUND_MARGIN_PX` around them, as
@@ -152,6 +155,7 @@ def bounds(
     the Fisher information (times the noise's variance). With all of a frame of 320 x 240 px the
     bound would be lower by at most 1.0 %, of markers that the frame cuts by 1.3 %
     (``tests/measure/test_bound.py``).
+    Of a board, ``std`` is of its pose, and κ is that of the depth of its middle.
     Levels of black, white and background are unknown; with ``unknown_blur`` the point spread is,
     too. From Kay, "Fundamentals of statistical signal processing: estimation theory" (1993),
     section 3.9, with analytic derivatives (:mod:`sweep.model.derivatives`).
@@ -180,11 +184,12 @@ def bounds(
             status[i] = BoundStatus.clipped
         if status[i] != BoundStatus.given:
             continue
+        key = scenes.markers[scenes.marker[row]]
         view = marker_view(
-            scenes.markers[scenes.marker[row]], scenes.size_m[row], scenes.cameras.optics(row),
-            low[i], noise_variance(noise),
+            key, scenes.size_m[row], scenes.cameras.optics(row), low[i], noise_variance(noise)
         )
-        state = state_of(scenes.rotation[row], scenes.translation[row], blur, levels)
+        arm = scenes.rotation[row] @ middle_m(key) if isinstance(key, Board) else np.zeros(3)
+        state = state_of(scenes.rotation[row], scenes.translation[row] + arm, blur, levels)
         width, height = (high[i] - low[i]).tolist()
         if unknown_blur:
             state[SPREAD] = max(state[SPREAD], MIN_SPREAD_PX)
@@ -194,6 +199,8 @@ def bounds(
         if not exists:
             status[i] = BoundStatus.no_contrast
             continue
+        if arm.any():
+            covariance = covariance_elsewhere(covariance, -arm)
         std[i] = np.sqrt(np.diag(covariance))
         mirror[i] = math.sqrt(mirror_chi_square)
     return Bounds(status, std, kappa, mirror)

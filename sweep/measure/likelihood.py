@@ -1,4 +1,4 @@
-"""The likelihood of a marker's pixels: fitted to an image, and how sharp it is at the truth.
+"""The likelihood of a target's pixels: fitted to an image, and how sharp it is at the truth.
 
 Pixels are exact levels plus independent Gaussian noise. The pose (and the point spread, if it is
 free) is moved by Levenberg-Marquardt; the three grey levels enter linearly and are solved for at
@@ -9,6 +9,7 @@ squares problems whose variables separate", SIAM J. Numer. Anal. 10, 1973).
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.measure.positive_definite import solve_positive
+from sweep.model.board import Board
 from sweep.model.coverage import MarkerEdges
 from sweep.model.derivatives import (
     LEVELS,
@@ -24,8 +26,8 @@ from sweep.model.derivatives import (
     differentiate,
     normal_equations,
 )
-from sweep.model.marker import MarkerKey, edges, module_count
 from sweep.model.pose import rotations, vectors
+from sweep.model.printed import PrintKey, edges_of, extent_of, unit_m
 from sweep.model.projection import Optics, Projection
 from sweep.typing import Floats
 
@@ -62,16 +64,17 @@ PATIENCE = 2
 
 
 class MarkerView(NamedTuple):
-    """An image's known parameters: the marker, its size, the camera and the noise.
+    """An image's known parameters: the marker or board, its size, the camera and the noise.
 
     Attributes
     ----------
     edges
-        The marker's edges.
+        The edges of all that is printed, in modules from the top left corner of the black square;
+        of a board, from that of a square of its first marker's size around the board's middle.
     extent
-        (2,) least and greatest column of the marker's outline, in modules.
+        (4,) left, top, right and bottom of the outline, in the same coordinates.
     modules, size_m
-        Modules along the black square's side, and its length.
+        Modules along that square's side, and its length.
     optics
         The camera; its principal point is relative to the image's first pixel.
     variance
@@ -87,15 +90,37 @@ class MarkerView(NamedTuple):
 
 
 def marker_view(
-    marker: MarkerKey, size_m: float, optics: Optics, corner: NDArray[np.int64], variance: float
+    key: PrintKey, size_m: float, optics: Optics, corner: NDArray[np.int64], variance: float
 ) -> MarkerView:
-    """Return the view of a marker in an image whose first pixel is ``corner`` (2,) of the frame."""
-    modules = module_count(marker[0])
+    """Return the view of a marker in an image whose first pixel is ``corner`` (2,) of the frame.
+
+    Of a board, ``size_m`` is its first marker's side, and the pose is that of its middle, which
+    :func:`middle_m` gives: its perspective and the pose's mirror are those of a marker there.
+    """
+    extent = extent_of(key)
+    outline, box = _around_middle(key) if isinstance(key, Board) else (edges_of(key), extent.sheet)
     local = optics.intrinsics.copy()
     local[2:] -= corner
     return MarkerView(
-        edges(*marker), np.array([-marker[2], modules + marker[2]]), float(modules), float(size_m),
+        outline, box, extent.modules, float(size_m),
         Optics(local, optics.lens, optics.distorted), float(variance),
+    )
+
+
+def middle_m(board: Board) -> Floats:
+    """Return the middle (3,) of a board's sheet in its frame, in metres."""
+    left, top, right, bottom = extent_of(board).sheet
+    return np.array([(left + right) / 2, -(top + bottom) / 2, 0.0]) * unit_m(board)
+
+
+@lru_cache(maxsize=64)
+def _around_middle(board: Board) -> tuple[MarkerEdges, Floats]:
+    """Return edges and extent of a board as :class:`MarkerView` has them."""
+    outline, extent = edges_of(board), extent_of(board)
+    shift = extent.modules / 2 - (extent.sheet[:2] + extent.sheet[2:]) / 2
+    return (
+        MarkerEdges(outline.ends + np.tile(shift, 2), outline.sides),
+        extent.sheet + np.tile(shift, 2),
     )
 
 
@@ -136,10 +161,10 @@ def is_before_camera(state: Floats, view: MarkerView) -> bool:
     facing = 0.0
     for i in range(3):
         facing += rotation[i, 2] * position[i]
-    low, high = view.extent
+    left, top, right, bottom = view.extent
     nearest = min(
-        plane[2, 0] * low + plane[2, 1] * low, plane[2, 0] * low + plane[2, 1] * high,
-        plane[2, 0] * high + plane[2, 1] * low, plane[2, 0] * high + plane[2, 1] * high,
+        plane[2, 0] * left + plane[2, 1] * top, plane[2, 0] * left + plane[2, 1] * bottom,
+        plane[2, 0] * right + plane[2, 1] * top, plane[2, 0] * right + plane[2, 1] * bottom,
     ) + plane[2, 2]
     return facing < 0.0 and nearest > 0.0
 

@@ -77,7 +77,7 @@ def photograph_view(detections: Detections, i: int, reach: float) -> PhotographV
         else surroundings(on_board, extent)
     )
     marker = MarkerView(
-        around, np.array([-extent, modules + extent]), float(modules),
+        around, np.repeat([-extent, modules + extent], 2), float(modules),
         float(detections.size_m[i]), optics, 1.0,
     )
     to_modules[:, 2] += to_modules[:, :2] @ low

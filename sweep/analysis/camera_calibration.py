@@ -93,9 +93,9 @@ def camera_calibrations(
         - ``intrinsic_error``, ``intrinsic_std`` (..., intrinsic): estimated minus true, and the
           standard deviation that OpenCV reports; fx to cy in px, the coefficients as they are.
         - ``rms_px``: OpenCV's residual.
-        - ``position_error_m`` (..., direction, xyz): of a target of 0.2 m, parallel to the image plane
-          at ``target_m``, in the frame's centre and most of the way to its corner, from points
-          without noise: what the calibration alone does to a pose, camera frame.
+        - ``position_error_m`` (..., direction, xyz): of a target of 0.2 m, parallel to the image
+          plane at ``target_m``, in the frame's centre and most of the way to its corner, from
+          points without noise: what the calibration alone does to a pose, camera frame.
 
     Raises
     ------

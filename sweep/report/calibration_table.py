@@ -31,7 +31,8 @@ def calibration_table(summary: xr.Dataset) -> Table:
             first = name == numbers[0]
             depths = [
                 f"{1e3 * float(one['position_rmse_m'].sel(direction=where, xyz='z')):.2g}"
-                if first and np.isfinite(one["position_rmse_m"].sel(direction=where, xyz="z")) else ""
+                if first and np.isfinite(one["position_rmse_m"].sel(direction=where, xyz="z"))
+                else ""
                 for where in one["direction"].values.tolist()
             ]
             rows.append([

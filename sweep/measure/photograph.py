@@ -42,14 +42,17 @@ from sweep.measure.photograph_model import (
 )
 from sweep.measure.photograph_noise import Judgement, judge
 from sweep.measure.photometric import refined_corners
+from sweep.measure.quadrilaterals import from_unit_square
 from sweep.measure.solver import both_planar_solutions, reprojection_errors_px
 from sweep.model.marker import OUTSIDE
 from sweep.typing import Floats
 
 COARSE_STEPS, FINE_STEPS = 10, 30
-SETTLED, COARSELY_SETTLED = 0.25, 4.0
+SETTLED, COARSELY_SETTLED = 16.0, 4.0
 """Squared standard deviations of the last undamped step, of the pixels and of their means. The step
-is taken, and leaves about an eighth of its length."""
+is taken: near the minimum the one after it is a hundredth as long, or with sharpening a quarter.
+Poses on boards of 50 px differ by 0.02 standard deviations, root mean square, from those of a fit
+that goes on to the end."""
 
 FIRST_SPREAD_PX = 0.7
 """Point spread at which fits start."""
@@ -233,12 +236,16 @@ class PhotometricReal:
         turns = np.concatenate([rotation for rotation, _ in poses], axis=1)
         shifts = np.concatenate([translation for _, translation in poses], axis=1)
         positions = np.full((count, 2, 3), np.nan)
+        with np.errstate(invalid="ignore", divide="ignore"):  # three corners on a line
+            squares = from_unit_square(detections.corners)
+        # The first of the two solutions of each set of corners, then the others.
+        order = np.argsort(np.arange(turns.shape[1]) % 2, kind="stable")
+        reach = math.ceil(3 * self.radius_px) if self.sharpening else 0
         for i in range(count):
-            # The first of the two solutions of each set of corners, then the others.
-            order = np.argsort(np.arange(turns.shape[1]) % 2, kind="stable")
             starts = _starts(turns[i, order], shifts[i, order])
-            if len(starts):
-                self._estimate(detections, i, starts, len(sets), out, positions)
+            view = photograph_view(detections, i, squares[i], reach) if len(starts) else None
+            if view is not None:
+                self._estimate(detections, i, view, starts, len(sets), out, positions)
         for turn, position, error in (
             (out.rotation, positions[:, 0], out.reprojection_px),
             (out.alternative_rotation, positions[:, 1], out.alternative_reprojection_px),
@@ -252,14 +259,10 @@ class PhotometricReal:
         return out
 
     def _estimate(
-        self, detections: Detections, i: int, starts: Floats, tried: int, out: Estimates,
-        positions: Floats,
+        self, detections: Detections, i: int, view: PhotographView, starts: Floats, tried: int,
+        out: Estimates, positions: Floats,
     ) -> None:
         """Write the estimate of one detection to ``out``, and the positions of both poses."""
-        reach = math.ceil(3 * self.radius_px) if self.sharpening else 0
-        view = photograph_view(detections, i, reach)
-        if view is None:
-            return
         outside = bool((view.marker.edges.sides == OUTSIDE).any())
         nuisances = Nuisances(outside, self.light, self.tone, self.sharpening, self.radius_px)
         covariance = np.empty((6, 6))
@@ -270,8 +273,8 @@ class PhotometricReal:
             out.status[i] = EstimateStatus.not_converged
             return
         judgement = found.judgement
-        turns = np.diag(covariance)[:3] if judgement.exists else np.array([math.inf])
-        if abs(found.contrast) < MIN_CONTRAST or not turns.max() < math.pi**2:
+        largest = covariance.diagonal()[:3].max() if judgement.exists else math.inf
+        if abs(found.contrast) < MIN_CONTRAST or not largest < math.pi**2:
             return
         out.status[i] = (
             EstimateStatus.not_explained if judgement.misfit_px > MAX_MISFIT_PX

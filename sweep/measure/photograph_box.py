@@ -29,26 +29,34 @@ MODELLED_PX = 5.0
 """Pixels around the fitted ones within which print is in the model: what blur carries inwards."""
 
 
-def photograph_view(detections: Detections, i: int, reach: float) -> PhotographView | None:
+def photograph_view(
+    detections: Detections, i: int, square: Floats, reach: float
+) -> PhotographView | None:
     """Return what is fitted of one detection, and what is known of it; None if that is nothing.
 
-    The pixels of the marker and of its quiet zone, as far as the detected corners tell; ``reach``
-    is how far sharpening carries in px.
+    The pixels of the marker and of its quiet zone, as far as the detected corners tell: ``square``
+    (3, 3) is the homography of the unit square to them. ``reach`` is how far sharpening carries in
+    px.
     """
     padding = PADDING_PX + reach
     dictionary, _, margin = detections.markers[i]
     modules = module_count(dictionary)
-    corners = detections.corners[i]
-    side = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
+    corners = detections.corners[i].tolist()
+    side = 0.25 * sum(math.dist(corners[k - 1], corners[k]) for k in range(4))
     on_board = None if detections.on_board is None else detections.on_board[i]
     ring = margin if on_board is None else clear_modules(on_board)
     ring = min(max(ring, overhang(dictionary) + 0.5), overhang(dictionary) + RING_MODULES)
-    to_modules = _homography(corners, modules)
-    if not np.isfinite(to_modules).all() or not side > 0:
+    if not np.isfinite(square).all() or np.linalg.det(square) == 0.0:
         return None
-    outline = np.array([[-ring, -ring], [modules + ring, -ring], [modules + ring] * 2,
-                        [-ring, modules + ring]])
-    pixels = _mapped(np.asarray(np.linalg.inv(to_modules), dtype=np.float64), outline)
+    to_pixels = square / [modules, modules, 1.0]
+    to_modules = np.asarray(np.linalg.inv(to_pixels), dtype=np.float64)
+    low_end, high_end = -ring, modules + ring
+    outline = to_pixels @ np.array([
+        [low_end, high_end, high_end, low_end], [low_end, low_end, high_end, high_end], [1.0] * 4,
+    ])
+    if not (outline[2] > 0.0).all():
+        return None  # part of it is behind the horizon
+    pixels = (outline[:2] / outline[2]).T
     image, origin = detections.images[i], detections.origins[i]
     low = np.floor(pixels.min(axis=0) - padding).astype(np.int64)
     high = np.ceil(pixels.max(axis=0) + padding).astype(np.int64) + 1
@@ -114,31 +122,6 @@ def _fitted_pixels(
         if first < last:
             spans[i, 0], spans[i, 1] = first, last
     return at, spans
-
-
-def _homography(corners: Floats, modules: float) -> Floats:
-    """Return the homography (3, 3) that takes the corners (4, 2) to the square's, in modules."""
-    square = modules * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    middle = corners.mean(axis=0)
-    rows = []
-    for (x, y), (u, v) in zip((corners - middle).tolist(), square.tolist(), strict=True):
-        rows.append([x, y, 1, 0, 0, 0, -u * x, -u * y, u])
-        rows.append([0, 0, 0, x, y, 1, -v * x, -v * y, v])
-    system_of = np.array(rows)
-    try:
-        solution = np.linalg.solve(system_of[:, :8], system_of[:, 8])
-    except np.linalg.LinAlgError:
-        return np.full((3, 3), np.nan)
-    homography = np.append(solution, 1.0).reshape(3, 3)
-    homography[:, 2] -= homography[:, :2] @ middle
-    return homography
-
-
-def _mapped(homography: Floats, points: Floats) -> Floats:
-    """Return the images (..., 2) of points (..., 2); NaN behind the horizon."""
-    flat = points @ homography[:, :2].T + homography[:, 2]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(flat[..., 2:] > 0, flat[..., :2] / flat[..., 2:], np.nan)
 
 
 @compiled

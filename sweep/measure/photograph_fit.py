@@ -91,20 +91,26 @@ def add_products(columns: Floats, count: int, sums: Floats) -> None:
     """Add the products of the columns of ``count`` pixels to the tiles of the lower triangle."""
     for k in range(0, sums.shape[0], TILE):
         for m in range(0, k + 1, TILE):
-            s00 = s01 = s02 = s03 = s10 = s11 = s12 = s13 = 0.0
-            s20 = s21 = s22 = s23 = s30 = s31 = s32 = s33 = 0.0
-            for p in range(count):
-                row = columns[p]
-                a0, a1, a2, a3 = row[k], row[k + 1], row[k + 2], row[k + 3]
-                b0, b1, b2, b3 = row[m], row[m + 1], row[m + 2], row[m + 3]
-                s00, s01, s02, s03 = s00 + a0 * b0, s01 + a0 * b1, s02 + a0 * b2, s03 + a0 * b3
-                s10, s11, s12, s13 = s10 + a1 * b0, s11 + a1 * b1, s12 + a1 * b2, s13 + a1 * b3
-                s20, s21, s22, s23 = s20 + a2 * b0, s21 + a2 * b1, s22 + a2 * b2, s23 + a2 * b3
-                s30, s31, s32, s33 = s30 + a3 * b0, s31 + a3 * b1, s32 + a3 * b2, s33 + a3 * b3
-            _add_to_row(sums[k], m, s00, s01, s02, s03)
-            _add_to_row(sums[k + 1], m, s10, s11, s12, s13)
-            _add_to_row(sums[k + 2], m, s20, s21, s22, s23)
-            _add_to_row(sums[k + 3], m, s30, s31, s32, s33)
+            add_tile(columns, k, columns, m, count, sums)
+
+
+@compiled_inline
+def add_tile(left: Floats, k: int, right: Floats, m: int, count: int, sums: Floats) -> None:
+    """Add products of four columns of ``left`` from the k-th on with four of ``right``."""
+    s00 = s01 = s02 = s03 = s10 = s11 = s12 = s13 = 0.0
+    s20 = s21 = s22 = s23 = s30 = s31 = s32 = s33 = 0.0
+    for p in range(count):
+        row, other = left[p], right[p]
+        a0, a1, a2, a3 = row[k], row[k + 1], row[k + 2], row[k + 3]
+        b0, b1, b2, b3 = other[m], other[m + 1], other[m + 2], other[m + 3]
+        s00, s01, s02, s03 = s00 + a0 * b0, s01 + a0 * b1, s02 + a0 * b2, s03 + a0 * b3
+        s10, s11, s12, s13 = s10 + a1 * b0, s11 + a1 * b1, s12 + a1 * b2, s13 + a1 * b3
+        s20, s21, s22, s23 = s20 + a2 * b0, s21 + a2 * b1, s22 + a2 * b2, s23 + a2 * b3
+        s30, s31, s32, s33 = s30 + a3 * b0, s31 + a3 * b1, s32 + a3 * b2, s33 + a3 * b3
+    _add_to_row(sums[k], m, s00, s01, s02, s03)
+    _add_to_row(sums[k + 1], m, s10, s11, s12, s13)
+    _add_to_row(sums[k + 2], m, s20, s21, s22, s23)
+    _add_to_row(sums[k + 3], m, s30, s31, s32, s33)
 
 
 @compiled_inline
@@ -127,43 +133,37 @@ def evaluate(
     linear ones eliminated; ``linear`` gets the solution, from which ``state`` gets its last
     entries. Returns infinity if the linear parameters cannot be solved for.
     """
-    amount = state[AMOUNT]
-    squares = _evaluate(view, state, nuisances, work, information, gradient, linear)
-    if nuisances.sharpening and abs(state[AMOUNT] - amount) > MAX_AMOUNT_CHANGE:
-        squares = _evaluate(view, state, nuisances, work, information, gradient, linear)
-    return squares
-
-
-@compiled
-def _evaluate(
-    view: PhotographView, state: Floats, nuisances: Nuisances, work: System,
-    information: Floats, gradient: Floats, linear: Floats,
-) -> float:
-    """Evaluate a state, as :func:`evaluate`, with the slopes of the amount that it has."""
     free, count = information.shape[0], linear.shape[0]
-    matrix = np.empty((free + count + 1, free + count + 1))
-    draw(view, state, nuisances, work)
-    normal_equations(view, state, nuisances, work, matrix)
     end = free + count
+    matrix = np.empty((end + 1, end + 1))
     inner, right = np.empty((count, count)), np.empty((count, free + 1))
-    for k in range(count):
-        right[k, free] = matrix[free + k, end]
-        for m in range(count):
-            inner[k, m] = matrix[free + k, free + m]
-        for m in range(free):
-            right[k, m] = matrix[free + k, m]
-        # What covers no pixel is 0, and what cannot be told from the rest stays small.
-        inner[k, k] = inner[k, k] * (1.0 + 1e-9) if inner[k, k] > 0.0 else 1.0
-    if nuisances.outside and inner[2, 2] < MIN_OUTSIDE_PX:
-        inner[2] = 0.0
-        inner[:, 2] = 0.0
-        inner[2, 2] = 1.0
-        right[2] = 0.0
-    if not solve_positive(inner, right):
-        return math.inf
+    for _ in range(2):
+        draw(view, state, nuisances, work)
+        normal_equations(view, state, nuisances, work, matrix)
+        for k in range(count):
+            right[k, free] = matrix[free + k, end]
+            for m in range(count):
+                inner[k, m] = matrix[free + k, free + m]
+            for m in range(free):
+                right[k, m] = matrix[free + k, m]
+            # What covers no pixel is 0, and what cannot be told from the rest stays small.
+            inner[k, k] = inner[k, k] * (1.0 + 1e-9) if inner[k, k] > 0.0 else 1.0
+        if nuisances.outside and inner[2, 2] < MIN_OUTSIDE_PX:
+            for m in range(count):
+                inner[2, m] = inner[m, 2] = 0.0
+            for m in range(free + 1):
+                right[2, m] = 0.0
+            inner[2, 2] = 1.0
+        if not solve_positive(inner, right):
+            return math.inf
+        for k in range(count):
+            linear[k] = right[k, free]
+        amount = state[AMOUNT]
+        keep_linear(state, nuisances, linear)
+        if not abs(state[AMOUNT] - amount) > MAX_AMOUNT_CHANGE:
+            break
     squares = matrix[end, end]
     for k in range(count):
-        linear[k] = right[k, free]
         squares -= right[k, free] * matrix[free + k, end]
     for i in range(free):
         gradient[i] = matrix[i, end]
@@ -175,11 +175,10 @@ def _evaluate(
                 information[i, j] -= matrix[i, free + k] * right[k, j]
     if state[SPREAD] <= MIN_SPREAD_PX and gradient[POSE] < 0.0:
         # The squares fall beyond the limit.
-        information[POSE] = 0.0
-        information[:, POSE] = 0.0
+        for k in range(free):
+            information[POSE, k] = information[k, POSE] = 0.0
         information[POSE, POSE] = 1.0
         gradient[POSE] = 0.0
-    keep_linear(state, nuisances, linear)
     return max(float(squares), 0.0)
 
 
@@ -222,7 +221,8 @@ def fit_photograph(
     """Move ``state`` to the nearest minimum of the sum of squared residuals.
 
     Returns that sum, and whether the minimum was reached: the undamped Newton step is shorter than
-    ``settled`` squared standard deviations (of residuals as noise), and is taken.
+    ``settled`` squared standard deviations (of residuals as noise), and is taken. The sum after it
+    is the one that it predicts.
     """
     free, count = MOVED, linear_count(nuisances)
     freedom = max(pixel_count(view) - free - count, 1)
@@ -251,7 +251,7 @@ def fit_photograph(
                 moved = stepped(state, newton[:, 0])
                 if is_before_camera(moved, view.marker):
                     overwrite(state, moved)
-                return squares, True
+                return squares - decrement, True
         accepted = False
         for _attempt in range(8):
             damped = information.copy()

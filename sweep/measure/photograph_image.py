@@ -54,25 +54,19 @@ class Slopes(NamedTuple):
     ----------
     rates
         (height, 4 · (width + 1)): of each pixel the image's step from the pixel before, its
-        slopes by x and by y, and that by the point spread's variance as far as it is along x.
-    curved
-        (height, width) the slope by the point spread's variance as far as it is along y.
+        slopes by x and by y, and that by the point spread's variance.
     outside
         (height, width + 1) steps of the area outside.
     """
 
     rates: Floats
-    curved: Floats
     outside: Floats
 
 
 @compiled
 def slope_space(height: int, width: int) -> Slopes:
     """Return the scratch space for a box."""
-    return Slopes(
-        np.zeros((height, 4 * (width + 1))), np.zeros((height, width)),
-        np.zeros((height, width + 1)),
-    )
+    return Slopes(np.zeros((height, 4 * (width + 1))), np.zeros((height, width + 1)))
 
 
 @compiled
@@ -84,8 +78,8 @@ def _add_segment(
 
     ``jump`` is the image's step across it, ``outside`` that of the area outside.
     """
-    rates, curved, outsides = out
-    height, width = curved.shape
+    rates, outsides = out
+    height, width = outsides.shape[0], outsides.shape[1] - 1
     reach = REACH * sigma + 0.5
     if min(xa, xb) > width + reach or min(ya, yb) > height + reach or max(ya, yb) < -reach:
         return
@@ -105,6 +99,7 @@ def _add_segment(
             if first >= width or top > bottom:
                 continue
             weight_x, weight_y = WEIGHTS[node] * jump * dy, WEIGHTS[node] * jump * dx
+            curved_x, curved_y = 0.5 * weight_x / sigma, 0.5 * weight_y / sigma
             begin, end = max(first, 0), min(last, width - 1)
             # Columns left of the box are one step at its first column.
             passed = before = low = low_sum = low_density = 0.0
@@ -134,8 +129,8 @@ def _add_segment(
                     basis[4 * m] = weight_x * (share - before)
                     basis[4 * m + 1] = weight_x * near
                     basis[4 * m + 2] = -weight_y * near
-                    basis[4 * m + 3] = 0.5 * weight_x * (high_density - low_density) / sigma
-                    along_y[4 * m + 3] = 0.5 * weight_y * near / sigma
+                    basis[4 * m + 3] = curved_x * (high_density - low_density)
+                    along_y[4 * m + 3] = curved_y * near
                 before, low, low_sum, low_density = share, high, high_sum, high_density
             at = (top - y) * scale + 6.0 * _STEPS
             low, low_density = 0.0, 0.0

@@ -210,7 +210,7 @@ def smooth(image: Floats, radius: float, smoothed: Floats, scratch: Floats) -> N
 @compiled
 def draw(view: PhotographView, state: Floats, nuisances: Nuisances, work: System) -> None:
     """Write the images of a state to ``work.images``."""
-    (rates, curved, outsides), images = work.slopes, work.images
+    (rates, outsides), images = work.slopes, work.images
     height, width = view.levels.shape
     values = np.zeros(3)
     # The level of what is outside is no slope's if it is not estimated.
@@ -225,8 +225,7 @@ def draw(view: PhotographView, state: Floats, nuisances: Nuisances, work: System
         # Beyond the modelled extent is black.
         level, outside = 0.0, 0.0
         shares, squares, by_x, by_y = images[0, i], images[1, i], images[2, i], images[3, i]
-        by_spread, outer, row, along_y = images[4, i], images[5, i], rates[i], curved[i]
-        steps = outsides[i]
+        by_spread, outer, row, steps = images[4, i], images[5, i], rates[i], outsides[i]
         for j in range(width):
             level += row[4 * j]
             outside += steps[j]
@@ -236,9 +235,8 @@ def draw(view: PhotographView, state: Floats, nuisances: Nuisances, work: System
             gain = 1.0 + tone * (1.0 - 2.0 * level)
             by_x[j] = gain * row[4 * j + 1]
             by_y[j] = gain * row[4 * j + 2]
-            by_spread[j] = gain * (row[4 * j + 3] + along_y[j])
+            by_spread[j] = gain * row[4 * j + 3]
         row[:] = 0.0
-        along_y[:] = 0.0
         steps[:] = 0.0
     if not nuisances.sharpening:
         return

@@ -27,7 +27,7 @@ import numpy as np
 
 from sweep.compilation import compiled
 from sweep.measure.likelihood import DEPTH
-from sweep.measure.photograph_fit import GROUP, TILE, add_products
+from sweep.measure.photograph_fit import GROUP, TILE, add_products, add_tile
 from sweep.measure.photograph_model import (
     CONTRAST,
     MOVED,
@@ -61,6 +61,9 @@ MAX_CORRELATION = 0.9
 
 HELD = 8
 """Components of nodes that move a pixel's level: two of each of the four nodes around it."""
+
+WIDE, RESIDUAL = 2 * TILE, POSE
+"""Numbers kept of each pixel: the pose's six changes by its level, and its residual."""
 
 
 class Judgement(NamedTuple):
@@ -132,6 +135,22 @@ def _run_of_a_cell(view: PhotographView, i: int, first: int, last: int) -> tuple
 
 
 @compiled
+def _write_cell(
+    view: PhotographView, state: Floats, nuisances: Nuisances, images: Floats, i: int, first: int,
+    size: int, columns: Floats,
+) -> tuple[int, int]:
+    """Write the columns of a row's pixels of one cell: by parameters, the level, by shifts.
+
+    ``first`` is the first pixel. Returns the cell, and the pixel after the last.
+    """
+    cell, stop = _run_of_a_cell(view, i, first, view.spans[i, 1])
+    group = columns[: stop - first]
+    write_columns(view, state, nuisances, images, i, first, group)
+    _write_shifts(view, state, images, i, first, cell, group, size + 1)
+    return cell, stop
+
+
+@compiled
 def _products(
     view: PhotographView, state: Floats, nuisances: Nuisances, images: Floats, size: int
 ) -> Floats:
@@ -145,57 +164,65 @@ def _products(
     for i in range(len(view.spans)):
         first, last = view.spans[i]
         while first < last:
-            cell, stop = _run_of_a_cell(view, i, first, last)
-            group = columns[: stop - first]
-            write_columns(view, state, nuisances, images, i, first, group)
-            _write_shifts(view, state, images, i, first, cell, group, size + 1)
+            cell, stop = _write_cell(view, state, nuisances, images, i, first, size, columns)
             add_products(columns, stop - first, sums[cell])
             first = stop
     return sums
 
 
 @compiled
-def _summed(field: Floats, across: float, along: float) -> None:
-    """Replace fields (height, width, n) by their sums with weights across^|Δx| · along^|Δy|."""
-    height, width, count = field.shape
-    before = np.empty((width, count))
+def _correlated_products(
+    field: Floats, view: PhotographView, across: float, along: float
+) -> Floats:
+    """Return the sum (6, 6) over pairs of pixels of their products times the noise's correlation.
+
+    ``field`` (height, width, WIDE) has the six numbers of each pixel; those not fitted are 0. The
+    sum over pairs is that over a pixel's own row and the rows above, and its transpose.
+    """
+    height, width, _ = field.shape
+    above, pairs = np.zeros((width, WIDE)), np.zeros((width, WIDE))
+    passed, sums = np.empty((width, POSE)), np.zeros((WIDE, WIDE))
     for i in range(height):
         row = field[i]
+        a = b = c = d = e = f = 0.0
         for j in range(width):
-            for k in range(count):
-                before[j, k] = row[j, k]
-                if j > 0:
-                    before[j, k] += across * before[j - 1, k]
-        # The sums over the pixels before, the pixel itself included, and over those after it.
-        for j in range(width - 2, -1, -1):
-            for k in range(count):
-                row[j, k] += across * row[j + 1, k]
-        for j in range(1, width):
-            for k in range(count):
-                row[j, k] += across * before[j - 1, k]
-    flat = field.reshape(height, width * count)
-    passed = flat.copy()
-    for i in range(1, height):
-        for j in range(width * count):
-            passed[i, j] += along * passed[i - 1, j]
-    for i in range(height - 2, -1, -1):
-        for j in range(width * count):
-            flat[i, j] += along * flat[i + 1, j]
-    for i in range(1, height):
-        for j in range(width * count):
-            flat[i, j] += along * passed[i - 1, j]
+            at, before = row[j], passed[j]
+            before[0], before[1], before[2], before[3], before[4], before[5] = a, b, c, d, e, f
+            a, b, c = across * (a + at[0]), across * (b + at[1]), across * (c + at[2])
+            d, e, f = across * (d + at[3]), across * (e + at[4]), across * (f + at[5])
+        a = b = c = d = e = f = 0.0
+        for j in range(width - 1, -1, -1):
+            at, before, sum_above, pair = row[j], passed[j], above[j], pairs[j]
+            a, b, c, d, e, f = a + at[0], b + at[1], c + at[2], d + at[3], e + at[4], f + at[5]
+            before[0], before[1], before[2] = before[0] + a, before[1] + b, before[2] + c
+            before[3], before[4], before[5] = before[3] + d, before[4] + e, before[5] + f
+            a, b, c = across * a, across * b, across * c
+            d, e, f = across * d, across * e, across * f
+            for m in range(POSE):
+                weighted = along * sum_above[m]
+                sum_above[m] = weighted + before[m]
+                pair[m] = 2.0 * weighted + before[m]
+        first, last = view.spans[i]
+        for k in range(0, WIDE, TILE):
+            for m in range(0, WIDE, TILE):
+                add_tile(row[first:last], k, pairs[first:last], m, last - first, sums)
+    products = np.empty((POSE, POSE))
+    for k in range(POSE):
+        for m in range(POSE):
+            products[k, m] = 0.5 * (sums[k, m] + sums[m, k])
+    return products
 
 
 @compiled
-def _lagged(residuals: Floats, view: PhotographView, down: int, right: int) -> float:
-    """Return the mean product of residuals of fitted pixels a lag apart; others are 0."""
+def _lagged(field: Floats, view: PhotographView, down: int, right: int) -> float:
+    """Return the mean product of residuals of fitted pixels a lag apart."""
     total, count = 0.0, 0
-    for i in range(len(residuals) - down):
+    for i in range(len(field) - down):
         first = max(view.spans[i, 0], view.spans[i + down, 0] - right)
         last = min(view.spans[i, 1], view.spans[i + down, 1] - right)
-        row, other = residuals[i], residuals[i + down]
+        row, other = field[i], field[i + down]
         for j in range(first, last):
-            total += row[j] * other[j + right]
+            total += row[j, RESIDUAL] * other[j + right, RESIDUAL]
         count += max(last - first, 0)
     return total / max(count, 1)
 
@@ -265,9 +292,8 @@ def judge(
     pull -= _product(crossed.T, fitted)
     shifts, ridged = pull.copy(), schur.copy()
     mean_square = 0.0
-    for i in range(height):
-        for j in range(view.spans[i, 0], view.spans[i, 1]):
-            mean_square += view.levels[i, j] ** 2 / pixels
+    for cell in range(len(sums)):
+        mean_square += sums[cell, size, size] / pixels
     for k in range(size):
         mean_square -= fitted[k, 0] * levels[k, 0] / pixels
     for k in range(nodes):
@@ -276,41 +302,35 @@ def judge(
         return none
     # What is left after the best field of shifts is noise.
     fitted -= _product(influence, shifts)
-    residuals = np.zeros((height, width))
-    influences = np.zeros((height, width, POSE))
-    _write_residuals(
-        view, state, nuisances, work.images, inverse, fitted, shifts, residuals, influences
-    )
-    variance = _lagged(residuals, view, 0, 0)
-    across = _ratio(_lagged(residuals, view, 0, 1), variance)
-    along = _ratio(_lagged(residuals, view, 1, 0), variance)
+    field = np.zeros((height, width, WIDE))
+    _write_residuals(view, state, nuisances, work.images, inverse, fitted, shifts, field)
+    variance = _lagged(field, view, 0, 0)
+    across = _ratio(_lagged(field, view, 0, 1), variance)
+    along = _ratio(_lagged(field, view, 1, 0), variance)
     variance *= pixels / freedom
-    fields = influences.copy()
-    _summed(fields, across, along)
-    covariance[:] = 0.0
-    for i in range(height):
-        for j in range(view.spans[i, 0], view.spans[i, 1]):
-            for m in range(POSE):
-                for k in range(POSE):
-                    covariance[m, k] += variance * fields[i, j, m] * influences[i, j, k]
+    products = _correlated_products(field, view, across, along)
+    for m in range(POSE):
+        for k in range(POSE):
+            covariance[m, k] = variance * products[m, k]
     raised = 0.0
     for m in range(POSE):
         raised += covariance[m, m] / (variance * inverse[m, m] * POSE) if variance > 0.0 else 0.0
     correlations = _correlations()
-    spread = _product(schur, _product(correlations, schur))
+    spread = _product(schur, schur)
     noise_pull = expected = trace = square_trace = 0.0
     for a in range(nodes):
         noise_pull += pull[a, 0] ** 2
-        expected += spread[a, a]
         trace += schur[a, a]
         for b in range(nodes):
+            expected += correlations[a, b] * spread[a, b]
             square_trace += schur[a, b] ** 2
     # The noise alone gives a pull of that mean, and of this standard deviation.
     excess = noise_pull - raised * variance * trace
     chance = SIGNIFICANT * raised * variance * math.sqrt(2.0 * square_trace)
     shift_variance = excess / expected if excess > chance else 0.0
     misfit = math.sqrt(excess / square_trace) if excess > chance else 0.0
-    shifted = _product(influence, _product(correlations, influence.T))
+    of_pose = influence[:POSE]
+    shifted = _product(of_pose, _product(correlations, of_pose.T))
     distance = abs(state[DEPTH])
     for m in range(POSE):
         for k in range(POSE):
@@ -322,31 +342,36 @@ def judge(
 @compiled
 def _write_residuals(
     view: PhotographView, state: Floats, nuisances: Nuisances, images: Floats, inverse: Floats,
-    fitted: Floats, shifts: Floats, residuals: Floats, influences: Floats,
+    fitted: Floats, shifts: Floats, field: Floats,
 ) -> None:
-    """Write residuals (height, width), and the pose's changes by them (height, width, 6)."""
+    """Write the pose's changes by the pixels' levels, and residuals, to ``field``."""
     size = len(fitted)
-    columns, weights = np.empty((GROUP, size + 1 + HELD)), np.empty((size, POSE))
+    columns, weights = np.empty((GROUP, size + 1 + HELD)), np.zeros((size + 1, WIDE))
+    of_cell = np.empty(HELD)
+    weights[size, RESIDUAL] = 1.0
     for k in range(size):
+        weights[k, RESIDUAL] = -fitted[k, 0]
         for m in range(POSE):
             weights[k, m] = inverse[k, m]
     for i in range(len(view.spans)):
         first, last = view.spans[i]
         while first < last:
-            cell, stop = _run_of_a_cell(view, i, first, last)
-            group = columns[: stop - first]
-            write_columns(view, state, nuisances, images, i, first, group)
-            _write_shifts(view, state, images, i, first, cell, group, size + 1)
+            cell, stop = _write_cell(view, state, nuisances, images, i, first, size, columns)
+            for a in range(HELD):
+                of_cell[a] = shifts[_component(cell, a), 0]
             for j in range(stop - first):
-                column, changes = group[j], influences[i, first + j]
-                residual = column[size]
-                for k in range(size):
-                    residual -= column[k] * fitted[k, 0]
-                    for m in range(POSE):
-                        changes[m] += column[k] * weights[k, m]
+                column, out = columns[j], field[i, first + j]
+                s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0
+                for k in range(size + 1):
+                    value, weight = column[k], weights[k]
+                    s0, s1 = s0 + value * weight[0], s1 + value * weight[1]
+                    s2, s3 = s2 + value * weight[2], s3 + value * weight[3]
+                    s4, s5 = s4 + value * weight[4], s5 + value * weight[5]
+                    s6, s7 = s6 + value * weight[6], s7 + value * weight[7]
                 for a in range(HELD):
-                    residual -= column[size + 1 + a] * shifts[_component(cell, a), 0]
-                residuals[i, first + j] = residual
+                    s6 -= column[size + 1 + a] * of_cell[a]
+                out[0], out[1], out[2], out[3] = s0, s1, s2, s3
+                out[4], out[5], out[6], out[7] = s4, s5, s6, s7
             first = stop
 
 

@@ -17,6 +17,7 @@ from sweep.measure.photograph_model import (
     draw,
     system,
 )
+from sweep.measure.quadrilaterals import from_unit_square
 from sweep.measure.surroundings import BoardMarker, clear_modules, surroundings
 from sweep.model.board_image import BoardPose, render_board
 from sweep.model.board_kinds import Charuco, Grid
@@ -153,7 +154,7 @@ def test_image_and_slopes_are_those_of_dense_sampling(lens):
     rng = np.random.default_rng(2)
     image = photograph(CHARUCO, pose, rng, lens=lens)
     found = detections(CHARUCO, [5], image, pose, rng, lens=lens, error_px=0.0)
-    view = photograph_view(found, 0, 2.0)
+    view = photograph_view(found, 0, from_unit_square(found.corners)[0], 2.0)
     turn, position = pose_of(CHARUCO, 5, pose)
     work = system(*view.levels.shape)
     state = np.zeros(STATE_LENGTH)

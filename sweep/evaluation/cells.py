@@ -178,7 +178,9 @@ def _run_batch(
         if result.boards is None or boards is None:
             add(compute(DETECTION, DetectionResults(scenes, flags, result.corners)))
         else:
-            add(compute(BOARD_DETECTION, BoardResults(boards, result.boards, flags)))
+            of_boards = {name: function for name, function in BOARD_DETECTION.items()
+                         if name in columns}  # without chessboards their corners are no variable
+            add(compute(of_boards, BoardResults(boards, result.boards, flags)))
         for j, estimator in enumerate(estimating):
             rows = np.flatnonzero((flags == DetectionStatus.detected) & need[:, k, j])
             start = time.perf_counter()

@@ -74,6 +74,12 @@ def arranged(values: Sequence[Any]) -> Charuco | Grid | Markers:
     (kind, dictionary, marker_id, size_m, quiet, rows, columns, gap_m, corner_squares, squares_x,
      squares_y, square_m, legacy_pattern, markers) = values
     margin_m = quiet * size_m / module_count(dictionary)
+    # Along an axis, numbers are floating-point.
+    counts: list[Any] = [
+        None if each is None else int(each)
+        for each in (marker_id, rows, columns, squares_x, squares_y)
+    ]
+    marker_id, rows, columns, squares_x, squares_y = counts
     if kind == "grid" and (rows, columns, corner_squares) != (1, 1, False):
         return Grid(
             dictionary=dictionary, rows=rows, columns=columns, marker_m=size_m, gap_m=gap_m,
@@ -143,8 +149,9 @@ def listed_markers(value: Any) -> tuple[tuple[Any, ...], ...]:
             raise ValueError(f"{expected}; {(unknown or missing)[0]} is "
                              f"{'unknown' if unknown else 'missing'} in one")
         numbers = [each for key, each in row.items() if key in table]
-        if any(isinstance(each, bool) or not isinstance(each, (int, float)) or abs(each) > 1e6
-               for each in numbers) or not isinstance(row["marker_id"], int):
+        bounded = all(isinstance(each, (int, float)) and not isinstance(each, bool)
+                      and abs(each) <= 1e6 for each in numbers)
+        if not bounded or not isinstance(row["marker_id"], int):
             raise ValueError(f"{expected}, all finite numbers up to 10^6")
         if row["marker_id"] < 0 or (row["size_m"] is not None and row["size_m"] <= 0):
             raise ValueError(f"{expected}; IDs from 0 on and sizes above 0")

@@ -306,7 +306,7 @@ def _bitmap(
 def _board_bitmap(
     board: Board, black: float, white: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """As :func:`_bitmap`, of a board: pixels on edges have the mean of their area."""
+    """As :func:`_bitmap`, of a board: pixels on edges have the mean of their area, beside it 0."""
     extent = extent_of(board)
     scale = float(WARP_PX_PER_MODULE)
     left, top, right, bottom = extent.sheet.tolist()
@@ -315,24 +315,31 @@ def _board_bitmap(
     ])
     width, height = math.ceil((right - left) * scale), math.ceil((bottom - top) * scale)
     cover, bitmap = np.zeros((height, width + 2)), np.empty((height, width))
-    level = np.array([white, black, white])
     coverage.accumulate(
-        cover, edges_of(board), level,
+        cover, edges_of(board), np.array([0.0, black, white]),
         Projection(plane, Optics(np.array([1.0, 1.0, 0.0, 0.0]), lens.pack(()), False)), 0, 0, 0.0,
     )
-    coverage.sum_levels(cover, white, bitmap)
+    coverage.sum_levels(cover, 0.0, bitmap)
     x0, y0, x1, y1 = ((extent.ink - np.tile(extent.sheet[:2], 2)) * scale - 0.5).tolist()
     corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], dtype=np.float32)
     return bitmap.astype(np.float32), corners
 
 
+def _bitmap_share(key: PrintKey, bitmap: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the share (height, width) of each pixel of a bitmap that is printed on a sheet."""
+    return _bitmap(key, 1.0, 1.0)[0] if isinstance(key, Board) else np.ones_like(bitmap)
+
+
 @lru_cache(maxsize=1024)
 def _grey_bitmap(
-    key: PrintKey, black: float, white: float
+    key: PrintKey, black: float, white: float, behind: float
 ) -> tuple[Grey, NDArray[np.float32]]:
-    """As :func:`_bitmap`, in 8 bits."""
+    """As :func:`_bitmap`, in 8 bits; ``behind`` is the level between a board's sheets."""
     bitmap, corners = _bitmap(key, black, white)
-    return quantise(bitmap.astype(np.float64)), corners
+    levels = bitmap.astype(np.float64)
+    if isinstance(key, Board):
+        levels += (1.0 - _bitmap_share(key, bitmap)) * behind
+    return quantise(levels), corners
 
 
 def _perspective(
@@ -346,7 +353,10 @@ def _perspective(
 def _warp_grey(scenes: Scenes, row: int, box: Box, view: Grey) -> None:
     """Take the paper's steps 5-8: only the corners are projected, and OpenCV warps the bitmap."""
     background, black, white = scenes.levels[row].tolist()
-    bitmap, corners = _grey_bitmap(scenes.markers[scenes.marker[row]], black, white)
+    key = scenes.markers[scenes.marker[row]]
+    bitmap, corners = _grey_bitmap(
+        key, black, white, background if isinstance(key, Board) else 0.0
+    )
     transform = _perspective(scenes, row, box, corners)
     size = (box[2] - box[0], box[3] - box[1])
     level = int(background + (0.5 + coverage.ROUNDING_SNAP))
@@ -358,11 +368,12 @@ def _warp_grey(scenes: Scenes, row: int, box: Box, view: Grey) -> None:
 def _warp_levels(
     scenes: Scenes, row: int, box: Box, mean: NDArray[np.float64], share: NDArray[np.float64]
 ) -> None:
-    """As :func:`_warp_grey`, not quantised, with the marker's share as the warp of ones."""
-    bitmap, corners = _bitmap(
-        scenes.markers[scenes.marker[row]], *scenes.levels[row, 1:].tolist()
-    )
+    """As :func:`_warp_grey`, not quantised, with the marker's share as the warp of its own."""
+    key = scenes.markers[scenes.marker[row]]
+    bitmap, corners = _bitmap(key, *scenes.levels[row, 1:].tolist())
     transform = _perspective(scenes, row, box, corners)
     size = (box[2] - box[0], box[3] - box[1])
     mean[:] = cv2.warpPerspective(bitmap, transform, size, flags=cv2.INTER_LINEAR)
-    share[:] = cv2.warpPerspective(np.ones_like(bitmap), transform, size, flags=cv2.INTER_LINEAR)
+    share[:] = cv2.warpPerspective(
+        _bitmap_share(key, bitmap), transform, size, flags=cv2.INTER_LINEAR
+    )

@@ -102,6 +102,7 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
             f"{reading.source}: estimator.solver: missing; a board needs one of "
             f"{', '.join(name for name, each in SOLVERS.items() if each.of_boards)}"
         )
+        return
     wrong = set()
     for all_points, solvers in reading.together("points", "solver"):
         for points, solver in itertools.product(all_points, solvers):

@@ -1,0 +1,226 @@
+"""Runs with boards give what a plain OpenCV loop over full frames gives."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from support.blocks import run_block
+from support.board_pictures import DICTIONARY, KINDS, NAME, SIZE_M, opencv_board
+from support.lengths import first_of
+from sweep.model.extent import marker_boxes
+from sweep.model.renderers import render
+from sweep.model.scene import build_scenes
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
+
+CAMERA = np.array([[300.0, 0, 159.5], [0, 300, 119.5], [0, 0, 1]])
+LENS = [-0.2, 0.05, 0.0, 0.0]
+METHODS = {
+    "iterative": cv2.SOLVEPNP_ITERATIVE, "sqpnp": cv2.SOLVEPNP_SQPNP, "ippe": cv2.SOLVEPNP_IPPE,
+    "epnp": cv2.SOLVEPNP_EPNP,
+}
+DETECTED, NOT_VISIBLE = 1, 5
+SOLVED, SOLVER_FAILED, TOO_FEW = 1, 3, "too_few_points"
+
+
+def text(name, trials, window):
+    kind = dict(KINDS[name])
+    tables = "".join(
+        "[[board.markers]]\n" + "".join(f"{key} = {value}\n" for key, value in row.items())
+        for row in kind.pop("markers", [])
+    )
+    board = "".join(
+        f"{key} = {str(value).lower() if isinstance(value, bool) else repr(value)}\n"
+        for key, value in kind.items()
+    )
+    points = ["markers", "chessboard"] if "square_m" in kind else ["markers"]
+    return f"""
+seed = 8
+[camera]
+width_px = 320
+height_px = 240
+fx_px = 300
+fy_px = 300
+[marker]
+dictionary = "{NAME}"
+size_m = {SIZE_M}
+[board]
+{board}{tables}
+[pose]
+tilt_deg = {{ uniform = [0, 70] }}
+azimuth_deg = {{ uniform = [0, 360] }}
+roll_deg = {{ uniform = [0, 360] }}
+bearing_x_deg = {{ uniform = [-24, 24] }}
+bearing_y_deg = {{ uniform = [-18, 18] }}
+[scene]
+window = "{window}"
+black = 30
+white = 220
+background = 100
+noise_grey = 3
+blur_px = 0.5
+[estimator]
+guarded = false
+[axes]
+distance_m = [0.13, 0.25]
+trial = {trials}
+distortion = [[], {LENS}]
+cornerRefinementMethod = ["none", "subpix"]
+solver = {list(METHODS)}
+points = {points}
+"""
+
+
+def board_detector(board, refinement):
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = refinement
+    detector = cv2.aruco.ArucoDetector(DICTIONARY, parameters)
+    charuco = isinstance(board, cv2.aruco.CharucoBoard)
+    return detector, cv2.aruco.CharucoDetector(board) if charuco else None
+
+
+def exact(points, board):
+    """The board's own points next to OpenCV's float32 ones, the same to the bit: where a solver's
+    iterations end (at FLT_EPSILON, or after 15 steps of SQPnP) hangs on the last digits."""
+    known = np.concatenate([board.corners_m.reshape(-1, 3), board.chessboard_m])
+    distance = np.linalg.norm(points[:, None] - known, axis=2)
+    assert distance.min(axis=1).max() < 1e-7
+    return known[distance.argmin(axis=1)]
+
+
+def mean_side(corners):
+    quads = np.array(corners).reshape(-1, 4, 2)
+    return np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2).mean()
+
+
+def plain_pose(objects, pixels, lens, method, limit_px):
+    """OpenCV's pose of a board in OpenCV's frame, and its RMS error; None if it is no pose."""
+    try:
+        found, rvec, tvec = cv2.solvePnP(objects, pixels, CAMERA, lens, flags=method)
+    except cv2.error:
+        return None
+    if not found or not np.isfinite([rvec, tvec]).all():
+        return None
+    depth = objects @ Rotation.from_rotvec(rvec.ravel()).as_matrix().T[:, 2] + tvec[2]
+    if (depth <= 0).any():
+        return None
+    off = cv2.projectPoints(objects, rvec, tvec, CAMERA, lens)[0].reshape(-1, 2) - pixels
+    rms = np.sqrt(np.mean(np.sum(off**2, axis=1)))
+    return None if rms > limit_px else (rvec.ravel(), tvec.ravel(), rms)
+
+
+@pytest.mark.parametrize("window", first_of(("full", "auto"), 1))
+@pytest.mark.parametrize("name", first_of(("charuco", *(k for k in KINDS if k != "charuco")), 2))
+def test_a_board_of_a_run_is_what_a_plain_opencv_loop_finds(name, window, request):
+    trials = 15 if request.node.get_closest_marker("long") else 1
+    pipeline = Pipeline.from_text(text(name, trials, window), [])
+    shape = tuple(len(axis) for axis in scene_axes(pipeline))
+    block = Block((0,) * len(shape), shape)
+    result = run_block(pipeline, block)
+    assert not result.failures
+    got = {
+        key: column.reshape(len(block), *column.shape[len(shape) :])
+        for key, column in result.values.items()
+    }
+    values = scene_values(pipeline, block_indices(block))
+    scenes = build_scenes(values, len(block))
+    (printed,) = set(values["board"].listed(len(block)))
+    boxes = marker_boxes(scenes)
+    board, ours = opencv_board(name)
+    object_corners = ours(board.getObjPoints())
+    number = {marker_id: k for k, marker_id in enumerate(board.getIds().ravel().tolist())}
+    points_names = ["markers", "chessboard"] if "square_m" in KINDS[name] else ["markers"]
+    compared = solved = 0
+    for row in range(len(block)):
+        if (got["detection"][row] == NOT_VISIBLE).all():
+            continue
+        lens = np.array(LENS) if scenes.cameras.distorted[row] else None
+        image = render(scenes, row, boxes[row], (0, 0, 320, 240))
+        rotation, position = scenes.rotation[row], scenes.translation[row]
+        vector = Rotation.from_matrix(rotation).as_rotvec()
+
+        def projected(points, vector=vector, position=position, lens=lens):
+            return cv2.projectPoints(points, vector, position, CAMERA, lens)[0].reshape(-1, 2)
+
+        for k, refinement in enumerate((0, 1)):
+            if window == "auto" and refinement:
+                continue  # refined corners depend on the window: tests/evaluation/test_window.py
+            detector, charuco = board_detector(board, refinement)
+            corners, ids, _ = detector.detectMarkers(image)
+            listed = [] if ids is None else ids.ravel().tolist()
+            flags = got["marker_detection"][row, k]
+            assert got["detection"][row, k] == DETECTED or not (flags == DETECTED).any()
+            # What is detected is in the loop's list, with its corners; a marker of the loop that
+            # lies at the truth is detected.
+            for marker_id, m in number.items():
+                quads = [np.reshape(q, (4, 2)) for q, i in zip(corners, listed, strict=True)
+                         if i == marker_id]
+                truth = projected(object_corners[m])
+                errors = [np.abs(q - truth).max() for q in quads]
+                if quads and min(errors) < 3:
+                    assert flags[m] == DETECTED
+                    error = got["marker_corner_error_px"][row, k, m]
+                    # Corners as OpenCV's float32, and OpenCV's float32 points of the board.
+                    assert np.abs(error - (quads[int(np.argmin(errors))] - truth)).max() < 1e-4
+                    compared += 1
+                elif flags[m] != DETECTED:
+                    assert np.isnan(got["marker_corner_error_px"][row, k, m]).all()
+                else:
+                    assert quads
+            if not (flags == DETECTED).any():
+                continue
+            # matchImagePoints of a CharucoBoard takes the chessboard's corners.
+            markers = cv2.aruco.Board(board.getObjPoints(), DICTIONARY, board.getIds())
+            found = [markers.matchImagePoints(corners, ids)]
+            if charuco is not None:
+                cross, cross_ids, _, _ = charuco.detectBoard(
+                    image, markerCorners=corners, markerIds=ids
+                )
+                seen = np.isfinite(got["chessboard_corner_error_px"][row, k]).all(axis=1)
+                indices = [] if cross_ids is None else cross_ids.ravel().tolist()
+                assert np.flatnonzero(seen).tolist() == sorted(indices)
+                if indices:
+                    order = np.argsort(indices)
+                    truth = projected(ours(board.getChessboardCorners())[indices])
+                    off = cross.reshape(-1, 2) - truth
+                    # A window changes a corner's refinement in its last digits.
+                    assert np.abs(
+                        got["chessboard_corner_error_px"][row, k][seen] - off[order]
+                    ).max() < 2e-3
+                found.append(
+                    board.matchImagePoints(cross, cross_ids) if indices else (None, None)
+                )
+            for (solver, method), (p, _) in (
+                (each, point) for each in METHODS.items() for point in enumerate(points_names)
+            ):
+                at = (row, k, list(METHODS).index(solver), p)
+                objects, pixels = found[p]
+                status = got["estimate"][at]
+                if objects is None or len(objects) < 4:
+                    assert status not in (SOLVED, SOLVER_FAILED)
+                    continue
+                pose = plain_pose(
+                    exact(ours(objects.reshape(-1, 3)), printed),
+                    pixels.reshape(-1, 2).astype(np.float64), lens, method, 0.25 * mean_side([
+                        q for q, i in zip(corners, listed, strict=True) if i in number
+                    ]),
+                )
+                if pose is None or status != SOLVED:
+                    # What lies at the limit may fall on either side of it.
+                    assert (pose is None) == (status != SOLVED)
+                    continue
+                solved += 1
+                assert got["point_count"][at] == len(pixels)
+                # A window changes the last digits of a chessboard's corners; SQPnP ends 2e-4 m
+                # apart for objects that differ by rounding.
+                scale = 500 if solver == "sqpnp" else 1 if window == "full" else 50
+                error = pose[1] - position
+                assert np.abs(got["translation_error_m"][at] - error).max() < scale * 1e-6
+                turn = Rotation.from_rotvec(pose[0]) * Rotation.from_matrix(rotation).inv()
+                stored = Rotation.from_rotvec(got["rotation_error_rad"][at].astype(np.float64))
+                assert (stored * turn.inv()).magnitude() < scale * 1e-5
+                assert abs(got["reprojection_error_px"][at] - pose[2]) < scale * 1e-4
+    print(f"\n{name}, {window}: {len(block)} boards, {compared} markers, {solved} poses")
+    assert compared > 2 * trials
+    assert solved > 2 * trials

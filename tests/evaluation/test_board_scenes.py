@@ -1,0 +1,253 @@
+"""Boards of pipelines have the images of their parts, each clipped to each pixel or sampled."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from support.bent_sheets import flat_points
+from support.board_pictures import KINDS, NAME, SIZE_M, clipped_frame, painted, parts
+from support.lengths import first_of, lengths
+from support.small_scenes import image_of, scenes_of
+from sweep.model.exposure import marker_exposure
+from sweep.model.extent import marker_boxes
+from sweep.model.renderers import marker_levels
+
+LEVELS = {"black": 20.3, "white": 230.1, "background": 90.4}
+SIZE = (96, 80)
+
+TEXT = f"""
+seed = 3
+[camera]
+width_px = {SIZE[0]}
+height_px = {SIZE[1]}
+fx_px = 110
+fy_px = 105
+[marker]
+dictionary = "{NAME}"
+size_m = {SIZE_M}
+[scene]
+black = {LEVELS["black"]}
+white = {LEVELS["white"]}
+background = {LEVELS["background"]}
+[estimator]
+solver = "iterative"
+[pose]
+distance_m = 0.2
+"""
+
+
+def board_text(name):
+    """The pipeline's text with a board of ``KINDS``, or of what a dictionary says."""
+    kind = KINDS[name] if isinstance(name, str) else name
+    values = "".join(
+        f"{key} = {json.dumps(value)}\n" for key, value in kind.items() if key != "markers"
+    )
+    tables = "".join(
+        "[[board.markers]]\n" + "".join(f"{key} = {value}\n" for key, value in row.items())
+        for row in kind.get("markers", [])
+    )
+    return f"{TEXT}[board]\n{values}{tables}"
+
+
+def drawn(count, seed):
+    """Poses as settings, some cut by the frame."""
+    rng = np.random.default_rng(seed)
+    return [
+        [f"distance_m={rng.uniform(0.1, 0.5)}", f"tilt_deg={rng.uniform(0, 75)}",
+         f"azimuth_deg={rng.uniform(0, 360)}", f"roll_deg={rng.uniform(0, 360)}",
+         f"bearing_x_deg={rng.uniform(-20, 20)}", f"bearing_y_deg={rng.uniform(-15, 15)}"]
+        for _ in range(count)
+    ]
+
+
+def shown(scenes):
+    """Whether all of a board lies well before the camera and faces it."""
+    return (
+        scenes.outline_m[0, :, 2].min() > 0.03
+        and scenes.rotation[0, :, 2] @ scenes.translation[0] < 0
+    )
+
+
+def expected(name, scenes, hides=None):
+    return clipped_frame(
+        name, LEVELS, scenes.cameras.view[0], scenes.rotation[0], scenes.translation[0], SIZE,
+        hides,
+    )
+
+
+def exact_levels(scenes, areas=None):
+    """Levels (h, w) of the frame before quantisation."""
+    box = marker_boxes(scenes)[0]
+    frame = np.full((SIZE[1], SIZE[0]), LEVELS["background"])
+    if box[2] > box[0]:
+        if areas is None:
+            mean, share = marker_levels(scenes, 0, tuple(box.tolist()))
+            inner = mean + (1 - share) * LEVELS["background"]
+        else:
+            inner = marker_exposure(scenes, 0, tuple(box.tolist()), areas)
+        frame[box[1] : box[3], box[0] : box[2]] = inner
+    return frame
+
+
+@pytest.mark.parametrize("name", first_of(KINDS, 3))
+@lengths(2, 40)
+def test_every_pixel_of_a_board_is_its_clipped_area(name, count):
+    compared, worst = 0, 0.0
+    for settings in drawn(4 * count, 1):
+        scenes = scenes_of(settings, board_text(name))
+        if not shown(scenes) or compared == count:
+            continue
+        compared += 1
+        # The plain image (one call for all its scenes), and the levels before quantisation.
+        clipped = expected(name, scenes)
+        worst = max(worst, np.abs(exact_levels(scenes) - clipped).max())
+        image = image_of(settings, text=board_text(name))
+        off = np.abs(image - clipped)
+        assert off.max() < 0.5 + 255e-9
+    print(f"{name}: {compared} poses, worst {worst:.1e} grey levels")
+    assert compared == count
+    assert worst < 255e-9
+
+
+@pytest.mark.parametrize("name", first_of([name for name in KINDS if name != "markers"], 1))
+@lengths(2, 20)
+def test_an_occluded_board_is_its_clipped_parts_and_the_sheet(name, count):
+    rng = np.random.default_rng(4)
+    compared = 0
+    for pose in drawn(4 * count, 2):
+        share, angle = rng.choice([0.1, 0.3, 0.7]), float(rng.choice([0.0, 90.0, 37.0, -140.0]))
+        settings = [*pose, f"occlusion={share}", f"occlusion_deg={angle}", "occluder=150"]
+        scenes = scenes_of(settings, board_text(name))
+        if not shown(scenes) or compared == count:
+            continue
+        compared += 1
+        # The sheet hides a share of the width of what is black.
+        points = np.concatenate([
+            corners for corners, level, _ in parts(name, LEVELS) if level == LEVELS["black"]
+        ])
+        low, high = points.min(axis=0), points.max(axis=0)
+        normal = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
+        limit = normal @ (low + high) / 2 + (high - low) @ np.abs(normal) * (0.5 - share)
+        areas = np.array([LEVELS["background"], LEVELS["black"], LEVELS["white"], 150.0])
+        found = exact_levels(scenes, areas)
+        assert np.abs(found - expected(name, scenes, (normal, limit, 150.0))).max() < 255e-9
+    assert compared == count
+
+
+ROUND = [f"{key}={round(level)}" for key, level in LEVELS.items()]
+"""Levels that 8 bits have."""
+
+LENS = "distortion=[-0.25, 0.08, 0.001, -0.0008]"
+
+
+@pytest.mark.parametrize("name", first_of(KINDS, 1))
+@pytest.mark.parametrize("settings", [[], [LENS]])
+@lengths(1, 6)
+def test_samples_of_a_board_are_its_exact_image(name, settings, count):
+    compared = 0
+    for pose in drawn(4 * count, 3):
+        scenes = scenes_of([*pose, *settings], board_text(name))
+        if not shown(scenes) or compared == count:
+            continue
+        compared += 1
+        text = board_text(name)
+        exact = image_of([*pose, *settings], text=text).astype(float)
+        sampled = image_of([*pose, *settings, "renderer='supersample-16-jittered'"], text=text)
+        # An edge of 210 levels crosses 16 to 32 of 256 cells, the sample of each on either side:
+        # 210 sqrt(32 / 6) / 256 = 1.9 levels of standard deviation, of which 5 hold.
+        off = exact - sampled
+        assert np.abs(off).max() < 10.5
+        assert np.sqrt(np.mean(off**2)) < 1.2
+        assert abs(off.mean()) < 0.1
+    assert compared == count
+
+
+@pytest.mark.parametrize("case", first_of(
+    [(name, lens) for lens in ([LENS], []) for name in ("charuco", "markers", "april")], 1
+))
+def test_a_blurred_board_is_its_finer_image_through_a_gaussian(case):
+    name, lens = case
+    fine, blur_px = 8, 0.9
+    pose = ["distance_m=0.24", "tilt_deg=35", "azimuth_deg=50", "roll_deg=25", *lens, *ROUND]
+    found = image_of([*pose, f"blur_px={blur_px}"], text=board_text(name)).astype(float)
+    finer = image_of(
+        [*pose, f"width_px={fine * SIZE[0]}", f"height_px={fine * SIZE[1]}", f"fx_px={fine * 110}",
+         f"fy_px={fine * 105}"],
+        text=board_text(name),
+    ).astype(float)
+    blurred = gaussian_filter(finer, fine * blur_px, mode="nearest", truncate=6)
+    mean = blurred.reshape(SIZE[1], fine, SIZE[0], fine).mean(axis=(1, 3))
+    # Rounding to a grey level, and what pixels of an eighth blur.
+    assert np.abs(found - mean).max() < 0.5 + 0.5
+    assert abs((found - mean).mean()) < 0.05
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["charuco", "markers", "april"])
+@pytest.mark.parametrize(("bend", "curvature"), [("cylinder", 4.0), ("saddle", -3.0)])
+def test_a_bent_board_is_what_rays_meet(name, bend, curvature):
+    settings = ["distance_m=0.3", "tilt_deg=25", "azimuth_deg=50", "roll_deg=25",
+                f"curvature_per_m={curvature}", f"bend='{bend}'", "bend_deg=23", *ROUND]
+    scenes = scenes_of(settings, board_text(name))
+    found = image_of(settings, text=board_text(name)).astype(float)
+    fine = 12
+    rng = np.random.default_rng(5)
+    shape = SIZE[1] * fine, SIZE[0] * fine
+    v, u = (np.indices(shape) + rng.random((2, *shape))) / fine - 0.5
+    fx, fy, cx, cy = scenes.cameras.view[0]
+    rays = np.column_stack([((u - cx) / fx).ravel(), ((v - cy) / fy).ravel(), np.ones(u.size)])
+    points = flat_points(
+        rays, scenes.rotation[0], scenes.translation[0], bend, curvature, np.radians(23)
+    )
+    levels = {key: round(level) for key, level in LEVELS.items()}
+    sampled = painted(name, levels, points).reshape(SIZE[1], fine, SIZE[0], fine).mean(axis=(1, 3))
+    off = found - sampled
+    # 210 sqrt(24 / 6) / 144 = 2.9 levels of standard deviation; 5 of them, and the rounding.
+    assert np.abs(off).max() < 15
+    assert np.sqrt(np.mean(off**2)) < 1.7
+    assert abs(off.mean()) < 0.15
+
+
+SINGLE = {
+    "grid": {"kind": "grid", "rows": 1, "columns": 1, "gap_m": 0.01},
+    "markers": {"kind": "markers", "markers": [{"marker_id": 0, "x_m": 0, "y_m": 0}]},
+}
+WITH = (
+    [], ["blur_px=0.7", "noise_grey=3"], [LENS], ["renderer='warp'"],
+    ["renderer='supersample-4'"], ["curvature_per_m=6", "bend_deg=30"],
+    ["curvature_per_m=6", LENS, "blur_px=0.5", "occlusion=0.2"], ["background=230.1"],
+    ["velocity_x_m_s=0.3", "exposure_s=0.01"], ["marker_scale=1.02", "jpeg_quality=70"],
+)
+
+
+@pytest.mark.parametrize("settings", first_of(WITH, 8))
+@pytest.mark.parametrize("kind", SINGLE)
+def test_a_board_of_one_marker_is_that_marker_to_the_bit(settings, kind):
+    poses = [["distance_m=0.06", "tilt_deg=40", "azimuth_deg=70", "roll_deg=200"],
+             ["distance_m=0.1", "bearing_x_deg=20", "tilt_deg=10"]]
+    for pose in poses:
+        single = image_of([*pose, *settings], text=TEXT)
+        board = image_of([*pose, *settings], text=board_text(SINGLE[kind]))
+        assert np.ptp(single) > 100
+        np.testing.assert_array_equal(board, single)
+
+
+@pytest.mark.parametrize("case", first_of(
+    [(name, more) for more in ([], ["noise_grey=0.1"]) for name in reversed(KINDS)], 1
+))
+def test_a_warped_board_has_the_levels_of_its_exact_image(case, tmp_path):
+    name, more = case
+    pose = ["distance_m=0.3", "tilt_deg=30", "azimuth_deg=70", "roll_deg=30", *more]
+    path = tmp_path / "behind.png"
+    cv2.imwrite(str(path), np.full((SIZE[1], SIZE[0]), 90, dtype=np.uint8))
+    for behind in ([], [f"background='{path}'"]):
+        exact, warped = (
+            image_of([*pose, *behind, renderer], text=board_text(name)).astype(float)
+            for renderer in ("renderer='exact'", "renderer='warp'")
+        )
+        # Interpolation takes a point of each pixel, not its mean: right on average alone.
+        assert abs((exact - warped).mean()) < 2
+        assert np.abs(cv2.blur(exact - warped, (7, 7))).max() < 45

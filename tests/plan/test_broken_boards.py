@@ -1,0 +1,82 @@
+"""A board that cannot be says so, in one line."""
+
+import numpy as np
+import pytest
+
+from sweep.errors import PipelineError
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import scene_values
+
+TEXT = """
+[marker]
+dictionary = "DICT_4X4_50"
+size_m = 0.05
+[estimator]
+solver = "iterative"
+[pose]
+distance_m = 0.4
+[board]
+"""
+ONE = "[[board.markers]]\nmarker_id = 1\nx_m = 0\ny_m = 0\n"
+OTHER = "[[board.markers]]\nmarker_id = 2\nx_m = 0.1\ny_m = 0\n"
+GRID = 'kind = "grid"\nrows = 5\ncolumns = 7\ngap_m = 0.01'
+TABLE = f'kind = "markers"\n{ONE}{OTHER}'
+
+BROKEN = {
+    "markers that overlap": (
+        TABLE.replace("0.1", "0.06"), "board.markers = [1, 2]: expected markers that do not overlap"
+    ),
+    "an ID twice": (
+        TABLE.replace("= 2", "= 1"), "board.markers = [1, 1]: expected each ID once; 1 is listed"
+    ),
+    "an ID beyond the dictionary": (TABLE.replace("= 2", "= 50"), "expected IDs from 0 to 49"),
+    "an unknown key of a marker": (TABLE.replace("y_m = 0\n", "z_m = 0\n", 1), "z_m is unknown"),
+    "a missing key of a marker": (TABLE.replace("x_m = 0.1\n", ""), "x_m is missing in one"),
+    "a coordinate that is no number": (TABLE.replace("0.1", "nan"), "all finite numbers"),
+    "a coordinate that is text": (TABLE.replace("0.1", '"a"'), "all finite numbers"),
+    "a marker without size": (TABLE + "size_m = 0", "sizes above 0"),
+    "a dictionary too small": (
+        'kind = "charuco"\nsquares_x = 20\nsquares_y = 20\nsquare_m = 0.06',
+        "expected IDs from 0 to 49, which is what DICT_4X4_50 has; the board has 200 markers",
+    ),
+    "markers larger than their squares": (
+        'kind = "diamond"\nsquare_m = 0.05', "marker.size_m = 0.05: expected below square_m"
+    ),
+    "too many markers": (GRID.replace("7", "1000"), "a board of at most 4000 markers; it has 5000"),
+    "a kind without its sizes": ('kind = "diamond"', 'board.square_m: missing; kind = "diamond"'),
+    "sizes without a kind": ("rows = 3", "board.rows = 3: expected a kind beside it"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_board_that_cannot_be_is_one_line(name):
+    text, expected = BROKEN[name]
+    with pytest.raises(PipelineError) as error:
+        Pipeline.from_text(TEXT + text, [])
+    (line,) = str(error.value).splitlines()
+    assert expected in line
+    assert len(line) < 400
+
+
+@pytest.mark.parametrize(("setting", "expected"), [
+    ("solver='ippe_square'", "others with points = largest_marker"),
+    ("points='chessboard'", "kind = charuco or diamond, which have a chessboard"),
+])
+def test_a_solver_that_boards_lack_is_one_line(setting, expected):
+    with pytest.raises(PipelineError) as error:
+        Pipeline.from_text(TEXT + GRID, [setting])
+    (line,) = str(error.value).splitlines()
+    assert expected in line
+
+
+def test_without_a_solver_the_message_names_those_of_boards():
+    with pytest.raises(PipelineError) as error:
+        Pipeline.from_text(TEXT.replace('solver = "iterative"', "") + GRID, [])
+    (line,) = str(error.value).splitlines()
+    assert "estimator.solver: missing; a board needs one of ippe, iterative, sqpnp, epnp" in line
+
+
+def test_rows_of_a_grid_can_be_an_axis():
+    pipeline = Pipeline.from_text(TEXT + GRID, ["rows=[1,2,5]"])
+    boards = scene_values(pipeline, [np.arange(3)])["board"].listed(3)
+    assert [len(board) for board in boards] == [7, 14, 35]

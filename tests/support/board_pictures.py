@@ -1,0 +1,163 @@
+"""Boards as lists of convex parts, laid out by OpenCV, and their images by polygon clipping."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import cv2
+import numpy as np
+
+from support.exact_image import add_clipped, kept
+
+NAME = "DICT_5X5_100"
+DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+MODULES = 7
+SIZE_M = 0.021
+MODULE_M = SIZE_M / MODULES
+
+CHARUCO: Mapping[str, Any] = {
+    "kind": "charuco", "squares_x": 4, "squares_y": 4, "square_m": 0.03,
+}
+TABLE = ((5, -0.04, 0.0, SIZE_M, 30.0), (9, 0.03, 0.01, 0.035, -70.0), (2, 0.0, -0.05, 0.028, 0.0))
+KINDS: dict[str, Mapping[str, Any]] = {
+    "grid": {"kind": "grid", "rows": 2, "columns": 3, "gap_m": 0.006},
+    "april": {"kind": "grid", "rows": 2, "columns": 2, "gap_m": 0.006, "corner_squares": True},
+    "charuco": CHARUCO,
+    "legacy": {**CHARUCO, "legacy_pattern": True},
+    "diamond": {"kind": "diamond", "square_m": 0.03},
+    "markers": {"kind": "markers", "markers": [
+        dict(zip(("marker_id", "x_m", "y_m", "size_m", "roll_deg"), row, strict=True))
+        for row in TABLE
+    ]},
+}
+"""Name -> what a pipeline has under [board]; markers of 5 x 5 bits from ID 0 on."""
+
+
+def table_corners():
+    """Return the corners (3, 4, 2) of the table's markers, right and up in m."""
+    corners = []
+    for _, x, y, size, roll in TABLE:
+        square = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]) * size / 2
+        c, s = np.cos(np.radians(roll)), np.sin(np.radians(roll))
+        corners.append(square @ np.array([[c, s], [-s, c]]) + [x, y])
+    return np.array(corners)
+
+
+def opencv_board(name):
+    """Return OpenCV's board and what takes its points (right, down, z in) to ours."""
+    kind = KINDS[name]
+    if kind["kind"] == "grid":
+        gap, shape = kind["gap_m"], (kind["columns"], kind["rows"])
+        board = cv2.aruco.GridBoard(shape, SIZE_M, gap, DICTIONARY)
+        middle = (np.array(shape) * (SIZE_M + gap) - gap) / 2
+    elif kind["kind"] == "markers":
+        points = np.pad(table_corners() * [1, -1], ((0, 0), (0, 0), (0, 1)))
+        board = cv2.aruco.Board(
+            points.astype(np.float32), DICTIONARY, np.array([row[0] for row in TABLE])
+        )
+        middle = np.zeros(2)
+    else:
+        shape = (3, 3) if name == "diamond" else (kind["squares_x"], kind["squares_y"])
+        board = cv2.aruco.CharucoBoard(shape, kind["square_m"], SIZE_M, DICTIONARY)
+        board.setLegacyPattern(name == "legacy")
+        middle = np.array(shape) * kind["square_m"] / 2
+    return board, lambda points: (np.asarray(points) - [*middle, 0]) * [1, -1, -1]
+
+
+def rectangle(left, up, right, down):
+    return np.array([[left, up], [right, up], [right, down], [left, down]])
+
+
+def parts(name, levels):
+    """Yield convex corners (4, 2), right and up in m, the level there, and the level below it.
+
+    In the order of painting.
+    """
+    kind = KINDS[name]
+    black, white, behind = levels["black"], levels["white"], levels["background"]
+    board, ours = opencv_board(name)
+    if name == "markers":
+        squares = [(corners, 1.0) for corners in table_corners()]
+    else:
+        # OpenCV's points are float32: what lies on one lattice is put there.
+        squares = [(np.round(corners / 0.0005) * 0.0005, None)
+                   for corners in ours(board.getObjPoints())]
+        if kind["kind"] == "grid":
+            step, shape = SIZE_M + kind["gap_m"], np.array([kind["columns"], kind["rows"]])
+            half = (shape * step - kind["gap_m"]) / 2 + (kind["gap_m"] if name == "april" else 0)
+        else:
+            step = kind["square_m"]
+            shape = np.array([kind.get("squares_x", 3), kind.get("squares_y", 3)])
+            half = shape * step / 2
+        yield rectangle(*(-half - MODULE_M) * [1, -1], *(half + MODULE_M) * [1, -1]), white, behind
+        if name == "april":
+            for i, j in np.ndindex(shape[1] + 1, shape[0] + 1):
+                x, y = -half[0] + j * step, half[1] - i * step
+                yield rectangle(x, y, x + kind["gap_m"], y - kind["gap_m"]), black, white
+        elif name != "grid":
+            white_first = name == "legacy" and shape[1] % 2 == 0
+            for i, j in np.ndindex(shape[1], shape[0]):
+                if (i + j + white_first) % 2 == 0:
+                    x, y = -half[0] + j * step, half[1] - i * step
+                    yield rectangle(x, y, x + step, y - step), black, white
+    for marker_id, (corners, quiet) in zip(board.getIds().ravel().tolist(), squares, strict=True):
+        top_left, right, down = corners[[0, 1, 3], :2]
+        across, along = (right - top_left) / MODULES, (down - top_left) / MODULES
+
+        def cell(x0, y0, x1, y1, start=top_left, a=across, b=along):
+            return np.array([
+                start + x * a + y * b for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+            ])
+
+        if quiet is not None:
+            yield cell(-quiet, -quiet, MODULES + quiet, MODULES + quiet), white, behind
+        bits = cv2.aruco.generateImageMarker(DICTIONARY, marker_id, MODULES)
+        for i, j in np.ndindex(MODULES, MODULES):
+            if not bits[i, j]:
+                yield cell(j, i, j + 1, i + 1), black, white
+
+
+def painted(name, levels, points):
+    """Return the levels (n,) of points (n, 2), right and up in m; NaN is beside the board."""
+    found = np.full(len(points), float(levels["background"]))
+    for corners, level, _ in parts(name, levels):
+        inside = np.ones(len(points), dtype=bool)
+        for start, stop in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            along = stop - start
+            off = points - start
+            inside &= along[0] * off[:, 1] - along[1] * off[:, 0] <= 0
+        found[inside] = level
+    return found
+
+
+def clipped_frame(name, levels, view, rotation, translation, size, hides=None):
+    """Return the levels (height, width) of a frame: each part clipped to each pixel.
+
+    ``view``: fx, fy, cx, cy. ``hides``: (normal (2,), limit, level) of a sheet over what lies
+    beyond ``normal · point = limit`` on the board, which ends where the board's sheet does; then
+    the board must have one sheet.
+    """
+    shape = size[1], size[0]
+    image, share = np.full(shape, float(levels["background"])), np.zeros(shape)
+    matrix = np.array([[view[0], 0, view[2]], [0, view[1], view[3]], [0, 0, 1]])
+    frame = np.array([[1, 0, 0.5], [0, 1, 0.5], [-1, 0, size[0] - 0.5], [0, -1, size[1] - 0.5]])
+    plane = matrix @ np.column_stack([rotation[:, :2], translation])
+
+    def paint(corners, jump):
+        polygon = [plane @ [*point, 1.0] for point in corners]
+        for side in frame:
+            polygon = kept(polygon, side)
+        if len(polygon) > 2:
+            add_clipped(
+                image, share, np.array([point[:2] / point[2] for point in polygon]), jump
+            )
+
+    for number, (corners, level, below) in enumerate(parts(name, levels)):
+        if hides is None:
+            paint(corners, level - below)
+            continue
+        normal, limit, cover = hides
+        flat = np.column_stack([corners, np.ones(4)])
+        paint([p[:2] for p in kept(list(flat), np.array([*-normal, limit]))], level - below)
+        if number == 0:
+            paint([p[:2] for p in kept(list(flat), np.array([*normal, -limit]))], cover - below)
+    return image

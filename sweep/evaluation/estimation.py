@@ -111,6 +111,8 @@ def board_detections_for(
         [boards.boards[row] for row in rows.tolist()],
         [result.boards.points[row] for row in rows.tolist()],
         cameras.take(rows), noise[rows], blur[rows], (size / scenes.size_m)[rows],
+        [result.images[row] for row in rows.tolist()] if result.images else [],
+        result.origins[rows],
     )
 
 

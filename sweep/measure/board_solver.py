@@ -18,7 +18,7 @@ from sweep.measure.solver import both_planar_solutions, estimate
 from sweep.model.board import Board
 from sweep.model.camera import Cameras
 from sweep.model.pose import rotation_of_vector, transform_points
-from sweep.typing import Floats, Integers
+from sweep.typing import Floats, Grey, Integers
 
 BOARD_METHODS: dict[str, int] = {
     "iterative": cv2.SOLVEPNP_ITERATIVE,
@@ -63,6 +63,8 @@ class BoardDetections:
         N cameras, and (N,) as :class:`sweep.measure.estimation.Detections` has them.
     scale
         (N,) believed size of the board relative to the true one.
+    images, origins
+        As :class:`sweep.measure.estimation.Detections` has them.
     """
 
     boards: Sequence[Board]
@@ -71,12 +73,15 @@ class BoardDetections:
     noise_grey: Floats
     blur_px: Floats
     scale: Floats
+    images: Sequence[Grey]
+    origins: Integers
 
     def take(self, rows: NDArray[np.intp]) -> BoardDetections:
         """Return the detections of the given rows."""
         return BoardDetections(
             [self.boards[row] for row in rows], [self.points[row] for row in rows],
             self.cameras.take(rows), self.noise_grey[rows], self.blur_px[rows], self.scale[rows],
+            [self.images[row] for row in rows] if len(self.images) else [], self.origins[rows],
         )
 
 
@@ -175,10 +180,10 @@ class BoardSolver:
         if self.points == "largest_marker":
             poses = self._of_marker(one, objects, pixels)
         elif self.points == "each_marker":
-            poses = _of_each_marker(one, objects, pixels)
+            poses = poses_of_each_marker(one, objects, pixels)
         else:
             method = BOARD_METHODS[self.solver]
-            solve = _guarded if self.guarded else _plain
+            solve = guarded_poses if self.guarded else _plain
             poses = solve(objects, pixels, one.cameras, method)
         found = [
             _Solution(rotation, translation, reprojection_px(
@@ -264,7 +269,7 @@ def _of_board(
     return turned, translation - turned @ to_board[1]
 
 
-def _of_each_marker(
+def poses_of_each_marker(
     one: BoardDetections, objects: Floats, pixels: Floats
 ) -> list[tuple[Floats, Floats]]:
     """Return the board's poses from both planar solutions of each marker."""
@@ -308,7 +313,7 @@ def _called(
 _Z_IN = np.diag([1.0, -1.0, -1.0])
 
 
-def _guarded(
+def guarded_poses(
     objects: Floats, pixels: Floats, cameras: Cameras, method: int
 ) -> list[tuple[Floats, Floats]]:
     """Solve in a stable frame: undistorted pixels, points of unit size, z in, roll within 45°.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 
 from sweep.declaration import parameter
+from sweep.measure.board_photometric import BoardPhotometric
 from sweep.measure.board_solver import BOARD_METHODS, BoardEstimator, BoardSolver
 from sweep.measure.estimation import PoseEstimator
 from sweep.measure.photograph import PhotometricReal
@@ -71,7 +72,7 @@ SOLVERS: dict[str, Solver] = {
     "photometric": Solver(
         "maximum likelihood on the pixels, started from ippe",
         lambda setting: Photometric(setting.refined_starts, setting.estimate_blur),
-        needs_images=True, planar_only=True,
+        needs_images=True, planar_only=True, of_boards=True,
     ),
     "photometric_real": Solver(
         "least squares on the pixels of photographs: what else is on the board, point spread, "
@@ -215,6 +216,8 @@ def build(setting: EstimatorSetting) -> PoseEstimator:
 
 def build_for_boards(setting: EstimatorSetting) -> BoardEstimator:
     """Return the estimator of boards' poses that a setting describes."""
+    if setting.solver == "photometric":
+        return BoardPhotometric(setting.refined_starts, setting.estimate_blur)
     return BoardSolver(
         setting.solver, setting.points, setting.refine, setting.guarded,
         setting.reprojection_limit, setting.corner_noise_px,

@@ -45,7 +45,7 @@ from sweep.measure.positive_definite import pose_covariance
 from sweep.measure.solver import both_planar_solutions, reprojection_errors_px
 from sweep.model.derivatives import LEVELS, POSE, work_space
 from sweep.model.marker import module_count
-from sweep.typing import Floats
+from sweep.typing import Floats, Grey
 
 COARSE_STEPS = 15
 FINE_STEPS = 30
@@ -197,6 +197,49 @@ def explains(chi_square: float, freedom: int, noise_grey: float) -> bool:
     return abs(deviation) <= EXCESS if noise_grey >= MIN_NOISE else deviation <= EXCESS
 
 
+def start_states(
+    rotation: Floats, translation: Floats, spread_px: float, spread_free: bool
+) -> Floats:
+    """Return the states (K, 16) of the finite ones of M poses (M, 3, 3), (M, 3)."""
+    spread = max(spread_px, LIKELY_SPREAD_PX) if spread_free else spread_px
+    none = np.zeros(LEVELS)
+    states = np.array(
+        [state_of(*pose, spread, none) for pose in zip(rotation, translation, strict=True)]
+    )
+    return np.asarray(states[np.isfinite(states).all(axis=1)])
+
+
+def write_most_likely(
+    image: Floats, starts: Floats, view: MarkerView, spread_free: bool, noise_grey: float,
+    out: Estimates, i: int,
+) -> tuple[Floats, Floats] | None:
+    """Write the most likely pose of an image as estimate ``i``, but for reprojection errors.
+
+    Arguments as :func:`locate` and :func:`explains` take them. Returns the state (16,) and that of
+    the next minimum, NaN if there is none; None if no pose was written.
+    """
+    free = POSE + 1 if spread_free else POSE
+    information = np.empty((free, free))
+    state, chi_square, reached, other, _ = locate(image, starts, view, spread_free, information)
+    freedom = image.size - free - LEVELS
+    if not math.isfinite(chi_square) or freedom < 1:
+        return None
+    if not reached:
+        out.status[i] = EstimateStatus.not_converged
+        return None
+    out.status[i] = (
+        EstimateStatus.solved if explains(chi_square, freedom, noise_grey)
+        else EstimateStatus.not_explained
+    )
+    out.rotation[i], out.translation[i] = rotation_of(state), state[POSITION]
+    out.alternative_rotation[i] = rotation_of(other)
+    covariance, exists = pose_covariance(information, view.variance, abs(state[DEPTH]))
+    if exists:
+        out.covariance[i] = covariance
+    out.residual_ratio[i] = chi_square / freedom
+    return state, other
+
+
 @dataclass(frozen=True, slots=True)
 class Photometric:
     """Maximum likelihood on the pixels as a pose estimator.
@@ -232,9 +275,10 @@ class Photometric:
         turns = np.concatenate([rotation for rotation, _ in poses], axis=1)
         shifts = np.concatenate([translation for _, translation in poses], axis=1)
         windows = _windows(detections)
-        free = POSE + 1 if self.spread_free else POSE
         for i in range(count):
-            starts = self._starts(turns[i], shifts[i], float(detections.blur_px[i]))
+            starts = start_states(
+                turns[i], shifts[i], float(detections.blur_px[i]), self.spread_free
+            )
             left, top, right, bottom = windows[i]
             if not len(starts) or right - left < 2 or bottom - top < 2:
                 continue
@@ -244,38 +288,12 @@ class Photometric:
                 detections.origins[i] + (left, top), noise_variance(noise),
             )
             image = detections.images[i][top:bottom, left:right].astype(np.float64)
-            information = np.empty((free, free))
-            state, chi_square, reached, other, _ = locate(
-                image, starts, view, self.spread_free, information
-            )
-            freedom = image.size - free - LEVELS
-            if not math.isfinite(chi_square) or freedom < 1:
-                continue
-            if not reached:
-                out.status[i] = EstimateStatus.not_converged
-                continue
-            out.status[i] = (
-                EstimateStatus.solved if explains(chi_square, freedom, noise)
-                else EstimateStatus.not_explained
-            )
-            out.rotation[i], out.translation[i] = rotation_of(state), state[POSITION]
-            out.alternative_rotation[i] = rotation_of(other)
-            out.alternative_reprojection_px[i] = self._reprojection_px(other, detections, i)
-            out.reprojection_px[i] = self._reprojection_px(state, detections, i)
-            covariance, exists = pose_covariance(information, view.variance, abs(state[DEPTH]))
-            if exists:
-                out.covariance[i] = covariance
-            out.residual_ratio[i] = chi_square / freedom
+            fitted = write_most_likely(image, starts, view, self.spread_free, noise, out, i)
+            if fitted is not None:
+                state, other = fitted
+                out.alternative_reprojection_px[i] = self._reprojection_px(other, detections, i)
+                out.reprojection_px[i] = self._reprojection_px(state, detections, i)
         return out
-
-    def _starts(self, rotation: Floats, translation: Floats, spread_px: float) -> Floats:
-        """Return the states (K, 16) of the finite ones of M poses (M, 3, 3), (M, 3)."""
-        spread = max(spread_px, LIKELY_SPREAD_PX) if self.spread_free else spread_px
-        none = np.zeros(LEVELS)
-        states = np.array(
-            [state_of(*pose, spread, none) for pose in zip(rotation, translation, strict=True)]
-        )
-        return np.asarray(states[np.isfinite(states).all(axis=1)])
 
     @staticmethod
     def _reprojection_px(state: Floats, detections: Detections, i: int) -> float:
@@ -310,15 +328,23 @@ def refined_corners(detections: Detections) -> Floats:
     """Return the corners (N, 4, 2) after ``cv2.cornerSubPix``, its window OpenCV's for markers."""
     refined = detections.corners.copy()
     for i, image in enumerate(detections.images):
-        corners = detections.corners[i] - detections.origins[i]
-        if not ((corners >= 0) & (corners <= np.array(image.shape[::-1]) - 1)).all():
-            continue
-        side = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
-        module = side / module_count(detections.markers[i][0])
-        half = min(5, max(1, round(0.3 * module)))
-        moved = cv2.cornerSubPix(
-            image, np.ascontiguousarray(corners[:, None], dtype=np.float32), (half, half),
-            (-1, -1), (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 30, 0.1),
+        moved = refined_quad(
+            image, detections.corners[i] - detections.origins[i],
+            module_count(detections.markers[i][0]),
         )
-        refined[i] = moved[:, 0] + detections.origins[i]
+        if moved is not None:
+            refined[i] = moved + detections.origins[i]
     return refined
+
+
+def refined_quad(image: Grey, corners: Floats, modules: float) -> Floats | None:
+    """As :func:`refined_corners`, of corners (4, 2) in pixels of the image; None if one is not."""
+    if not ((corners >= 0) & (corners <= np.array(image.shape[::-1]) - 1)).all():
+        return None
+    side = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
+    half = min(5, max(1, round(0.3 * (side / modules))))
+    moved = cv2.cornerSubPix(
+        image, np.ascontiguousarray(corners[:, None], dtype=np.float32), (half, half),
+        (-1, -1), (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 30, 0.1),
+    )
+    return np.asarray(moved[:, 0], dtype=np.float64)

@@ -103,6 +103,15 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
             f"{', '.join(name for name, each in SOLVERS.items() if each.of_boards)}"
         )
         return
+    for name, all_pixels in (("points", "markers"), ("refine", "none")):
+        for chosen, solvers in reading.together(name, "solver"):
+            others = [each for each in chosen if each != all_pixels]
+            if others and "photometric" in solvers:
+                reading.fault(
+                    f"estimator.{name}", others[0],
+                    f"{all_pixels} beside solver = photometric, which takes all pixels",
+                )
+                break
     wrong = set()
     for all_points, solvers in reading.together("points", "solver"):
         for points, solver in itertools.product(all_points, solvers):

@@ -1,0 +1,104 @@
+"""Poses of boards from pixels: against the bound of their pixels, and where a marker is wrong.
+
+With ``-s`` the long tests print RMSE/bound of rotation and position, and NEES.
+"""
+
+import numpy as np
+import pytest
+
+from sweep.errors import PipelineError
+from sweep.evaluation.cells import run_cells
+from sweep.measure.board_photometric import BoardPhotometric
+from sweep.measure.flags import BoundStatus, EstimateStatus
+from sweep.plan.experiment import Pipeline
+
+CHARUCO = 'kind = "charuco"\nsquares_x = 5\nsquares_y = 4\nsquare_m = 0.03'
+GRID = 'kind = "grid"\nrows = 3\ncolumns = 3\ngap_m = 0.01'
+
+TEXT = """
+seed = 5
+[camera]
+width_px = 640
+height_px = 480
+fx_px = 600
+fy_px = 600
+[marker]
+dictionary = "DICT_5X5_100"
+size_m = 0.02
+[board]
+BOARD
+[pose]
+distance_m = 0.4
+tilt_deg = { uniform = [0, 60] }
+jitter_px = 20
+[scene]
+blur_px = 0.5
+noise_grey = 2
+black = 40
+white = 200
+background = 120
+bound = "known_blur"
+[estimator]
+solver = "photometric"
+[axes]
+trial = TRIALS
+"""
+
+
+def computed(board, trials, *settings):
+    text = TEXT.replace("BOARD", board).replace("TRIALS", str(trials))
+    result = run_cells(Pipeline.from_text(text, settings), [np.arange(trials)])
+    assert not result.failures
+    columns = {name: parts[0] for name, parts in result.columns.items() if parts}
+    assert (columns["bound"] == BoundStatus.given).all()
+    errors = np.concatenate(
+        [columns["rotation_error_rad"], columns["translation_error_m"]], axis=1
+    )
+    return columns, errors / columns["bound_std"]
+
+
+def test_board_s_pose_from_pixels_is_within_its_own_bound():
+    """One of twelve errors beyond six deviations: probability below 1e-7."""
+    columns, relative = computed(GRID, 2)
+    assert (columns["estimate"] == EstimateStatus.solved).all()
+    assert np.abs(relative).max() < 6
+    np.testing.assert_allclose(columns["predicted_std"], columns["bound_std"], rtol=0.05)
+    assert (np.abs(columns["residual_variance_ratio"] - 1) < 0.1).all()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("board", [CHARUCO, GRID], ids=["charuco", "grid"])
+@pytest.mark.parametrize("blur", ["known_blur", "unknown_blur"])
+def test_board_s_pose_from_pixels_attains_the_bound(board, blur):
+    """RMSE of 400 x 3 errors scatters by 2 %, the mean of 400 NEES by 0.17."""
+    free = str(blur == "unknown_blur").lower()
+    columns, relative = computed(board, 400, f"estimate_blur={free}", f"bound={blur}")
+    assert (columns["estimate"] == EstimateStatus.solved).all()
+    rotation, position = np.sqrt((relative.reshape(-1, 2, 3) ** 2).mean(axis=(0, 2)))
+    nees = columns["nees"].mean()
+    print(f"\n| {board.split()[2]} | {blur} | {rotation:.3f} | {position:.3f} | {nees:.2f} |")
+    assert 0.90 < rotation < 1.10
+    assert 0.90 < position < 1.10
+    assert abs(nees - 6) < 5 * np.sqrt(12 / 400)
+
+
+@pytest.mark.long
+def test_board_with_a_wrong_marker_is_solved_from_the_others(monkeypatch):
+    """Corners of one of nine markers are moved by a third of its side, before the starts."""
+    estimate = BoardPhotometric.__call__
+
+    def spoiled(self, detections):
+        for found in detections.points:
+            found.corners_px[0] += [15.0, -10.0]
+        return estimate(self, detections)
+
+    monkeypatch.setattr(BoardPhotometric, "__call__", spoiled)
+    columns, relative = computed(GRID, 2)
+    assert (columns["estimate"] == EstimateStatus.solved).all()
+    assert np.abs(relative).max() < 6
+
+
+def test_points_have_no_meaning_beside_all_pixels():
+    for setting in ('points="each_marker"', 'refine="vvs"'):
+        with pytest.raises(PipelineError, match="beside solver = photometric"):
+            computed(GRID, 1, setting)

@@ -18,6 +18,8 @@ from sweep.model.board import Board
 from sweep.model.extent import outside_of_frame
 from sweep.model.pose import transform_points
 from sweep.model.scene import Scenes
+from sweep.model.solid_board import unseen_markers
+from sweep.model.solid_scene import solid_planes
 from sweep.typing import Floats, Integers
 
 Quad = NDArray[np.floating[Any]]
@@ -103,6 +105,9 @@ def board_scenes(
         for row in rows[visibility[rows] == DetectionStatus.not_run].tolist():
             outside = outside_of_frame(scenes, row, board.corners_m, corners_px[row, :size])
             flags[row, :size][outside] = DetectionStatus.not_visible
+            if scenes.solid[row]:
+                unseen = unseen_markers(board, solid_planes(scenes, row))
+                flags[row, :size][unseen] = DetectionStatus.not_visible
     return BoardScenes(boards, ids, corners_px, chessboard_px, flags)
 
 

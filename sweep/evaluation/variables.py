@@ -20,7 +20,7 @@ from sweep.measure.covariance import squared_deviations
 from sweep.measure.estimation import Estimates
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.model.columns import Column
-from sweep.model.extent import areas_px, marker_areas_px
+from sweep.model.extent import areas_px
 from sweep.model.pose import vector_of_rotation, viewing_angle
 from sweep.model.scene import Scenes
 from sweep.plan.parameters import Stage
@@ -102,6 +102,15 @@ def _alternative_angle_deg(results: EstimationResults) -> Floats:
     return np.asarray(np.degrees(np.linalg.norm(other, axis=1)))
 
 
+def _board_area_px(boards: BoardScenes) -> Floats:
+    """Return the total area (N,) of the squares of a board's markers that are seen, px²."""
+    unseen = boards.flags == DetectionStatus.not_visible
+    seen = np.where(unseen[..., None, None], 0.0, boards.corners_px)
+    across, down = seen[:, :, 2] - seen[:, :, 0], seen[:, :, 3] - seen[:, :, 1]
+    area = 0.5 * np.abs(across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0])
+    return np.where(unseen.all(axis=1), np.nan, np.nansum(area, axis=1))
+
+
 def _marker_flags(results: BoardResults) -> NDArray[np.uint8]:
     """Return the flags of the markers (N, M): the board's where it was not searched."""
     known = results.searched[:, None] | (
@@ -162,7 +171,7 @@ DETECTION: dict[str, Callable[[DetectionResults], NDArray[Any]]] = {
 """Variable of the detection -> its values (N, ...)."""
 
 BOARD_SCENE: dict[str, Callable[[BoardScenes], NDArray[Any]]] = {
-    "marker_area_px": lambda boards: marker_areas_px(boards.corners_px),
+    "marker_area_px": _board_area_px,
     "board_marker_id": lambda boards: np.where(boards.marker_id < 0, np.nan, boards.marker_id),
 }
 """Variable of the scene that boards have, or have otherwise -> its values (N, ...)."""

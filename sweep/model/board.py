@@ -23,6 +23,7 @@ from sweep.model.marker import (
     module_count,
     overhang,
 )
+from sweep.model.pose import rotation_of_vector
 from sweep.typing import Floats, Integers
 
 
@@ -40,7 +41,10 @@ class Print(NamedTuple):
     x_m, y_m
         Its centre in the board's frame.
     roll_rad
-        Its turn in the board's plane, from x to y.
+        Its turn in its plane, from x to y.
+    z_m, turn
+        Of a print that is not in the board's plane: its centre's height, and the rotation (3, 3)
+        of its plane; None of one in it.
     """
 
     edges: MarkerEdges
@@ -49,6 +53,8 @@ class Print(NamedTuple):
     x_m: float = 0.0
     y_m: float = 0.0
     roll_rad: float = 0.0
+    z_m: float = 0.0
+    turn: Floats | None = None
 
     def plane(self, rotation: Floats, translation: Floats) -> Floats:
         """Return what takes (column, row, 1) to the camera frame, (3, 3).
@@ -57,6 +63,10 @@ class Print(NamedTuple):
         (:func:`sweep.model.scene.build_scenes`) is the same to the bit.
         """
         cosine, sine = math.cos(self.roll_rad), math.sin(self.roll_rad)
+        if self.turn is not None:
+            translation = translation + rotation @ [self.x_m, self.y_m, self.z_m]
+            flat = self._replace(x_m=0.0, y_m=0.0, turn=None)
+            return flat.plane(rotation @ self.turn, translation)
         right = rotation[:, 0] * cosine + rotation[:, 1] * sine
         up = rotation[:, 1] * cosine - rotation[:, 0] * sine
         centre = translation + rotation[:, 0] * self.x_m + rotation[:, 1] * self.y_m
@@ -77,7 +87,7 @@ class Chessboard(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Board:
-    """A planar target.
+    """A target: flat, or of markers that each have a plane and a sheet of their own.
 
     Attributes
     ----------
@@ -108,12 +118,17 @@ class Board:
         return len(self.marker_ids)
 
     @property
+    def is_flat(self) -> bool:
+        """Whether all is printed in one plane."""
+        return all(each.turn is None for each in self.prints)
+
+    @property
     def is_single(self) -> bool:
         """Whether it is one marker on its own sheet, upright at the origin."""
         if len(self.prints) > 1 or len(self) != 1:
             return False
         only = self.prints[0]
-        return only.x_m == only.y_m == only.roll_rad == 0.0
+        return self.is_flat and only.x_m == only.y_m == only.roll_rad == 0.0
 
     def edges(self, leave_out: Sequence[int] = ()) -> MarkerEdges:
         """Return the edges of all prints in metres, right and *down* from the board's origin.
@@ -151,6 +166,25 @@ def marker_print(
         outline = MarkerEdges(outline.ends[seen], sides[seen])
     return Print(
         outline, size_m / module_count(dictionary), size_m / 2, x_m, y_m, math.radians(roll_deg)
+    )
+
+
+def solid_print(
+    flat: Print, z_m: float, tilt_deg: float, azimuth_deg: float
+) -> tuple[Print, Floats]:
+    """Return a print with its centre at a height and its plane tilted, and its corners (4, 3).
+
+    By ``tilt_deg`` about the axis (cos azimuth, sin azimuth, 0) of the board, after its roll; the
+    corners are those of its marker's square: TL, TR, BR, BL.
+    """
+    turn = rotation_of_vector(
+        math.radians(tilt_deg) * np.array([[
+            math.cos(math.radians(azimuth_deg)), math.sin(math.radians(azimuth_deg)), 0.0
+        ]])
+    )[0]
+    corners = corners_of(2 * flat.half_m, 0.0, 0.0, math.degrees(flat.roll_rad))
+    return flat._replace(z_m=z_m, turn=turn), np.asarray(
+        corners @ turn.T + [flat.x_m, flat.y_m, z_m]
     )
 
 

@@ -8,9 +8,7 @@ is the middle of the chessboard or of the grid; of a table of markers it is the 
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -24,52 +22,25 @@ from sweep.model.board import (
     marker_print,
     rectangles_print,
 )
-from sweep.model.board_overlap import first_overlap
+from sweep.model.board_declaring import (
+    MAX_MARKERS,
+    Fault,
+    dictionary_of_all,
+    id_faults,
+    length,
+    margin,
+    refuse,
+    required,
+)
 from sweep.model.marker import (
     BLACK,
     OUTSIDE,
     WHITE,
-    marker_count,
-    missing_package,
     module_count,
     overhang,
 )
-from sweep.model.marker import Marker as SingleMarker
+from sweep.model.marker_table import Markers
 from sweep.typing import Floats, Integers
-
-MAX_MARKERS = 4000
-"""The most markers of a board; a dictionary of OpenCV has 1,000, of AprilTag's most have fewer."""
-
-_DICTIONARY = SingleMarker.__dataclass_fields__["dictionary"].metadata["declaration"]
-
-
-class Fault(NamedTuple):
-    """A key whose value cannot be, and what was expected."""
-
-    key: str
-    value: Any
-    expected: str
-
-
-def _required(meaning: str, **declared: Any) -> Any:
-    """Return a declared field without a default."""
-    return parameter(dataclasses.MISSING, meaning, **declared)
-
-
-def _dictionary() -> Any:
-    return _required(
-        "the dictionary of all markers, as of a single marker", choices=_DICTIONARY.choices,
-        prefix=_DICTIONARY.prefix,
-        numbers=_DICTIONARY.numbers,
-    )
-
-
-def _length(meaning: str) -> Any:
-    return _required(meaning, unit="m", low=0, high=1e6, open_low=True)
-
-
-def _margin(meaning: str) -> Any:
-    return parameter(None, meaning, unit="m", low=0, high=1e6)
 
 
 def _first_id() -> Any:
@@ -87,18 +58,18 @@ def _ids() -> Any:
 class Charuco:
     """A chessboard with markers in its white squares."""
 
-    dictionary: str = _dictionary()
-    squares_x: int = _required("squares in a row", low=2, high=1000)
-    squares_y: int = _required("squares in a column", low=2, high=1000)
-    square_m: float = _length("side of a square")
-    marker_m: float = _length("side of a marker's black square")
+    dictionary: str = dictionary_of_all()
+    squares_x: int = required("squares in a row", low=2, high=1000)
+    squares_y: int = required("squares in a column", low=2, high=1000)
+    square_m: float = length("side of a square")
+    marker_m: float = length("side of a marker's black square")
     first_id: int | None = _first_id()
     ids: tuple[int, ...] | None = _ids()
     legacy_pattern: bool = parameter(
         False, "the pattern before OpenCV 4.6: an even number of squares_y begins with white at "
         "the top left",
     )
-    margin_m: float | None = _margin(
+    margin_m: float | None = margin(
         "width of the white sheet beyond the chessboard (default: one module of a marker)"
     )
 
@@ -124,7 +95,7 @@ class Charuco:
 
     def board(self) -> Board:
         """Return the board; ValueError with its faults, a line each."""
-        _refuse(self.faults())
+        refuse(self.faults())
         codes = self._codes()
         rows, columns = np.nonzero(codes == WHITE)
         middle = np.array([self.squares_x, self.squares_y]) / 2 * self.square_m
@@ -144,11 +115,11 @@ class Charuco:
 class Grid:
     """Markers in rows and columns: ArUco's GridBoard, Kalibr's AprilGrid."""
 
-    dictionary: str = _dictionary()
-    rows: int = _required("rows of markers", low=1, high=1000)
-    columns: int = _required("markers in a row", low=1, high=1000)
-    marker_m: float = _length("side of a marker's black square")
-    gap_m: float = _required(
+    dictionary: str = dictionary_of_all()
+    rows: int = required("rows of markers", low=1, high=1000)
+    columns: int = required("markers in a row", low=1, high=1000)
+    marker_m: float = length("side of a marker's black square")
+    gap_m: float = required(
         "distance between the black squares of neighbours", unit="m", low=0, high=1e6
     )
     first_id: int | None = _first_id()
@@ -157,7 +128,7 @@ class Grid:
         False, "black squares of the gap's size at the corners of every marker, as an AprilGrid "
         "has them",
     )
-    margin_m: float | None = _margin(
+    margin_m: float | None = margin(
         "width of the white sheet beyond the markers and squares (default: one module of a marker)"
     )
 
@@ -181,7 +152,7 @@ class Grid:
 
     def board(self) -> Board:
         """Return the board; ValueError with its faults, a line each."""
-        _refuse(self.faults())
+        refuse(self.faults())
         step = self.marker_m + self.gap_m
         row, column = np.indices((self.rows, self.columns)).reshape(2, -1)
         shape = np.array([self.columns, self.rows])
@@ -200,106 +171,10 @@ class Grid:
         )
 
 
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class BoardMarker:
-    """One of a table of markers."""
-
-    marker_id: int = _required("the marker's ID in its dictionary", low=0, high=10**6)
-    x_m: float = _required("its centre, right of the origin", unit="m", low=-1e6, high=1e6)
-    y_m: float = _required("its centre, above the origin", unit="m", low=-1e6, high=1e6)
-    size_m: float = _length("side of its black square")
-    roll_deg: float = parameter(
-        0.0, "its turn in the board's plane, from x to y", unit="degree", low=-360, high=360
-    )
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class Markers:
-    """A table of markers in one plane, each on a sheet of its own or all on one."""
-
-    dictionary: str = _dictionary()
-    markers: tuple[BoardMarker, ...] = _required("tables [[markers]], one for each")
-    quiet_zone_modules: float | None = parameter(
-        None, "width of the white that surrounds each marker on its own sheet (default: 1)",
-        unit="module", low=0, high=100,
-    )
-    margin_m: float | None = _margin(
-        "width of the one white sheet beyond all markers; without it each has its own"
-    )
-
-    def faults(self) -> list[Fault]:
-        """Return what keeps the values from being a board."""
-        faults = []
-        if self.margin_m is not None and self.quiet_zone_modules is not None:
-            faults.append(Fault(
-                "margin_m", self.margin_m,
-                "margin_m (one sheet) or quiet_zone_modules (a sheet each), not both; delete one "
-                "of them",
-            ))
-        ids = [each.marker_id for each in self.markers]
-        faults += _listed_faults("markers", ids, self.dictionary)
-        if not faults:
-            pair = first_overlap(
-                np.array([[each.x_m, each.y_m] for each in self.markers]),
-                self._sides(), np.radians([each.roll_deg for each in self.markers]),
-            )
-            if pair is not None:
-                quiet = "" if self.margin_m is not None else " with their quiet zones"
-                faults.append(Fault(
-                    "markers", [ids[i] for i in pair],
-                    f"markers that do not overlap{quiet}; these two do",
-                ))
-        return faults
-
-    def _sides(self) -> Floats:
-        """Return the side (n,) of what is printed of each marker, with its quiet zone."""
-        quiet = self._quiet or 0.0
-        around = 1 + 2 * (overhang(self.dictionary) + quiet) / module_count(self.dictionary)
-        return np.array([each.size_m * around for each in self.markers])
-
-    @property
-    def _quiet(self) -> float | None:
-        if self.margin_m is not None:
-            return None
-        return 1.0 if self.quiet_zone_modules is None else self.quiet_zone_modules
-
-    def board(self) -> Board:
-        """Return the board; ValueError with its faults, a line each."""
-        _refuse(self.faults())
-        prints = [
-            marker_print(
-                self.dictionary, each.marker_id, each.size_m, self._quiet, each.x_m, each.y_m,
-                each.roll_deg,
-            )
-            for each in self.markers
-        ]
-        corners = np.array([
-            corners_of(each.size_m, each.x_m, each.y_m, each.roll_deg) for each in self.markers
-        ])
-        if self.margin_m is not None:
-            printed = np.concatenate([
-                corners_of(side, each.x_m, each.y_m, each.roll_deg)[:, :2] * [1.0, -1.0]
-                for each, side in zip(self.markers, self._sides().tolist(), strict=True)
-            ])
-            box = [*(printed.min(axis=0) - self.margin_m), *(printed.max(axis=0) + self.margin_m)]
-            prints.append(rectangles_print(np.array([box]), OUTSIDE, WHITE))
-        return Board(
-            self.dictionary, tuple(each.marker_id for each in self.markers), corners,
-            tuple(prints), np.empty((0, 3)),
-        )
-
-
 KINDS: dict[str, type[Charuco | Grid | Markers]] = {
     "charuco": Charuco, "grid": Grid, "markers": Markers,
 }
 """The kinds of boards by the names that files have for them."""
-
-
-def _refuse(faults: Sequence[Fault]) -> None:
-    if faults:
-        raise ValueError(
-            "\n".join(f"{key} = {value}: expected {expected}" for key, value, expected in faults)
-        )
 
 
 def _printed_side(dictionary: str, marker_m: float) -> float:
@@ -325,36 +200,12 @@ def _id_faults(kind: Charuco | Grid, count: int) -> list[Fault]:
     if kind.ids is None:
         first = kind.first_id or 0
         key = "first_id" if kind.first_id is not None else "dictionary"
-        return _listed_faults(
+        return id_faults(
             key, list(range(first, first + count)), kind.dictionary, getattr(kind, key)
         )
     if len(kind.ids) != count:
         return [Fault("ids", list(kind.ids), f"{count} IDs, one for each marker in reading order")]
-    return _listed_faults("ids", list(kind.ids), kind.dictionary)
-
-
-def _listed_faults(
-    key: str, ids: list[int], dictionary: str, written: Any = None
-) -> list[Fault]:
-    """Return the faults of markers' IDs; ``written`` is what the key has if not these."""
-    missing = missing_package(dictionary)
-    if missing is not None:
-        return [Fault("dictionary", dictionary, f"one whose package is installed: {missing}")]
-    written = ids if written is None else written
-    if not 1 <= len(ids) <= MAX_MARKERS:
-        return [Fault(key, ids, f"1 to {MAX_MARKERS} markers; these are {len(ids)}")]
-    faults = []
-    twice = [marker_id for marker_id, count in Counter(ids).items() if count > 1]
-    if twice:
-        faults.append(Fault(key, written, f"each ID once; {twice[0]} is listed more than once"))
-    count = marker_count(dictionary)
-    if min(ids) < 0 or max(ids) >= count:
-        faults.append(Fault(
-            key, written,
-            f"IDs from 0 to {count - 1}, which is what {dictionary} has; the board has "
-            f"{len(ids)} markers with IDs up to {max(ids)}",
-        ))
-    return faults
+    return id_faults("ids", list(kind.ids), kind.dictionary)
 
 
 def _ids_of(kind: Charuco | Grid, count: int) -> tuple[int, ...]:

@@ -9,8 +9,10 @@ from typing import Any
 
 from sweep.declaration import parameter
 from sweep.model.board import Board
-from sweep.model.board_kinds import BoardMarker, Charuco, Fault, Grid, Markers
+from sweep.model.board_declaring import Fault
+from sweep.model.board_kinds import Charuco, Grid
 from sweep.model.marker import module_count
+from sweep.model.marker_table import BoardMarker, Markers
 
 SINGLE = "none"
 """The kind of a marker without a board."""
@@ -46,8 +48,9 @@ class BoardValues:
         "with white at the top left",
     )
     markers: tuple[tuple[float, ...], ...] | None = parameter(
-        None, "the markers of kind = markers, each marker_id, x_m, y_m and, if wanted, size_m and "
-        "roll_deg", list_text="tables [[board.markers]]",
+        None, "the markers of kind = markers, each marker_id, x_m, y_m and, if wanted, size_m, "
+        "roll_deg, z_m, and tilt_deg about an axis at azimuth_deg",
+        list_text="tables [[board.markers]]",
     )
 
 
@@ -91,15 +94,15 @@ def arranged(values: Sequence[Any]) -> Charuco | Grid | Markers:
             dictionary=dictionary, squares_x=across, squares_y=down, square_m=square_m,
             marker_m=size_m, first_id=marker_id, legacy_pattern=legacy_pattern, margin_m=margin_m,
         )
-    listed = markers if kind == "markers" else ((marker_id, 0.0, 0.0, size_m, 0.0),)
+    listed = markers if kind == "markers" else ((marker_id, 0.0, 0.0, size_m, 0.0, 0.0, 0.0, 0.0),)
     return Markers(
         dictionary=dictionary, quiet_zone_modules=quiet,
         markers=tuple(
             BoardMarker(
                 marker_id=int(number), x_m=x, y_m=y, size_m=size_m if side is None else side,
-                roll_deg=roll,
+                roll_deg=roll, z_m=z, tilt_deg=tilt, azimuth_deg=azimuth,
             )
-            for number, x, y, side, roll in listed
+            for number, x, y, side, roll, z, tilt, azimuth in listed
         ),
     )
 
@@ -123,12 +126,15 @@ def arranged_board(*values: Any) -> Board:
     return arranged(values).board()
 
 
-MARKER_KEYS = {"marker_id": True, "x_m": True, "y_m": True, "size_m": False, "roll_deg": False}
+MARKER_KEYS = {
+    "marker_id": True, "x_m": True, "y_m": True, "size_m": False, "roll_deg": False, "z_m": False,
+    "tilt_deg": False, "azimuth_deg": False,
+}
 """Key of a table [[board.markers]] -> whether it must be there."""
 
 
 def listed_markers(value: Any) -> tuple[tuple[Any, ...], ...]:
-    """Return tables [[board.markers]] as tuples of ID, x, y, size or None, and turn.
+    """Return tables [[board.markers]] as tuples: ID, x, y, size or None, roll, z, tilt, azimuth.
 
     Raises
     ------
@@ -158,6 +164,11 @@ def listed_markers(value: Any) -> tuple[tuple[Any, ...], ...]:
         size = None if row["size_m"] is None else float(row["size_m"])
         rows.append((
             row["marker_id"], float(row["x_m"]), float(row["y_m"]), size,
-            float(row["roll_deg"] or 0.0),
+            *(float(row[key] or 0.0) for key in ("roll_deg", "z_m", "tilt_deg", "azimuth_deg")),
         ))
     return tuple(rows)
+
+
+def is_solid(markers: Sequence[Sequence[Any]] | None) -> bool:
+    """Return whether listed markers are in several planes, or in another than the board's."""
+    return any(z != 0.0 or tilt != 0.0 for *_, z, tilt, _ in markers or ())

@@ -17,6 +17,7 @@ from sweep.model.projection import Projection
 from sweep.model.scene import Box, Scenes
 from sweep.model.scene_sheet import scene_sheet
 from sweep.model.sheet import FLAT, Sheet
+from sweep.model.solid_scene import accumulate_solid
 from sweep.typing import Floats
 
 SHARP_PANEL_PX = 3 / 16
@@ -65,6 +66,8 @@ def marker_exposure(
     standard deviation that the point spread is widened by, in quadrature.
     """
     effect = scenes.effect(row)
+    if scenes.solid[row]:
+        return _solid_exposure(scenes, row, box, levels, math.hypot(effect["blur_px"], added_px))
     key = scenes.markers[scenes.marker[row]]
     outlines = (
         occluded_edges(key, effect["occlusion"], effect["occlusion_deg"])
@@ -110,6 +113,21 @@ def marker_exposure(
     if not varies:
         return np.asarray(images[0])
     return _focused(images, np.array(spread), wanted)
+
+
+def _solid_exposure(
+    scenes: Scenes, row: int, box: Box, levels: Floats, blur_px: float
+) -> Floats:
+    """As :func:`marker_exposure`, of a board in several planes at rest, blurred evenly."""
+    shape = (box[3] - box[1], box[2] - box[0])
+    wanted = np.full(shape, blur_px)
+    spread, varies = _spreads(wanted)
+    images = np.empty((len(spread), *shape))
+    for image, sigma in zip(images, spread, strict=True):
+        cover = np.zeros((shape[0], shape[1] + 2))
+        accumulate_solid(cover, scenes, row, levels[:3], box, sigma)
+        coverage.sum_levels(cover, levels[0], image)
+    return _focused(images, np.array(spread), wanted) if varies else np.asarray(images[0])
 
 
 @compiled

@@ -17,6 +17,8 @@ from sweep.model.pose import transform_points
 from sweep.model.scene import Box, Scenes
 from sweep.model.scene_sheet import curved_rows, scene_sheet, sheet_folds, sheet_outline_px
 from sweep.model.sheet import bent_point
+from sweep.model.solid_board import facing as planes_facing
+from sweep.model.solid_scene import facing_sheets, sheet_outlines_px, solid_planes
 from sweep.typing import Floats, Masks
 
 WARP_PX_PER_MODULE = 10
@@ -69,7 +71,11 @@ def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
     Clipped at the frame; empty (all zero) if no part of the marker is in it.
     """
     low, high = scenes.outline_px.min(axis=1), scenes.outline_px.max(axis=1)
-    curved = np.flatnonzero(scenes.cameras.distorted & np.isfinite(low).all(axis=1))
+    bulging = scenes.cameras.distorted & np.isfinite(low).all(axis=1)
+    for row in np.flatnonzero(bulging & scenes.solid).tolist():
+        points = sheet_outlines_px(scenes, row, CHORDS_PER_SIDE)
+        low[row], high[row] = points.min(axis=0) - 2, points.max(axis=0) + 2
+    curved = np.flatnonzero(bulging & ~scenes.solid)
     if len(curved):
         points = _outline(scenes, curved, quiet=True, per_side=CHORDS_PER_SIDE)
         low[curved], high[curved] = points.min(axis=1) - 2, points.max(axis=1) + 2
@@ -277,12 +283,6 @@ def areas_px(scenes: Scenes) -> Floats:
     return np.abs(area)
 
 
-def marker_areas_px(corners_px: Floats) -> Floats:
-    """Return the total area (N,) in px² of quadrilaterals (N, M, 4, 2); NaN counts as none."""
-    areas = np.abs(_shoelace(corners_px.reshape(-1, 4, 2))).reshape(corners_px.shape[:2])
-    return np.where(np.isnan(areas).all(axis=1), np.nan, np.nansum(areas, axis=1))
-
-
 def _shoelace(points: Floats) -> Floats:
     """Return the signed areas (N,) of polygons (N, M, 2)."""
     local = points - points[:, :1]
@@ -304,6 +304,8 @@ def hidden(scenes: Scenes) -> NDArray[np.bool_]:
     towards = np.sum(scenes.rotation[:, :, 2] * scenes.translation, axis=1)
     # A tilt of 90° is not quite one in double precision.
     facing = towards < -EDGE_ON * np.linalg.norm(scenes.translation, axis=1)
+    for row in np.flatnonzero(scenes.solid).tolist():
+        facing[row] = planes_facing(solid_planes(scenes, row)).any()
     return np.asarray(~facing | ~np.isfinite(scenes.outline_px).all(axis=(1, 2)))
 
 
@@ -333,12 +335,10 @@ def outside_of_frame(scenes: Scenes, row: int, corners_m: Floats, corners_px: Fl
     for i in np.flatnonzero(cut):
         polygon = corners_px[i]
         if scenes.cameras.distorted[row]:
-            corners = corners_m[i]
-            sides = corners + t * (np.roll(corners, -1, axis=0) - corners)
+            sides = corners_m[i] + t * (np.roll(corners_m[i], -1, axis=0) - corners_m[i])
             points = np.ascontiguousarray(np.swapaxes(sides, 0, 1)).reshape(1, -1, 3)
-            polygon = camera.project(transform_points(
-                points, scenes.rotation[row : row + 1], scenes.translation[row : row + 1]
-            ))[0]
+            pose = scenes.rotation[row : row + 1], scenes.translation[row : row + 1]
+            polygon = camera.project(transform_points(points, *pose))[0]
         outside[i] = not _meets_frame(polygon, limit)
     return outside
 
@@ -385,7 +385,12 @@ def not_modelled(scenes: Scenes) -> NDArray[np.bool_]:
         low, high = scenes.outline_px[row].min(axis=0), scenes.outline_px[row].max(axis=0)
         if np.isfinite(low).all() and scenes.motion(row) is not None:
             folded[row] |= not np.isfinite(_exposed_extent(scenes, row, low, high)).all()
-    rows = np.flatnonzero(scenes.cameras.distorted & np.isfinite(scenes.outline_px).all((1, 2)))
+    bulging = scenes.cameras.distorted & np.isfinite(scenes.outline_px).all((1, 2))
+    for row in np.flatnonzero(bulging & scenes.solid).tolist():
+        quads = facing_sheets(scenes, row)
+        lenses = np.repeat(scenes.cameras.lenses[row : row + 1], len(quads), axis=0)
+        folded[row] |= lens_model.folds(quads[..., :2] / quads[..., 2:], lenses).any()
+    rows = np.flatnonzero(bulging & ~scenes.solid)
     if len(rows):
         points = scenes.outline_m[rows]
         folded[rows] |= lens_model.folds(

@@ -24,6 +24,7 @@ from sweep.model.printed import PrintKey, edge_table, edges_of, extent_of, unit_
 from sweep.model.projection import Optics, Projection
 from sweep.model.scene import Box, Scenes
 from sweep.model.sensing import sensed, sensed_window
+from sweep.model.solid_scene import accumulate_solid
 from sweep.model.supersampling import SampledMarker, supersample
 from sweep.model.tone import bloomed
 from sweep.typing import Floats
@@ -271,6 +272,9 @@ def _cover(
 ) -> NDArray[np.float64]:
     """Return the accumulated edges of a scene's marker, (height, width + 2) of ``box``."""
     cover = np.zeros((box[3] - box[1], box[2] - box[0] + 2))
+    if scenes.solid[row]:
+        accumulate_solid(cover, scenes, row, levels, box, 0.0)
+        return cover
     outlines = edges_of(scenes.markers[scenes.marker[row]])
     coverage.accumulate(
         cover, outlines, levels, scenes.projection(row), box[0], box[1], 0.0

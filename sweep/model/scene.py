@@ -22,6 +22,7 @@ from sweep.model.plugged_scene import NO_PLUGINS, ScenePlugins
 from sweep.model.pose import rotation_of_angles, transform_points
 from sweep.model.printed import PrintKey, box_corners, extent_of
 from sweep.model.projection import Projection
+from sweep.model.solid_board import box_px
 from sweep.typing import Floats
 
 Key = TypeVar("Key")
@@ -111,6 +112,8 @@ class Scenes:
         black) and of the printed quiet zone, both flat; NaN at z <= 0.
     outline_m
         (N, 4, 3) the latter's corners in the camera frame.
+    solid
+        (N,) whether markers are in several planes: the corners are of a rectangle about the image.
     """
 
     cameras: Cameras
@@ -132,6 +135,7 @@ class Scenes:
     corners_px: Floats
     outline_px: Floats
     outline_m: Floats
+    solid: NDArray[np.bool_]
     renderer: Sequence[str]
     background: Sequence[float | str]
     plain: NDArray[np.bool_]
@@ -307,6 +311,12 @@ def build_scenes(
     outline_m = transform_points(around_m, rotation, translation)
     corners_px = cameras.project(transform_points(square_m, rotation, translation))
     outline_px = cameras.project(outline_m)
+    solid = np.array([isinstance(key, Board) and not key.is_flat for key in markers])[marker]
+    for row in np.flatnonzero(solid).tolist():
+        corners_px[row] = outline_px[row] = box_px(
+            markers[marker[row]], cameras.take(np.array([row])), rotation[row], translation[row],
+            float(printed[row] / size[row]),
+        )
 
     levels = np.stack(
         [
@@ -330,7 +340,7 @@ def build_scenes(
     plain = np.array(
         mapped(lambda name, level: name == "exact" and not isinstance(level, str),
                "renderer", "background"), dtype=bool,
-    )
+    ) & ~solid
     return Scenes(
         cameras=cameras,
         frame=np.stack([numbers("width_px"), numbers("height_px")], axis=1).astype(np.int64),
@@ -351,6 +361,7 @@ def build_scenes(
         corners_px=corners_px,
         outline_px=outline_px,
         outline_m=outline_m,
+        solid=solid,
         renderer=mapped(str, "renderer"),
         background=column("background").listed(count),
         plain=plain & ~affected,

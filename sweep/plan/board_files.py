@@ -11,8 +11,9 @@ from typing import Any
 from sweep.declaration import plain_types
 from sweep.messages import nearest, plain, refusal, shown
 from sweep.model.board import Board
-from sweep.model.board_kinds import KINDS, BoardMarker
+from sweep.model.board_kinds import KINDS
 from sweep.model.image_file import read_regular
+from sweep.model.marker_table import BoardMarker
 from sweep.plan.parameters import Parameter, Stage
 from sweep.plan.toml_text import MAX_BYTES, read_document
 
@@ -81,7 +82,12 @@ def board_of(document: Mapping[str, Any], source: str) -> Board:
             f"{source}: {key} = {shown(value)}: expected {expected}"
             for key, value, expected in broken
         ])
-    return made.board()
+    board = made.board()
+    if not board.is_flat:
+        raise refusal([
+            f"{source}: markers: expected one plane, for photographs: no z_m, no tilt_deg"
+        ])
+    return board
 
 
 def _checked(

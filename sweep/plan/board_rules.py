@@ -10,9 +10,16 @@ from typing import Any
 from sweep.environments.interpreters import INSTALLED
 from sweep.measure.estimators import SOLVERS
 from sweep.messages import shown
-from sweep.model.board_values import ARRANGING, NEEDED, SINGLE, arrangement_faults
+from sweep.model.board_values import (
+    ARRANGING,
+    NEEDED,
+    SINGLE,
+    arrangement_faults,
+    is_solid,
+)
+from sweep.model.effects import GEOMETRIC
 from sweep.plan.alternatives import PHOTOGRAPHS
-from sweep.plan.parameters import Parameter
+from sweep.plan.parameters import PARAMETERS, Parameter
 from sweep.plan.reader import Reading
 from sweep.plugins.recording import is_recording
 
@@ -126,7 +133,37 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
             + ("" if solver not in SOLVERS else "; others with points = largest_marker"
                if SOLVERS[solver].corners_alone else ""),
         )
+    if any(map(is_solid, reading.values("markers"))):
+        _several_planes(reading)
     if "chessboard" in reading.values("points") and not {"charuco", "diamond"} & set(kinds):
         reading.fault(
             "estimator.points", "chessboard", "kind = charuco or diamond, which have a chessboard"
         )
+
+
+IN_ONE_PLANE = tuple(
+    name for name in GEOMETRIC if name not in ("blur_px", "marker_scale", "sharpening")
+)
+"""Switches of effects that boards in several planes cannot have."""
+
+
+def _several_planes(reading: Reading) -> None:
+    """Refuse what markers in several planes cannot have: solvers for a plane, effects, bounds."""
+    why = "for markers with z_m or tilt_deg"
+    for name in reading.values("solver"):
+        known = SOLVERS.get(name)
+        if known is not None and known.planar_only and any(
+            points in ("markers", "chessboard") for points in reading.values("points")
+        ):
+            reading.fault("estimator.solver", name, f"one of iterative, sqpnp, epnp, {why}")
+    for name in IN_ONE_PLANE:
+        if any(value != PARAMETERS[name].default for value in reading.values(name)) or (
+            name in reading.distributions
+        ):
+            reading.fault(f"scene.{name}", reading.written(name), f"it absent, {why}")
+    for name, only in (("renderer", "exact"), ("bound", "none")):
+        for value in reading.values(name):
+            if value != only:
+                reading.fault(f"scene.{name}", value, f"{only}, {why}")
+    if any(reading.values("refineDetectedMarkers")):
+        reading.fault("detector.refineDetectedMarkers", True, f"false, {why}")

@@ -4,8 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from sweep.model.board_kinds import BoardMarker, Charuco, Grid, Markers
+from sweep.model.board_kinds import Charuco, Grid
 from sweep.model.board_overlap import first_overlap
+from sweep.model.marker_table import BoardMarker, Markers
 
 DICTIONARY = "DICT_4X4_250"
 OPENCV = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)

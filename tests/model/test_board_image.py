@@ -7,11 +7,12 @@ import pytest
 from support.bent_sheets import flat_points
 from support.exact_image import LENSES, add_clipped, values
 from sweep.model.board_image import BoardPose, Curvature, render_board
-from sweep.model.board_kinds import BoardMarker, Charuco, Grid, Markers
+from sweep.model.board_kinds import Charuco, Grid
 from sweep.model.effects import NEUTRAL
 from sweep.model.extent import marker_boxes
 from sweep.model.image_shift import shift_waves
 from sweep.model.lens import pack
+from sweep.model.marker_table import BoardMarker, Markers
 from sweep.model.pose import rotation_of_angles
 from sweep.model.projection import Optics
 from sweep.model.renderers import quantise, render

@@ -1,0 +1,212 @@
+"""Targets of markers that are not in one plane: which are seen, and what of them others hide.
+
+Each marker has a convex sheet of its own. The image is the sum of the visible parts of all sheets
+that face the camera. What a sheet in front hides of another is subtracted: of the part of an area
+inside a half plane the edges are those inside, and those outside projected onto its line, which
+enclose the same area (as those under an occluding sheet in :mod:`sweep.model.printed`). Of several
+sheets in front, by inclusion and exclusion.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+
+from sweep.model.board import Board, Print
+from sweep.model.camera import Cameras
+from sweep.model.coverage import MarkerEdges
+from sweep.typing import Floats, Masks
+
+_NEGLIGIBLE = 1e-12
+"""Sine of an angle, of rays from the camera, below which sheets only touch in the image."""
+
+
+class _Face(NamedTuple):
+    """A sheet before the camera.
+
+    Attributes
+    ----------
+    number
+        Of its print on the board.
+    plane
+        (3, 3) takes (column, row, 1) to the camera frame.
+    corners
+        (4, 3) of the sheet, in the camera frame.
+    normals
+        (4, 3) of the planes through the camera and the sheet's sides; inwards.
+    """
+
+    number: int
+    plane: Floats
+    corners: Floats
+    normals: Floats
+
+
+def print_planes(board: Board, rotation: Floats, translation: Floats, scale: float) -> Floats:
+    """Return the planes (P, 3, 3) of a board's prints, printed ``scale`` times as large."""
+    planes = np.array([each.plane(rotation, translation) for each in board.prints])
+    planes[:, :, 2] = translation + scale * (planes[:, :, 2] - translation)
+    planes[:, :, :2] *= scale
+    return planes
+
+
+def sheet_corners(each: Print) -> Floats:
+    """Return the corners (4, 3) of a print's sheet as (column, row, 1)."""
+    points = each.edges.ends.reshape(-1, 2)
+    (left, top), (right, bottom) = points.min(axis=0), points.max(axis=0)
+    return np.array([[left, top, 1.0], [right, top, 1.0], [right, bottom, 1.0],
+                     [left, bottom, 1.0]])
+
+
+def outlines(board: Board, planes: Floats) -> Floats:
+    """Return the corners (P, 4, 3) of all sheets in the camera frame."""
+    return np.array([
+        sheet_corners(each) @ plane.T for each, plane in zip(board.prints, planes, strict=True)
+    ])
+
+
+def facing(planes: Floats) -> Masks:
+    """Return (P,) which planes show their printed side to the camera."""
+    # Columns run right and rows down, so that their cross product points away from the viewer.
+    away = np.cross(planes[:, :, 0], planes[:, :, 1])
+    return np.asarray(np.einsum("pi,pi->p", away, planes[:, :, 2]) > 0)
+
+
+def _faces(board: Board, planes: Floats) -> list[_Face]:
+    """Return the sheets that face the camera."""
+    faces = []
+    corners = outlines(board, planes)
+    for k in np.flatnonzero(facing(planes)).tolist():
+        around = corners[k]
+        normals = np.cross(around, np.roll(around, -1, axis=0))
+        normals /= np.linalg.norm(normals, axis=1)[:, None]
+        normals *= np.sign(normals @ around.mean(axis=0))[:, None]
+        faces.append(_Face(k, planes[k], around, normals))
+    return faces
+
+
+def _common(one: _Face, other: _Face) -> Floats:
+    """Return the corners (n, 3) of that part of a sheet which the other's outline encloses."""
+    polygon = one.corners
+    for normal in other.normals:
+        inside = polygon @ normal
+        kept = []
+        for i in range(len(polygon)):
+            j = (i + 1) % len(polygon)
+            if inside[i] > 0:
+                kept.append(polygon[i])
+            if (inside[i] > 0) != (inside[j] > 0):
+                t = inside[i] / (inside[i] - inside[j])
+                kept.append(polygon[i] + t * (polygon[j] - polygon[i]))
+        polygon = np.array(kept).reshape(-1, 3)
+        if len(polygon) < 3:
+            return np.empty((0, 3))
+    return polygon
+
+
+def _hides(front: _Face, behind: _Face) -> bool:
+    """Return whether a sheet hides a part of another."""
+    common = _common(behind, front)
+    if not len(common):
+        return False
+    rays = common / np.linalg.norm(common, axis=1)[:, None]
+    spread = np.cross(rays[1:] - rays[0], np.roll(rays, -1, axis=0)[1:] - rays[0])
+    if not np.abs(spread).max() > _NEGLIGIBLE:
+        return False
+    ray = rays.mean(axis=0)
+    distances = []
+    for face in (front, behind):
+        normal = np.cross(face.plane[:, 0], face.plane[:, 1])
+        distances.append(float(normal @ face.plane[:, 2]) / float(normal @ ray))
+    return distances[0] < distances[1]
+
+
+def _occluders(faces: list[_Face]) -> list[list[_Face]]:
+    """Return for each sheet those that hide a part of it."""
+    return [
+        [front for front in faces if front is not behind and _hides(front, behind)]
+        for behind in faces
+    ]
+
+
+def visible_prints(board: Board, planes: Floats) -> list[tuple[MarkerEdges, Floats]]:
+    """Return the edges of what is seen of each print, and its plane (3, 3)."""
+    seen = []
+    faces = _faces(board, planes)
+    for face, fronts in zip(faces, _occluders(faces), strict=True):
+        outline = board.prints[face.number].edges
+        parts = [outline]
+        for count in range(1, len(fronts) + 1):
+            for some in itertools.combinations(fronts, count):
+                part = outline
+                for front in some:
+                    for line in front.normals @ face.plane:
+                        part = _within(part, line)
+                parts.append(
+                    MarkerEdges(part.ends, part.sides[:, ::-1] if count % 2 else part.sides)
+                )
+        seen.append((
+            MarkerEdges(
+                np.concatenate([part.ends for part in parts]),
+                np.concatenate([part.sides for part in parts]),
+            ), face.plane,
+        ))
+    return seen
+
+
+def _within(outline: MarkerEdges, line: Floats) -> MarkerEdges:
+    """Return the edges of the part of all areas where line · (column, row, 1) is not negative."""
+    length = float(line[:2] @ line[:2])
+    if length == 0.0:
+        return outline if line[2] >= 0 else MarkerEdges(outline.ends[:0], outline.sides[:0])
+    start, stop = outline.ends[:, :2], outline.ends[:, 2:]
+    a, b = start @ line[:2] + line[2], stop @ line[:2] + line[2]
+    crossing = (a < 0) != (b < 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cut = np.where(crossing[:, None], start + (a / (a - b))[:, None] * (stop - start), stop)
+
+    def projected(points: Floats, value: Floats) -> Floats:
+        return points - np.minimum(value, 0.0)[:, None] / length * line[:2]
+
+    first = np.hstack([projected(start, a), np.where(
+        crossing[:, None], cut, projected(stop, b)
+    )])
+    second = np.hstack([cut, projected(stop, b)])[crossing]
+    return MarkerEdges(
+        np.concatenate([first, second]),
+        np.concatenate([outline.sides, outline.sides[crossing]]),
+    )
+
+
+def unseen_markers(board: Board, planes: Floats) -> Masks:
+    """Return (M,) which markers show their back, or are wholly behind another's sheet."""
+    unseen = ~facing(planes)[: len(board)]
+    faces = _faces(board, planes)
+    for face, fronts in zip(faces, _occluders(faces), strict=True):
+        printed = board.prints[face.number]
+        side = 2 * printed.half_m / printed.unit_m
+        square = np.array([
+            [0.0, 0.0, 1.0], [side, 0.0, 1.0], [side, side, 1.0], [0.0, side, 1.0]
+        ]) @ face.plane.T
+        if any((square @ front.normals.T >= 0).all() for front in fronts):
+            unseen[face.number] = True
+    return np.asarray(unseen)
+
+
+def box_px(
+    board: Board | object, camera: Cameras, rotation: Floats, translation: Floats, scale: float
+) -> Floats:
+    """Return the rectangle (4, 2) in px about the images of a solid board's sheets.
+
+    Of those that face the camera, if any does; NaN if a part of one is not before it.
+    """
+    if not isinstance(board, Board):
+        raise TypeError("a single marker is flat")
+    planes = print_planes(board, rotation, translation, scale)
+    seen = facing(planes)
+    corners = outlines(board, planes)[seen if seen.any() else slice(None)]
+    pixels = camera.project(np.ascontiguousarray(corners.reshape(1, -1, 3)))[0]
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    return np.array([low, [high[0], low[1]], high, [low[0], high[1]]])

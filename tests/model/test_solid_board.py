@@ -1,0 +1,148 @@
+"""Targets of markers in several planes: images against rays, hidden markers, what is refused."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from support.solid_pictures import traced
+from sweep.errors import PipelineError
+from sweep.evaluation.board_search import board_scenes
+from sweep.evaluation.cells import run_cells
+from sweep.evaluation.search import visibility_flags
+from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.model.renderers import marker_levels
+from sweep.model.scene import build_scenes
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import scene_values
+
+LEVELS = 120.0, 10.0, 230.0
+
+
+def marker(marker_id, x, y, z, *, tilt=0.0, azimuth=0.0, roll=0.0, size=0.04):
+    return {"marker_id": marker_id, "x_m": x, "y_m": y, "z_m": z, "tilt_deg": tilt,
+            "azimuth_deg": azimuth, "roll_deg": roll, "size_m": size}
+
+
+CUBE = [marker(0, 0, 0, 0.028)] + [
+    marker(1 + k, 0.028 * np.sin(np.radians(a)), -0.028 * np.cos(np.radians(a)), 0.0, tilt=90,
+           azimuth=a)
+    for k, a in enumerate((0.0, 90.0, 180.0, 270.0))
+]
+FIELD = [  # each hides a part of the one before, two of them the same part
+    marker(1, 0, 0, 0), marker(2, 0.02, 0.01, 0.03, tilt=25, azimuth=40, size=0.025),
+    marker(3, -0.02, -0.015, 0.05, roll=30, size=0.02),
+    marker(4, 0.005, -0.005, 0.07, roll=10, size=0.015),
+]
+
+
+def pipeline(markers, tilt_deg=30.0, **sections):
+    return Pipeline.from_dict({
+        "seed": 1,
+        "camera": {"width_px": 160, "height_px": 120, "fx_px": 150, "fy_px": 150},
+        "marker": {"dictionary": "DICT_4X4_50"},
+        "board": {"kind": "markers", "markers": markers},
+        "pose": {"distance_m": 0.2, "tilt_deg": tilt_deg, "azimuth_deg": 70, "roll_deg": 20},
+        "scene": {"background": LEVELS[0], "black": LEVELS[1], "white": LEVELS[2],
+                  **sections.pop("scene", {})},
+        "estimator": {"solver": "iterative", **sections.pop("estimator", {})},
+        **sections,
+    })
+
+
+def scenes_of(chosen):
+    return build_scenes(scene_values(chosen, []), 1)
+
+
+def image_of(scenes):
+    width, height = scenes.frame[0].tolist()
+    mean, share = marker_levels(scenes, 0, (0, 0, width, height))
+    return mean + (1 - share) * LEVELS[0]
+
+
+def turned(each):
+    """The rotation of a marker on its target: SciPy's."""
+    azimuth = np.radians(each["azimuth_deg"])
+    axis = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    tilt = Rotation.from_rotvec(np.radians(each["tilt_deg"]) * axis)
+    return (tilt * Rotation.from_euler("z", each["roll_deg"], degrees=True)).as_matrix()
+
+
+def rays_of(markers, scenes, per_side):
+    return traced(
+        [(each["marker_id"], np.array([each["x_m"], each["y_m"], each["z_m"]]), turned(each),
+          each["size_m"]) for each in markers],
+        "DICT_4X4_50", LEVELS, (160, 120, 150.0, 79.5, 59.5),
+        (scenes.rotation[0], scenes.translation[0]), per_side,
+    )
+
+
+@pytest.mark.parametrize(("markers", "tilt_deg"), [
+    (FIELD, 60.0),
+    *(pytest.param(markers, tilt, marks=pytest.mark.long)
+      for markers in (CUBE, FIELD) for tilt in (0.0, 30.0, 75.0, 150.0)),
+])
+def test_an_image_is_that_of_rays(markers, tilt_deg):
+    """Errors of the rays fall with the power 1.5 of their number along a side, those of the image
+    would stay."""
+    scenes = scenes_of(pipeline(markers, tilt_deg))
+    image = image_of(scenes)
+    coarse, fine = (
+        np.sqrt(((image - rays_of(markers, scenes, n)) ** 2).mean()) for n in (4, 16)
+    )
+    assert fine < 0.35
+    assert fine < 0.25 * coarse or fine == coarse == 0
+
+
+def test_sheets_behind_others_and_backs_are_not_visible():
+    hidden = [marker(0, 0, 0, 0, size=0.01), marker(1, 0, 0, 0.05), marker(2, 0.05, 0, 0),
+              marker(3, -0.05, 0, 0, tilt=180)]
+    chosen = pipeline(hidden, tilt_deg=0.0)
+    scenes, values = scenes_of(chosen), scene_values(chosen, [])
+    boards = board_scenes(scenes, values["board"].listed(1), visibility_flags(scenes), (4, 0))
+    not_visible = DetectionStatus.not_visible
+    assert boards.flags[0].tolist() == [
+        not_visible, DetectionStatus.not_run, DetectionStatus.not_run, not_visible
+    ]
+
+
+@pytest.mark.parametrize("solver", ["iterative", "sqpnp", "epnp"])
+def test_a_cube_gives_its_pose(solver):
+    chosen = pipeline(CUBE, 40.0, estimator={"solver": solver}, scene={"blur_px": 0.5})
+    found = run_cells(chosen, [])
+    assert found.failures == []
+    assert found.columns["estimate"][0].tolist() == [EstimateStatus.solved]
+    assert found.columns["point_count"][0][0] >= 8
+    assert found.columns["rotation_error_deg"][0][0] < 5
+    assert np.linalg.norm(found.columns["translation_error_m"][0]) < 0.008
+
+
+def test_a_marker_alone_in_another_plane_is_a_marker_at_its_pose():
+    single = Pipeline.from_dict({
+        "camera": {"width_px": 160, "height_px": 120, "fx_px": 150, "fy_px": 150},
+        "marker": {"dictionary": "DICT_4X4_50", "marker_id": 7, "size_m": 0.04},
+        "pose": {"distance_m": 0.15, "tilt_deg": 0.0},
+        "scene": {"background": LEVELS[0], "black": LEVELS[1], "white": LEVELS[2]},
+    })
+    raised = pipeline([marker(7, 0, 0, 0.05)], tilt_deg=0.0, pose={"distance_m": 0.2})
+    np.testing.assert_allclose(
+        image_of(scenes_of(raised)), image_of(scenes_of(single)), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(("change", "fault"), [
+    ({"estimator": {"solver": "ippe"}}, "one of iterative, sqpnp, epnp"),
+    ({"scene": {"curvature_per_m": 1.0}}, "it absent, for markers with z_m or tilt_deg"),
+    ({"scene": {"renderer": "warp"}}, "exact, for markers"),
+    ({"scene": {"bound": "known_blur", "noise_grey": 2.0}}, "none, for markers"),
+    ({"detector": {"refineDetectedMarkers": True}}, "false, for markers"),
+])
+def test_what_needs_a_plane_is_refused(change, fault):
+    with pytest.raises(PipelineError, match=fault):
+        pipeline(CUBE, **change)
+
+
+def test_markers_that_overlap_in_their_plane_are_refused():
+    tilted = [marker(k, 0.0, 0.02 * k, 0.0, tilt=90, azimuth=90) for k in range(2)]
+    with pytest.raises(PipelineError, match="do not overlap"):
+        pipeline(tilted)
+    assert pipeline([marker(0, 0, 0, 0), marker(1, 0, 0, 0.01)]) is not None

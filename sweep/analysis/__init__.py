@@ -8,6 +8,7 @@ each.
 from __future__ import annotations
 
 from sweep.analysis.ambiguities import ambiguity
+from sweep.analysis.board_markers import per_marker
 from sweep.analysis.bound_ratios import efficiency
 from sweep.analysis.camera_calibration import calibration_summary, camera_calibrations
 from sweep.analysis.comparisons import compare
@@ -31,6 +32,6 @@ __all__ = [
     "covariance_trust", "detection_limit", "detection_rate", "efficiency",
     "environment_differences", "error_models", "error_statistics",
     "failure_composition", "farthest_met", "flip_rate", "marker_ranking", "model_covariance",
-    "model_errors", "precision_reached", "renderer_bias", "requirement_limits",
+    "model_errors", "per_marker", "precision_reached", "renderer_bias", "requirement_limits",
     "simulation_gap",
 ]

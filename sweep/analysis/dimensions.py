@@ -9,7 +9,8 @@ from typing import Any
 
 import xarray as xr
 
-from sweep.analysis.pose_view import REQUIRED_VARIABLES
+from sweep.analysis.board_markers import AXIS
+from sweep.analysis.pose_view import DETECTION_INPUTS, REQUIRED_VARIABLES
 from sweep.errors import ArgumentError, DatasetError, SweepError
 from sweep.plan.alternatives import PHOTOGRAPHS
 from sweep.plan.camera_values import SQUARE_FORMAT, stored_text
@@ -166,8 +167,12 @@ def kept_dimensions(results: xr.Dataset, per: Sequence[str]) -> tuple[str, ...]:
 
 
 def require_poses(results: xr.Dataset) -> None:
-    """Raise DatasetError unless a dataset has the variables of results, and poses."""
-    lacking = [name for name in REQUIRED_VARIABLES if name not in results]
+    """Raise DatasetError unless a dataset has the variables of results, and poses.
+
+    Of boards' markers (`sweep.analysis.per_marker`) it has detections alone.
+    """
+    required = DETECTION_INPUTS if AXIS in results.dims else REQUIRED_VARIABLES
+    lacking = [name for name in required if name not in results]
     if lacking:
         present = ", ".join(map(str, results.data_vars)) or "none"
         raise DatasetError(f"no variable {', '.join(lacking)}; there are {present}")

@@ -26,6 +26,7 @@ from sweep.exchange.truth import TruthTables
 from sweep.execution.affordability import free_disk
 from sweep.messages import byte_count, plain
 from sweep.model.renderers import render
+from sweep.plan.boards import shows_boards
 from sweep.plan.experiment import Pipeline
 from sweep.store.provenance import environment, fingerprint
 
@@ -117,13 +118,19 @@ def export(
     ArgumentError
         If ``workers`` is below 1.
     StoreError
-        If the folder holds something else, or cannot be written, or there is too much to write.
+        If the folder holds something else, or cannot be written, or there is too much to write, or
+        scenes show boards.
     RunError
         If an image cannot be rendered.
     """
     started = time.perf_counter()
     if workers is not None and workers < 1:
         raise ArgumentError("workers", workers, "expected at least 1")
+    if shows_boards(pipeline):
+        raise StoreError(
+            f"{pipeline.source}: shows boards, whose markers the table of truth has no rows for; "
+            'only single markers are exported: delete [board], or --set \'kind="none"\''
+        )
     target = Path(folder)
     count = scene_count(pipeline)
     if count > MAX_SCENES:

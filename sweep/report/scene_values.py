@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -44,7 +45,19 @@ def _difference(
     return "" if same else "  (stored: other last digits)"
 
 
+MAX_NUMBERS = 12
+"""Numbers of a variable that are written out; of more, as of boards' corners, a summary is."""
+
+
 def _text(variable: Variable, value: NDArray[Any]) -> str:
     if variable.flags is not None:
-        return str(variable.flags(int(value)).name)
+        names = Counter(variable.flags(int(flag)).name for flag in np.ravel(value))
+        return next(iter(names)) if np.ndim(value) == 0 else ", ".join(
+            f"{count} {name}" for name, count in names.items())
+    if value.size > MAX_NUMBERS:
+        known = value[np.isfinite(value)]
+        if not known.size:
+            return f"{value.size} x nan"
+        return (f"RMS {coordinate(float(np.sqrt(np.mean(known**2))))}, largest "
+                f"{coordinate(float(np.abs(known).max()))} of {known.size} numbers")
     return " ".join(coordinate(float(number)) for number in value.ravel())

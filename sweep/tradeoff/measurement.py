@@ -323,7 +323,8 @@ def _corner_noise_scale(
 
     1 for estimators whose covariance does not come from the corners' noise.
     """
-    error = results["corner_error_px"].astype(np.float64)
+    of_board = "marker_corner_error_px" in results
+    error = results["marker_corner_error_px" if of_board else "corner_error_px"].astype(np.float64)
     searched = [axis.name for axis in pipeline.axes_of(Stage.detection)]
     over = [dim for dim in error.dims if dim not in (*per, *searched)]
     measured = (error**2).mean(over).compute()

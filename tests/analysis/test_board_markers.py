@@ -1,0 +1,61 @@
+"""Rates and corners of the markers of boards, against plain NumPy."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from sweep.analysis import detection_rate, error_statistics, per_marker
+from sweep.errors import DatasetError
+from sweep.measure.flags import DetectionStatus, uncounted_values
+
+pytestmark = pytest.mark.quick
+
+
+def _boards() -> xr.Dataset:
+    """Return 2 sizes x 30 draws of boards of 3 markers, the first size with 2 of them."""
+    rng = np.random.default_rng(4)
+    flags = rng.choice(
+        [DetectionStatus.detected, DetectionStatus.rejected, DetectionStatus.not_visible],
+        size=(2, 30, 3), p=[0.6, 0.3, 0.1],
+    ).astype(np.uint8)
+    flags[0, :, 2] = DetectionStatus.not_on_board
+    errors = rng.normal(size=(2, 30, 3, 4, 2)).astype(np.float32)
+    errors[flags != DetectionStatus.detected] = np.nan
+    scene = ("size_m", "trial")
+    return xr.Dataset(
+        {
+            "true_tvec_m": ((*scene, "xyz"), np.ones((2, 30, 3))),
+            "detection": (scene, flags.min(axis=2)),
+            "marker_detection": ((*scene, "marker"), flags),
+            "marker_corner_error_px": ((*scene, "marker", "corner", "xy"), errors),
+            "board_marker_id": ((*scene, "marker"), np.tile(np.float32([4, 5, 6]), (2, 30, 1))),
+        },
+        {"size_m": [0.02, 0.04], "trial": np.arange(30), "marker": np.arange(3)},
+    )
+
+
+@pytest.mark.parametrize("chunked", [False, True])
+def test_rates_of_markers_count_those_that_are_on_the_board_and_visible(chunked: bool) -> None:
+    boards = _boards()
+    flags = boards["marker_detection"].to_numpy()
+    markers = per_marker(boards.chunk(trial=7) if chunked else boards)
+    counted = ~np.isin(flags, uncounted_values(DetectionStatus))
+    table = detection_rate(markers, per=["size_m", "board_marker"]).compute()
+    np.testing.assert_array_equal(table["looked_for"], counted.sum(axis=1))
+    np.testing.assert_array_equal(table["detected"], (flags == 1).sum(axis=1))
+    assert np.isnan(table["detection_rate"].sel(size_m=0.02, board_marker=2))
+    pooled = detection_rate(markers).compute()
+    assert pooled["looked_for"] == counted.sum()
+    assert pooled["draws"] <= 60, "markers of one image are one draw at most"
+    by_id = detection_rate(markers, bins={"board_marker_id": [4, 5, 7]}).compute()
+    assert by_id["looked_for"].values.tolist() == [counted[..., 0].sum(), counted[..., 1:].sum()]
+    squares = np.nanmean(boards["marker_corner_error_px"].to_numpy() ** 2, axis=(0, 1, 3, 4))
+    found = (markers["corner_error_px"] ** 2).mean(["size_m", "trial", "corner", "xy"])
+    np.testing.assert_allclose(found, squares, rtol=1e-5)
+
+
+def test_estimates_are_not_those_of_markers() -> None:
+    with pytest.raises(DatasetError, match="no variable estimate"):
+        error_statistics(per_marker(_boards()))
+    with pytest.raises(DatasetError, match="the scenes show no boards"):
+        per_marker(_boards().drop_vars("marker_detection"))

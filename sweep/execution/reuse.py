@@ -386,5 +386,6 @@ def _read(
     for k, name in enumerate(new_names):
         if name not in names:
             part = np.expand_dims(part, k)
+    part = variable.fitted(part)
     shape = [len(indices[n]) if n in indices else part.shape[k] for k, n in enumerate(new_names)]
     return np.array(np.broadcast_to(part, shape))

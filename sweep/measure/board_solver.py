@@ -310,6 +310,10 @@ def _called(
     ]
 
 
+COLLINEAR = 1e-6
+"""Least extent of points across their line, of unit size along it: points of a line leave the turn
+about it open, and SQPnP and EPnP return any."""
+
 _Z_IN = np.diag([1.0, -1.0, -1.0])
 
 
@@ -329,6 +333,8 @@ def guarded_poses(
     if not size > 0 or not np.isfinite(flat).all():
         return []
     unit = (objects - middle) / size @ _Z_IN
+    if np.linalg.svd(unit[:, :2], compute_uv=False)[1] < COLLINEAR:
+        return []
     planar = np.column_stack([unit[:, :2], np.ones(len(unit))])
     (right, _, _), *_ = np.linalg.lstsq(planar, flat, rcond=None)
     turn = round(math.atan2(right[1], right[0]) / (math.pi / 2)) % 4

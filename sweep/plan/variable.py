@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sweep.measure.flags import DetectionStatus, Flag
 from sweep.plan.axes import Axis
 from sweep.plan.parameters import Stage
@@ -177,6 +180,23 @@ class Variable:
         """Lengths of the inner dimensions."""
         lengths = dict(self.lengths)
         return tuple(lengths.get(name, len(LABELS[name])) for name in self.inner)
+
+    def fitted(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return another store's values (..., inner) cut or filled to this one's inner lengths.
+
+        A store's boards have as many markers as the largest of its grid: what is cut or filled
+        lies beyond the boards of the cells that two grids share.
+        """
+        lengths = self.inner_shape
+        cut: list[Any] = [..., *(slice(length) for length in lengths)]
+        kept: NDArray[Any] = values[tuple(cut)]
+        outer = kept.ndim - len(lengths)
+        missing = [a - b for a, b in zip(lengths, kept.shape[outer:], strict=True)]
+        if not any(missing):
+            return kept
+        beyond = DetectionStatus.not_on_board if self.flags is DetectionStatus else math.nan
+        widths = [(0, 0)] * outer + [(0, each) for each in missing]
+        return np.pad(kept, widths, constant_values=beyond)
 
     def configuration_axes(self, pipeline: Pipeline) -> tuple[Axis, ...]:
         """Return the axes of detection and estimation that it has, stage by stage.

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from sweep.errors import PipelineError
+from sweep.measure.flags import DetectionStatus
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_values
+from sweep.plan.schema import variables_of
 
 TEXT = """
 [marker]
@@ -80,3 +82,18 @@ def test_rows_of_a_grid_can_be_an_axis():
     pipeline = Pipeline.from_text(TEXT + GRID, ["rows=[1,2,5]"])
     boards = scene_values(pipeline, [np.arange(3)])["board"].listed(3)
     assert [len(board) for board in boards] == [7, 14, 35]
+
+
+def test_cells_of_smaller_boards_fit_the_largest_of_another_grid():
+    flags, errors = (
+        next(variable for variable in variables_of(Pipeline.from_text(TEXT + GRID, ["rows=[1,2]"]))
+             if variable.name == name)
+        for name in ("marker_detection", "marker_corner_error_px")
+    )
+    some = np.arange(1, 15, dtype=np.uint8).reshape(2, 7)
+    assert (flags.fitted(some)[:, :7] == some).all()
+    assert (flags.fitted(some)[:, 7:] == DetectionStatus.not_on_board).all()
+    wide = np.zeros((3, 35, 4, 2), dtype=np.float32)
+    assert errors.fitted(wide).shape == (3, 14, 4, 2)
+    assert np.isnan(errors.fitted(wide[:, :7])[:, 7:]).all()
+    assert errors.fitted(wide[:, :7]).dtype == np.float32

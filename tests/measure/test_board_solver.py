@@ -1,0 +1,76 @@
+"""Poses of boards by guarded solvers, from noise-free points and from points of one line."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from support.lengths import lengths
+from sweep.measure.board_solver import BOARD_METHODS, BoardDetections, BoardPoints, BoardSolver
+from sweep.measure.flags import EstimateStatus
+from sweep.model.board_kinds import Charuco
+from sweep.model.camera import Cameras
+from sweep.model.lens import pack
+from sweep.model.pose import rotation_of_angles
+
+BOARD = Charuco(
+    dictionary="DICT_5X5_100", squares_x=5, squares_y=4, square_m=0.03, marker_m=0.02
+).board()
+VIEW = np.array([600.0, 600.0, 319.5, 239.5])
+CAMERA = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])
+LENS = (-0.2, 0.05, 0.001, -0.0005)
+
+
+def solved(solver, points, chessboard, rotation, translation, distortion):
+    """The estimate from a ChArUco board's exact markers and chessboard corners, as OpenCV
+    projects them."""
+    packed = pack(distortion)
+    vector, lens = Rotation.from_matrix(rotation).as_rotvec(), np.array(distortion or (0.0,) * 4)
+
+    def pixels(objects):
+        return cv2.projectPoints(objects, vector, translation, CAMERA, lens)[0].reshape(-1, 2)
+
+    found = BoardPoints(
+        np.arange(len(BOARD)), pixels(BOARD.corners_m.reshape(-1, 3)).reshape(-1, 4, 2),
+        chessboard, pixels(BOARD.chessboard_m[chessboard]),
+    )
+    detections = BoardDetections(
+        [BOARD], [found], Cameras(VIEW[None], packed[None], np.array([bool(distortion)])),
+        np.zeros(1), np.zeros(1), np.ones(1),
+    )
+    return BoardSolver(solver, points, "none", True, 0.25, None)(detections)
+
+
+@pytest.mark.parametrize("solver", BOARD_METHODS)
+@pytest.mark.parametrize("distortion", [(), LENS])
+@lengths(6, 200)
+def test_exact_points_of_a_board_give_its_pose(solver, distortion, count):
+    rng = np.random.default_rng(6)
+    number = np.arange(len(BOARD.chessboard_m))
+    for k in range(count):
+        tilt = rng.choice([0.0, 1e-6, 1e-3, 30.0, 80.0, rng.uniform(0, 85)])
+        roll = float(rng.choice([0.0, 90.0, 180.0, 270.0, rng.uniform(0, 360)]))
+        rotation = rotation_of_angles(
+            np.radians([tilt]), rng.uniform(0, 7, 1), np.radians([roll])
+        )[0]
+        translation = rng.choice([0.3, 1.0, 10.0]) * np.array([*rng.uniform(-0.2, 0.2, 2), 1.0])
+        points = ("markers", "chessboard")[k % 2]
+        found = solved(solver, points, number, rotation, translation, distortion)
+        if found.status[0] != EstimateStatus.solved:
+            assert solver == "epnp"
+            continue
+        error = Rotation.from_matrix(found.rotation[0] @ rotation.T).magnitude()
+        assert np.degrees(error) < 0.05
+        off = np.linalg.norm(found.translation[0] - translation)
+        assert off < 1e-3 * np.linalg.norm(translation)
+
+
+@pytest.mark.parametrize("solver", BOARD_METHODS)
+def test_points_of_one_line_are_no_pose(solver):
+    rotation = rotation_of_angles(np.radians([30.0]), np.ones(1), np.zeros(1))[0]
+    for line in ([0, 1, 2, 3], [0, 4, 8], [8, 9, 10, 11]):
+        found = solved(
+            solver, "chessboard", np.array(line), rotation, np.array([0.0, 0.0, 0.5]), ()
+        )
+        wanted = EstimateStatus.too_few_points if len(line) < 4 else EstimateStatus.solver_failed
+        assert found.status[0] == wanted

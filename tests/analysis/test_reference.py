@@ -110,9 +110,9 @@ def expected_flips(found):
 
 
 OF_LOOKED_FOR = ("solved", "wrong_id", "rejected", "no_candidate", "solver_failed",
-                 "not_converged", "not_explained", "failed", "crashed")
-OUTCOMES = (*OF_LOOKED_FOR, "not_visible", "not_modelled", "not_in_photograph", "not_run",
-            "not_needed")
+                 "not_converged", "not_explained", "too_few_points", "failed", "crashed")
+OUTCOMES = (*OF_LOOKED_FOR, "not_visible", "not_modelled", "not_in_photograph", "not_on_board",
+            "not_run", "not_needed")
 
 
 def outcome(pose):

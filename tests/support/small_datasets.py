@@ -197,6 +197,7 @@ def looked_for(pose):
     return pose["detection"] not in {
         DetectionStatus.not_run, DetectionStatus.not_visible, DetectionStatus.not_modelled,
         DetectionStatus.not_needed, DetectionStatus.not_in_photograph,
+        DetectionStatus.not_on_board,
     }
 
 

@@ -15,7 +15,7 @@ from distributed import Client, LocalCluster
 import sweep
 from sweep.errors import ArgumentError, RunError
 from sweep.execution import cluster as clusters
-from sweep.execution import in_flight, stall
+from sweep.execution import in_flight, stall, worker_versions
 from sweep.execution.cluster import borrowed, embedded
 from sweep.execution.distributed_internals import worker_states
 from sweep.execution.in_flight import BlocksInFlight
@@ -25,6 +25,7 @@ from sweep.isolation import machine_memory
 from sweep.isolation.interrupts import Interrupts
 from sweep.store.lifecycle import create_store
 from sweep.store.lock import locked
+from sweep.store.provenance import fingerprint
 
 PIPELINE = sweep.Pipeline.from_dict(
     {"pose": {"side_px": 40, "jitter_px": 0.5}, "axes": {"trial": 40}}
@@ -100,6 +101,18 @@ def test_workers_that_are_threads_of_the_caller_are_refused():
     # A scene that crashes, and the time limit, end the process of a worker.
     with local_cluster(1, processes=False, protocol="tcp://") as cluster:
         assert "its workers are threads of this process" in refusal(cluster)
+
+
+def test_workers_with_other_versions_are_refused(tmp_path, monkeypatch):
+    async def elsewhere(_, given):
+        return {"tcp://worker": ({**fingerprint(given), "opencv": "0.0"}, ("elsewhere", 1), [])}
+
+    monkeypatch.setattr(worker_versions, "_worker_identities", elsewhere)
+    with local_cluster(1, processes=False, protocol="tcp://") as cluster:
+        for given in ({"scheduler": cluster.scheduler_address}, {"client": cluster}):
+            with pytest.raises(ArgumentError, match=r"tcp://worker: opencv 0\.0, here"):
+                execute(PIPELINE, tmp_path / "other.zarr", **given)
+    assert not (tmp_path / "other.zarr").exists()
 
 
 @pytest.mark.long

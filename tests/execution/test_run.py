@@ -429,20 +429,6 @@ def test_blocks_cover_the_grid_once_and_are_listed_lazily():
     assert str(next(iter(huge))) == "0-1"
 
 
-def test_workers_with_other_versions_are_refused(pipeline, cluster, tmp_path, monkeypatch):
-    from sweep.execution import worker_versions  # noqa: PLC0415
-    from sweep.store.provenance import fingerprint  # noqa: PLC0415
-
-    async def elsewhere(_, given):
-        return {"tcp://worker": ({**fingerprint(given), "opencv": "0.0"}, ("elsewhere", 1), [])}
-
-    monkeypatch.setattr(worker_versions, "_worker_identities", elsewhere)
-    for given in ({"scheduler": cluster.scheduler_address}, {"client": cluster}):
-        with pytest.raises(ArgumentError, match=r"tcp://worker: opencv 0\.0, here"):
-            execute(pipeline, tmp_path / "other.zarr", **given)
-    assert not (tmp_path / "other.zarr").exists()
-
-
 def test_workers_refuse_a_store_that_was_begun_with_other_versions(pipeline, tmp_path):
     url = str(tmp_path / "begun.zarr")
     store = create_store(url, pipeline, (2, 4, 2, 3))

@@ -19,7 +19,7 @@ from sweep.measure.flags import EstimateStatus
 from sweep.model.calibration_error import COEFFICIENTS, VIEW
 from sweep.model.camera import Cameras
 from sweep.model.columns import Column
-from sweep.model.lens import pack
+from sweep.model.lens import pack, pack_once
 from sweep.model.scene import Scenes
 from sweep.plan.beliefs import CALIBRATED
 from sweep.typing import Floats
@@ -56,7 +56,7 @@ def assumed_cameras(
     coefficients = [CALIBRATED + name for name in COEFFICIENTS if CALIBRATED + name in values]
     if calibrated and coefficients:
         each = np.stack([values[name].values for name in coefficients], axis=1)
-        lenses = np.array([pack.__wrapped__(tuple(row)) for row in each.tolist()])
+        lenses = np.array([pack_once(tuple(row)) for row in each.tolist()])
         distorted = np.asarray(lenses[:, :14].any(axis=1))
     if estimator.believed_distortion is not None:
         packed = pack(estimator.believed_distortion)

@@ -60,15 +60,25 @@ def fold_radius(coefficients: Sequence[float]) -> float:
     return first
 
 
-@lru_cache(maxsize=1024)
 def pack(coefficients: tuple[float, ...]) -> NDArray[np.float64]:
-    """Return a lens as the vector (24,) that the compiled functions take."""
+    """Return a lens as the vector (24,) that the compiled functions take.
+
+    Each call returns an array of its own: for one that is read-only each function would be
+    compiled a second time.
+    """
+    return _kept(coefficients).copy()
+
+
+def pack_once(coefficients: tuple[float, ...]) -> NDArray[np.float64]:
+    """Return what :func:`pack` does, for coefficients that do not come again: nothing is kept."""
     packed = np.zeros(PACKED)
     packed[: len(coefficients)] = coefficients
     packed[14:23] = _tilt_matrix(packed[12], packed[13]).ravel()
     packed[23] = fold_radius(coefficients)
-    packed.setflags(write=False)
     return packed
+
+
+_kept = lru_cache(maxsize=1024)(pack_once)
 
 
 @compiled

@@ -93,6 +93,8 @@ def sheet_of(
     length_px: float = math.inf,
 ) -> Sheet:
     """Return a sheet of a shape in units of ``unit_m``, with the shift's waves and its length."""
+    # Functions are compiled once for each layout of an array in memory.
+    waves = np.ascontiguousarray(waves)
     return Sheet(
         float(centre[0]), float(centre[1]), shape.curvature_per_m * unit_m,
         math.cos(shape.direction_rad), -math.sin(shape.direction_rad), shape.saddle,

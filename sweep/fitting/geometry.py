@@ -8,9 +8,9 @@ their corners beside the centres, which turn a pose. The farther the field reach
 the second one beside the first.
 
 Their covariance follows from the field, too: that of xᵀAx and xᵀBx is 2 tr(AVBV) for normal x of
-covariance V (Searle, "Linear Models", 1971, section 2.5). Size and length that the sums do not
-refuse are the interval. So it is as wide as at the values in it: a small sum has itself a small
-spread, and an interval from the spread would end too early.
+covariance V (Searle, "Linear Models", 1971, section 2.5). The interval has the sizes and lengths
+that the logarithms of the sums do not refuse. An interval from the spread of the sums would end too
+early where they are small: their spread is then small, too.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class Residuals:
 
     Attributes
     ----------
-    squares
-        (2,) px², without those that the pixels' noise is expected to add.
+    squares, noise
+        (2,) px², and what the pixels' noise is expected to add to them.
     fields
         (2, lengths) what a field of standard deviation 1 px adds, for each of :data:`LENGTHS`.
     covariance
@@ -59,6 +59,7 @@ class Residuals:
     """
 
     squares: Floats
+    noise: Floats
     fields: Floats
     covariance: Floats
 
@@ -164,11 +165,10 @@ def residuals_of(
             _traces(by_noise, by_noise), mixed + mixed.T, _traces(by_field, by_field)
         )
     flat = shifts.ravel()
-    squares = [
-        float(flat @ form @ flat - np.trace(each))
-        for form, each in zip(forms, by_noise, strict=True)
-    ]
-    return Residuals(np.array(squares), fields, covariance)
+    return Residuals(
+        np.array([flat @ form @ flat for form in forms]),
+        np.array([np.trace(each) for each in by_noise]), fields, covariance,
+    )
 
 
 def _traces(first: Sequence[Floats], second: Sequence[Floats]) -> Floats:
@@ -195,64 +195,63 @@ class Shifts:
 
 def shifts_of(residuals: Sequence[Residuals], width_px: float) -> Shifts:
     """Return the field of shifts that has the sums of squares of n photographs' residuals."""
-    squares = np.array([each.squares for each in residuals])
-    fields = np.array([each.fields for each in residuals])
-    covariance = np.array([each.covariance for each in residuals])
-    size, length = _matched(squares.sum(axis=0), fields.sum(axis=0))
+    total = Residuals(*(
+        np.sum([getattr(each, name) for each in residuals], axis=0)
+        for name in ("squares", "noise", "fields", "covariance")
+    ))
+    size, length = _matched(total.squares - total.noise, total.fields)
     first, last = np.log(LENGTHS[[0, -1]]).tolist()
     finer = np.linspace(first, last, FINER * (len(LENGTHS) - 1) + 1)
-    distance = _distances(
-        squares.sum(axis=0), _at_lengths(fields.sum(axis=0), finer, 1),
-        _at_lengths(covariance.sum(axis=0), finer, 1), SIZES_PX[:, None],
-    )
-    limit = float(special.chdtri(1, 1 - LEVEL)) * _excess(
-        squares, fields, covariance, math.exp(size), length
-    )
+    expected, covariance = _expected(total, SIZES_PX[:, None], finer)
+    refused = _distance(
+        np.log(total.squares / expected),
+        covariance / (expected[..., None] * expected[..., None, :]),
+    ) / _excess(residuals, math.exp(size), length)
+    limit = float(special.chdtri(1, 1 - LEVEL))
     sizes, lengths = (
-        Estimate(value, *_ends(grid, distance.min(axis=axis), limit)).mapped(math.exp)
+        Estimate(value, *_ends(grid, refused.min(axis=axis), limit)).mapped(math.exp)
         for value, grid, axis in ((size, np.log(SIZES_PX), 1), (length, finer, 0))
     )
-    own = _at_lengths(fields.sum(axis=1), length, 1)
-    return Shifts(
-        sizes, lengths.mapped(lambda share: share * width_px), squares.sum(axis=1) / own
-    )
+    return Shifts(sizes, lengths.mapped(lambda share: share * width_px), np.array([
+        float((each.squares - each.noise).sum()) / np.interp(
+            length, np.log(LENGTHS), each.fields.sum(axis=0)
+        ) for each in residuals
+    ]))
 
 
-def _at_lengths(values: Floats, length: Floats | float, axis: int) -> Floats:
-    """Return values at logarithms of lengths, in the place of those at LENGTHS."""
-    return np.asarray(interpolate.interp1d(np.log(LENGTHS), values, axis=axis)(length))
+def _expected(
+    sums: Residuals, size_px: Floats | float, length: Floats | float
+) -> tuple[Floats, Floats]:
+    """Return what sums of squares are (..., 2), and their covariance (..., 2, 2), with a field.
 
-
-def _distances(squares: Floats, fields: Floats, covariance: Floats, size_px: Floats) -> Floats:
-    """Return the squared standard deviations of sums from what sizes and lengths lead to.
-
-    Sums are (..., 2), fields (2, lengths), covariances (3, lengths, 2, 2), sizes (sizes, 1).
+    ``length`` has the logarithms of shares of the width.
     """
-    size = size_px**2
-    first, second = (squares[k] - size * fields[k] for k in range(2))
-    one, both, other = (
-        covariance[0, :, i, j] + size * covariance[1, :, i, j] + size**2 * covariance[2, :, i, j]
-        for i, j in ((0, 0), (0, 1), (1, 1))
-    )
+    at, square = np.log(LENGTHS), np.asarray(size_px)[..., None] ** 2
+    fields = interpolate.interp1d(at, sums.fields.T, axis=0)(length)
+    none, mixed, both = interpolate.interp1d(at, sums.covariance, axis=1)(length)
+    square2 = square[..., None]
+    return sums.noise + square * fields, none + square2 * (mixed + square2 * both)
+
+
+def _distance(deviations: Floats, covariance: Floats) -> Floats:
+    """Return the squares (...) of deviations (..., 2), in units of their covariance."""
+    first, second = deviations[..., 0], deviations[..., 1]
+    one, both, other = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
     return np.asarray(
         (first**2 * other - 2 * first * second * both + second**2 * one) / (one * other - both**2)
     )
 
 
-def _excess(
-    squares: Floats, fields: Floats, covariance: Floats, size_px: float, length: float
-) -> float:
+def _excess(residuals: Sequence[Residuals], size_px: float, length: float) -> float:
     """Return how many times as much photographs vary as photographs with one field do; 1 or more.
 
     It is 1 if chance does it with more than 5 %.
     """
-    at = np.array([length])
-    total = sum(
-        float(_distances(one, _at_lengths(field, at, 1), _at_lengths(each, at, 1),
-                         np.array([[size_px]]))[0, 0])
-        for one, field, each in zip(squares, fields, covariance, strict=True)
-    )
-    freedom = squares.size - 2
+    total = 0.0
+    for each in residuals:
+        expected, covariance = _expected(each, size_px, length)
+        total += float(_distance(each.squares - expected, covariance))
+    freedom = 2 * len(residuals) - 2
     return total / freedom if total > special.chdtri(freedom, 1 - LEVEL) else 1.0
 
 

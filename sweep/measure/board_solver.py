@@ -17,7 +17,7 @@ from sweep.measure.flags import EstimateStatus
 from sweep.measure.solver import both_planar_solutions, estimate
 from sweep.model.board import Board
 from sweep.model.camera import Cameras
-from sweep.model.pose import rotation_of_vector, transform_points
+from sweep.model.pose import rotation_of_vector, transform_points, vector_of_rotation
 from sweep.typing import Floats, Grey, Integers
 
 BOARD_METHODS: dict[str, int] = {
@@ -217,7 +217,7 @@ class BoardSolver:
     ) -> _Solution:
         """Return a pose after OpenCV's refinement on all points; the start if it fails."""
         refine: Any = cv2.solvePnPRefineLM if self.refine == "lm" else cv2.solvePnPRefineVVS
-        vector, _ = cv2.Rodrigues(start.rotation)
+        vector = vector_of_rotation(start.rotation[None])[0][:, None]
         try:
             r, t = refine(
                 objects, pixels, cameras.matrix(0), _lens(cameras), vector,

@@ -62,7 +62,8 @@ def measured(
 
 def _of_fixed_trials(flags):
     """Return the flags but that of trials which a precision did not need."""
-    return [each for each in flags if each.name != "not_needed"]
+    return [each for each in flags
+            if each.name not in ("not_needed", "not_on_board", "too_few_points")]
 
 
 def with_flags_of_every_kind(rng, results):
@@ -109,7 +110,7 @@ def poses(results, **kept):
 def looked_for(pose):
     return pose["detection"] not in {
         DetectionStatus.not_run, DetectionStatus.not_visible, DetectionStatus.not_modelled,
-        DetectionStatus.not_in_photograph,
+        DetectionStatus.not_in_photograph, DetectionStatus.not_on_board,
     }
 
 

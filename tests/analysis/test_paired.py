@@ -176,7 +176,7 @@ def test_p_values_of_ids_are_pearsons_third_curve_near_the_exact_ones(case):
             tails = curve.cdf(hits + 0.5), curve.sf(hits - 0.5)
             assert p_value == pytest.approx(min(1.0, 2 * min(tails)), rel=1e-9)
             exact = min(1.0, 2 * min(exact_tails(hits, parts)))
-            assert p_value == pytest.approx(exact, rel=0.02, abs=0.002)
+            assert p_value == pytest.approx(exact, rel=0.03, abs=0.002)
 
 
 def test_of_two_ids_looked_for_alike_the_p_value_is_that_of_cochran_mantel_and_haenszel():

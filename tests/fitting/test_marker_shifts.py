@@ -43,9 +43,10 @@ def photograph(generator):
 
     def squares():
         drawn = factor @ generator.normal(size=len(points))
-        return np.array([drawn @ form @ drawn - np.trace(form @ NOISE) for form in forms])
+        return np.array([drawn @ form @ drawn for form in forms])
 
-    return Residuals(np.zeros(2), fields, covariance), squares
+    noise = np.array([np.trace(form @ NOISE) for form in forms])
+    return Residuals(np.zeros(2), noise, fields, covariance), squares
 
 
 @pytest.mark.long

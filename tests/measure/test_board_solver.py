@@ -36,7 +36,7 @@ def solved(solver, points, chessboard, rotation, translation, distortion):
     )
     detections = BoardDetections(
         [BOARD], [found], Cameras(VIEW[None], packed[None], np.array([bool(distortion)])),
-        np.zeros(1), np.zeros(1), np.ones(1),
+        np.zeros(1), np.zeros(1), np.ones(1), [], np.zeros((1, 2), dtype=np.int64),
     )
     return BoardSolver(solver, points, "none", True, 0.25, None)(detections)
 

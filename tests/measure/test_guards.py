@@ -61,8 +61,14 @@ def cameras(count, lens=()):
 # The guards sit in one place.
 
 PLACES = {
-    "solvePnP": {"measure/solver.py"},
-    "solvePnPGeneric": {"measure/solver.py", "photographs/board_truth.py"},  # starts a fit
+    "solvePnP": {
+        "measure/solver.py",
+        "analysis/camera_calibration.py",  # upright targets without noise, z in
+    },
+    "solvePnPGeneric": {
+        "measure/solver.py", "measure/board_solver.py",
+        "photographs/board_truth.py",  # starts a fit
+    },
     "Rodrigues": set(),
     "projectPoints": {"photographs/pose_fit.py"},  # of boards before the camera
     "undistortPoints": set(),

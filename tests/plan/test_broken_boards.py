@@ -32,7 +32,7 @@ BROKEN = {
         TABLE.replace("= 2", "= 1"), "board.markers = [1, 1]: expected each ID once; 1 is listed"
     ),
     "an ID beyond the dictionary": (TABLE.replace("= 2", "= 50"), "expected IDs from 0 to 49"),
-    "an unknown key of a marker": (TABLE.replace("y_m = 0\n", "z_m = 0\n", 1), "z_m is unknown"),
+    "an unknown key of a marker": (TABLE.replace("y_m = 0\n", "w_m = 0\n", 1), "w_m is unknown"),
     "a missing key of a marker": (TABLE.replace("x_m = 0.1\n", ""), "x_m is missing in one"),
     "a coordinate that is no number": (TABLE.replace("0.1", "nan"), "all finite numbers"),
     "a coordinate that is text": (TABLE.replace("0.1", '"a"'), "all finite numbers"),

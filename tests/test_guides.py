@@ -33,7 +33,7 @@ NAMES = [str(path.relative_to(TOP)) for path in GUIDES]
 ROOMS_WITH_A_GUIDE = ("analysis", "execution", "integrity", "measure", "tradeoff")
 BLOCK = re.compile(r"(?:<!-- ([^\n]*?) -->\n)?```(\w*)\n(.*?)```", re.DOTALL)
 
-FIRST_READ = ("README.md", "pipelines/README.md", "pipelines/photographs/README.md")
+FIRST_READ = ("README.md", "pipelines/README.md")
 """Guides whose blocks are run by default; those of all guides are run by the long tests."""
 
 SHOWN = {

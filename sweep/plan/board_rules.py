@@ -18,6 +18,7 @@ from sweep.model.board_values import (
     is_solid,
 )
 from sweep.model.effects import GEOMETRIC
+from sweep.model.renderers import renderer_fault
 from sweep.plan.alternatives import PHOTOGRAPHS
 from sweep.plan.parameters import PARAMETERS, Parameter
 from sweep.plan.reader import Reading
@@ -101,6 +102,9 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
     for name in reading.values("environment"):
         if name != INSTALLED:
             reading.fault("detector.environment", name, f"{INSTALLED}, for boards")
+    for name in reading.values("renderer"):
+        if renderer_fault(name) is not None:
+            reading.fault("scene.renderer", name, f"{renderer_fault(name)}, for boards")
     for name in reading.values("detector"):
         if is_recording(name):
             reading.fault("detector.detector", name, "a detector that searches images, for boards")

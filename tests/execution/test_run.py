@@ -186,7 +186,7 @@ GROWN = {
     "new axis": ["background=[128, 60]"],
 }
 
-GROWN_SHORT = ("trial", "new axis")
+GROWN_SHORT = ("new axis",)
 """Draws, and another axis."""
 
 GROWN_EXTENTS = {"dictionary": 2, "background": 1, "distance_m": 3, "tilt_deg": 2, "trial": 2}

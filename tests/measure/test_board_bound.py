@@ -96,6 +96,7 @@ def found_of(scenes, unknown_blur=False):
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("parts", "pose"),
     [

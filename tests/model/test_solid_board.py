@@ -87,10 +87,10 @@ def test_an_image_is_that_of_rays(markers, tilt_deg):
     scenes = scenes_of(pipeline(markers, tilt_deg))
     image = image_of(scenes)
     coarse, fine = (
-        np.sqrt(((image - rays_of(markers, scenes, n)) ** 2).mean()) for n in (4, 16)
+        np.sqrt(((image - rays_of(markers, scenes, n)) ** 2).mean()) for n in (3, 9)
     )
-    assert fine < 0.35
-    assert fine < 0.25 * coarse or fine == coarse == 0
+    assert fine < 0.8
+    assert fine < 0.3 * coarse or fine == coarse == 0
 
 
 def test_sheets_behind_others_and_backs_are_not_visible():

@@ -18,6 +18,7 @@ from sweep.analysis.described import describes
 from sweep.analysis.dimensions import DRAWS, axes_of, stored_pipeline
 from sweep.analysis.intervals import wilson
 from sweep.errors import ArgumentError, DatasetError, SweepError
+from sweep.measure.board_solver import guarded_poses
 from sweep.measure.flags import CalibrationStatus
 from sweep.measure.intrinsics import (
     FREE_COEFFICIENTS,
@@ -28,6 +29,7 @@ from sweep.measure.intrinsics import (
 )
 from sweep.model.board import Board
 from sweep.model.camera import Cameras
+from sweep.model.lens import pack
 from sweep.model.pose import rotation_of_vector, transform_points
 from sweep.model.scene import build_cameras
 from sweep.plan.boards import shows_boards
@@ -79,7 +81,6 @@ def camera_calibrations(
         are taken for 0.
     target_m
         Distance of a target whose position is estimated with each calibrated camera, m.
-
     offset_px
         Added to all pixels: 0.5 is the error of a program that takes the first pixel's corner for
         the origin, where OpenCV has its centre.
@@ -334,18 +335,17 @@ def _position_errors(
     corner = np.array([
         _AT_CORNER * (frame[0] - 1 - cx) / fx, _AT_CORNER * (frame[1] - 1 - cy) / fy
     ])
-    matrix = np.array([
-        [one.values[0], 0.0, one.values[2]], [0.0, one.values[1], one.values[3]], [0.0, 0.0, 1.0]
-    ])
+    assumed = Cameras(
+        one.values[None, :4], np.array([pack(tuple(one.values[4:].tolist()))]),
+        np.array([one.values[4:].any()]),
+    )
     errors = np.full((len(DIRECTIONS), 3), np.nan)
     for k, bearing in enumerate((np.zeros(2), corner)):
         position = np.array([*(bearing * distance_m), distance_m])
         pixels = camera.project(transform_points(target[None], rotation, position[None]))[0]
         if not np.isfinite(pixels).all():
             continue
-        success, _, found = cv2.solvePnP(
-            target * [1.0, -1.0, -1.0], pixels, matrix, one.values[4:], flags=cv2.SOLVEPNP_IPPE
-        )
-        if success:
-            errors[k] = np.ravel(found) - position
+        poses = guarded_poses(target, pixels, assumed, cv2.SOLVEPNP_IPPE)
+        if poses:
+            errors[k] = poses[0][1] - position
     return errors

@@ -21,6 +21,7 @@ from sweep.measure.estimation import Estimates
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.model.columns import Column
 from sweep.model.extent import areas_px
+from sweep.model.polygon import signed_areas
 from sweep.model.pose import vector_of_rotation, viewing_angle
 from sweep.model.scene import Scenes
 from sweep.plan.parameters import Stage
@@ -106,8 +107,7 @@ def _board_area_px(boards: BoardScenes) -> Floats:
     """Return the total area (N,) of the squares of a board's markers that are seen, px²."""
     unseen = boards.flags == DetectionStatus.not_visible
     seen = np.where(unseen[..., None, None], 0.0, boards.corners_px)
-    across, down = seen[:, :, 2] - seen[:, :, 0], seen[:, :, 3] - seen[:, :, 1]
-    area = 0.5 * np.abs(across[..., 0] * down[..., 1] - across[..., 1] * down[..., 0])
+    area = np.abs(signed_areas(seen.reshape(-1, 4, 2))).reshape(unseen.shape)
     return np.where(unseen.all(axis=1), np.nan, np.nansum(area, axis=1))
 
 

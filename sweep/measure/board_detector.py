@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -31,7 +31,7 @@ class BoardDetectorSetting:
     )
 
 
-class BoardOutput:
+class BoardOutput(NamedTuple):
     """What is found on a board in one image: markers, and a chessboard's corners.
 
     Attributes
@@ -42,14 +42,9 @@ class BoardOutput:
         (C,) and (C, 2) indices and pixels of the chessboard's corners that were found.
     """
 
-    __slots__ = ("chessboard_ids", "chessboard_px", "markers")
-
-    def __init__(
-        self, markers: DetectorOutput, chessboard_ids: Integers, chessboard_px: Floats
-    ) -> None:
-        self.markers = markers
-        self.chessboard_ids = chessboard_ids
-        self.chessboard_px = chessboard_px
+    markers: DetectorOutput
+    chessboard_ids: Integers
+    chessboard_px: Floats
 
 
 _NO_IDS, _NO_CORNERS = np.zeros(0, dtype=np.int64), np.zeros((0, 2))

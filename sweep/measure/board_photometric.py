@@ -17,6 +17,7 @@ from sweep.measure.board_solver import (
     MIN_POINTS,
     BoardDetections,
     guarded_poses,
+    one_by_one,
     poses_of_each_marker,
     reprojection_px,
 )
@@ -58,11 +59,7 @@ class BoardPhotometric:
 
     def __call__(self, detections: BoardDetections) -> Estimates:
         """Return the poses, with covariances from the curvature of the likelihood."""
-        count = len(detections.boards)
-        out = Estimates.none(count, EstimateStatus.solver_failed)
-        for i in range(count):
-            self._estimate(detections.take(np.array([i])), i, out)
-        return out
+        return one_by_one(detections, self._estimate)
 
     def _estimate(self, one: BoardDetections, i: int, out: Estimates) -> None:
         """Write the estimate of a single board as number ``i``."""

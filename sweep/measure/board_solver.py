@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -17,6 +17,7 @@ from sweep.measure.flags import EstimateStatus
 from sweep.measure.solver import both_planar_solutions, estimate
 from sweep.model.board import Board
 from sweep.model.camera import Cameras
+from sweep.model.polygon import signed_areas
 from sweep.model.pose import rotation_of_vector, transform_points, vector_of_rotation
 from sweep.typing import Floats, Grey, Integers
 
@@ -98,6 +99,17 @@ class BoardEstimator(Protocol):
         ...
 
 
+def one_by_one(
+    detections: BoardDetections, write: Callable[[BoardDetections, int, Estimates], None]
+) -> Estimates:
+    """Return the estimates that ``write`` writes of each board, as the number that it gets."""
+    count = len(detections.boards)
+    out = Estimates.none(count, EstimateStatus.solver_failed)
+    for i in range(count):
+        write(detections.take(np.array([i])), i, out)
+    return out
+
+
 class _Solution(NamedTuple):
     """A pose (3, 3), (3,) in metres, and its RMS reprojection error; all NaN if there is none."""
 
@@ -133,11 +145,7 @@ class BoardSolver:
 
     def __call__(self, detections: BoardDetections) -> Estimates:
         """Return the poses, with covariances if the corners' noise is given."""
-        count = len(detections.boards)
-        out = Estimates.none(count, EstimateStatus.solver_failed)
-        for i in range(count):
-            self._estimate(detections.take(np.array([i])), i, out)
-        return out
+        return one_by_one(detections, self._estimate)
 
     def _estimate(self, one: BoardDetections, i: int, out: Estimates) -> None:
         """Write the estimate of a single board as number ``i``."""
@@ -151,10 +159,11 @@ class BoardSolver:
         side = float(np.linalg.norm(
             np.roll(found.corners_px, -1, axis=1) - found.corners_px, axis=2
         ).mean())
-        kept = [each for each in solutions if each.error_px <= self.reprojection_limit * side]
-        if not kept or kept[0] is not solutions[0]:
+        limit = self.reprojection_limit * side
+        if not solutions or not solutions[0].error_px <= limit:
             return
-        best, other = kept[0], (*kept[1:], _NONE)[0]
+        best = solutions[0]
+        other = next((each for each in solutions[1:] if each.error_px <= limit), _NONE)
         out.status[i], out.point_count[i] = EstimateStatus.solved, len(pixels)
         out.rotation[i], out.translation[i], out.reprojection_px[i] = best
         out.alternative_rotation[i], _, out.alternative_reprojection_px[i] = other
@@ -169,7 +178,7 @@ class BoardSolver:
             return board.chessboard_m[found.chessboard], found.chessboard_px
         marker, corners = found.marker, found.corners_px
         if self.points == "largest_marker" and len(marker):
-            largest = np.argmax(_areas(corners))
+            largest = np.argmax(np.abs(signed_areas(corners)))
             marker, corners = marker[[largest]], corners[[largest]]
         return board.corners_m[marker].reshape(-1, 3), corners.reshape(-1, 2)
 
@@ -228,14 +237,6 @@ class BoardSolver:
         rotation, translation = rotation_of_vector(r.reshape(1, 3))[0], t.ravel()
         error = reprojection_px(rotation, translation, objects, pixels, cameras)
         return _Solution(rotation, translation, error) if math.isfinite(error) else start
-
-
-def _areas(corners: Floats) -> Floats:
-    """Return the areas (K,) of quadrilaterals (K, 4, 2) in px²."""
-    diagonals = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
-    return np.asarray(0.5 * np.abs(
-        diagonals[0][:, 0] * diagonals[1][:, 1] - diagonals[0][:, 1] * diagonals[1][:, 0]
-    ))
 
 
 def _lens(cameras: Cameras) -> Floats | None:

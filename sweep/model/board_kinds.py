@@ -82,6 +82,11 @@ class Charuco:
         black = (row + column + self._begins_white) % 2 == 0
         return np.where(black, BLACK, WHITE).astype(np.int64)
 
+    @property
+    def counts(self) -> tuple[int, int]:
+        """How many markers and chessboard corners it has."""
+        return int((self._codes() == WHITE).sum()), (self.squares_x - 1) * (self.squares_y - 1)
+
     def faults(self) -> list[Fault]:
         """Return what keeps the values from being a board."""
         whole = _printed_side(self.dictionary, self.marker_m)
@@ -91,7 +96,7 @@ class Charuco:
                 "marker_m", self.marker_m,
                 f"below square_m = {self.square_m:g}{_with_overhang(self.dictionary, whole)}",
             ))
-        return faults + _id_faults(self, int((self._codes() == WHITE).sum()))
+        return faults + _id_faults(self, self.counts[0])
 
     def board(self) -> Board:
         """Return the board; ValueError with its faults, a line each."""
@@ -132,6 +137,11 @@ class Grid:
         "width of the white sheet beyond the markers and squares (default: one module of a marker)"
     )
 
+    @property
+    def counts(self) -> tuple[int, int]:
+        """How many markers and chessboard corners it has."""
+        return self.rows * self.columns, 0
+
     def faults(self) -> list[Fault]:
         """Return what keeps the values from being a board."""
         whole = _printed_side(self.dictionary, self.marker_m)
@@ -148,7 +158,7 @@ class Grid:
                 "corner_squares", self.corner_squares,
                 f"false: the markers of {self.dictionary} have modules where the squares are",
             ))
-        return faults + _id_faults(self, self.rows * self.columns)
+        return faults + _id_faults(self, self.counts[0])
 
     def board(self) -> Board:
         """Return the board; ValueError with its faults, a line each."""

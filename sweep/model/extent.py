@@ -13,6 +13,7 @@ from sweep.model.demosaic import REACH_PX
 from sweep.model.jpeg import BLOCK_PX
 from sweep.model.motion import BEHIND, MEANINGLESS, Motion, MovingMarker, row_times, track
 from sweep.model.point_spread import REACH
+from sweep.model.polygon import half_plane, signed_areas
 from sweep.model.pose import transform_points
 from sweep.model.scene import Box, Scenes
 from sweep.model.scene_sheet import curved_rows, scene_sheet, sheet_folds, sheet_outline_px
@@ -276,20 +277,11 @@ def path_px(scenes: Scenes, row: int, box: Box) -> float:
 def areas_px(scenes: Scenes) -> Floats:
     """Return the projected black square's area (N,) in px², along its curved edges."""
     points = scenes.corners_px
-    area = _shoelace(points)
+    area = signed_areas(points)
     curved = np.flatnonzero(scenes.cameras.distorted & np.isfinite(area))
     if len(curved):
-        area[curved] = _shoelace(_outline(scenes, curved, quiet=False, per_side=256))
+        area[curved] = signed_areas(_outline(scenes, curved, quiet=False, per_side=256))
     return np.abs(area)
-
-
-def _shoelace(points: Floats) -> Floats:
-    """Return the signed areas (N,) of polygons (N, M, 2)."""
-    local = points - points[:, :1]
-    following = np.roll(local, -1, axis=1)
-    with np.errstate(over="ignore", invalid="ignore"):
-        doubled = local[..., 0] * following[..., 1] - local[..., 1] * following[..., 0]
-        return np.asarray(0.5 * doubled.sum(axis=1))
 
 
 EDGE_ON = 1e-12
@@ -347,26 +339,10 @@ def _meets_frame(polygon: Floats, limit: Floats) -> bool:
     """Return whether a polygon (M, 2) has a part of positive area in [-0.5, limit]."""
     for axis in (0, 1):
         for sign, bound in ((1.0, -0.5), (-1.0, -limit[axis])):
-            polygon = _half_plane(polygon, sign * polygon[:, axis] - bound)
+            polygon = half_plane(polygon, sign * polygon[:, axis] - bound)
             if len(polygon) < 3:
                 return False
-    return bool(np.abs(_shoelace(polygon[None])[0]) > 0)
-
-
-def _half_plane(polygon: Floats, inside: Floats) -> Floats:
-    """Clip a polygon (M, 2) to the half plane in which a linear function is not negative.
-
-    ``inside`` (M,) are the function's values at the polygon's points.
-    """
-    kept = []
-    for i in range(len(polygon)):
-        j = (i + 1) % len(polygon)
-        if inside[i] >= 0:
-            kept.append(polygon[i])
-        if (inside[i] >= 0) != (inside[j] >= 0):
-            t = inside[i] / (inside[i] - inside[j])
-            kept.append(polygon[i] + t * (polygon[j] - polygon[i]))
-    return np.array(kept).reshape(-1, 2)
+    return bool(np.abs(signed_areas(polygon[None])[0]) > 0)
 
 
 def not_modelled(scenes: Scenes) -> NDArray[np.bool_]:

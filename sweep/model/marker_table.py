@@ -71,6 +71,11 @@ class Markers:
         "width of the one white sheet beyond all markers; without it each has its own"
     )
 
+    @property
+    def counts(self) -> tuple[int, int]:
+        """How many markers and chessboard corners it has."""
+        return len(self.markers), 0
+
     def faults(self) -> list[Fault]:
         """Return what keeps the values from being a board."""
         faults = []

@@ -17,6 +17,7 @@ import numpy as np
 from sweep.model.board import Board, Print
 from sweep.model.camera import Cameras
 from sweep.model.coverage import MarkerEdges
+from sweep.model.polygon import half_plane
 from sweep.typing import Floats, Masks
 
 _NEGLIGIBLE = 1e-12
@@ -91,16 +92,7 @@ def _common(one: _Face, other: _Face) -> Floats:
     """Return the corners (n, 3) of that part of a sheet which the other's outline encloses."""
     polygon = one.corners
     for normal in other.normals:
-        inside = polygon @ normal
-        kept = []
-        for i in range(len(polygon)):
-            j = (i + 1) % len(polygon)
-            if inside[i] > 0:
-                kept.append(polygon[i])
-            if (inside[i] > 0) != (inside[j] > 0):
-                t = inside[i] / (inside[i] - inside[j])
-                kept.append(polygon[i] + t * (polygon[j] - polygon[i]))
-        polygon = np.array(kept).reshape(-1, 3)
+        polygon = half_plane(polygon, polygon @ normal)
         if len(polygon) < 3:
             return np.empty((0, 3))
     return polygon

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -373,3 +374,12 @@ def _expand(form: str, ends: list[Any], quota: int) -> Sequence[Any]:
     if not (ends[0] > 0 and ends[1] > 0):
         raise misuse
     return list(map(float, np.geomspace(ends[0], ends[1], ends[2])))
+
+
+def combinations(axes: Sequence[Axis]) -> list[dict[str, Any]]:
+    """Return the parameters' values at all combinations of axes, the last axis fastest."""
+    rows = ([axis.at(index) for index in range(len(axis))] for axis in axes)
+    return [
+        {name: value for row in chosen for name, value in row.items()}
+        for chosen in itertools.product(*rows)
+    ]

@@ -20,7 +20,8 @@ from sweep.model.board_values import (
 from sweep.model.effects import GEOMETRIC
 from sweep.model.renderers import renderer_fault
 from sweep.plan.alternatives import PHOTOGRAPHS
-from sweep.plan.parameters import PARAMETERS, Parameter
+from sweep.plan.axes import combinations
+from sweep.plan.parameters import PARAMETERS
 from sweep.plan.reader import Reading
 from sweep.plugins.recording import is_recording
 
@@ -54,18 +55,13 @@ def boards_can_be_printed(reading: Reading) -> None:
         for name, value, expected in arrangement_faults(values):
             if (name, expected) not in seen:
                 seen.add((name, expected))
-                reading.fault(_path(reading.parameters, name), value, expected)
+                reading.fault(f"{reading.parameters[name].section}.{name}", value, expected)
         if len(seen) > MAX_FAULTS:
             return
 
 
 MAX_FAULTS = 10
 """Faults of boards after which no other board is checked."""
-
-
-def _path(parameters: Any, name: str) -> str:
-    parameter: Parameter | None = parameters.get(name)
-    return name if parameter is None else f"{parameter.section}.{name}"
 
 
 def _arrangements(reading: Reading) -> Iterator[tuple[Any, ...]]:
@@ -77,11 +73,10 @@ def _arrangements(reading: Reading) -> Iterator[tuple[Any, ...]]:
             f"{reading.source}: axes: {count:,} different boards: expected at most {MAX_BOARDS:,}"
         )
         return
-    for index in itertools.product(*(range(len(axis)) for axis in axes)):
-        chosen = {name: reading.fixed.get(name) for name in ARRANGING}
-        for axis, number in zip(axes, index, strict=True):
-            chosen |= axis.at(number)
-        yield tuple(chosen[name] for name in ARRANGING)
+    fixed = {name: reading.fixed.get(name) for name in ARRANGING}
+    for chosen in combinations(axes):
+        values = fixed | chosen
+        yield tuple(values[name] for name in ARRANGING)
 
 
 def boards_are_searched_and_solved(reading: Reading) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from sweep.measure.foreign_detector import ForeignSetting
 from sweep.model.board_values import ARRANGING, arranged_board
 from sweep.model.camera import canonical_distortion
 from sweep.model.columns import Column, map_columns
-from sweep.plan.axes import TRIAL, Axis
+from sweep.plan.axes import TRIAL, Axis, combinations
 from sweep.plan.beliefs import CALIBRATED, believed_calibration, calibrated_columns
 from sweep.plan.boards import shows_boards
 from sweep.plan.draws import bits, even_uniform, geometry_keys, jointly_drawn, uniform
@@ -219,15 +218,6 @@ def block_indices(block: Block) -> list[NDArray[np.intp]]:
         *(np.arange(a, b) for a, b in zip(block.starts, block.stops, strict=True)), indexing="ij"
     )
     return [grid.ravel() for grid in grids]
-
-
-def combinations(axes: Sequence[Axis]) -> list[dict[str, Any]]:
-    """Return the parameters' values at all combinations of axes, the last axis fastest."""
-    rows = ([axis.at(index) for index in range(len(axis))] for axis in axes)
-    return [
-        {name: value for row in chosen for name, value in row.items()}
-        for chosen in itertools.product(*rows)
-    ]
 
 
 def _fixed(pipeline: Pipeline, section: str) -> dict[str, Any]:

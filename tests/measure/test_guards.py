@@ -61,10 +61,7 @@ def cameras(count, lens=()):
 # The guards sit in one place.
 
 PLACES = {
-    "solvePnP": {
-        "measure/solver.py",
-        "analysis/camera_calibration.py",  # upright targets without noise, z in
-    },
+    "solvePnP": {"measure/solver.py"},
     "solvePnPGeneric": {
         "measure/solver.py", "measure/board_solver.py",
         "photographs/board_truth.py",  # starts a fit

@@ -5,8 +5,9 @@ import pytest
 
 import sweep
 from sweep.errors import PipelineError
+from sweep.plan.axes import combinations
 from sweep.plan.cell_selection import cell, parse_selection, selection_text
-from sweep.plan.grid import combinations, scene_values
+from sweep.plan.grid import scene_values
 from sweep.plan.overrides import parse_settings
 from sweep.plan.parameters import Stage
 

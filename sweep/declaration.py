@@ -1,4 +1,8 @@
-"""One parameter of an experiment, declared once: a dataclass field with unit, range and meaning."""
+"""A value that users write, declared once: a dataclass field with unit, range and meaning.
+
+Keys of tables are checked against the fields that declare them: of pipelines, of boards' files and
+of the tables in them, of plug-ins' settings.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +10,11 @@ import dataclasses
 import math
 import types
 import typing
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+from sweep.messages import nearest, plain, shown
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +24,8 @@ class Declaration:
     ``low`` and ``high`` are inclusive unless ``open_low`` excludes the lower end. ``drawable``
     parameters may be drawn from a distribution per trial. ``lengths`` are those that a list of
     numbers may have, ``list_text`` says so in words. ``plugin`` is the kind of plug-in that may be
-    named in place of a choice.
+    named in place of a choice. ``reads`` returns a value that is no choice in its type, or raises
+    ValueError with what was expected, in place of the checks by type.
     """
 
     meaning: str
@@ -32,6 +40,7 @@ class Declaration:
     lengths: tuple[int, ...] = ()
     list_text: str = ""
     plugin: str = ""
+    reads: Callable[[Any], Any] | None = None
 
     def range_text(self) -> str:
         """Return the allowed values in words, as error messages and the reference print them."""
@@ -75,10 +84,148 @@ class Declaration:
         return above and number <= self.high and abs(number) < 1e300
 
 
+@dataclass(frozen=True, slots=True)
+class Declared:
+    """A declared field: its name, types without None, default (MISSING if it must be given)."""
+
+    name: str
+    types: tuple[type, ...]
+    default: Any
+    declaration: Declaration
+
+    @property
+    def unit(self) -> str:
+        """The unit; empty if it has none."""
+        return self.declaration.unit
+
+    def expected(self) -> str:
+        """Return the allowed values in words."""
+        if tuple in self.types:
+            if self.declaration.list_text:
+                return self.declaration.list_text
+            *counts, last = self.declaration.lengths
+            return f"a list of {', '.join(map(str, counts))} or {last} finite numbers"
+        words = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
+        kind = " or ".join(words[kind] for kind in self.types)
+        extent = self.declaration.range_text()
+        if self.declaration.choices:
+            return extent
+        return f"{kind} {extent}".strip()
+
+    def check(self, value: Any) -> Any:
+        """Return ``value`` in the field's type; ValueError(expectation) if not allowed."""
+        if self.declaration.reads is not None and value not in self.declaration.choices:
+            return self.declaration.reads(value)
+        if tuple in self.types and isinstance(value, (list, tuple)):
+            numbers = all(_is_number(item) and abs(item) < 1e300 for item in value)
+            if numbers and len(value) in self.declaration.lengths:
+                return tuple(float(item) for item in value)
+        elif bool in self.types and isinstance(value, bool):
+            return value
+        elif int in self.types and isinstance(value, int) and not isinstance(value, bool):
+            if self.declaration.admits(value):
+                return value
+        elif float in self.types and _is_number(value):
+            if abs(value) < 1e300 and self.declaration.admits(float(value)):
+                return float(value)
+        elif str in self.types and isinstance(value, str):
+            if self.declaration.choices:
+                choice = self.declaration.choice(value)
+                if choice is not None:
+                    return choice
+            elif value:
+                return value
+        raise ValueError(self.expected() + self._hint(value))
+
+    def _hint(self, value: Any) -> str:
+        """Return the choice that a wrong value may stand for."""
+        choices = self.declaration.choices
+        if isinstance(value, str) and choices:
+            return nearest(value.removeprefix(self.declaration.prefix), choices)
+        if isinstance(value, int) and (name := self.declaration.of_number(value)):
+            return f"; OpenCV's constant {value} is {name}"
+        return ""
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
 def parameter(default: Any, meaning: str, **declared: Any) -> Any:
     """Return a dataclass field that carries its :class:`Declaration` (keywords as its fields)."""
     declaration = Declaration(meaning, **declared)
     return dataclasses.field(default=default, metadata={"declaration": declaration})
+
+
+def declared_fields(declaring: type) -> dict[str, Declared]:
+    """Return the fields that a dataclass declares, by name."""
+    hints = typing.get_type_hints(declaring)
+    return {
+        field.name: Declared(
+            field.name, plain_types(hints[field.name]), field.default,
+            field.metadata["declaration"],
+        )
+        for field in dataclasses.fields(declaring)
+    }
+
+
+class TablesError(ValueError):
+    """Faults of several tables: ``lines`` begin with what follows the name of the tables."""
+
+    def __init__(self, expected: str, lines: Sequence[str]) -> None:
+        super().__init__(expected)
+        self.lines = tuple(lines)
+
+
+def check_table(
+    declared: Mapping[str, Declared], table: Mapping[str, Any], owner: str
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the values of a table's keys, defaults included, and a line for each fault.
+
+    ``owner`` says in messages what has the keys.
+    """
+    values = {name: each.default for name, each in declared.items()}
+    lines = []
+    for key, value in table.items():
+        if key not in declared:
+            lines.append(
+                f"{plain(key)}: unknown; expected a key of {owner}: {', '.join(declared)}"
+                f"{nearest(key, list(declared))}"
+            )
+            continue
+        try:
+            values[key] = declared[key].check(value)
+        except TablesError as faults:
+            lines += [f"{key}{line}" for line in faults.lines]
+        except ValueError as error:
+            lines.append(f"{plain(key)} = {shown(value)}: expected {error}")
+    lines += [
+        f"{name}: missing; expected {each.expected()}: {each.declaration.meaning}"
+        for name, each in declared.items()
+        if each.default is dataclasses.MISSING and name not in table
+    ]
+    return values, lines
+
+
+def check_tables(
+    declared: Mapping[str, Declared], value: Any, owner: str, expected: str
+) -> list[dict[str, Any]]:
+    """Return the values of each of a list of tables, as :func:`check_table`.
+
+    Raises
+    ------
+    ValueError
+        ``expected``, if it is no list of tables; :class:`TablesError` for the faults in them.
+    """
+    if not isinstance(value, (list, tuple)) or not all(isinstance(each, Mapping) for each in value):
+        raise ValueError(expected)
+    checked = [check_table(declared, table, owner) for table in value]
+    lines = [
+        f"[{number}].{line}" for number, (_, faults) in enumerate(checked) for line in faults
+    ]
+    if lines:
+        raise TablesError(expected, lines)
+    return [values for values, _ in checked]
 
 
 def plain_types(hint: Any) -> tuple[type, ...]:

@@ -51,7 +51,22 @@ def _first_id() -> Any:
 
 
 def _ids() -> Any:
-    return parameter(None, "IDs of all markers in reading order, in place of first_id")
+    return parameter(
+        None, "IDs of all markers in reading order, in place of first_id", list_text=_LIST_OF_IDS,
+        reads=_read_ids,
+    )
+
+
+_LIST_OF_IDS = "a list of whole numbers from 0 on"
+
+
+def _read_ids(value: Any) -> tuple[int, ...]:
+    if not isinstance(value, list) or not all(
+        isinstance(item, int) and not isinstance(item, bool) and 0 <= item <= 10**6
+        for item in value
+    ):
+        raise ValueError(_LIST_OF_IDS)
+    return tuple(value)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)

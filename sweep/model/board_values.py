@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from sweep.declaration import parameter
+from sweep.declaration import check_tables, declared_fields, parameter
 from sweep.model.board import Board
 from sweep.model.board_declaring import Fault
 from sweep.model.board_kinds import Charuco, Grid
@@ -16,6 +17,20 @@ from sweep.model.marker_table import BoardMarker, Markers
 
 SINGLE = "none"
 """The kind of a marker without a board."""
+
+
+_LISTED = {name: each if name != "size_m" else dataclasses.replace(each, default=None)
+           for name, each in declared_fields(BoardMarker).items()}
+"""Keys of a table [[board.markers]]."""
+
+
+def listed_markers(value: Any) -> tuple[tuple[Any, ...], ...]:
+    """Return tables of markers as tuples: ID, x, y, size or None, roll, z, tilt, azimuth.
+
+    ValueError or TablesError if they are not such tables.
+    """
+    expected = f"tables with {', '.join(_LISTED)}"
+    return tuple(tuple(row.values()) for row in check_tables(_LISTED, value, "a marker", expected))
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +65,7 @@ class BoardValues:
     markers: tuple[tuple[float, ...], ...] | None = parameter(
         None, "the markers of kind = markers, each marker_id, x_m, y_m and, if wanted, size_m, "
         "roll_deg, z_m, and tilt_deg about an axis at azimuth_deg",
-        list_text="tables [[board.markers]]",
+        list_text="tables [[board.markers]]", reads=listed_markers,
     )
 
 
@@ -124,49 +139,6 @@ def arrangement_faults(values: Sequence[Any]) -> list[Fault]:
 def arranged_board(*values: Any) -> Board:
     """Return the board that values of :data:`ARRANGING` declare, the same for the same values."""
     return arranged(values).board()
-
-
-MARKER_KEYS = {
-    "marker_id": True, "x_m": True, "y_m": True, "size_m": False, "roll_deg": False, "z_m": False,
-    "tilt_deg": False, "azimuth_deg": False,
-}
-"""Key of a table [[board.markers]] -> whether it must be there."""
-
-
-def listed_markers(value: Any) -> tuple[tuple[Any, ...], ...]:
-    """Return tables [[board.markers]] as tuples: ID, x, y, size or None, roll, z, tilt, azimuth.
-
-    Raises
-    ------
-    ValueError
-        The expectation, if they are not such tables.
-    """
-    expected = f"tables [[board.markers]] with {', '.join(MARKER_KEYS)}"
-    if not isinstance(value, (list, tuple)) or not value:
-        raise ValueError(expected)
-    rows = []
-    for table in value:
-        if not isinstance(table, Mapping):
-            raise ValueError(expected)  # noqa: TRY004  (a fault of the file)
-        row: dict[str, Any] = {key: table.get(key) for key in MARKER_KEYS}
-        unknown = sorted(map(str, table.keys() - MARKER_KEYS.keys()))
-        missing = [key for key, needed in MARKER_KEYS.items() if needed and key not in table]
-        if unknown or missing:
-            raise ValueError(f"{expected}; {(unknown or missing)[0]} is "
-                             f"{'unknown' if unknown else 'missing'} in one")
-        numbers = [each for key, each in row.items() if key in table]
-        bounded = all(isinstance(each, (int, float)) and not isinstance(each, bool)
-                      and abs(each) <= 1e6 for each in numbers)
-        if not bounded or not isinstance(row["marker_id"], int):
-            raise ValueError(f"{expected}, all finite numbers up to 10^6")
-        if row["marker_id"] < 0 or (row["size_m"] is not None and row["size_m"] <= 0):
-            raise ValueError(f"{expected}; IDs from 0 on and sizes above 0")
-        size = None if row["size_m"] is None else float(row["size_m"])
-        rows.append((
-            row["marker_id"], float(row["x_m"]), float(row["y_m"]), size,
-            *(float(row[key] or 0.0) for key in ("roll_deg", "z_m", "tilt_deg", "azimuth_deg")),
-        ))
-    return tuple(rows)
 
 
 def is_solid(markers: Sequence[Sequence[Any]] | None) -> bool:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
-from sweep.declaration import parameter
+from sweep.declaration import check_tables, declared_fields, parameter
 from sweep.model.board import (
     Board,
     Print,
@@ -57,12 +58,22 @@ class BoardMarker:
         return self.z_m == self.tilt_deg == 0.0
 
 
+_TABLES = "tables [[markers]]"
+
+
+def _read_markers(value: Any) -> tuple[BoardMarker, ...]:
+    rows = check_tables(declared_fields(BoardMarker), value, "a marker", _TABLES)
+    return tuple(BoardMarker(**row) for row in rows)
+
+
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Markers:
     """A table of markers, each on a sheet of its own or, in one plane, all on one."""
 
     dictionary: str = dictionary_of_all()
-    markers: tuple[BoardMarker, ...] = required("tables [[markers]], one for each")
+    markers: tuple[BoardMarker, ...] = required(
+        "one for each", list_text=_TABLES, reads=_read_markers
+    )
     quiet_zone_modules: float | None = parameter(
         None, "width of the white that surrounds each marker on its own sheet (default: 1)",
         unit="module", low=0, high=100,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import threading
 from collections.abc import Sequence
 from functools import lru_cache
@@ -22,6 +21,7 @@ from sweep.model.photograph import photograph_image
 from sweep.model.plugged_scene import MarkerView
 from sweep.model.printed import PrintKey, edge_table, edges_of, extent_of, unit_m
 from sweep.model.projection import Optics, Projection
+from sweep.model.renderer_names import RENDERERS, SUPERSAMPLE
 from sweep.model.scene import Box, Scenes
 from sweep.model.sensing import sensed, sensed_window
 from sweep.model.solid_scene import accumulate_solid
@@ -31,18 +31,8 @@ from sweep.typing import Floats
 
 Grey = NDArray[np.uint8]
 
-SUPERSAMPLE = re.compile(r"supersample-([1-9][0-9]{0,2})(-jittered)?")
-
-
 PHOTOGRAPH = "photograph"
 """Renderer of scenes whose background is a photograph that shows the marker already."""
-
-
-def renderer_fault(name: str) -> str | None:
-    """Return an error message if ``name`` is not a valid renderer, else None."""
-    if name in ("exact", "warp") or SUPERSAMPLE.fullmatch(name):
-        return None
-    return "exact, warp, supersample-N or supersample-N-jittered with N from 1 to 999"
 
 
 @lru_cache(maxsize=16)
@@ -212,7 +202,7 @@ def marker_levels(
     else:
         match = SUPERSAMPLE.fullmatch(renderer)
         if match is None:
-            raise ValueError(f"renderer = {renderer!r}: expected {renderer_fault(renderer)}")
+            raise ValueError(f"renderer = {renderer!r}: expected {RENDERERS}")
         supersample(
             mean, share, _sampled_marker(scenes, row), int(match[1]), match[2] is not None,
             box[0], box[1],

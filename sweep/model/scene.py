@@ -22,6 +22,7 @@ from sweep.model.plugged_scene import NO_PLUGINS, ScenePlugins
 from sweep.model.pose import rotation_of_angles, transform_points
 from sweep.model.printed import PrintKey, box_corners, extent_of
 from sweep.model.projection import Projection
+from sweep.model.renderer_names import renderer_name
 from sweep.model.solid_board import box_px
 from sweep.typing import Floats
 
@@ -38,7 +39,7 @@ class Scene:
         "exact: area coverage; warp: the paper's, 10 px a module, INTER_LINEAR; supersample-N: "
         "N x N regular samples a pixel; supersample-N-jittered: at random within their cells; or a "
         "plug-in: the name of an installed one, or file:name beside the pipeline",
-        plugin="renderer",
+        plugin="renderer", reads=renderer_name,
     )
     window: str = parameter(
         "auto",

@@ -18,7 +18,7 @@ from sweep.model.board_values import (
     is_solid,
 )
 from sweep.model.effects import GEOMETRIC
-from sweep.model.renderers import renderer_fault
+from sweep.model.renderer_names import RENDERERS, is_renderer
 from sweep.plan.alternatives import PHOTOGRAPHS
 from sweep.plan.axes import combinations
 from sweep.plan.parameters import PARAMETERS
@@ -98,8 +98,8 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
         if name != INSTALLED:
             reading.fault("detector.environment", name, f"{INSTALLED}, for boards")
     for name in reading.values("renderer"):
-        if renderer_fault(name) is not None:
-            reading.fault("scene.renderer", name, f"{renderer_fault(name)}, for boards")
+        if not is_renderer(name):
+            reading.fault("scene.renderer", name, f"{RENDERERS}, for boards")
     for name in reading.values("detector"):
         if is_recording(name):
             reading.fault("detector.detector", name, "a detector that searches images, for boards")

@@ -143,8 +143,8 @@ def parameters_with(plugins: tuple[DeclaredPlugin, ...]) -> Mapping[str, Paramet
         for setting in plugin.settings:
             name = setting.name
             parameter = Parameter(
-                name, section, SECTIONS[section][1], setting.types, setting.default,
-                setting.declaration,
+                name, setting.types, setting.default, setting.declaration, section,
+                SECTIONS[section][1],
             )
             if name in PARAMETERS:
                 raise PluginError(f"another name for its setting {name}: the pipeline has this one")

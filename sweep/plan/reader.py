@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sweep.declaration import TablesError
 from sweep.messages import MAX_FAULTS, nearest, plain, shown
 from sweep.plan.axes import (
     MAX_LISTED,
@@ -242,6 +243,8 @@ def _read_section(reading: Reading, section: str) -> None:
                 reading.distributions[key] = parse_distribution(parameter, value)
             else:
                 reading.fixed[key] = parameter.check(value)
+        except TablesError as error:
+            reading.faults += [f"{reading.source}: {path}{line}" for line in error.lines]
         except ValueError as error:
             if key not in reading.unread:
                 reading.fault(path, value, str(error))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from sweep.declaration import Declaration, plain_types
+from sweep.declaration import Declaration, Declared, plain_types
 from sweep.errors import PluginError
 from sweep.plugins import RECORDS, DetectorPlugin, Plugin
 from sweep.plugins.calls import call
@@ -23,13 +23,8 @@ TYPES: dict[str, type] = {"float": float, "int": int, "bool": bool, "str": str}
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
-    """One setting of a plug-in: name, types, default and declaration."""
-
-    name: str
-    types: tuple[type, ...]
-    default: Any
-    declaration: Declaration
+class Setting(Declared):
+    """One setting of a plug-in."""
 
     def to_json(self) -> dict[str, Any]:
         """Return it as a store records it."""
@@ -237,7 +232,10 @@ def _settings(record: Plugin) -> Iterator[Setting]:
     for field in dataclasses.fields(record.settings):
         declaration = field.metadata.get("declaration")
         kinds = plain_types(hints[field.name])
-        if not isinstance(declaration, Declaration) or not set(kinds) <= set(TYPES.values()):
+        if (
+            not isinstance(declaration, Declaration) or declaration.reads is not None
+            or not set(kinds) <= set(TYPES.values())
+        ):
             raise PluginError(
                 f"the setting {field.name} as `name: type = parameter(default, meaning)` with "
                 f"one of the types {', '.join(TYPES)}"

@@ -32,11 +32,31 @@ BROKEN = {
         TABLE.replace("= 2", "= 1"), "board.markers = [1, 1]: expected each ID once; 1 is listed"
     ),
     "an ID beyond the dictionary": (TABLE.replace("= 2", "= 50"), "expected IDs from 0 to 49"),
-    "an unknown key of a marker": (TABLE.replace("y_m = 0\n", "w_m = 0\n", 1), "w_m is unknown"),
-    "a missing key of a marker": (TABLE.replace("x_m = 0.1\n", ""), "x_m is missing in one"),
-    "a coordinate that is no number": (TABLE.replace("0.1", "nan"), "all finite numbers"),
-    "a coordinate that is text": (TABLE.replace("0.1", '"a"'), "all finite numbers"),
-    "a marker without size": (TABLE + "size_m = 0", "sizes above 0"),
+    "an unknown key of a marker": (
+        TABLE.replace("y_m = 0\n", "y_m = 0\nw_m = 0\n", 1),
+        "board.markers[0].w_m: unknown; expected a key of a marker: marker_id, x_m",
+    ),
+    "a missing key of a marker": (
+        TABLE.replace("x_m = 0.1\n", ""), "board.markers[1].x_m: missing; expected a number"
+    ),
+    "a coordinate that is no number": (
+        TABLE.replace("0.1", "nan"), "board.markers[1].x_m = nan: expected a number from"
+    ),
+    "a coordinate that is text": (
+        TABLE.replace("0.1", '"a"'), 'board.markers[1].x_m = "a": expected a number from'
+    ),
+    "a marker without size": (
+        TABLE + "size_m = 0", "board.markers[1].size_m = 0: expected a number above 0"
+    ),
+    "an ID below 0": (
+        TABLE.replace("= 2", "= -2"), "board.markers[1].marker_id = -2: expected a whole number"
+    ),
+    "no table of markers": (
+        'kind = "markers"\nmarkers = [3]', "board.markers = [3]: expected tables with marker_id"
+    ),
+    "an empty list of markers": (
+        'kind = "markers"\nmarkers = []', "board.markers = []: expected 1 to 4000 markers"
+    ),
     "a dictionary too small": (
         'kind = "charuco"\nsquares_x = 20\nsquares_y = 20\nsquare_m = 0.06',
         "expected IDs from 0 to 49, which is what DICT_4X4_50 has; the board has 200 markers",
@@ -58,6 +78,14 @@ def test_a_board_that_cannot_be_is_one_line(name):
     (line,) = str(error.value).splitlines()
     assert expected in line
     assert len(line) < 400
+
+
+def test_all_faults_of_a_table_come_at_once():
+    with pytest.raises(PipelineError) as error:
+        Pipeline.from_text(TEXT + TABLE.replace("x_m = 0\n", "X = 0\n") + "size_m = true", [])
+    assert [line.split(" ")[1] for line in error.value.faults] == [
+        "board.markers[0].X:", "board.markers[0].x_m:", "board.markers[1].size_m"
+    ]
 
 
 @pytest.mark.parametrize(("setting", "expected"), [

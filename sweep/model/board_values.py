@@ -78,6 +78,11 @@ NEEDED: dict[str, tuple[str, ...]] = {
 }
 """Kind -> the parameters that it must have."""
 
+OPTIONAL: dict[str, tuple[str, ...]] = {
+    "grid": ("corner_squares",), "charuco": ("legacy_pattern",),
+}
+"""Kind -> the parameters that it may have."""
+
 FROM_MARKER = ("dictionary", "marker_id", "size_m", "quiet_zone_modules")
 """Parameters of [marker] that a board takes."""
 
@@ -120,6 +125,13 @@ def arranged(values: Sequence[Any]) -> Charuco | Grid | Markers:
             for number, x, y, side, roll, z, tilt, azimuth in listed
         ),
     )
+
+
+def used_by(kind: Any) -> tuple[str, ...]:
+    """Return the parameters of [board] that a kind uses; () of what is no kind."""
+    if not isinstance(kind, str):
+        return ()
+    return (*NEEDED.get(kind, ()), *OPTIONAL.get(kind, ()))
 
 
 ARRANGING = ("kind", *FROM_MARKER, "rows", "columns", "gap_m", "corner_squares", "squares_x",

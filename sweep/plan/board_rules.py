@@ -16,6 +16,7 @@ from sweep.model.board_values import (
     SINGLE,
     arrangement_faults,
     is_solid,
+    used_by,
 )
 from sweep.model.effects import GEOMETRIC
 from sweep.model.renderer_names import RENDERERS, is_renderer
@@ -41,11 +42,18 @@ def boards_can_be_printed(reading: Reading) -> None:
             f"{reading.source}: board.{name}: missing; kind = {shown(kind)} needs it: "
             f"{reading.parameters[name].declaration.meaning}"
         )
-    if kinds and all(kind == SINGLE for kind in kinds):
-        for name in given:
-            reading.fault(f"board.{name}", reading.written(name), "a kind beside it, such as grid")
+    used = {name for kind in kinds for name in used_by(kind)}
+    for name in given if kinds else ():
+        if name not in used:
+            users = " or ".join(kind for kind in NEEDED if name in used_by(kind))
+            reading.fault(
+                f"board.{name}", reading.written(name),
+                f"kind = {users}, which uses it; kind = {' or '.join(dict.fromkeys(kinds))} "
+                "does not: delete it",
+            )
+    if all(kind == SINGLE for kind in kinds):
         return
-    if not kinds or needed or not all(reading.values(name) for name in ARRANGING):
+    if needed or not all(reading.values(name) for name in ARRANGING):
         return
     if reading.axis_of("markers") is not None:
         reading.fault("axes.markers", "...", "markers under [board]: they cannot be an axis")

@@ -9,6 +9,7 @@ import tomlkit
 import tomlkit.items
 
 from sweep.messages import MAX_FAULTS, nearest, plain, refusal
+from sweep.model.board_values import used_by
 from sweep.plan.alternatives import RIVALS
 from sweep.plan.axes import DISTRIBUTION_FORMS, TRIAL
 from sweep.plan.camera_files import FILE_DEVIATIONS, FILE_VALUES, OTHER_WAYS
@@ -118,7 +119,7 @@ def apply_settings(
     """
     _leave_camera_file(document, chosen)
     _delete(document, displaced_by(chosen))
-    _delete(document, _other_counts(chosen))
+    _delete(document, _other_counts(chosen) | _of_other_boards(chosen, parameters))
     for name, value in chosen.items():
         if name in HEADER:
             document[name] = value
@@ -132,6 +133,17 @@ def apply_settings(
         ):
             _write(document, name, value, parameters)
         # Otherwise a section is no table, which reading the document reports.
+
+
+def _of_other_boards(
+    chosen: Mapping[str, Any], parameters: Mapping[str, Parameter]
+) -> set[str]:
+    """Return the parameters of boards that chosen kinds do not use; those of other kinds go."""
+    if "kind" not in chosen:
+        return set()
+    kinds = chosen["kind"] if isinstance(chosen["kind"], list) else [chosen["kind"]]
+    used = {"kind", *chosen, *(name for kind in kinds for name in used_by(kind))}
+    return {name for name, each in parameters.items() if each.section == "board"} - used
 
 
 def _other_counts(chosen: Collection[str]) -> set[str]:
@@ -164,7 +176,8 @@ def fix_values(
         document.pop(section, None)
     _leave_camera_file(document, chosen)
     _delete(document, {
-        TRIAL, *displaced_by(chosen), *(name for name, value in axes.items() if is_zip(value)),
+        TRIAL, *displaced_by(chosen), *_of_other_boards(chosen, parameters),
+        *(name for name, value in axes.items() if is_zip(value)),
     })
     for name, value in chosen.items():
         written = list(value) if isinstance(value, tuple) else value

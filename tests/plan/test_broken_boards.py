@@ -66,7 +66,16 @@ BROKEN = {
     ),
     "too many markers": (GRID.replace("7", "1000"), "a board of at most 4000 markers; it has 5000"),
     "a kind without its sizes": ('kind = "diamond"', 'board.square_m: missing; kind = "diamond"'),
-    "sizes without a kind": ("rows = 3", "board.rows = 3: expected a kind beside it"),
+    "sizes without a kind": (
+        "rows = 3", "board.rows = 3: expected kind = grid, which uses it; kind = none does not"
+    ),
+    "a size of another kind": (
+        GRID + "\nsquare_m = 0.06",
+        "board.square_m = 0.06: expected kind = charuco or diamond, which uses it; kind = grid ",
+    ),
+    "a list of markers beside a grid": (
+        f"{GRID}\n{ONE}", "expected kind = markers, which uses it; kind = grid does not"
+    ),
 }
 
 
@@ -104,6 +113,44 @@ def test_without_a_solver_the_message_names_those_of_boards():
         Pipeline.from_text(TEXT.replace('solver = "iterative"', "") + GRID, [])
     (line,) = str(error.value).splitlines()
     assert "estimator.solver: missing; a board needs one of ippe, iterative, sqpnp, epnp" in line
+
+
+AXIS = """[axes]
+target = { zip = { kind = ["none", "charuco", "grid"], size_m = [0.1, 0.03, 0.05] } }
+"""
+OF_KINDS = """rows = 2
+columns = 2
+gap_m = 0.01
+squares_x = 3
+squares_y = 3
+square_m = 0.06
+"""
+OF_BOARDS = TEXT.replace("size_m = 0.05\n", "") + OF_KINDS
+
+
+def test_each_of_several_kinds_uses_its_own_keys():
+    pipeline = Pipeline.from_text(OF_BOARDS + AXIS, [])
+    boards = scene_values(pipeline, [np.arange(3)])["board"].listed(3)
+    assert [len(board) for board in boards] == [1, 4, 4]
+
+
+@pytest.mark.parametrize(("kind", "kept"), [
+    ("charuco", {"squares_x", "squares_y", "square_m"}), ("grid", {"rows", "columns", "gap_m"}),
+    ("none", set()),
+])
+def test_a_kind_that_is_chosen_drops_the_keys_of_others(kind, kept):
+    axis = Pipeline.from_text(OF_BOARDS + AXIS, [])
+    fixed = axis.fixed_at({"kind": kind, "size_m": 0.03})
+    assert {name for name in fixed.given if axis.parameters[name].section == "board"} == {
+        "kind", *kept
+    }
+    single = Pipeline.from_text(TEXT + GRID, [f"kind={kind}", *(
+        f"{name}={value}" for name, value in (line.split(" = ") for line in OF_KINDS.splitlines())
+        if name in kept
+    )])
+    assert {name for name in single.given if axis.parameters[name].section == "board"} == {
+        "kind", *kept
+    }
 
 
 def test_rows_of_a_grid_can_be_an_axis():

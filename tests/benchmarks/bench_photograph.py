@@ -12,7 +12,8 @@ from bench_photometric import best_ms
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from support.photographs import drawn_pose, photograph, scenes_of
+from support.board_scenes import board_scene
+from support.photographs import drawn_pose, photograph
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.measure.estimation import Detections
 from sweep.measure.flags import EstimateStatus
@@ -47,7 +48,7 @@ def detections(side, effects):
             corners.append(pixels + rng.normal(0, 0.3, (4, 2)))
             images.append(taken.image)
     count, markers = len(corners), len(BOARD)
-    cameras = scenes_of(camera, effects, 0).cameras.take(np.zeros(count, dtype=int))
+    cameras = board_scene(BOARD, camera, pose).cameras.take(np.zeros(count, dtype=int))
     return Detections(
         np.array(corners), cameras, np.full(count, 0.03), np.full(count, 2.0), np.zeros(count),
         [(BOARD.dictionary, BOARD.marker_ids[k % markers], 1.0) for k in range(count)], images,

@@ -185,6 +185,67 @@ def test_a_blurred_board_is_its_finer_image_through_a_gaussian(case):
     assert abs((found - mean).mean()) < 0.05
 
 
+def sampled(name, scenes, size, points, blur_px=0.0):
+    """Levels (h, w) of the frame's first columns and rows, ``size``, by 12 x 12 samples a pixel.
+
+    Each is at random in its cell. ``points`` takes normalised coordinates (n, 2) of the image to
+    points (n, 2) on the board.
+    """
+    fine, pad = 12, 5 if blur_px else 0  # pad: pixels around the image
+    rng = np.random.default_rng(5)
+    shape = (size[1] + 2 * pad) * fine, (size[0] + 2 * pad) * fine
+    v, u = (np.indices(shape) + rng.random((2, *shape))) / fine - 0.5 - pad
+    fx, fy, cx, cy = scenes.cameras.view[0]
+    seen = points(np.column_stack([((u - cx) / fx).ravel(), ((v - cy) / fy).ravel()]))
+    levels = painted(name, {key: round(level) for key, level in LEVELS.items()}, seen)
+    levels = levels.reshape(shape)
+    if blur_px:
+        levels = cv2.GaussianBlur(levels, (0, 0), blur_px * fine)
+    mean = levels.reshape(shape[0] // fine, fine, -1, fine).mean(axis=(1, 3))
+    return mean[pad : pad + size[1], pad : pad + size[0]]
+
+
+def agrees_with_samples(off):
+    print(f"mean {off.mean():.2f}, RMS {np.sqrt(np.mean(off**2)):.2f} grey levels off samples")
+    # 210 sqrt(24 / 6) / 144 = 2.9 levels of standard deviation; 5 of them, and the rounding.
+    assert np.abs(off).max() < 15
+    assert np.sqrt(np.mean(off**2)) < 1.7
+    assert abs(off.mean()) < 0.15
+
+
+def before_lens(distorted, k1, k2, p1, p2):
+    """Normalised coordinates (n, 2) without the lens, by iterating OpenCV's published formula."""
+    xd, yd = distorted.T
+    x, y = xd, yd
+    for _ in range(30):
+        r2, before = x * x + y * y, x
+        radial = 1 / (1 + (k2 * r2 + k1) * r2)
+        x = (xd - 2 * p1 * x * y - p2 * (r2 + 2 * x * x)) * radial
+        y = (yd - 2 * p2 * before * y - p1 * (r2 + 2 * y * y)) * radial
+    assert np.abs(x - before).max() < 1e-9
+    return np.column_stack([x, y])
+
+
+@pytest.mark.parametrize("case", first_of(
+    [(size, name, blur_px) for size in ((56, 40), SIZE) for blur_px in (0.8, 0.0)
+     for name in ("charuco", "markers", "april")], 1
+))
+def test_a_board_behind_a_lens_is_what_rays_meet(case):
+    size, name, blur_px = case
+    settings = ["distance_m=0.2", "tilt_deg=35", "azimuth_deg=50", "roll_deg=25", LENS, *ROUND,
+                f"blur_px={blur_px}"]
+    scenes = scenes_of(settings, board_text(name))
+    plane = np.column_stack([scenes.rotation[0, :, :2], scenes.translation[0]])
+
+    def points(distorted):
+        flat = before_lens(distorted, -0.25, 0.08, 0.001, -0.0008)
+        met = np.column_stack([flat, np.ones(len(flat))]) @ np.linalg.inv(plane).T
+        return met[:, :2] / met[:, 2:]
+
+    found = image_of(settings, text=board_text(name))[: size[1], : size[0]]
+    agrees_with_samples(found - sampled(name, scenes, size, points, blur_px))
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["charuco", "markers", "april"])
 @pytest.mark.parametrize(("bend", "curvature"), [("cylinder", 4.0), ("saddle", -3.0)])
@@ -192,23 +253,32 @@ def test_a_bent_board_is_what_rays_meet(name, bend, curvature):
     settings = ["distance_m=0.3", "tilt_deg=25", "azimuth_deg=50", "roll_deg=25",
                 f"curvature_per_m={curvature}", f"bend='{bend}'", "bend_deg=23", *ROUND]
     scenes = scenes_of(settings, board_text(name))
-    found = image_of(settings, text=board_text(name)).astype(float)
-    fine = 12
-    rng = np.random.default_rng(5)
-    shape = SIZE[1] * fine, SIZE[0] * fine
-    v, u = (np.indices(shape) + rng.random((2, *shape))) / fine - 0.5
-    fx, fy, cx, cy = scenes.cameras.view[0]
-    rays = np.column_stack([((u - cx) / fx).ravel(), ((v - cy) / fy).ravel(), np.ones(u.size)])
-    points = flat_points(
-        rays, scenes.rotation[0], scenes.translation[0], bend, curvature, np.radians(23)
-    )
-    levels = {key: round(level) for key, level in LEVELS.items()}
-    sampled = painted(name, levels, points).reshape(SIZE[1], fine, SIZE[0], fine).mean(axis=(1, 3))
-    off = found - sampled
-    # 210 sqrt(24 / 6) / 144 = 2.9 levels of standard deviation; 5 of them, and the rounding.
-    assert np.abs(off).max() < 15
-    assert np.sqrt(np.mean(off**2)) < 1.7
-    assert abs(off.mean()) < 0.15
+
+    def points(flat):
+        return flat_points(
+            np.column_stack([flat, np.ones(len(flat))]), scenes.rotation[0],
+            scenes.translation[0], bend, curvature, np.radians(23),
+        )
+
+    found = image_of(settings, text=board_text(name))
+    agrees_with_samples(found - sampled(name, scenes, SIZE, points))
+
+
+def test_an_image_behind_a_board_shows_beside_it_and_alone_where_there_is_none(tmp_path):
+    noise = np.random.default_rng(5).integers(0, 256, (SIZE[1], SIZE[0])).astype(np.uint8)
+    path = tmp_path / "behind.png"
+    cv2.imwrite(str(path), noise)
+    behind, text = f"background='{path}'", board_text("charuco")
+    facing = ["distance_m=0.25", *ROUND]
+    found, plain = image_of([*facing, behind], text=text), image_of(facing, text=text)
+    # 126 mm of sheet at 0.25 m: 55.4 px wide about 47.5, 52.9 px high about 39.5.
+    beside = np.ones_like(noise, dtype=bool)
+    beside[13:67, 19:77] = False
+    np.testing.assert_array_equal(found[beside], noise[beside])
+    np.testing.assert_array_equal(found[14:65, 21:75], plain[14:65, 21:75])
+    for out in ("bearing_x_deg=80", "bearing_y_deg=-80"):
+        np.testing.assert_array_equal(image_of([*facing, behind, out], text=text), noise)
+        assert (image_of([*facing, out], text=text) == 90).all()
 
 
 SINGLE = {
@@ -219,6 +289,7 @@ WITH = (
     [], ["blur_px=0.7", "noise_grey=3"], [LENS], ["renderer='warp'"],
     ["renderer='supersample-4'"], ["curvature_per_m=6", "bend_deg=30"],
     ["curvature_per_m=6", LENS, "blur_px=0.5", "occlusion=0.2"], ["background=230.1"],
+    ["curvature_per_m=5", "bend_deg=30", "geometry_px=0.8", "geometry_length_px=40"],
     ["velocity_x_m_s=0.3", "exposure_s=0.01"], ["marker_scale=1.02", "jpeg_quality=70"],
 )
 

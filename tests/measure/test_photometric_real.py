@@ -6,6 +6,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.stats import chi2
 
+from support.board_scenes import BoardPose, board_scene, levels_of
 from sweep.evaluation.cells import run_cells
 from sweep.measure.estimation import Detections
 from sweep.measure.flags import EstimateStatus
@@ -19,12 +20,10 @@ from sweep.measure.photograph_model import (
 )
 from sweep.measure.quadrilaterals import from_unit_square
 from sweep.measure.surroundings import BoardMarker, clear_modules, surroundings
-from sweep.model.board_image import BoardPose, render_board
 from sweep.model.board_kinds import Charuco, Grid
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.marker import WHITE
-from sweep.model.projection import Optics
 from sweep.plan.experiment import Pipeline
 
 ALARM = 1e-7
@@ -50,15 +49,20 @@ def rotation(tilt, azimuth, roll):
     return turn @ cv2.Rodrigues(np.array([0.0, 0.0, roll]))[0] @ np.diag([1.0, -1.0, -1.0])
 
 
+def camera_of(view, lens):
+    """Return a camera's parameters."""
+    names = ("fx_px", "fy_px", "cx_px", "cy_px")
+    return {"width_px": 320, "height_px": 240, "distortion": lens,
+            **dict(zip(names, view.tolist(), strict=True))}
+
+
 def photograph(
     board, pose, rng, *, blur=0.8, noise=2.0, light=0.0, tone=0.0, amount=0.0, correlation=0.0,
     lens=(), shift=None,
 ):
     """Return an image of a board with what cameras do to levels, by plain NumPy and SciPy."""
-    share = render_board(
-        board, Optics(VIEW, pack(lens), bool(lens)), (320, 240), pose, black=0.0, white=1.0,
-        background=0.5, blur_px=blur,
-    )
+    scenes = board_scene(board, camera_of(VIEW, lens), pose, blur_px=blur)
+    share = levels_of(scenes, background=0.5, black=0.0, white=1.0)
     if shift is not None:
         share = cv2.remap(share.astype(np.float32), *shift, cv2.INTER_CUBIC).astype(np.float64)
     level = 40 + 150 * (share + tone * share * (1 - share))
@@ -168,10 +172,9 @@ def test_image_and_slopes_are_those_of_dense_sampling(lens):
         row[first:last] = True
 
     def exact(du=0.0, dv=0.0, blur=0.8):
-        optics = Optics(VIEW + np.array([0.0, 0.0, du, dv]), pack(lens), bool(lens))
-        whole = render_board(
-            CHARUCO, optics, (320, 240), pose, black=0.0, white=1.0, background=0.0, blur_px=blur
-        )
+        camera = camera_of(VIEW + np.array([0.0, 0.0, du, dv]), lens)
+        scenes = board_scene(CHARUCO, camera, pose, blur_px=float(blur))
+        whole = levels_of(scenes, background=0.0, black=0.0, white=1.0)
         return whole[top : top + height, left : left + width][used]
 
     # Panels of two standard deviations and a cut at four: 1e-3 of the contrast.

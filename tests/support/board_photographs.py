@@ -5,9 +5,7 @@ import json
 import cv2
 import numpy as np
 
-from sweep.model.board_image import BoardPose, render_board
-from sweep.model.lens import pack
-from sweep.model.projection import Optics
+from support.board_scenes import BoardPose, board_scene, levels_of
 from sweep.plan.board_files import board_of
 
 SIZE = (360, 270)
@@ -58,11 +56,12 @@ def camera(size=SIZE, view=VIEW):
 
 def image(pose, seed, view=VIEW):
     """Return a photograph (height, width)."""
-    optics = Optics(np.array(view), np.array(pack(())), False)
-    levels = render_board(
-        board(), optics, SIZE, BoardPose(pose[0], np.array(pose[1])), black=35.0, white=210.0,
-        background=120.0, blur_px=0.6,
+    view = dict(zip(("fx_px", "fy_px", "cx_px", "cy_px"), view, strict=True))
+    scenes = board_scene(
+        board(), {"width_px": SIZE[0], "height_px": SIZE[1], **view},
+        BoardPose(pose[0], np.array(pose[1])), blur_px=0.6,
     )
+    levels = levels_of(scenes, background=120.0, black=35.0, white=210.0)
     noise = np.random.default_rng(seed).normal(0.0, 2.0, levels.shape)
     return np.clip(np.rint(levels + noise), 0, 255).astype(np.uint8)
 

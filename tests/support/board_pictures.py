@@ -119,13 +119,18 @@ def parts(name, levels):
 def painted(name, levels, points):
     """Return the levels (n,) of points (n, 2), right and up in m; NaN is beside the board."""
     found = np.full(len(points), float(levels["background"]))
+    order = np.argsort(points[:, 0])
+    x, y = points[order].T
     for corners, level, _ in parts(name, levels):
-        inside = np.ones(len(points), dtype=bool)
+        first = np.searchsorted(x, corners[:, 0].min())
+        last = np.searchsorted(x, corners[:, 0].max(), side="right")
+        inside = np.ones(last - first, dtype=bool)
         for start, stop in zip(corners, np.roll(corners, -1, axis=0), strict=True):
             along = stop - start
-            off = points - start
-            inside &= along[0] * off[:, 1] - along[1] * off[:, 0] <= 0
-        found[inside] = level
+            inside &= (
+                along[0] * (y[first:last] - start[1]) - along[1] * (x[first:last] - start[0]) <= 0
+            )
+        found[order[first:last][inside]] = level
     return found
 
 

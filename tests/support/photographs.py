@@ -9,16 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from support.exact_image import values
+from support.board_scenes import BoardPose, board_scene, image_of_board
 from sweep.model.board import Board
-from sweep.model.board_image import BoardPose, Curvature, render_board
-from sweep.model.effects import NEUTRAL
-from sweep.model.image_shift import shift_waves
 from sweep.model.pose import rotation_of_angles
-from sweep.model.scene import build_scenes
-from sweep.model.sensing import sensed
-from sweep.model.sheet import Shape
-from sweep.model.tone import bloomed
 
 WEBCAM = {
     "sharpening": 0.6, "sharpening_px": 1.5, "bloom": 0.15, "tone_gamma": 0.9, "blur_px": 0.6,
@@ -36,58 +29,14 @@ class Photograph:
     pose: BoardPose
 
 
-def scenes_of(camera, effects, key):
-    """The scene whose camera and effects a photograph has (its marker is not seen)."""
-    unknown = {*effects} - {*NEUTRAL, "black", "white", "background"}
-    if unknown:
-        raise ValueError(f"no effect has {sorted(unknown)}")
-    refused = {*effects} & {
-        "occlusion", "exposure_s", "row_time_s", "aperture_mm", "marker_scale",
-    }
-    if refused:
-        raise ValueError(f"these photographs have no {sorted(refused)}")
-    value = values(**(NEUTRAL | {"distance_m": 1.0, "noise_key": key} | camera | effects))
-    return build_scenes(value, 1)
-
-
 def photograph(board: Board, camera: dict, pose: BoardPose, effects: dict, key: int) -> Photograph:
     """Return a photograph of a board.
 
     ``camera`` has width_px, height_px, fx_px and perhaps cx_px, cy_px and distortion, as sections
     of pipelines have them; ``effects`` the parameters of effects and levels by name; ``key`` makes
-    its noise and shifts. Raises ValueError if the board has no image from there.
+    its noise and shifts.
     """
-    # Quantisation alone would go another way: an effect of no strength that is active.
-    scenes = scenes_of(camera, {"gain": 1.0 + 1e-15} | effects, key)
-    effect = scenes.effect(0)
-    background, black, white = scenes.levels[0].tolist()
-    curvature = None
-    if effect["curvature_per_m"] != 0 or effect["geometry_px"] != 0:
-        shape = Shape(
-            effect["curvature_per_m"], np.radians(effect["bend_deg"]),
-            scenes.meaning("bend", effect) == "saddle",
-        )
-        curvature = Curvature(shape)
-        if effect["geometry_px"] != 0:
-            length = effect["geometry_length_px"]
-            waves = shift_waves(effect["geometry_px"], length, np.uint64(key))
-            curvature = Curvature(shape, waves, length)
-    frame = int(scenes.frame[0, 0]), int(scenes.frame[0, 1])
-
-    def seen(blur_px):
-        return render_board(
-            board, scenes.cameras.optics(0), frame, pose, black=black, white=white,
-            background=background, blur_px=blur_px, curvature=curvature,
-        )
-
-    levels, overshoot = seen(effect["blur_px"]), None
-    if effect["sharpening"] != 0:
-        wide = seen(float(np.hypot(effect["blur_px"], effect["sharpening_px"])))
-        overshoot = effect["sharpening"] * (levels - wide)
-    if effect["bloom"] != 0:
-        levels = bloomed(levels, black, white, effect["bloom"])
-    window = (0, 0, *frame)
-    return Photograph(sensed(scenes, 0, levels, overshoot, window, window), pose)
+    return Photograph(image_of_board(board_scene(board, camera, pose, key, **effects)), pose)
 
 
 def drawn_pose(rng, board: Board, camera: dict, share: float) -> BoardPose:

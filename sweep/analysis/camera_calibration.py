@@ -16,7 +16,7 @@ import xarray as xr
 
 from sweep.analysis.described import describes
 from sweep.analysis.dimensions import DRAWS, axes_of, stored_pipeline
-from sweep.analysis.intervals import wilson
+from sweep.analysis.intervals import DEVIATIONS, wilson
 from sweep.errors import ArgumentError, DatasetError, SweepError
 from sweep.measure.board_solver import guarded_poses
 from sweep.measure.flags import CalibrationStatus
@@ -44,9 +44,6 @@ DIRECTIONS = ("centre", "corner")
 
 POINTS = {"chessboard": "chessboard_corner_error_px", "markers": "marker_corner_error_px"}
 """The points of a calibration -> the variable that has their errors."""
-
-_SIGMA = 1.959963984540054
-"""Standard deviations of a 95 % interval."""
 
 _AT_CORNER = 0.8
 """Share of the way from the principal point to the frame's corner."""
@@ -233,7 +230,7 @@ def calibration_summary(calibrated: xr.Dataset) -> xr.Dataset:
     error = calibrated["intrinsic_error"].where(solved)
     std = calibrated["intrinsic_std"].where(solved)
     free = (std > 0).any("set")
-    held = ((abs(error) <= _SIGMA * std) & solved).sum("set")
+    held = ((abs(error) <= DEVIATIONS * std) & solved).sum("set")
     count = solved.sum("set")
     low, high = xr.apply_ufunc(wilson, held, count, output_core_dims=[[], []])
     with_sets = count.where(count > 0)

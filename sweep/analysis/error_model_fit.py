@@ -12,9 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
 
-from sweep.analysis.intervals import TAIL
 from sweep.typing import Floats
 
 FLOOR = 1e-18
@@ -215,15 +213,6 @@ def _bias(
     covariance = np.linalg.inv(_normal(design, penalty, weight)).astype(np.float64)
     coefficients = covariance @ ((design * weight[:, None]).T @ mean)
     return scale * coefficients, covariance * scale[:, None] * scale
-
-
-def normal_quantile() -> float:
-    """Return the standard errors from the middle to the ends of a 95 % interval.
-
-    >>> round(normal_quantile(), 3)
-    1.96
-    """
-    return float(special.ndtri(1.0 - TAIL))
 
 
 def _normal(basis: Floats, penalty: Floats, weight: Floats) -> Floats:

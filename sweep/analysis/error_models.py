@@ -19,7 +19,6 @@ from sweep.analysis.error_model_fit import (
     fit_error,
     grid_points,
     hat_basis,
-    normal_quantile,
     select_knots,
     union,
 )
@@ -34,6 +33,7 @@ from sweep.analysis.error_model_sums import (
     Moments,
     sums_of,
 )
+from sweep.analysis.intervals import DEVIATIONS
 from sweep.analysis.pose_view import SIGNED_INPUTS, pose_arrays
 from sweep.errors import DatasetError
 from sweep.measure.flags import Flag, flag
@@ -252,7 +252,7 @@ def _knot_variables(
     fits: Sequence[Sequence[Fit]], knots: Sequence[Floats], kept: Sequence[str],
     shape: tuple[int, ...],
 ) -> dict[str, Any]:
-    grid, z = [len(each) for each in knots], normal_quantile()
+    grid, z = [len(each) for each in knots], DEVIATIONS
     distance = np.exp(knots[0])
     dims = (*kept, "quantity", *PREDICTORS)
 
@@ -330,7 +330,7 @@ def _exponents(
     moments: Sequence[Moments], kept: Sequence[str], shape: tuple[int, ...]
 ) -> dict[str, Any]:
     """Return the power of the distance, or of the side, with which sigma goes."""
-    z, values = normal_quantile(), np.full((3, len(moments), len(QUANTITIES)), np.nan)
+    z, values = DEVIATIONS, np.full((3, len(moments), len(QUANTITIES)), np.nan)
     for model, each in enumerate(moments):
         for k in range(len(QUANTITIES)):
             sums = each.of(k)

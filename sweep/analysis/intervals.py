@@ -19,6 +19,9 @@ LEVEL = 0.95
 TAIL = (1.0 - LEVEL) / 2.0
 """Probability beyond each end."""
 
+DEVIATIONS = float(special.ndtri(1.0 - TAIL))
+"""Standard deviations from the middle to the ends, of a normal variable: 1.96."""
+
 MAX_N = 10**15  # up to here n, n - successes and successes + 1/2 are exact in doubles
 # With as many successes and failures, the Cornish-Fisher expansion is right to 3e-12; scipy's
 # inverse is off by up to 7e-12 below that, and by up to 1e-8 far above.

@@ -48,15 +48,32 @@ class Intrinsics:
         them; those of coefficients that are not estimated are 0.
     rms_px
         OpenCV's root mean square of the residuals' lengths.
-    views
-        How many were used.
+    used
+        The numbers of the views that were used.
+    turns, shifts
+        (len(used), 3) the board's pose in each: rotation vectors and translations in metres, of
+        points whose y and z have the opposite sign.
     """
 
     status: CalibrationStatus
     values: Floats
     std: Floats
     rms_px: float
-    views: int
+    used: tuple[int, ...]
+    turns: Floats
+    shifts: Floats
+
+    @property
+    def views(self) -> int:
+        """How many views were used."""
+        return len(self.used)
+
+    @staticmethod
+    def none(status: CalibrationStatus, used: Sequence[int]) -> Intrinsics:
+        """Return that there is no calibration from the views ``used``."""
+        missing = np.full(len(INTRINSICS), np.nan)
+        poses = np.full((len(used), 3), np.nan)
+        return Intrinsics(status, missing, missing, np.nan, tuple(used), poses, poses)
 
 
 def calibrate(
@@ -75,25 +92,27 @@ def calibrate(
     coefficients
         A key of :data:`FREE_COEFFICIENTS`.
     """
-    missing = np.full(len(INTRINSICS), np.nan)
     used = [i for i, points in enumerate(objects) if _spans_a_plane(points)]
     if len(used) < MIN_VIEWS:
-        return Intrinsics(CalibrationStatus.too_few_views, missing, missing, np.nan, len(used))
+        return Intrinsics.none(CalibrationStatus.too_few_views, used)
     try:
-        rms, matrix, lens, _, _, deviations, *_ = cv2.calibrateCameraExtended(
+        rms, matrix, lens, turns, shifts, deviations, *_ = cv2.calibrateCameraExtended(
             [(objects[i] * [1.0, -1.0, -1.0]).astype(np.float32) for i in used],
             [pixels[i].astype(np.float32) for i in used], frame, np.eye(3), np.zeros(5),
             flags=FREE_COEFFICIENTS[coefficients],
         )
     except cv2.error:
-        return Intrinsics(CalibrationStatus.failed, missing, missing, np.nan, len(used))
+        return Intrinsics.none(CalibrationStatus.failed, used)
     values = np.array([
         matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *np.ravel(lens)[:5],
     ], dtype=np.float64)
     std = np.ravel(deviations)[: len(INTRINSICS)].astype(np.float64)
     if not (np.isfinite(values).all() and np.isfinite(std).all() and (values[:2] > 0).all()):
-        return Intrinsics(CalibrationStatus.failed, missing, missing, np.nan, len(used))
-    return Intrinsics(CalibrationStatus.calibrated, values, std, float(rms), len(used))
+        return Intrinsics.none(CalibrationStatus.failed, used)
+    return Intrinsics(
+        CalibrationStatus.calibrated, values, std, float(rms), tuple(used),
+        *(np.array(each, dtype=np.float64).reshape(-1, 3) for each in (turns, shifts)),
+    )
 
 
 def _spans_a_plane(points: Floats) -> bool:

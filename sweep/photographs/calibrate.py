@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
-import cv2
 import numpy as np
 
 from sweep.errors import ArgumentError
+from sweep.measure import intrinsics
+from sweep.measure.flags import CalibrationStatus
 from sweep.model.pose import rotation_of_vector
 from sweep.photographs.corners import FoundCorners
 from sweep.photographs.pose_fit import Lens
@@ -20,9 +20,6 @@ MIN_PHOTOGRAPHS = 4
 
 MIN_CORNERS = 12
 """Corners of a board in a photograph that is used."""
-
-COUNT = 9
-"""Numbers that are estimated: fx, fy, cx, cy, k1, k2, p1, p2, k3."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +48,7 @@ class CalibratedCamera:
 
 
 def calibrate(size: tuple[int, int], found: Sequence[FoundCorners]) -> CalibratedCamera:
-    """Calibrate a camera with five lens coefficients (``cv2.calibrateCameraExtended``).
+    """Calibrate a camera with five coefficients (:func:`sweep.measure.intrinsics.calibrate`).
 
     Parameters
     ----------
@@ -73,41 +70,35 @@ def calibrate(size: tuple[int, int], found: Sequence[FoundCorners]) -> Calibrate
             f"board, from different sides; there are {len(used)}; take more, or give the file of a "
             "calibration",
         )
-    try:
-        rms, matrix, distortion, turns, shifts, deviations, *_ = cv2.calibrateCameraExtended(
-            [(each.points * [1.0, -1.0, -1.0]).astype(np.float32) for each in used],
-            [each.pixels.astype(np.float32) for each in used], size, np.eye(3), np.zeros(5),
-        )
-    except cv2.error as error:
+    made = intrinsics.calibrate(
+        [each.points for each in used], [each.pixels for each in used], size
+    )
+    if made.status != CalibrationStatus.calibrated:
         raise ArgumentError(
-            "camera", "calibrate", f"OpenCV cannot calibrate from these photographs: {error.err}"
-        ) from None
-    lens = Lens(
-        np.asarray(matrix, dtype=np.float64), np.asarray(distortion, dtype=np.float64).ravel()[:5]
-    )
-    covariance = _covariance(lens, used, turns, shifts)
+            "camera", "calibrate",
+            "OpenCV cannot calibrate from these photographs; take others, from different sides, or "
+            "give the file of a calibration",
+        )
+    fx, fy, cx, cy, *distortion = made.values.tolist()
+    lens = Lens.of(fx, fy, cx, cy, tuple(distortion))
     return CalibratedCamera(
-        lens, tuple(np.asarray(deviations).ravel()[:COUNT].tolist()), covariance, float(rms),
-        len(used),
+        lens, tuple(made.std.tolist()), _covariance(lens, [used[i] for i in made.used], made),
+        made.rms_px, made.views,
     )
 
 
-def _covariance(
-    lens: Lens, used: Sequence[FoundCorners], turns: Sequence[Any], shifts: Sequence[Any]
-) -> Floats:
+def _covariance(lens: Lens, used: Sequence[FoundCorners], made: intrinsics.Intrinsics) -> Floats:
     """Return the covariance (9, 9) of the camera's numbers beside the photographs' poses.
 
     That of least squares with the residuals' variance: the inverse of the Schur complement of the
     poses in the normal equations, as of a bundle adjustment (Triggs et al., 2000, section 6.1).
     """
-    information = np.zeros((COUNT, COUNT))
+    numbers = len(intrinsics.INTRINSICS)
+    information = np.zeros((numbers, numbers))
     squares, count = 0.0, 0
-    for found, turn, shift in zip(used, turns, shifts, strict=True):
-        at = (
-            found.points * [1.0, -1.0, -1.0],
-            rotation_of_vector(np.asarray(turn, dtype=np.float64).reshape(1, 3))[0],
-            np.asarray(shift, dtype=np.float64).ravel(),
-        )
+    rotations = rotation_of_vector(made.turns)
+    for found, rotation, shift in zip(used, rotations, made.shifts, strict=True):
+        at = (found.points * [1.0, -1.0, -1.0], rotation, shift)
         image, by_pose = lens.derivatives(*at)
         pose, camera = by_pose.reshape(-1, 6), lens.camera_derivatives(*at)
         cross = pose.T @ camera
@@ -116,4 +107,4 @@ def _covariance(
         count += 2 * len(found.points) - 6
     scale = np.sqrt(np.diag(information))  # the numbers' units differ by many powers of ten
     scaled = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)
-    return np.asarray(squares / max(count - COUNT, 1) * scaled / np.outer(scale, scale))
+    return np.asarray(squares / max(count - numbers, 1) * scaled / np.outer(scale, scale))

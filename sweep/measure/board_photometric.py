@@ -154,7 +154,7 @@ def _refined(one: BoardDetections) -> Floats:
 def _window(one: BoardDetections, poses: list[Pose]) -> list[int]:
     """Return what is fitted of the image: left, top, right, bottom around the sheet in any pose."""
     board = one.boards[0]
-    sheet = box_corners(extent_of(board).sheet[None]) * unit_m(board) * float(one.scale[0])
+    sheet = box_corners(extent_of(board).target[None]) * unit_m(board) * float(one.scale[0])
     size = np.array(one.images[0].shape[::-1])
     pixels = np.concatenate([
         one.cameras.project(transform_points(sheet, rotation[None], translation[None]))[0]

@@ -27,7 +27,7 @@ from sweep.model.derivatives import (
     normal_equations,
 )
 from sweep.model.pose import rotations, vectors
-from sweep.model.printed import PrintKey, edges_of, extent_of, unit_m
+from sweep.model.printed import PrintKey, edges_of, extent_of, target_edges, unit_m
 from sweep.model.projection import Optics, Projection
 from sweep.typing import Floats
 
@@ -109,18 +109,18 @@ def marker_view(
 
 def middle_m(board: Board) -> Floats:
     """Return the middle (3,) of a board's sheet in its frame, in metres."""
-    left, top, right, bottom = extent_of(board).sheet
+    left, top, right, bottom = extent_of(board).target
     return np.array([(left + right) / 2, -(top + bottom) / 2, 0.0]) * unit_m(board)
 
 
 @lru_cache(maxsize=64)
 def _around_middle(board: Board) -> tuple[MarkerEdges, Floats]:
     """Return edges and extent of a board as :class:`MarkerView` has them."""
-    outline, extent = edges_of(board), extent_of(board)
-    shift = extent.modules / 2 - (extent.sheet[:2] + extent.sheet[2:]) / 2
+    outline, extent = target_edges(board), extent_of(board)
+    shift = extent.modules / 2 - (extent.target[:2] + extent.target[2:]) / 2
     return (
         MarkerEdges(outline.ends + np.tile(shift, 2), outline.sides),
-        extent.sheet + np.tile(shift, 2),
+        extent.target + np.tile(shift, 2),
     )
 
 

@@ -105,6 +105,8 @@ class Board:
         the top left as ``cv2.aruco.CharucoBoard`` counts them; (0, 3) of other boards.
     chessboard
         A ChArUco board's squares; None of other boards.
+    distractors
+        What stands beside it and is no part of it, each on a sheet of its own.
     """
 
     dictionary: str
@@ -113,41 +115,50 @@ class Board:
     prints: tuple[Print, ...]
     chessboard_m: Floats
     chessboard: Chessboard | None = None
+    distractors: tuple[Print, ...] = ()
 
     def __len__(self) -> int:
         return len(self.marker_ids)
 
     @property
     def is_flat(self) -> bool:
-        """Whether all is printed in one plane."""
-        return all(each.turn is None for each in self.prints)
+        """Whether all is printed in one plane, distractors included."""
+        return all(each.turn is None for each in (*self.prints, *self.distractors))
 
     @property
     def is_single(self) -> bool:
-        """Whether it is one marker on its own sheet, upright at the origin."""
-        if len(self.prints) > 1 or len(self) != 1:
+        """Whether it is one marker on its own sheet, upright at the origin, and nothing else."""
+        if len(self.prints) > 1 or len(self) != 1 or self.distractors:
             return False
         only = self.prints[0]
         return self.is_flat and only.x_m == only.y_m == only.roll_rad == 0.0
 
     def edges(self, leave_out: Sequence[int] = ()) -> MarkerEdges:
-        """Return the edges of all prints in metres, right and *down* from the board's origin.
+        """Return the edges of the board's prints, as :func:`edges_on_sheet` does.
 
-        Their plane is (rotation[:, 0], -rotation[:, 1], translation). ``leave_out``: indices of
-        prints that are not wanted, such as a marker's.
+        ``leave_out``: indices of prints that are not wanted, such as a marker's.
         """
-        kept = [each for i, each in enumerate(self.prints) if i not in set(leave_out)]
-        on_sheet = [each.plane(np.eye(3), np.array([0.0, 0.0, 1.0])) for each in kept]
-        ends = [
-            (each.edges.ends.reshape(-1, 2) @ plane[:2, :2].T + plane[:2, 2]).reshape(-1, 4)
-            for each, plane in zip(kept, on_sheet, strict=True)
-        ]
-        return MarkerEdges(
-            np.concatenate([*ends, np.empty((0, 4))]) * [1.0, -1.0, 1.0, -1.0],
-            np.concatenate([
-                *(each.edges.sides for each in kept), np.empty((0, 2), dtype=np.int64)
-            ]),
+        return edges_on_sheet(
+            [each for i, each in enumerate(self.prints) if i not in set(leave_out)]
         )
+
+
+def edges_on_sheet(prints: Sequence[Print]) -> MarkerEdges:
+    """Return the edges of prints in metres, right and *down* from the board's origin.
+
+    Their plane is (rotation[:, 0], -rotation[:, 1], translation).
+    """
+    on_sheet = [each.plane(np.eye(3), np.array([0.0, 0.0, 1.0])) for each in prints]
+    ends = [
+        (each.edges.ends.reshape(-1, 2) @ plane[:2, :2].T + plane[:2, 2]).reshape(-1, 4)
+        for each, plane in zip(prints, on_sheet, strict=True)
+    ]
+    return MarkerEdges(
+        np.concatenate([*ends, np.empty((0, 4))]) * [1.0, -1.0, 1.0, -1.0],
+        np.concatenate([
+            *(each.edges.sides for each in prints), np.empty((0, 2), dtype=np.int64)
+        ]),
+    )
 
 
 def marker_print(

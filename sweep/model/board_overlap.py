@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sweep.typing import Floats
+from sweep.typing import Floats, Masks
 
 TOUCHING = 1e-9
 """Share of a side by which squares may overlap and still count as touching: rounding."""
@@ -39,3 +39,24 @@ def first_overlap(centres: Floats, sides: Floats, rolls_rad: Floats) -> tuple[in
         return None
     i, j = pairs[np.argmax(overlapping)].tolist()
     return i, j
+
+
+def sheets_overlap(one: Floats, others: Floats) -> Masks:
+    """Return (n,) which of n rectangles (n, 4, 3) overlap another (4, 3) in its plane.
+
+    By the separating axis theorem, as :func:`first_overlap`; those in other planes do not.
+    """
+    sides = np.stack([one[1] - one[0], one[3] - one[0]])
+    other_sides = np.stack([others[:, 1] - others[:, 0], others[:, 3] - others[:, 0]], axis=1)
+    side = np.linalg.norm(sides, axis=1).min()
+    normal = np.cross(*sides) / np.linalg.norm(np.cross(*sides))
+    coplanar = (np.abs((others - one[0]) @ normal) <= TOUCHING * side).all(axis=1)
+    separation = np.full(len(others), -np.inf)
+    for along in (*(np.broadcast_to(each, (len(others), 3)) for each in sides),
+                  other_sides[:, 0], other_sides[:, 1]):
+        axis = along / np.linalg.norm(along, axis=1)[:, None]
+        a = axis @ one.T
+        b = np.einsum("ni,nki->nk", axis, others)
+        gap = np.maximum(b.min(axis=1) - a.max(axis=1), a.min(axis=1) - b.max(axis=1))
+        separation = np.maximum(separation, gap)
+    return np.asarray(coplanar & (separation < -TOUCHING * side))

@@ -12,6 +12,12 @@ from sweep.declaration import check_tables, declared_fields, parameter
 from sweep.model.board import Board
 from sweep.model.board_declaring import Fault
 from sweep.model.board_kinds import Charuco, Grid
+from sweep.model.distractors import (
+    listed_distractors,
+    listing_faults,
+    overlap_faults,
+    with_distractors,
+)
 from sweep.model.marker import module_count
 from sweep.model.marker_table import BoardMarker, Markers
 
@@ -67,6 +73,11 @@ class BoardValues:
         "roll_deg, z_m, and tilt_deg about an axis at azimuth_deg",
         list_text="tables [[board.markers]]", reads=listed_markers,
     )
+    distractors: tuple[tuple[Any, ...], ...] | None = parameter(
+        None, "what stands beside the board, or beside the marker, and is no part of it: the same "
+        "keys as of markers; without marker_id a black square; dictionary if it is another one",
+        list_text="tables [[board.distractors]]", reads=listed_distractors,
+    )
 
 
 NEEDED: dict[str, tuple[str, ...]] = {
@@ -95,7 +106,7 @@ PIPELINE_NAMES = {
 def arranged(values: Sequence[Any]) -> Charuco | Grid | Markers:
     """Return the board that values of :data:`ARRANGING` declare, unchecked."""
     (kind, dictionary, marker_id, size_m, quiet, rows, columns, gap_m, corner_squares, squares_x,
-     squares_y, square_m, legacy_pattern, markers) = values
+     squares_y, square_m, legacy_pattern, markers, _) = values
     margin_m = quiet * size_m / module_count(dictionary)
     # Along an axis, numbers are floating-point.
     counts: list[Any] = [
@@ -131,28 +142,33 @@ def used_by(kind: Any) -> tuple[str, ...]:
     """Return the parameters of [board] that a kind uses; () of what is no kind."""
     if not isinstance(kind, str):
         return ()
-    return (*NEEDED.get(kind, ()), *OPTIONAL.get(kind, ()))
+    return (*NEEDED.get(kind, ()), *OPTIONAL.get(kind, ()), "distractors")
 
 
 ARRANGING = ("kind", *FROM_MARKER, "rows", "columns", "gap_m", "corner_squares", "squares_x",
-             "squares_y", "square_m", "legacy_pattern", "markers")
-"""The parameters that :func:`arranged` takes, in its order."""
+             "squares_y", "square_m", "legacy_pattern", "markers", "distractors")
+"""The parameters that :func:`arranged_board` takes, in its order."""
 
 
 def arrangement_faults(values: Sequence[Any]) -> list[Fault]:
     """Return what keeps values of :data:`ARRANGING` from being a board, by pipelines' names."""
+    _, dictionary, *_, listed = values
+    faults = arranged(values).faults() + listing_faults(listed, dictionary)
+    if listed and not faults:
+        faults = overlap_faults(arranged_board(*values), listed)
     return [
         Fault(PIPELINE_NAMES.get(fault.key, fault.key), fault.value, fault.expected)
-        for fault in arranged(values).faults()
+        for fault in faults
     ]
 
 
 @lru_cache(maxsize=1024)
 def arranged_board(*values: Any) -> Board:
     """Return the board that values of :data:`ARRANGING` declare, the same for the same values."""
-    return arranged(values).board()
+    _, _, _, size_m, quiet_modules, *_, listed = values
+    return with_distractors(arranged(values).board(), listed, size_m, quiet_modules)
 
 
-def is_solid(markers: Sequence[Sequence[Any]] | None) -> bool:
-    """Return whether listed markers are in several planes, or in another than the board's."""
-    return any(z != 0.0 or tilt != 0.0 for *_, z, tilt, _ in markers or ())
+def is_solid(listed: Sequence[Sequence[Any]] | None) -> bool:
+    """Return whether listed markers or distractors are not all in the board's plane."""
+    return any(z != 0.0 or tilt != 0.0 for *_, z, tilt, _ in (row[:8] for row in listed or ()))

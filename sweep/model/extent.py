@@ -9,17 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model import lens as lens_model
+from sweep.model.board import Board
 from sweep.model.demosaic import REACH_PX
 from sweep.model.jpeg import BLOCK_PX
 from sweep.model.motion import BEHIND, MEANINGLESS, Motion, MovingMarker, row_times, track
 from sweep.model.point_spread import REACH
 from sweep.model.polygon import half_plane, signed_areas
 from sweep.model.pose import transform_points
+from sweep.model.printed import extent_of
 from sweep.model.scene import Box, Scenes
 from sweep.model.scene_sheet import curved_rows, scene_sheet, sheet_folds, sheet_outline_px
 from sweep.model.sheet import bent_point
-from sweep.model.solid_board import facing as planes_facing
-from sweep.model.solid_scene import facing_sheets, sheet_outlines_px, solid_planes
+from sweep.model.solid_scene import board_faces, facing_sheets, sheet_outlines_px
 from sweep.typing import Floats, Masks
 
 WARP_PX_PER_MODULE = 10
@@ -291,14 +292,28 @@ EDGE_ON = 1e-12
 def hidden(scenes: Scenes) -> NDArray[np.bool_]:
     """Return (N,) whether a marker is seen from behind or edge on, or has a corner at z <= 0.
 
-    The quiet zone's corners count, since the marker is drawn with it.
+    The quiet zone's corners count, since the marker is drawn with it; not what is beside a board.
     """
     towards = np.sum(scenes.rotation[:, :, 2] * scenes.translation, axis=1)
     # A tilt of 90° is not quite one in double precision.
     facing = towards < -EDGE_ON * np.linalg.norm(scenes.translation, axis=1)
     for row in np.flatnonzero(scenes.solid).tolist():
-        facing[row] = planes_facing(solid_planes(scenes, row)).any()
-    return np.asarray(~facing | ~np.isfinite(scenes.outline_px).all(axis=(1, 2)))
+        facing[row] = board_faces(scenes, row)
+    behind: Masks = np.asarray(~np.isfinite(scenes.outline_px).all(axis=(1, 2)))
+    for row in np.flatnonzero(behind).tolist():
+        key = scenes.markers[scenes.marker[row]]
+        if isinstance(key, Board) and key.distractors:
+            behind[row] = _own_sheet_behind(scenes, row)
+    return np.asarray(~facing | behind)
+
+
+def _own_sheet_behind(scenes: Scenes, row: int) -> bool:
+    """Return whether a board has a corner at z <= 0, whatever stands beside it."""
+    if scenes.solid[row]:
+        return not np.isfinite(scenes.corners_px[row]).all()
+    target = extent_of(scenes.markers[scenes.marker[row]]).target
+    (corners,), depth = _rectangle(target[None], 1), scenes.plane[row][2]
+    return bool((corners @ depth[:2] + depth[2] <= 0).any())
 
 
 def outside_frame(scenes: Scenes, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -350,13 +365,11 @@ def not_modelled(scenes: Scenes) -> NDArray[np.bool_]:
 
     That is so if the lens model folds on the marker, or if during the exposure it does so, or the
     marker comes behind the camera or shows its back; and if a bent marker hides a part of itself,
-    or shifts fold its image, in the middle of the exposure.
+    or shifts fold its image, in the middle of the exposure. What is beside a board counts, too.
     """
-    folded = np.zeros(len(scenes), dtype=bool)
+    folded: Masks = np.asarray(~np.isfinite(scenes.outline_px).all(axis=(1, 2)))
     for row in curved_rows(scenes).tolist():
-        folded[row] = (
-            np.isfinite(scenes.outline_px[row]).all() and sheet_folds(scenes, row)
-        )
+        folded[row] = folded[row] or sheet_folds(scenes, row)
     for row in np.flatnonzero(scenes.affected).tolist():
         low, high = scenes.outline_px[row].min(axis=0), scenes.outline_px[row].max(axis=0)
         if np.isfinite(low).all() and scenes.motion(row) is not None:

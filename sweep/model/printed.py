@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.model.board import Board
+from sweep.model.board import Board, edges_on_sheet
 from sweep.model.coverage import MarkerEdges
 from sweep.model.marker import (
     BLACK,
@@ -39,6 +39,8 @@ class Extent(NamedTuple):
     ----------
     sheet
         Left, top, right, bottom of all that is printed, the white around it included.
+    target
+        The same without what stands beside a board.
     ink
         The same of a marker's black square, or of a board's markers and squares.
     modules_beyond
@@ -50,6 +52,7 @@ class Extent(NamedTuple):
     """
 
     sheet: Floats
+    target: Floats
     ink: Floats
     modules_beyond: float
     origin: Floats
@@ -60,16 +63,17 @@ class Extent(NamedTuple):
 def extent_of(key: PrintKey) -> Extent:
     """Return where the parts of a print end."""
     if isinstance(key, Board):
-        outline = edges_of(key)
+        outline = target_edges(key)
         black = (outline.sides == BLACK).any(axis=1)
         return Extent(
-            _box(outline.ends), _box(outline.ends[black]), 0.0, np.zeros(2),
-            float(module_count(key.dictionary)),
+            _box(edges_of(key).ends), _box(outline.ends), _box(outline.ends[black]), 0.0,
+            np.zeros(2), float(module_count(key.dictionary)),
         )
     n, margin = float(module_count(key[0])), key[2]
+    sheet = np.array([-margin, -margin, n + margin, n + margin])
     return Extent(
-        np.array([-margin, -margin, n + margin, n + margin]), np.array([0.0, 0.0, n, n]),
-        float(overhang(key[0])), np.array([n / 2, n / 2]), n,
+        sheet, sheet, np.array([0.0, 0.0, n, n]), float(overhang(key[0])),
+        np.array([n / 2, n / 2]), n,
     )
 
 
@@ -94,13 +98,26 @@ def unit_m(board: Board) -> float:
 
 
 @lru_cache(maxsize=64)
-def _board_edges(board: Board) -> MarkerEdges:
+def target_edges(board: Board) -> MarkerEdges:
+    """Return the edges of a board, without what stands beside it, in units."""
     outline = board.edges()
     return MarkerEdges(outline.ends / unit_m(board), outline.sides)
 
 
+@lru_cache(maxsize=64)
+def _board_edges(board: Board) -> MarkerEdges:
+    own = target_edges(board)
+    if not board.distractors:
+        return own
+    beside = edges_on_sheet(board.distractors)
+    return MarkerEdges(
+        np.concatenate([own.ends, beside.ends / unit_m(board)]),
+        np.concatenate([own.sides, beside.sides]),
+    )
+
+
 def edges_of(key: PrintKey) -> MarkerEdges:
-    """Return the edges of all that is printed, in units."""
+    """Return the edges of all that is printed, beside a board too, in units."""
     return _board_edges(key) if isinstance(key, Board) else edges(*key)
 
 

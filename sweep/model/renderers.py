@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model import coverage, drawing, lens
-from sweep.model.board import Board
+from sweep.model.board import Board, edges_on_sheet
 from sweep.model.exposure import marker_exposure
 from sweep.model.extent import WARP_PX_PER_MODULE
 from sweep.model.image_file import decode_grey
@@ -233,8 +233,8 @@ def _sampled_marker(scenes: Scenes, row: int) -> SampledMarker:
 def _board_table(board: Board) -> tuple[Floats, Floats]:
     """Return the edges (E, 6) and the prints (P, 6) of a board, as `SampledMarker` has them."""
     tables, prints, first = [], [], 0
-    for number in range(len(board.prints)):
-        outline = board.edges([k for k in range(len(board.prints)) if k != number])
+    for each in (*board.prints, *board.distractors):
+        outline = edges_on_sheet([each])
         ends = outline.ends / unit_m(board)
         points = ends.reshape(-1, 2)
         tables.append(np.hstack([ends, outline.sides]))

@@ -23,7 +23,7 @@ from sweep.model.pose import rotation_of_angles, transform_points
 from sweep.model.printed import PrintKey, box_corners, extent_of
 from sweep.model.projection import Projection
 from sweep.model.renderer_names import renderer_name
-from sweep.model.solid_board import box_px
+from sweep.model.solid_board import boxes_px
 from sweep.typing import Floats
 
 Key = TypeVar("Key")
@@ -110,7 +110,7 @@ class Scenes:
         The plug-ins' effects and renderers, and (N,) each setting of the renderers.
     corners_px, outline_px
         (N, 4, 2) images of the corners of the black square of ``size_m`` (of a board, of what is
-        black) and of the printed quiet zone, both flat; NaN at z <= 0.
+        black) and of all that is printed, beside a board too, both flat; NaN at z <= 0.
     outline_m
         (N, 4, 3) the latter's corners in the camera frame.
     solid
@@ -314,9 +314,9 @@ def build_scenes(
     outline_px = cameras.project(outline_m)
     solid = np.array([isinstance(key, Board) and not key.is_flat for key in markers])[marker]
     for row in np.flatnonzero(solid).tolist():
-        corners_px[row] = outline_px[row] = box_px(
-            markers[marker[row]], cameras.take(np.array([row])), rotation[row], translation[row],
-            float(printed[row] / size[row]),
+        camera, scale = cameras.take(np.array([row])), float(printed[row] / size[row])
+        corners_px[row], outline_px[row] = boxes_px(
+            markers[marker[row]], camera, rotation[row], translation[row], scale
         )
 
     levels = np.stack(

@@ -1,15 +1,17 @@
-"""Targets of markers that are not in one plane: which are seen, and what of them others hide.
+"""Targets that are not in one plane: which markers are seen, and what of them others hide.
 
-Each marker has a convex sheet of its own. The image is the sum of the visible parts of all sheets
-that face the camera. What a sheet in front hides of another is subtracted: of the part of an area
-inside a half plane the edges are those inside, and those outside projected onto its line, which
-enclose the same area (as those under an occluding sheet in :mod:`sweep.model.printed`). Of several
-sheets in front, by inclusion and exclusion.
+Each marker has a convex sheet of its own, or all of them one; what stands beside them has its own.
+The image is the sum of the visible parts of all sheets that face the camera. What a sheet in front
+hides of another is subtracted: of the part of an area inside a half plane the edges are those
+inside, and those outside projected onto its line, which enclose the same area (as those under an
+occluding sheet in :mod:`sweep.model.printed`). Of several sheets in front, by inclusion and
+exclusion.
 """
 
 from __future__ import annotations
 
 import itertools
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +32,7 @@ class _Face(NamedTuple):
     Attributes
     ----------
     number
-        Of its print on the board.
+        Of :func:`sheets_of` the board.
     plane
         (3, 3) takes (column, row, 1) to the camera frame.
     corners
@@ -45,9 +47,17 @@ class _Face(NamedTuple):
     normals: Floats
 
 
-def print_planes(board: Board, rotation: Floats, translation: Floats, scale: float) -> Floats:
-    """Return the planes (P, 3, 3) of a board's prints, printed ``scale`` times as large."""
-    planes = np.array([each.plane(rotation, translation) for each in board.prints])
+@lru_cache(maxsize=64)
+def sheets_of(board: Board) -> tuple[Print, ...]:
+    """Return what is printed on each sheet: a board's own, or its markers', then distractors'."""
+    of_each = len(board.prints) == len(board)
+    own = board.prints if of_each else (Print(board.edges(), 1.0, 0.0),)
+    return own + board.distractors
+
+
+def sheet_planes(board: Board, rotation: Floats, translation: Floats, scale: float) -> Floats:
+    """Return the planes (P, 3, 3) of a board's sheets, printed ``scale`` times as large."""
+    planes = np.array([each.plane(rotation, translation) for each in sheets_of(board)])
     planes[:, :, 2] = translation + scale * (planes[:, :, 2] - translation)
     planes[:, :, :2] *= scale
     return planes
@@ -64,8 +74,14 @@ def sheet_corners(each: Print) -> Floats:
 def outlines(board: Board, planes: Floats) -> Floats:
     """Return the corners (P, 4, 3) of all sheets in the camera frame."""
     return np.array([
-        sheet_corners(each) @ plane.T for each, plane in zip(board.prints, planes, strict=True)
+        sheet_corners(each) @ plane.T
+        for each, plane in zip(sheets_of(board), planes, strict=True)
     ])
+
+
+def own_sheets(board: Board) -> int:
+    """Return how many of a board's sheets are its own."""
+    return len(sheets_of(board)) - len(board.distractors)
 
 
 def facing(planes: Floats) -> Masks:
@@ -124,11 +140,12 @@ def _occluders(faces: list[_Face]) -> list[list[_Face]]:
 
 
 def visible_prints(board: Board, planes: Floats) -> list[tuple[MarkerEdges, Floats]]:
-    """Return the edges of what is seen of each print, and its plane (3, 3)."""
+    """Return the edges of what is seen of each sheet's print, and its plane (3, 3)."""
     seen = []
+    sheets = sheets_of(board)
     faces = _faces(board, planes)
     for face, fronts in zip(faces, _occluders(faces), strict=True):
-        outline = board.prints[face.number].edges
+        outline = sheets[face.number].edges
         parts = [outline]
         for count in range(1, len(fronts) + 1):
             for some in itertools.combinations(fronts, count):
@@ -174,31 +191,45 @@ def _within(outline: MarkerEdges, line: Floats) -> MarkerEdges:
 
 def unseen_markers(board: Board, planes: Floats) -> Masks:
     """Return (M,) which markers show their back, or are wholly behind another's sheet."""
-    unseen = ~facing(planes)[: len(board)]
+    unseen = np.ones(len(board), dtype=bool)
     faces = _faces(board, planes)
     for face, fronts in zip(faces, _occluders(faces), strict=True):
-        printed = board.prints[face.number]
+        for number, square in _squares(board)[face.number]:
+            corners = square @ face.plane.T
+            unseen[number] = any((corners @ front.normals.T >= 0).all() for front in fronts)
+    return unseen
+
+
+@lru_cache(maxsize=64)
+def _squares(board: Board) -> list[list[tuple[int, Floats]]]:
+    """Return the markers of each sheet: number, and corners (4, 3) as (column, row, 1)."""
+    squares: list[list[tuple[int, Floats]]] = [[] for _ in sheets_of(board)]
+    if len(board.prints) > len(board):
+        squares[0] = list(enumerate(board.corners_m * [1.0, -1.0, 0.0] + [0.0, 0.0, 1.0]))
+        return squares
+    for number, printed in enumerate(board.prints):
         side = 2 * printed.half_m / printed.unit_m
-        square = np.array([
+        squares[number] = [(number, np.array([
             [0.0, 0.0, 1.0], [side, 0.0, 1.0], [side, side, 1.0], [0.0, side, 1.0]
-        ]) @ face.plane.T
-        if any((square @ front.normals.T >= 0).all() for front in fronts):
-            unseen[face.number] = True
-    return np.asarray(unseen)
+        ]))]
+    return squares
 
 
-def box_px(
+def boxes_px(
     board: Board | object, camera: Cameras, rotation: Floats, translation: Floats, scale: float
 ) -> Floats:
-    """Return the rectangle (4, 2) in px about the images of a solid board's sheets.
+    """Return rectangles (2, 4, 2) in px about the images of a solid board's sheets, and of all.
 
     Of those that face the camera, if any does; NaN if a part of one is not before it.
     """
     if not isinstance(board, Board):
         raise TypeError("a single marker is flat")
-    planes = print_planes(board, rotation, translation, scale)
-    seen = facing(planes)
-    corners = outlines(board, planes)[seen if seen.any() else slice(None)]
-    pixels = camera.project(np.ascontiguousarray(corners.reshape(1, -1, 3)))[0]
-    low, high = pixels.min(axis=0), pixels.max(axis=0)
-    return np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+    planes = sheet_planes(board, rotation, translation, scale)
+    boxes = []
+    for count in (own_sheets(board), len(planes)):
+        seen, corners = facing(planes[:count]), outlines(board, planes)[:count]
+        corners = corners[seen if seen.any() else slice(None)]
+        pixels = camera.project(np.ascontiguousarray(corners.reshape(1, -1, 3)))[0]
+        low, high = pixels.min(axis=0), pixels.max(axis=0)
+        boxes.append([low, [high[0], low[1]], high, [low[0], high[1]]])
+    return np.array(boxes)

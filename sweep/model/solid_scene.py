@@ -8,7 +8,7 @@ from sweep.model import coverage
 from sweep.model.board import Board
 from sweep.model.projection import Projection
 from sweep.model.scene import Box, Scenes
-from sweep.model.solid_board import facing, outlines, print_planes, visible_prints
+from sweep.model.solid_board import facing, outlines, own_sheets, sheet_planes, visible_prints
 from sweep.typing import Floats
 
 
@@ -21,9 +21,9 @@ def solid_board(scenes: Scenes, row: int) -> Board:
 
 
 def solid_planes(scenes: Scenes, row: int) -> Floats:
-    """Return the planes (P, 3, 3) of the prints of one scene's board."""
+    """Return the planes (P, 3, 3) of the sheets of one scene's board."""
     scale = 1.0 if scenes.effects is None else float(scenes.effects["marker_scale"][row])
-    return print_planes(
+    return sheet_planes(
         solid_board(scenes, row), scenes.rotation[row], scenes.translation[row], scale
     )
 
@@ -47,6 +47,12 @@ def facing_sheets(scenes: Scenes, row: int) -> Floats:
     """Return the corners (P, 4, 3) in the camera frame of the sheets that face the camera."""
     planes = solid_planes(scenes, row)
     return np.ascontiguousarray(outlines(solid_board(scenes, row), planes)[facing(planes)])
+
+
+def board_faces(scenes: Scenes, row: int) -> bool:
+    """Return whether a sheet of one scene's board faces the camera, be it before it or not."""
+    seen = facing(solid_planes(scenes, row))
+    return bool(seen[: own_sheets(solid_board(scenes, row))].any())
 
 
 def sheet_outlines_px(scenes: Scenes, row: int, per_side: int) -> Floats:

@@ -51,25 +51,33 @@ def boards_can_be_printed(reading: Reading) -> None:
                 f"kind = {users}, which uses it; kind = {' or '.join(dict.fromkeys(kinds))} "
                 "does not: delete it",
             )
-    if all(kind == SINGLE for kind in kinds):
+    if not _shows_boards(reading):
         return
     if needed or not all(reading.values(name) for name in ARRANGING):
         return
-    if reading.axis_of("markers") is not None:
-        reading.fault("axes.markers", "...", "markers under [board]: they cannot be an axis")
-        return
+    for name in ("markers", "distractors"):
+        if reading.axis_of(name) is not None:
+            reading.fault(f"axes.{name}", "...", f"{name} under [board]: they cannot be an axis")
+            return
     seen = set()
     for values in _arrangements(reading):
         for name, value, expected in arrangement_faults(values):
             if (name, expected) not in seen:
                 seen.add((name, expected))
-                reading.fault(f"{reading.parameters[name].section}.{name}", value, expected)
+                section = reading.parameters[name.partition("[")[0]].section
+                reading.fault(f"{section}.{name}", value, expected)
         if len(seen) > MAX_FAULTS:
             return
 
 
 MAX_FAULTS = 10
 """Faults of boards after which no other board is checked."""
+
+
+def _shows_boards(reading: Reading) -> bool:
+    """Return whether scenes show a board, or a marker with something beside it."""
+    beside = any(reading.values("distractors"))
+    return beside or any(kind != SINGLE for kind in reading.values("kind"))
 
 
 def _arrangements(reading: Reading) -> Iterator[tuple[Any, ...]]:
@@ -91,7 +99,7 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
     """Demand detectors, solvers and renderers that can do boards."""
     kinds = reading.values("kind")
     on_boards = ("points", "refine", "refineDetectedMarkers", "minMarkers")
-    if not kinds or all(kind == SINGLE for kind in kinds):
+    if not _shows_boards(reading):
         for name in on_boards:
             if name in reading.given:
                 reading.fault(
@@ -140,7 +148,9 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
             + ("" if solver not in SOLVERS else "; others with points = largest_marker"
                if SOLVERS[solver].corners_alone else ""),
         )
-    if any(map(is_solid, reading.values("markers"))):
+    if any(reading.values("distractors")):
+        _beside_others(reading)
+    if any(map(is_solid, (*reading.values("markers"), *reading.values("distractors")))):
         _several_planes(reading)
     if "chessboard" in reading.values("points") and not {"charuco", "diamond"} & set(kinds):
         reading.fault(
@@ -154,10 +164,21 @@ IN_ONE_PLANE = tuple(
 """Switches of effects that boards in several planes cannot have."""
 
 
+def _beside_others(reading: Reading) -> None:
+    """Refuse what knows the target alone: an image of it without distractors."""
+    why = "with nothing beside the target; delete [[board.distractors]]"
+    for value in reading.values("bound"):
+        if value != "none":
+            reading.fault("scene.bound", value, f"none, or a scene {why}")
+    if "photometric" in reading.values("solver"):
+        reading.fault("estimator.solver", "photometric", f"another solver, or a scene {why}")
+
+
 def _several_planes(reading: Reading) -> None:
-    """Refuse what markers in several planes cannot have: solvers for a plane, effects, bounds."""
-    why = "for markers with z_m or tilt_deg"
-    for name in reading.values("solver"):
+    """Refuse what sheets in several planes cannot have: solvers for a plane, effects, bounds."""
+    target = any(map(is_solid, reading.values("markers")))
+    why = f"for {'markers' if target else 'distractors'} with z_m or tilt_deg"
+    for name in reading.values("solver") if target else ():
         known = SOLVERS.get(name)
         if known is not None and known.planar_only and any(
             points in ("markers", "chessboard") for points in reading.values("points")
@@ -172,5 +193,5 @@ def _several_planes(reading: Reading) -> None:
         for value in reading.values(name):
             if value != only:
                 reading.fault(f"scene.{name}", value, f"{only}, {why}")
-    if any(reading.values("refineDetectedMarkers")):
+    if target and any(reading.values("refineDetectedMarkers")):
         reading.fault("detector.refineDetectedMarkers", True, f"false, {why}")

@@ -15,8 +15,13 @@ _SIZED_BY = ("kind", "rows", "columns", "squares_x", "squares_y", "legacy_patter
 
 
 def shows_boards(pipeline: Pipeline) -> bool:
-    """Return whether the scenes of a pipeline show boards; single markers count as boards then."""
-    return pipeline.any_value("kind", lambda kind: kind != SINGLE)
+    """Return whether the scenes of a pipeline show boards; single markers count as boards then.
+
+    Markers with something beside them do, too.
+    """
+    return bool(pipeline.values_of("distractors")[0]) or pipeline.any_value(
+        "kind", lambda kind: kind != SINGLE
+    )
 
 
 def largest_board(pipeline: Pipeline) -> tuple[int, int]:

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.blocks import run_block
-from support.board_pictures import DICTIONARY, KINDS, NAME, SIZE_M, opencv_board
+from support.board_pictures import DICTIONARY, KINDS, NAME, SIZE_M, board_toml, opencv_board
 from support.lengths import first_of
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render
@@ -25,15 +25,7 @@ SOLVED, SOLVER_FAILED, TOO_FEW = 1, 3, "too_few_points"
 
 
 def text(name, trials, window):
-    kind = dict(KINDS[name])
-    tables = "".join(
-        "[[board.markers]]\n" + "".join(f"{key} = {value}\n" for key, value in row.items())
-        for row in kind.pop("markers", [])
-    )
-    board = "".join(
-        f"{key} = {str(value).lower() if isinstance(value, bool) else repr(value)}\n"
-        for key, value in kind.items()
-    )
+    kind = KINDS[name]
     points = ["markers", "chessboard"] if "square_m" in kind else ["markers"]
     return f"""
 seed = 8
@@ -45,8 +37,7 @@ fy_px = 300
 [marker]
 dictionary = "{NAME}"
 size_m = {SIZE_M}
-[board]
-{board}{tables}
+{board_toml(kind)}
 [pose]
 tilt_deg = {{ uniform = [0, 70] }}
 azimuth_deg = {{ uniform = [0, 360] }}

@@ -1,14 +1,20 @@
 """Boards of pipelines have the images of their parts, each clipped to each pixel or sampled."""
 
-import json
-
 import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
 from support.bent_sheets import flat_points
-from support.board_pictures import KINDS, NAME, SIZE_M, clipped_frame, painted, parts
+from support.board_pictures import (
+    KINDS,
+    NAME,
+    SIZE_M,
+    board_toml,
+    clipped_frame,
+    painted,
+    parts,
+)
 from support.lengths import first_of, lengths
 from support.small_scenes import image_of, scenes_of
 from sweep.model.exposure import marker_exposure
@@ -42,14 +48,7 @@ distance_m = 0.2
 def board_text(name):
     """The pipeline's text with a board of ``KINDS``, or of what a dictionary says."""
     kind = KINDS[name] if isinstance(name, str) else name
-    values = "".join(
-        f"{key} = {json.dumps(value)}\n" for key, value in kind.items() if key != "markers"
-    )
-    tables = "".join(
-        "[[board.markers]]\n" + "".join(f"{key} = {value}\n" for key, value in row.items())
-        for row in kind.get("markers", [])
-    )
-    return f"{TEXT}[board]\n{values}{tables}"
+    return TEXT + board_toml(kind)
 
 
 def drawn(count, seed):
@@ -92,7 +91,7 @@ def exact_levels(scenes, areas=None):
     return frame
 
 
-@pytest.mark.parametrize("name", first_of(KINDS, 3))
+@pytest.mark.parametrize("name", first_of(["beside", *(k for k in KINDS if k != "beside")], 4))
 @lengths(1, 40)
 def test_every_pixel_of_a_board_is_its_clipped_area(name, count):
     compared, worst = 0, 0.0
@@ -112,7 +111,7 @@ def test_every_pixel_of_a_board_is_its_clipped_area(name, count):
     assert worst < 255e-9
 
 
-@pytest.mark.parametrize("name", first_of([name for name in KINDS if name != "markers"], 1))
+@pytest.mark.parametrize("name", first_of(KINDS, 1))
 @lengths(2, 20)
 def test_an_occluded_board_is_its_clipped_parts_and_the_sheet(name, count):
     rng = np.random.default_rng(4)
@@ -126,7 +125,8 @@ def test_an_occluded_board_is_its_clipped_parts_and_the_sheet(name, count):
         compared += 1
         # The sheet hides a share of the width of what is black.
         points = np.concatenate([
-            corners for corners, level, _ in parts(name, LEVELS) if level == LEVELS["black"]
+            corners for corners, level, _ in parts(name, LEVELS, beside=False)
+            if level == LEVELS["black"]
         ])
         low, high = points.min(axis=0), points.max(axis=0)
         normal = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
@@ -166,7 +166,7 @@ def test_samples_of_a_board_are_its_exact_image(name, settings, count):
 
 
 @pytest.mark.parametrize("case", first_of(
-    [(name, lens) for lens in ([LENS], []) for name in ("charuco", "markers", "april")], 0
+    [(name, lens) for lens in ([LENS], []) for name in ("charuco", "markers", "april", "beside")], 0
 ))
 def test_a_blurred_board_is_its_finer_image_through_a_gaussian(case):
     name, lens = case
@@ -247,7 +247,7 @@ def test_a_board_behind_a_lens_is_what_rays_meet(case):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["charuco", "markers", "april"])
+@pytest.mark.parametrize("name", ["charuco", "markers", "april", "beside"])
 @pytest.mark.parametrize(("bend", "curvature"), [("cylinder", 4.0), ("saddle", -3.0)])
 def test_a_bent_board_is_what_rays_meet(name, bend, curvature):
     settings = ["distance_m=0.3", "tilt_deg=25", "azimuth_deg=50", "roll_deg=25",

@@ -1,5 +1,6 @@
 """Targets of markers in several planes: images against rays, hidden markers, what is refused."""
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -12,6 +13,7 @@ from sweep.evaluation.search import visibility_flags
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.renderers import marker_levels
 from sweep.model.scene import build_scenes
+from sweep.plan.boards import largest_board
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_values
 
@@ -39,7 +41,7 @@ def pipeline(markers, tilt_deg=30.0, **sections):
     return Pipeline.from_dict({
         "seed": 1,
         "camera": {"width_px": 160, "height_px": 120, "fx_px": 150, "fy_px": 150},
-        "marker": {"dictionary": "DICT_4X4_50"},
+        "marker": {"dictionary": "DICT_4X4_50", "size_m": 0.04},
         "board": {"kind": "markers", "markers": markers},
         "pose": {"distance_m": 0.2, "tilt_deg": tilt_deg, "azimuth_deg": 70, "roll_deg": 20},
         "scene": {"background": LEVELS[0], "black": LEVELS[1], "white": LEVELS[2],
@@ -67,12 +69,12 @@ def turned(each):
     return (tilt * Rotation.from_euler("z", each["roll_deg"], degrees=True)).as_matrix()
 
 
-def rays_of(markers, scenes, per_side):
+def rays_of(markers, scenes, per_side, ground=None):
     return traced(
         [(each["marker_id"], np.array([each["x_m"], each["y_m"], each["z_m"]]), turned(each),
           each["size_m"]) for each in markers],
         "DICT_4X4_50", LEVELS, (160, 120, 150.0, 79.5, 59.5),
-        (scenes.rotation[0], scenes.translation[0]), per_side,
+        (scenes.rotation[0], scenes.translation[0]), per_side, ground,
     )
 
 
@@ -93,6 +95,51 @@ def test_an_image_is_that_of_rays(markers, tilt_deg):
     assert fine < 0.3 * coarse or fine == coarse == 0
 
 
+BOARDS = {
+    "markers": {"kind": "markers", "markers": FIELD[:2]},
+    "charuco": {"kind": "charuco", "squares_x": 3, "squares_y": 3, "square_m": 0.03},
+}
+
+
+@pytest.mark.parametrize(("name", "tilt_deg"), [
+    ("markers", 60.0),
+    *(pytest.param(name, tilt, marks=pytest.mark.long)
+      for name in BOARDS for tilt in (0.0, 30.0, 75.0)),
+])
+def test_distractors_in_front_of_a_board_hide_it(name, tilt_deg):
+    """The board is flat on one sheet, or of several; rays as above."""
+    boards = BOARDS[name]
+    distractors = FIELD[2:] if name == "markers" else FIELD[1:]
+    chosen = pipeline([], tilt_deg, board={**boards, "distractors": distractors},
+                      marker={"dictionary": "DICT_4X4_50", "size_m": 0.02})
+    scenes = scenes_of(chosen)
+    image = image_of(scenes)
+    shown = distractors if name == "charuco" else FIELD
+    coarse, fine = (
+        np.sqrt(((image - rays_of(
+            shown, scenes, n, charuco_level if name == "charuco" else None
+        )) ** 2).mean()) for n in (3, 9)
+    )
+    assert fine < 0.8
+    assert fine < 0.3 * coarse
+    assert largest_board(chosen)[0] == (4 if name == "charuco" else 2)
+
+
+def charuco_level(points):
+    """The level of points (n, 2) of a ChArUco of 3 x 3 squares of 30 mm, laid out by OpenCV."""
+    board = cv2.aruco.CharucoBoard(
+        (3, 3), 0.03, 0.02, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    )
+    px_per_m = 18000  # 9 x 6 px a module, 540 a square
+    picture = board.generateImage((1620, 1620), marginSize=0)
+    at = np.floor((points * [1, -1] + 0.045) * px_per_m).astype(int)
+    inside = ((at >= 0) & (at < 1620)).all(axis=1)
+    level = np.where(np.abs(points).max(axis=1) < 0.045 + 0.02 / 6, LEVELS[2], np.nan)
+    shown = picture[at[inside, 1], at[inside, 0]]
+    level[inside] = np.where(shown > 127, LEVELS[2], LEVELS[1])
+    return level
+
+
 def test_sheets_behind_others_and_backs_are_not_visible():
     hidden = [marker(0, 0, 0, 0, size=0.01), marker(1, 0, 0, 0.05), marker(2, 0.05, 0, 0),
               marker(3, -0.05, 0, 0, tilt=180)]
@@ -103,6 +150,14 @@ def test_sheets_behind_others_and_backs_are_not_visible():
     assert boards.flags[0].tolist() == [
         not_visible, DetectionStatus.not_run, DetectionStatus.not_run, not_visible
     ]
+
+
+def test_a_marker_of_a_sheet_that_a_distractor_hides_is_not_visible():
+    boards = {"kind": "grid", "rows": 1, "columns": 2, "gap_m": 0.02}
+    chosen = pipeline([], 0.0, board={**boards, "distractors": [marker(9, 0.03, 0.0, 0.05)]})
+    scenes, values = scenes_of(chosen), scene_values(chosen, [])
+    boards = board_scenes(scenes, values["board"].listed(1), visibility_flags(scenes), (2, 0))
+    assert boards.flags[0].tolist() == [DetectionStatus.not_run, DetectionStatus.not_visible]
 
 
 @pytest.mark.parametrize("solver", ["iterative", "sqpnp", "epnp"])

@@ -22,6 +22,12 @@ distance_m = 0.4
 ONE = "[[board.markers]]\nmarker_id = 1\nx_m = 0\ny_m = 0\n"
 OTHER = "[[board.markers]]\nmarker_id = 2\nx_m = 0.1\ny_m = 0\n"
 GRID = 'kind = "grid"\nrows = 5\ncolumns = 7\ngap_m = 0.01'
+
+
+def beside(**keys):
+    return "\n[[board.distractors]]\n" + "".join(f"{k} = {v}\n" for k, v in keys.items())
+
+
 TABLE = f'kind = "markers"\n{ONE}{OTHER}'
 
 BROKEN = {
@@ -69,6 +75,32 @@ BROKEN = {
     "sizes without a kind": (
         "rows = 3", "board.rows = 3: expected kind = grid, which uses it; kind = none does not"
     ),
+    "a distractor on the board": (
+        GRID + beside(x_m=0.2, y_m=0.16),
+        "board.distractors[0].x_m = 0.2: expected no overlap with the board, white quiet zones",
+    ),
+    "distractors on one another": (
+        GRID + beside(x_m=0.5, y_m=0) + beside(x_m=0.55, y_m=0.01, roll_deg=45),
+        "board.distractors[1].x_m = 0.55: expected no overlap with distractors[0]",
+    ),
+    "a distractor on a tilted one": (
+        GRID + beside(x_m=0.5, y_m=0, tilt_deg=90, azimuth_deg=0)
+        + beside(x_m=0.5, y_m=0, z_m=0.03, tilt_deg=90, azimuth_deg=0),
+        "board.distractors[1].x_m = 0.5: expected no overlap with distractors[0]",
+    ),
+    "an unknown ID of a distractor": (
+        GRID + beside(x_m=0.5, y_m=0, marker_id=50),
+        "board.distractors[0].marker_id = 50: expected an ID from 0 to 49, which is what DICT_4X4",
+    ),
+    "an unknown key of a distractor": (
+        GRID + beside(x_m=0.5, y_m=0, side_m=5), "board.distractors[0].side_m: unknown; expected"
+    ),
+    "a distractor without a position": (
+        GRID + beside(x_m=0.5), "board.distractors[0].y_m: missing; expected a number"
+    ),
+    "distractors that are no tables": (
+        GRID + "\ndistractors = 3", "board.distractors = 3: expected tables with marker_id, x_m"
+    ),
     "a size of another kind": (
         GRID + "\nsquare_m = 0.06",
         "board.square_m = 0.06: expected kind = charuco or diamond, which uses it; kind = grid ",
@@ -106,6 +138,31 @@ def test_a_solver_that_boards_lack_is_one_line(setting, expected):
         Pipeline.from_text(TEXT + GRID, [setting])
     (line,) = str(error.value).splitlines()
     assert expected in line
+
+
+DISTRACTOR = beside(x_m=0.5, y_m=0)
+
+
+@pytest.mark.parametrize(("board", "setting", "expected"), [
+    (GRID + DISTRACTOR, "solver='photometric'", "another solver, or a scene with nothing beside"),
+    (GRID + DISTRACTOR, "bound='known_blur'", "none, or a scene with nothing beside the target"),
+    (GRID + beside(x_m=0.5, y_m=0, z_m=0.1), "curvature_per_m=1",
+     "it absent, for distractors with z_m or tilt_deg"),
+    (DISTRACTOR, "solver='ippe_square'", "for boards; others with points = largest_marker"),
+])
+def test_what_distractors_cannot_have_is_one_line(board, setting, expected):
+    with pytest.raises(PipelineError) as error:
+        Pipeline.from_text(TEXT + board, [setting])
+    (line,) = str(error.value).splitlines()
+    assert expected in line
+
+
+def test_distractors_may_touch_share_an_id_and_stand_in_planes_of_their_own():
+    sheet = 0.05 * 8 / 6
+    apart = beside(x_m=0.5, y_m=0) + beside(x_m=0.5 + sheet, y_m=0) + "marker_id = 3"
+    above = beside(x_m=0, y_m=0, z_m=0.1) + beside(x_m=0.5, y_m=0, tilt_deg=20)
+    for board in (GRID + apart, apart, GRID + above, TABLE + above):
+        assert Pipeline.from_text(TEXT + board, []) is not None
 
 
 def test_without_a_solver_the_message_names_those_of_boards():

@@ -1,5 +1,6 @@
 """Boards as lists of convex parts, laid out by OpenCV, and their images by polygon clipping."""
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -28,18 +29,38 @@ KINDS: dict[str, Mapping[str, Any]] = {
         dict(zip(("marker_id", "x_m", "y_m", "size_m", "roll_deg"), row, strict=True))
         for row in TABLE
     ]},
+    "beside": {"kind": "grid", "rows": 2, "columns": 2, "gap_m": 0.006, "distractors": [
+        {"marker_id": 40, "x_m": 0.055, "y_m": 0.01, "size_m": 0.028, "roll_deg": 30.0},
+        {"x_m": -0.05, "y_m": 0.005, "size_m": 0.02, "roll_deg": -50.0},
+        {"marker_id": 7, "x_m": 0.0, "y_m": -0.045, "dictionary": "DICT_4X4_50"},
+    ]},
 }
 """Name -> what a pipeline has under [board]; markers of 5 x 5 bits from ID 0 on."""
 
 
+def board_toml(kind):
+    """Return the text of [board] of a pipeline."""
+    values = "".join(
+        f"{key} = {json.dumps(value)}\n" for key, value in kind.items()
+        if key not in ("markers", "distractors")
+    )
+    tables = "".join(
+        f"[[board.{name}]]\n" + "".join(f"{key} = {json.dumps(v)}\n" for key, v in row.items())
+        for name in ("markers", "distractors") for row in kind.get(name, [])
+    )
+    return f"[board]\n{values}{tables}"
+
+
+def square_corners(x, y, size, roll):
+    """Return the corners (4, 2) of a square, right and up in m."""
+    square = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]) * size / 2
+    c, s = np.cos(np.radians(roll)), np.sin(np.radians(roll))
+    return square @ np.array([[c, s], [-s, c]]) + [x, y]
+
+
 def table_corners():
     """Return the corners (3, 4, 2) of the table's markers, right and up in m."""
-    corners = []
-    for _, x, y, size, roll in TABLE:
-        square = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]) * size / 2
-        c, s = np.cos(np.radians(roll)), np.sin(np.radians(roll))
-        corners.append(square @ np.array([[c, s], [-s, c]]) + [x, y])
-    return np.array(corners)
+    return np.array([square_corners(*row[1:]) for row in TABLE])
 
 
 def opencv_board(name):
@@ -67,10 +88,10 @@ def rectangle(left, up, right, down):
     return np.array([[left, up], [right, up], [right, down], [left, down]])
 
 
-def parts(name, levels):
+def parts(name, levels, *, beside=True):
     """Yield convex corners (4, 2), right and up in m, the level there, and the level below it.
 
-    In the order of painting.
+    In the order of painting; ``beside``: with the distractors.
     """
     kind = KINDS[name]
     black, white, behind = levels["black"], levels["white"], levels["background"]
@@ -93,27 +114,45 @@ def parts(name, levels):
             for i, j in np.ndindex(shape[1] + 1, shape[0] + 1):
                 x, y = -half[0] + j * step, half[1] - i * step
                 yield rectangle(x, y, x + kind["gap_m"], y - kind["gap_m"]), black, white
-        elif name != "grid":
+        elif kind["kind"] != "grid":
             white_first = name == "legacy" and shape[1] % 2 == 0
             for i, j in np.ndindex(shape[1], shape[0]):
                 if (i + j + white_first) % 2 == 0:
                     x, y = -half[0] + j * step, half[1] - i * step
                     yield rectangle(x, y, x + step, y - step), black, white
     for marker_id, (corners, quiet) in zip(board.getIds().ravel().tolist(), squares, strict=True):
-        top_left, right, down = corners[[0, 1, 3], :2]
-        across, along = (right - top_left) / MODULES, (down - top_left) / MODULES
-
-        def cell(x0, y0, x1, y1, start=top_left, a=across, b=along):
-            return np.array([
-                start + x * a + y * b for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
-            ])
-
-        if quiet is not None:
-            yield cell(-quiet, -quiet, MODULES + quiet, MODULES + quiet), white, behind
         bits = cv2.aruco.generateImageMarker(DICTIONARY, marker_id, MODULES)
-        for i, j in np.ndindex(MODULES, MODULES):
-            if not bits[i, j]:
-                yield cell(j, i, j + 1, i + 1), black, white
+        yield from marker_parts(corners, bits, quiet, levels)
+    for row in kind.get("distractors", []) if beside else []:
+        used = getattr(cv2.aruco, row.get("dictionary", NAME))
+        dictionary = cv2.aruco.getPredefinedDictionary(used)
+        modules = dictionary.markerSize + 2
+        bits = np.zeros((modules, modules)) if "marker_id" not in row else (
+            cv2.aruco.generateImageMarker(dictionary, row["marker_id"], modules)
+        )
+        corners = square_corners(
+            row["x_m"], row["y_m"], row.get("size_m", SIZE_M), row.get("roll_deg", 0.0)
+        )
+        yield from marker_parts(corners, bits, 1.0, levels)
+
+
+def marker_parts(corners, bits, quiet, levels):
+    """As :func:`parts`, of a marker with its square's corners; ``quiet``: on its own sheet."""
+    black, white, behind = levels["black"], levels["white"], levels["background"]
+    top_left, right, down = corners[[0, 1, 3], :2]
+    modules = len(bits)
+    across, along = (right - top_left) / modules, (down - top_left) / modules
+
+    def cell(x0, y0, x1, y1):
+        return np.array([
+            top_left + x * across + y * along for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+        ])
+
+    if quiet is not None:
+        yield cell(-quiet, -quiet, modules + quiet, modules + quiet), white, behind
+    for i, j in np.ndindex(modules, modules):
+        if not bits[i, j]:
+            yield cell(j, i, j + 1, i + 1), black, white
 
 
 def painted(name, levels, points):
@@ -138,8 +177,7 @@ def clipped_frame(name, levels, view, rotation, translation, size, hides=None):
     """Return the levels (height, width) of a frame: each part clipped to each pixel.
 
     ``view``: fx, fy, cx, cy. ``hides``: (normal (2,), limit, level) of a sheet over what lies
-    beyond ``normal · point = limit`` on the board, which ends where the board's sheet does; then
-    the board must have one sheet.
+    beyond ``normal · point = limit`` on the board, which ends where all that is printed does.
     """
     shape = size[1], size[0]
     image, share = np.full(shape, float(levels["background"])), np.zeros(shape)
@@ -156,13 +194,20 @@ def clipped_frame(name, levels, view, rotation, translation, size, hides=None):
                 image, share, np.array([point[:2] / point[2] for point in polygon]), jump
             )
 
-    for number, (corners, level, below) in enumerate(parts(name, levels)):
-        if hides is None:
+    listed = list(parts(name, levels))
+    if hides is None:
+        for corners, level, below in listed:
             paint(corners, level - below)
-            continue
-        normal, limit, cover = hides
+        return image
+    normal, limit, cover = hides
+
+    def beyond(corners, sign):
         flat = np.column_stack([corners, np.ones(4)])
-        paint([p[:2] for p in kept(list(flat), np.array([*-normal, limit]))], level - below)
-        if number == 0:
-            paint([p[:2] for p in kept(list(flat), np.array([*normal, -limit]))], cover - below)
+        return [p[:2] for p in kept(list(flat), sign * np.array([*normal, -limit]))]
+
+    for corners, level, below in listed:
+        paint(beyond(corners, -1), level - below)
+    points = np.concatenate([corners for corners, *_ in listed])
+    (left, down), (right, up) = points.min(axis=0), points.max(axis=0)
+    paint(beyond(rectangle(left, up, right, down), 1), cover - levels["background"])
     return image

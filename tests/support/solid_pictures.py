@@ -5,12 +5,13 @@ import numpy as np
 from sweep.model.marker import modules
 
 
-def traced(markers, dictionary, levels, camera, pose, per_side):
+def traced(markers, dictionary, levels, camera, pose, per_side, ground=None):
     """The mean levels (height, width) of ``per_side``² rays a pixel.
 
     ``markers``: (ID, centre (3,), rotation (3, 3), size_m) in the target's frame, each on a sheet
     with a quiet zone of one module; ``levels`` of outside, black, white; ``camera``: width, height,
-    f, cx, cy; ``pose``: rotation and translation of the target.
+    f, cx, cy; ``pose``: rotation and translation of the target. ``ground``: returns the level of
+    points (n, 2) of the target's plane, NaN where nothing is printed.
     """
     width, height, focal, cx, cy = camera
     rotation, translation = pose
@@ -19,6 +20,12 @@ def traced(markers, dictionary, levels, camera, pose, per_side):
     x, y = np.meshgrid((u - cx) / focal, (v - cy) / focal)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1)
     nearest, level = np.full(x.shape, np.inf), np.full(x.shape, float(levels[0]))
+    if ground is not None:
+        depth = rotation[:, 2] @ translation / (rays @ rotation[:, 2])
+        points = (rays * depth[..., None] - translation) @ rotation[:, :2]
+        seen = ground(points.reshape(-1, 2)).reshape(x.shape)
+        hit = np.isfinite(seen) & (depth > 0)
+        nearest[hit], level[hit] = depth[hit], seen[hit]
     for marker_id, centre, turn, size in markers:
         axes, middle = rotation @ turn, rotation @ centre + translation
         if axes[:, 2] @ middle >= 0:

@@ -1,0 +1,150 @@
+"""Distractors beside a target are in its image and in the search, and count for nothing else."""
+
+import cv2
+import numpy as np
+import pytest
+
+from support.lengths import lengths
+from sweep.evaluation.board_search import board_scenes
+from sweep.evaluation.cells import run_cells
+from sweep.evaluation.search import search, search_windows, visibility_flags
+from sweep.measure.board_detector import BoardDetectorSetting
+from sweep.measure.detector import DetectorSetting
+from sweep.measure.flags import DetectionStatus
+from sweep.model.extent import marker_boxes
+from sweep.model.renderers import render
+from sweep.model.scene import build_scenes
+from sweep.plan.boards import largest_board
+from sweep.plan.experiment import Pipeline
+from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
+
+DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+GRID = {"kind": "grid", "rows": 2, "columns": 2, "gap_m": 0.01}
+BOARD_ID = {"marker_id": 2, "x_m": 0.11, "y_m": 0.0}
+SQUARE = {"x_m": -0.1, "y_m": 0.02, "size_m": 0.03, "roll_deg": 20.0}
+OTHER = {"marker_id": 30, "x_m": 0.0, "y_m": 0.1}
+BESIDE = [BOARD_ID, SQUARE, OTHER]
+
+
+def pipeline(board, *settings, **sections):
+    return Pipeline.from_dict({
+        "seed": 5,
+        "camera": {"width_px": 320, "height_px": 240, "fx_px": 300, "fy_px": 300},
+        "marker": {"dictionary": "DICT_4X4_50", "size_m": 0.04, "quiet_zone_modules": 1},
+        "board": board,
+        "pose": {"distance_m": 0.35, **sections.pop("pose", {})},
+        "scene": {"background": 120, "black": 30, "white": 220, "blur_px": 0.5,
+                  **sections.pop("scene", {})},
+        "estimator": {"solver": "iterative", "guarded": False},
+        **sections,
+    }, settings=settings)
+
+
+def shown(chosen):
+    values = scene_values(chosen, [])
+    return build_scenes(values, 1), values
+
+
+def one(chosen, name):
+    return run_cells(chosen, []).columns[name][0][0]
+
+
+def searched(chosen, count, window):
+    """Scenes, their boards, and what is found in windows or whole frames."""
+    shape = tuple(len(axis) for axis in scene_axes(chosen))
+    values = scene_values(chosen, block_indices(Block((0,) * len(shape), shape)))
+    scenes = build_scenes(values, count)
+    flags = visibility_flags(scenes)
+    boards = board_scenes(scenes, values["board"].listed(count), flags, largest_board(chosen))
+    results, _, _ = search(
+        scenes, (flags == DetectionStatus.not_run)[:, None], [DetectorSetting()],
+        np.full(count, window == "full"), [], boards=boards,
+        board_settings=[BoardDetectorSetting()],
+    )
+    return scenes, results[0].boards
+
+
+@lengths(4, 80)
+def test_what_is_found_in_windows_is_what_a_plain_loop_finds_in_frames(count):
+    """Also where the frame cuts distractors; the one with an ID of the board gets to solvers."""
+    chosen = pipeline({**GRID, "distractors": BESIDE}, axes={"trial": count}, pose={
+        "tilt_deg": {"uniform": [0, 60]}, "azimuth_deg": {"uniform": [0, 360]},
+        "roll_deg": {"uniform": [0, 360]}, "bearing_x_deg": {"uniform": [-22, 22]},
+        "bearing_y_deg": {"uniform": [-15, 15]},
+    })
+    scenes, found = searched(chosen, count, "auto")
+    _, whole = searched(chosen, count, "full")
+    np.testing.assert_array_equal(found.marker_flags, whole.marker_flags)
+    boxes, twice = marker_boxes(scenes), 0
+    detector = cv2.aruco.ArucoDetector(DICTIONARY)
+    for row in np.flatnonzero(found.flags != DetectionStatus.not_visible).tolist():
+        image = render(scenes, row, boxes[row], (0, 0, 320, 240))
+        quads, ids, _ = detector.detectMarkers(image)
+        expected = sorted(
+            (each, *np.ravel(quad)) for each, quad in
+            zip([] if ids is None else ids.ravel().tolist(), quads, strict=True) if each < 4
+        )
+        got = sorted(
+            (k, *quad.ravel()) for k, quad in
+            zip(found.points[row].marker.tolist(), found.points[row].corners_px, strict=True)
+        )
+        np.testing.assert_allclose(got, expected, atol=1e-3)
+        twice += [each[0] for each in expected].count(2) == 2
+    assert twice > count / 4
+
+
+def test_pixels_beyond_the_window_are_the_background():
+    chosen = pipeline({**GRID, "distractors": BESIDE}, pose={"tilt_deg": 40, "distance_m": 0.5})
+    scenes, _ = shown(chosen)
+    boxes = marker_boxes(scenes)
+    image = render(scenes, 0, boxes[0], (0, 0, 320, 240)).astype(int)
+    left, top, right, bottom = search_windows(
+        scenes, boxes, DetectorSetting(), np.zeros(1, dtype=bool)
+    )[0]
+    assert (right - left) * (bottom - top) < 320 * 240
+    image[top:bottom, left:right] = 120
+    assert (image == 120).all()
+
+
+@pytest.mark.parametrize("board", [GRID, {"kind": "none"}])
+def test_a_target_is_visible_and_as_large_as_without_distractors(board):
+    for pose in ({}, {"bearing_x_deg": -36.0}):
+        plain, beside = (
+            pipeline({**board, **more}, pose=pose)
+            for more in (({} if board is GRID else {"distractors": [SQUARE]}),
+                         {"distractors": BESIDE})
+        )
+        assert largest_board(beside) == largest_board(plain)
+        for name in ("marker_area_px", "detection", "marker_detection", "board_marker_id"):
+            np.testing.assert_array_equal(one(beside, name), one(plain, name))
+    # At the last pose the frame shows the distractor with the board's ID alone.
+    assert one(beside, "detection") == DetectionStatus.not_visible
+
+
+def test_an_id_of_the_board_elsewhere_is_no_detection_of_its_marker():
+    """Marker 2 is hidden; what has its ID lies beside the board."""
+    chosen = pipeline({
+        "kind": "markers", "markers": [
+            {"marker_id": 0, "x_m": -0.03, "y_m": 0.0}, {"marker_id": 2, "x_m": 0.03, "y_m": 0.0},
+        ], "distractors": [{**BOARD_ID, "x_m": -0.1}],
+    }, scene={"occlusion": 0.4, "occluder": 120})
+    flags = one(chosen, "marker_detection")
+    assert flags[0] == DetectionStatus.detected
+    assert flags[1] in (DetectionStatus.no_candidate, DetectionStatus.rejected)
+    _, found = searched(chosen, 1, "auto")
+    assert found.points[0].marker.tolist().count(1) == 1  # as OpenCV's matchImagePoints takes it
+
+
+@pytest.mark.parametrize(("beside", "tilt", "expected"), [
+    ([], 60.0, DetectionStatus.not_run),
+    ([{"marker_id": 1, "x_m": 0.0, "y_m": 0.45}], 60.0, DetectionStatus.not_modelled),
+    ([{"marker_id": 1, "x_m": 0.0, "y_m": 0.45, "z_m": 0.02}], 60.0, DetectionStatus.not_modelled),
+    ([{"marker_id": 1, "x_m": 0.0, "y_m": 0.45}], 120.0, DetectionStatus.not_visible),
+])
+def test_what_comes_behind_the_camera_beside_a_target_is_not_modelled(beside, tilt, expected):
+    chosen = pipeline({**GRID, "distractors": beside}, pose={"tilt_deg": tilt})
+    scenes, values = shown(chosen)
+    flags = visibility_flags(scenes)
+    assert flags[0] == expected
+    boards = board_scenes(scenes, values["board"].listed(1), flags, largest_board(chosen))
+    assert (boards.flags == expected).all()

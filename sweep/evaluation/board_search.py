@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sweep.measure.board_detector import BoardOutput
 from sweep.measure.board_solver import BoardPoints
-from sweep.measure.classify import classify
+from sweep.measure.classify import Quads, classify_decoded, flag_rejected, stacked
 from sweep.measure.detector import DetectorOutput
 from sweep.measure.flags import DetectionStatus
 from sweep.model.board import Board
@@ -21,8 +21,6 @@ from sweep.model.scene import Scenes
 from sweep.model.solid_board import unseen_markers
 from sweep.model.solid_scene import solid_planes
 from sweep.typing import Floats, Integers
-
-Quad = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,55 +134,64 @@ def findings(
         np.zeros((0, 2)),
     )
     points = [none] * count
-    for row, quads, ids, rejected in searched:
-        visible = np.flatnonzero(boards.flags[row] == DetectionStatus.not_run)
-        if len(visible):
-            corners_px = boards.corners_px[row, visible]
-            decoded, missed = (_near(corners_px, some, origin[row]) for some in (quads, rejected))
-            marker_flags[row, visible], marker_corners[row, visible] = classify(
-                corners_px, boards.marker_id[row, visible],
-                [
-                    (k, [quads[i] for i in decoded[k]],
-                     None if ids is None or not len(decoded[k]) else ids[decoded[k]],
-                     [rejected[i] for i in missed[k]])
-                    for k in range(len(visible))
-                ],
-                np.broadcast_to(origin[row], (len(visible), 2)),
-            )
-        points[row] = _points(boards.boards[row], quads, ids, completed.get(row), origin[row])
-        found = points[row]
-        chessboard_px[row, found.chessboard] = found.chessboard_px
+    numbers = {
+        board: {each: k for k, each in enumerate(board.marker_ids)}
+        for board in dict.fromkeys(boards.boards)
+    }
+    visible = boards.flags == DetectionStatus.not_run
+    # Markers as one list, whichever board they are on.
+    first = np.concatenate([[0], np.cumsum(visible.sum(axis=1))])
+    decoded, rejected = [], []
+    for row, quads, ids, others in searched:
+        true_px = boards.corners_px[row, visible[row]]
+        read = stacked(quads) + origin[row]
+        claimed = np.full(len(read), -1) if ids is None else np.ravel(ids)
+        decoded.append(_at(true_px, read, claimed, first[row]))
+        missed = stacked(others) + origin[row]
+        rejected.append(_at(true_px, missed, np.full(len(missed), -1), first[row]))
+        points[row] = _points(
+            numbers[boards.boards[row]], read, claimed, completed.get(row), origin[row]
+        )
+        chessboard_px[row, points[row].chessboard] = points[row].chessboard_px
+    corners_px = boards.corners_px[visible]
+    found, marker_corners[visible] = classify_decoded(
+        corners_px, boards.marker_id[visible], _joined(decoded)
+    )
+    flag_rejected(found, corners_px, _joined(rejected))
+    marker_flags[visible] = found
     flags = np.full(count, DetectionStatus.not_visible, dtype=np.uint8)
     for flag in (*reversed(_NOT_FOUND), DetectionStatus.detected):
         flags[(marker_flags == flag).any(axis=1)] = flag
     return BoardFindings(flags, marker_flags, marker_corners, chessboard_px, points)
 
 
-def _near(
-    corners_px: Floats, quads: Sequence[Quad], origin: Floats
-) -> list[NDArray[np.intp]]:
-    """Return for each of M markers the quadrilaterals whose centre lies in its bounding box."""
-    if not len(quads):
-        return [np.zeros(0, dtype=np.intp)] * len(corners_px)
-    centres = np.array([np.reshape(quad, (4, 2)).mean(axis=0) for quad in quads]) + origin
+def _at(
+    corners_px: Floats, quads: Floats, ids: NDArray[np.integer[Any]], first: int
+) -> Quads:
+    """Return quadrilaterals (Q, 4, 2) at each of M markers, whose rows begin with ``first``.
+
+    Those whose centre lies in a marker's bounding box.
+    """
     low, high = corners_px.min(axis=1) - 1, corners_px.max(axis=1) + 1
-    inside = (centres >= low[:, None]).all(axis=2) & (centres <= high[:, None]).all(axis=2)
-    return [np.flatnonzero(each) for each in inside]
+    centres = quads.mean(axis=1)
+    inside = ((centres >= low[:, None]) & (centres <= high[:, None])).all(axis=2)
+    marker, quad = np.nonzero(inside)
+    return Quads(marker + first, quads[quad], ids[quad].astype(np.int64))
+
+
+def _joined(parts: Sequence[Quads]) -> Quads:
+    """Return the quadrilaterals of all parts."""
+    none = Quads(np.zeros(0, dtype=np.intp), np.zeros((0, 4, 2)), np.zeros(0, dtype=np.int64))
+    return Quads(*(np.concatenate(column) for column in zip(none, *parts, strict=True)))
 
 
 def _points(
-    board: Board, quads: Sequence[Quad], ids: NDArray[Any] | None, completed: BoardOutput | None,
-    origin: Floats,
+    numbers: Mapping[int, int], quads: Floats, ids: NDArray[np.integer[Any]],
+    completed: BoardOutput | None, origin: Floats,
 ) -> BoardPoints:
     """Return the decoded markers with an ID of the board, and the chessboard's corners."""
-    number = {each: k for k, each in enumerate(board.marker_ids)}
-    decoded = [] if ids is None else [
-        (number[each], np.asarray(quad, dtype=np.float64).reshape(4, 2) + origin)
-        for each, quad in zip(np.ravel(ids).tolist(), quads, strict=True) if each in number
-    ]
+    marker = np.array([numbers.get(each, -1) for each in ids.tolist()], dtype=np.int64)
     chessboard = np.zeros(0, dtype=np.int64) if completed is None else completed.chessboard_ids
     pixels = np.zeros((0, 2)) if completed is None else completed.chessboard_px + origin
-    return BoardPoints(
-        np.array([k for k, _ in decoded], dtype=np.int64),
-        np.array([quad for _, quad in decoded]).reshape(-1, 4, 2), chessboard, pixels,
-    )
+    known = marker >= 0
+    return BoardPoints(marker[known], quads[known], chessboard, pixels)

@@ -19,13 +19,14 @@ from sweep.evaluation.recorded_search import (
     recording_of,
 )
 from sweep.evaluation.results import Failure, exception_text
-from sweep.measure.board_detector import BoardDetectorSetting, BoardOutput, complete
+from sweep.measure.board_detector import BoardDetectorSetting, BoardOutput
 from sweep.measure.classify import classify
 from sweep.measure.detector import NOISE_MARGIN_PX, DetectorOutput, windows
 from sweep.measure.detectors import (
     AnyDetectorSetting,
     FindFunction,
     full_frame_reason,
+    make_board_detector,
     make_detector,
     margin_px,
     uneven_light_needs_frame,
@@ -181,6 +182,10 @@ def search(
     ]
     recordings = [recording_of(setting) for setting in settings]
     passes = [_Pass(make_detector(setting)) for setting in settings]
+    board_detectors = [
+        make_board_detector(setting, board_setting)
+        for setting, board_setting in zip(settings, board_settings, strict=boards is not None)
+    ]
     imaged = wanted if keep else wanted & np.array([each is None for each in recordings])
     dictionary, sides = scenes.dictionary, scenes.frame.max(axis=1).tolist()
     render_s = 0.0
@@ -230,8 +235,8 @@ def search(
                 try:
                     output = find(searched, dictionary[row], sides[row])
                     if boards is not None:
-                        completed = complete(
-                            searched, boards.boards[row], output, board_settings[k]
+                        completed = board_detectors[k].complete(
+                            searched, boards.boards[row], output
                         )
                         setting_pass.completed[row], output = completed, completed.markers
                     note((row, *output))

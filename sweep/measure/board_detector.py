@@ -50,39 +50,70 @@ class BoardOutput(NamedTuple):
 _NO_IDS, _NO_CORNERS = np.zeros(0, dtype=np.int64), np.zeros((0, 2))
 
 
-def complete(
-    image: NDArray[np.uint8], board: Board, markers: DetectorOutput, setting: BoardDetectorSetting
-) -> BoardOutput:
-    """Return what is found on a board in an image (h, w) in which ``markers`` were detected.
+class BoardDetector:
+    """What OpenCV does with markers when it knows the board, by one setting.
 
-    ``cv2.aruco.ArucoDetector.refineDetectedMarkers`` and ``cv2.aruco.CharucoDetector.detectBoard``
-    are called without a camera: their homographies are local.
+    Parameters
+    ----------
+    setting
+        How it uses the board.
+    parameters
+        Those of the detector of markers, of which it takes the refinement of corners.
     """
-    corners, ids, rejected = markers
-    if ids is None or not len(ids):
-        return BoardOutput(markers, _NO_IDS, _NO_CORNERS)
-    if setting.refineDetectedMarkers and rejected:
-        refine: Any = _detector(board.dictionary).refineDetectedMarkers
-        corners, ids, rejected, _ = refine(
-            image, _opencv_board(board), list(corners), ids, list(rejected)
+
+    def __init__(
+        self, setting: BoardDetectorSetting, parameters: cv2.aruco.DetectorParameters
+    ) -> None:
+        self._setting = setting
+        self._parameters = parameters
+        self._refining: dict[str, cv2.aruco.ArucoDetector] = {}
+        self._charuco: dict[Board, cv2.aruco.CharucoDetector] = {}
+
+    def complete(
+        self, image: NDArray[np.uint8], board: Board, markers: DetectorOutput
+    ) -> BoardOutput:
+        """Return what is found on a board in an image (h, w) in which ``markers`` were detected.
+
+        ``cv2.aruco.ArucoDetector.refineDetectedMarkers`` and
+        ``cv2.aruco.CharucoDetector.detectBoard`` are called without a camera: their homographies
+        are local.
+        """
+        corners, ids, rejected = markers
+        if ids is None or not len(ids):
+            return BoardOutput(markers, _NO_IDS, _NO_CORNERS)
+        if self._setting.refineDetectedMarkers and rejected:
+            refine: Any = self._refining_detector(board.dictionary).refineDetectedMarkers
+            corners, ids, rejected, _ = refine(
+                image, _opencv_board(board), list(corners), ids, list(rejected)
+            )
+            markers = list(corners), ids, list(rejected)
+        if board.chessboard is None:
+            return BoardOutput(markers, _NO_IDS, _NO_CORNERS)
+        pixels, found, _, _ = self._charuco_detector(board).detectBoard(
+            image, markerCorners=list(corners), markerIds=ids
         )
-        markers = list(corners), ids, list(rejected)
-    if board.chessboard is None:
-        return BoardOutput(markers, _NO_IDS, _NO_CORNERS)
-    pixels, found, _, _ = _charuco_detector(board, setting.minMarkers).detectBoard(
-        image, markerCorners=list(corners), markerIds=ids
-    )
-    if found is None or not len(found):
-        return BoardOutput(markers, _NO_IDS, _NO_CORNERS)
-    return BoardOutput(
-        markers, np.asarray(found, dtype=np.int64).ravel(),
-        np.asarray(pixels, dtype=np.float64).reshape(-1, 2),
-    )
+        if found is None or not len(found):
+            return BoardOutput(markers, _NO_IDS, _NO_CORNERS)
+        return BoardOutput(
+            markers, np.asarray(found, dtype=np.int64).ravel(),
+            np.asarray(pixels, dtype=np.float64).reshape(-1, 2),
+        )
 
+    def _refining_detector(self, dictionary: str) -> cv2.aruco.ArucoDetector:
+        if dictionary not in self._refining:
+            self._refining[dictionary] = cv2.aruco.ArucoDetector(
+                opencv_dictionary(dictionary), self._parameters
+            )
+        return self._refining[dictionary]
 
-@lru_cache(maxsize=64)
-def _detector(dictionary: str) -> cv2.aruco.ArucoDetector:
-    return cv2.aruco.ArucoDetector(opencv_dictionary(dictionary))
+    def _charuco_detector(self, board: Board) -> cv2.aruco.CharucoDetector:
+        if board not in self._charuco:
+            parameters = cv2.aruco.CharucoParameters()
+            parameters.minMarkers = self._setting.minMarkers
+            self._charuco[board] = cv2.aruco.CharucoDetector(
+                charuco_board(board), parameters, self._parameters
+            )
+        return self._charuco[board]
 
 
 @lru_cache(maxsize=64)
@@ -105,12 +136,3 @@ def charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
     )
     charuco.setLegacyPattern(squares.legacy_pattern)
     return charuco
-
-
-@lru_cache(maxsize=64)
-def _charuco_detector(board: Board, min_markers: int) -> cv2.aruco.CharucoDetector:
-    detector = cv2.aruco.CharucoDetector(charuco_board(board))
-    parameters = detector.getCharucoParameters()
-    parameters.minMarkers = min_markers
-    detector.setCharucoParameters(parameters)
-    return detector

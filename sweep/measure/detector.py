@@ -243,20 +243,26 @@ def perimeter_rates(setting: DetectorSetting, side: int, frame_side: int) -> tup
     return (int(low * frame_side) + 0.5) / side, (int(high * frame_side) + 0.5) / side
 
 
+def opencv_parameters(setting: DetectorSetting) -> cv2.aruco.DetectorParameters:
+    """Return a setting as OpenCV's detectors take it."""
+    parameters = cv2.aruco.DetectorParameters()
+    defaults = DetectorSetting()
+    for field in dataclasses.fields(setting):
+        value = getattr(setting, field.name)
+        if field.name == "cornerRefinementMethod":
+            value = REFINEMENTS[value]
+        elif value == getattr(defaults, field.name):
+            continue
+        setattr(parameters, field.name, value)
+    return parameters
+
+
 class Detector:
     """One setting of OpenCV's detector in this process; OpenCV's objects cannot be pickled."""
 
     def __init__(self, setting: DetectorSetting) -> None:
         self._setting = setting
-        self._parameters = cv2.aruco.DetectorParameters()
-        defaults = DetectorSetting()
-        for field in dataclasses.fields(setting):
-            value = getattr(setting, field.name)
-            if field.name == "cornerRefinementMethod":
-                value = REFINEMENTS[value]
-            elif value == getattr(defaults, field.name):
-                continue
-            setattr(self._parameters, field.name, value)
+        self._parameters = opencv_parameters(setting)
         self._searches: dict[tuple[str, int, int], SearchFunction] = {}
 
     def find(self, image: NDArray[np.uint8], dictionary: str, frame_side: int) -> DetectorOutput:

@@ -14,7 +14,14 @@ from sweep.declaration import parameter
 from sweep.environments.interpreters import INSTALLED
 from sweep.errors import PluginError
 from sweep.measure import detector as opencv
-from sweep.measure.detector import UNEVEN_LIGHT_CONSTANT, Detector, DetectorOutput, DetectorSetting
+from sweep.measure.board_detector import BoardDetector, BoardDetectorSetting
+from sweep.measure.detector import (
+    UNEVEN_LIGHT_CONSTANT,
+    Detector,
+    DetectorOutput,
+    DetectorSetting,
+    opencv_parameters,
+)
 from sweep.measure.foreign_detector import ForeignDetector, ForeignSetting
 from sweep.measure.plugged_detector import PluggedDetector
 from sweep.plugins import DetectorPlugin
@@ -66,6 +73,14 @@ def make_detector(setting: AnyDetectorSetting) -> FindFunction:
     if is_recording(setting.plugin.name):
         return _find_nothing
     return _kept_plugin(setting).find
+
+
+def make_board_detector(
+    setting: AnyDetectorSetting, board_setting: BoardDetectorSetting
+) -> BoardDetector:
+    """Return what finds corners by means of a board, beside the detector of a setting."""
+    of_opencv = setting if isinstance(setting, DetectorSetting) else DetectorSetting()
+    return BoardDetector(board_setting, opencv_parameters(of_opencv))
 
 
 def _find_nothing(

@@ -51,6 +51,8 @@ white = 220
 background = 100
 noise_grey = 3
 blur_px = 0.5
+[detector]
+cornerRefinementMaxIterations = 1
 [estimator]
 guarded = false
 [axes]
@@ -66,9 +68,11 @@ points = {points}
 def board_detector(board, refinement):
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = refinement
+    parameters.cornerRefinementMaxIterations = 1  # of the chessboard's corners, too
     detector = cv2.aruco.ArucoDetector(DICTIONARY, parameters)
-    charuco = isinstance(board, cv2.aruco.CharucoBoard)
-    return detector, cv2.aruco.CharucoDetector(board) if charuco else None
+    if not isinstance(board, cv2.aruco.CharucoBoard):
+        return detector, None
+    return detector, cv2.aruco.CharucoDetector(board, cv2.aruco.CharucoParameters(), parameters)
 
 
 def exact(points, board):

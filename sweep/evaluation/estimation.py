@@ -16,13 +16,14 @@ from sweep.measure.board_solver import BoardDetections
 from sweep.measure.estimation import Detections, Estimates
 from sweep.measure.estimators import EstimatorSetting
 from sweep.measure.flags import EstimateStatus
+from sweep.model.beside import beside_pixels
 from sweep.model.calibration_error import COEFFICIENTS, VIEW
 from sweep.model.camera import Cameras
 from sweep.model.columns import Column
 from sweep.model.lens import pack, pack_once
 from sweep.model.scene import Scenes
 from sweep.plan.beliefs import CALIBRATED
-from sweep.typing import Floats
+from sweep.typing import Floats, Masks
 
 
 def assumed_cameras(
@@ -107,12 +108,18 @@ def board_detections_for(
         raise TypeError("no boards were searched")
     cameras, size = assumed_cameras(estimator, values, scenes)
     noise, blur = _assumed_noise_and_blur(estimator, scenes)
+    images = [result.images[row] for row in rows.tolist()] if result.images else []
+    beside: list[Masks] = []
+    if images and any(boards.boards[row].distractors for row in rows.tolist()):
+        for row, image in zip(rows.tolist(), images, strict=True):
+            left, top = result.origins[row].tolist()
+            box = left, top, left + image.shape[1], top + image.shape[0]
+            beside.append(beside_pixels(scenes, row, box))
     return BoardDetections(
         [boards.boards[row] for row in rows.tolist()],
         [result.boards.points[row] for row in rows.tolist()],
-        cameras.take(rows), noise[rows], blur[rows], (size / scenes.size_m)[rows],
-        [result.images[row] for row in rows.tolist()] if result.images else [],
-        result.origins[rows],
+        cameras.take(rows), noise[rows], blur[rows], (size / scenes.size_m)[rows], images,
+        result.origins[rows], beside,
     )
 
 

@@ -1,6 +1,7 @@
 """Pose of a board from pixels: maximum likelihood with the exact image of all that is printed.
 
-As :mod:`sweep.measure.photometric` has it for a marker. The starts are poses from the corners of
+As :mod:`sweep.measure.photometric` has it for a marker. Pixels that show something beside the board
+are left out. The starts are poses from the corners of
 all detected markers, and that of the marker on which most of the others agree: one marker that is
 wrong spoils the former.
 """
@@ -87,10 +88,10 @@ class BoardPhotometric:
             board, scale * unit_m(board) * module_count(board.dictionary), one.cameras.optics(0),
             one.origins[0] + (left, top), noise_variance(noise),
         )
-        fitted = write_most_likely(
-            one.images[0][top:bottom, left:right].astype(np.float64), starts, view,
-            self.spread_free, noise, out, i,
-        )
+        image = one.images[0][top:bottom, left:right].astype(np.float64)
+        if len(one.beside):
+            image[one.beside[0][top:bottom, left:right]] = np.nan
+        fitted = write_most_likely(image, starts, view, self.spread_free, noise, out, i)
         if fitted is None:
             return
         points = scale * board.corners_m[found.marker].reshape(-1, 3)

@@ -19,7 +19,7 @@ from sweep.model.board import Board
 from sweep.model.camera import Cameras
 from sweep.model.polygon import signed_areas
 from sweep.model.pose import rotation_of_vector, transform_points, vector_of_rotation
-from sweep.typing import Floats, Grey, Integers
+from sweep.typing import Floats, Grey, Integers, Masks
 
 BOARD_METHODS: dict[str, int] = {
     "iterative": cv2.SOLVEPNP_ITERATIVE,
@@ -66,6 +66,8 @@ class BoardDetections:
         (N,) believed size of the board relative to the true one.
     images, origins
         As :class:`sweep.measure.estimation.Detections` has them.
+    beside
+        Of each image which pixels show something beside the board; empty if none does.
     """
 
     boards: Sequence[Board]
@@ -76,6 +78,7 @@ class BoardDetections:
     scale: Floats
     images: Sequence[Grey]
     origins: Integers
+    beside: Sequence[Masks] = ()
 
     def take(self, rows: NDArray[np.intp]) -> BoardDetections:
         """Return the detections of the given rows."""
@@ -83,6 +86,7 @@ class BoardDetections:
             [self.boards[row] for row in rows], [self.points[row] for row in rows],
             self.cameras.take(rows), self.noise_grey[rows], self.blur_px[rows], self.scale[rows],
             [self.images[row] for row in rows] if len(self.images) else [], self.origins[rows],
+            [self.beside[row] for row in rows] if len(self.beside) else [],
         )
 
 

@@ -34,6 +34,7 @@ from sweep.measure.likelihood import (
 )
 from sweep.measure.positive_definite import pose_covariance
 from sweep.model import coverage
+from sweep.model.beside import beside_pixels
 from sweep.model.board import Board
 from sweep.model.derivatives import POSE, work_space
 from sweep.model.effects import IN_BOUND, NEUTRAL
@@ -105,9 +106,11 @@ def depth_nonlinearity(covariance: Floats, state: Floats) -> float:
 
 @compiled
 def bound_of_scene(
-    state: Floats, view: MarkerView, height: int, width: int, spread_free: bool
+    state: Floats, view: MarkerView, image: Floats, spread_free: bool
 ) -> tuple[Floats, bool, float, float]:
     """Return the bound of one scene, from its true state.
+
+    ``image`` (height, width) is overwritten, but for its pixels that are NaN: they are left out.
 
     One function, since each that calls :func:`sweep.measure.likelihood.fit` takes a second to
     compile.
@@ -121,7 +124,8 @@ def bound_of_scene(
     """
     free = POSE + 1 if spread_free else POSE
     information, gradient = np.empty((free, free)), np.empty(free)
-    image, work = np.zeros((height, width)), work_space(height, width)
+    height, width = image.shape
+    work = work_space(height, width)
     curvature(image, state.copy(), view, work, spread_free, information, gradient)
     covariance, exists = pose_covariance(information, view.variance, abs(state[DEPTH]))
     for i in range(3):
@@ -133,7 +137,11 @@ def bound_of_scene(
     cover, levels = np.zeros((height, width + 2)), state[GREY_LEVELS]
     truth = Projection(plane_of(state, view), view.optics)
     coverage.accumulate(cover, view.edges, levels, truth, 0, 0, state[SPREAD])
-    coverage.sum_levels(cover, levels[0], image)
+    exact = np.empty((height, width))
+    coverage.sum_levels(cover, levels[0], exact)
+    for i in range(height):
+        for j in range(width):
+            image[i, j] += exact[i, j]
     chi_square, reached = fit(
         image, squares(image), mirrored_state(state), view, work, spread_free,
         MIRROR_STEPS, SETTLED, MAX_MIRROR_DISTANCE**2, information,
@@ -155,7 +163,8 @@ def bounds(
     the Fisher information (times the noise's variance). With all of a frame of 320 x 240 px the
     bound would be lower by at most 1.0 %, of markers that the frame cuts by 1.3 %
     (``tests/measure/test_bound.py``).
-    Of a board, ``std`` is of its pose, and κ is that of the depth of its middle.
+    Of a board, ``std`` is of its pose, and κ is that of the depth of its middle; pixels that show
+    something beside it are left out.
     Levels of black, white and background are unknown; with ``unknown_blur`` the point spread is,
     too. From Kay, "Fundamentals of statistical signal processing: estimation theory" (1993),
     section 3.9, with analytic derivatives (:mod:`sweep.model.derivatives`).
@@ -193,8 +202,13 @@ def bounds(
         width, height = (high[i] - low[i]).tolist()
         if unknown_blur:
             state[SPREAD] = max(state[SPREAD], MIN_SPREAD_PX)
+        image = np.zeros((height, width))
+        if isinstance(key, Board) and key.distractors:
+            left, top = low[i].tolist()
+            box = left, top, left + width, top + height
+            image[beside_pixels(scenes, row, box)] = np.nan
         covariance, exists, kappa[i], mirror_chi_square = bound_of_scene(
-            state, view, height, width, unknown_blur
+            state, view, image, unknown_blur
         )
         if not exists:
             status[i] = BoundStatus.no_contrast

@@ -379,11 +379,11 @@ def mirrored_state(state: Floats) -> Floats:
 
 @compiled
 def squares(image: Floats) -> float:
-    """Return the sum of squared levels."""
+    """Return the sum of squared levels of the pixels that are not NaN."""
     total = 0.0
     for i in range(image.shape[0]):
         for j in range(image.shape[1]):
-            total += image[i, j] * image[i, j]
+            total += 0.0 if math.isnan(image[i, j]) else image[i, j] * image[i, j]
     return total
 
 

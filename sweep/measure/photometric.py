@@ -43,7 +43,7 @@ from sweep.measure.likelihood import (
 )
 from sweep.measure.positive_definite import pose_covariance
 from sweep.measure.solver import both_planar_solutions, reprojection_errors_px
-from sweep.model.derivatives import LEVELS, POSE, work_space
+from sweep.model.derivatives import LEVELS, POSE, known_pixels, work_space
 from sweep.model.marker import module_count
 from sweep.typing import Floats, Grey
 
@@ -98,7 +98,7 @@ def locate(
     Parameters
     ----------
     image
-        (height, width) grey levels.
+        (height, width) grey levels; pixels that are NaN are left out.
     starts
         (K, 16) states; those behind the camera are skipped.
     view
@@ -136,11 +136,11 @@ def locate(
         if is_before_camera(states[k], view):
             chi_square[k] = coarse_fit(states[k], least(chi_square) + HOPELESS)
     work = work_space(image.shape[0], image.shape[1])
-    total = squares(image)
+    total, count_px = squares(image), known_pixels(image)
     best, other = np.full(STATE_LENGTH, math.nan), np.full(STATE_LENGTH, math.nan)
     lowest = next_lowest = math.inf
     reached = False
-    freedom = image.size - free - LEVELS
+    freedom = count_px - free - LEVELS
     likely = freedom + EXCESS * math.sqrt(2.0 * freedom)
     for k in range(2 * count + 1):
         worth = lowest + HOPELESS
@@ -221,7 +221,7 @@ def write_most_likely(
     free = POSE + 1 if spread_free else POSE
     information = np.empty((free, free))
     state, chi_square, reached, other, _ = locate(image, starts, view, spread_free, information)
-    freedom = image.size - free - LEVELS
+    freedom = known_pixels(image) - free - LEVELS
     if not math.isfinite(chi_square) or freedom < 1:
         return None
     if not reached:

@@ -304,8 +304,9 @@ def normal_equations(
 ) -> None:
     """Sum up JᵀJ and Jᵀ·image over the pixels of a box, and clear ``work``.
 
-    J's columns are the first ``free`` slopes and the areas of outside, black and white.
-    ``matrix`` (free + 3, free + 3) and ``vector`` (free + 3,) are overwritten.
+    J's columns are the first ``free`` slopes and the areas of outside, black and white; pixels that
+    are NaN are left out. ``matrix`` (free + 3, free + 3) and ``vector`` (free + 3,) are
+    overwritten.
     """
     shares, slots, slopes = work
     size = free + LEVELS
@@ -319,7 +320,8 @@ def normal_equations(
         for j in range(width):
             more_black, more_white, slot = shares[0, i, j], shares[1, i, j], slots[i, j]
             level = image[i, j]
-            if more_black == 0.0 and more_white == 0.0 and slot < 0:
+            known = not math.isnan(level)
+            if more_black == 0.0 and more_white == 0.0 and slot < 0 and known:
                 pixels += 1.0
                 total += level
                 continue
@@ -332,6 +334,10 @@ def normal_equations(
             black += more_black
             white += more_white
             shares[0, i, j] = shares[1, i, j] = 0.0
+            if not known:
+                slots[i, j] = -1
+                pixels = total = 0.0
+                continue
             if slot < 0:
                 pixels, total = 1.0, level
                 continue
@@ -354,3 +360,13 @@ def normal_equations(
     for k in range(size):
         for m in range(k):
             matrix[m, k] = matrix[k, m]
+
+
+@compiled
+def known_pixels(image: Floats) -> int:
+    """Return how many pixels are not NaN."""
+    count = 0
+    for i in range(image.shape[0]):
+        for j in range(image.shape[1]):
+            count += not math.isnan(image[i, j])
+    return count

@@ -148,8 +148,6 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
             + ("" if solver not in SOLVERS else "; others with points = largest_marker"
                if SOLVERS[solver].corners_alone else ""),
         )
-    if any(reading.values("distractors")):
-        _beside_others(reading)
     if any(map(is_solid, (*reading.values("markers"), *reading.values("distractors")))):
         _several_planes(reading)
     if "chessboard" in reading.values("points") and not {"charuco", "diamond"} & set(kinds):
@@ -164,16 +162,6 @@ IN_ONE_PLANE = tuple(
 """Switches of effects that boards in several planes cannot have."""
 
 
-def _beside_others(reading: Reading) -> None:
-    """Refuse what knows the target alone: an image of it without distractors."""
-    why = "with nothing beside the target; delete [[board.distractors]]"
-    for value in reading.values("bound"):
-        if value != "none":
-            reading.fault("scene.bound", value, f"none, or a scene {why}")
-    if "photometric" in reading.values("solver"):
-        reading.fault("estimator.solver", "photometric", f"another solver, or a scene {why}")
-
-
 def _several_planes(reading: Reading) -> None:
     """Refuse what sheets in several planes cannot have: solvers for a plane, effects, bounds."""
     target = any(map(is_solid, reading.values("markers")))
@@ -184,6 +172,8 @@ def _several_planes(reading: Reading) -> None:
             points in ("markers", "chessboard") for points in reading.values("points")
         ):
             reading.fault("estimator.solver", name, f"one of iterative, sqpnp, epnp, {why}")
+    if not target and "photometric" in reading.values("solver"):
+        reading.fault("estimator.solver", "photometric", f"another one, {why}")
     for name in IN_ONE_PLANE:
         if any(value != PARAMETERS[name].default for value in reading.values(name)) or (
             name in reading.distributions

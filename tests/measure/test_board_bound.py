@@ -3,12 +3,14 @@
 import cv2
 import numpy as np
 import pytest
+from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import Rotation
 
 from support.exact_image import add_clipped, values
 from sweep.measure.bound import BACKGROUND_MARGIN_PX, bounds
 from sweep.measure.flags import BoundStatus
 from sweep.model.board_kinds import Charuco
+from sweep.model.distractors import with_distractors
 from sweep.model.effects import NEUTRAL
 from sweep.model.extent import marker_boxes
 from sweep.model.marker_table import BoardMarker, Markers
@@ -51,8 +53,12 @@ def rectangles(sheets, squares, markers):
     return sheets, black
 
 
-def reference(scenes, sheets, black, noise):
-    """Deviations (6,) of the bound, from images of clipped polygons; the levels are unknown."""
+def reference(scenes, sheets, black, noise, hides=None):
+    """Deviations (6,) of the bound, from images of clipped polygons; the levels are unknown.
+
+    ``hides``: corners (4, 2) on the board of what hides the pixels that it touches, and their
+    neighbours.
+    """
     view, frame = scenes.cameras.view[0], scenes.frame[0]
     low = np.maximum(marker_boxes(scenes)[0, :2] - BACKGROUND_MARGIN_PX, 0)
     high = np.minimum(marker_boxes(scenes)[0, 2:] + BACKGROUND_MARGIN_PX, frame)
@@ -77,6 +83,14 @@ def reference(scenes, sheets, black, noise):
         step[k] = 1e-6
         slopes.append(levels @ (areas(step) - areas(-step)) / 2e-6)
     design = np.concatenate([slopes, areas(np.zeros(6))]).T
+    if hides is not None:
+        share = np.zeros((height, width))
+        points = np.pad(hides, ((0, 0), (0, 1))) @ scenes.rotation[0].T + scenes.translation[0]
+        add_clipped(
+            np.zeros_like(share), share, points[:, :2] / points[:, 2:] * view[:2] + view[2:] - low,
+            0.0,
+        )
+        design = design[maximum_filter(np.abs(share), 3).ravel() < 1e-9]
     norms = np.linalg.norm(design, axis=0)
     inverse = np.linalg.inv(np.linalg.qr(design / norms)[1])
     covariance = (noise**2 + 1 / 12) * (inverse @ inverse.T) / np.outer(norms, norms)
@@ -113,6 +127,20 @@ def test_bound_of_a_board_is_that_of_differences_of_clipped_polygons(parts, pose
     expected = reference(scenes, *rectangles(sheets, squares, markers), 2.0)
     # Edges near pixels' corners cross them within a step.
     np.testing.assert_allclose(found_of(scenes).std[0], expected, rtol=2e-5)
+
+
+def test_pixels_of_a_distractor_tell_nothing_of_the_board():
+    """It touches the board's sheet, so that neighbours of its pixels see the board's edge."""
+    board, sheets, squares, markers = charuco()
+    side = 0.03 * 8 / 6
+    beside = with_distractors(board, [(None, 0.07 + side / 2, 0.0, 0.03, 0, 0, 0, 0, None)], 1, 1)
+    pose = {"distance_m": 0.22, "tilt_deg": 33.0, "azimuth_deg": 20.0, "roll_deg": 12.0}
+    scenes = scene(beside, **pose)
+    x, y = np.array([[-1, 1, 1, -1], [1, 1, -1, -1]]) * side / 2
+    square = np.column_stack([x + 0.07 + side / 2, y])
+    expected = reference(scenes, *rectangles(sheets, squares, markers), 2.0, square)
+    np.testing.assert_allclose(found_of(scenes).std[0], expected, rtol=2e-5)
+    assert (found_of(scenes).std > 1.002 * found_of(scene(board, **pose)).std).any()
 
 
 @pytest.mark.parametrize("unknown_blur", [False, True])

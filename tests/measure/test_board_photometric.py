@@ -14,6 +14,13 @@ from sweep.plan.experiment import Pipeline
 
 CHARUCO = 'kind = "charuco"\nsquares_x = 5\nsquares_y = 4\nsquare_m = 0.03'
 GRID = 'kind = "grid"\nrows = 3\ncolumns = 3\ngap_m = 0.01'
+BESIDE = GRID + "".join(
+    f"\n[[board.distractors]]\n{text}" for text in (
+        "marker_id = 4\nx_m = 0.057\ny_m = 0.0", "x_m = -0.06\ny_m = 0.01\nroll_deg = 10",
+        "marker_id = 70\nx_m = 0.01\ny_m = 0.065\nroll_deg = 45",
+    )
+)
+"""A grid whose sheet another touches, and two near it."""
 
 TEXT = """
 seed = 5
@@ -66,8 +73,17 @@ def test_board_s_pose_from_pixels_is_within_its_own_bound():
     assert (np.abs(columns["residual_variance_ratio"] - 1) < 0.1).all()
 
 
+def test_pose_from_pixels_is_not_biased_by_distractors():
+    """As above: one of 12 errors beyond six deviations has a probability below 1e-7."""
+    columns, relative = computed(BESIDE, 2)
+    assert (columns["estimate"] == EstimateStatus.solved).all()
+    assert np.abs(relative).max() < 6
+    np.testing.assert_allclose(columns["predicted_std"], columns["bound_std"], rtol=0.1)
+    assert (np.abs(columns["residual_variance_ratio"] - 1) < 0.1).all()
+
+
 @pytest.mark.long
-@pytest.mark.parametrize("board", [CHARUCO, GRID], ids=["charuco", "grid"])
+@pytest.mark.parametrize("board", [CHARUCO, GRID, BESIDE], ids=["charuco", "grid", "beside"])
 @pytest.mark.parametrize("blur", ["known_blur", "unknown_blur"])
 def test_board_s_pose_from_pixels_attains_the_bound(board, blur):
     """RMSE of 400 x 3 errors scatters by 2 %, the mean of 400 NEES by 0.17."""
@@ -76,7 +92,8 @@ def test_board_s_pose_from_pixels_attains_the_bound(board, blur):
     assert (columns["estimate"] == EstimateStatus.solved).all()
     rotation, position = np.sqrt((relative.reshape(-1, 2, 3) ** 2).mean(axis=(0, 2)))
     nees = columns["nees"].mean()
-    print(f"\n| {board.split()[2]} | {blur} | {rotation:.3f} | {position:.3f} | {nees:.2f} |")
+    name = board.split()[2] + " beside others" * ("distractors" in board)
+    print(f"\n| {name} | {blur} | {rotation:.3f} | {position:.3f} | {nees:.2f} |")
     assert 0.90 < rotation < 1.10
     assert 0.90 < position < 1.10
     assert abs(nees - 6) < 5 * np.sqrt(12 / 400)

@@ -141,12 +141,13 @@ def test_a_solver_that_boards_lack_is_one_line(setting, expected):
 
 
 DISTRACTOR = beside(x_m=0.5, y_m=0)
+SOLID = beside(x_m=0.5, y_m=0, z_m=0.1)
 
 
 @pytest.mark.parametrize(("board", "setting", "expected"), [
-    (GRID + DISTRACTOR, "solver='photometric'", "another solver, or a scene with nothing beside"),
-    (GRID + DISTRACTOR, "bound='known_blur'", "none, or a scene with nothing beside the target"),
-    (GRID + beside(x_m=0.5, y_m=0, z_m=0.1), "curvature_per_m=1",
+    (GRID + SOLID, "solver='photometric'", "another one, for distractors with z_m or tilt_deg"),
+    (GRID + SOLID, "bound='known_blur'", "none, for distractors with z_m or tilt_deg"),
+    (GRID + SOLID, "curvature_per_m=1",
      "it absent, for distractors with z_m or tilt_deg"),
     (DISTRACTOR, "solver='ippe_square'", "for boards; others with points = largest_marker"),
 ])

@@ -13,7 +13,7 @@ from sweep.analysis.counts import Count, Rate
 from sweep.analysis.described import describes
 from sweep.analysis.dimensions import axes_of, require_dimension
 from sweep.analysis.pose_pairs import Pair, paired_arrays
-from sweep.analysis.pose_shifts import CORNERS, corner_shift, pose_shifts
+from sweep.analysis.pose_shifts import corner_shift, corners_moved, corners_of, pose_shifts
 from sweep.analysis.pose_view import DETECTION_INPUTS, ERROR_INPUTS, pose_arrays
 from sweep.errors import ArgumentError
 from sweep.measure.flags import DetectionStatus
@@ -46,8 +46,9 @@ def environment_differences(results: xr.Dataset, reference: str | None = None) -
           detection differs (``changed``); of them ``gained`` and ``lost`` detections, and
           ``other_id`` that are decoded as another marker in just one of both.
         - ``corners_moved``: share of the poses detected in both (``detected_in_both``) of which
-          any corner has another value, however little (``moved``). ``corner_shift_rms_px``: RMS
-          over these poses, corners, x and y of the difference.
+          any corner has another value, however little, or is found in one only, as a board's can
+          be (``moved``). ``corner_shift_rms_px``: RMS over these poses, the corners found in both,
+          x and y of the difference.
         - ``range_bias_percent``: mean difference of the relative z errors, signed (above 0:
           farther than in the other), poses solved in both.
         - ``rotation_shift_deg``: RMS norm of the difference of the rotation errors, poses solved
@@ -83,12 +84,13 @@ def environment_differences(results: xr.Dataset, reference: str | None = None) -
     def pairs(*names: str) -> dict[str, xr.DataArray]:
         return paired_arrays(pose_arrays(others, names), pose_arrays(results, names))
 
+    corners = corners_of(results)
+
     def moved(pair: Pair) -> Masks:
-        differ = (pair.first[CORNERS] != pair.second[CORNERS]).any(axis=(-2, -1))
-        return np.asarray(differ & detected_in_both(pair))
+        return np.asarray(corners_moved(pair, corners) & detected_in_both(pair))
 
     detections = aggregate(
-        results, pairs(*DETECTION_INPUTS, CORNERS), kept("detection"),
+        results, pairs(*DETECTION_INPUTS, corners), kept("detection"),
         [
             Rate("flag_changes", "changed of compared", flag_changed, lambda pair: pair.compared,
                  counts=(("compared", "poses that were looked for in both environments"),
@@ -102,7 +104,7 @@ def environment_differences(results: xr.Dataset, reference: str | None = None) -
             Rate("corners_moved", "moved of detected_in_both", moved, detected_in_both,
                  counts=(("detected_in_both", "poses detected in both environments"),
                          ("moved", "of them, poses of which a corner has another value"))),
-            corner_shift("the other's"),
+            corner_shift("the other's", corners),
         ],
         Pair,
     )

@@ -47,9 +47,14 @@ def image_sides(results: xr.Dataset, bins: Bins) -> xr.DataArray:
     if "side_px" in shell.coords:
         sides = shell["side_px"].astype(np.float64)
     else:
+        distance = parameter_value(shell, "distance_m")
+        if distance is None:
+            raise DatasetError(
+                "distance_m: is no number of this store, whose poses are given in the world; a "
+                "limit needs an axis distance_m or side_px (per= takes any axis for rates)")
         values = {name: parameter_value(shell, name) for name in (*VIEW_PARAMETERS, "size_m")}
         fx = xr.DataArray(intrinsics(*(values[name] for name in VIEW_PARAMETERS))[0])
-        sides = (fx * values["size_m"] / parameter_value(shell, "distance_m")).astype(np.float64)
+        sides = (fx * values["size_m"] / distance).astype(np.float64)
     if not (np.isfinite(sides) & (sides > 0)).all():
         raise DatasetError("sides must be finite and above 0 px: see the coordinates of the size, "
                            "the distance and the camera")

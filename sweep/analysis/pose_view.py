@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from sweep.analysis.board_markers import AXIS
 from sweep.analysis.signed_errors import SignedErrors
 from sweep.errors import DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, uncounted_values
@@ -53,6 +54,10 @@ def pose_arrays(results: xr.Dataset, names: Iterable[str]) -> dict[str, xr.DataA
     for name in dict.fromkeys(names):
         variable = "true_tvec_m" if name == DEPTH else name
         if variable not in results:
+            if AXIS in results.dims:
+                raise DatasetError(
+                    f"no variable {variable}: a board's markers have detections alone; estimates "
+                    "are the board's: give the dataset that per_marker was given")
             raise DatasetError(f"no variable {variable}; "
                                f"there are {', '.join(map(str, results.data_vars)) or 'none'}")
         array = results[variable]

@@ -9,7 +9,7 @@ from sweep.analysis.counts import Rate
 from sweep.analysis.described import describes
 from sweep.analysis.dimensions import axes_of, require_dimension
 from sweep.analysis.pose_pairs import Pair, paired_arrays
-from sweep.analysis.pose_shifts import CORNERS, corner_shift, pose_shifts
+from sweep.analysis.pose_shifts import corner_shift, corners_of, pose_shifts
 from sweep.analysis.pose_view import DETECTION_INPUTS, ERROR_INPUTS, pose_arrays
 from sweep.errors import ArgumentError
 from sweep.plan.parameters import Stage
@@ -35,8 +35,8 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
 
         - ``detection_disagreement``: share of the poses looked for with both (``compared``) that
           are detected with one of them only (``differing``).
-        - ``corner_shift_rms_px``: RMS over poses detected with both, corners, x and y of the
-          difference of the corners' errors.
+        - ``corner_shift_rms_px``: RMS over poses detected with both, corners (of boards those found
+          with both), x and y of the difference of the corners' errors.
         - ``range_bias_percent``: mean difference of the relative z errors, signed (above 0:
           farther than with the reference), poses solved with both.
         - ``rotation_shift_deg``: RMS norm of the difference of the rotation errors, poses solved
@@ -73,15 +73,16 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
     def pairs(*names: str) -> dict[str, xr.DataArray]:
         return paired_arrays(pose_arrays(others, names), pose_arrays(results, names))
 
+    corners = corners_of(results)
     detections = aggregate(
-        results, pairs(*DETECTION_INPUTS, CORNERS), kept("detection"),
+        results, pairs(*DETECTION_INPUTS, corners), kept("detection"),
         [
             Rate("detection_disagreement", "differing of compared",
                  lambda pair: pair.first.detected != pair.second.detected,
                  lambda pair: pair.compared,
                  counts=(("compared", "poses that were looked for with both renderers"),
                          ("differing", "poses detected with one of both renderers only"))),
-            corner_shift("the reference's"),
+            corner_shift("the reference's", corners),
         ],
         Pair,
     )

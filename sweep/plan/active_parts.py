@@ -16,6 +16,7 @@ from sweep.measure.foreign_detector import own_defaults
 from sweep.messages import label
 from sweep.model.camera import canonical_distortion
 from sweep.model.effect import Effect, is_coded
+from sweep.plan.boards import target_word
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings
 from sweep.plan.parameters import PARAMETERS
@@ -72,7 +73,7 @@ def _described(plugin: DeclaredPlugin) -> str:
 
 def parts(pipeline: Pipeline) -> list[Part]:
     """Return every optional part, active or not."""
-    effects = effects_of(pipeline.plugins)
+    effects, target = effects_of(pipeline.plugins), target_word(pipeline)
     lens = pipeline.any_value("distortion", lambda value: len(canonical_distortion(value)) > 0)
     draws = [*pipeline.distributions]
     if pipeline.any_value("jitter_px", lambda value: value > 0):
@@ -101,7 +102,8 @@ def parts(pipeline: Pipeline) -> list[Part]:
     if uneven and any(uneven_light_needs_frame(setting, gain) for setting in settings):
         whole.append("adaptiveThreshConstant is low for uneven light")
     if image:
-        whole.append("the background is an image: clutter near the marker may change the detection")
+        whole.append(
+            f"the background is an image: clutter near the {target} may change the detection")
     if asked:
         whole.append('window = "full"')
     noisy = any(effect.switch in draws for effect in effects if effect.widens == "noise")
@@ -132,7 +134,7 @@ def parts(pipeline: Pipeline) -> list[Part]:
         Part("background image", image, "background names a file" if image else "a level"),
         Part(
             "window", windowed,
-            f"{', '.join(str(m) for m in margins)} px around the marker's pixels{noise}"
+            f"{', '.join(str(m) for m in margins)} px around the {target}'s pixels{noise}"
             if windowed else "the full frame",
         ),
         Part(

@@ -19,6 +19,7 @@ from sweep.model.camera import (
 from sweep.model.lens import fold_radius
 from sweep.model.marker import module_count
 from sweep.plan.beliefs import belief_notes
+from sweep.plan.boards import relative_sizes, shows_boards
 from sweep.plan.camera_values import FIELDS_OF_VIEW
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes, scene_values
@@ -49,7 +50,10 @@ class CameraFacts:
         Whether the pixels are square everywhere on the grid.
     side_px
         Side of the black square parallel to the image plane, at the farthest and the nearest
-        pose; None if the distance is not one of the pipeline's numbers.
+        pose; None if the distance is not one of the pipeline's numbers. Of boards the sides of the
+        smallest and the largest marker.
+    boards
+        Whether scenes show boards.
     """
 
     width_px: Range
@@ -65,6 +69,7 @@ class CameraFacts:
     off_centre_y: Range
     square: bool
     side_px: Range | None
+    boards: bool
 
     def line(self) -> str:
         """Return the camera in one line."""
@@ -81,6 +86,7 @@ class CameraFacts:
         if self.side_px is not None:
             far, near = self.side_px
             parts.append(
+                f"the markers have sides of {_text(self.side_px, 4)} px" if self.boards else
                 f"the marker's side is {far:.4g} px" if far == near else
                 f"the marker's side is {near:.4g} px at the nearest pose, {far:.4g} px at the "
                 "farthest"
@@ -151,7 +157,8 @@ def camera_facts(pipeline: Pipeline) -> CameraFacts:
     square = all(
         np.all(are_square(fx, fy)) for fx, fy in zip(found["fx_px"], found["fy_px"], strict=True)
     )
-    return CameraFacts(square=square, side_px=_side(pipeline, ranges["fx_px"]), **ranges)
+    return CameraFacts(square=square, side_px=_side(pipeline, ranges["fx_px"]),
+                       boards=shows_boards(pipeline), **ranges)
 
 
 def _ends(pipeline: Pipeline, name: str) -> tuple[Any, Any] | None:
@@ -168,6 +175,12 @@ def _ends(pipeline: Pipeline, name: str) -> tuple[Any, Any] | None:
 
 
 def _side(pipeline: Pipeline, fx: Range) -> Range | None:
+    """Return the least and the largest side of a marker in pixels."""
+    sides, (least, largest) = _side_of_size_m(pipeline, fx), relative_sizes(pipeline)
+    return sides and (sides[0] * least, sides[1] * largest)
+
+
+def _side_of_size_m(pipeline: Pipeline, fx: Range) -> Range | None:
     """Return the least and the largest side in pixels, fx · size / distance."""
     if (sides := _ends(pipeline, "side_px")) is not None:
         return sides
@@ -269,7 +282,8 @@ def _side_notes(pipeline: Pipeline, facts: CameraFacts) -> list[str]:
         line = f"at most {near:.4g} px, less than a pixel a module: too small to be read"
     elif far > max(facts.width_px[1], facts.height_px[1]):
         line = f"at least {far:.4g} px, more than the frame's"
-    return [f"the marker's side is {line}{units}"] if line else []
+    whose = "the markers' sides are" if facts.boards else "the marker's side is"
+    return [f"{whose} {line}{units}"] if line else []
 
 
 def _centre_notes(facts: CameraFacts) -> list[str]:

@@ -14,6 +14,7 @@ from sweep.model.extent import hidden, outside_frame
 from sweep.model.pose import viewing_angle
 from sweep.model.scene import Scenes, build_scenes
 from sweep.plan.alternatives import WORLD
+from sweep.plan.boards import target_word
 from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes, scene_values
 from sweep.plan.parameters import PARAMETERS
@@ -149,15 +150,16 @@ def _visibility_notes(pipeline: Pipeline, facts: PoseFacts) -> list[str]:
     lines = []
     world = any(name in pipeline.given for name in WORLD)
     framed = {"frame_x", "frame_y"} & pipeline.given
+    target = target_word(pipeline)
     where = "outside the frame of the camera" if world else "outside the frame"
     for chosen, what in (
         (facts.behind, "have a corner behind the camera: not_visible"),
         (facts.averted,
-         "show the marker's back or its edge (a viewing angle of 90° or more): not_visible"),
+         f"show the {target}'s back or its edge (a viewing angle of 90° or more): not_visible"),
         (facts.outside, f"are {where}: not_visible"
-         + ("" if world or framed else "; frame_x and frame_y place a marker within it")),
+         + ("" if world or framed else f"; frame_x and frame_y place a {target} within it")),
         (facts.cut, "are cut off by the frame's edge"
-         + ("; where the marker is too large for the frame, frame_x and frame_y put it in the "
+         + (f"; where the {target} is too large for the frame, frame_x and frame_y put it in the "
             "middle" if framed else "")),
     ):
         if chosen.mean() > MIN_SHARE:
@@ -197,8 +199,8 @@ def _distance_notes(pipeline: Pipeline, facts: PoseFacts) -> list[str]:
         return []
     name = "side_px" if "side_px" in pipeline.given else "distance_m"
     line = (
-        f"{name} counts along the optical axis: off it, the marker's centre is up to "
-        f"{farther:.3g} times as far away"
+        f"{name} counts along the optical axis: off it, the {target_word(pipeline)}'s centre is up "
+        f"to {farther:.3g} times as far away"
     )
     return [line]
 

@@ -15,6 +15,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.analysis import covariance_trust, efficiency, error_statistics, renderer_bias
+from sweep.analysis.pose_shifts import corners_of
 from sweep.analysis.stopped_sampling import computed_scenes
 from sweep.errors import ArgumentError, StoreError
 from sweep.execution.progress import StageReport
@@ -321,13 +322,16 @@ def _corner_noise_scale(
 ) -> xr.DataArray:
     """Return the factor from squared deviations under the assumed to the measured corner noise.
 
-    1 for estimators whose covariance does not come from the corners' noise.
+    1 for estimators whose covariance does not come from the corners' noise. Those of a chessboard's
+    points have the noise of its corners, all others that of markers' corners.
     """
-    of_board = "marker_corner_error_px" in results
-    error = results["marker_corner_error_px" if of_board else "corner_error_px"].astype(np.float64)
     searched = [axis.name for axis in pipeline.axes_of(Stage.detection)]
-    over = [dim for dim in error.dims if dim not in (*per, *searched)]
-    measured = (error**2).mean(over).compute()
+
+    def measured(name: str) -> xr.DataArray:
+        error = results[name].astype(np.float64)
+        over = [dim for dim in error.dims if dim not in (*per, *searched)]
+        return (error**2).mean(over).compute()
+
     axes = pipeline.axes_of(Stage.estimation)
     assumed = np.array(
         [
@@ -343,7 +347,12 @@ def _corner_noise_scale(
         return xr.DataArray(values.reshape(shape), dims=names,
                             coords={name: results[name] for name in names})
 
-    scale = over_estimators(assumed) ** 2 / measured
+    noise = measured(corners_of(results))
+    chessboard = np.array([setting.points == "chessboard" for setting in estimators(pipeline)])
+    if chessboard.any():
+        noise = noise.where(
+            ~over_estimators(chessboard), measured("chessboard_corner_error_px"))
+    scale = over_estimators(assumed) ** 2 / noise
     return scale.where(~over_estimators(from_images), 1.0)
 
 

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from sweep.analysis import detection_rate, error_statistics, per_marker
+from sweep.analysis import (
+    detection_rate,
+    environment_differences,
+    error_statistics,
+    per_marker,
+    renderer_bias,
+)
 from sweep.errors import DatasetError
 from sweep.measure.flags import DetectionStatus, uncounted_values
 
@@ -55,7 +61,36 @@ def test_rates_of_markers_count_those_that_are_on_the_board_and_visible(chunked:
 
 
 def test_estimates_are_not_those_of_markers() -> None:
-    with pytest.raises(DatasetError, match="no variable estimate"):
+    with pytest.raises(DatasetError, match="no variable estimate: a board's markers have"):
         error_statistics(per_marker(_boards()))
     with pytest.raises(DatasetError, match="the scenes show no boards"):
         per_marker(_boards().drop_vars("marker_detection"))
+
+
+@pytest.mark.parametrize(("axis", "differences"), [
+    ("renderer", renderer_bias), ("environment", environment_differences),
+])
+def test_corners_of_boards_are_paired_where_both_found_them(axis, differences) -> None:
+    rng = np.random.default_rng(7)
+    names = ["exact", "other"]
+    boards = xr.concat([_boards(), _boards()], dim=axis).assign_coords({axis: names})
+    errors = boards["marker_corner_error_px"].to_numpy()
+    errors[1] += rng.normal(scale=0.1, size=errors[1].shape).astype(np.float32)
+    errors[1][rng.random(errors.shape[1:4]) < 0.3] = np.nan  # markers that the second lost
+    errors[1, :, :5] = errors[0, :, :5]
+    solved = boards["detection"].to_numpy() == DetectionStatus.detected
+    zeros = np.zeros((*solved.shape, 3), dtype=np.float32)
+    dims = boards["detection"].dims
+    table = differences(boards.assign(
+        estimate=(dims, solved.astype(np.uint8)), flipped=(dims, solved.astype(np.uint8)),
+        rotation_error_rad=((*dims, "xyz"), zeros), translation_error_m=((*dims, "xyz"), zeros),
+    )).compute()
+    shift = np.square(errors[1].astype(float) - errors[0])
+    found = np.isfinite(shift).any(axis=(2, 3, 4)) & solved[0]
+    each = np.nanmean(shift[found], axis=(1, 2, 3))
+    other = table.sel({axis: "other"})
+    assert other["corner_shift_rms_px"] == pytest.approx(np.sqrt(each.mean()), rel=1e-9)
+    if axis == "environment":
+        differ = ~np.isclose(errors[0], errors[1], rtol=0, atol=0, equal_nan=True)
+        assert other["moved"] == (differ.any(axis=(2, 3, 4)) & solved[0]).sum()
+        assert other["detected_in_both"] == solved[0].sum()

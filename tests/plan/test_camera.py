@@ -222,6 +222,20 @@ def test_plan_names_focal_lengths_fields_of_view_and_sides(tmp_path, capsys):
     ) in capsys.readouterr().out
 
 
+def test_sides_of_a_board_s_markers_are_their_own():
+    # 600 · 0.01 / 2 and 600 · 0.04 / 1 px; the size of [marker] is that of no marker.
+    board = Pipeline.from_dict({
+        "camera": {"fx_px": 600}, "estimator": {"solver": "sqpnp"}, "marker": {"size_m": 0.5},
+        "board": {"kind": "markers", "markers": [
+            {"marker_id": 0, "x_m": 0, "y_m": 0, "size_m": 0.04},
+            {"marker_id": 1, "x_m": 0.1, "y_m": 0, "size_m": 0.01},
+        ]}, "axes": {"distance_m": [1, 2]},
+    })
+    facts = camera_facts(board)
+    assert facts.side_px == pytest.approx((3, 24))
+    assert "the markers have sides of 3 to 24 px" in facts.line()
+
+
 def test_a_marker_at_the_camera_s_depth_has_no_side_and_no_warning():
     world = Pipeline.from_dict({
         "pose": {"camera_x_m": 0}, "marker": {"size_m": 0.1}, "camera": {"fx_px": 600},

@@ -17,9 +17,8 @@ from scipy.special import ndtr
 
 from support.exact_image import (
     LENSES,
-    add_clipped,
+    add_part,
     clipped_image,
-    kept,
     modules_of,
     plane_of,
     values,
@@ -669,15 +668,8 @@ def occluded_image(value):
         [value["fx_px"], 0, (width - 1) / 2], [0, value["fx_px"], (height - 1) / 2], [0, 0, 1],
     ])
     plane = view @ plane_of(value).astype(np.float64)
-    frame = np.array([[1, 0, 0.5], [0, 1, 0.5], [-1, 0, width - 0.5], [0, -1, height - 0.5]])
     for part, level in parts:
-        polygon = [plane @ [*point, 1.0] for point in part]
-        for side in frame:
-            polygon = kept(polygon, side)
-        if len(polygon) > 2:
-            add_clipped(
-                levels, share, np.array([point[:2] / point[2] for point in polygon]), level
-            )
+        add_part(levels, share, [plane @ [*point, 1.0] for point in part], level)
     return levels + (1 - share) * value["background"]
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from support.exact_image import add_clipped, kept
+from support.exact_image import add_part, kept
 
 NAME = "DICT_5X5_100"
 DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
@@ -182,17 +182,10 @@ def clipped_frame(name, levels, view, rotation, translation, size, hides=None):
     shape = size[1], size[0]
     image, share = np.full(shape, float(levels["background"])), np.zeros(shape)
     matrix = np.array([[view[0], 0, view[2]], [0, view[1], view[3]], [0, 0, 1]])
-    frame = np.array([[1, 0, 0.5], [0, 1, 0.5], [-1, 0, size[0] - 0.5], [0, -1, size[1] - 0.5]])
     plane = matrix @ np.column_stack([rotation[:, :2], translation])
 
     def paint(corners, jump):
-        polygon = [plane @ [*point, 1.0] for point in corners]
-        for side in frame:
-            polygon = kept(polygon, side)
-        if len(polygon) > 2:
-            add_clipped(
-                image, share, np.array([point[:2] / point[2] for point in polygon]), jump
-            )
+        add_part(image, share, [plane @ [*point, 1.0] for point in corners], jump)
 
     listed = list(parts(name, levels))
     if hides is None:

@@ -128,21 +128,27 @@ def add_clipped(levels, share, polygon, level):
             share[v, u] += abs(area)
 
 
+def add_part(levels, share, polygon, level):
+    """Add the image of a convex polygon of homogeneous pixels, clipped to the frame's."""
+    height, width = levels.shape
+    half = EXTENDED(0.5)
+    for side in np.array([[1, 0, half], [0, 1, half], [-1, 0, width - half],
+                          [0, -1, height - half]]):
+        polygon = kept(polygon, side)
+    if len(polygon) > 2:
+        pixels = np.array([point[:2] / point[2] for point in polygon]).astype(np.float64)
+        add_clipped(levels, share, pixels, level)
+
+
 def clipped_image(value):
     """Levels and share (height, width) of a frame: every cell clipped to every pixel."""
     width, height = value["width_px"], value["height_px"]
     levels, share = np.zeros((height, width)), np.zeros((height, width))
     vertices, white = vertices_of(value), modules_of(value)
     assert (vertices[..., 2] > 0).all()
-    half = EXTENDED(0.5)
-    frame = np.array([[1, 0, half], [0, 1, half], [-1, 0, width - half], [0, -1, height - half]])
     for i, j in np.ndindex(white.shape):
         cell = [vertices[i, j], vertices[i, j + 1], vertices[i + 1, j + 1], vertices[i + 1, j]]
-        for plane in frame:
-            cell = kept(cell, plane)
-        if len(cell) > 2:
-            polygon = np.array([point[:2] / point[2] for point in cell]).astype(np.float64)
-            add_clipped(levels, share, polygon, value["white" if white[i, j] else "black"])
+        add_part(levels, share, cell, value["white" if white[i, j] else "black"])
     return levels, share
 
 

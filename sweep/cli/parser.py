@@ -68,8 +68,9 @@ def _meant(word: str) -> str:
     if word in ("--dry-run", "--dryrun", "-n"):
         return "; `sweep plan PIPELINE` shows what would run"
     if word.startswith("-"):
-        flags = {flag: [each.name for each in COMMANDS if flag in _options(each)]
-                 for command in COMMANDS for flag in _options(command) if flag.startswith("--")}
+        options = {command.name: _options(command) for command in COMMANDS}
+        flags = {flag: [name for name, listed in options.items() if flag in listed]
+                 for each in options.values() for flag in each if flag.startswith("--")}
         name = word.partition("=")[0]
         if name in flags:
             return f"; {name} is a flag of {', '.join(f'sweep {each}' for each in flags[name])}"

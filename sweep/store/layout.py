@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any, cast
 
 import google_crc32c
@@ -96,7 +97,7 @@ class PlannedArray:
         """Create the array without values."""
         options = {} if self.fill is None else {"fill_value": self.fill}
         return group.create_array(
-            self.path, shape=self.shape, chunks=self.chunks, dtype=self.dtype,
+            self.path, shape=self.shape, chunks=self.chunks, dtype=_dtype(self.dtype),
             dimension_names=self.dimensions, compressors=_codecs(), attributes=self.attributes,
             overwrite=True, **options,
         )
@@ -134,7 +135,7 @@ class PlannedArray:
         expected = {
             "shape": self.shape,
             "chunks": self.chunks,
-            "dtype": np.dtype(_dtype(self.dtype)),
+            "dtype": np.dtype(_dtype(self.dtype).to_native_dtype()),
             "dimensions": self.dimensions,
             "codecs": [codec.to_dict() for codec in _codecs()],
             "chunk keys": ("default", "/"),
@@ -169,8 +170,10 @@ class PlannedArray:
         return ""
 
 
+@cache
 def _dtype(name: str) -> Any:
-    return parse_dtype(name, zarr_format=3).to_native_dtype()
+    """Return Zarr's data type of a name; it looks through all that it knows, each time."""
+    return parse_dtype(name, zarr_format=3)
 
 
 def _equal(a: Any, b: Any) -> bool:

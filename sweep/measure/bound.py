@@ -18,6 +18,7 @@ from sweep.measure.likelihood import (
     GREY_LEVELS,
     MIN_NOISE,
     MIN_SPREAD_PX,
+    POSITION,
     SETTLED,
     SPREAD,
     MarkerView,
@@ -33,6 +34,7 @@ from sweep.measure.likelihood import (
     state_of,
 )
 from sweep.measure.positive_definite import pose_covariance
+from sweep.measure.solid_bound import solid_covariance
 from sweep.model import coverage
 from sweep.model.beside import beside_pixels
 from sweep.model.board import Board
@@ -164,7 +166,8 @@ def bounds(
     bound would be lower by at most 1.0 %, of markers that the frame cuts by 1.3 %
     (``tests/measure/test_bound.py``).
     Of a board, ``std`` is of its pose, and κ is that of the depth of its middle; pixels that show
-    something beside it are left out.
+    something beside it are left out. Of one in several planes, κ is what it would be of a flat one
+    with the same covariance, and there is no mirrored minimum.
     Levels of black, white and background are unknown; with ``unknown_blur`` the point spread is,
     too. From Kay, "Fundamentals of statistical signal processing: estimation theory" (1993),
     section 3.9, with analytic derivatives (:mod:`sweep.model.derivatives`).
@@ -207,9 +210,18 @@ def bounds(
             left, top = low[i].tolist()
             box = left, top, left + width, top + height
             image[beside_pixels(scenes, row, box)] = np.nan
-        covariance, exists, kappa[i], mirror_chi_square = bound_of_scene(
-            state, view, image, unknown_blur
-        )
+        if isinstance(key, Board) and not key.is_planar:
+            state[POSITION] = scenes.translation[row]
+            covariance, exists = solid_covariance(
+                scenes, row, state, low[i], image, view.variance, spread_free=unknown_blur
+            )
+            if exists:
+                kappa[i], arm = depth_nonlinearity(covariance, state), np.zeros(3)
+            mirror_chi_square = math.nan
+        else:
+            covariance, exists, kappa[i], mirror_chi_square = bound_of_scene(
+                state, view, image, unknown_blur
+            )
         if not exists:
             status[i] = BoundStatus.no_contrast
             continue

@@ -187,7 +187,7 @@ def curvature(
     grey_levels = state[GREY_LEVELS]
     count = differentiate(
         work, view.edges, grey_levels, Projection(plane_of(state, view), view.optics),
-        state[POSITION], state[SPREAD],
+        state[POSITION], state[SPREAD], 0,
     )
     distance = abs(state[DEPTH])
     for slot in range(count):

@@ -123,7 +123,12 @@ class Board:
     @property
     def is_flat(self) -> bool:
         """Whether all is printed in one plane, distractors included."""
-        return all(each.turn is None for each in (*self.prints, *self.distractors))
+        return self.is_planar and all(each.turn is None for each in self.distractors)
+
+    @property
+    def is_planar(self) -> bool:
+        """Whether the board is in one plane, whatever stands beside it."""
+        return all(each.turn is None for each in self.prints)
 
     @property
     def is_single(self) -> bool:

@@ -217,7 +217,7 @@ def velocity(
 @compiled
 def differentiate(
     work: Work, edges: MarkerEdges, levels: Floats, projection: Projection, translation: Floats,
-    sigma: float,
+    sigma: float, count: int,
 ) -> int:
     """Draw a marker's image and its derivatives; return how many pixels have slopes.
 
@@ -232,6 +232,8 @@ def differentiate(
         (3,) grey levels of outside, black and white that the slopes are for.
     translation
         (3,) position of the marker's centre, about which ω turns it.
+    count
+        Pixels that have slopes already, of sheets in other planes.
     """
     for area in range(2):
         # Black is 1 and all else 0, then white.
@@ -246,7 +248,6 @@ def differentiate(
     at_a, at_b = np.empty(POSE), np.empty(POSE)
     shift_x, shift_y = optics.intrinsics[2] + 0.5 + margin, optics.intrinsics[3] + 0.5 + margin
     far_x, far_y = width + 2.0 * margin, height + 2.0 * margin
-    count = 0
     for e in range(ends.shape[0]):
         jump = levels[sides[e, 1]] - levels[sides[e, 0]]
         if jump == 0.0:

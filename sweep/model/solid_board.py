@@ -20,7 +20,7 @@ from sweep.model.board import Board, Print
 from sweep.model.camera import Cameras
 from sweep.model.coverage import MarkerEdges
 from sweep.model.polygon import half_plane
-from sweep.typing import Floats, Masks
+from sweep.typing import Floats, Integers, Masks
 
 _NEGLIGIBLE = 1e-12
 """Sine of an angle, of rays from the camera, below which sheets only touch in the image."""
@@ -139,37 +139,82 @@ def _occluders(faces: list[_Face]) -> list[list[_Face]]:
     ]
 
 
-def visible_prints(board: Board, planes: Floats) -> list[tuple[MarkerEdges, Floats]]:
-    """Return the edges of what is seen of each sheet's print, and its plane (3, 3)."""
+class VisiblePrint(NamedTuple):
+    """What is seen of a sheet's print.
+
+    Attributes
+    ----------
+    number
+        Of :func:`sheets_of` the board.
+    edges, plane
+        Its edges, and what takes (column, row, 1) to the camera frame, (3, 3).
+    mover
+        (E,) the number of the sheet with which the image of each edge moves: of an edge at which
+        another sheet hides this one, the other's.
+    """
+
+    number: int
+    edges: MarkerEdges
+    plane: Floats
+    mover: Integers
+
+
+def visible_prints(board: Board, planes: Floats, first: int = 0) -> list[VisiblePrint]:
+    """Return what is seen of the print of each sheet, from number ``first`` on."""
     seen = []
     sheets = sheets_of(board)
     faces = _faces(board, planes)
     for face, fronts in zip(faces, _occluders(faces), strict=True):
+        if face.number < first:
+            continue
         outline = sheets[face.number].edges
-        parts = [outline]
+        own = np.full(len(outline.ends), face.number)
+        parts, movers = [outline], [own]
         for count in range(1, len(fronts) + 1):
             for some in itertools.combinations(fronts, count):
-                part = outline
+                part, mover = outline, own
                 for front in some:
                     for line in front.normals @ face.plane:
-                        part = _within(part, line)
+                        part, mover = _within(part, line, mover, front.number)
                 parts.append(
                     MarkerEdges(part.ends, part.sides[:, ::-1] if count % 2 else part.sides)
                 )
-        seen.append((
-            MarkerEdges(
-                np.concatenate([part.ends for part in parts]),
-                np.concatenate([part.sides for part in parts]),
-            ), face.plane,
-        ))
+                movers.append(mover)
+        edges = MarkerEdges(
+            np.concatenate([part.ends for part in parts]),
+            np.concatenate([part.sides for part in parts]),
+        )
+        seen.append(VisiblePrint(face.number, edges, face.plane, np.concatenate(movers)))
     return seen
 
 
-def _within(outline: MarkerEdges, line: Floats) -> MarkerEdges:
-    """Return the edges of the part of all areas where line · (column, row, 1) is not negative."""
+def moving_edges(seen: VisiblePrint, planes: Floats) -> list[tuple[MarkerEdges, Floats]]:
+    """Return the edges of a print, each in the plane of the sheet that it moves with, and these.
+
+    The image is the same: an edge at which a sheet in front ends lies on the sheet's outline.
+    """
+    groups = []
+    for number in np.unique(seen.mover).tolist():
+        ends, sides = (each[seen.mover == number] for each in seen.edges)
+        if number != seen.number:
+            points = np.column_stack([ends.reshape(-1, 2), np.ones(2 * len(ends))])
+            moved = points @ np.linalg.solve(planes[number], seen.plane).T
+            ends = np.ascontiguousarray((moved[:, :2] / moved[:, 2:]).reshape(-1, 4))
+        groups.append((MarkerEdges(ends, sides), planes[number]))
+    return groups
+
+
+def _within(
+    outline: MarkerEdges, line: Floats, mover: Integers, front: int
+) -> tuple[MarkerEdges, Integers]:
+    """Return the edges of the part of all areas where line · (column, row, 1) is not negative.
+
+    And with which sheet each moves: those on the line with ``front``, others as ``mover`` says.
+    """
     length = float(line[:2] @ line[:2])
     if length == 0.0:
-        return outline if line[2] >= 0 else MarkerEdges(outline.ends[:0], outline.sides[:0])
+        kept = slice(None) if line[2] >= 0 else slice(0)
+        return MarkerEdges(outline.ends[kept], outline.sides[kept]), mover[kept]
     start, stop = outline.ends[:, :2], outline.ends[:, 2:]
     a, b = start @ line[:2] + line[2], stop @ line[:2] + line[2]
     crossing = (a < 0) != (b < 0)
@@ -183,10 +228,11 @@ def _within(outline: MarkerEdges, line: Floats) -> MarkerEdges:
         crossing[:, None], cut, projected(stop, b)
     )])
     second = np.hstack([cut, projected(stop, b)])[crossing]
+    moved = np.where(a < 0, front, mover), np.where(b < 0, front, mover)[crossing]
     return MarkerEdges(
         np.concatenate([first, second]),
         np.concatenate([outline.sides, outline.sides[crossing]]),
-    )
+    ), np.concatenate(moved)
 
 
 def unseen_markers(board: Board, planes: Floats) -> Masks:

@@ -29,17 +29,18 @@ def solid_planes(scenes: Scenes, row: int) -> Floats:
 
 
 def accumulate_solid(
-    cover: Floats, scenes: Scenes, row: int, levels: Floats, box: Box, sigma: float
+    cover: Floats, scenes: Scenes, row: int, levels: Floats, box: Box, sigma: float,
+    first: int = 0,
 ) -> None:
-    """Add the edges of all that is seen of a scene's board to ``cover``.
+    """Add the edges of all that is seen of a scene's board, from sheet ``first`` on, to ``cover``.
 
     ``cover`` is (height, width + 2) of ``box``; ``levels`` and ``sigma`` as
     :func:`sweep.model.coverage.accumulate` takes them.
     """
     optics = scenes.cameras.optics(row)
-    for outline, plane in visible_prints(solid_board(scenes, row), solid_planes(scenes, row)):
+    for seen in visible_prints(solid_board(scenes, row), solid_planes(scenes, row), first):
         coverage.accumulate(
-            cover, outline, levels, Projection(plane, optics), box[0], box[1], sigma
+            cover, seen.edges, levels, Projection(seen.plane, optics), box[0], box[1], sigma
         )
 
 

@@ -163,7 +163,7 @@ IN_ONE_PLANE = tuple(
 
 
 def _several_planes(reading: Reading) -> None:
-    """Refuse what sheets in several planes cannot have: solvers for a plane, effects, bounds."""
+    """Refuse what sheets in several planes cannot have: solvers for a plane, and effects."""
     target = any(map(is_solid, reading.values("markers")))
     why = f"for {'markers' if target else 'distractors'} with z_m or tilt_deg"
     for name in reading.values("solver") if target else ():
@@ -172,16 +172,13 @@ def _several_planes(reading: Reading) -> None:
             points in ("markers", "chessboard") for points in reading.values("points")
         ):
             reading.fault("estimator.solver", name, f"one of iterative, sqpnp, epnp, {why}")
-    if not target and "photometric" in reading.values("solver"):
-        reading.fault("estimator.solver", "photometric", f"another one, {why}")
     for name in IN_ONE_PLANE:
         if any(value != PARAMETERS[name].default for value in reading.values(name)) or (
             name in reading.distributions
         ):
             reading.fault(f"scene.{name}", reading.written(name), f"it absent, {why}")
-    for name, only in (("renderer", "exact"), ("bound", "none")):
-        for value in reading.values(name):
-            if value != only:
-                reading.fault(f"scene.{name}", value, f"{only}, {why}")
+    for value in reading.values("renderer"):
+        if value != "exact":
+            reading.fault("scene.renderer", value, f"exact, {why}")
     if target and any(reading.values("refineDetectedMarkers")):
         reading.fault("detector.refineDetectedMarkers", True, f"false, {why}")

@@ -188,7 +188,7 @@ def test_a_marker_alone_in_another_plane_is_a_marker_at_its_pose():
     ({"estimator": {"solver": "ippe"}}, "one of iterative, sqpnp, epnp"),
     ({"scene": {"curvature_per_m": 1.0}}, "it absent, for markers with z_m or tilt_deg"),
     ({"scene": {"renderer": "warp"}}, "exact, for markers"),
-    ({"scene": {"bound": "known_blur", "noise_grey": 2.0}}, "none, for markers"),
+    ({"estimator": {"solver": "photometric"}}, "one of iterative, sqpnp, epnp"),
     ({"detector": {"refineDetectedMarkers": True}}, "false, for markers"),
 ])
 def test_what_needs_a_plane_is_refused(change, fault):

@@ -145,8 +145,7 @@ SOLID = beside(x_m=0.5, y_m=0, z_m=0.1)
 
 
 @pytest.mark.parametrize(("board", "setting", "expected"), [
-    (GRID + SOLID, "solver='photometric'", "another one, for distractors with z_m or tilt_deg"),
-    (GRID + SOLID, "bound='known_blur'", "none, for distractors with z_m or tilt_deg"),
+    (GRID + SOLID, "renderer='warp'", "exact, for distractors with z_m or tilt_deg"),
     (GRID + SOLID, "curvature_per_m=1",
      "it absent, for distractors with z_m or tilt_deg"),
     (DISTRACTOR, "solver='ippe_square'", "for boards; others with points = largest_marker"),

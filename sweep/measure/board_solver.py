@@ -14,7 +14,12 @@ from numpy.typing import NDArray
 from sweep.measure.covariance import point_covariance
 from sweep.measure.estimation import Estimates
 from sweep.measure.flags import EstimateStatus
-from sweep.measure.solver import both_planar_solutions, estimate
+from sweep.measure.solver import (
+    CREDIBLE_RATIO,
+    CREDIBLE_SHARE,
+    both_planar_solutions,
+    estimate,
+)
 from sweep.model.board import Board
 from sweep.model.camera import Cameras
 from sweep.model.polygon import signed_areas
@@ -159,10 +164,10 @@ class BoardSolver:
         if len(pixels) < MIN_POINTS:
             out.status[i] = EstimateStatus.too_few_points
             return
-        solutions = self._solutions(one, objects, pixels)
         side = float(np.linalg.norm(
             np.roll(found.corners_px, -1, axis=1) - found.corners_px, axis=2
         ).mean())
+        solutions = self._solutions(one, objects, pixels, side)
         limit = self.reprojection_limit * side
         if not solutions or not solutions[0].error_px <= limit:
             return
@@ -187,25 +192,25 @@ class BoardSolver:
         return board.corners_m[marker].reshape(-1, 3), corners.reshape(-1, 2)
 
     def _solutions(
-        self, one: BoardDetections, objects: Floats, pixels: Floats
+        self, one: BoardDetections, objects: Floats, pixels: Floats, side_px: float
     ) -> list[_Solution]:
-        """Return the poses by their reprojection error, the best first."""
+        """Return the poses by their reprojection error, the best first.
+
+        ``side_px`` is the mean side of the detected markers.
+        """
         if self.points == "largest_marker":
-            poses = self._of_marker(one, objects, pixels)
+            ordered = _by_error(self._of_marker(one, objects, pixels), objects, pixels, one.cameras)
         elif self.points == "each_marker":
             poses = poses_of_each_marker(one, objects, pixels)
+            ordered = _by_error(poses, objects, pixels, one.cameras)
         else:
             method = BOARD_METHODS[self.solver]
             solve = guarded_poses if self.guarded else _plain
-            poses = solve(objects, pixels, one.cameras, method)
-        found = [
-            _Solution(rotation, translation, reprojection_px(
-                rotation, translation, objects, pixels, one.cameras
-            ))
-            for rotation, translation in poses
-        ]
-        ordered = sorted((each for each in found if math.isfinite(each.error_px)),
-                         key=lambda each: each.error_px)
+            ordered = _by_error(
+                solve(objects, pixels, one.cameras, method), objects, pixels, one.cameras
+            )
+            if self.guarded and self.solver != "epnp":
+                ordered = _or_others(ordered, one, objects, pixels, CREDIBLE_SHARE * side_px)
         if self.refine != "none" and ordered:
             ordered[0] = self._refined(ordered[0], objects, pixels, one.cameras)
         return ordered[:2]
@@ -255,6 +260,39 @@ def reprojection_px(
         transform_points(objects[None], rotation[None], translation[None])
     )[0]
     return float(np.sqrt(((projected - pixels) ** 2).sum(axis=1).mean()))
+
+
+def _by_error(
+    poses: Sequence[tuple[Floats, Floats]], objects: Floats, pixels: Floats, cameras: Cameras
+) -> list[_Solution]:
+    """Return poses with their reprojection errors, the best first; none that is not finite."""
+    found = [
+        _Solution(*pose, reprojection_px(*pose, objects, pixels, cameras)) for pose in poses
+    ]
+    return sorted((each for each in found if math.isfinite(each.error_px)),
+                  key=lambda each: each.error_px)
+
+
+def _or_others(
+    ordered: list[_Solution], one: BoardDetections, objects: Floats, pixels: Floats,
+    credible_px: float,
+) -> list[_Solution]:
+    """Return solutions, or those of ITERATIVE or IPPE where the best is not credible.
+
+    As for single markers: IPPE is not finite for a fifth of the boards that face the camera
+    exactly, and SQPnP has no solution of boards of a few pixels.
+    """
+    if ordered and ordered[0].error_px <= credible_px:
+        return ordered
+    for method in (cv2.SOLVEPNP_ITERATIVE, cv2.SOLVEPNP_IPPE):
+        others = _by_error(
+            guarded_poses(objects, pixels, one.cameras, method), objects, pixels, one.cameras
+        )
+        if others and not (
+            ordered and ordered[0].error_px <= CREDIBLE_RATIO * others[0].error_px
+        ):
+            ordered = others
+    return ordered
 
 
 def _marker_frame(corners_m: Floats) -> tuple[float, tuple[Floats, Floats]]:

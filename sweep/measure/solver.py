@@ -205,11 +205,11 @@ _UNIT_SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-
 
 _Z_OUT = np.array([1.0, -1.0, -1.0])
 
-_CREDIBLE_SHARE = 0.05
+CREDIBLE_SHARE = 0.05
 """Solutions with a reprojection error below this share of the side are accepted; wrong solutions
 lie far above it. Others are compared with ITERATIVE's."""
 
-_CREDIBLE_RATIO = 2.0
+CREDIBLE_RATIO = 2.0
 """The largest ratio of a solution's reprojection error to that of ITERATIVE."""
 
 _FAR_SHARE = 1 / 800
@@ -254,7 +254,7 @@ def _guarded(
 
     error = errors(np.arange(len(points)), rotation[:, 0], translation[:, 0])
     with np.errstate(invalid="ignore"):
-        doubtful = ~(error <= _CREDIBLE_SHARE * side)
+        doubtful = ~(error <= CREDIBLE_SHARE * side)
     rows = np.flatnonzero(doubtful & known)
     if len(rows):
         for k in range(1, 4):
@@ -271,7 +271,7 @@ def _guarded(
             )
             other = errors(rows, others[0][:, 0], others[1][:, 0])
             with np.errstate(invalid="ignore"):
-                better = ~(error[rows] <= _CREDIBLE_RATIO * other) & np.isfinite(other)
+                better = ~(error[rows] <= CREDIBLE_RATIO * other) & np.isfinite(other)
             chosen = rows[better]
             rotation[chosen], translation[chosen] = others[0][better], others[1][better]
             error[chosen] = other[better]

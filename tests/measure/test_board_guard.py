@@ -1,0 +1,239 @@
+"""Guarded solvers of boards at their edges: right, or flagged; never nonsense, never a warning."""
+
+import itertools
+import warnings
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from support.lengths import lengths
+from sweep.measure.board_solver import BOARD_METHODS, BoardDetections, BoardPoints, BoardSolver
+from sweep.measure.flags import EstimateStatus
+from sweep.model.board_kinds import Charuco, Grid
+from sweep.model.camera import Cameras
+from sweep.model.lens import pack
+from sweep.model.marker_table import BoardMarker, Markers
+from sweep.model.pose import rotation_of_angles
+
+VIEW = np.array([600.0, 600.0, 319.5, 239.5])
+CAMERA = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])
+LENSES = {"none": (), "mild": (-0.3, 0.1, 0.0, 0.0), "folds": (-0.5, 0.0, 0.0, 0.0)}
+NO_CHESSBOARD = np.zeros(0, dtype=np.int64), np.zeros((0, 2))
+
+
+def charuco(size_m):
+    """A ChArUco of 5 x 4 squares whose longer side is ``size_m``."""
+    return Charuco(
+        dictionary="DICT_5X5_100", squares_x=5, squares_y=4, square_m=size_m / 5,
+        marker_m=size_m / 8,
+    ).board()
+
+
+BOARDS = {
+    "charuco": charuco(0.15),
+    "millimetre": charuco(0.001),
+    "kilometre": charuco(1000.0),
+    "one marker": Grid(
+        dictionary="DICT_4X4_50", rows=1, columns=1, marker_m=0.05, gap_m=0.01
+    ).board(),
+    "a thousand": Grid(
+        dictionary="DICT_4X4_1000", rows=25, columns=40, marker_m=0.01, gap_m=0.005
+    ).board(),
+    "folded": Markers(dictionary="DICT_4X4_50", quiet_zone_modules=1.0, markers=tuple(
+        BoardMarker(marker_id=k, x_m=x, y_m=0.0, size_m=0.05, tilt_deg=tilt, azimuth_deg=90.0)
+        for k, (x, tilt) in enumerate([(-0.05, -30.0), (0.05, 30.0)])
+    )).board(),
+}
+
+
+def detections(board, points, lens=()):
+    camera = Cameras(VIEW[None], pack(lens)[None], np.array([bool(lens)]))
+    return BoardDetections(
+        [board], [points], camera, np.zeros(1), np.zeros(1), np.ones(1), [],
+        np.zeros((1, 2), dtype=np.int64),
+    )
+
+
+def settings(board, refines):
+    """Each guarded solver that boards have, for all its points and refinements."""
+    flat = board.is_flat
+    for solver, refine in itertools.product(BOARD_METHODS, refines):
+        if flat or solver != "ippe":
+            yield BoardSolver(solver, "markers", refine, True, 0.25, 0.3)
+            if board.chessboard is not None:
+                yield BoardSolver(solver, "chessboard", refine, True, 0.25, 0.3)
+    for points, solver in (("each_marker", "ippe"), ("largest_marker", "ippe_square"),
+                           ("largest_marker", "ap3p")):
+        yield BoardSolver(solver, points, "none", True, 0.25, 0.3)
+
+
+def judged(solver, asked):
+    """Return the estimate of a single board, after checks of what all estimates must fulfil."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = solver(asked)
+    status, context = found.status[0], str(solver)
+    assert status in (
+        EstimateStatus.solved, EstimateStatus.solver_failed, EstimateStatus.too_few_points
+    ), context
+    rotation, translation = found.rotation[0], found.translation[0]
+    if status != EstimateStatus.solved:
+        assert np.isnan(rotation).all(), context
+        assert np.isnan(translation).all(), context
+        assert np.isnan(found.reprojection_px[0]), context
+        assert np.isnan(found.covariance[0]).all(), context
+        return found
+    # 1e-9: a hundred thousand roundings.
+    assert np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-9, context
+    assert np.linalg.det(rotation) > 0, context
+    assert np.isfinite(translation).all(), context
+    assert np.isfinite(found.reprojection_px[0]), context
+    board, points = asked.boards[0], asked.points[0]
+    used = (board.chessboard_m[points.chessboard] if solver.points == "chessboard"
+            else board.corners_m[points.marker].reshape(-1, 3))
+    depth = (used @ rotation.T + translation)[:, 2]
+    if solver.points == "largest_marker":
+        depth = depth.reshape(-1, 4)[depth.reshape(-1, 4).min(axis=1).argmax()]  # the one used
+    assert depth.min() > 0, context
+    alternative = found.alternative_rotation[0]
+    assert np.isnan(alternative).all() == np.isnan(found.alternative_reprojection_px[0]), context
+    return found
+
+
+def projected(objects, rotation, translation, lens=()):
+    vector = Rotation.from_matrix(rotation).as_rotvec()
+    coefficients = np.array(lens or (0.0,) * 4)
+    return cv2.projectPoints(objects, vector, translation, CAMERA, coefficients)[0].reshape(-1, 2)
+
+
+def sighted(board, rotation, translation, lens=()):
+    """All points of a board as OpenCV projects them."""
+    corners = projected(board.corners_m.reshape(-1, 3), rotation, translation, lens)
+    number = np.arange(len(board.chessboard_m))
+    chessboard = (projected(board.chessboard_m, rotation, translation, lens)
+                  if len(number) else np.zeros((0, 2)))
+    return BoardPoints(np.arange(len(board)), corners.reshape(-1, 4, 2), number, chessboard)
+
+
+SPANS_PX = (1.0, 10.0, 100.0, 600.0, 6e3, 6e5)
+"""How wide a board is that faces the camera: to 1000 times the frame."""
+
+TILTS_DEG = ((0.0, 0.0), (0.0, 60.0), (60.0, 85.0), (85.0, 89.9))
+
+
+@lengths(1, 12)
+@pytest.mark.parametrize("name", [
+    "charuco", *(pytest.param(name, marks=pytest.mark.long) for name in BOARDS if name != "charuco")
+])
+def test_exact_points_give_the_pose_at_any_size_distance_and_tilt(count, name):
+    rng = np.random.default_rng(41)
+    board = BOARDS[name]
+    corners_m = board.corners_m.reshape(-1, 3)
+    extent = float(np.ptp(corners_m, axis=0).max())
+    seen = 0
+    for span_px, tilts, _ in itertools.product(SPANS_PX, TILTS_DEG, range(count)):
+        rotation = rotation_of_angles(
+            np.radians([rng.uniform(*tilts)]), rng.uniform(0, 7, 1), rng.uniform(0, 7, 1)
+        )[0]
+        translation = np.array([0.0, 0.0, extent * 600 / span_px])
+        depth = (corners_m @ rotation.T + translation)[:, 2]
+        if depth.min() < 1e-3 * translation[2]:
+            continue  # behind the camera
+        seen += 1
+        asked = detections(board, sighted(board, rotation, translation))
+        for solver in settings(board, ("none", "lm") if count > 1 else ("none",)):
+            found = judged(solver, asked)
+            if solver.solver == "epnp":
+                continue  # unreliable, and says so
+            context = solver, span_px, tilts
+            assert found.status[0] == EstimateStatus.solved, context
+            error = Rotation.from_matrix(found.rotation[0] @ rotation.T).magnitude()
+            # OpenCV's iterations end at about 0.01 degrees.
+            assert np.degrees(error) < 0.05, context
+    assert seen >= 10 * count
+
+
+@pytest.mark.parametrize("solver", ["ippe", "sqpnp"])
+def test_what_opencv_cannot_solve_is_solved_by_another_method(solver):
+    board = BOARDS["charuco"]
+    unsolved = 0
+    for k, span_px in itertools.product(range(12), (1.0, 100.0)):
+        rotation = rotation_of_angles(np.zeros(1), np.zeros(1), np.array([0.5 * k]))[0]
+        translation = np.array([0.0, 0.0, 0.15 * 600 / span_px])
+        points = sighted(board, rotation, translation)
+        asked = detections(board, points)
+        plain = BoardSolver(solver, "markers", "none", False, 0.25, None)(asked)
+        unsolved += plain.status[0] != EstimateStatus.solved
+        found = judged(BoardSolver(solver, "markers", "none", True, 0.25, None), asked)
+        error = Rotation.from_matrix(found.rotation[0] @ rotation.T).magnitude()
+        assert np.degrees(error) < 0.05
+    assert unsolved > 0
+
+
+def behind(points):
+    """The images of points behind the camera: those of a board that is upside down."""
+    return 2 * VIEW[2:] - points
+
+
+def garbage(board, rng):
+    """Points that no board gave, by kind: markers, their corners, and chessboard corners."""
+    rotation = rotation_of_angles(np.array([0.5]), np.array([1.0]), np.array([2.0]))[0]
+    exact = sighted(board, rotation, np.array([0.0, 0.0, 0.5]))
+    some = len(board)
+    line = rng.uniform(0, 600, 2) + rng.uniform(-1, 1, (some, 4, 1)) * rng.uniform(-300, 300, 2)
+    kinds = {
+        "random": rng.uniform(-200, 800, (some, 4, 2)),
+        "all noise": exact.corners_px + rng.normal(0, 1000, (some, 4, 2)),
+        "collinear": line,
+        "in one row": np.stack([rng.uniform(0, 600, (some, 4)), np.full((some, 4), 9.0)], 2),
+        "identical": np.full((some, 4, 2), rng.uniform(0, 600)),
+        "at the principal point": np.full((some, 4, 2), VIEW[2:]),
+        "tiny": 320 + rng.uniform(-1e-9, 1e-9, (some, 4, 2)),
+        "behind the camera": behind(exact.corners_px),
+        "in the wrong order": exact.corners_px[rng.permutation(some)],
+    }
+    # The detector's corners are float32.
+    for largest in (1e5, 1e20, 3e38):
+        kinds[f"up to {largest:g}"] = rng.uniform(-largest, largest, (some, 4, 2))
+    number = np.arange(len(board.chessboard_m))
+    for kind, corners in kinds.items():
+        chessboard = rng.permutation(corners.reshape(-1, 2))
+        chessboard = np.resize(chessboard, (len(number), 2)) if len(number) else np.zeros((0, 2))
+        yield kind, BoardPoints(np.arange(some), corners, number, chessboard)
+        one = rng.integers(some, size=1)
+        yield f"one marker, {kind}", BoardPoints(one, corners[one], *NO_CHESSBOARD)
+    yield "nothing", BoardPoints(number[:0], np.zeros((0, 4, 2)), *NO_CHESSBOARD)
+    twice = np.zeros(2, dtype=np.int64)
+    yield "an ID twice", BoardPoints(twice, exact.corners_px[:2], *NO_CHESSBOARD)
+
+
+@lengths(1, 40)
+@pytest.mark.parametrize(("name", "lens"), [
+    ("charuco", "none"), pytest.param("folded", "mild", marks=pytest.mark.long),
+    *(pytest.param(name, "folds", marks=pytest.mark.long) for name in BOARDS),
+])
+def test_garbage_is_solved_in_front_of_the_camera_or_not_at_all(count, name, lens):
+    rng = np.random.default_rng(43)
+    board = BOARDS[name]
+    for _ in range(count if len(board) < 100 else 1):
+        for _, points in garbage(board, rng):
+            for solver in settings(board, ("none", "lm", "vvs") if count > 1 else ("lm",)):
+                judged(solver, detections(board, points, LENSES[lens]))
+
+
+def test_one_marker_of_a_thousand_gives_the_boards_pose():
+    board = BOARDS["a thousand"]
+    rotation = rotation_of_angles(np.radians([40.0]), np.ones(1), np.array([0.3]))[0]
+    translation = np.array([0.1, 0.05, 0.5])
+    exact = sighted(board, rotation, translation)
+    one = np.array([617])
+    asked = detections(board, BoardPoints(one, exact.corners_px[one], *NO_CHESSBOARD))
+    for solver in settings(board, ("none",)):
+        if solver.solver == "epnp":
+            continue
+        found = judged(solver, asked)
+        assert found.status[0] == EstimateStatus.solved
+        error = Rotation.from_matrix(found.rotation[0] @ rotation.T).magnitude()
+        assert np.degrees(error) < 0.05

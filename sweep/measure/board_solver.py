@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -120,14 +121,18 @@ def one_by_one(
 
 
 class _Solution(NamedTuple):
-    """A pose (3, 3), (3,) in metres, and its RMS reprojection error; all NaN if there is none."""
+    """A pose (3, 3), (3,) in metres, its reprojection error, and the points (k, 3) that gave it.
+
+    All are NaN if there is none.
+    """
 
     rotation: Floats
     translation: Floats
     error_px: float
+    objects: Floats
 
 
-_NONE = _Solution(np.full((3, 3), np.nan), np.full(3, np.nan), math.nan)
+_NONE = _Solution(np.full((3, 3), np.nan), np.full(3, np.nan), math.nan, np.zeros((0, 3)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,11 +179,11 @@ class BoardSolver:
         best = solutions[0]
         other = next((each for each in solutions[1:] if each.error_px <= limit), _NONE)
         out.status[i], out.point_count[i] = EstimateStatus.solved, len(pixels)
-        out.rotation[i], out.translation[i], out.reprojection_px[i] = best
-        out.alternative_rotation[i], _, out.alternative_reprojection_px[i] = other
+        out.rotation[i], out.translation[i], out.reprojection_px[i], used = best
+        out.alternative_rotation[i], _, out.alternative_reprojection_px[i], _ = other
         if self.corner_noise_px is not None:
             out.covariance[i] = point_covariance(
-                best.rotation, best.translation, objects, one.cameras, self.corner_noise_px
+                best.rotation, best.translation, used, one.cameras, self.corner_noise_px
             )
 
     def _points(self, board: Board, found: BoardPoints) -> tuple[Floats, Floats]:
@@ -202,7 +207,8 @@ class BoardSolver:
             ordered = _by_error(self._of_marker(one, objects, pixels), objects, pixels, one.cameras)
         elif self.points == "each_marker":
             poses = poses_of_each_marker(one, objects, pixels)
-            ordered = _by_error(poses, objects, pixels, one.cameras)
+            used = np.repeat(objects.reshape(-1, 4, 3), 2, axis=0)
+            ordered = _by_error(poses, objects, pixels, one.cameras, used)
         else:
             method = BOARD_METHODS[self.solver]
             solve = guarded_poses if self.guarded else _plain
@@ -245,7 +251,8 @@ class BoardSolver:
             return start
         rotation, translation = rotation_of_vector(r.reshape(1, 3))[0], t.ravel()
         error = reprojection_px(rotation, translation, objects, pixels, cameras)
-        return _Solution(rotation, translation, error) if math.isfinite(error) else start
+        found = _Solution(rotation, translation, error, objects)
+        return found if math.isfinite(error) else start
 
 
 def _lens(cameras: Cameras) -> Floats | None:
@@ -263,11 +270,14 @@ def reprojection_px(
 
 
 def _by_error(
-    poses: Sequence[tuple[Floats, Floats]], objects: Floats, pixels: Floats, cameras: Cameras
+    poses: Sequence[tuple[Floats, Floats]], objects: Floats, pixels: Floats, cameras: Cameras,
+    used: Iterable[Floats] | None = None,
 ) -> list[_Solution]:
-    """Return poses with their reprojection errors, the best first; none that is not finite."""
+    """Return the finite poses, the best first; ``used`` gave each, by default all points."""
+    given = itertools.repeat(objects, len(poses)) if used is None else used
     found = [
-        _Solution(*pose, reprojection_px(*pose, objects, pixels, cameras)) for pose in poses
+        _Solution(*pose, reprojection_px(*pose, objects, pixels, cameras), points)
+        for pose, points in zip(poses, given, strict=True)
     ]
     return sorted((each for each in found if math.isfinite(each.error_px)),
                   key=lambda each: each.error_px)

@@ -1,4 +1,5 @@
-"""Poses of boards by guarded solvers, from noise-free points and from points of one line."""
+"""Poses of boards by guarded solvers, from noise-free points and from points of one line; their
+covariances."""
 
 import cv2
 import numpy as np
@@ -21,7 +22,8 @@ CAMERA = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])
 LENS = (-0.2, 0.05, 0.001, -0.0005)
 
 
-def solved(solver, points, chessboard, rotation, translation, distortion):
+def solved(solver, points, chessboard, rotation, translation, distortion, refine="none",
+           noise_px=None):
     """The estimate from a ChArUco board's exact markers and chessboard corners, as OpenCV
     projects them."""
     packed = pack(distortion)
@@ -38,7 +40,7 @@ def solved(solver, points, chessboard, rotation, translation, distortion):
         [BOARD], [found], Cameras(VIEW[None], packed[None], np.array([bool(distortion)])),
         np.zeros(1), np.zeros(1), np.ones(1), [], np.zeros((1, 2), dtype=np.int64),
     )
-    return BoardSolver(solver, points, "none", True, 0.25, None)(detections)
+    return BoardSolver(solver, points, refine, True, 0.25, noise_px)(detections)
 
 
 @pytest.mark.parametrize("solver", BOARD_METHODS)
@@ -74,3 +76,26 @@ def test_points_of_one_line_are_no_pose(solver):
         )
         wanted = EstimateStatus.too_few_points if len(line) < 4 else EstimateStatus.solver_failed
         assert found.status[0] == wanted
+
+
+@pytest.mark.parametrize("points", ["markers", "chessboard", "largest_marker", "each_marker"])
+@pytest.mark.parametrize("refine", ["none", "lm"])
+def test_covariance_is_that_of_the_points_that_gave_the_pose(points, refine):
+    """By OpenCV's derivatives; the pose of one marker is as uncertain as its four corners make it,
+    unless it is refined on those of all."""
+    rotation = rotation_of_angles(np.radians([30.0]), np.ones(1), np.zeros(1))[0]
+    translation, noise_px = np.array([0.02, -0.01, 0.5]), 0.3
+    number = np.arange(len(BOARD.chessboard_m))
+    found = solved("iterative", points, number, rotation, translation, (), refine, noise_px)
+
+    def deviations(objects):
+        vector = Rotation.from_matrix(rotation).as_rotvec()
+        slopes = cv2.projectPoints(objects, vector, translation, CAMERA, None)[1][:, :6]
+        return noise_px * np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)))[3:]
+
+    together = {"markers": BOARD.corners_m.reshape(-1, 3), "chessboard": BOARD.chessboard_m}
+    if refine == "lm":
+        together["each_marker"] = together["markers"]
+    sets = [together[points]] if points in together else BOARD.corners_m
+    given = np.sqrt(np.diag(found.covariance[0]))[3:]
+    assert any(np.allclose(given, deviations(each), rtol=1e-3) for each in sets)

@@ -49,6 +49,7 @@ def test_every_public_name_exists_and_is_listed():
         sweep.runs  # noqa: B018
 
 
+@pytest.mark.usefixtures("no_child")
 def test_examples_of_the_docstrings_run(tmp_path):
     runner = doctest.DocTestRunner()
     finder = doctest.DocTestFinder(recurse=False)

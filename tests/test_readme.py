@@ -64,6 +64,7 @@ def test_a_close_look_is_that_of_the_run():
     assert windowed.errors["rotation_error_deg"] > 0
 
 
+@pytest.mark.usefixtures("no_child")
 def test_plan_says_what_is_active_and_what_it_takes(capsys):
     smoke = str(TOP / "pipelines" / "smoke.toml")
     assert main(["plan", smoke, "--set", "distortion=[-0.3, 0.1, 0, 0]"]) == 0

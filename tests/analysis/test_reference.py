@@ -198,7 +198,7 @@ def assert_all_agree(answer, groups, names, expected):
         assert_values(here, expected(found), dict(zip(names, index, strict=True)))
 
 
-CASES = pytest.mark.parametrize(("grid", "per"), [
+EVERY = [
     ("all", ()), ("all", ("tilt_deg",)), ("all", ("side_px", "dictionary")),
     ("all", ("noise_grey", "cornerRefinementMethod")), ("all", ("trial",)),
     ("all", ("trial", "marker_id")), ("small", tuple(n for n in ALL if n != "solver")),
@@ -207,7 +207,15 @@ CASES = pytest.mark.parametrize(("grid", "per"), [
     ("no trial", ()), ("no trial", ("cornerRefinementMethod",)),
     ("one trial", ()), ("one trial", ("tilt_deg",)), ("only trial", ()), ("only trial", ("trial",)),
     ("settings first", ()), ("settings first", ("distance_m",)),
+]
+CASES = pytest.mark.parametrize(("grid", "per"), EVERY)
+LAST = [case for case, following in zip(EVERY, [*EVERY[1:], ("", ())], strict=True)
+        if case[0] != following[0]]
+SLOWER_CASES = pytest.mark.parametrize(("grid", "per"), [
+    pytest.param(*case, marks=() if case in LAST else pytest.mark.long) for case in EVERY
 ])
+"""The same, of which by default one of each grid is tried."""
+
 ESTIMATION_CASES = pytest.mark.parametrize(("grid", "per"), [
     ("all", ("solver",)), ("all", ("tilt_deg", "solver", "noise_grey")), ("small", tuple(ALL)),
     ("settings first", ("solver",)), ("settings first", ("cornerRefinementMethod", "solver")),
@@ -236,7 +244,7 @@ def test_flip_rates_of_solvers_are_those_of_plain_loops(grid, per):
     test_flip_rates_are_those_of_plain_loops(grid, per)
 
 
-@CASES
+@SLOWER_CASES
 def test_failures_are_those_of_plain_loops(grid, per):
     results = GRIDS[grid]
     answer = failure_composition(results, per).compute()
@@ -254,7 +262,7 @@ def test_failures_of_solvers_are_those_of_plain_loops(grid, per):
     test_failures_are_those_of_plain_loops(grid, per)
 
 
-@CASES
+@SLOWER_CASES
 def test_errors_are_those_of_plain_loops(grid, per):
     assert_all_agree(error_statistics(GRIDS[grid], per), poses_of(grid, "estimate", per), per,
                      expected_errors)

@@ -174,7 +174,7 @@ def whole(pipeline):
     return Block((0,) * len(shape), shape)
 
 
-@lengths(2, 28)
+@lengths(1, 28)
 @pytest.mark.parametrize("window", ["full", "auto"])
 def test_kernel_gives_what_a_plain_opencv_loop_gives(count, window):
     flags, corners, statuses, poses = plain_loop(count)

@@ -126,7 +126,7 @@ def test_pose_that_a_margin_of_16_px_lost_to_the_apriltag_search_is_found_as_in_
     assert windowed.flags == framed.flags
 
 
-@lengths(250, 10_600)
+@lengths(100, 10_600)
 @pytest.mark.parametrize("refinement", REFINEMENTS)
 def test_window_finds_what_the_frame_of_640_by_480_holds(count, refinement):
     compare(count, 640, 480, refinement)
@@ -173,7 +173,7 @@ OTHER_SETTINGS = [
 ]
 
 
-@lengths(24, 500)
+@lengths(10, 500)
 @pytest.mark.parametrize(
     "given", OTHER_SETTINGS, ids=lambda given: ",".join(f"{k}={v}" for k, v in given.items())
 )
@@ -189,7 +189,7 @@ def test_window_finds_what_the_frame_holds_under_other_settings(count, given):
     assert difference.max(initial=0.0) <= (0.0 if exact else np.spacing(np.float32(640)))
 
 
-@lengths(24, 500)
+@lengths(10, 500)
 @pytest.mark.parametrize("changed", ["quiet_zone_modules=0", "distortion=[-0.3,0.1,0.001,-0.002]"])
 def test_window_finds_what_the_frame_holds_without_quiet_zone_and_through_a_lens(count, changed):
     scenes = visible_scenes(count, settings=[changed])

@@ -102,9 +102,6 @@ def test_worker_whose_machine_is_at_fault_is_used_no_more(
     (line,) = str(raised.value).splitlines()
     assert "machine fault on " in line
     assert "MemoryError" in line
-    two_workers.run(machine_faults.clear, workers=[sound])
-    assert run_on(two_workers, tmp_path / "none.zarr") == 0
-    assert same(tmp_path / "none.zarr", undisturbed)
 
 
 @pytest.mark.long

@@ -34,10 +34,10 @@ def test_child_calls_functions_and_tells_what_they_raise():
     ("function", "arguments", "limit_s", "how"),
     [
         (signal.raise_signal, (signal.SIGSEGV,), 60, "SIGSEGV"),
-        (os.abort, (), 60, "SIGABRT"),
+        pytest.param(os.abort, (), 60, "SIGABRT", marks=pytest.mark.long),
         (signal.raise_signal, (signal.SIGKILL,), 60, "SIGKILL"),
         (os._exit, (3,), 60, "exit status 3"),
-        (time.sleep, (600,), 0.5, "time limit of 0.5 s"),
+        pytest.param(time.sleep, (600,), 0.5, "time limit of 0.5 s", marks=pytest.mark.long),
         # It keeps the interpreter's lock.
         (pow, (3, 10**9), 0.5, "time limit of 0.5 s"),
     ],

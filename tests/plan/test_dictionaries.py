@@ -10,6 +10,7 @@ import tomlkit
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from support.lengths import lengths
 from sweep.errors import PipelineError
 from sweep.plan.alternatives import IN_CAMERA, superseded
 from sweep.plan.axes import TRIAL
@@ -87,13 +88,17 @@ def file_text(document):
     return tomlkit.dumps(written)
 
 
-@settings(max_examples=150, deadline=None)
-@given(documents())
-def test_text_of_a_pipeline_reads_back_to_an_equal_one(document):
-    pipeline = Pipeline.from_dict(document, name="a")
-    assert Pipeline.from_text(pipeline.to_toml(), name="a") == pipeline
-    file = Pipeline.from_text(file_text(document), name="a")
-    assert dataclasses.replace(file, text=pipeline.text) == pipeline
+@lengths(40, 400)
+def test_text_of_a_pipeline_reads_back_to_an_equal_one(count):
+    @settings(max_examples=count, deadline=None)
+    @given(documents())
+    def check(document):
+        pipeline = Pipeline.from_dict(document, name="a")
+        assert Pipeline.from_text(pipeline.to_toml(), name="a") == pipeline
+        file = Pipeline.from_text(file_text(document), name="a")
+        assert dataclasses.replace(file, text=pipeline.text) == pipeline
+
+    check()
 
 
 @pytest.mark.long
@@ -121,25 +126,27 @@ def test_faults_are_those_of_a_file(document, data):
     assert outcomes[0] == outcomes[1]
 
 
-@settings(max_examples=200, deadline=None)
-@given(st.dictionaries(
-    st.text(max_size=5),
-    st.recursive(
+@lengths(50, 500)
+def test_any_document_is_written_as_toml_that_means_the_same(count):
+    values = st.recursive(
         st.one_of(st.booleans(), st.integers(), st.floats(allow_nan=False), st.dates(),
                   st.text(max_size=9)),
         lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner,
                                                                     max_size=3),
         max_leaves=8,
-    ),
-    max_size=4,
-))
-def test_any_document_is_written_as_toml_that_means_the_same(document):
-    try:
-        text = document_text(document)
-        text.encode()
-    except UnicodeEncodeError:
-        return  # a lone surrogate is no UTF-8
-    assert read_document(text) == document
+    )
+
+    @settings(max_examples=count, deadline=None)
+    @given(st.dictionaries(st.text(max_size=5), values, max_size=4))
+    def check(document):
+        try:
+            text = document_text(document)
+            text.encode()
+        except UnicodeEncodeError:
+            return  # a lone surrogate is no UTF-8
+        assert read_document(text) == document
+
+    check()
 
 
 def test_values_of_python_and_numpy_stand_for_those_of_toml(tmp_path):

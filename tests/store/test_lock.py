@@ -64,7 +64,7 @@ def ended_process():
     return ended.pid
 
 
-@lengths(15, 1000)
+@lengths(8, 1000)
 @pytest.mark.parametrize("finds", ["nothing", pytest.param("dead", marks=pytest.mark.long)])
 def test_of_processes_that_race_for_a_lock_exactly_one_holds_it(count, finds, store):
     ran = subprocess.run(

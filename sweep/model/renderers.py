@@ -297,17 +297,31 @@ def _bitmap(
     return bitmap.astype(np.float32), corners
 
 
+MAX_BITMAP_PX = 25_000_000
+"""The most pixels of a board's bitmap, which take 0.5 GB while it is drawn."""
+
+MAX_BITMAP_SIDE = 32_766
+"""The longest side of what ``cv2.warpPerspective`` takes, whose coordinates are 16-bit integers."""
+
+
+def bitmap_shape(board: Board) -> tuple[int, int]:
+    """Return height and width of the bitmap that ``renderer = "warp"`` draws of a board."""
+    left, top, right, bottom = extent_of(board).sheet.tolist()
+    height, width = (WARP_PX_PER_MODULE * each for each in (bottom - top, right - left))
+    return math.ceil(height), math.ceil(width)
+
+
 def _board_bitmap(
     board: Board, black: float, white: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """As :func:`_bitmap`, of a board: pixels on edges have the mean of their area, beside it 0."""
     extent = extent_of(board)
     scale = float(WARP_PX_PER_MODULE)
-    left, top, right, bottom = extent.sheet.tolist()
+    left, top, _, _ = extent.sheet.tolist()
     plane = np.array([
         [scale, 0.0, -left * scale - 0.5], [0.0, scale, -top * scale - 0.5], [0.0, 0.0, 1.0]
     ])
-    width, height = math.ceil((right - left) * scale), math.ceil((bottom - top) * scale)
+    height, width = bitmap_shape(board)
     cover, bitmap = np.zeros((height, width + 2)), np.empty((height, width))
     coverage.accumulate(
         cover, edges_of(board), np.array([0.0, black, white]),

@@ -14,17 +14,21 @@ from sweep.model.board_values import (
     ARRANGING,
     NEEDED,
     SINGLE,
+    arranged_board,
     arrangement_faults,
     is_solid,
     used_by,
 )
 from sweep.model.effects import GEOMETRIC
 from sweep.model.renderer_names import RENDERERS, is_renderer
+from sweep.model.renderers import MAX_BITMAP_PX, MAX_BITMAP_SIDE, bitmap_shape
 from sweep.plan.alternatives import PHOTOGRAPHS
 from sweep.plan.axes import combinations
 from sweep.plan.parameters import PARAMETERS
 from sweep.plan.reader import Reading
 from sweep.plugins.recording import is_recording
+
+WARP = "warp"
 
 MAX_BOARDS = 10_000
 """The most boards of a grid: all are checked before anything is computed."""
@@ -67,6 +71,22 @@ def boards_can_be_printed(reading: Reading) -> None:
                 section = reading.parameters[name.partition("[")[0]].section
                 reading.fault(f"{section}.{name}", value, expected)
         if len(seen) > MAX_FAULTS:
+            return
+    if not seen and WARP in reading.values("renderer"):
+        _bitmaps_fit(reading)
+
+
+def _bitmaps_fit(reading: Reading) -> None:
+    """Demand boards of which ``warp`` can draw bitmaps."""
+    for values in _arrangements(reading):
+        height, width = bitmap_shape(arranged_board(*values))
+        if max(height, width) > MAX_BITMAP_SIDE or height * width > MAX_BITMAP_PX:
+            reading.fault(
+                "scene.renderer", WARP,
+                f"another renderer: warp draws bitmaps of at most {MAX_BITMAP_PX:,} pixels, and a "
+                f"side of {MAX_BITMAP_SIDE:,}; this board and what is beside it would take "
+                f"{width:,} x {height:,}",
+            )
             return
 
 

@@ -129,6 +129,17 @@ def test_all_faults_of_a_table_come_at_once():
     ]
 
 
+@pytest.mark.parametrize(("x_m", "size"), [(30, "36,08. x 80"), (3, None)])
+def test_warp_s_bitmap_of_a_board_has_a_limit(x_m, size):
+    """OpenCV warps no more than 2^15 pixels a side."""
+    text = TEXT + TABLE.replace("0.1", str(x_m))
+    if size is None:
+        Pipeline.from_text(text, ["renderer=warp"])
+    else:
+        with pytest.raises(PipelineError, match=f'"warp": expected another renderer.* {size}$'):
+            Pipeline.from_text(text, ["renderer=warp"])
+
+
 @pytest.mark.parametrize(("setting", "expected"), [
     ("solver='ippe_square'", "others with points = largest_marker"),
     ("points='chessboard'", "kind = charuco or diamond, which have a chessboard"),

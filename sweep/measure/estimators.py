@@ -12,6 +12,7 @@ from sweep.measure.board_solver import BOARD_METHODS, BoardEstimator, BoardSolve
 from sweep.measure.estimation import PoseEstimator
 from sweep.measure.photograph import PhotometricReal
 from sweep.measure.photometric import Photometric
+from sweep.measure.plugged_board import PluggedBoardEstimator
 from sweep.measure.plugged_estimator import PluggedEstimator
 from sweep.measure.recorded_pose import RecordedPose
 from sweep.measure.solver import OPENCV_SOLVERS, CornerSolver, OpenCVSolver
@@ -216,6 +217,8 @@ def build(setting: EstimatorSetting) -> PoseEstimator:
 
 def build_for_boards(setting: EstimatorSetting) -> BoardEstimator:
     """Return the estimator of boards' poses that a setting describes."""
+    if isinstance(setting, PluggedEstimatorSetting):
+        return _kept_plugin(setting)
     if setting.solver == "photometric":
         return BoardPhotometric(setting.refined_starts, setting.estimate_blur)
     return BoardSolver(
@@ -226,7 +229,9 @@ def build_for_boards(setting: EstimatorSetting) -> BoardEstimator:
 
 @lru_cache(maxsize=1024)
 def _kept_plugin(setting: PluggedEstimatorSetting) -> PluggedEstimator:
-    return PluggedEstimator(
-        setting.solver, setting.own.record(), setting.own.instance(), setting.reprojection_limit,
+    record = setting.own.record()
+    kind = PluggedBoardEstimator if record.of_boards else PluggedEstimator
+    return kind(
+        setting.solver, record, setting.own.instance(), setting.reprojection_limit,
         setting.corner_noise_px,
     )

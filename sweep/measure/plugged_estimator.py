@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sweep.errors import PluginError
 from sweep.measure.covariance import corner_covariance
-from sweep.measure.estimation import Detections, Estimates
+from sweep.measure.estimation import Estimates
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.solver import reprojection_errors_px
 from sweep.plugins import EstimatorPlugin, Poses
@@ -22,7 +22,7 @@ ROTATION_ATOL = 1e-6
 
 
 class PluggedEstimator:
-    """One setting of a plug-in's solver in this process.
+    """One setting of a plug-in's solver of single markers in this process.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class PluggedEstimator:
                 f"{name}: make returns a {type(self._solve).__name__}, not a function"
             )
 
-    def __call__(self, detections: Detections) -> Estimates:
+    def __call__(self, detections: Any) -> Estimates:
         """Return the poses that the plug-in finds, those that are credible.
 
         NaN, a corner behind the camera, and a reprojection error above the limit are no solution.
@@ -60,10 +60,10 @@ class PluggedEstimator:
         PluginError
             If the plug-in raises, or returns what cannot be poses; in one line.
         """
-        count = len(detections.corners)
+        count = len(detections.origins)
         if count == 0:
             return Estimates.none(0, EstimateStatus.solver_failed)
-        poses = self._checked(call(self._name, self._solve, _copied(detections)), count)
+        poses = self._checked(call(self._name, self._solve, self._copied(detections)), count)
         rotation, translation = poses.rotation, poses.translation
         reprojection = self._reprojection_px(rotation, translation, detections)
         solved = self._is_credible(reprojection, detections)
@@ -79,9 +79,7 @@ class PluggedEstimator:
             alternative[missing], alternative_px[missing] = np.nan, np.nan
         covariance = poses.covariance
         if covariance is None and self._noise_px is not None:
-            covariance = corner_covariance(
-                rotation, translation, detections.cameras, detections.size_m, self._noise_px
-            )
+            covariance = self._covariance(rotation, translation, detections, self._noise_px)
         if covariance is None:
             covariance = np.full((count, 6, 6), np.nan)
         covariance[~solved] = np.nan
@@ -91,6 +89,7 @@ class PluggedEstimator:
             status=status.astype(np.uint8), rotation=rotation, translation=translation,
             reprojection_px=reprojection, alternative_rotation=alternative,
             alternative_reprojection_px=alternative_px, covariance=covariance,
+            point_count=np.where(solved, self._point_counts(detections), np.nan),
         )
 
     def _checked(self, returned: Any, count: int) -> Poses:
@@ -134,22 +133,32 @@ class PluggedEstimator:
                 f"{self._name}: returned a {name} that is no rotation matrix ({off:.2g} off)"
             )
 
+    def _copied(self, detections: Any) -> Any:
+        """Return a copy: what a plug-in does to it reaches nobody else."""
+        copied = detections.take(np.arange(len(detections.origins)))
+        return dataclasses.replace(copied, images=[np.array(image) for image in copied.images])
+
+    def _point_counts(self, detections: Any) -> Floats:
+        """Return (N,) points of boards; NaN for single markers."""
+        return np.full(len(detections.origins), np.nan)
+
+    def _covariance(
+        self, rotation: Floats, translation: Floats, detections: Any, noise_px: float
+    ) -> Floats:
+        return corner_covariance(
+            rotation, translation, detections.cameras, detections.size_m, noise_px
+        )
+
     def _reprojection_px(
-        self, rotation: Floats, translation: Floats, detections: Detections
+        self, rotation: Floats, translation: Floats, detections: Any
     ) -> Floats:
         with np.errstate(invalid="ignore", over="ignore"):
             return reprojection_errors_px(
                 rotation, translation, detections.size_m, detections.corners, detections.cameras
             )
 
-    def _is_credible(self, reprojection_px: Floats, detections: Detections) -> NDArray[np.bool_]:
+    def _is_credible(self, reprojection_px: Floats, detections: Any) -> NDArray[np.bool_]:
         sides = np.roll(detections.corners, -1, axis=1) - detections.corners
         side_px = np.linalg.norm(sides, axis=2).mean(axis=1)
         with np.errstate(invalid="ignore"):
             return np.asarray(reprojection_px <= self._limit * side_px)
-
-
-def _copied(detections: Detections) -> Detections:
-    """Return a copy: what a plug-in does to it reaches nobody else."""
-    copied = detections.take(np.arange(len(detections.corners)))
-    return dataclasses.replace(copied, images=[np.array(image) for image in copied.images])

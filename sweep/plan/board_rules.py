@@ -119,7 +119,14 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
     """Demand detectors, solvers and renderers that can do boards."""
     kinds = reading.values("kind")
     on_boards = ("points", "refine", "refineDetectedMarkers", "minMarkers")
+    plugged = [each.name for each in reading.plugins if each.of_boards]
     if not _shows_boards(reading):
+        for name in reading.values("solver"):
+            if name in plugged:
+                reading.fault(
+                    "estimator.solver", name, "a solver of single markers, or a board: give kind "
+                    "under [board]",
+                )
         for name in on_boards:
             if name in reading.given:
                 reading.fault(
@@ -148,9 +155,12 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
     for name, all_pixels in (("points", "markers"), ("refine", "none")):
         for chosen, solvers in reading.together(name, "solver"):
             others = [each for each in chosen if each != all_pixels]
-            if others and "photometric" in solvers:
+            own = next((each for each in solvers if each in ("photometric", *plugged)), None)
+            if others and own is not None:
                 reading.fault(
                     f"estimator.{name}", others[0],
+                    f"{all_pixels} beside solver = {own}, which chooses by itself"
+                    if own in plugged else
                     f"{all_pixels} beside solver = photometric, which takes all pixels",
                 )
                 break
@@ -159,14 +169,17 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
         for points, solver in itertools.product(all_points, solvers):
             one = points == "largest_marker"
             known = SOLVERS.get(solver)
-            if known is None or not (known.of_boards or (one and known.corners_alone)):
+            if solver not in plugged and (
+                known is None or not (known.of_boards or (one and known.corners_alone))
+            ):
                 wrong.add(solver)
     for solver in sorted(wrong):
         reading.fault(
             "estimator.solver", solver, "one of "
             f"{', '.join(name for name, each in SOLVERS.items() if each.of_boards)} for boards"
-            + ("" if solver not in SOLVERS else "; others with points = largest_marker"
-               if SOLVERS[solver].corners_alone else ""),
+            + (", or a plug-in with of_boards=True" if solver not in SOLVERS
+               else "; others with points = largest_marker" if SOLVERS[solver].corners_alone
+               else ""),
         )
     if any(map(is_solid, (*reading.values("markers"), *reading.values("distractors")))):
         _several_planes(reading)

@@ -150,11 +150,16 @@ class EstimatorPlugin(Plugin):
         :class:`sweep.measure.estimation.Detections`, N of them, that returns :class:`Poses`.
     needs_images
         Whether it uses the pixels: the detections' images are kept for it.
+    of_boards
+        Whether it estimates boards: the function gets
+        :class:`sweep.measure.board_solver.BoardDetections` in place of single markers, and the
+        poses are the boards'.
     """
 
     kind: ClassVar[str] = "estimator"
     make: Callable[[Any], Callable[[Any], Any]]
     needs_images: bool = False
+    of_boards: bool = False
 
     def __post_init__(self) -> None:
         """Refuse what cannot be called."""

@@ -69,7 +69,7 @@ class DeclaredPlugin:
         Those that a detector knows; empty for all.
     threads
         Threads that it uses.
-    needs_images, random, widens, step
+    needs_images, of_boards, random, widens, step
         As :class:`sweep.plugins.EstimatorPlugin` and :class:`sweep.plugins.EffectPlugin` have them.
     """
 
@@ -83,6 +83,7 @@ class DeclaredPlugin:
     dictionaries: tuple[str, ...] = ()
     threads: int = 1
     needs_images: bool = False
+    of_boards: bool = False
     random: bool = False
     widens: str = "nothing"
     step: str = "light"
@@ -212,7 +213,8 @@ def declare(kind: str, name: str, folder: str) -> DeclaredPlugin:
 
 
 TRAITS: dict[str, type] = {
-    "threads": int, "needs_images": bool, "random": bool, "widens": str, "step": str,
+    "threads": int, "needs_images": bool, "of_boards": bool, "random": bool, "widens": str,
+    "step": str,
 }
 """Fields of records that are known without importing them."""
 

@@ -139,3 +139,60 @@ trial = 32
     # The four corners' errors are opposite to each other; their mean is the centre's error.
     # Drawn from the seed: no chance is in it.
     assert abs(errors.mean(axis=(0, 1))).max() < 0.05
+
+
+BOARD = """
+[marker]
+size_m = 0.03
+[board]
+kind = "grid"
+rows = 3
+columns = 4
+gap_m = 0.01
+[pose]
+distance_m = 0.4
+tilt_deg = 30
+jitter_px = 5
+[axes]
+trial = 3
+"""
+
+
+def test_the_solver_of_boards_is_nearly_as_exact_as_ours():
+    pipeline = pipeline_of(BOARD + 'solver = ["sqpnp", "consensus:SOLVER"]')
+    columns = run_cells(pipeline, [np.arange(3)]).columns
+    ours, own = columns["rotation_error_deg"]
+    assert (columns["estimate"][1] == EstimateStatus.solved).all()
+    assert (columns["point_count"][1] == columns["point_count"][0]).all()
+    assert np.abs(own).max() < 1.0 > np.abs(ours).max()
+
+
+NONSENSE = """
+import numpy as np
+from sweep.plugins import EstimatorPlugin
+
+def near(of):
+    def solve(detections):
+        for each in detections.points:
+            each.corners_px[:] = 0
+        count = len(detections.boards)
+        return np.tile(np.eye(3), (count, 1, 1)), np.full((count, 3), of)
+    return EstimatorPlugin(make=lambda _: solve, of_boards=True)
+
+FAR, BEHIND, NOWHERE = near(1e9), near(-1.0), near(np.nan)
+SHORT = EstimatorPlugin(make=lambda _: lambda __: (np.eye(3), 0), of_boards=True)
+"""
+
+
+def test_what_a_solver_of_boards_returns_is_checked(tmp_path):
+    (tmp_path / "odd.py").write_text(NONSENSE)
+    pipeline = Pipeline.from_text(
+        BOARD + 'solver = ["sqpnp", "odd:FAR", "odd:BEHIND", "odd:NOWHERE", "odd:SHORT"]',
+        folder=tmp_path,
+    )
+    result = run_cells(pipeline, [np.arange(3)])
+    ours, *odd, short = result.columns["estimate"]
+    assert (ours == EstimateStatus.solved).all()
+    assert all((each == EstimateStatus.solver_failed).all() for each in odd)
+    assert (short == EstimateStatus.failed).all()
+    assert "returned a rotation of shape (3, 3); expected (1, 3, 3)" in result.failures[0].text

@@ -105,10 +105,16 @@ def _alternative_angle_deg(results: EstimationResults) -> Floats:
 
 def _board_area_px(boards: BoardScenes) -> Floats:
     """Return the total area (N,) of the squares of a board's markers that are seen, px²."""
-    unseen = boards.flags == DetectionStatus.not_visible
+    on_board = boards.marker_id >= 0
+    unseen = ~on_board | (boards.flags == DetectionStatus.not_visible)
     seen = np.where(unseen[..., None, None], 0.0, boards.corners_px)
     area = np.abs(signed_areas(seen.reshape(-1, 4, 2))).reshape(unseen.shape)
-    return np.where(unseen.all(axis=1), np.nan, np.nansum(area, axis=1))
+    sizes = on_board.sum(axis=1)
+    total = np.full(len(area), np.nan)
+    for size in np.unique(sizes):  # the order of a sum is that of its length: not of other boards'
+        rows = sizes == size
+        total[rows] = np.nansum(area[rows, :size], axis=1)
+    return np.where(unseen.all(axis=1), np.nan, total)
 
 
 def _marker_flags(results: BoardResults) -> NDArray[np.uint8]:

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from support.blocks import run_block
 from support.board_pictures import DICTIONARY, KINDS, NAME, SIZE_M, board_toml, opencv_board
 from support.lengths import first_of
+from sweep.evaluation.cells import run_cells
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
@@ -219,3 +220,34 @@ def test_a_board_of_a_run_is_what_a_plain_opencv_loop_finds(name, window, reques
     print(f"\n{name}, {window}: {len(block)} boards, {compared} markers, {solved} poses")
     assert compared > 2 * trials
     assert solved > 2 * trials
+
+
+def test_results_of_a_board_do_not_depend_on_larger_boards_of_the_grid():
+    shown = """
+[marker]
+dictionary = "DICT_4X4_50"
+size_m = 0.03
+[board]
+kind = "grid"
+columns = 3
+gap_m = 0.01
+[pose]
+distance_m = 0.4
+tilt_deg = 30
+jitter_px = 5
+[estimator]
+solver = "sqpnp"
+[axes]
+trial = 12
+"""
+    small, both = (
+        run_cells(Pipeline.from_text(shown + f"rows = {rows}\nbearing_x_deg = [0, 80]\n"),
+                  [np.tile(np.arange(12), 2), np.zeros(24, dtype=int), np.repeat([0, 1], 12)])
+        for rows in ([2], [2, 3])
+    )
+    area = small.columns["marker_area_px"][0]
+    np.testing.assert_array_equal(both.columns["marker_area_px"][0], area)
+    assert np.isfinite(area[:12]).all()
+    assert np.isnan(area[12:]).all()  # outside the frame
+    for name in ("translation_error_m", "rotation_error_deg", "estimate"):
+        np.testing.assert_array_equal(both.columns[name][0], small.columns[name][0])

@@ -18,6 +18,9 @@ SIZES_BESIDE = ("size_m", "hfov_deg", "focal_length_mm", "fx_px", "width_px")
 
 IDS = "marker_id"
 
+BOARDS = "kind"
+"""The parameter by which boards differ, on an axis of its own or with others."""
+
 
 def conditions(
     results: xr.Dataset, per: Sequence[str] | None, required_per: Sequence[str] = ()
@@ -47,7 +50,8 @@ def conditions(
 def usual_conditions(results: xr.Dataset) -> tuple[str, ...]:
     """Return the axis of the size in the image, or the first other one with numbers, and of angles.
 
-    IDs of markers are no conditions.
+    And that of boards, if there are several: what holds of them together holds of none that someone
+    puts up. IDs of markers are no conditions.
     """
     axes = [name for name in axes_of(results, Stage.scene)
             if name != DRAWS and results.sizes[name] > 1]
@@ -55,4 +59,6 @@ def usual_conditions(results: xr.Dataset) -> tuple[str, ...]:
               and results[name].dtype.kind in "fiu"]
     size = next((name for name in (*SIZE_AXES, *SIZES_BESIDE, *others) if name in axes), None)
     angle = next((name for name in ANGLE_AXES if name in axes), None)
-    return tuple(name for name in (size, angle) if name)
+    boards = next((name for name in axes if BOARDS in results.coords
+                   and results[BOARDS].dims == (name,)), None)
+    return tuple(dict.fromkeys(name for name in (size, angle, boards) if name))

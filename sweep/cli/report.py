@@ -38,7 +38,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--per", action="append", metavar="AXES",
         help="axes whose values are conditions, such as distance_m,tilt_deg; '' pools all "
-        "(default: those of [require], else the axes of size and angle)",
+        "(default: those of [require], else the axes of size, angle and boards)",
     )
     parser.add_argument(
         "--error-model", action="append", default=[], metavar="FILE",

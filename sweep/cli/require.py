@@ -33,7 +33,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         "--per", metavar="AXES",
         help="axes whose values are conditions, at each of which all must hold, such as "
         "distance_m,tilt_deg; others are pooled, with '' all (default: those of [require], else "
-        "the axes of size and angle)",
+        "the axes of size, angle and boards)",
     )
     parser.add_argument(
         "--pipeline", metavar="FILE",

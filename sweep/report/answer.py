@@ -12,6 +12,7 @@ from sweep.analysis.registry import error_headings
 from sweep.errors import DatasetError, StoreError
 from sweep.plan.parameters import Stage
 from sweep.report.ambiguity_sentence import threshold_sentence
+from sweep.report.board_text import board_sentence, board_tables
 from sweep.report.choice import belief_sentence, belief_table, choice_sentence, choice_table
 from sweep.report.configurations import configurations
 from sweep.report.environment_differences import environment_tables
@@ -101,11 +102,13 @@ def answer(data: ReportData) -> Answer:
         found.headline,
         warnings + sentences(found.reasons, choice_sentence(data),
                              belief_sentence(data, best),
-                             threshold_sentence(data, best), _cost(data), _size(data)),
+                             threshold_sentence(data, best), _cost(data), _size(data),
+                             board_sentence(data)),
         known.spoken(best) if known.several else "", tiles,
         (*found.tables, *belief_table(data, best), *size_errors_table(data, best),
          *choice_table(data), *environment_tables(data)),
-        (*found.details, _errors_table(one, known.names[best] if known.several else ""),
+        (*found.details, *board_tables(data),
+         _errors_table(one, known.names[best] if known.several else ""),
          signed_errors_table(data), *error_model_tables(data)),
     )
 

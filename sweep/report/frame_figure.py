@@ -10,6 +10,7 @@ import xarray as xr
 from sweep.analysis import detection_rate
 from sweep.analysis.binning import Bins
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
+from sweep.plan.boards import target_word
 from sweep.plan.parameters import Stage
 from sweep.report.charts import draw_map
 from sweep.report.configurations import settings_of, shown_lines, shown_note
@@ -92,9 +93,9 @@ def _render(data: ReportData) -> RenderedFigure:
     return RenderedFigure(
         "frame", "Detection by place in the frame",
         sentences(
-            "Detection rate by the place of the marker's centre in the frame; a dash: no pose was "
-            "looked for there.", denominators(summary), shown_note(shown, len(names)),
-            data.pooled(),
+            f"Detection rate by the place of the {target_word(data.pipeline)}'s centre in the "
+            "frame; a dash: no pose was looked for there.", denominators(summary),
+            shown_note(shown, len(names)), data.pooled(),
         ),
         table_of(summary if several else summary.isel({CONFIGURATION: 0}),
                  "Detection rate by place, with 95 % intervals", dims, RATES),

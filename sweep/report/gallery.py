@@ -13,10 +13,11 @@ import numpy as np
 
 from sweep.errors import SweepError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene
-from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.measure.flags import DetectionStatus, EstimateStatus, uncounted_values
+from sweep.plan.boards import target_word
 from sweep.plan.cell_selection import cell, coordinates_text, selection_text
 from sweep.plan.experiment import Pipeline
-from sweep.report.formatting import degrees, number
+from sweep.report.formatting import degrees, number, plural
 from sweep.report.report_data import ReportData, store_errors
 from sweep.report.scene_drawing import cut_to_marker, draw_outlines
 from sweep.report.scene_selection import Index, select_scenes
@@ -45,6 +46,8 @@ class Scene:
         Width and height of the picture, px.
     problem
         Why there is no picture, or how it differs from the stored values; empty otherwise.
+    chessboard
+        Whether corners of a chessboard are drawn.
     """
 
     titles: tuple[str, ...]
@@ -55,6 +58,7 @@ class Scene:
     picture: bytes | None
     size: tuple[int, int] = (0, 0)
     problem: str = ""
+    chessboard: bool = False
 
 
 def scenes_of(data: ReportData) -> Iterator[Scene]:
@@ -96,7 +100,9 @@ def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
         scene, result=result, picture=encoded.tobytes(),
         problem=f"Differs from the store: {difference}." if difference else "",
         size=(picture.shape[1], picture.shape[0]),
-        alt=f"Rendered marker with its true outline and the detections: {result}",
+        alt=f"Rendered {target_word(data.pipeline)} with its true outline and the detections: "
+            f"{result}",
+        chessboard=bool(np.isfinite(inspected.chessboard).any()),
     )
 
 
@@ -116,6 +122,11 @@ def _flags_text(detection: DetectionStatus, estimate: EstimateStatus) -> str:
 def _result_text(scene: SceneInspection) -> str:
     """Return the flags and the errors of the pose, in words."""
     parts = [scene.detection.name.replace("_", " "), f"area {number(scene.area_px)} px\u00b2"]
+    if "marker_detection" in scene.values:
+        flags = scene.values["marker_detection"]
+        counted = flags[~np.isin(flags, uncounted_values(DetectionStatus))]
+        found = int((counted == DetectionStatus.detected).sum())
+        parts.insert(1, f"{found} of {plural(len(counted), 'visible marker')}")
     if scene.detection is DetectionStatus.detected and scene.estimate is not EstimateStatus.solved:
         parts.append(scene.estimate.name.replace("_", " "))
     rotation = scene.errors["rotation_error_deg"]

@@ -11,7 +11,7 @@ from sweep.report.answer import Answer
 from sweep.report.figure import RenderedFigure
 from sweep.report.gallery import Scene
 from sweep.report.provenance_facts import Provenance
-from sweep.report.scene_drawing import LEGEND, css_colour
+from sweep.report.scene_drawing import CHESSBOARD_LEGEND, LEGEND, css_colour
 from sweep.report.svg import panel_svg
 from sweep.report.theme import css_variables
 
@@ -24,10 +24,12 @@ def page(
     scenes: Iterable[Scene], require: Sequence[str] = (),
 ) -> str:
     """Return the report as HTML, from the templates beside this module; all text is escaped."""
+    scenes = list(scenes)
+    legend = (*LEGEND, *([CHESSBOARD_LEGEND] if any(scene.chessboard for scene in scenes) else []))
     return _environment().get_template("page.html").render(
         policy=POLICY, title=title, answer=answer, provenance=provenance, figures=figures,
-        scenes=list(scenes), require=require,
-        legend=[(text, css_colour(colour)) for text, colour in LEGEND],
+        scenes=scenes, require=require,
+        legend=[(text, css_colour(colour)) for text, colour in legend],
     )
 
 

@@ -32,6 +32,8 @@ LEGEND: tuple[tuple[str, Colour], ...] = (
 )
 """The meaning of the colours."""
 
+CHESSBOARD_LEGEND = ("corners of the chessboard", CHESSBOARD)
+
 MAX_SIDE = 900
 MIN_SIDE = 560
 LINE_HEIGHT = 26
@@ -197,7 +199,7 @@ def _captioned(canvas: NDArray[np.uint8], scene: SceneInspection, title: str) ->
     if np.isfinite(scene.markers).all(axis=(1, 2)).any():
         legend.append(LEGEND[1])
     if np.isfinite(scene.chessboard).any():
-        legend.append(("corners of the chessboard", CHESSBOARD))
+        legend.append(CHESSBOARD_LEGEND)
     if other_quadrilaterals(scene):
         legend.append(LEGEND[2])
     if scene.rejected:

@@ -9,7 +9,9 @@ import xarray as xr
 
 from sweep.analysis import detection_rate, error_statistics, flip_rate
 from sweep.analysis.binning import Bins
+from sweep.plan.boards import target_word
 from sweep.plan.parameters import Stage
+from sweep.report.board_text import detected_words
 from sweep.report.charts import draw_map
 from sweep.report.configurations import BOTH, settings_of, shown_lines, shown_note
 from sweep.report.curves import WIDE_FROM, curves_of
@@ -79,7 +81,7 @@ def _detection(data: ReportData) -> RenderedFigure:
     return RenderedFigure(
         "detection", f"Detection rate by {_short_name(along)}",
         sentences(
-            f"Share of the poses looked for in which the marker is detected, against its "
+            f"Share of the poses looked for in which {detected_words(data)}, against its "
             f"{long_name(along)}{_by_angle(data)}.",
             interval_sentence(
                 data, curves.summary, "detection_rate", marks="Bands and bars"
@@ -99,9 +101,9 @@ def _errors(data: ReportData) -> RenderedFigure:
     return RenderedFigure(
         "errors", f"Errors of the pose by {_short_name(along)}",
         sentences(
-            f"Error of the estimated pose against the marker's {long_name(along)}"
-            f"{_by_angle(data)}: median and 95 % quantile (p95) of the rotation error and of the "
-            "range error (depth, relative to the true depth).",
+            f"Error of the estimated pose against the {target_word(data.pipeline)}'s "
+            f"{long_name(along)}{_by_angle(data)}: median and 95 % quantile (p95) of "
+            "the rotation error and of the range error (depth, relative to the true depth).",
             FLOOR_NOTE if any(below_floor(curves.summary[each.variable].values)
                               for each in ERROR_CURVES) else "",
             interval_sentence(data, curves.summary, "rotation_median_deg", "range_p95_percent",
@@ -135,8 +137,8 @@ def _signed(data: ReportData) -> RenderedFigure:
         sentences(
             f"Mean error of the solved poses that are not flipped, estimated minus true, against "
             f"the {long_name(along)}: the range in percent of the true depth; x (right), y (down) "
-            "and z (forward) of the marker's position in the camera's frame; yaw. The table also "
-            "has the standard deviations, and pitch and roll.",
+            f"and z (forward) of the {target_word(data.pipeline)}'s position in the camera's "
+            "frame; yaw. The table also has the standard deviations, and pitch and roll.",
             interval_sentence(
                 data, curves.summary, "z_bias_m", "yaw_bias_deg", marks="Bars and bands"
             ),

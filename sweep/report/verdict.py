@@ -12,6 +12,7 @@ import xarray as xr
 from sweep.analysis import detection_rate
 from sweep.analysis.requirements import Decision, check_requirements
 from sweep.plan.axes import TRIAL
+from sweep.plan.boards import target_word
 from sweep.plan.parameters import Stage
 from sweep.report.configurations import (
     Settings,
@@ -96,7 +97,8 @@ def _required(data: ReportData, course: Course) -> Verdict:
     others = [known.spoken(k) for k in order[1:]
               if not known.wrong[k] and _same(reach.limits[k], limits)]
     if not limit.judged:
-        headline = "There is nothing to judge: the marker was looked for in no pose."
+        headline = (f"There is nothing to judge: the {target_word(data.pipeline)} was looked "
+                    "for in no pose.")
     elif limit.rank >= 0 and reach.decided(limit):
         headline = f"Yes {reached}{together}{whose}."
     elif limit.rank >= 0:
@@ -247,7 +249,8 @@ def _how_far(data: ReportData) -> Verdict:
     several = len(names) > 1
     if not np.nan_to_num(rates["looked_for"].values).sum():
         return Verdict(
-            "The marker was looked for in no pose: it was visible and modelled in none.")
+            f"The {target_word(data.pipeline)} was looked for in no pose: it was visible and "
+            "modelled in none.")
     if course.along is None:
         return _how_often(settings, names, rates, most_exact_first(data, settings))
     wrong = [False] * len(names)

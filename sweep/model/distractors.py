@@ -27,8 +27,7 @@ from sweep.model.marker import (
     module_count,
 )
 from sweep.model.marker_table import BoardMarker
-from sweep.model.solid_board import own_sheets, sheet_corners, sheets_of
-from sweep.typing import Floats
+from sweep.model.solid_board import own_sheets, sheets_m, sheets_of
 
 _DICTIONARY = Marker.__dataclass_fields__["dictionary"].metadata["declaration"]
 
@@ -112,7 +111,7 @@ def listing_faults(
 def overlap_faults(board: Board, listed: Sequence[Sequence[Any]]) -> list[Fault]:
     """Return the first overlap of a distractor with its board, or with another distractor."""
     sheets = sheets_of(board)
-    corners = np.array([_corners_m(each) for each in sheets])
+    corners = sheets_m(board)
     own = own_sheets(board)
     for number in range(len(sheets) - own):
         before = corners[: own + number]
@@ -125,8 +124,3 @@ def overlap_faults(board: Board, listed: Sequence[Sequence[Any]]) -> list[Fault]
                 f"no overlap with {name}, white quiet zones included; move it",
             )]
     return []
-
-
-def _corners_m(each: Print) -> Floats:
-    """Return the corners (4, 3) of a print's sheet in the board's frame."""
-    return np.asarray(sheet_corners(each) @ each.plane(np.eye(3), np.zeros(3)).T)

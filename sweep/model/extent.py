@@ -20,7 +20,7 @@ from sweep.model.printed import extent_of
 from sweep.model.scene import Box, Scenes
 from sweep.model.scene_sheet import curved_rows, scene_sheet, sheet_folds, sheet_outline_px
 from sweep.model.sheet import bent_point
-from sweep.model.solid_scene import board_faces, facing_sheets, sheet_outlines_px
+from sweep.model.solid_scene import board_faces, extent_in_frame, facing_sheets, sheet_outlines_px
 from sweep.typing import Floats, Masks
 
 WARP_PX_PER_MODULE = 10
@@ -70,7 +70,8 @@ less than 1/1000 of the side's bulge, well inside the 2 px that :func:`marker_bo
 def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
     """Return the boxes (N, 4) left, top, right, bottom (half-open) of pixels a marker may touch.
 
-    Clipped at the frame; empty (all zero) if no part of the marker is in it.
+    Clipped at the frame; empty (all zero) if no part of the marker is in it. Of a board on several
+    sheets those count that the frame sees.
     """
     low, high = scenes.outline_px.min(axis=1), scenes.outline_px.max(axis=1)
     bulging = scenes.cameras.distorted & np.isfinite(low).all(axis=1)
@@ -87,9 +88,14 @@ def marker_boxes(scenes: Scenes) -> NDArray[np.int64]:
     warp_rows = np.flatnonzero([name == "warp" for name in scenes.renderer])
     if len(warp_rows):
         low[warp_rows], high[warp_rows] = _warp_extent(scenes, warp_rows)
+    limit = scenes.frame.astype(np.float64)
+    for row in np.flatnonzero(((low < 0) | (high > limit - 1)).any(axis=1)).tolist():
+        affected = scenes.affected[row]
+        reach_px = REACH_PX + REACH * _largest_spread_px(scenes, row) if affected else 0.0
+        extent = low[row], high[row], reach_px
+        low[row], high[row] = extent_in_frame(scenes, row, *extent, CHORDS_PER_SIDE)
     for row in np.flatnonzero(scenes.affected & np.isfinite(low).all(axis=1)).tolist():
         low[row], high[row] = _exposed_extent(scenes, row, low[row], high[row])
-    limit = scenes.frame.astype(np.float64)
     if scenes.effects is not None:
         reach = np.where(scenes.effects["bayer"] > 0, REACH_PX, 0.0)[:, None]
         low, high = low - reach, high + reach
@@ -335,8 +341,12 @@ def outside_of_frame(scenes: Scenes, row: int, corners_m: Floats, corners_px: Fl
     ``corners_m`` (M, 4, 3) are their corners on the board, ``corners_px`` (M, 4, 2) the images.
     """
     limit = scenes.frame[row] - 0.5
+    low, high = corners_px < -0.5, corners_px > limit
+    cut = (low | high).any(axis=(1, 2))
     outside = np.zeros(len(corners_m), dtype=bool)
-    cut = ((corners_px < -0.5) | (corners_px > limit)).any(axis=(1, 2))
+    if not scenes.cameras.distorted[row]:
+        outside = (low.all(axis=1) | high.all(axis=1)).any(axis=1)
+        cut &= ~outside
     t = np.arange(CHORDS_PER_SIDE)[:, None, None] / CHORDS_PER_SIDE
     camera = scenes.cameras.take(np.array([row]))
     for i in np.flatnonzero(cut):

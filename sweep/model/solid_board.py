@@ -71,11 +71,25 @@ def sheet_corners(each: Print) -> Floats:
                      [left, bottom, 1.0]])
 
 
+@lru_cache(maxsize=64)
+def _corners(board: Board) -> tuple[Floats, ...]:
+    """Return the corners (4, 3) of each of a board's sheets."""
+    return tuple(sheet_corners(each) for each in sheets_of(board))
+
+
+@lru_cache(maxsize=64)
+def sheets_m(board: Board) -> Floats:
+    """Return the corners (P, 4, 3) of all sheets in the board's frame."""
+    return np.array([
+        corners @ each.plane(np.eye(3), np.zeros(3)).T
+        for corners, each in zip(_corners(board), sheets_of(board), strict=True)
+    ])
+
+
 def outlines(board: Board, planes: Floats) -> Floats:
     """Return the corners (P, 4, 3) of all sheets in the camera frame."""
     return np.array([
-        sheet_corners(each) @ plane.T
-        for each, plane in zip(sheets_of(board), planes, strict=True)
+        corners @ plane.T for corners, plane in zip(_corners(board), planes, strict=True)
     ])
 
 
@@ -93,15 +107,15 @@ def facing(planes: Floats) -> Masks:
 
 def _faces(board: Board, planes: Floats) -> list[_Face]:
     """Return the sheets that face the camera."""
-    faces = []
-    corners = outlines(board, planes)
-    for k in np.flatnonzero(facing(planes)).tolist():
-        around = corners[k]
-        normals = np.cross(around, np.roll(around, -1, axis=0))
-        normals /= np.linalg.norm(normals, axis=1)[:, None]
-        normals *= np.sign(normals @ around.mean(axis=0))[:, None]
-        faces.append(_Face(k, planes[k], around, normals))
-    return faces
+    numbers = np.flatnonzero(facing(planes))
+    around = outlines(board, planes)[numbers]
+    normals = np.cross(around, np.roll(around, -1, axis=1))
+    normals /= np.linalg.norm(normals, axis=2)[..., None]
+    normals *= np.sign(np.einsum("pkj,pj->pk", normals, around.mean(axis=1)))[..., None]
+    return [
+        _Face(k, planes[k], each, inwards)
+        for k, each, inwards in zip(numbers.tolist(), around, normals, strict=True)
+    ]
 
 
 def _common(one: _Face, other: _Face) -> Floats:
@@ -133,9 +147,21 @@ def _hides(front: _Face, behind: _Face) -> bool:
 
 def _occluders(faces: list[_Face]) -> list[list[_Face]]:
     """Return for each sheet those that hide a part of it."""
+    if not faces:
+        return []
+    corners = np.array([face.corners for face in faces])
+    before: Masks = np.asarray((corners[..., 2] > 0).all(axis=1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        flat = corners[..., :2] / corners[..., 2:]
+    low, high = (np.where(before[:, None], end, sign * np.inf) for end, sign in (
+        (flat.min(axis=1), -1), (flat.max(axis=1), 1)
+    ))
+    # Without this, sheets that lie far from each other in the image cost most of the time.
+    near: Masks = np.asarray(((low[:, None] <= high) & (high[:, None] >= low)).all(axis=2))
+    np.fill_diagonal(near, val=False)
     return [
-        [front for front in faces if front is not behind and _hides(front, behind)]
-        for behind in faces
+        [faces[k] for k in np.flatnonzero(near[i]).tolist() if _hides(faces[k], behind)]
+        for i, behind in enumerate(faces)
     ]
 
 

@@ -322,3 +322,26 @@ def test_a_warped_board_has_the_levels_of_its_exact_image(case, tmp_path):
         # Interpolation takes a point of each pixel, not its mean: right on average alone.
         assert abs((exact - warped).mean()) < 2
         assert np.abs(cv2.blur(exact - warped, (7, 7))).max() < 45
+
+
+TABLE = """
+[[board.markers]]
+marker_id = {number}
+x_m = {x}
+y_m = 0.0
+z_m = {z}
+"""
+
+
+@pytest.mark.parametrize("settings", [[], ["blur_px=0.8", "bayer=RGGB"], ["tilt_deg=60"]])
+@pytest.mark.parametrize("z", [0.0, 0.004])
+def test_markers_outside_the_frame_widen_no_window(settings, z):
+    """The image is that of the frame's marker alone, and so is the box, up to 3 px."""
+    alone = TEXT + '[board]\nkind = "markers"\n' + TABLE.format(number=0, x=0.0, z=0.0)
+    many = alone + "".join(
+        TABLE.format(number=k, x=x, z=z) for k, x in enumerate((-3.6, -0.4, 0.4, 0.8, 3.2), 1)
+    )
+    one, several = (marker_boxes(scenes_of(settings, each))[0] for each in (alone, many))
+    assert np.abs(one - several).max() <= 3
+    assert one[2] - one[0] < 0.7 * SIZE[0]
+    np.testing.assert_array_equal(image_of(settings, text=alone), image_of(settings, text=many))

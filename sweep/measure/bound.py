@@ -40,6 +40,7 @@ from sweep.model.beside import beside_pixels
 from sweep.model.board import Board
 from sweep.model.derivatives import POSE, work_space
 from sweep.model.effects import IN_BOUND, NEUTRAL
+from sweep.model.printed import side_m
 from sweep.model.projection import Projection
 from sweep.model.scene import Scenes
 from sweep.typing import Floats
@@ -198,7 +199,8 @@ def bounds(
             continue
         key = scenes.markers[scenes.marker[row]]
         view = marker_view(
-            key, scenes.size_m[row], scenes.cameras.optics(row), low[i], noise_variance(noise)
+            key, side_m(key, float(scenes.size_m[row])), scenes.cameras.optics(row), low[i],
+            noise_variance(noise),
         )
         arm = scenes.rotation[row] @ middle_m(key) if isinstance(key, Board) else np.zeros(3)
         state = state_of(scenes.rotation[row], scenes.translation[row] + arm, blur, levels)

@@ -97,6 +97,14 @@ def unit_m(board: Board) -> float:
     return side / module_count(board.dictionary)
 
 
+def side_m(key: PrintKey, size_m: float) -> float:
+    """Return the side of a print's first marker in metres: ``size_m`` unless it has its own."""
+    if not isinstance(key, Board):
+        return size_m
+    side = unit_m(key) * module_count(key.dictionary)
+    return size_m if math.isclose(side, size_m, rel_tol=1e-9) else side
+
+
 @lru_cache(maxsize=64)
 def target_edges(board: Board) -> MarkerEdges:
     """Return the edges of a board, without what stands beside it, in units."""

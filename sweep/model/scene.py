@@ -20,7 +20,7 @@ from sweep.model.effects import CODED, NEUTRAL, PLAIN, VELOCITIES
 from sweep.model.marker import marker_corners, overhang
 from sweep.model.plugged_scene import NO_PLUGINS, ScenePlugins
 from sweep.model.pose import rotation_of_angles, transform_points
-from sweep.model.printed import PrintKey, box_corners, extent_of
+from sweep.model.printed import PrintKey, box_corners, extent_of, side_m
 from sweep.model.projection import Projection
 from sweep.model.renderer_names import renderer_name
 from sweep.model.solid_board import boxes_px
@@ -90,7 +90,7 @@ class Scenes:
     sheet, ink, origin
         (N, 4) and (N, 2) in modules, as :class:`sweep.model.printed.Extent` has them.
     size_m
-        (N,) side of the black square; of a board, of its first marker's.
+        (N,) side of the black square; of a board, of markers without a side of their own.
     rotation, translation
         (N, 3, 3) and (N, 3): the true pose, metres, camera frame.
     plane
@@ -278,13 +278,13 @@ def build_scenes(
     # A quiet zone on a background of its own level is invisible, unless a sheet hides a part of
     # it: it is not modelled.
     keys: list[PrintKey] = mapped(
-        lambda board, dictionary, marker_id, width, white, background, occlusion: (
-            (dictionary, int(marker_id),
+        lambda board, dictionary, marker_id, size_m, width, white, background, occlusion: (
+            (dictionary, int(marker_id) if board is None else board.marker_ids[0],
              overhang(dictionary)
              + (0.0 if background == white and occlusion == 0 else float(width)))
-            if board is None or board.is_single else board
+            if board is None or (board.is_single and side_m(board, size_m) == size_m) else board
         ),
-        "board", "dictionary", "marker_id", "quiet_zone_modules", "white", "background",
+        "board", "dictionary", "marker_id", "size_m", "quiet_zone_modules", "white", "background",
         "occlusion",
     )
     markers, marker = distinct(keys)
@@ -295,7 +295,12 @@ def build_scenes(
         np.array([getattr(each, name) for each in extents])[marker]
         for name in ("sheet", "ink", "origin")
     )
-    printed = size * numbers("marker_scale")
+    # The first marker of a board may have a side of its own.
+    side = np.array([
+        side_m(markers[number], each)
+        for number, each in zip(marker.tolist(), size.tolist(), strict=True)
+    ]) if any(isinstance(key, Board) for key in markers) else size
+    printed = side * numbers("marker_scale")
     half, module = printed / 2, printed / modules
     on_board = np.array([isinstance(key, Board) for key in markers])[marker]
     half[on_board] = margin[on_board] = 0.0
@@ -307,14 +312,14 @@ def build_scenes(
     )
     square_m = marker_corners(size)
     around_m = marker_corners(printed * (1 + 2 * margin / modules))
-    square_m[on_board] = box_corners(ink[on_board]) * (size / modules)[on_board, None, None]
+    square_m[on_board] = box_corners(ink[on_board]) * (side / modules)[on_board, None, None]
     around_m[on_board] = box_corners(sheet[on_board]) * module[on_board, None, None]
     outline_m = transform_points(around_m, rotation, translation)
     corners_px = cameras.project(transform_points(square_m, rotation, translation))
     outline_px = cameras.project(outline_m)
     solid = np.array([isinstance(key, Board) and not key.is_flat for key in markers])[marker]
     for row in np.flatnonzero(solid).tolist():
-        camera, scale = cameras.take(np.array([row])), float(printed[row] / size[row])
+        camera, scale = cameras.take(np.array([row])), float(printed[row] / side[row])
         corners_px[row], outline_px[row] = boxes_px(
             markers[marker[row]], camera, rotation[row], translation[row], scale
         )

@@ -98,16 +98,17 @@ def own_sheets(board: Board) -> int:
     return len(sheets_of(board)) - len(board.distractors)
 
 
-def facing(planes: Floats) -> Masks:
-    """Return (P,) which planes show their printed side to the camera."""
+def facing(board: Board, planes: Floats) -> Masks:
+    """Return (P,) which sheets show their printed side to the camera, and are not behind it."""
     # Columns run right and rows down, so that their cross product points away from the viewer.
     away = np.cross(planes[:, :, 0], planes[:, :, 1])
-    return np.asarray(np.einsum("pi,pi->p", away, planes[:, :, 2]) > 0)
+    shown = np.einsum("pi,pi->p", away, planes[:, :, 2]) > 0
+    return np.asarray(shown & (outlines(board, planes)[..., 2] > 0).any(axis=1))
 
 
 def _faces(board: Board, planes: Floats) -> list[_Face]:
     """Return the sheets that face the camera."""
-    numbers = np.flatnonzero(facing(planes))
+    numbers = np.flatnonzero(facing(board, planes))
     around = outlines(board, planes)[numbers]
     normals = np.cross(around, np.roll(around, -1, axis=1))
     normals /= np.linalg.norm(normals, axis=2)[..., None]
@@ -299,7 +300,7 @@ def boxes_px(
     planes = sheet_planes(board, rotation, translation, scale)
     boxes = []
     for count in (own_sheets(board), len(planes)):
-        seen, corners = facing(planes[:count]), outlines(board, planes)[:count]
+        seen, corners = facing(board, planes)[:count], outlines(board, planes)[:count]
         corners = corners[seen if seen.any() else slice(None)]
         pixels = camera.project(np.ascontiguousarray(corners.reshape(1, -1, 3)))[0]
         low, high = pixels.min(axis=0), pixels.max(axis=0)

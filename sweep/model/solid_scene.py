@@ -59,14 +59,14 @@ def accumulate_solid(
 
 def facing_sheets(scenes: Scenes, row: int) -> Floats:
     """Return the corners (P, 4, 3) in the camera frame of the sheets that face the camera."""
-    planes = solid_planes(scenes, row)
-    return np.ascontiguousarray(outlines(solid_board(scenes, row), planes)[facing(planes)])
+    board, planes = solid_board(scenes, row), solid_planes(scenes, row)
+    return np.ascontiguousarray(outlines(board, planes)[facing(board, planes)])
 
 
 def board_faces(scenes: Scenes, row: int) -> bool:
-    """Return whether a sheet of one scene's board faces the camera, be it before it or not."""
-    seen = facing(solid_planes(scenes, row))
-    return bool(seen[: own_sheets(solid_board(scenes, row))].any())
+    """Return whether a sheet of one scene's board faces the camera, and is not behind it."""
+    board = solid_board(scenes, row)
+    return bool(facing(board, solid_planes(scenes, row))[: own_sheets(board)].any())
 
 
 def sheet_outlines_px(scenes: Scenes, row: int, per_side: int) -> Floats:

@@ -171,6 +171,27 @@ def test_a_cube_gives_its_pose(solver):
     assert np.linalg.norm(found.columns["translation_error_m"][0]) < 0.008
 
 
+def test_markers_around_the_camera_leave_the_image_of_those_before_it():
+    """Two walls and the wall behind: rays meet the marker ahead alone."""
+    ahead = [marker(1, 0, 0, 0)]
+    around = [
+        *ahead,
+        marker(2, 0.6, 0, 1, tilt=90, azimuth=270), marker(3, -0.6, 0, 1, tilt=90, azimuth=90),
+        marker(4, 0, 0, 2, tilt=180),
+    ]
+    scenes = scenes_of(pipeline(around))
+    assert visibility_flags(scenes).tolist() == [DetectionStatus.not_run]
+    alone = scenes_of(pipeline([marker(1, 0, 0, 0)]))
+    np.testing.assert_allclose(image_of(scenes), image_of(alone), atol=1e-9)
+    assert np.abs(image_of(scenes) - rays_of(ahead, scenes, 5)).mean() < 0.1
+    result = run_cells(pipeline(around), [])
+    assert result.columns["marker_detection"][0].tolist() == [
+        [DetectionStatus.detected, *[DetectionStatus.not_visible] * 3]
+    ]
+    behind = visibility_flags(scenes_of(pipeline(around[-1:])))
+    assert behind.tolist() == [DetectionStatus.not_visible]
+
+
 def test_a_marker_alone_in_another_plane_is_a_marker_at_its_pose():
     single = Pipeline.from_dict({
         "camera": {"width_px": 160, "height_px": 120, "fx_px": 150, "fy_px": 150},

@@ -138,10 +138,10 @@ def test_an_id_of_the_board_elsewhere_is_no_detection_of_its_marker():
 @pytest.mark.parametrize(("beside", "tilt", "expected"), [
     ([], 60.0, DetectionStatus.not_run),
     ([{"marker_id": 1, "x_m": 0.0, "y_m": 0.45}], 60.0, DetectionStatus.not_modelled),
-    ([{"marker_id": 1, "x_m": 0.0, "y_m": 0.45, "z_m": 0.02}], 60.0, DetectionStatus.not_modelled),
+    ([{"marker_id": 1, "x_m": 0.0, "y_m": 0.45, "z_m": 0.02}], 60.0, DetectionStatus.not_run),
     ([{"marker_id": 1, "x_m": 0.0, "y_m": 0.45}], 120.0, DetectionStatus.not_visible),
 ])
-def test_what_comes_behind_the_camera_beside_a_target_is_not_modelled(beside, tilt, expected):
+def test_what_comes_behind_the_camera_is_not_modelled_in_the_board_s_plane(beside, tilt, expected):
     chosen = pipeline({**GRID, "distractors": beside}, pose={"tilt_deg": tilt})
     scenes, values = shown(chosen)
     flags = visibility_flags(scenes)

@@ -105,6 +105,14 @@ def side_m(key: PrintKey, size_m: float) -> float:
     return size_m if math.isclose(side, size_m, rel_tol=1e-9) else side
 
 
+def sides_m(keys: Sequence[PrintKey], number: NDArray[np.intp], size_m: Floats) -> Floats:
+    """Return :func:`side_m` of N prints, ``keys[number]`` with sizes (N,)."""
+    if not any(isinstance(key, Board) for key in keys):
+        return size_m
+    each = zip(number.tolist(), size_m.tolist(), strict=True)
+    return np.array([side_m(keys[k], size) for k, size in each])
+
+
 @lru_cache(maxsize=64)
 def target_edges(board: Board) -> MarkerEdges:
     """Return the edges of a board, without what stands beside it, in units."""

@@ -20,7 +20,7 @@ from sweep.model.effects import CODED, NEUTRAL, PLAIN, VELOCITIES
 from sweep.model.marker import marker_corners, overhang
 from sweep.model.plugged_scene import NO_PLUGINS, ScenePlugins
 from sweep.model.pose import rotation_of_angles, transform_points
-from sweep.model.printed import PrintKey, box_corners, extent_of, side_m
+from sweep.model.printed import PrintKey, box_corners, extent_of, side_m, sides_m
 from sweep.model.projection import Projection
 from sweep.model.renderer_names import renderer_name
 from sweep.model.solid_board import boxes_px
@@ -291,15 +291,9 @@ def build_scenes(
     extents = [extent_of(key) for key in markers]
     modules = np.array([each.modules for each in extents])[marker]
     margin = np.array([-each.sheet[0] for each in extents])[marker]
-    sheet, ink, origin = (
-        np.array([getattr(each, name) for each in extents])[marker]
-        for name in ("sheet", "ink", "origin")
-    )
-    # The first marker of a board may have a side of its own.
-    side = np.array([
-        side_m(markers[number], each)
-        for number, each in zip(marker.tolist(), size.tolist(), strict=True)
-    ]) if any(isinstance(key, Board) for key in markers) else size
+    sheet, ink, origin = (np.array([getattr(each, name) for each in extents])[marker]
+                          for name in ("sheet", "ink", "origin"))
+    side = sides_m(markers, marker, size)
     printed = side * numbers("marker_scale")
     half, module = printed / 2, printed / modules
     on_board = np.array([isinstance(key, Board) for key in markers])[marker]

@@ -21,6 +21,8 @@ METHODS = {
     "iterative": cv2.SOLVEPNP_ITERATIVE, "sqpnp": cv2.SOLVEPNP_SQPNP, "ippe": cv2.SOLVEPNP_IPPE,
     "epnp": cv2.SOLVEPNP_EPNP,
 }
+ITERATIONS = {"full": 1, "auto": 30}
+"""Of the refinement of corners, for each window. Unfinished, it depends on the window."""
 DETECTED, NOT_VISIBLE = 1, 5
 SOLVED, SOLVER_FAILED, TOO_FEW = 1, 3, "too_few_points"
 
@@ -53,7 +55,7 @@ background = 100
 noise_grey = 3
 blur_px = 0.5
 [detector]
-cornerRefinementMaxIterations = 1
+cornerRefinementMaxIterations = {ITERATIONS[window]}
 [estimator]
 guarded = false
 [axes]
@@ -66,10 +68,10 @@ points = {points}
 """
 
 
-def board_detector(board, refinement):
+def board_detector(board, refinement, iterations):
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = refinement
-    parameters.cornerRefinementMaxIterations = 1  # of the chessboard's corners, too
+    parameters.cornerRefinementMaxIterations = iterations  # of the chessboard's corners, too
     detector = cv2.aruco.ArucoDetector(DICTIONARY, parameters)
     if not isinstance(board, cv2.aruco.CharucoBoard):
         return detector, None
@@ -142,7 +144,7 @@ def test_a_board_of_a_run_is_what_a_plain_opencv_loop_finds(name, window, reques
         for k, refinement in enumerate((0, 1)):
             if window == "auto" and refinement:
                 continue  # refined corners depend on the window: tests/evaluation/test_window.py
-            detector, charuco = board_detector(board, refinement)
+            detector, charuco = board_detector(board, refinement, ITERATIONS[window])
             corners, ids, _ = detector.detectMarkers(image)
             listed = [] if ids is None else ids.ravel().tolist()
             flags = got["marker_detection"][row, k]

@@ -76,6 +76,7 @@ def id_faults(
         faults.append(Fault(
             key, written,
             f"IDs from 0 to {count - 1}, which is what {dictionary} has; the board has "
-            f"{len(ids)} markers with IDs up to {max(ids)}",
+            f"{len(ids)} markers with IDs up to {max(ids)}; take a larger dictionary, or fewer "
+            "markers",
         ))
     return faults

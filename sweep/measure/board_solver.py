@@ -1,4 +1,7 @@
-"""The pose of a board from its points: OpenCV's solvers, guarded or as plain calls."""
+"""The pose of a board from its points: OpenCV's solvers, guarded or as plain calls.
+
+Above 400 lines: the guard shares the calls that it guards.
+"""
 
 from __future__ import annotations
 
@@ -387,7 +390,16 @@ def guarded_poses(
         return []
     unit = (objects - middle) / size @ _Z_IN
     if np.linalg.svd(unit[:, :2], compute_uv=False)[1] < COLLINEAR:
-        return []
+        _, extents, axes = np.linalg.svd(unit @ _Z_IN, full_matrices=False)
+        if extents[1] < COLLINEAR:
+            return []
+        # In a plane across the board's, such as one face of a cube: solved in their own.
+        axes *= np.sign(np.linalg.det(axes))
+        own = guarded_poses((objects - middle) @ axes.T, pixels, cameras, method)
+        return [
+            (turned, position - turned @ middle)
+            for turned, position in ((rotation @ axes, position) for rotation, position in own)
+        ]
     planar = np.column_stack([unit[:, :2], np.ones(len(unit))])
     (right, _, _), *_ = np.linalg.lstsq(planar, flat, rcond=None)
     turn = round(math.atan2(right[1], right[0]) / (math.pi / 2)) % 4

@@ -7,12 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.lengths import lengths
+from sweep.evaluation.cells import run_cells
 from sweep.measure.board_solver import BOARD_METHODS, BoardDetections, BoardPoints, BoardSolver
-from sweep.measure.flags import EstimateStatus
+from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.board_kinds import Charuco
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.pose import rotation_of_angles
+from sweep.plan.experiment import Pipeline
 
 BOARD = Charuco(
     dictionary="DICT_5X5_100", squares_x=5, squares_y=4, square_m=0.03, marker_m=0.02
@@ -99,3 +101,42 @@ def test_covariance_is_that_of_the_points_that_gave_the_pose(points, refine):
     sets = [together[points]] if points in together else BOARD.corners_m
     given = np.sqrt(np.diag(found.covariance[0]))[3:]
     assert any(np.allclose(given, deviations(each), rtol=1e-3) for each in sets)
+
+
+@pytest.mark.parametrize("tilt_deg", [30, 60])
+@pytest.mark.parametrize("solver", ["iterative", "sqpnp"])
+def test_a_marker_across_the_board_s_plane_is_solved_alone(solver, tilt_deg):
+    """The side face of a cube: its corners lie on a line of the board's plane."""
+    text = """
+[camera]
+width_px = 1280
+height_px = 720
+fx_px = 900
+[marker]
+dictionary = "DICT_4X4_50"
+size_m = 0.04
+[board]
+kind = "markers"
+[[board.markers]]
+marker_id = 1
+x_m = 0.025
+y_m = 0
+z_m = -0.025
+tilt_deg = 90
+azimuth_deg = 90
+[pose]
+distance_m = 0.4
+azimuth_deg = 90
+[scene]
+background = 120
+[detector]
+cornerRefinementMethod = "subpix"
+[estimator]
+solver = "sqpnp"
+"""
+    pipeline = Pipeline.from_text(text, [f"tilt_deg={tilt_deg}", f"solver={solver!r}"])
+    result = run_cells(pipeline, [])
+    columns = {name: parts[0] for name, parts in result.columns.items() if parts}
+    assert columns["detection"][0] == DetectionStatus.detected
+    assert columns["estimate"][0] == EstimateStatus.solved
+    assert np.linalg.norm(columns["rotation_error_rad"][0]) < 0.1

@@ -6,13 +6,16 @@ them. It has more than 400 lines, for each public function stands here with all 
 
 from __future__ import annotations
 
-import functools
 import importlib
 import os
 import sys
-import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
+from typing import TYPE_CHECKING, Any
+
+from sweep import library
+from sweep.execution import BLOCK_TASK
+from sweep.isolation.child_process import Child
+from sweep.messages import notice
 
 if sys.version_info < (3, 11):  # noqa: UP036  (a copy of the sources, which pip did not check)
     _PROBLEM = "sweep needs Python 3.11 or newer; this is Python {}.{}".format(*sys.version_info)
@@ -34,11 +37,11 @@ if TYPE_CHECKING:
     import xarray as xr
     from distributed import Client
 
-    from sweep.analysis.flag_labels import decode_flags
+    from sweep.analysis.dataset import decode_flags
     from sweep.execution.cluster import Cluster
     from sweep.execution.progress import Progress
     from sweep.fitting.folders import FittedScene
-    from sweep.plan.experiment import Pipeline
+    from sweep.plan.pipeline import Pipeline
     from sweep.tradeoff.choice_search import Choice
 
 __all__ = [
@@ -47,11 +50,8 @@ __all__ = [
     "fit", "limit", "open", "photos", "run", "size", "twins",
 ]
 
-_IMPORTED_ON_USE = {"Pipeline": "sweep.plan.experiment", "Progress": "sweep.execution.progress",
-                    "decode_flags": "sweep.analysis.flag_labels"}
-
-Arguments = ParamSpec("Arguments")
-Returned = TypeVar("Returned")
+_IMPORTED_ON_USE = {"Pipeline": "sweep.plan.pipeline", "Progress": "sweep.execution.progress",
+                    "decode_flags": "sweep.analysis.dataset"}
 
 
 def __getattr__(name: str) -> Any:
@@ -65,29 +65,6 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
 
 
-def _with_older_arguments(function: Callable[Arguments, Returned]) -> Callable[Arguments, Returned]:
-    """Accept what `run` took in version 0.5, with a warning: deprecated since 0.6."""
-    @functools.wraps(function)
-    def run_as_before(*positional: Any, **options: Any) -> Returned:
-        older = [
-            *(["a second positional argument; use store="] if len(positional) == 2 else []),
-            *(["on_progress=; use progress="] if "on_progress" in options else []),
-            *(["block_s=; blocks are sized by a measurement"] if "block_s" in options else []),
-        ]
-        if not older:
-            return cast("Callable[..., Returned]", function)(*positional, **options)
-        for what in older:
-            warnings.warn(f"sweep.run: {what}", DeprecationWarning, stacklevel=2)
-        if len(positional) == 2:
-            options["store"] = positional[1]
-        if "on_progress" in options:
-            options["progress"] = options.pop("on_progress")
-        return cast("Callable[..., Returned]", _run)(*positional[:1], **options)
-
-    return run_as_before
-
-
-@_with_older_arguments
 def run(
     pipeline: Pipeline | Mapping[str, Any] | str | os.PathLike[str],
     *,
@@ -98,7 +75,6 @@ def run(
     reuse: Sequence[str | os.PathLike[str]] = (),
     overwrite: bool = False,
     retry_failed: bool = False,
-    durable: bool = False,
     yes: bool = False,
     progress: bool | Callable[[Progress], None] | None = None,
     time_limit_s: float | None = None,
@@ -130,9 +106,6 @@ def run(
         Delete an existing store.
     retry_failed
         Compute the blocks again in which cells failed or crashed, also of a finished store.
-    durable
-        Flush each block to the disk before it counts as committed, so that a power failure takes
-        no committed block.
     yes
         Run also what is predicted to take more than a day, or more than is free on the disk; such
         a run is refused otherwise. Reused cells are not predicted, so that it is not then.
@@ -171,7 +144,7 @@ def run(
     """
     return _run(
         pipeline, store=store, workers=workers, client=client, scheduler=scheduler, reuse=reuse,
-        overwrite=overwrite, retry_failed=retry_failed, durable=durable, yes=yes,
+        overwrite=overwrite, retry_failed=retry_failed, yes=yes,
         progress=progress, time_limit_s=time_limit_s,
     )
 
@@ -240,17 +213,11 @@ def limit(
     >>> limits["value"].item()
     40.0
     """
-    from sweep.execution import BLOCK_TASK  # noqa: PLC0415  (as the docstring of the package says)
-    from sweep.execution.progress import progress_report  # noqa: PLC0415
-    from sweep.isolation.child_process import Child  # noqa: PLC0415
-    from sweep.messages import notice  # noqa: PLC0415
-
     # The child imports its packages while this process does.
-    with Child(BLOCK_TASK) as child, progress_report(progress) as report:
-        from sweep.execution.limit_search import search_limits  # noqa: PLC0415
+    with Child(BLOCK_TASK) as child, library.progress.progress_report(progress) as report:
 
         source = _pipeline(pipeline) if isinstance(pipeline, Mapping) else pipeline
-        limits, summary = search_limits(
+        limits, summary = library.limit_search.search_limits(
             source, require=require, along=along, per=per, at_all=at_all, max_trials=max_trials,
             coarse_trials=coarse_trials, store=store, workers=workers, client=client,
             scheduler=scheduler, reuse=reuse, overwrite=overwrite, yes=yes, progress=report,
@@ -266,21 +233,15 @@ def _run(
     progress: bool | Callable[[Progress], None] | None = None,
     **options: Any,
 ) -> xr.Dataset:
-    from sweep.execution import BLOCK_TASK  # noqa: PLC0415  (as the docstring says)
-    from sweep.execution.progress import progress_report  # noqa: PLC0415
-    from sweep.isolation.child_process import Child  # noqa: PLC0415
-    from sweep.messages import notice  # noqa: PLC0415
 
     # The child imports its packages while this process does.
-    with Child(BLOCK_TASK) as child, progress_report(progress) as report:
-        from sweep.execution.runner import execute  # noqa: PLC0415
+    with Child(BLOCK_TASK) as child, library.progress.progress_report(progress) as report:
 
         read = _pipeline(pipeline)
         if options.get("store") is None and isinstance(pipeline, (str, os.PathLike)):
-            from sweep.store.stored_pipeline import names_store  # noqa: PLC0415
 
-            options["store"] = pipeline if names_store(pipeline) else None
-        summary = execute(read, progress=report, child=child, **options)
+            options["store"] = pipeline if library.lifecycle.names_store(pipeline) else None
+        summary = library.runner.execute(read, progress=report, child=child, **options)
     for line in summary.warnings:
         notice(line)
     if summary.advice:
@@ -288,25 +249,24 @@ def _run(
     return open(summary.store)
 
 
-def _pipeline(given: Pipeline | Mapping[str, Any] | str | os.PathLike[str]) -> Pipeline:
-    from sweep.plan.experiment import Pipeline  # noqa: PLC0415
-    from sweep.store.stored_pipeline import read_pipeline  # noqa: PLC0415
+def _pipeline(
+    given: library.pipeline.Pipeline | Mapping[str, Any] | str | os.PathLike[str],
+) -> library.pipeline.Pipeline:
 
-    if isinstance(given, Pipeline):
+    if isinstance(given, library.pipeline.Pipeline):
         pipeline = given
     elif isinstance(given, Mapping):
-        pipeline = Pipeline.from_dict(given)
+        pipeline = library.pipeline.Pipeline.from_dict(given)
     elif isinstance(given, (str, os.PathLike)):
-        pipeline = read_pipeline(given)
+        pipeline = library.lifecycle.read_pipeline(given)
     else:
         raise ArgumentError(
             "pipeline", given,
             "expected a Pipeline, the path of a TOML file or of a store, or a mapping",
         )
     if pipeline.requirements:
-        from sweep.analysis.required_pipeline import check_required  # noqa: PLC0415
 
-        check_required(pipeline.requirements, pipeline.source)
+        library.requirements.check_required(pipeline.requirements, pipeline.source)
     return pipeline
 
 
@@ -334,9 +294,7 @@ def open(store: str | os.PathLike[str]) -> xr.Dataset:  # noqa: A001  (as xarray
     >>> results.side_px.values.tolist()
     [20.0, 40.0]
     """
-    from sweep.store.lifecycle import open_dataset  # noqa: PLC0415  (xarray is slow to import)
-
-    return open_dataset(store)
+    return library.lifecycle.open_dataset(store)
 
 
 def photos(
@@ -384,12 +342,8 @@ def photos(
     ArgumentError, PipelineError, StoreError, RunError
         As for :func:`run`; photographs, cameras and boards that do not fit are told in a line.
     """
-    from sweep.messages import notice  # noqa: PLC0415
-    from sweep.photographs.prepare import prepare  # noqa: PLC0415
-    from sweep.photographs.record_files import record_home  # noqa: PLC0415
-
-    home, name = record_home(store)
-    prepared = prepare(
+    home, name = library.folder.record_home(store)
+    prepared = library.prepare.prepare(
         folders, camera, board=board, poses=poses, stereo=stereo, settings=settings, home=home,
         name=name, overwrite=overwrite,
     )
@@ -437,15 +391,16 @@ def twins(
     ArgumentError, PipelineError, StoreError, RunError
         As for :func:`run`; also if the store is not of photographs.
     """
-    from sweep.photographs.twins import read_scene, twin_pipeline, twin_store  # noqa: PLC0415
-    from sweep.store.stored_pipeline import read_pipeline  # noqa: PLC0415
-
     named = "twins" if isinstance(scene, Mapping) else scene
-    parameters = scene if isinstance(scene, Mapping) else read_scene(scene)
+    parameters = scene if isinstance(scene, Mapping) else library.twins.read_scene(scene)
     return _run(
-        twin_pipeline(read_pipeline(photographs), parameters, repeats),
-        store=store or twin_store(photographs, named),
-        workers=workers, overwrite=overwrite, progress=progress,
+        library.twins.twin_pipeline(
+            library.lifecycle.read_pipeline(photographs), parameters, repeats
+        ),
+        store=store or library.twins.twin_store(photographs, named),
+        workers=workers,
+        overwrite=overwrite,
+        progress=progress,
     )
 
 
@@ -485,10 +440,7 @@ def fit(
     ArgumentError, PipelineError, StoreError
         As for :func:`photos`; photographs to which nothing can be fitted are told in a line.
     """
-    from sweep.fitting.folders import fit_folder  # noqa: PLC0415
-    from sweep.messages import notice  # noqa: PLC0415
-
-    fitted = fit_folder(
+    fitted = library.folders.fit_folder(
         folders, camera, board=board, poses=poses, stereo=stereo, settings=settings,
         markers=markers, check=check,
     )
@@ -540,17 +492,11 @@ def size(
     >>> found.answers[found.best].value, found.answers[found.best].next
     (40.0, 4.0)
     """
-    from sweep.execution import BLOCK_TASK  # noqa: PLC0415
-    from sweep.execution.progress import progress_report  # noqa: PLC0415
-    from sweep.isolation.child_process import Child  # noqa: PLC0415
-    from sweep.messages import notice  # noqa: PLC0415
-
     if not 0.0 < limit_s < float("inf"):
         raise ArgumentError("limit_s", limit_s, "expected a finite number above 0")
-    with Child(BLOCK_TASK) as child, progress_report(progress) as report:
-        from sweep.tradeoff.choice_search import search_choice  # noqa: PLC0415
+    with Child(BLOCK_TASK) as child, library.progress.progress_report(progress) as report:
 
-        found = search_choice(
+        found = library.choice_search.search_choice(
             _pipeline(pipeline), store, limit_s=limit_s, progress=report, child=child,
             workers=workers, reuse=reuse, overwrite=overwrite, yes=yes)
     for line in found.notes:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sweep.messages import nearest, plain, shown
+from sweep.messages import nearest, plain, shown, similar_names
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,8 +25,10 @@ class Declaration:
     ``low`` and ``high`` are inclusive unless ``open_low`` excludes the lower end. ``drawable``
     parameters may be drawn from a distribution per trial. ``lengths`` are those that a list of
     numbers may have, ``list_text`` says so in words. ``plugin`` is the kind of plug-in that may be
-    named in place of a choice. ``reads`` returns a value that is no choice in its type, or raises
-    ValueError with what was expected, in place of the checks by type.
+    named in place of a choice. ``abbreviated`` choices are known by their number and the letters
+    before it, such as ``36h11`` and ``tag36h11`` of ``DICT_APRILTAG_36h11``. ``reads`` returns a
+    value that is no choice in its type, or raises ValueError with what was expected, in place of
+    the checks by type.
     """
 
     meaning: str
@@ -40,6 +43,7 @@ class Declaration:
     lengths: tuple[int, ...] = ()
     list_text: str = ""
     plugin: str = ""
+    abbreviated: bool = False
     reads: Callable[[Any], Any] | None = None
 
     def range_text(self) -> str:
@@ -69,7 +73,20 @@ class Declaration:
         if word in self.choices:
             return word
         bare = self._bare(word.strip().replace("::", ".").rpartition(".")[2])
-        return next((choice for choice in self.choices if self._bare(choice) == bare), None)
+        found = next((choice for choice in self.choices if self._bare(choice) == bare), None)
+        return self._abbreviated(bare) if found is None and self.abbreviated else found
+
+    def _abbreviated(self, word: str) -> str | None:
+        """Return the one choice with a word's number, whose letters before it end as the word's."""
+        letters, number = _letters_and_number(word)
+        if not number or word.isdecimal():
+            return None
+        found = {
+            choice.casefold(): choice for choice in self.choices
+            for theirs, same in [_letters_and_number(choice)]
+            if same == number and theirs.endswith(letters)
+        }
+        return next(iter(found.values())) if len(found) == 1 else None
 
     def _bare(self, word: str) -> str:
         return word.casefold().removeprefix(self.prefix.casefold())
@@ -82,6 +99,18 @@ class Declaration:
         """Return whether a finite number lies in the declared range."""
         above = number > self.low if self.open_low else number >= self.low
         return above and number <= self.high and abs(number) < 1e300
+
+
+def _letters_and_number(word: str) -> tuple[str, str]:
+    """Return what stands before the first digit, and the rest, in lower case without separators.
+
+    >>> _letters_and_number("DICT_4X4_50"), _letters_and_number("tag36h11")
+    (('dict', '4x450'), ('tag', '36h11'))
+    """
+    bare = re.sub(r"[^a-z0-9]", "", word.casefold())
+    letters = re.match(r"[a-z]*", bare)
+    count = letters.end() if letters else 0
+    return bare[:count], bare[count:]
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +170,8 @@ class Declared:
         """Return the choice that a wrong value may stand for."""
         choices = self.declaration.choices
         if isinstance(value, str) and choices:
-            return nearest(value.removeprefix(self.declaration.prefix), choices)
+            bare = value.removeprefix(self.declaration.prefix)
+            return similar_names(bare, choices) or nearest(bare, choices)
         if isinstance(value, int) and (name := self.declaration.of_number(value)):
             return f"; OpenCV's constant {value} is {name}"
         return ""

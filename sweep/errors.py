@@ -130,7 +130,3 @@ class MachineFaultError(RunError):
 
 class PluginError(SweepError):
     """A plug-in that cannot be used, or that returned what it must not; one line."""
-
-
-class EnvironmentFaultError(SweepError):
-    """A detector's environment that cannot be made or used; one line."""

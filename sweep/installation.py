@@ -1,20 +1,19 @@
-"""Installations that cannot work: reported in one line before anything is computed."""
+"""The installation: what cannot work is refused in one line, what may surprise is warned of."""
 
 from __future__ import annotations
 
-import importlib.util
-from collections.abc import Iterator
+import multiprocessing
+from functools import cache
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 
 from sweep.errors import StoreError
+from sweep.messages import notice
 
 OPENCV = "opencv-contrib-python-headless"
 """The distribution of OpenCV that this project requires."""
 
-OPENCV_DISTRIBUTIONS = (
-    OPENCV, "opencv-contrib-python", "opencv-python", "opencv-python-headless",
-)
-"""All distributions that install the package ``cv2``, into the same files."""
+OTHER_OPENCV = ("opencv-contrib-python", "opencv-python", "opencv-python-headless")
+"""Other distributions that install the package ``cv2``, into the same files."""
 
 NAMESAKE = "sweep"
 """A distribution of another project, whose package has the same name as this one's."""
@@ -22,64 +21,70 @@ NAMESAKE = "sweep"
 COMMAND = "sweep.cli:main"
 """The entry point of this project's distributions, under whichever name."""
 
+REMEDY = f"`pip install --force-reinstall {OPENCV}`"
+
 
 def check_installation() -> None:
-    """Refuse installations whose files overwrite each other, or that lack OpenCV.
+    """Refuse an installation that lacks ArUco or whose files are another project's.
+
+    Another distribution of OpenCV is warned of, once: which OpenCV is loaded is recorded in every
+    store (`sweep.store.provenance.fingerprint`).
 
     Raises
     ------
     StoreError
-        If OpenCV is missing, if another or several distributions of it are installed, or if the
-        other project's distribution ``sweep`` is; one line each, with the commands to run.
+        In one line, with the command that mends it.
     """
-    for problem in _problems():
-        raise StoreError(problem)
-
-
-def check_loaded_opencv(loaded: str) -> None:
-    """Refuse an OpenCV that is not the one that is installed.
-
-    Parameters
-    ----------
-    loaded
-        Its own version, ``cv2.__version__``.
-
-    Raises
-    ------
-    StoreError
-        If it contradicts the version that the package's metadata name; in one line.
-    """
-    package = _installed(OPENCV)
-    own = loaded.partition("-")[0].split(".")
-    if package is not None and package.version.split(".")[:3] != own:
-        raise StoreError(
-            f"OpenCV {loaded} is loaded, but {OPENCV} {package.version} is installed: another "
-            "package has overwritten its files, or stands before it in Python's path; "
-            f"`pip install --force-reinstall {OPENCV}`"
-        )
-
-
-def _problems() -> Iterator[str]:
     namesake = _installed(NAMESAKE)
     if namesake is not None and not _is_ours(namesake):
-        yield (
+        raise StoreError(
             f"another project's package `sweep` ({namesake.version}) is installed, and its files "
             "overwrite those of fiducial-sweep: `pip uninstall sweep`, then "
             "`pip install --force-reinstall fiducial-sweep`"
         )
-    versions = {
-        name: package.version for name in OPENCV_DISTRIBUTIONS
+    check_opencv()
+    if multiprocessing.parent_process() is None:  # a worker's client has said it
+        _warn_of_other_opencv()
+
+
+def check_opencv() -> None:
+    """Refuse an OpenCV that cannot be imported, or that has no ArUco.
+
+    Raises
+    ------
+    StoreError
+        In one line, with the command that mends it.
+    """
+    try:
+        import cv2  # noqa: PLC0415  (slow to import)
+    except ImportError as error:
+        lines = str(error).splitlines() or [type(error).__name__]
+        raise StoreError(f"OpenCV cannot be imported: {lines[0]}; {REMEDY}") from None
+    if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
+        version = getattr(cv2, "__version__", "of no version")
+        raise StoreError(
+            f"OpenCV {version} is loaded, which has no cv2.aruco.ArucoDetector: {REMEDY}"
+        )
+
+
+@cache
+def _warn_of_other_opencv() -> None:
+    """Write a line to stderr if OpenCV is installed in another way than this project asks for."""
+    others = {
+        name: package.version for name in OTHER_OPENCV
         if (package := _installed(name)) is not None
     }
-    listed = " and ".join(f"{name} {version}" for name, version in versions.items())
-    replace = f"`pip uninstall {' '.join(versions)}`, then `pip install {OPENCV}`"
-    if len(versions) > 1:
-        yield (f"several distributions of OpenCV are installed and overwrite each other: {listed}; "
-               f"{replace}")
-    elif versions and OPENCV not in versions:
-        yield f"{listed} is installed in place of {OPENCV}: {replace}"
-    elif not versions or importlib.util.find_spec("cv2") is None:
-        yield f"OpenCV is missing: `pip install --force-reinstall {OPENCV}`"
+    required = _installed(OPENCV)
+    if not others and required is not None:
+        return
+    import cv2  # noqa: PLC0415  (slow to import)
+
+    listed = " and ".join(f"{name} {version}" for name, version in others.items())
+    beside = "is missing" if required is None else f"{required.version} is installed, too"
+    notice(
+        f"warning: {listed or 'an unknown distribution'} has installed OpenCV, and {OPENCV} "
+        f"{beside}; OpenCV {cv2.__version__} is loaded and recorded in stores"
+    )
 
 
 def _installed(name: str) -> Distribution | None:

@@ -1,4 +1,4 @@
-"""Text of messages: few, short, printable lines.
+"""Text for users: messages of few, short, printable lines, tables in columns, and JSON.
 
 Messages quote names and values of files that may be anyone's. Quotes are cut and their control
 characters escaped, so that they neither forge a line nor control a terminal.
@@ -7,10 +7,17 @@ characters escaped, so that they neither forge a line nor control a terminal.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import difflib
+import enum
 import itertools
+import json
+import math
+import os
+import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from sweep.errors import PipelineError
@@ -119,14 +126,17 @@ def label(value: Any) -> str:
     return value if isinstance(value, str) else repr(value)
 
 
+MAX_FILES = 10_000
+"""Names of a folder among which a similar one is searched."""
+
 MAX_WORD_LENGTH = 60
 """Longer words are not compared with known ones."""
 
 
-def nearest(word: str, known: Sequence[str]) -> str:
+def nearest(word: str, known: Sequence[str], cutoff: float = 0.6) -> str:
     """Return "; did you mean ...?" with the most similar known word, or "" if none is similar.
 
-    Letters' cases, underscores and hyphens do not count.
+    Letters' cases, underscores and hyphens do not count. ``cutoff``: least share of equal letters.
 
     >>> nearest("tilt", ["roll_deg", "tilt_deg"]), nearest("MarkerID", ["marker_id"])
     ('; did you mean tilt_deg?', '; did you mean marker_id?')
@@ -138,14 +148,118 @@ def nearest(word: str, known: Sequence[str]) -> str:
     simple = {_letters(name): name for name in known}
     close = close or [
         simple[each]
-        for each in difflib.get_close_matches(_letters(word), list(simple), n=1, cutoff=0.6)
+        for each in difflib.get_close_matches(_letters(word), list(simple), n=1, cutoff=cutoff)
     ]
-    close = close or difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    close = close or difflib.get_close_matches(word, known, n=1, cutoff=cutoff - 0.1)
     return f"; did you mean {close[0]}?" if close else ""
+
+
+MAX_SIMILAR = 6
+"""Names of which a word may be a part that are listed."""
+
+
+def similar_names(word: str, known: Sequence[str]) -> str:
+    """Return "; did you mean A, B or C?" with the known names that a word is a part of, or "".
+
+    >>> similar_names("4x4", ["DICT_4X4_100", "DICT_4X4_50", "DICT_5X5_50"])
+    '; did you mean DICT_4X4_50 or DICT_4X4_100?'
+    """
+    part = _letters(word)
+    names = {name.casefold(): name for name in known if part in _letters(name)}
+    if len(part) < 2 or len(names) < 2:
+        return ""
+    *others, last = sorted(names.values(), key=lambda name: (len(name), name))[:MAX_SIMILAR]
+    return f"; did you mean {', '.join(others)} or {last}?"
+
+
+def nearest_file(path: str | os.PathLike[str]) -> str:
+    """Return "; did you mean ...?" with the most similar name in a missing path's folder, or ""."""
+    wanted = Path(path)
+    try:
+        if wanted.exists():
+            return ""
+        names = [each.name for each in itertools.islice(wanted.parent.iterdir(), MAX_FILES)]
+    except (OSError, ValueError):
+        return ""
+    alike = [name for name in names if Path(name).suffix.lower() == wanted.suffix.lower()]
+    stems = {Path(name).stem.casefold(): name for name in alike}
+    close = [stems[stem] for stem in difflib.get_close_matches(
+        wanted.stem.casefold(), list(stems), n=1, cutoff=0.6)]
+    close = close or difflib.get_close_matches(wanted.name, names, n=1, cutoff=0.8)
+    return f"; did you mean {plain(wanted.with_name(close[0]), 300)}?" if close else ""
 
 
 def _letters(word: str) -> str:
     return word.casefold().replace("_", "").replace("-", "")
+
+
+def columns(rows: Sequence[Sequence[Any]], *, gap: str = "  ", right: Sequence[int] = ()) -> str:
+    r"""Return rows as lines with aligned columns; those numbered in ``right`` end together.
+
+    >>> print(columns([["solver", "poses"], ["ippe", 1200]], right=[1]))
+    solver  poses
+    ippe     1200
+    """
+    texts = [[str(cell) for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
+    return "\n".join(
+        gap.join(cell.rjust(width) if k in right else cell.ljust(width)
+                 for k, (cell, width) in enumerate(zip(row, widths, strict=True))).rstrip()
+        for row in texts
+    )
+
+
+def to_json(content: Mapping[str, Any], indent: int | None = 2) -> str:
+    r"""Return the text of a JSON object: what every command prints with ``--json``.
+
+    Dataclasses, enumerations (by name), paths, NumPy's arrays and numbers count as what JSON has.
+    A number that does not exist (NaN) is ``null``. So is an infinite one, and a key NAME_flag
+    beside its NAME says ``"infinite"`` or ``"-infinite"``; beside a list, NAME_flag is a list of
+    that shape with ``null`` for its other items.
+
+    >>> to_json({"low": 0.5, "high": math.inf, "median": math.nan}, None)
+    '{"low": 0.5, "high": null, "high_flag": "infinite", "median": null}'
+    >>> to_json({"errors": [1.0, -math.inf]}, None)
+    '{"errors": [1.0, null], "errors_flag": [null, "-infinite"]}'
+    """
+    return json.dumps(_json_value(content), indent=indent, allow_nan=False)
+
+
+def _json_value(value: Any) -> Any:
+    value = _unwrapped(value)
+    if isinstance(value, Mapping):
+        found: dict[str, Any] = {}
+        for name, item in value.items():
+            key = str(_unwrapped(name))
+            found[key] = _json_value(item)
+            if (flag := _infinite(item)) is not None:
+                found[f"{key}_flag"] = flag
+        return found
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [_json_value(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, (str, bool, int)) else str(value)
+
+
+def _infinite(value: Any) -> Any:
+    """Return the flag of a number, or of nested lists of numbers; None if none is infinite."""
+    value = _unwrapped(value)
+    if isinstance(value, float) and math.isinf(value):
+        return "infinite" if value > 0 else "-infinite"
+    if isinstance(value, (list, tuple)):
+        flags = [_infinite(item) for item in value]
+        return flags if any(flag is not None for flag in flags) else None
+    return None
+
+
+def _unwrapped(value: Any) -> Any:
+    """Return a dataclass as its fields, an enumeration's member as its name, an array as lists."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, enum.Enum):
+        return value.name
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
 BYTE_UNITS = ("bytes", "kB", "MB", "GB", "TB", "PB")
@@ -171,3 +285,17 @@ def duration(seconds: float) -> str:
         if seconds >= 2 * length:
             return f"{seconds / length:.1f} {unit}"
     return f"{seconds:.1f} s"
+
+
+def quoted(*words: str) -> str:
+    r"""Return words of a command, quoted for a shell on one line.
+
+    >>> print(quoted("a b", "two\nlines"))
+    'a b' $'two\nlines'
+    """
+
+    def escaped(word: str) -> str:
+        word = word.replace("\\", "\\\\").replace("'", "\\'")
+        return f"$'{plain(word, len(word))}'"
+
+    return " ".join(shlex.quote(word) if word.isprintable() else escaped(word) for word in words)

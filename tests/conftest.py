@@ -3,6 +3,7 @@
 import gc
 import os
 import resource
+import signal
 import sys
 from collections import defaultdict
 from pathlib import Path
@@ -13,6 +14,11 @@ from distributed import LocalCluster
 # Hundreds of processes import the same modules: they are compiled once, wherever the tests run.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
+
+# Who starts the tests may ignore Ctrl-C (`nohup`, a job in the background), and the commands that
+# they start would, too.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 pytest.register_assert_rewrite("support")
 

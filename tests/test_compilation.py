@@ -1,37 +1,31 @@
-"""Compiled code: cached by content, for this package alone, wherever a folder is writable."""
+"""Compiled code: cached by Numba wherever a folder is writable, and never from other sources."""
 
 from __future__ import annotations
 
 import ast
-import errno
 import gc
 import os
-import pickle
-import random
 import shutil
 import subprocess
 import sys
-import tempfile
-from hashlib import sha256
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 
 from sweep import compilation
-from sweep.cli.first_use import announce_compilation
-from sweep.plan.experiment import Pipeline
+from sweep.cli.prepared import announce_compilation
+from sweep.errors import MachineFaultError
+from sweep.plan.pipeline import Pipeline
 
 TOP = Path(compilation.__file__).parent.parent
-UNIT = "from sweep.model.supersampling import _unit; print(_unit(5), _unit.py_func(5))"
+UNIT = "from sweep.model.exposure import _unit; print(_unit(5), _unit.py_func(5))"
 """Compiles little: a function of one file that calls one of another."""
 
 
 def run(script, top=TOP, **environment):
     variables = {k: v for k, v in os.environ.items() if not k.startswith("NUMBA_")}
     variables |= {"PYTHONPATH": str(top), **environment}
-    variables = {name: value for name, value in variables.items() if value is not None}
     done = subprocess.run(
         [sys.executable, "-c", script], env=variables, capture_output=True, text=True, check=False,
         cwd="/",
@@ -40,34 +34,33 @@ def run(script, top=TOP, **environment):
     return done.stdout.split()
 
 
+@pytest.fixture
+def package(tmp_path):
+    """The folder of a copy of the package that was never compiled."""
+    ignored = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(TOP / "sweep", tmp_path / "package" / "sweep", ignore=ignored)
+    return tmp_path / "package"
+
+
 def test_functions_and_settings_of_the_caller_are_untouched(tmp_path):
     (tmp_path / "mine.py").write_text(
         "import numba\n@numba.njit(cache=True)\ndef twice(x):\n    return 2 * x\n"
     )
     before, after, value, folder = run(
-        "import numba; before = numba.config.CACHE_DIR; import mine, sweep.model.supersampling as s"
+        "import numba; before = numba.config.CACHE_DIR; import mine, sweep.model.exposure as s"
         "; s._unit(1); print(repr(before), repr(numba.config.CACHE_DIR), mine.twice(3),"
         " mine.twice.stats.cache_path)",
         top=f"{TOP}{os.pathsep}{tmp_path}",
     )
     assert (before, after, value) == ("''", "''", "6")
     assert Path(folder) == tmp_path / "__pycache__"
-    assert list(Path(folder).glob("mine.twice*.nbc"))
-
-
-def test_folder_of_the_environment_is_used(tmp_path):
-    run(UNIT, NUMBA_CACHE_DIR=str(tmp_path))
-    (folder,) = tmp_path.iterdir()
-    assert folder.name == f"compiled-{compilation.sources_digest()}"
-    assert list(folder.glob("supersampling._unit*.nbc"))
 
 
 @pytest.mark.long
-def test_code_compiled_from_an_older_version_of_another_file_is_not_used(tmp_path):
-    package, cached = tmp_path / "package", str(tmp_path / "cached")
-    ignored = shutil.ignore_patterns("__pycache__")
-    shutil.copytree(TOP / "sweep", package / "sweep", ignore=ignored)
+def test_code_compiled_from_an_older_version_of_another_file_is_not_used(package, tmp_path):
+    cached = str(tmp_path / "cached")
     first, _ = run(UNIT, top=package, NUMBA_CACHE_DIR=cached)
+    assert list(Path(cached).glob("*/supersampling._unit*.nbc"))
     other = package / "sweep" / "model" / "splitmix.py"
     text = other.read_text()
     assert "np.uint64(31)" in text
@@ -78,121 +71,51 @@ def test_code_compiled_from_an_older_version_of_another_file_is_not_used(tmp_pat
 
 
 @pytest.mark.long
-def test_read_only_package_without_a_home_uses_a_private_temporary_folder(tmp_path):
-    script = (
-        "import os, pathlib\n"
-        "def home(): raise RuntimeError('Could not determine home directory.')\n"
-        "pathlib.Path.home = home\n"
-        f"os.access = lambda path, mode: str(path).startswith({str(tmp_path)!r})\n"
-    )
-    first, _ = run(script + UNIT, TMPDIR=str(tmp_path), HOME=None)
-    (folder,) = tmp_path.iterdir()
-    assert folder.stat().st_mode & 0o777 == 0o700
-    assert list(folder.glob("compiled-*/supersampling._unit*.nbc"))
-    assert run(script + UNIT, TMPDIR=str(tmp_path), HOME=None)[0] == first
-    # Others may have put something into a folder that they can write to: it is not loaded.
-    folder.chmod(0o777)
-    (path,) = run(script + "from sweep import compilation; print(compilation.cache_folder())",
-                  TMPDIR=str(tmp_path), HOME=None)
-    assert path == "None"
-    assert run(script + UNIT, TMPDIR=str(tmp_path), HOME=None)[0] == first
-
-
-def empty(path):
-    path.write_bytes(b"")
-
-
-def halve(path):
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
-def flip(path):
-    content = bytearray(path.read_bytes())
-    content[-len(content) // 3] ^= 1
-    path.write_bytes(content)
-
-
-def replace_by_folder(path):
-    path.unlink()
-    (path / "x").mkdir(parents=True)
-
-
-def replace_by_another_object(path):
-    content = pickle.dumps({"not": "code"})
-    path.write_bytes(sha256(content).digest() + content)
-
-
-def replace_by_numbas_own(path):
-    path.write_bytes(pickle.dumps(numba.__version__) + pickle.dumps(("stamp", {})))
-
-
-@pytest.fixture
-def cached(monkeypatch, tmp_path):
-    """A function that compiles anew with a cache in a folder: returns its value and cache hits."""
-    monkeypatch.setattr(compilation, "cache_folder", lambda: tmp_path / "cache")
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
-    (tmp_path / "tmp").mkdir()
-
-    def call():
-        function = compilation.compiled(_fraction)
-        value = function(5)
-        return value, sum(function.stats.cache_hits.values())
-
-    return call
-
-
-def _fraction(number):
-    return (number * 7 % 11) / 11
-
-
-DAMAGE = (empty, halve, flip, replace_by_folder, replace_by_another_object, replace_by_numbas_own)
-
-
-@pytest.mark.parametrize("damage", DAMAGE)
-@pytest.mark.parametrize("kind", ["*.nbi", "*.nbc", "*.nb?"])
-def test_damaged_cache_costs_a_compilation_and_nothing_else(damage, kind, cached, tmp_path):
-    assert cached() == (_fraction(5), 0)
-    assert cached() == (_fraction(5), 1)
-    files = [path for path in (tmp_path / "cache").glob(kind) if path.is_file()]
-    assert files
-    for path in files:
-        damage(path)
-    assert cached() == (_fraction(5), 0)
-    assert cached() == (_fraction(5), 1)  # it was replaced
-
-
-def test_flipped_byte_of_machine_code_is_never_executed(cached, tmp_path):
-    cached()
-    (path,) = (tmp_path / "cache").glob("*.nbc")
-    sound = path.read_bytes()
-    generator = random.Random(7)
-    for _ in range(8):
-        content = bytearray(sound)
-        content[generator.randrange(len(content))] ^= 1 << generator.randrange(8)
-        path.write_bytes(content)
-        assert cached() == (_fraction(5), 0)
-
-
-def test_cache_in_a_folder_without_space_is_replaced_by_a_private_one(
-    cached, monkeypatch, tmp_path
+@pytest.mark.parametrize("home", [True, False])
+def test_read_only_package_is_compiled_once_for_the_user_or_else_in_each_process(
+    home, package, tmp_path
 ):
-    real = compilation._CacheFile._open_for_write
+    (package / "sweep" / "model" / "__pycache__").write_text("a file: no folder can be made")
+    own = str(tmp_path / "home") if home else "/dev/null"
+    environment = {"HOME": own, "XDG_CACHE_HOME": f"{own}/.cache"}
+    value, interpreted = run(UNIT, top=package, **environment)
+    assert float(value) == float(interpreted)
+    assert bool(list(tmp_path.glob("home/.cache/**/supersampling._unit*.nbc"))) == home
+    cached, hits = run(
+        "import sweep.model.exposure as s; from sweep.compilation import is_cached; "
+        "cached = is_cached(s.__name__, '_unit'); s._unit(5); "
+        "print(cached, sum(s._unit.stats.cache_hits.values()))", top=package, **environment)
+    assert (cached, hits) == (str(home), str(int(home)))
 
-    def full(self, path):
-        if str(path).startswith(str(tmp_path / "cache")):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return real(self, path)
 
-    monkeypatch.setattr(compilation._CacheFile, "_open_for_write", full)
-    assert cached() == (_fraction(5), 0)
-    assert cached() == (_fraction(5), 1)
-    (private,) = (tmp_path / "tmp").iterdir()
-    assert private.stat().st_mode & 0o777 == 0o700
-    # Nor is there space for that one: every process compiles.
-    shutil.rmtree(private)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
-    assert cached() == (_fraction(5), 0)
-    assert cached() == (_fraction(5), 0)
+FRACTION = """
+from sweep.compilation import compiled
+
+@compiled
+def fraction(number):
+    return (number * 7 % 11) / 11
+"""
+
+
+@pytest.mark.parametrize("kind", ["*.nbi", "*.nbc"])
+def test_damaged_cache_is_the_fault_of_a_machine_and_names_the_folder(kind, monkeypatch, tmp_path):
+    (tmp_path / "fractions_of_11.py").write_text(FRACTION)
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def imported():
+        sys.modules.pop("fractions_of_11", None)
+        return __import__("fractions_of_11").fraction
+
+    assert imported()(5) == 2 / 11
+    loaded = imported()
+    assert (loaded(5), sum(loaded.stats.cache_hits.values())) == (2 / 11, 1)
+    (path,) = (tmp_path / "__pycache__").glob(kind)
+    path.write_bytes(path.read_bytes()[:20])
+    with pytest.raises(MachineFaultError, match=r"delete its \.nbi and \.nbc files") as raised:
+        imported()(5)
+    assert str(tmp_path / "__pycache__") in str(raised.value)
+    path.unlink()
+    assert imported()(5) == 2 / 11
 
 
 def test_what_compiled_code_uses_is_declared_in_the_sources_of_the_digest():
@@ -244,7 +167,8 @@ def _added_thrice(values, step):
 def test_constants_of_callers_make_no_functions_of_their_own():
     enabled = gc.isenabled()
     for function in (_added, _added_thrice):  # an earlier run may have left them on disk
-        function._cache.flush()
+        for index in Path(function.stats.cache_path).glob(f"*.{function.__name__}-*.nbi"):
+            index.unlink()
     assert _added_thrice(np.array([3.0]), 4) == 16.0
     assert len(_added.signatures) == 1  # each constant made one before: `fit` was compiled thrice
     assert gc.isenabled() == enabled
@@ -270,20 +194,18 @@ def test_compiled_functions_assign_no_arrays_to_slices():
                     assert not sliced, f"{path.name}:{node.lineno}"
 
 
-def test_first_use_is_announced_and_no_later_one(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(compilation, "cache_folder", lambda: tmp_path)
-    monkeypatch.setattr(compilation, "_substitute_folder", lambda: tmp_path / "none")
+def test_first_use_is_announced_and_no_later_one(monkeypatch, capsys):
+    cached = set()
+    monkeypatch.setattr(
+        "sweep.compilation.is_cached", lambda module, name: f"{module}.{name}" in cached)
     plain = Pipeline.from_text("[pose]\nside_px = 50")
     bound = Pipeline.from_text(
         "[pose]\nside_px = 50\n[scene]\nnoise_grey = 2\nbound = 'known_blur'")
-    for pipeline, compiled, line in (
-        (plain, "", "compiling, once for this version: about 8 s\n"),
-        (bound, "", "compiling, once for this version: about 18 s\n"),
-        (bound, "coverage.accumulate-1", "compiling, once for this version: about 10 s\n"),
-        (plain, "", ""),
-        (bound, "likelihood.fit-1", ""),
+    for pipeline, compiled, seconds in (
+        (plain, "", 8), (bound, "", 18), (bound, "sweep.model.coverage.accumulate", 10),
+        (plain, "", 0), (bound, "sweep.measure.likelihood.fit", 0),
     ):
-        if compiled:
-            (tmp_path / f"{compiled}.py311.nbi").touch()
+        cached.add(compiled)
         announce_compilation(pipeline)
+        line = f"compiling, once for this version: about {seconds} s\n" if seconds else ""
         assert capsys.readouterr().err == line

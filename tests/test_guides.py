@@ -16,14 +16,14 @@ from typing import NamedTuple
 
 import pytest
 
+from support.guide_tables import TABLES, outdated_tables
 from support.here import calls_here
 from support.room_picture import PICTURE, drawn
 from sweep.cli import main
 from sweep.photographs.twins import read_scene
-from sweep.plan.board_files import read_board
-from sweep.plan.experiment import Pipeline
+from sweep.plan.board_rules import read_board
 from sweep.plan.parameters import PARAMETERS, SECTIONS, Stage
-from sweep.plan.reference import TABLES, outdated_tables
+from sweep.plan.pipeline import Pipeline
 
 TOP = Path(__file__).parent.parent
 FOLDERS = ("pipelines", "sweep", "tests", "notebooks")
@@ -261,7 +261,7 @@ def test_parameters_variables_flags_solvers_and_effects_are_those_of_the_declara
     names = []
     for path in GUIDES:
         text = path.read_text()
-        assert not outdated_tables(text), f"python -m sweep.plan.reference {path}"
+        assert not outdated_tables(text), f"python tests/support/guide_tables.py {path}"
         names += re.findall("<!-- table: (.*) -->", text)
     parts = {f"parameters.{section}" for section in SECTIONS}
     parts |= {name for name in TABLES if name.startswith("flags.")}

@@ -37,7 +37,7 @@ def test_rooms_import_one_way():
 @pytest.mark.parametrize(("lower", "upper"), [
     ("model/pose.py", "sweep.measure.flags"),
     ("store/layout.py", "sweep.evaluation"),      # neighbours are independent, too
-    pytest.param("plan/draws.py", "sweep.report.theme", marks=pytest.mark.long),
+    pytest.param("plan/draws.py", "sweep.report.charts", marks=pytest.mark.long),
 ])
 def test_an_import_upwards_breaks_the_contract(copied, lower, upper):
     with (copied / "sweep" / lower).open("a") as file:
@@ -46,6 +46,18 @@ def test_an_import_upwards_breaks_the_contract(copied, lower, upper):
     assert status == 1
     assert "BROKEN" in output
     assert f"sweep.{lower[:-3].replace('/', '.')} -> {upper}" in output
+
+
+@pytest.mark.parametrize(("imported", "importer"), [
+    ("model/pose.py", "sweep.model.scene"),
+    pytest.param("plan/axes.py", "sweep.plan.pipeline", marks=pytest.mark.long),
+])
+def test_a_circle_inside_a_room_breaks_the_contract(copied, imported, importer):
+    with (copied / "sweep" / imported).open("a") as file:
+        file.write(f"\nif False:\n    import {importer}\n")
+    status, output = contract_of(copied)
+    assert status == 1
+    assert "No circle of imports" in output
 
 
 def test_a_room_that_the_contract_does_not_name_breaks_it(copied):

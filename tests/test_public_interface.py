@@ -115,24 +115,6 @@ def test_what_is_no_pipeline_is_an_argument_error():
         sweep.run(3)
 
 
-@pytest.mark.long
-def test_arguments_of_version_0_5_are_accepted_with_a_warning(finished, tmp_path):
-    pipeline = sweep.Pipeline.from_text(TEXT)
-    with pytest.warns(DeprecationWarning, match="second positional argument; use store="):
-        results = sweep.run(pipeline, finished)
-    assert results.identical(sweep.open(finished))
-    seen = []
-    with pytest.warns(DeprecationWarning, match="use progress=|sized by") as warned:
-        sweep.run(
-            pipeline, store=tmp_path / "few.zarr", on_progress=seen.append, block_s=0.1
-        )
-    assert {str(each.message) for each in warned} == {
-        "sweep.run: on_progress=; use progress=",
-        "sweep.run: block_s=; blocks are sized by a measurement",
-    }
-    assert seen
-
-
 RIGHT = """
 from pathlib import Path
 
@@ -190,7 +172,7 @@ def test_mypy_sees_the_types_of_the_installed_package_in_a_users_script(tmp_path
     revealed = [line.partition("Revealed type is ")[2] for line in lines if "Revealed" in line]
     assert revealed == [
         '"xarray.core.dataset.Dataset"', '"xarray.core.dataset.Dataset"',
-        '"sweep.plan.experiment.Pipeline"', '"str"', '"str"',
+        '"sweep.plan.pipeline.Pipeline"', '"str"', '"str"',
     ], ran.stdout + ran.stderr
     errors = [line for line in lines if ": error:" in line]
     assert all(line.startswith("wrong.py:") for line in errors), ran.stdout

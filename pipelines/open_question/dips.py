@@ -19,10 +19,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from bit_reading import Reading, cell_mixing
 from numpy.typing import NDArray
 from scipy.signal import find_peaks, peak_widths
-
-from sweep.measure.bit_reading import Reading, cell_mixing
 
 PROMINENCE = 0.06
 SAME_PLACE = 0.10

@@ -8,14 +8,14 @@ from pathlib import Path
 import cv2
 import matplotlib as mpl
 import numpy as np
+from bit_reading import reading_of
 from dips import Rates
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sweep.measure.bit_reading import reading_of
-from sweep.measure.detector import DetectorSetting
+from sweep.measure.detectors import DetectorSetting
 from sweep.model.marker import modules
-from sweep.report.theme import COLOURS, FAINT, INK, RULE, STRIP
+from sweep.report.charts import COLOURS, FAINT, INK, RULE, STRIP
 
 BLUE, VERMILION, GREEN, _, SKY, ORANGE, _ = COLOURS
 STYLE = {

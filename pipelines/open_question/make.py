@@ -20,7 +20,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import xarray as xr
+from bit_reading import lone_cells, predicted_rates, reading_of
 from dips import PROMINENCE, Rates, dips, half_read, pairs
+from quadrilaterals import Surround, upright_corners
 from sweeps import (
     DEVELOPMENT,
     HELD_BACK,
@@ -36,10 +38,8 @@ from sweeps import (
 
 import sweep
 from sweep.analysis import compare
-from sweep.measure.bit_reading import lone_cells, predicted_rates, reading_of
-from sweep.measure.detector import DetectorSetting
+from sweep.measure.detectors import DetectorSetting
 from sweep.measure.flags import DetectionStatus
-from sweep.measure.quadrilaterals import Surround, upright_corners
 from sweep.model.marker import module_count, modules, opencv_dictionary
 
 FOLDER = Path(__file__).parent

@@ -16,13 +16,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import xarray as xr
+from bit_reading import predicted_rates, reading_of
 from dips import Rates
+from quadrilaterals import Surround, upright_corners
 
 import sweep
-from sweep.measure.bit_reading import predicted_rates, reading_of
-from sweep.measure.detector import DetectorSetting
+from sweep.measure.detectors import DetectorSetting
 from sweep.measure.flags import DetectionStatus
-from sweep.measure.quadrilaterals import Surround, upright_corners
 from sweep.model.marker import dictionary_names, marker_count, module_count, modules
 
 FOLDER = Path(__file__).parent

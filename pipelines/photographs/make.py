@@ -26,19 +26,17 @@ from numpy.typing import NDArray
 
 import sweep
 from sweep.analysis import simulation_gap
-from sweep.fitting.marker_state import VARIANCE
-from sweep.fitting.photograph_fit import START, fit_photograph
-from sweep.fitting.scenes import photograph_scenes
-from sweep.fitting.views import is_saturated, photograph_views
+from sweep.fitting.photograph_fit import START, VARIANCE, fit_photograph
+from sweep.fitting.views import is_saturated, photograph_scenes, photograph_views
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
 from sweep.photographs.twins import read_scene, twin_pipeline
-from sweep.plan.board_files import read_board
+from sweep.plan.board_rules import read_board
+from sweep.plan.experiment import scene_plugins
 from sweep.plan.grid import scene_axes, scene_values
-from sweep.plan.scene_plugins import scene_plugins
-from sweep.report.gap_table import gap_table
-from sweep.store.stored_pipeline import read_pipeline
+from sweep.report.gap_figure import gap_table
+from sweep.store.lifecycle import read_pipeline
 
 FOLDER = Path(__file__).parent
 

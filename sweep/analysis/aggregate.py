@@ -17,16 +17,29 @@ import xarray as xr
 from dask.typing import Key
 from numpy.typing import NDArray
 
-from sweep.analysis.binning import Binning, Bins, read_bins
-from sweep.analysis.dimensions import is_fixed, is_sampling_stopped, of_photographs
-from sweep.analysis.graph import ChunkReader, ReadBlock, TaskLayer, add_pass, array_of_blocks
-from sweep.analysis.layout import Arrays, Layout, Lengths
-from sweep.analysis.photograph_statistics import by_photograph
-from sweep.analysis.pose_view import COMMON
-from sweep.analysis.replicates import replicate_order, replicated
-from sweep.analysis.states import BlockState, Nothing, State
-from sweep.analysis.statistic import Output, SinglePass, Statistic, Variables, ViewT
-from sweep.analysis.stopped_sampling import as_stopped, common_trials
+from sweep.analysis.binning import (
+    Arrays,
+    Binning,
+    Bins,
+    ChunkReader,
+    Layout,
+    Lengths,
+    ReadBlock,
+    TaskLayer,
+    add_pass,
+    array_of_blocks,
+    read_bins,
+)
+from sweep.analysis.dataset import is_fixed, is_sampling_stopped, of_photographs
+from sweep.analysis.draws import (
+    as_stopped,
+    by_photograph,
+    common_trials,
+    replicate_order,
+    replicated,
+)
+from sweep.analysis.poses import COMMON
+from sweep.analysis.statistic import Nothing, Output, SinglePass, State, Statistic, Variables, ViewT
 
 MAX_AT_ONCE = 1 << 21
 """Poses, times the lengths of inner dimensions, up to which what is in memory is one block.
@@ -62,7 +75,7 @@ def aggregate(
     bins
         Edges (n + 1,) of bins [low, high) of a variable or coordinate of the scene.
     stopped
-        Whether sampling was stopped (`sweep.analysis.stopped_sampling`); by default what the
+        Whether sampling was stopped (`sweep.analysis.draws`); by default what the
         dataset's attributes say.
 
     Returns
@@ -135,7 +148,7 @@ class Passes(Generic[ViewT]):
         """Whether no statistic needs the second pass."""
         return all(isinstance(statistic, SinglePass) for statistic in self.statistics)
 
-    def first_pass(self, sizes: Mapping[str, int], read: ReadBlock) -> list[BlockState[Any]]:
+    def first_pass(self, sizes: Mapping[str, int], read: ReadBlock) -> list[State]:
         """Return the states of a block."""
         return self._by_bin(sizes, read, lambda poses, _: [
             statistic.first_pass(poses) for statistic in self.statistics])
@@ -147,7 +160,7 @@ class Passes(Generic[ViewT]):
 
     def second_pass(
         self, sizes: Mapping[str, int], read: ReadBlock, known: Sequence[State]
-    ) -> list[BlockState[Any]]:
+    ) -> list[State]:
         """Return the states of a block."""
         return self._by_bin(sizes, read, lambda poses, number: [
             statistic.second_pass(poses, state.every_nth(self.binning.count, number))
@@ -175,8 +188,8 @@ class Passes(Generic[ViewT]):
 
     def _by_bin(
         self, sizes: Mapping[str, int], read: ReadBlock,
-        pass_over: Callable[[ViewT, int], list[BlockState[Any]]],
-    ) -> list[BlockState[Any]]:
+        pass_over: Callable[[ViewT, int], list[State]],
+    ) -> list[State]:
         """Return the states of all combinations of bins, those of a group together."""
         arrays = self.layout.arrange(read(), sizes)
         by_bin = []
@@ -186,7 +199,7 @@ class Passes(Generic[ViewT]):
         return [type(states[0]).interleave(states) for states in zip(*by_bin, strict=True)]
 
 
-def fold(*parts: Sequence[BlockState[Any]]) -> list[State]:
+def fold(*parts: Sequence[State]) -> list[State]:
     """Return the folded states of some cells, of all their draws."""
     return [functools.reduce(type(states[0]).merge, states).fold()
             for states in zip(*parts, strict=True)]

@@ -18,21 +18,21 @@ from numpy.typing import ArrayLike
 from sweep.analysis.aggregate import aggregate
 from sweep.analysis.binning import Bins
 from sweep.analysis.counts import Count, Rate, scaled_to_draws
-from sweep.analysis.described import describes
-from sweep.analysis.dimensions import (
+from sweep.analysis.dataset import (
     as_names,
     configuration_axes,
+    describes,
     is_sampling_stopped,
     kept_dimensions,
 )
+from sweep.analysis.draws import TAIL_SHARE
 from sweep.analysis.intervals import TAIL, clopper_pearson
-from sweep.analysis.pose_view import ESTIMATE_INPUTS, Poses, pose_arrays
+from sweep.analysis.poses import ESTIMATE_INPUTS, Poses, pose_arrays
 from sweep.analysis.rates import FLIPPED, SOLVED
 from sweep.analysis.statistic import Statistic
-from sweep.analysis.stopped_sampling import TAIL_SHARE
 from sweep.errors import ArgumentError
 from sweep.measure.flags import Flag, flag
-from sweep.plan.variable import cf_attributes
+from sweep.plan.schema import cf_attributes
 from sweep.typing import Floats, Integers, Masks
 
 THRESHOLDS = (
@@ -249,7 +249,9 @@ def _along_thresholds(table: xr.Dataset, tried: Sequence[float]) -> xr.Dataset:
     """Return a table of variables at single thresholds as one of variables along them."""
     def along(name: str, end: str = "") -> xr.DataArray:
         parts = [table[_at(name, threshold, end)] for threshold in tried]
-        joined = xr.concat(parts, dim="threshold").transpose(..., "threshold")
+        joined = xr.concat(
+            parts, dim="threshold", coords="minimal", compat="override", join="exact",
+        ).transpose(..., "threshold")
         return joined.chunk({"threshold": -1}) if joined.chunks is not None else joined
 
     variables = {name: table[name] for name in ("solved", "flipped", "without_alternative")}

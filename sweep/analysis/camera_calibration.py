@@ -14,8 +14,7 @@ import cv2
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.described import describes
-from sweep.analysis.dimensions import DRAWS, axes_of, stored_pipeline
+from sweep.analysis.dataset import DRAWS, axes_of, describes, stored_pipeline
 from sweep.analysis.intervals import DEVIATIONS, wilson
 from sweep.errors import ArgumentError, DatasetError, SweepError
 from sweep.measure.board_solver import guarded_poses
@@ -32,11 +31,11 @@ from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.pose import rotation_of_vector, transform_points
 from sweep.model.scene import build_cameras
-from sweep.plan.boards import shows_boards
-from sweep.plan.experiment import Pipeline
+from sweep.plan.experiment import shows_boards
 from sweep.plan.grid import scene_axes, scene_values
 from sweep.plan.parameters import Stage
-from sweep.plan.variable import cf_attributes
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.schema import cf_attributes
 from sweep.typing import Floats
 
 DIRECTIONS = ("centre", "corner")

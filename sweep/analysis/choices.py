@@ -1,9 +1,4 @@
-"""The choice that meets requirements at all conditions: of a size, and among other settings.
-
-What a choice is stands in `sweep.plan.choice_rule`, when one is answered in
-`sweep.analysis.choice_walk`. Every alternative, a combination of the values of the axes ``among``,
-has its own answer.
-"""
+"""Which value, smallest, largest or cheapest, meets requirements at all conditions."""
 
 from __future__ import annotations
 
@@ -16,19 +11,195 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sweep.analysis.choice_walk import Decisions, error_shares, needed, walk
-from sweep.analysis.requirable import MIN_DRAWS
 from sweep.analysis.requirements import (
+    ERROR_PROBABILITY,
+    MIN_DRAWS,
     Decision,
     ErrorShares,
     Requirement,
+    combined_decision,
     decide,
     parse_requirements,
+    read_requirements,
 )
-from sweep.plan.choice_rule import ChoiceRule
-from sweep.plan.experiment import Pipeline
+from sweep.messages import shown
+from sweep.plan.axes import TRIAL
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.sampling import CHOOSE, ChoiceRule
 from sweep.typing import Floats, Masks
 
+# --------------------------------------------------------------------------------------------------
+# What is wrong with a choice before anything is computed, a line each.
+
+def choice_faults(pipeline: Pipeline, rule: ChoiceRule, shares: ErrorShares) -> list[str]:
+    """Return what makes a choice impossible.
+
+    Those are requirements that cannot be, and those that ``max_trials`` cannot show to be met even
+    if no trial fails.
+    """
+    required, faults = read_requirements(rule.requirements)
+    lines = [f"require.all = {shown(text)}: {problem}" for text, problem in faults]
+    kept = {TRIAL, rule.along, *rule.among, *rule.per}
+    pooled = math.prod(len(axis) for axis in pipeline.axes if axis.name not in kept)
+    for each in required:
+        least = math.ceil(least_draws(each, shares.met) / pooled)
+        if least > rule.max_trials:
+            lines.append(
+                f"{CHOOSE}.max_trials = {rule.max_trials}: expected at least {least:,}: fewer "
+                f"cannot show {each.text} with this confidence, even if all meet it")
+    return lines
+
+
+def least_draws(requirement: Requirement, share: float) -> int:
+    """Return the draws below which a requirement cannot be decided as met.
+
+    Of a rate, with no failure Clopper and Pearson's end is the tail's n-th root; a quantile needs
+    an order statistic beyond; means are not decided below `MIN_DRAWS`.
+
+    Examples
+    --------
+    >>> from sweep.analysis.requirements import parse_requirement
+    >>> least_draws(parse_requirement("detection >= 0.99"), 1.0)
+    368
+    """
+    what = requirement.requirable
+    tail = (1.0 - what.level) * share / 2.0
+    if what.is_rate:
+        good = requirement.limit if requirement.at_least else 1.0 - requirement.limit
+        return math.ceil(math.log(tail) / math.log(good)) if 0.0 < good < 1.0 else 1
+    if what.percent is not None:
+        share_below = what.percent / 100.0
+        return math.ceil(math.log(tail) / math.log(
+            1.0 - share_below if requirement.at_least else share_below))
+    return MIN_DRAWS
+
+
+# --------------------------------------------------------------------------------------------------
+# The walk from the safe end of an axis to the wanted one: what is answered, what is needed still.
+#
+# The values of the axis stand in the order of the walk: for the smallest size that will do, from
+# the largest down. Each value's conditions are decided one by one. The answer is the last value
+# of the walk that meets the requirements, as all values before it do that can be judged: so a
+# value beyond one that fails, on the other side of a dip, is no answer. Values at which nothing
+# can be judged, such as sizes that do not fit into the image, are left out.
+#
+# That makes the error of the answer that of a single decision: it is wrong only if, at the first
+# value of the walk that truly fails, the condition at which it fails is decided as met. Neither
+# the number of values nor that of conditions counts (Berger, "Multiparameter hypothesis testing
+# and acceptance sampling", Technometrics 24, 1982: an intersection-union test; Marcus, Peritz and
+# Gabriel, Biometrika 63, 1976: tests in a fixed order); the numbers of waves, after each of which
+# a decision is made, and of alternatives do (Bonferroni).
+
+Decisions = NDArray[np.uint8]
+
+
+def error_shares(
+    confidence: float, *, waves: int, alternatives: int, values: int, conditions: int,
+    requirements: int,
+) -> ErrorShares:
+    """Return the shares of the error probability that each decision of a search may spend.
+
+    Parameters
+    ----------
+    confidence
+        Probability with which no answer fails, and, again, with which no value that is told to
+        fail meets all.
+    waves
+        How often a decision is made at most: once after each wave.
+    alternatives, values, conditions, requirements
+        How many there are. "Met" is corrected for waves and alternatives, "not met" for all.
+
+    Examples
+    --------
+    >>> error_shares(0.9, waves=10, alternatives=2, values=5, conditions=2, requirements=1)
+    ErrorShares(met=0.1, not_met=0.01)
+    """
+    met = (1.0 - confidence) / ERROR_PROBABILITY / waves / alternatives
+    not_met = met / (values * conditions * requirements)
+    return ErrorShares(float(f"{met:.12g}"), float(f"{not_met:.12g}"))
+
+
+def needed(decision: Decisions, keeps: Masks) -> Masks:
+    """Return which cells need more trials, (..., values, conditions).
+
+    Those are the undecided conditions of the values up to the first that fails, or seems to: of
+    that one, only the conditions at which it seems to fail. What lies beyond it waits until it is
+    decided, and is never needed if it does fail.
+
+    Parameters
+    ----------
+    decision
+        (..., values, conditions) of `sweep.analysis.requirements.Decision`, in the order of the
+        walk.
+    keeps
+        Of the same shape: where the estimates keep all limits.
+    """
+    undecided = decision == Decision.undecided
+    seems = undecided & ~keeps
+    value = combined_decision(decision, -1)
+    stops = (value == Decision.not_met) | seems.any(axis=-1)
+    before = np.cumsum(stops, axis=-1) == 0
+    first = stops & (np.cumsum(stops, axis=-1) == 1) & (value == Decision.undecided)
+    return np.asarray((undecided & before[..., None]) | (seems & first[..., None]))
+
+
+@dataclass(frozen=True, slots=True)
+class Walk:
+    """How far a walk came; indices along the walk.
+
+    Attributes
+    ----------
+    answer
+        The last value before which, and at which, all is met; -1 for none.
+    next
+        The first value that is not met or undecided; the number of values if there is none.
+    isolated
+        Values from ``next`` on that fail, or seem to, and beyond which another seems to meet all:
+        failures that a search by halving would have stepped over.
+    passing
+        The values beyond that seem to meet all, or do.
+    """
+
+    answer: int
+    next: int
+    isolated: tuple[int, ...]
+    passing: tuple[int, ...]
+
+
+def walk(decision: Decisions, keeps: Masks) -> Walk:
+    """Return how far a walk comes, of one alternative.
+
+    Parameters
+    ----------
+    decision, keeps
+        (values, conditions), as in `needed`.
+
+    Examples
+    --------
+    >>> met, failed = Decision.met, Decision.not_met
+    >>> decision = np.array([[met], [met], [failed], [met], [failed]], np.uint8)
+    >>> walk(decision, decision == met)
+    Walk(answer=1, next=2, isolated=(2,), passing=(3,))
+    """
+    value = combined_decision(decision, -1)
+    judged = value != Decision.not_applicable
+    stops = np.flatnonzero(judged & (value != Decision.met))
+    after = int(stops[0]) if stops.size else len(value)
+    met = np.flatnonzero(value[:after] == Decision.met)
+    applicable = decision != Decision.not_applicable
+    seems = (keeps | ~applicable).all(axis=-1) & judged & (value != Decision.not_met)
+    passing = [k for k in range(after + 1, len(value)) if seems[k]]
+    isolated = [k for k in range(after, passing[-1])
+                if judged[k] and (not seems[k] or k == after)] if passing else []
+    return Walk(int(met[-1]) if met.size else -1, after, tuple(isolated), tuple(passing))
+
+
+# --------------------------------------------------------------------------------------------------
+# The choice that meets requirements at all conditions: of a size, and among other settings.
+#
+# What a choice is stands in `sweep.plan.sampling`, when one is answered in
+# `sweep.analysis.choices`. Every alternative, a combination of the values of the axes ``among``,
+# has its own answer.
 
 @dataclass(frozen=True, slots=True)
 class Cause:
@@ -101,6 +272,10 @@ class Answer:
         Those values beyond.
     nearest
         If none is met: what is nearest to it.
+    is_open
+        Whether it is undecided what the answer is: the next value may meet them, too.
+    possible
+        The last value that may do so: none before it is decided to fail.
     """
 
     alternative: Mapping[str, Any]
@@ -112,6 +287,8 @@ class Answer:
     isolated: tuple[tuple[float, Cause], ...] = ()
     passing: tuple[float, ...] = ()
     nearest: Nearest | None = None
+    is_open: bool = False
+    possible: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +306,8 @@ class ChoiceCells:
     each, excess
         (alternatives, values, conditions, requirements): the decision, and how far the value is
         beyond the limit, relative to it; negative on the right side of it, infinite for no number.
+    hopeless
+        (alternatives, values, conditions): undecided, and no number of trials will tell.
     """
 
     table: xr.Dataset
@@ -136,13 +315,15 @@ class ChoiceCells:
     keeps: Masks
     each: Decisions
     excess: Floats
+    hopeless: Masks
     among: tuple[str, ...]
     per: tuple[str, ...]
 
     def needed(self) -> xr.DataArray:
         """Return which cells need more trials, dimensions (*among, along, *per)."""
         template = self.table["decision"].isel(requirement=0, drop=True)
-        return template.copy(data=needed(self.decision, self.keeps).reshape(template.shape))
+        decision = np.where(self.hopeless, np.uint8(Decision.not_met), self.decision)
+        return template.copy(data=needed(decision, self.keeps).reshape(template.shape))
 
 
 def choice_shares(pipeline: Pipeline, rule: ChoiceRule, waves: int) -> ErrorShares:
@@ -186,17 +367,14 @@ def choice_cells(results: xr.Dataset, rule: ChoiceRule, shares: ErrorShares) -> 
                        name not in (*kept, "trial", "xyz"))
     with np.errstate(invalid="ignore"):
         coming = cells("draws") / poses * rule.max_trials * pooled
-    hopeless = (poses >= MIN_DRAWS) & (coming < MIN_DRAWS)
-    each = np.where(hopeless & (cells("decision") == Decision.undecided),
-                    Decision.not_met, cells("decision")).astype(np.uint8)
+    each = cells("decision").astype(np.uint8)
+    hopeless = (poses >= MIN_DRAWS) & (coming < MIN_DRAWS) & (each == Decision.undecided)
+    decision = combined_decision(each, -1)
     excess = np.stack([_excess(one, cells("value")[..., k]) for k, one in enumerate(required)], -1)
     excess = np.where(each == Decision.not_applicable, -np.inf, excess)
-    applicable = each != Decision.not_applicable
-    decision = np.where((each == Decision.not_met).any(-1), Decision.not_met, np.where(
-        ((each == Decision.met) | ~applicable).all(-1), Decision.met, Decision.undecided))
-    decision = np.where(applicable.any(-1), decision, Decision.not_applicable).astype(np.uint8)
     return ChoiceCells(
-        table, decision, np.asarray((excess <= 0.0).all(-1)), each, excess, rule.among, rule.per)
+        table, decision, np.asarray((excess <= 0.0).all(-1)), each, excess,
+        hopeless.any(-1) & (decision == Decision.undecided), rule.among, rule.per)
 
 
 def _excess(requirement: Requirement, value: Floats) -> Floats:
@@ -246,11 +424,17 @@ def _answer(
         judged = (cells.decision[k] != Decision.not_applicable).any(axis=1)
         best = int(np.argmin(np.where(judged, worst, np.inf)))
         nearest = Nearest(values[best], float(worst[best]), _cause(cells, k, best))
+    value = combined_decision(cells.decision[k], -1)
+    failing = np.flatnonzero(value == Decision.not_met)
+    before = value[: failing[0] if failing.size else len(value)]
+    possible = np.flatnonzero(before != Decision.not_applicable)
+    is_open = bool((before == Decision.undecided).any())
     return Answer(
         alternative, came.answer >= 0, values[came.answer] if came.answer >= 0 else None, tightest,
         after, cause,
         tuple((_number(values[at]), _cause(cells, k, at)) for at in came.isolated),
-        tuple(_number(values[at]) for at in came.passing), nearest)
+        tuple(_number(values[at]) for at in came.passing), nearest, is_open,
+        values[possible[-1]] if possible.size else None)
 
 
 def _number(value: float | None) -> float:

@@ -1,27 +1,204 @@
-"""Two configurations on the same scenes, pose by pose: what differs, and whether it is chance."""
+"""Paired comparisons: configurations, renderers, and stores on the same images."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from sweep.analysis.aggregate import aggregate
-from sweep.analysis.binning import Bins
-from sweep.analysis.counts import Count, CountOfDraws
-from sweep.analysis.described import describes
-from sweep.analysis.dimensions import DRAWS, is_sampling_stopped, kept_dimensions
+from sweep.analysis.binning import Arrays, Bins
+from sweep.analysis.counts import Count, CountOfDraws, Rate, newcombe_and_mcnemar
+from sweep.analysis.dataset import (
+    DRAWS,
+    as_names,
+    axes_of,
+    configuration_axes,
+    describes,
+    fingerprint_of,
+    is_grid_axis,
+    is_sampling_stopped,
+    kept_dimensions,
+    require_dimension,
+    require_poses,
+    stored_pipeline,
+)
+from sweep.analysis.draws import stopped_level
 from sweep.analysis.intervals import LEVEL
-from sweep.analysis.means import Mean, RootMeanSquareRatio
-from sweep.analysis.paired_rates import newcombe_and_mcnemar
-from sweep.analysis.pose_pairs import TRUTH, Pair, paired_arrays, require_pairs
-from sweep.analysis.pose_view import ERROR_INPUTS, Poses, norm_squared, pose_arrays
-from sweep.analysis.quantities import QUANTITIES, Quantity
+from sweep.analysis.means import Mean, RootMeanSquare, RootMeanSquareRatio
+from sweep.analysis.poses import (
+    DETECTION_INPUTS,
+    ERROR_INPUTS,
+    OF_MARKERS,
+    QUANTITIES,
+    REQUIRED_VARIABLES,
+    SIGNED,
+    Poses,
+    Quantity,
+    norm_squared,
+    pose_arrays,
+)
 from sweep.analysis.statistic import Statistic
-from sweep.analysis.stopped_sampling import stopped_level
-from sweep.typing import Floats, Masks
+from sweep.errors import ArgumentError, DatasetError, SweepError
+from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.messages import plain
+from sweep.model.pose import rotation_of_vector, vector_of_rotation
+from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.schema import LABELS, cf_attributes
+from sweep.typing import Floats, Integers, Masks
+
+# --------------------------------------------------------------------------------------------------
+# The same poses with two configurations, of a store or of two stores, as statistics read them.
+
+TRUTH = ("true_tvec_m", "true_rvec")
+"""Variables that are the same for both poses of a pair."""
+
+
+class Pair:
+    """The poses of two datasets, pose by pose.
+
+    Parameters
+    ----------
+    arrays
+        Those of `paired_arrays`, (groups, cells, draws, settings, ...).
+    """
+
+    def __init__(self, arrays: Arrays) -> None:
+        self.first, self.second = Poses(arrays, "first "), Poses(arrays, "second ")
+
+    @property
+    def draws(self) -> Masks:
+        """Which draws were run in both: (groups, cells, draws)."""
+        return self.first.draws & self.second.draws
+
+    @property
+    def compared(self) -> Masks:
+        """Poses that were looked for in both."""
+        return self.first.looked_for & self.second.looked_for
+
+    @property
+    def differing(self) -> Masks:
+        """Poses whose truth differs."""
+        names = [name for name in TRUTH if name in self.first and name in self.second]
+        differ = [(self.first[name] != self.second[name]).any(axis=-1) for name in names]
+        return np.asarray(np.any(differ, axis=0))
+
+    @property
+    def both_solved(self) -> Masks:
+        """Poses that were solved in both."""
+        return self.first.solved & self.second.solved
+
+
+def paired_arrays(
+    first: dict[str, xr.DataArray], second: dict[str, xr.DataArray]
+) -> dict[str, xr.DataArray]:
+    """Return the arrays of two datasets by the names that `Pair` gives them."""
+    return {f"{side} {name}": array.reset_coords(drop=True)
+            for side, arrays in (("first", first), ("second", second))
+            for name, array in arrays.items()}
+
+
+def require_pairs(first: xr.Dataset, second: xr.Dataset) -> None:
+    """Raise DatasetError unless two datasets are of the same scenes and draws."""
+    for name, value in first.coords.items():
+        if (is_grid_axis(name, first) and not value.dims
+                and name in second.coords and not second[name].dims):
+            values = value.item(), second[name].item()
+            if values[0] != values[1]:
+                raise DatasetError(f"not the same scenes: {name} is {values[0]} and {values[1]}, "
+                                   "with other draws")
+    axes, others = axes_of(first), axes_of(second)
+    if set(axes) != set(others):
+        raise DatasetError(f"not the same scenes: dimensions {', '.join(axes) or 'none'} "
+                           f"and {', '.join(others) or 'none'}")
+    for name in axes:
+        if not np.array_equal(first[name].values, second[name].values):
+            raise DatasetError(f"not the same scenes: the values of {name} differ")
+    seeds = [fingerprint_of(side).get("seed") for side in (first, second)]
+    if None not in seeds and seeds[0] != seeds[1]:
+        raise DatasetError(f"not the same draws: seeds {seeds[0]} and {seeds[1]}")
+    sampling = [fingerprint_of(side).get("sampling", "independent") for side in (first, second)]
+    if sampling[0] != sampling[1]:
+        raise DatasetError(f"not the same draws: sampling {sampling[0]} and {sampling[1]}")
+
+
+# --------------------------------------------------------------------------------------------------
+# How far corners and poses moved between two treatments of the same images, as statistics.
+
+CORNERS = "corner_error_px"
+OF_BOARDS = next(name for name, single in OF_MARKERS.items() if single == CORNERS)
+ROTATION_VARIABLE = "rotation_error_rad"
+
+_ROTATION, _DEPTH = QUANTITIES[:2]
+
+_POSE_DIMENSIONS = 4
+"""Groups, cells, draws and settings: what stands before the dimensions of a pose's corners."""
+
+
+def corners_of(results: xr.Dataset) -> str:
+    """Return the name of the corners' errors: a marker's, or those of a board's markers."""
+    return OF_BOARDS if OF_BOARDS in results else CORNERS
+
+
+def corner_shift(whose: str, corners: str) -> RootMeanSquare[Pair]:
+    """Return the RMS of the second corners minus the first, ``whose`` in its description.
+
+    ``corners`` as :func:`corners_of` returns it. Of a board the corners count that both found; one
+    without any does not count.
+    """
+    def in_both(pair: Pair) -> Masks:
+        shown = pair.compared & pair.first.detected & pair.second.detected
+        return shown if corners == CORNERS else np.asarray(
+            shown & np.isfinite(_corner_shift(pair, corners)[..., 0]))
+
+    return RootMeanSquare(
+        "corner_shift_rms_px", f"RMS of a corner's coordinate minus {whose}", "px",
+        lambda pair: _corner_shift(pair, corners), in_both)
+
+
+def pose_shifts(whose: str) -> list[Mean[Pair] | RootMeanSquare[Pair]]:
+    """Return bias of the range and RMS of the rotation, second minus first, as `corner_shift`."""
+    return [
+        Mean("range_bias_percent",
+             f"mean depth error minus {whose}, of the true depth, both solved", "percent",
+             lambda pair: _DEPTH.vector(pair.second) - _DEPTH.vector(pair.first),
+             lambda pair: pair.both_solved),
+        RootMeanSquare(
+            "rotation_shift_deg",
+            f"RMS of the rotation error minus {whose}, both solved and not flipped",
+            _ROTATION.units, _rotation_shift,
+            lambda pair: pair.first.unflipped & pair.second.unflipped),
+    ]
+
+
+def _corner_shift(pair: Pair, corners: str) -> Floats:
+    """Return the mean squared difference (..., 1) of the corners that both found, else NaN."""
+    moved = np.subtract(pair.second[corners], pair.first[corners], dtype=np.float64) ** 2
+    if corners == CORNERS:
+        return np.asarray(moved.mean(axis=(-2, -1))[..., None])
+    inner = tuple(range(_POSE_DIMENSIONS, moved.ndim))
+    found = np.isfinite(moved).sum(axis=inner)
+    total = np.nansum(moved, axis=inner)
+    return np.where(found > 0, total / np.maximum(found, 1), np.nan)[..., None]
+
+
+def _rotation_shift(pair: Pair) -> Floats:
+    moved = np.subtract(
+        pair.second[ROTATION_VARIABLE], pair.first[ROTATION_VARIABLE], dtype=np.float64
+    )
+    return norm_squared(np.degrees(moved))[..., None]
+
+
+# --------------------------------------------------------------------------------------------------
+# Two configurations on the same scenes, pose by pose: what differs, and whether it is chance.
 
 PairStatistic = Statistic[Pair, Any, Any, Any]
 
@@ -52,7 +229,8 @@ def compare(
           ``both_detected``, ``only_first_detected``, ``only_second_detected`` and
           ``neither_detected`` of them; the same four of ``solved``.
         - ``detection_difference`` of the rates, with its interval. ``detection_p_value``: how
-          often chance alone makes the two discordant counts as unequal.
+          often chance alone makes the two discordant counts as unequal. ``solved_difference`` and
+          ``solved_p_value`` likewise.
         - ``run_in_one``: poses that one of the two alone ran, as in stores whose sampling stopped
           after different trials: only trials that both have are compared.
         - ``different_scenes``: compared poses whose truth differs, as in stores with other
@@ -198,22 +376,542 @@ def _differences(quantity: Quantity, level: float) -> list[PairStatistic]:
 
 
 def _tested(table: xr.Dataset, level: float) -> dict[str, xr.DataArray]:
-    """Return the difference of the detection rates with its interval, and McNemar's test."""
-    counts = [table[f"{name}_detected"] for name in (
-        "both", "only_first", "only_second", "neither")]
-    arrays = xr.apply_ufunc(
-        newcombe_and_mcnemar, *counts, table["draws"], table["drawn"], kwargs={"level": level},
-        output_core_dims=[[]] * 4, dask="parallelized", output_dtypes=[np.float64] * 4,
+    """Return the differences of both rates with their intervals, and McNemar's tests."""
+    tested: dict[str, xr.DataArray] = {}
+    for rate, reached in (("detection", "detected"), ("solved", "solved")):
+        counts = [table[f"{name}_{reached}"] for name in (
+            "both", "only_first", "only_second", "neither")]
+        arrays = xr.apply_ufunc(
+            newcombe_and_mcnemar, *counts, table["draws"], table["drawn"],
+            kwargs={"level": level}, output_core_dims=[[]] * 4, dask="parallelized",
+            output_dtypes=[np.float64] * 4,
+        )
+        difference = f"{rate} rate, second minus first"
+        meanings = {
+            f"{rate}_difference": difference,
+            f"{rate}_difference_low": f"lower end of the 95 % interval: {difference}",
+            f"{rate}_difference_high": f"upper end of the 95 % interval: {difference}",
+            f"{rate}_p_value": f"chance that the discordant counts differ so much if the {rate} "
+                               "rates are equal (McNemar, exact)",
+        }
+        tested |= {
+            name: array.assign_attrs(long_name=meaning, units="1")
+            for (name, meaning), array in zip(meanings.items(), arrays, strict=True)
+        }
+    return tested
+
+
+# --------------------------------------------------------------------------------------------------
+# What a renderer changes against the exact one, paired scene by scene.
+
+@describes
+def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
+    """Return what each renderer changes against ``reference``, paired scene by scene.
+
+    Parameters
+    ----------
+    results
+        The dataset of a run with a dimension ``renderer``.
+    reference
+        The renderer that the others are compared with.
+
+    Returns
+    -------
+    xr.Dataset
+        Dimensions: renderer and those of the detector's settings; for the pose variables also
+        those of the estimator's. All others are pooled. Lazy if ``results`` is. The interval of
+        ``x`` is in ``x_low`` and ``x_high``.
+
+        - ``detection_disagreement``: share of the poses looked for with both (``compared``) that
+          are detected with one of them only (``differing``).
+        - ``corner_shift_rms_px``: RMS over poses detected with both, corners (of boards those found
+          with both), x and y of the difference of the corners' errors.
+        - ``range_bias_percent``: mean difference of the relative z errors, signed (above 0:
+          farther than with the reference), poses solved with both.
+        - ``rotation_shift_deg``: RMS norm of the difference of the rotation errors, poses solved
+          and not flipped with both.
+
+    Raises
+    ------
+    ArgumentError
+        If ``reference`` is not a renderer of the dataset.
+    DatasetError
+        If the dataset has no dimension ``renderer``, lacks variables of results, or has no poses.
+
+    Notes
+    -----
+    95 % intervals over the random draws, conditional on the grid, as in `sweep.analysis.compare`.
+
+    Examples
+    --------
+    >>> both = xr.concat([results, results], dim="renderer").assign_coords(
+    ...     renderer=["exact", "area"])
+    >>> renderer_bias(both)["detection_disagreement"].values.tolist()
+    [0.0, 0.0]
+    """
+    require_dimension(results, "renderer")
+    renderers = [str(name) for name in results["renderer"].values]
+    if reference not in renderers:
+        raise ArgumentError("reference", reference, f"the renderers are {', '.join(renderers)}")
+    others = results.isel(renderer=renderers.index(reference), drop=True)
+    scene = axes_of(results, Stage.scene)
+
+    def kept(name: str) -> list[str]:
+        return ["renderer", *(str(dim) for dim in results[name].dims if dim not in scene)]
+
+    def pairs(*names: str) -> dict[str, xr.DataArray]:
+        return paired_arrays(pose_arrays(others, names), pose_arrays(results, names))
+
+    corners = corners_of(results)
+    detections = aggregate(
+        results, pairs(*DETECTION_INPUTS, corners), kept("detection"),
+        [
+            Rate("detection_disagreement", "differing of compared",
+                 lambda pair: pair.first.detected != pair.second.detected,
+                 lambda pair: pair.compared,
+                 counts=(("compared", "poses that were looked for with both renderers"),
+                         ("differing", "poses detected with one of both renderers only"))),
+            corner_shift("the reference's", corners),
+        ],
+        Pair,
     )
-    difference = "detection rate, second minus first"
-    meanings = {
-        "detection_difference": difference,
-        "detection_difference_low": f"lower end of the 95 % interval: {difference}",
-        "detection_difference_high": f"upper end of the 95 % interval: {difference}",
-        "detection_p_value": "chance that the discordant counts differ so much if the detection "
-                             "rates are equal (McNemar, exact)",
+    poses = aggregate(
+        results, pairs(*ERROR_INPUTS), kept("estimate"), pose_shifts("the reference's"), Pair)
+    return detections.drop_vars("draws").assign(poses)
+
+
+# --------------------------------------------------------------------------------------------------
+# Whether a new store's results are significantly worse than an older one's, pose by pose.
+
+MARGIN = 0.01
+"""Part of the older store's mean absolute error by which errors may grow: less is no regression.
+
+Another version of a library changes last digits of all poses in one direction: that is
+significant, and of no account.
+"""
+
+
+@dataclass(frozen=True)
+class Regression:
+    """A comparison at one configuration: the condition at which it is worst.
+
+    Attributes
+    ----------
+    quantity
+        "detection_rate", or a kind of error: the mean of its absolute value.
+    configuration, condition
+        Values by axis.
+    difference, low, high
+        New minus old with its interval, at a level for all comparisons together (Bonferroni).
+    units
+        Of these.
+    worse
+        Whether it is significantly worse at any condition.
+    """
+
+    quantity: str
+    configuration: Mapping[str, Any]
+    condition: Mapping[str, Any]
+    difference: float
+    low: float
+    high: float
+    units: str
+    worse: bool
+
+
+def regressions(
+    old: xr.Dataset, new: xr.Dataset, variables: Iterable[str] = (), per: Sequence[str] = (),
+) -> list[Regression]:
+    """Return how the detection rate and the errors that ``variables`` are of have changed.
+
+    Parameters
+    ----------
+    old, new
+        Two stores over the same scenes and configurations, with the same seed.
+    variables
+        Names of what is required; without any, rotation and range are compared.
+    per
+        Axes whose values are conditions; others of the scene are pooled.
+
+    Returns
+    -------
+    list of Regression
+        The detection rate and each kind of error, for each configuration the worst condition.
+        The rate is worse if McNemar's exact test says so. An error is, if the lower end of the
+        interval of its paired mean difference, on the poses that both solved, lies above `MARGIN`
+        of the old mean. False "worse" of any has a probability below 0.05.
+
+    Raises
+    ------
+    ArgumentError, DatasetError
+        As in `sweep.analysis.compare`.
+    """
+    known = [*QUANTITIES, *(each for group in SIGNED.values() for each in group)]
+    quantities = [each for each in known if any(
+        name.startswith(f"{each.name}_") and name.endswith(f"_{each.unit}") for name in variables)]
+    quantities = quantities or list(QUANTITIES[:2])
+    configuration = configuration_axes(new)
+    kept = kept_dimensions(new, tuple(dict.fromkeys((*configuration, *as_names(per)))))
+    count = math.prod(new.sizes[name] for name in kept) * (1 + len(quantities))
+    level = 1.0 - (1.0 - LEVEL) / count
+    table = paired_table(old, new, kept, None, quantities, level).compute()
+    if int(table["different_scenes"].sum()):
+        raise DatasetError("the scenes of the two stores differ, so that nothing can be paired; "
+                           "compare stores of one pipeline")
+    tests = [_rate_test(table, 1.0 - level), *(_error_test(table, each) for each in quantities)]
+    return [found for test in tests for found in _worst(test, configuration)]
+
+
+def _rate_test(table: xr.Dataset, error: float) -> xr.Dataset:
+    """Return difference, low, high and worse of the detection rate."""
+    difference = table["detection_difference"]
+    return xr.Dataset({
+        "difference": difference, "low": table["detection_difference_low"],
+        "high": table["detection_difference_high"],
+        "worse": (difference < 0.0) & (table["detection_p_value"] <= error),
+        "excess": -difference,
+    }).assign_attrs(quantity="detection_rate", units="")
+
+
+def _error_test(table: xr.Dataset, quantity: Quantity) -> xr.Dataset:
+    name = quantity.named("difference")
+    return xr.Dataset({
+        "difference": table[name], "low": table[f"{name}_low"], "high": table[f"{name}_high"],
+        "worse": table[f"{name}_low"] > MARGIN * table[quantity.named("first")],
+        "excess": table[name],
+    }).assign_attrs(quantity=f"mean absolute {quantity.words}", units=quantity.units)
+
+
+def _worst(test: xr.Dataset, configuration: Sequence[str]) -> Iterator[Regression]:
+    conditions = [str(dim) for dim in test["worse"].dims if dim not in configuration]
+    for at in np.ndindex(*(test.sizes[name] for name in configuration)):
+        one = test.isel(dict(zip(configuration, at, strict=True))).transpose(*conditions)
+        worse = one["worse"].values
+        excess = np.nan_to_num(one["excess"].values, nan=-np.inf)
+        excess = np.where(worse, excess, -np.inf) if worse.any() else excess
+        index = np.unravel_index(int(np.argmax(excess)), excess.shape)
+        cell = one.isel({name: int(k) for name, k in zip(conditions, index, strict=True)})
+        yield Regression(
+            test.attrs["quantity"], {name: one[name].item() for name in configuration},
+            {name: cell[name].item() for name in conditions},
+            float(cell["difference"]), float(cell["low"]), float(cell["high"]),
+            test.attrs["units"], bool(worse.any()))
+
+
+# --------------------------------------------------------------------------------------------------
+# Differences between two stores of one pipeline, such as two versions of OpenCV made.
+
+CORNER_VARIABLES = ("corner_error_px", "marker_corner_error_px", "chessboard_corner_error_px")
+"""Variables of corners: of a single marker, or of a board's markers and of its chessboard."""
+
+STATISTICS = ("median", "p99", "worst")
+"""Coordinates of the dimension ``statistic``."""
+
+TRUTH_RTOL = 1e-9
+"""Relative difference of true poses up to which they are one: other processors round otherwise."""
+
+_NOT_COMPUTED = (DetectionStatus.not_run, DetectionStatus.not_needed)
+
+
+@describes
+def store_differences(first: xr.Dataset, second: xr.Dataset) -> xr.Dataset:
+    """Return how detections, corners and poses of two stores of one pipeline differ.
+
+    Parameters
+    ----------
+    first, second
+        The datasets of two runs of the same pipeline, with other versions of OpenCV, NumPy, Numba,
+        of a plug-in, or on other processors: draws and images are the same, so that each pose is
+        compared with itself.
+
+    Returns
+    -------
+    xr.Dataset
+        Dimensions: those of the detector's settings, for estimates and poses also those of the
+        estimator's; ``statistic``: median, p99 and worst. Scenes are pooled. It is computed at
+        once, a chunk of ``first`` at a time.
+
+        - ``detections`` and ``estimates`` (..., first_flag, second_flag): poses by their flag in
+          the first store and in the second; ``detections_compared``: those computed in both;
+          ``detections_differing`` and ``estimates_differing``: those whose flag differs.
+          ``computed_once``: poses that just one of the two computed.
+        - ``corners_compared``: corners that both found; ``corners_found_once``: those that one
+          found; ``corners_differing``: those of which x or y is another number, however near;
+          ``corner_shift_px``: how far these are apart.
+        - ``poses_compared``: poses that both solved; ``poses_differing``: those of which a
+          component of position or rotation is another number; ``position_shift_m`` and
+          ``rotation_shift_deg``: how far these are apart. NaN where none differs.
+        - ``fingerprint`` (entry, store): versions, builds and files that differ, as text.
+
+    Raises
+    ------
+    DatasetError
+        In one line, if the datasets are not of one pipeline with the same axes, draws and seed.
+
+    Notes
+    -----
+    Counts and quantiles are those of the poses that were computed; they are no estimates and have
+    no intervals. `sweep.analysis.compare` tells whether rates and errors differ beyond chance.
+
+    Examples
+    --------
+    >>> moved = results.assign(corner_error_px=results["corner_error_px"] + 0.5)
+    >>> table = store_differences(results, moved)
+    >>> int(table["detections_differing"]), int(table["corners_differing"])
+    (0, 96)
+    >>> table["corner_shift_px"].values.round(4).tolist()
+    [0.7071, 0.7071, 0.7071]
+    """
+    _require_one_pipeline(first, second)
+    scene = axes_of(first, Stage.scene)
+    found = [dim for dim in axes_of(first, Stage.scene, Stage.detection) if dim not in scene]
+    solved = [dim for dim in axes_of(first) if dim not in scene]
+    corners = [name for name in CORNER_VARIABLES if name in first and name in second]
+    names = [*REQUIRED_VARIABLES, *TRUTH, *corners]
+    names = [name for name in dict.fromkeys(names) if name in first and name in second]
+    detections, estimates = _Flags(DetectionStatus), _Flags(EstimateStatus)
+    shifts = _Shifts(("corner_shift_px",))
+    motions = _Shifts(("position_shift_m", "rotation_shift_deg"))
+    once: Any = 0
+    for part in _chunks(first["detection"], scene):
+        pair = [side[names].isel(part).load() for side in (first, second)]
+        _require_equal_truths(pair[0], pair[1], scene)
+        flags = [_column(side, "detection", scene, found) for side in pair]
+        computed = [~np.isin(each, _NOT_COMPUTED) for each in flags]
+        both = computed[0] & computed[1]
+        once = once + (computed[0] ^ computed[1]).sum(axis=0)
+        detections.add(flags[0], flags[1], both)
+        for name in corners:
+            shifts.add(*_corner_shifts(pair, name, scene, found, both))
+        flags = [_column(side, "estimate", scene, solved) for side in pair]
+        estimates.add(flags[0], flags[1], np.logical_and(*(
+            ~np.isin(each, (EstimateStatus.not_run, EstimateStatus.not_needed)) for each in flags
+        )))
+        motions.add(*_motions(pair, scene, solved, np.logical_and(*(
+            each == EstimateStatus.solved for each in flags
+        ))))
+    table = xr.Dataset(coords={
+        **{dim: first[dim] for dim in solved if dim in first.coords},
+        "statistic": list(STATISTICS),
+    })
+    sizes = {dim: first.sizes[dim] for dim in solved}
+    for name, dims, values, meaning, units in (
+        ("detections_compared", found, detections.compared, "poses computed in both", "1"),
+        ("detections_differing", found, detections.differing,
+         "of them, poses with another flag of detection", "1"),
+        ("computed_once", found, once, "poses that one store computed and the other did not", "1"),
+        ("corners_compared", found, shifts.compared, "corners that both found", "1"),
+        ("corners_found_once", found, shifts.once, "corners that one of both found", "1"),
+        ("corners_differing", found, shifts.differing, "corners with another coordinate", "1"),
+        ("corner_shift_px", found, shifts.statistics(0), "distance of corners that differ", "px"),
+        ("estimates_differing", solved, estimates.differing,
+         "poses with another flag of the estimate", "1"),
+        ("poses_compared", solved, motions.compared, "poses that both solved", "1"),
+        ("poses_differing", solved, motions.differing,
+         "poses with another position or rotation", "1"),
+        ("position_shift_m", solved, motions.statistics(0), "distance of positions that differ",
+         "m"),
+        ("rotation_shift_deg", solved, motions.statistics(1), "angle of rotations that differ",
+         "degree"),
+    ):
+        shape = [sizes[dim] for dim in dims]
+        inner = ["statistic"] if units != "1" else []
+        table[name] = (
+            (*dims, *inner), np.reshape(values, (*shape, *(len(STATISTICS) for _ in inner))),
+            cf_attributes(meaning, units),
+        )
+    for name, dims, tally in (
+        ("detections", found, detections), ("estimates", solved, estimates),
+    ):
+        kinds = [each.name for each in tally.flags]
+        sides = [f"{side}_{name.removesuffix('s')}" for side in ("first", "second")]
+        table = table.assign_coords(dict.fromkeys(sides, kinds))
+        table[name] = (
+            (*dims, *sides), tally.counts.reshape(*(sizes[dim] for dim in dims), *[len(kinds)] * 2),
+            cf_attributes("poses by their flags in the first and in the second store", "1"),
+        )
+    differences = list(_fingerprint_differences(fingerprint_of(first), fingerprint_of(second)))
+    table = table.assign_coords(
+        entry=np.array([entry for entry, _, _ in differences], dtype=object),
+        store=["first", "second"],
+    )
+    table["fingerprint"] = (
+        ("entry", "store"),
+        np.array([pair for _, *pair in differences], dtype=object).reshape(-1, 2),
+        cf_attributes("what the results depend on and differs between the stores"),
+    )
+    return table
+
+
+class _Flags:
+    """Pairs of flags, counted: ``counts`` (configurations, flags, flags)."""
+
+    def __init__(self, kind: type[IntEnum]) -> None:
+        self.flags = list(kind)
+        self.counts: Integers = np.zeros((1, len(self.flags), len(self.flags)), dtype=np.int64)
+
+    def add(self, first: NDArray[Any], second: NDArray[Any], both: Masks) -> None:
+        """Add flags (scenes, configurations) of the poses that both stores computed."""
+        values = np.array(self.flags)
+        size, count = len(values), first.shape[1]
+        codes = np.searchsorted(values, first) * size + np.searchsorted(values, second)
+        codes = codes + np.arange(count) * size**2
+        added = np.bincount(codes[both].ravel(), minlength=count * size**2)
+        self.counts = self.counts + added.reshape(count, size, size)
+
+    @property
+    def compared(self) -> Integers:
+        """(configurations,) poses."""
+        return np.asarray(self.counts.sum(axis=(1, 2)))
+
+    @property
+    def differing(self) -> Integers:
+        """(configurations,) poses with two different flags."""
+        return np.asarray(self.compared - np.trace(self.counts, axis1=1, axis2=2))
+
+
+class _Shifts:
+    """Distances of what differs, by configuration, with the numbers of what was compared."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.compared: Any = 0
+        self.differing: Any = 0
+        self.once: Any = 0
+        self._distances: list[list[list[Floats]]] = [[] for _ in names]
+
+    def add(self, both: Masks, once: Masks, differ: Masks, *distances: Floats) -> None:
+        """Add masks and distances (scenes, configurations, items)."""
+        self.compared = self.compared + both.sum(axis=(0, 2))
+        self.once = self.once + once.sum(axis=(0, 2))
+        self.differing = self.differing + differ.sum(axis=(0, 2))
+        for collected, each in zip(self._distances, distances, strict=True):
+            collected.append([
+                each[:, k][differ[:, k]].astype(np.float32) for k in range(each.shape[1])
+            ])
+
+    def statistics(self, k: int) -> Floats:
+        """Return (configurations, 3) median, 99th percentile and maximum of a distance."""
+        rows = []
+        for parts in zip(*self._distances[k], strict=True):
+            values = np.concatenate(parts).astype(np.float64)
+            rows.append(
+                [*np.quantile(values, (0.5, 0.99)), values.max()] if values.size
+                else [np.nan] * len(STATISTICS)
+            )
+        return np.array(rows)
+
+
+def _chunks(flags: xr.DataArray, scene: Sequence[str]) -> Iterator[dict[str, slice]]:
+    """Yield the parts of the scene axes that lie in one chunk of a variable."""
+    cuts = []
+    for dim in scene:
+        ends = np.cumsum([0, *flags.chunksizes.get(dim, (flags.sizes[dim],))]).tolist()
+        cuts.append([slice(*pair) for pair in itertools.pairwise(ends)])
+    for part in itertools.product(*cuts):
+        yield dict(zip(scene, part, strict=True))
+
+
+def _column(
+    results: xr.Dataset, name: str, scene: Sequence[str], settings: Sequence[str]
+) -> NDArray[Any]:
+    """Return a variable as (scenes, configurations, ...); 0 for flags that are missing."""
+    array = results[name]
+    inner = [str(dim) for dim in array.dims if dim in LABELS]
+    values = array.transpose(*scene, *settings, *inner).to_numpy()
+    lengths = [int(np.prod([array.sizes[dim] for dim in dims])) for dims in (scene, settings)]
+    values = values.reshape(*lengths, *(array.sizes[dim] for dim in inner))
+    return values if inner else np.nan_to_num(values, nan=0.0)
+
+
+def _corner_shifts(
+    pair: Sequence[xr.Dataset], name: str, scene: Sequence[str], settings: Sequence[str],
+    computed: Masks,
+) -> tuple[Masks, Masks, Masks, Floats]:
+    """Return which corners both found, one found, which differ, and how far they are apart, px."""
+    first, second = (_column(side, name, scene, settings) for side in pair)
+    first, second = (each.reshape(*each.shape[:2], -1, 2) for each in (first, second))
+    has_first, has_second = (np.isfinite(each).all(axis=-1) for each in (first, second))
+    both = has_first & has_second & computed[..., None]
+    once = (has_first ^ has_second) & computed[..., None]
+    differ = both & (first != second).any(axis=-1)
+    distance = np.linalg.norm(np.subtract(second, first, dtype=np.float64), axis=-1)
+    return both, once, differ, distance
+
+
+def _motions(
+    pair: Sequence[xr.Dataset], scene: Sequence[str], settings: Sequence[str], both: Masks
+) -> tuple[Masks, Masks, Masks, Floats, Floats]:
+    """Return which poses both solved, which differ, and distances in metres and degrees."""
+    positions, rotations = (
+        [_column(side, name, scene, settings) for side in pair]
+        for name in ("translation_error_m", "rotation_error_rad")
+    )
+    differ = both & np.logical_or(*(
+        (first != second).any(axis=-1) for first, second in (positions, rotations)
+    ))
+    distance = np.linalg.norm(np.subtract(*positions[::-1], dtype=np.float64), axis=-1)
+    turned = np.full(distance.shape, np.nan)
+    # Errors are rotations from the true one: R2 R1ᵀ = (R2 Rᵀ)(R1 Rᵀ)ᵀ.
+    first, second = (rotation_of_vector(each[differ].astype(np.float64)) for each in rotations)
+    relative = vector_of_rotation(second @ np.swapaxes(first, -1, -2))
+    turned[differ] = np.degrees(np.linalg.norm(relative, axis=-1))
+    none = np.zeros_like(both)[..., None]
+    return both[..., None], none, differ[..., None], distance[..., None], turned[..., None]
+
+
+def _require_one_pipeline(first: xr.Dataset, second: xr.Dataset) -> None:
+    """Raise DatasetError unless two datasets are of one pipeline."""
+    for side in (first, second):
+        require_poses(side)
+        pose_arrays(side, ERROR_INPUTS)  # raises for the markers of boards
+    require_pairs(first, second)
+    settings = [set(axes_of(side)) - set(axes_of(side, Stage.scene)) for side in (first, second)]
+    if settings[0] != settings[1]:
+        names = ", ".join(sorted(settings[0] ^ settings[1]))
+        raise DatasetError(f"not one pipeline: just one of the two has the axis {names}")
+    for name in sorted(settings[0]):
+        if not np.array_equal(first[name].values, second[name].values):
+            raise DatasetError(f"not one pipeline: the values of {name} differ")
+    try:
+        ours, theirs = (_parameters(stored_pipeline(side)) for side in (first, second))
+    except (KeyError, SweepError):
+        return  # they were cut or joined: their coordinates have been compared
+    for name in sorted({*ours, *theirs}):
+        if ours.get(name) != theirs.get(name):
+            values = (plain(each.get(name, "not given")) for each in (ours, theirs))
+            raise DatasetError(f"not one pipeline: {name} is {' and '.join(values)}")
+
+
+def _parameters(pipeline: Pipeline) -> dict[str, Any]:
+    """Return each parameter's value, distribution or values; of a file its content's digest."""
+    def content(value: Any) -> Any:
+        return pipeline.files.get(value, value) if isinstance(value, str) else value
+
+    listed = {
+        name: tuple(map(content, values))
+        for axis in pipeline.axes for name, values in axis.columns.items()
     }
-    return {
-        name: array.assign_attrs(long_name=meaning, units="1")
-        for (name, meaning), array in zip(meanings.items(), arrays, strict=True)
-    }
+    fixed = {name: content(value) for name, value in pipeline.fixed.items()}
+    return {**fixed, **pipeline.distributions, **listed}
+
+
+def _require_equal_truths(first: xr.Dataset, second: xr.Dataset, scene: Sequence[str]) -> None:
+    """Raise DatasetError unless the true poses are the same, but for rounding."""
+    for name in TRUTH:
+        if name not in first or name not in second:
+            continue
+        ours, theirs = (_column(side, name, scene, ()) for side in (first, second))
+        if not np.allclose(ours, theirs, TRUTH_RTOL, 1e-3 * TRUTH_RTOL, equal_nan=True):
+            raise DatasetError(f"not the same true poses: {name} differs")
+
+
+def _fingerprint_differences(
+    first: Mapping[str, Any], second: Mapping[str, Any], prefix: str = ""
+) -> Iterator[tuple[str, str, str]]:
+    """Yield name and both values of each entry in which two fingerprints differ."""
+    for key in sorted({*first, *second}):
+        ours, theirs = first.get(key, {}), second.get(key, {})
+        if isinstance(ours, Mapping) and isinstance(theirs, Mapping):
+            yield from _fingerprint_differences(ours, theirs, f"{prefix}{key}.")
+        elif ours != theirs:
+            yield f"{prefix}{key}", plain(ours or "none"), plain(theirs or "none")

@@ -1,4 +1,4 @@
-"""Counts of poses, and rates of them with intervals of a binomial proportion."""
+"""Counts of flags as rates with intervals, and paired differences of rates."""
 
 from __future__ import annotations
 
@@ -7,19 +7,23 @@ from dataclasses import dataclass
 from typing import Generic
 
 import numpy as np
+from scipy import special
 
 from sweep.analysis.intervals import LEVEL, clopper_pearson, jeffreys, wilson
-from sweep.analysis.states import BlockSample, BlockState, Sample, State
 from sweep.analysis.statistic import (
     OVER_ALL,
     Output,
+    Sample,
     SinglePass,
+    State,
     Variables,
     ViewT,
     with_interval,
 )
-from sweep.typing import Integers, Masks
+from sweep.typing import Floats, Integers, Masks
 
+# --------------------------------------------------------------------------------------------------
+# Counts of poses, and rates of them with intervals of a binomial proportion.
 
 def scaled_to_draws(hits: Integers, n: Integers, draws: Integers) -> tuple[Integers, Integers]:
     """Return ``hits`` of ``n`` poses as hits of draws, rounded down and up.
@@ -34,14 +38,10 @@ def scaled_to_draws(hits: Integers, n: Integers, draws: Integers) -> tuple[Integ
 
 
 @dataclass(frozen=True)
-class CountState(BlockState["CountState"]):
+class CountState(State):
     """How many poses there are, (groups,)."""
 
     n: Integers
-
-    def fold(self) -> CountState:
-        """Return itself."""
-        return self
 
 
 @dataclass(frozen=True)
@@ -81,9 +81,9 @@ class CountOfDraws(SinglePass[ViewT, Sample], Generic[ViewT]):
                 Output(self.draws, "random draws that the intervals are of", "1", "i8"),
                 Output(self.drawn, "whether any cell has two draws", "1", "?")]
 
-    def first_pass(self, poses: ViewT) -> BlockSample:
+    def first_pass(self, poses: ViewT) -> Sample:
         """Count."""
-        return BlockSample.of(self.of(poses))
+        return Sample.of(self.of(poses))
 
     def result(self, state: Sample) -> Variables:
         """Return the counts."""
@@ -96,18 +96,6 @@ class RateState(State):
 
     sample: Sample
     hits: Integers
-
-
-@dataclass(frozen=True)
-class BlockRateState(BlockState[RateState]):
-    """The same of a block."""
-
-    sample: BlockSample
-    hits: Integers
-
-    def fold(self) -> RateState:
-        """Return the state of all cells."""
-        return RateState(self.sample.fold(), self.hits)
 
 
 @dataclass(frozen=True)
@@ -143,11 +131,11 @@ class Rate(SinglePass[ViewT, RateState], Generic[ViewT]):
               if self.with_jeffreys else []),
         ]
 
-    def first_pass(self, poses: ViewT) -> BlockRateState:
+    def first_pass(self, poses: ViewT) -> RateState:
         """Count."""
         used = self.used(poses)
         hits = (self.successes(poses) & used).sum(axis=OVER_ALL)
-        return BlockRateState(BlockSample.of(used), np.asarray(hits))
+        return RateState(Sample.of(used), np.asarray(hits))
 
     def draws_of(self, state: RateState) -> Integers:
         """Return the number of draws that the interval is of."""
@@ -170,3 +158,48 @@ class Rate(SinglePass[ViewT, RateState], Generic[ViewT]):
             values[f"{self.name}{ending}_low"] = np.where(state.sample.drawn, low, np.nan)
             values[f"{self.name}{ending}_high"] = np.where(state.sample.drawn, high, np.nan)
         return values
+
+
+# --------------------------------------------------------------------------------------------------
+# The difference of two rates of the same pairs: its interval, and McNemar's test.
+
+def newcombe_and_mcnemar(
+    both: Integers, first: Integers, second: Integers, neither: Integers, draws: Integers,
+    drawn: Masks, level: float = LEVEL,
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return the difference of two paired rates, its interval's ends, and McNemar's p-value.
+
+    ``both``, ``first`` (alone), ``second`` (alone) and ``neither`` are counts of pairs, scaled to
+    ``draws`` if these are fewer; without ``drawn`` the interval and the p-value are NaN.
+    Newcombe, Statistics in Medicine 17 (1998), pages 2635-2650, method 10, with the continuity
+    correction of the correlation; the test is the exact binomial one of the discordant pairs.
+    """
+    n = both + first + second + neither
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = draws / np.maximum(n, 1)
+        rates, lows, highs = [], [], []
+        for hits in (both + second, both + first):
+            rates.append(hits / n)
+            fewest, most = scaled_to_draws(hits, n, draws)
+            lows.append(wilson(fewest, draws, level)[0])
+            highs.append(wilson(most, draws, level)[1])
+        margins = ((both + first) * (second + neither)).astype(np.float64) * (
+            (both + second) * (first + neither))
+        cross = both.astype(np.float64) * neither - first.astype(np.float64) * second
+        # Of counts scaled to draws.
+        corrected = np.maximum(cross * scale**2 - draws / 2, 0.0)
+        lessened = np.where(cross > 0, corrected, cross * scale**2)
+        correlation = np.where(margins > 0, lessened / (np.sqrt(margins) * scale**2), 0.0)
+
+        def reach(up: Floats, down: Floats) -> Floats:
+            squares = up**2 - 2 * correlation * up * down + down**2
+            return np.sqrt(np.maximum(squares, 0.0))
+
+        difference = rates[0] - rates[1]
+        low = difference - reach(rates[0] - lows[0], highs[1] - rates[1])
+        high = difference + reach(highs[0] - rates[0], rates[1] - lows[1])
+        _, fewer = scaled_to_draws(np.minimum(first, second), n, draws)
+        discordant = np.maximum(scaled_to_draws(first + second, n, draws)[0], fewer)
+        p_value = np.minimum(1.0, 2.0 * special.bdtr(fewer, discordant, 0.5))
+    low, high, p_value = (np.where(drawn, each, np.nan) for each in (low, high, p_value))
+    return difference, low, high, p_value

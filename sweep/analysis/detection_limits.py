@@ -9,26 +9,25 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.binning import Bins
+from sweep.analysis.binning import Bins, image_sides, parameters_along, require_size_axes
 from sweep.analysis.counts import scaled_to_draws
-from sweep.analysis.described import describes
-from sweep.analysis.dimensions import (
+from sweep.analysis.dataset import (
     DRAWS,
     as_names,
     axes_of,
+    describes,
     is_sampling_stopped,
     kept_dimensions,
+    parameter_value,
     require_poses,
 )
-from sweep.analysis.image_sides import image_sides, parameters_along, require_size_axes
+from sweep.analysis.draws import stopped_level, with_common_trials
 from sweep.analysis.intervals import LEVEL, clopper_pearson, wilson
 from sweep.analysis.rates import detection_rate
-from sweep.analysis.stopped_sampling import stopped_level, with_common_trials
-from sweep.analysis.stored_parameters import parameter_value
 from sweep.errors import ArgumentError
 from sweep.measure.flags import Flag, flag
 from sweep.model.marker import module_count
-from sweep.plan.variable import cf_attributes
+from sweep.plan.schema import cf_attributes
 from sweep.typing import Floats, Integers, Masks
 
 SIZE_AXES = ("side_px", "distance_m")
@@ -183,7 +182,7 @@ def _limit(
     """Return side, low, high, next smaller side and flag; arrays are (..., *sides), ``dims`` these.
 
     Poses of the same side are pooled; ``count`` is the largest number of distinct sides.
-    ``stopped`` says whether sampling was stopped (`sweep.analysis.stopped_sampling`).
+    ``stopped`` says whether sampling was stopped (`sweep.analysis.draws`).
     """
     shape = (*n.shape[: n.ndim - dims], math.prod(n.shape[n.ndim - dims :]))
     sides = np.broadcast_to(sides, n.shape).reshape(shape)

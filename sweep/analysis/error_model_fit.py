@@ -1,19 +1,44 @@
-"""Fits of an error's bias and standard deviation over knots of distance, side and viewing angle.
-
-Between knots the bias and the logarithm of the standard deviation are linear in ln(distance),
-ln(side) and the viewing angle. With two knots of the distance the standard deviation is a power of
-it: more knots are for what is no power law.
-"""
+"""The fit of error models: sums over draws, bins, and weighted least squares."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
-from dataclasses import dataclass
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
+import dask.array as da
 import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
 
-from sweep.typing import Floats
+from sweep.analysis.aggregate import aggregate
+from sweep.analysis.dataset import DRAWS, parameter_value
+from sweep.analysis.poses import (
+    DEPTH,
+    SIGNED_INPUTS,
+    Poses,
+    bearing_of,
+    in_sight_frame,
+    pose_arrays,
+    sight_rotation,
+    viewing_angle_of,
+)
+from sweep.analysis.statistic import Largest, Output, SinglePass, State, Variables
+from sweep.errors import DatasetError
+from sweep.measure.flags import DetectionStatus, uncounted_values
+from sweep.model.camera import VIEW_PARAMETERS, intrinsics
+from sweep.typing import Floats, Integers
+
+# --------------------------------------------------------------------------------------------------
+# Fits of an error's bias and standard deviation over knots of distance, side and viewing angle.
+#
+# Between knots the bias and the logarithm of the standard deviation are linear in ln(distance),
+# ln(side) and the viewing angle. With two knots of the distance the standard deviation is a power
+# of it: more knots are for what is no power law.
 
 FLOOR = 1e-18
 """Smallest mean square of an error: its unit is a radian or a share of the distance."""
@@ -308,3 +333,586 @@ def union(knots: Sequence[Sequence[Floats]]) -> list[Floats]:
 def grid_points(knots: Sequence[Floats]) -> Floats:
     """Return the points (n, axes) of a grid, the last axis fastest."""
     return np.stack([each.ravel() for each in np.meshgrid(*knots, indexing="ij")], axis=-1)
+
+
+# --------------------------------------------------------------------------------------------------
+# Streamed sums for error models: moments of errors in bins, and how many lie within two sigma.
+
+QUANTITIES = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
+"""Errors in the sight frame: of the position (m), and the rotation vector (rad)."""
+
+HALVES = 2
+"""The even trials and the odd ones."""
+
+MODEL, HALF, FOCAL_SIZE = "model", "half", "focal_size"
+"""Names of a block's arrays: the number of the model, the half, fx times the marker's side."""
+
+COUNTS = ("looked_for", "solved", "flipped", "judged")
+"""Columns of `Coverage` before the shares."""
+
+
+@dataclass(frozen=True)
+class Bins:
+    """Edges of the bins of distance (m), side (px), viewing angle and, at will, bearing (degrees).
+
+    A value at the last edge belongs to the last bin.
+    """
+
+    edges: tuple[Floats, ...]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Numbers of bins."""
+        return tuple(len(each) - 1 for each in self.edges)
+
+    def numbers(self, *values: Floats) -> tuple[Integers, NDArray[np.bool_]]:
+        """Return the flat numbers of the bins of points, and which points are in a bin."""
+        inside = np.ones(values[0].shape, dtype=bool)
+        flat = np.zeros(values[0].shape, dtype=np.int64)
+        for each, edges in zip(values, self.edges, strict=True):
+            number = np.searchsorted(edges, each, side="right") - 1
+            number = np.where(each == edges[-1], len(edges) - 2, number)
+            inside &= (number >= 0) & (number < len(edges) - 1)
+            flat = flat * (len(edges) - 1) + np.clip(number, 0, len(edges) - 2)
+        return flat, inside
+
+
+class SightErrors(Poses):
+    """Poses with their errors in the sight frame."""
+
+    @cached_property
+    def distance_m(self) -> Floats:
+        """True z of the marker's centre (...)."""
+        return np.asarray(self[DEPTH], dtype=np.float64)
+
+    @cached_property
+    def side_px(self) -> Floats:
+        """The black square's side (...), were it parallel to the image: fx · size / distance."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(self[FOCAL_SIZE] / self.distance_m, dtype=np.float64)
+
+    @cached_property
+    def viewing_angle_deg(self) -> Floats:
+        """Angle (...) between the marker's normal and the line of sight."""
+        return viewing_angle_of(self["true_rvec"], self["true_tvec_m"])
+
+    @cached_property
+    def bearing_deg(self) -> Floats:
+        """Angle (...) between the line of sight and the optical axis."""
+        return bearing_of(self["true_tvec_m"])
+
+    @property
+    def conditions(self) -> tuple[Floats, ...]:
+        """Distance, side, viewing angle and bearing, each (...)."""
+        return self.distance_m, self.side_px, self.viewing_angle_deg, self.bearing_deg
+
+    @cached_property
+    def in_camera(self) -> Floats:
+        """Errors (..., 6) along and about the camera's axes; positions over the distance."""
+        position = self["translation_error_m"].astype(np.float64) / self.distance_m[..., None]
+        return np.concatenate(
+            [position, self["rotation_error_rad"].astype(np.float64)], axis=-1)
+
+    @cached_property
+    def in_sight(self) -> Floats:
+        """The same in the sight frame."""
+        parts = (self.in_camera[..., :3], self.in_camera[..., 3:])
+        return np.concatenate(
+            [in_sight_frame(part, self["true_tvec_m"]) for part in parts], axis=-1)
+
+    def at(self, used: NDArray[np.bool_]) -> Floats:
+        """Return ln(distance), ln(side), viewing angle and bearing of the used poses, (n, 4)."""
+        distance, side, *angles = (
+            np.broadcast_to(each, used.shape)[used] for each in self.conditions)
+        return np.stack([np.log(distance), np.log(side), *angles], axis=-1)
+
+
+@dataclass(frozen=True)
+class Sums(State):
+    """Sums (groups, halves, bins, columns)."""
+
+    values: Floats
+
+
+@dataclass(frozen=True)
+class Region(State):
+    """Poses looked for in cells (groups, halves, cells, 1), and how far they reach.
+
+    Columns of ``reach``: the largest projection on each direction, then on its opposite.
+    """
+
+    counts: Floats
+    reach: Largest
+
+
+@dataclass(frozen=True)
+class _OfBins(SinglePass[SightErrors, Sums]):
+    """A statistic of a single variable, whose value is the array (halves, bins, columns)."""
+
+    bins: Bins
+
+    def outputs(self) -> Sequence[Output]:
+        """Return the variable."""
+        return [Output("sums", "sums over bins", "1", "O")]
+
+    def result(self, state: Sums) -> Variables:
+        """Return an array a group."""
+        return {"sums": _objects(state.values)}
+
+
+@dataclass(frozen=True)
+class SeenRegion(SinglePass[SightErrors, Region]):
+    """Cells of distance, side, viewing angle and bearing with poses, and how far poses reach.
+
+    ``directions`` (directions, 4) are in ln(distance), ln(side), viewing angle and bearing.
+    """
+
+    bins: Bins
+    directions: Floats = field(repr=False)
+
+    def outputs(self) -> Sequence[Output]:
+        """Return both variables."""
+        return [Output("counts", "poses looked for in cells", "1", "O"),
+                Output("reach", "largest projections on directions and their opposites", "1", "O")]
+
+    def result(self, state: Region) -> Variables:
+        """Return two arrays a group."""
+        return {"counts": _objects(state.counts.sum(axis=1)[..., 0]),
+                "reach": _objects(state.reach.values)}
+
+    def first_pass(self, poses: SightErrors) -> Region:
+        """Count in a block, and project."""
+        numbers, inside = _numbers(self.bins, poses)
+        groups = len(poses.detection)
+        shape = numbers.shape
+        counted = np.broadcast_to(poses.looked_for & (poses.distance_m > 0), shape)
+        of_group = np.broadcast_to(np.arange(groups).reshape(-1, 1, 1, 1), shape)[counted]
+        projected = poses.at(counted) @ self.directions.T
+        reach = np.full((groups, 2 * len(self.directions)), -np.inf)
+        np.maximum.at(reach, of_group, np.concatenate([projected, -projected], axis=-1))
+        used = numbers[inside]
+        return Region(_add(self.bins, used, groups, [np.ones(len(used))]), Largest(reach))
+
+
+def _objects(values: Sequence[Any] | Floats) -> NDArray[Any]:
+    """Return an array (groups,) whose elements are arrays."""
+    found = np.empty(len(values), dtype=object)
+    for group, each in enumerate(values):
+        found[group] = each
+    return found
+
+
+def _add(bins: Bins, at: Integers, groups: int, columns: Sequence[Any]) -> Floats:
+    """Return the sums (groups, halves, bins, columns) of values at flat numbers."""
+    size = groups * HALVES * math.prod(bins.shape)
+    sums = [np.bincount(at, weights=each, minlength=size) for each in columns]
+    return np.stack(sums, axis=-1).reshape(groups, HALVES, -1, len(columns)).astype(float)
+
+
+def _numbers(bins: Bins, poses: SightErrors) -> tuple[Integers, NDArray[np.bool_]]:
+    """Return the flat number of each pose's group, half and bin, and which poses have one."""
+    number, inside = bins.numbers(*poses.conditions[: len(bins.edges)])
+    groups = np.arange(len(poses.detection)).reshape(-1, 1, 1, 1)
+    flat = (groups * HALVES + poses[HALF]) * math.prod(bins.shape) + number
+    numbers, counted = np.broadcast_arrays(flat, inside & poses.looked_for)
+    return numbers, counted
+
+
+@dataclass(frozen=True)
+class BinMoments(_OfBins):
+    """Number of poses, sums of their coordinates and of the powers of each error."""
+
+    def first_pass(self, poses: SightErrors) -> Sums:
+        """Sum over a block."""
+        numbers, inside = _numbers(self.bins, poses)
+        groups, used = len(poses.detection), inside & poses.unflipped
+        errors = np.broadcast_to(poses.in_sight, (*numbers.shape, len(QUANTITIES)))[used]
+        columns = [np.ones(len(errors)), *poses.at(used)[:, :3].T]
+        for k in range(len(QUANTITIES)):
+            power = np.ones(len(errors))
+            for _ in range(POWERS):
+                power = power * errors[:, k]
+                columns.append(power)
+        return Sums(_add(self.bins, numbers[used], groups, columns))
+
+
+@dataclass(frozen=True)
+class Moments:
+    """What `BinMoments` gives of one model: arrays (halves, bins, columns)."""
+
+    values: Floats
+
+    def of(self, quantity: int, half: int | None = None) -> BinSums:
+        """Return the sums of an error, of one half of the trials or of all."""
+        values = self.values.sum(axis=0) if half is None else self.values[half]
+        count = values[:, 0]
+        at = values[:, 1:4] / np.maximum(count, 1.0)[:, None]
+        start = 4 + POWERS * quantity
+        return BinSums(count, at, values[:, start : start + POWERS]).filled()
+
+
+    def along(self, axis: int, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
+        """Return, of the bins along an axis, the poses and the sum of that coordinate."""
+        columns = self.values.sum(axis=0)[:, [0, 1 + axis]].reshape(*shape, 2)
+        count, total = np.moveaxis(
+            columns.sum(axis=tuple(k for k in range(len(shape)) if k != axis)), -1, 0)
+        return count, total
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """The model of each half, by which the other is judged.
+
+    ``bias`` and ``log_variance`` are (models, halves, knots, quantities), in the unit of
+    `SightErrors.in_sight`.
+    """
+
+    knots: Sequence[Floats]
+    bias: Floats
+    log_variance: Floats
+
+
+@dataclass(frozen=True)
+class Coverage(_OfBins):
+    """How many errors lie within two standard deviations of the bias, by a model of other draws.
+
+    Columns: `COUNTS`; those within, for each error in the sight frame; the same along and about the
+    camera's axes.
+    """
+
+    fitted: Fitted = field(repr=False)
+
+    def first_pass(self, poses: SightErrors) -> Sums:
+        """Count in a block."""
+        numbers, inside = _numbers(self.bins, poses)
+        shape = numbers.shape
+        used = inside & poses.unflipped
+        model, half = (np.broadcast_to(poses[name], shape)[used] for name in (MODEL, HALF))
+        basis = hat_basis(poses.at(used)[:, :3], self.fitted.knots)
+        other = 1 - half  # judged by the model of the other half
+        bias, log_variance = (
+            np.einsum("nk,nkq->nq", basis, each[model, other])
+            for each in (self.fitted.bias, self.fitted.log_variance))
+        sigma = np.exp(0.5 * log_variance)
+        size = (*shape, len(QUANTITIES))
+        sight = np.broadcast_to(poses.in_sight, size)[used]
+        camera = np.broadcast_to(poses.in_camera, size)[used]
+        turn = sight_rotation(np.broadcast_to(poses["true_tvec_m"], (*shape, 3))[used])
+        columns = list((np.abs(sight - bias) <= 2.0 * sigma).T.astype(float))
+        for part in (slice(0, 3), slice(3, 6)):
+            mean = np.einsum("nij,nj->ni", turn, bias[:, part])
+            spread = np.sqrt(np.einsum("nij,nj->ni", turn**2, sigma[:, part] ** 2))
+            columns += list(
+                (np.abs(camera[:, part] - mean) <= 2.0 * spread).T.astype(float))
+        groups = len(poses.detection)
+        counts = _add(self.bins, np.ravel(numbers), groups, [
+            np.ravel(np.broadcast_to(each, shape) & inside).astype(float)
+            for each in (poses.looked_for, poses.solved, poses.flipped, poses.unflipped)])
+        within = _add(self.bins, numbers[used], groups, columns)
+        return Sums(np.concatenate([counts, within], axis=-1))
+
+
+def sums_of(
+    results: xr.Dataset, kept: Sequence[str], focal_size: xr.DataArray,
+    *statistics: _OfBins | SeenRegion,
+) -> dict[str, list[Any]]:
+    """Return the arrays of each model by the statistics' variables, in the kept axes' order.
+
+    ``sums`` are (halves, bins, columns), ``counts`` (cells,) and ``reach`` (2 x directions,).
+    """
+    sizes = [results.sizes[name] for name in kept]
+    half = np.asarray(results[DRAWS].values) % HALVES
+    inputs: Mapping[str, xr.DataArray] = pose_arrays(results, SIGNED_INPUTS) | {
+        MODEL: xr.DataArray(np.arange(int(np.prod(sizes))).reshape(sizes), dims=tuple(kept)),
+        HALF: xr.DataArray(half.astype(np.int64), dims=DRAWS),
+        FOCAL_SIZE: focal_size,
+    }
+    table = aggregate(results, inputs, kept, statistics, SightErrors).compute()
+    return {str(name): list(values.transpose(*kept).values.ravel())
+            for name, values in table.data_vars.items()}
+
+
+# --------------------------------------------------------------------------------------------------
+# Conditions of error models: their bins in a dataset, and the joint region that was seen.
+
+PREDICTORS = {"distance_m": True, "side_px": True, "viewing_angle_deg": False}
+"""Name of a predictor -> whether its logarithm is what the model is linear in."""
+
+CONDITIONS = PREDICTORS | {"bearing_deg": False}
+"""The predictors, and the bearing: models do not depend on it, but hold where it was seen."""
+
+MAX_BINS = {"distance_m": 16, "side_px": 8, "viewing_angle_deg": 16}
+"""Bins of the fit into which values are put that are not a few."""
+
+MAX_CELLS = {"distance_m": 12, "side_px": 6, "viewing_angle_deg": 12}
+"""The same of the cells in which the fit is judged."""
+
+MAX_VALUES = 24
+"""Distinct values up to which each has a bin of its own."""
+
+SAME = 1e-6
+"""Values that differ by less, relatively (angles: in degrees / 100), are the same."""
+
+VARIES = {"distance_m": 1.02, "side_px": 1.02, "viewing_angle_deg": 1.0, "bearing_deg": 1.0}
+"""Ratio of the largest value to the smallest (angles: difference in degrees) from which on a
+predictor varies."""
+
+FRONTAL_DEG = 5.0
+"""Smallest viewing angles and bearings up to here: the model begins at 0."""
+
+POSES_A_CELL = 150
+"""Poses that a cell should have, on average, where cells can be made wider."""
+
+MAX_REGION_CELLS = 12
+"""Cells along a drawn condition in which the seen region is told."""
+
+POSES_A_REGION_CELL = 15
+"""Poses that such a cell should have, on average, so that none is empty by chance."""
+
+SLACK = 0.05
+"""Shares of two conditions' ranges by which their sum and difference may leave the seen ones; to it
+comes that of `CORNER`."""
+
+CORNER = 3.0
+"""Of n draws uniform in a square none lies in a corner of area 3 / n with a probability of 5 %:
+by the root of it sums and differences may leave the seen ones, too."""
+
+
+def focal_size_of(results: xr.Dataset) -> xr.DataArray:
+    """Return fx times the side of the black square, px · m, over the dimensions that it has.
+
+    Raises
+    ------
+    DatasetError
+        If a parameter is not known.
+    """
+    try:
+        values = {name: parameter_value(results, name) for name in (*VIEW_PARAMETERS, "size_m")}
+    except DatasetError:
+        if "side_px" not in results.coords:
+            raise
+        product = results["side_px"] * results["true_tvec_m"].isel(xyz=2, drop=True)
+    else:
+        fx = intrinsics(*(values[name] for name in VIEW_PARAMETERS))[0]
+        product = xr.DataArray(fx) * values["size_m"]
+    return product.astype(np.float64).reset_coords(drop=True)
+
+
+def bins_and_cells(
+    results: xr.Dataset, focal_size: xr.DataArray, found: Mapping[str, Floats]
+) -> tuple[Bins, Bins]:
+    """Return the bins that models are fitted to, and the wider cells in which they are judged.
+
+    Few distinct values, of an axis, have a bin and a cell each; others, which were drawn, have some
+    of about as many poses each. ``found``: the `distinct_values`.
+    """
+    found = {name: found[name] for name in PREDICTORS}
+    collinear = float(focal_size.max()) <= float(focal_size.min()) * VARIES["side_px"]
+    # The side that follows from the distance has one bin, as what does not vary.
+    single = {name for name, values in found.items() if not _varies(name, values)}
+    if collinear and "distance_m" not in single:
+        single.add("side_px")
+    drawn = [name for name, values in found.items()
+             if name not in single and len(values) > MAX_VALUES]
+    poses = _pose_count(results)
+    others = math.prod(len(values) for name, values in found.items()
+                       if name not in single and name not in drawn)
+    many = max(2, int((poses / (POSES_A_CELL * others)) ** (1.0 / max(len(drawn), 1))))
+    bins, cells = (
+        Bins(tuple(
+            _domain(name, values) if name in single
+            else _with_margin(name, _edges(name, values, min(most, limits[name])))
+            for name, values in found.items()
+        )) for most, limits in ((max(MAX_BINS.values()), MAX_BINS), (many, MAX_CELLS)))
+    return bins, cells
+
+
+def region_cells(
+    results: xr.Dataset, found: Mapping[str, Floats]
+) -> tuple[Bins, tuple[int, ...]]:
+    """Return the cells of conditions that poses are in or not, and which conditions were drawn.
+
+    Few distinct values, of an axis, have a cell each, also those that jitter spreads a little;
+    others have some cells of about as many values each.
+    """
+    middles = {name: _between(name, values) for name, values in found.items()}
+    drawn = [name for name, middle in middles.items() if middle is None]
+    others = math.prod(len(middle) + 1 for middle in middles.values() if middle is not None)
+    # Values that go together along an axis make fewer combinations.
+    others = min(others, _pose_count(results) // results.sizes.get(DRAWS, 1))
+    many = _pose_count(results) / (POSES_A_REGION_CELL * others)
+    count = min(max(1, int(many ** (1.0 / max(len(drawn), 1)))), MAX_REGION_CELLS)
+    edges = []
+    for name, values in found.items():
+        middle = middles[name]
+        if middle is None:
+            middle = np.unique(np.quantile(values, np.linspace(0.0, 1.0, count + 1))[1:-1])
+        edges.append(np.concatenate([[-np.inf], middle, [np.inf]]))
+    return Bins(tuple(edges)), tuple(k for k, name in enumerate(found) if name in drawn)
+
+
+def _pose_count(results: xr.Dataset) -> int:
+    return math.prod(results.sizes[name] for name in results["true_tvec_m"].dims if name != "xyz")
+
+
+def _between(name: str, values: Floats) -> Floats | None:
+    """Return the middles between the few values of a condition, None if it has many.
+
+    Values that jitter spreads by no more than what counts as the same are one.
+
+    >>> _between("bearing_deg", np.array([*np.linspace(0.0, 0.1, 99), 20.0])).tolist()
+    [10.05]
+    """
+    logarithmic, same = CONDITIONS[name], VARIES[name]
+    if len(values) <= MAX_VALUES:
+        last, first = values[:-1], values[1:]
+    else:
+        jumps = np.diff(np.log(values)) > math.log(same) if logarithmic else np.diff(values) > same
+        groups = np.split(values, np.flatnonzero(jumps) + 1)
+        if len(groups) > MAX_VALUES or any(_varies(name, group) for group in groups):
+            return None
+        last, first = (np.array([group[k] for group in some])
+                       for some, k in ((groups[:-1], -1), (groups[1:], 0)))
+    return np.asarray(np.sqrt(last * first) if logarithmic else (last + first) / 2)
+
+
+def region_directions(found: Mapping[str, Floats]) -> Floats:
+    """Return directions (n, 4) along which the seen region has two ends, the four axes first.
+
+    In ln(distance), ln(side), viewing angle and bearing. The fifth is ln(fx size); then follow, of
+    two conditions that vary, sum and difference in units of their ranges.
+    """
+    ranges = [np.ptp(np.log(values) if CONDITIONS[name] else values)
+              for name, values in found.items()]
+    unit = np.eye(len(ranges))
+    rows = [*unit, unit[0] + unit[1]]
+    varying = [k for k, (name, values) in enumerate(found.items()) if _varies(name, values)]
+    for a, b in itertools.combinations(varying, 2):
+        rows += [unit[a] / ranges[a] + sign * unit[b] / ranges[b] for sign in (1.0, -1.0)]
+    return np.stack(rows)
+
+
+def region_ends(directions: Floats, reach: Floats, draws: Floats) -> tuple[Floats, Floats]:
+    """Return the ends (models, directions) of the region along directions, from `SeenRegion`.
+
+    An end has a margin for rounding; where there is hardly an extent, as wide as what counts as
+    the same; of sums and differences `SLACK` and what so many ``draws`` (models,) in each cell of
+    the grid may leave empty in a corner (`CORNER`). Angles that begin near 0 begin at 0.
+    """
+    high, low = np.split(reach * np.repeat([1.0, -1.0], len(directions)), 2, axis=-1)
+    same = np.array([math.log(VARIES[name]) if logarithmic else VARIES[name]
+                     for name, logarithmic in CONDITIONS.items()])
+    # Knots at the ends lie 2e-6 outside the poses.
+    rounding = np.where(list(CONDITIONS.values()), 3.0 * SAME, 200.0 * SAME)
+    alone = [*range(len(same)), 0]  # ln(fx size) has the tolerance of ln(distance)
+    count = len(alone)
+    margin = np.repeat(SLACK + np.sqrt(CORNER / draws)[:, None], low.shape[1], axis=1)
+    margin[:, :count] = np.where(
+        high[:, :count] - low[:, :count] <= same[alone], same[alone], rounding[alone])
+    margin[:, count - 1] = np.maximum(margin[:, count - 1], 2.0 * rounding[0])  # of two ends
+    wider = low - margin
+    frontal = ~np.array(list(CONDITIONS.values())) & (wider[:, : len(same)] <= FRONTAL_DEG)
+    ends = np.where(frontal, 0.0, wider[:, : len(same)])
+    # Where an angle begins at 0, its sums and differences reach as much farther.
+    margin[:, count:] += (low[:, : len(same)] - ends) @ np.abs(directions[count:]).T
+    low, high = low - margin, high + margin
+    low[:, : len(same)] = ends
+    return low, high
+
+
+def _domain(name: str, values: Floats) -> Floats:
+    """Return the ends of the domain of what does not vary: as wide as what counts as the same."""
+    low, high = values[0], values[-1]
+    if PREDICTORS[name]:
+        return np.array([low / VARIES[name], high * VARIES[name]])
+    return np.array([max(low - VARIES[name], 0.0), high + VARIES[name]])
+
+
+def _with_margin(name: str, edges: Floats) -> Floats:
+    """Return edges whose ends are so far out that rounding puts no pose outside.
+
+    Viewing angles that begin near 0 begin at 0.
+    """
+    ends = edges[[0, -1]]
+    margin = 2.0 * SAME * ends if PREDICTORS[name] else 100.0 * SAME
+    low, high = ends + np.array([-1.0, 1.0]) * margin
+    if name == "viewing_angle_deg" and low <= FRONTAL_DEG:
+        low = 0.0
+    return np.concatenate([[low], edges[1:-1], [high]])
+
+
+def distinct_values(results: xr.Dataset, focal_size: xr.DataArray) -> dict[str, Floats]:
+    """Return the distinct values (n,) of each condition among the poses looked for.
+
+    Raises
+    ------
+    DatasetError
+        If no pose was looked for.
+    """
+    position = results["true_tvec_m"]
+    distance = position.isel(xyz=2, drop=True).reset_coords(drop=True)
+    angle = xr.apply_ufunc(
+        viewing_angle_of, results["true_rvec"].reset_coords(drop=True),
+        position.reset_coords(drop=True), input_core_dims=[["xyz"], ["xyz"]], dask="parallelized",
+        output_dtypes=[np.float64], dask_gufunc_kwargs={"allow_rechunk": True})
+    bearing = xr.apply_ufunc(
+        bearing_of, position.reset_coords(drop=True), input_core_dims=[["xyz"]],
+        dask="parallelized", output_dtypes=[np.float64],
+        dask_gufunc_kwargs={"allow_rechunk": True})
+    seen = results["detection"].reset_coords(drop=True)
+    counted = ~seen.isin(uncounted_values(DetectionStatus)) & (distance > 0)
+    counted = counted.any([dim for dim in counted.dims if dim not in position.dims])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        side = focal_size / distance
+    found = {
+        "distance_m": _distinct(distance.where(counted)),
+        "side_px": _distinct(side.where(counted)),
+        "viewing_angle_deg": _distinct(angle.where(counted), absolute=True),
+        "bearing_deg": _distinct(bearing.where(counted), absolute=True),
+    }
+    if not all(len(values) for values in found.values()):
+        raise DatasetError("no pose was looked for: there are no errors to model")
+    return found
+
+
+def _distinct(values: xr.DataArray, *, absolute: bool = False) -> Floats:
+    """Return the sorted values, those that are the same once."""
+    flat = da.unique(da.asarray(values.data).ravel()).compute()
+    flat = flat[np.isfinite(flat)]
+    if not len(flat):
+        return np.asarray(flat)
+    step = np.diff(flat)
+    return np.asarray(
+        flat[np.concatenate([[True], step > (100 * SAME if absolute else SAME * flat[1:])])])
+
+
+def _varies(name: str, values: Floats) -> bool:
+    """Return whether the last of the sorted values is another than the first."""
+    low, high, least = values[0], values[-1], VARIES[name]
+    return bool(high > low * least if CONDITIONS[name] else high - low > least)
+
+
+def _edges(name: str, values: Floats, count: int) -> Floats:
+    """Return edges of one bin a value, or of bins of about as many distinct values each."""
+    if len(values) <= MAX_VALUES:
+        middle = np.sqrt(values[:-1] * values[1:]) if PREDICTORS[name] else (
+            (values[:-1] + values[1:]) / 2)
+        return np.concatenate([values[:1], middle, values[-1:]])
+    return np.unique(np.quantile(values, np.linspace(0.0, 1.0, count + 1)))
+
+
+def knot_values(bins: Bins, moments: Sequence[Moments]) -> list[Floats]:
+    """Return the values that may be knots: of each axis the means of its bins, and both ends.
+
+    Where a bin is a single value that is the value itself.
+    """
+    knots = []
+    for axis, (logarithmic, edges) in enumerate(
+            zip(PREDICTORS.values(), bins.edges, strict=True)):
+        count, total = np.sum([each.along(axis, bins.shape) for each in moments], axis=0)
+        middle = total[count > 0] / count[count > 0]
+        ends = np.log(edges[[0, -1]]) if logarithmic else edges[[0, -1]]
+        if len(middle) > 1:
+            middle = np.unique(np.concatenate([ends[:1], middle[1:-1], ends[1:]]))
+        knots.append(middle)
+    return knots

@@ -1,44 +1,54 @@
-"""Error models: bias and standard deviation of a pose over distance, side and viewing angle."""
+"""Error models: bias and covariance of poses as functions of the condition."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
-from sweep.analysis.described import with_sampling
-from sweep.analysis.dimensions import DRAWS, axes_of, is_grid_axis, kept_dimensions
-from sweep.analysis.error_model_bins import PREDICTORS, bins_and_cells, focal_size_of, knot_values
+from sweep.analysis.dataset import DRAWS, axes_of, is_grid_axis, kept_dimensions, with_sampling
 from sweep.analysis.error_model_fit import (
-    BinSums,
-    Fit,
-    choose_knots,
-    differences,
-    fit_error,
-    grid_points,
-    hat_basis,
-    select_knots,
-    union,
-)
-from sweep.analysis.error_model_sums import (
+    CONDITIONS,
     COUNTS,
     HALVES,
+    PREDICTORS,
     QUANTITIES,
     BinMoments,
     Bins,
+    BinSums,
     Coverage,
+    Fit,
     Fitted,
     Moments,
+    SeenRegion,
+    bins_and_cells,
+    choose_knots,
+    differences,
+    distinct_values,
+    fit_error,
+    focal_size_of,
+    grid_points,
+    hat_basis,
+    knot_values,
+    region_cells,
+    region_directions,
+    region_ends,
+    select_knots,
     sums_of,
+    union,
 )
 from sweep.analysis.intervals import DEVIATIONS
-from sweep.analysis.pose_view import SIGNED_INPUTS, pose_arrays
-from sweep.errors import DatasetError
+from sweep.analysis.poses import SIGNED_INPUTS, bearing_of, pose_arrays, sight_rotation
+from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import Flag, flag
-from sweep.plan.variable import cf_attributes
-from sweep.typing import Floats, Integers
+from sweep.plan.schema import cf_attributes
+from sweep.typing import Floats, Integers, Masks
+
+# --------------------------------------------------------------------------------------------------
+# Error models: bias and standard deviation of a pose over distance, side and viewing angle.
 
 NOMINAL = 0.9545
 """Share of normal errors within two standard deviations."""
@@ -95,7 +105,7 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
         Dimensions: the axes that are kept apart; ``quantity``: ``x``, ``y``, ``z`` (m), and the
         rotation vector ``rotation_x``, ``rotation_y``, ``rotation_z`` (rad), estimated minus true,
         in the sight frame, which is the camera's frame turned so that z is the line of sight
-        (`sweep.analysis.sight_frame`; z is the error of the range); knots ``distance_m`` (along
+        (`sweep.analysis.poses`; z is the error of the range); knots ``distance_m`` (along
         the optical axis), ``side_px`` and ``viewing_angle_deg``; and cells of these three.
 
         - ``sigma``, ``bias`` at the knots, with ``_low`` and ``_high``. Between knots ln(sigma) and
@@ -110,6 +120,10 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
         - ``use`` (quantity, cells): whether the model may be used there (`Use`): the coverage lies
           within 0.93 to 0.97, with a tolerance of a standard error, and that of each half of the
           trials with one of two.
+        - ``region_low``, ``region_high`` (direction), ``region_seen`` (cells): the joint region of
+          distance, side, viewing angle and bearing in which poses were looked for; outside it the
+          model has no answer. In it are conditions whose weighted sums (``direction_weight``) lie
+          between both ends, and that are in a cell with poses.
         - ``flip_rate``, ``solved_rate`` and ``looked_for`` (cells). Flipped and missing poses are
           in these, not in sigma.
 
@@ -139,8 +153,11 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
     pose_arrays(results, SIGNED_INPUTS)
     _check_drawn(results, kept)
     focal_size = focal_size_of(results)
-    bins, cells = bins_and_cells(results, focal_size)
-    moments = [Moments(each) for each in sums_of(results, kept, focal_size, BinMoments(bins))]
+    found = distinct_values(results, focal_size)
+    bins, cells = bins_and_cells(results, focal_size, found)
+    (region, drawn), directions = region_cells(results, found), region_directions(found)
+    sums = sums_of(results, kept, focal_size, BinMoments(bins), SeenRegion(region, directions))
+    moments = [Moments(each) for each in sums["sums"]]
     _check_solved(moments, results, kept)
     values = knot_values(bins, moments)
     selected = [[select_knots(each.of(k, 0), each.of(k, 1), values) for k in range(len(QUANTITIES))]
@@ -158,17 +175,19 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
         np.array([[[getattr(fit, name) for fit in half[model]] for half in halves]
                   for model in range(len(moments))]).transpose(0, 1, 3, 2)
         for name in ("bias", "log_variance")))
-    judged = sums_of(results, kept, focal_size, Coverage(cells, fitted))
+    judged = sums_of(results, kept, focal_size, Coverage(cells, fitted))["sums"]
     shape = tuple(results.sizes[name] for name in kept)
     table = _knot_variables(fits(None), knots, kept, shape)
     table |= _cell_variables(judged, cells, kept, shape)
     table |= _exponents(moments, kept, shape)
+    table |= _region_variables(sums, region, drawn, directions, kept, shape)
     table["knots"] = ((*kept, "quantity", "predictor"), np.array(
         [[[len(each) for each in own] for own in model] for model in selected],
     ).reshape(*shape, len(QUANTITIES), -1), cf_attributes("knots that the error needs", "1"))
     coordinates: dict[str, Any] = {
         name: results[name].variable for name in kept if name in results.coords}
-    coordinates |= {"quantity": list(QUANTITIES), "predictor": list(PREDICTORS)}
+    coordinates |= {"quantity": list(QUANTITIES), "predictor": list(PREDICTORS),
+                    "condition": list(CONDITIONS)}
     for (name, logarithmic), own, edges in zip(
             PREDICTORS.items(), knots, cells.edges, strict=True):
         attributes = {"units": UNITS[name], "long_name": f"knots of {WORDS[name]}"}
@@ -178,18 +197,23 @@ def error_models(results: xr.Dataset) -> xr.Dataset:
         for ending, ends in (("low", edges[:-1]), ("high", edges[1:])):
             coordinates[f"cell_{name}_{ending}"] = (f"cell_{name}", ends, {
                 "units": UNITS[name], "long_name": f"{ending} end of cells of {WORDS[name]}"})
+    for name, edges in zip(CONDITIONS, region.edges, strict=True):
+        coordinates[f"region_{name}"] = (f"region_{name}", edges[:-1], {
+            "units": UNITS[name], "long_name": f"low end of cells of the region of {WORDS[name]}"})
     focal = focal_size.astype(np.float64)
     return with_sampling(xr.Dataset(table, coordinates, attrs={
         "focal_size_px_m": float(focal.mean()),
         "focal_size_varies": int(float(focal.max()) > float(focal.min()) * (1 + 1e-9)),
-    } | _extent(results)), results)
+    }), results)
 
 
-UNITS = {"distance_m": "m", "side_px": "px", "viewing_angle_deg": "degree"}
+UNITS = {"distance_m": "m", "side_px": "px", "viewing_angle_deg": "degree",
+         "bearing_deg": "degree"}
 WORDS = {
     "distance_m": "the distance along the optical axis",
     "side_px": "the side of the black square, were it parallel to the image",
     "viewing_angle_deg": "the angle between the marker's normal and the line of sight",
+    "bearing_deg": "the angle between the line of sight and the optical axis",
 }
 
 
@@ -233,12 +257,27 @@ def _check_solved(
                 f"error model needs {MIN_POSES} or more: more trials, or larger sides")
 
 
-def _extent(results: xr.Dataset) -> dict[str, float]:
-    """Return the largest bearing of the poses, in degrees."""
-    position = results["true_tvec_m"]
-    x, y, z = (position.isel(xyz=k, drop=True) for k in range(3))
-    tangent: xr.DataArray = ((x**2 + y**2) ** 0.5) / z
-    return {"max_bearing_deg": float(np.degrees(np.arctan(tangent.where(z > 0).max().compute())))}
+def _region_variables(
+    sums: Mapping[str, Any], region: Bins, drawn: Sequence[int], directions: Floats,
+    kept: Sequence[str], shape: tuple[int, ...],
+) -> dict[str, Any]:
+    """Return the joint region of the conditions that was seen, of each model."""
+    counts = np.stack(sums["counts"]).reshape(-1, *region.shape)
+    of_grid = counts.sum(axis=tuple(1 + k for k in drawn)).reshape(len(counts), -1)
+    draws = np.where(of_grid > 0, of_grid, np.inf).min(axis=1)
+    low, high = region_ends(directions, np.stack(sums["reach"]), draws)
+    seen = (counts > 0).reshape(*shape, *region.shape)
+    dims = (*kept, "direction")
+    return {
+        "direction_weight": (("direction", "condition"), directions, cf_attributes(
+            "weights of ln(distance), ln(side), viewing angle and bearing", "")),
+        "region_low": (dims, low.reshape(*shape, -1), cf_attributes(
+            "smallest weighted sum of a direction in the region", "")),
+        "region_high": (dims, high.reshape(*shape, -1), cf_attributes(
+            "largest weighted sum of a direction in the region", "")),
+        "region_seen": ((*kept, *(f"region_{name}" for name in CONDITIONS)), seen, cf_attributes(
+            "whether a cell of the conditions has poses", "1")),
+    }
 
 
 def _unscaled(values: Floats, distance_m: Floats) -> Floats:
@@ -353,3 +392,178 @@ def _exponents(
             (("", ""), ("_low", "lower end of the 95 % interval: "),
              ("_high", "upper end of the 95 % interval: ")), values, strict=True)
     }
+
+
+# --------------------------------------------------------------------------------------------------
+# Values of an error model at poses: bias, standard deviation and covariance.
+
+def model_errors(
+    model: xr.Dataset, distance_m: ArrayLike, viewing_angle_deg: ArrayLike,
+    side_px: ArrayLike | None = None, bearing_deg: ArrayLike | None = None,
+) -> xr.Dataset:
+    """Return bias and standard deviation of the pose's error at some conditions.
+
+    Parameters
+    ----------
+    model
+        One model of `error_models`: choose a configuration with ``models.isel(...)``.
+    distance_m
+        Distances (n,) along the optical axis.
+    viewing_angle_deg
+        Angles (n,) between the marker's normal and the line of sight.
+    side_px
+        Sides (n,) of the black square, were it parallel to the image; by default what follows from
+        the distance, if the store has one size and one focal length.
+    bearing_deg
+        Angles (n,) between the line of sight and the optical axis; by default any that was seen
+        with the other conditions.
+
+    Returns
+    -------
+    xr.Dataset
+        ``sigma``, ``bias`` (n, quantity), in metres and radians, in the sight frame; ``use`` (n,
+        quantity), flags of `Use`; ``flip_rate``, ``solved_rate`` (n,) of the cell. Where the store
+        has not seen the conditions together, all are NaN and ``use`` is ``no_poses``.
+
+    Raises
+    ------
+    ArgumentError
+        If there are several models, or no side where it does not follow.
+
+    Notes
+    -----
+    ln(sigma) and the bias (of positions: over the distance) are linear between the knots of the
+    model in ln(distance), ln(side) and the angle.
+
+    Examples
+    --------
+    >>> parts = [results.assign_coords(trial=results["trial"] + 8 * k) for k in range(40)]
+    >>> from sweep.analysis import error_models
+    >>> models = error_models(xr.concat(parts, "trial"))
+    >>> found = model_errors(models.isel(solver=0), [1.0, 99.0], 0.0)
+    >>> found["sigma"].sel(quantity="z").round(5).values.tolist()
+    [0.00076, nan]
+    """
+    if model["sigma"].dims != ("quantity", *PREDICTORS):
+        others = [str(dim) for dim in model["sigma"].dims if dim not in ("quantity", *PREDICTORS)]
+        raise ArgumentError("model", f"models for each {', '.join(others)}",
+                            "expected one model; choose one with models.isel(...)")
+    distance, angle = (np.atleast_1d(np.asarray(each, dtype=np.float64))
+                       for each in (distance_m, viewing_angle_deg))
+    if side_px is None:
+        if model.attrs["focal_size_varies"]:
+            raise ArgumentError("side_px", None, "expected the side: it varies in the store")
+        with np.errstate(divide="ignore"):
+            side_px = model.attrs["focal_size_px_m"] / distance
+    bearing = np.atleast_1d(np.asarray(np.nan if bearing_deg is None else bearing_deg, dtype=float))
+    distance, side, angle, bearing = np.broadcast_arrays(
+        distance, np.atleast_1d(np.asarray(side_px, dtype=np.float64)), angle, bearing)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = np.stack([np.log(distance), np.log(side), angle, bearing], axis=-1)
+    inside = _seen(model, at, any_bearing=bearing_deg is None)
+    cell = np.ravel_multi_index(tuple(
+        np.searchsorted(cell_edges(model, name)[1:-1], value, side="right")
+        for name, value in zip(PREDICTORS, (distance, side, angle), strict=True)),
+        model["flip_rate"].shape)
+    knots = [np.log(model[name].values) if logarithmic else model[name].values
+             for name, logarithmic in PREDICTORS.items()]
+    basis = hat_basis(at[:, : len(knots)], knots)
+    scale = np.where(np.arange(len(QUANTITIES)) < 3, 1.0, 0.0)[:, None]
+    metres = scale * model["distance_m"].values + (1.0 - scale)
+    bias = model["bias"].values / metres[:, :, None, None]
+    flat = (len(QUANTITIES), -1)
+    values = {
+        "sigma": np.exp(basis @ np.log(model["sigma"].values).reshape(flat).T),
+        "bias": basis @ bias.reshape(flat).T * (scale[:, 0] * distance[:, None] + 1 - scale[:, 0]),
+    }
+    use = model["use"].values.reshape(flat)[:, cell].T
+    inside &= (use != Use.no_poses).all(axis=1)
+    out: dict[str, Any] = {
+        name: (("pose", "quantity"), np.where(inside[:, None], each, np.nan),
+               {"units": "m, radian"}) for name, each in values.items()}
+    out["use"] = (("pose", "quantity"), np.where(inside[:, None], use, Use.no_poses),
+                  model["use"].attrs)
+    for name in ("flip_rate", "solved_rate"):
+        rate = model[name].values.ravel()[cell]
+        out[name] = ("pose", np.where(inside, rate, np.nan), model[name].attrs)
+    return xr.Dataset(out, {"quantity": list(QUANTITIES)})
+
+
+def model_covariance(
+    model: xr.Dataset, position_m: ArrayLike, viewing_angle_deg: ArrayLike,
+    side_px: ArrayLike | None = None,
+) -> xr.Dataset:
+    """Return covariance and bias of the pose's error along and about the camera's axes.
+
+    Parameters
+    ----------
+    model, viewing_angle_deg, side_px
+        As in `model_errors`.
+    position_m
+        Positions (n, 3) of the marker in the camera's frame; estimated ones do.
+
+    Returns
+    -------
+    xr.Dataset
+        ``covariance`` (pose, row, column) and ``bias`` (pose, row) in the order x, y, z (m),
+        rotation about x, y, z (rad): that of the message ``geometry_msgs/PoseWithCovariance`` of
+        ROS, whose 36 numbers are the rows one after another. Subtract the bias from the estimate
+        before the covariance describes what is left. ``use`` as in `model_errors`.
+
+    Raises
+    ------
+    ArgumentError
+        As in `model_errors`.
+
+    Notes
+    -----
+    Q diag(sigma²) Qᵀ for position and rotation each, with Q of `sight_rotation`.
+
+    Examples
+    --------
+    >>> parts = [results.assign_coords(trial=results["trial"] + 8 * k) for k in range(40)]
+    >>> from sweep.analysis import error_models
+    >>> models = error_models(xr.concat(parts, "trial"))
+    >>> pose = model_covariance(models.isel(solver=0), [0.0, 0.0, 1.0], 0.0)
+    >>> pose["covariance"].shape, bool(pose["covariance"][0, 2, 2] > 0)
+    ((1, 6, 6), True)
+    """
+    position = np.atleast_2d(np.asarray(position_m, dtype=np.float64))
+    values = model_errors(
+        model, position[:, 2], viewing_angle_deg, side_px, bearing_of(position))
+    turn = sight_rotation(position)
+    covariance = np.zeros((len(position), 6, 6))
+    bias = np.zeros((len(position), 6))
+    for part in (slice(0, 3), slice(3, 6)):
+        variance = values["sigma"].values[:, part] ** 2
+        covariance[:, part, part] = np.einsum("nij,nj,nkj->nik", turn, variance, turn)
+        bias[:, part] = np.einsum("nij,nj->ni", turn, values["bias"].values[:, part])
+    return xr.Dataset({
+        "covariance": (("pose", "row", "column"), covariance, {"units": "m2, m rad, rad2"}),
+        "bias": (("pose", "row"), bias, {"units": "m, radian"}), "use": values["use"],
+    })
+
+
+def cell_edges(model: xr.Dataset, name: str) -> Floats:
+    """Return the edges of a model's cells along a predictor."""
+    low, high = (model[f"cell_{name}_{end}"].values for end in ("low", "high"))
+    return np.append(low, high[-1])
+
+
+def _seen(model: xr.Dataset, at: Floats, *, any_bearing: bool) -> Masks:
+    """Return whether points (n, 4), in ln(distance), ln(side) and degrees, are in the region."""
+    weights, low, high = (model[name].values for name in (
+        "direction_weight", "region_low", "region_high"))
+    cells = model["region_seen"].values
+    if any_bearing:
+        free = weights[:, -1] == 0
+        at, weights, low, high = at[:, :-1], weights[free, :-1], low[free], high[free]
+        cells = np.asarray(cells.any(axis=-1))
+    plain = [np.exp(value) if logarithmic else value
+             for value, logarithmic in zip(at.T, CONDITIONS.values(), strict=False)]
+    numbers = tuple(
+        np.searchsorted(model[f"region_{name}"].values[1:], value, side="right")
+        for value, name in zip(plain, CONDITIONS, strict=False))
+    with np.errstate(invalid="ignore"):
+        projected = at @ weights.T
+    return np.asarray(((low <= projected) & (projected <= high)).all(axis=1) & cells[numbers])

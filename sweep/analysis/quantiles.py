@@ -1,27 +1,28 @@
-"""Quantiles of poses' errors, exact in little memory, with intervals that are order statistics."""
+"""Quantiles of errors, exact, with rank intervals."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Generic
+from typing import Generic, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import special
 
-from sweep.analysis.groups import group_numbers
 from sweep.analysis.intervals import LEVEL
-from sweep.analysis.radix_histogram import LowerTally, UpperTally
-from sweep.analysis.states import BlockSample, BlockState, Sample, State
 from sweep.analysis.statistic import (
     Output,
-    Statistic,
+    Sample,
+    SinglePass,
+    State,
     Variables,
     ViewT,
     interval_variables,
     with_interval,
 )
+from sweep.errors import DatasetError
 from sweep.measure.flags import Flag, flag
 from sweep.typing import Floats, Integers, Masks
 
@@ -37,52 +38,98 @@ class IntervalOf(Flag):
     too_few_draws = flag(3, "An end lies beyond the smallest or the largest draw.")
 
 
-@dataclass(frozen=True)
-class QuantileState(State):
-    """The poses that count, and their values by the upper bits."""
+MAX_VALUES = 2 * 10**8
+"""Values of a column that are sorted at once: 1.6 GB."""
 
-    sample: Sample
-    upper: UpperTally
-
-
-@dataclass(frozen=True)
-class BlockQuantileState(BlockState[QuantileState]):
-    """The same of a block."""
-
-    sample: BlockSample
-    upper: UpperTally
-
-    def fold(self) -> QuantileState:
-        """Return the state of all cells."""
-        return QuantileState(self.sample.fold(), self.upper)
+OF_VALUE = 1 << 32
+"""How many keys the values of a group can have."""
 
 
-@dataclass(frozen=True)
-class WantedRanks(State):
-    """What the second pass knows: the bins of the wanted ranks, and the ranks within these.
+@dataclass(frozen=True, slots=True, eq=False)
+class Keys:
+    """Non-negative values of all groups as whole numbers (m,), in any order.
 
-    ``bins`` and ``ranks`` are (groups, percents, 3): the quantile's, and its interval's ends'.
+    A key is the number of the value's group, and below it the bits of the value as a float32 (the
+    precision in which errors are stored), which are ordered as the values are. So the sorted keys
+    have the sorted values of each group, one group after the other.
     """
 
+    keys: NDArray[np.uint64] | NDArray[np.uint32]
+    """Of 32 bits where all values are of the first group, which takes half the memory."""
+
+    @classmethod
+    def of(cls, groups: Integers, values: Floats) -> Self:
+        """Return the keys of values (m,) of groups (m,); DatasetError as `merge`."""
+        require_values(len(values))
+        with np.errstate(over="ignore"):  # above 3.4e38: infinite
+            bits = np.abs(values).astype(np.float32).view(np.uint32)
+        return cls(groups.astype(np.uint64) * OF_VALUE + bits if groups.any() else bits)
+
+    def merge(self, other: Self) -> Self:
+        """Return the keys of the values of both.
+
+        Raises
+        ------
+        DatasetError
+            If they are too many to be sorted at once.
+        """
+        require_values(len(self.keys) + len(other.keys))
+        return type(self)(np.concatenate([self.keys, other.keys]))
+
+    @staticmethod
+    def interleave(parts: Sequence[Keys]) -> Keys:
+        """Return n parts as one of n times as many groups: g of the k-th becomes g * n + k."""
+        moved = [(*np.divmod(part.keys.astype(np.uint64), OF_VALUE), k)
+                 for k, part in enumerate(parts)]
+        return Keys(np.concatenate([
+            (group * len(parts) + k) * OF_VALUE + bits for group, bits, k in moved]))
+
+    def every_nth(self, n: int, first: int) -> Self:
+        """Return the keys of the groups ``first``, ``first + n`` and so on."""
+        group, bits = np.divmod(self.keys.astype(np.uint64), OF_VALUE)
+        chosen = group % n == first
+        return type(self)(group[chosen] // n * OF_VALUE + bits[chosen])
+
+    def values_at(self, ranks: Integers) -> Floats:
+        """Return the values at ranks (groups, ...), from 1; NaN for those that do not exist."""
+        self.keys.sort()  # in place: their order means nothing
+        ascending = self.keys
+        if ascending.dtype == np.uint32:
+            starts = np.array([0, *[len(ascending)] * len(ranks)])
+        else:
+            starts = np.searchsorted(
+                ascending, np.arange(len(ranks) + 1, dtype=np.uint64) * np.uint64(OF_VALUE))
+        shape = (len(ranks), *[1] * (ranks.ndim - 1))
+        first, size = starts[:-1].reshape(shape), np.diff(starts).reshape(shape)
+        exists = (ranks >= 1) & (ranks <= size)
+        if not len(ascending):
+            return np.full(ranks.shape, np.nan)
+        keys = ascending[np.where(exists, first + ranks - 1, 0)]
+        bits = (keys.astype(np.uint64) % OF_VALUE).astype(np.uint32)
+        return np.where(exists, bits.view(np.float32).astype(np.float64), np.nan)
+
+
+def require_values(count: int) -> None:
+    """Raise DatasetError if so many values cannot be sorted at once."""
+    if count > MAX_VALUES:
+        raise DatasetError(
+            f"quantiles of {count:,} poses at once: expected at most {MAX_VALUES:,}; divide them: "
+            "keep an axis apart (per=), or take a part of the dataset (isel) for each condition")
+
+
+@dataclass(frozen=True)
+class QuantileState(State):
+    """The poses that count, and their values."""
+
     sample: Sample
-    bins: Integers
-    ranks: Integers
+    values: Keys
 
 
 @dataclass(frozen=True)
-class LowerState(BlockState["LowerState"]):
-    """The values in the wanted bins, by all their bits."""
-
-    lower: LowerTally
-
-    def fold(self) -> LowerState:
-        """Return itself."""
-        return self
-
-
-@dataclass(frozen=True)
-class Quantiles(Statistic[ViewT, QuantileState, WantedRanks, LowerState], Generic[ViewT]):
+class Quantiles(SinglePass[ViewT, QuantileState], Generic[ViewT]):
     """The quantiles of `PERCENTS` of the errors of ``used`` poses; not ``solved`` is infinite.
+
+    The values of a column are in memory at once, up to `MAX_VALUES` of a block of the table.
 
     A quantile is the smallest value with at least that share at or below. The interval's ends are
     order statistics of the pooled sample: David and Nagaraja, "Order Statistics", 3rd ed. 2003,
@@ -113,15 +160,31 @@ class Quantiles(Statistic[ViewT, QuantileState, WantedRanks, LowerState], Generi
                     "both ends, or not", "", "u1", IntervalOf))
         return variables
 
-    def first_pass(self, poses: ViewT) -> BlockQuantileState:
-        """Count the values by their upper bits."""
+    def first_pass(self, poses: ViewT) -> QuantileState:
+        """Take the values."""
         used = self.used(poses)
-        upper = UpperTally.of(*self._grouped_errors(poses, used))
-        return BlockQuantileState(BlockSample.of(used), upper)
+        return QuantileState(
+            Sample.of(used), Keys.of(*self._grouped_errors(poses, used)))
 
-    def prepare_second(self, first: QuantileState) -> WantedRanks:
-        """Return the bins in which the wanted ranks lie."""
-        n, draws, drawn = first.sample.n, first.sample.draws, first.sample.drawn
+    def result(self, state: QuantileState) -> Variables:
+        """Return the quantiles, their intervals, and why these may have no ends."""
+        ranks, sample = self._ranks(state.sample), state.sample
+        values = state.values.values_at(ranks)
+        variables: Variables = {}
+        for at, statistic in enumerate(PERCENTS):
+            variables |= interval_variables(self.name.format(statistic), list(values[:, at].T))
+            if self.with_reason:
+                missing = np.isnan(values[:, at, 1:]).any(axis=1)
+                variables[f"{statistic}_interval"] = np.select(
+                    [sample.n == 0, ~sample.drawn, missing],
+                    [IntervalOf.not_run, IntervalOf.nothing_drawn, IntervalOf.too_few_draws],
+                    IntervalOf.given,
+                ).astype(np.uint8)
+        return variables
+
+    def _ranks(self, sample: Sample) -> Integers:
+        """Return the ranks (groups, percents, 3) of quantiles and their interval's ends."""
+        n, draws, drawn = sample.n, sample.draws, sample.drawn
         ranks = np.zeros((len(n), len(PERCENTS), 3), dtype=np.int64)
         for at, percent in enumerate(PERCENTS.values()):
             ranks[:, at, 0] = -(-n * percent // 100)
@@ -131,28 +194,7 @@ class Quantiles(Statistic[ViewT, QuantileState, WantedRanks, LowerState], Generi
                 ranks[same, at, 1] = low * n[same] // count
                 # One beyond the last if there is no such draw.
                 ranks[same, at, 2] = -(-high * n[same] // count) if high <= count else n[same] + 1
-        return WantedRanks(first.sample, *first.upper.bins_of(group_numbers(ranks), ranks))
-
-    def second_pass(self, poses: ViewT, known: WantedRanks) -> LowerState:
-        """Count the values in those bins by all their bits."""
-        groups, errors = self._grouped_errors(poses, self.used(poses))
-        return LowerState(LowerTally.of(groups, errors, known.bins))
-
-    def finish(self, known: WantedRanks, second: LowerState) -> Variables:
-        """Return the quantiles, their intervals, and why these may have no ends."""
-        bins, sample = known.bins, known.sample
-        values = second.lower.values_at(group_numbers(bins), bins, known.ranks)
-        variables: Variables = {}
-        for at, statistic in enumerate(PERCENTS):
-            variables |= interval_variables(self.name.format(statistic), list(values[:, at].T))
-            if self.with_reason:
-                missing = (bins[:, at, 1:] < 0).any(axis=1)
-                variables[f"{statistic}_interval"] = np.select(
-                    [sample.n == 0, ~sample.drawn, missing],
-                    [IntervalOf.not_run, IntervalOf.nothing_drawn, IntervalOf.too_few_draws],
-                    IntervalOf.given,
-                ).astype(np.uint8)
-        return variables
+        return ranks
 
     def _grouped_errors(self, poses: ViewT, used: Masks) -> tuple[Integers, Floats]:
         """Return the group and the error of each used pose, both (m,)."""

@@ -1,4 +1,4 @@
-"""How often a marker is detected, where its poses are lost, and how often a pose is mirrored."""
+"""Rates of detection and their rankings."""
 
 from __future__ import annotations
 
@@ -8,16 +8,28 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import xarray as xr
+from scipy import special, stats
 
 from sweep.analysis.aggregate import aggregate
 from sweep.analysis.binning import Bins
 from sweep.analysis.counts import Rate
-from sweep.analysis.described import describes
-from sweep.analysis.dimensions import kept_dimensions
-from sweep.analysis.pose_view import DETECTION_INPUTS, ESTIMATE_INPUTS, Poses, pose_arrays
+from sweep.analysis.dataset import (
+    DRAWS,
+    as_names,
+    axes_of,
+    describes,
+    is_grid_axis,
+    kept_dimensions,
+    require_dimension,
+)
+from sweep.analysis.draws import is_replicated, with_common_trials
+from sweep.analysis.poses import DETECTION_INPUTS, ESTIMATE_INPUTS, Poses, pose_arrays
+from sweep.errors import ArgumentError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, outcomes
-from sweep.typing import Masks
+from sweep.typing import Floats, Masks
 
+# --------------------------------------------------------------------------------------------------
+# How often a marker is detected, where its poses are lost, and how often a pose is mirrored.
 
 @dataclass(frozen=True)
 class PoseRate:
@@ -91,7 +103,7 @@ def detection_rate(
         - ``looked_for``: poses whose detection is none of not_run, not_visible, not_modelled, and
           ``detected`` of these.
         - ``draws``: the random draws that they are worth, since pooled settings see the same ones
-          (`sweep.analysis.states.Sample.draws`).
+          (`sweep.analysis.statistic.Sample.draws`).
         - ``detection_rate`` with Wilson's interval in ``detection_rate_low`` and
           ``detection_rate_high``, and Jeffreys' in ``detection_rate_jeffreys_low`` and
           ``detection_rate_jeffreys_high``.
@@ -238,9 +250,182 @@ def failure_composition(
         ("share_high", "share ", "_high", "upper end of the 95 % interval: share"),
     ):
         parts = [table[f"{begin}{outcome}{end}"] for outcome in OUTCOMES]
-        values = xr.concat(parts, dim="outcome").transpose(..., "outcome")
+        values = xr.concat(
+            parts, dim="outcome", coords="minimal", compat="override", join="exact",
+        ).transpose(..., "outcome")
         if name != "count":
             values = values.where(is_counted)
         variables[name] = values.assign_attrs(long_name=meaning, units="1")
     coordinates = {"outcome": ("outcome", list(OUTCOMES), {"long_name": "what became of the pose"})}
     return xr.Dataset(variables, dict(table.coords)).assign_coords(coordinates)
+
+
+# --------------------------------------------------------------------------------------------------
+# Which marker IDs are weak: each against the others, corrected for their number.
+
+SIGNIFICANCE = 0.05
+"""Chance that any ID at all is called weak, or strong, if all are alike."""
+
+MIN_SKEWNESS = 1e-6
+"""Below it the gamma distribution is normal to 1e-6, and its functions lose digits."""
+
+
+@describes
+def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
+    """Return how each marker ID compares with the others.
+
+    Parameters
+    ----------
+    results
+        The dataset of a run with a dimension ``marker_id``.
+    per
+        Dimensions that are kept; all others are pooled. Dictionaries hold different markers: a
+        dimension ``dictionary`` is always kept. Trials are the draws and cannot be kept.
+
+    Returns
+    -------
+    xr.Dataset
+        Dimensions (*per, marker_id); lazy if ``results`` is.
+
+        - ``looked_for`` and ``detection_rate`` with its interval, as in
+          `sweep.analysis.detection_rate`.
+        - ``expected_rate``: what the ID's cells would give if in each of them all IDs were alike.
+        - ``p_value`` of the ID against the others, stratified by cell; ``p_adjusted`` is corrected
+          for all comparisons in the table.
+        - ``weak``: below its expected rate with ``p_adjusted`` below 0.05.
+        - ``rank``: 1 has the lowest share of its expected rate.
+
+    Raises
+    ------
+    ArgumentError
+        If ``per`` names trials, or a dimension that does not exist.
+    DatasetError
+        If the dataset has no dimension ``marker_id``, lacks variables of results, or has no poses.
+
+    Notes
+    -----
+    The test is that of Cochran, Mantel and Haenszel: J. Natl. Cancer Inst. 22 (1959), 719-748.
+    Under the hypothesis the ID's detections in a cell are hypergeometric; the tails of their sum
+    are taken from the gamma distribution (Pearson's type III) with the same mean, variance and
+    skewness, with a continuity correction of 1/2, so that they are right if misses are rare. Draws
+    that are Sobol' points (``sampling = "sobol"``) are not independent: no p-values, none weak. The
+    correction is Holm's: Scandinavian Journal of Statistics 6 (1979), 65-70. If no cell has two
+    draws there are no intervals and no p-values, and no ID is weak.
+
+    Examples
+    --------
+    >>> markers = xr.concat([results, results], dim="marker_id").assign_coords(marker_id=[3, 7])
+    >>> table = marker_ranking(markers)
+    >>> table["detection_rate"].round(3).values.tolist(), table["weak"].values.tolist()
+    ([0.542, 0.542], [False, False])
+    """
+    require_dimension(results, "marker_id")
+    dictionaries = ["dictionary"] if "dictionary" in axes_of(results) else []
+    kept = kept_dimensions(results, (*as_names(per), *dictionaries, "marker_id"))
+    kept = (*(name for name in kept if name != "marker_id"), "marker_id")
+    if DRAWS in kept:
+        raise ArgumentError("per", DRAWS, "the ranking is over the trials; they cannot be kept")
+    cells = [name for name in axes_of(results) if name in results["detection"].dims
+             and name not in (*kept, DRAWS) and is_grid_axis(name, results)]
+    results = with_common_trials(results, kept)
+    table = detection_rate(results, kept)[
+        ["looked_for", "detection_rate", "detection_rate_low", "detection_rate_high"]]
+    counts = detection_rate(results, (*kept, *cells))
+    n = counts["draws"].astype(np.float64)
+    hits = (counts["detected"] * n / counts["looked_for"]).where(n > 0, 0.0)
+    strata = [n, n.sum("marker_id"), hits.sum("marker_id")]
+    expected, variance, third = xr.apply_ufunc(
+        hypergeometric_moments, *strata, dask="parallelized", output_core_dims=[[]] * 3,
+        output_dtypes=[np.float64] * 3,
+    )
+    sums = {name: array.sum(cells).transpose(*kept) for name, array in (
+        ("n", n), ("hits", hits), ("expected", expected), ("variance", variance),
+        ("third", third))}
+    # The test is of independent draws.
+    drawn = table["detection_rate_low"].notnull() & (not is_replicated(results))
+    p_value = xr.apply_ufunc(
+        two_sided, sums["hits"] - sums["expected"], sums["variance"], sums["third"],
+        dask="parallelized", output_dtypes=[np.float64],
+    ).where(drawn)
+    whole = dict.fromkeys(p_value.dims, -1)
+    adjusted = xr.apply_ufunc(
+        holm, p_value.chunk(whole) if p_value.chunks else p_value, dask="parallelized",
+        output_dtypes=[np.float64],
+    )
+    expected_rate = sums["expected"] / sums["n"]
+    share = table["detection_rate"] / expected_rate
+    rank = xr.apply_ufunc(
+        _rank, share.chunk(marker_id=-1) if share.chunks else share, dask="parallelized",
+        input_core_dims=[["marker_id"]], output_core_dims=[["marker_id"]],
+        output_dtypes=[np.float64],
+    )
+    below = table["detection_rate"] < expected_rate
+    meanings = {
+        "expected_rate": (expected_rate, "detection rate if all IDs were alike in each cell"),
+        "p_value": (p_value, "chance of a rate so far from it if they were alike"),
+        "p_adjusted": (adjusted, "the same for the whole table (Holm)"),
+        "weak": (below & (adjusted < SIGNIFICANCE),
+                 "whether the rate is below the expected one, p_adjusted < 0.05"),
+        "rank": (rank, "1 has the lowest share of its expected rate"),
+    }
+    return table.assign({
+        name: array.assign_attrs(long_name=meaning, units="1")
+        for name, (array, meaning) in meanings.items()
+    })
+
+
+def hypergeometric_moments(
+    n: Floats, total: Floats, all_hits: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Return mean, variance and third central moment of the hits of ``n`` draws of ``total``.
+
+    ``all_hits`` are those of all. Johnson, Kemp and Kotz, "Univariate Discrete Distributions",
+    3rd ed. 2005, section 6.3.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = n * all_hits / total
+        variance = mean * (total - all_hits) * (total - n) / (total * (total - 1.0))
+        third = variance * (total - 2 * all_hits) * (total - 2 * n) / (total * (total - 2.0))
+    return (np.where(total > 0, mean, 0.0), np.where(total > 1, variance, 0.0),
+            np.where(total > 2, third, 0.0))
+
+
+def two_sided(deviation: Floats, variance: Floats, third: Floats) -> Floats:
+    """Return twice the smaller tail of a sum of counts beyond its deviation from the mean.
+
+    Of the gamma distribution with that variance and third central moment, shifted to mean 0; with
+    a continuity correction of 1/2. Without skewness it is the normal distribution.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # In units in which the skewness is not negative.
+        sign = np.where(third < 0, -1.0, 1.0)
+        skewness = np.abs(third) / variance**1.5
+        shape, scale = 4.0 / skewness**2, np.sqrt(variance) * skewness / 2.0
+        upper, lower = sign * deviation - 0.5, sign * deviation + 0.5
+        symmetric = skewness < MIN_SKEWNESS
+        above = np.where(
+            symmetric, special.ndtr(-upper / np.sqrt(variance)),
+            special.gammaincc(shape, np.maximum(upper, -shape * scale) / scale + shape))
+        below = np.where(
+            symmetric, special.ndtr(lower / np.sqrt(variance)),
+            special.gammainc(shape, np.maximum(lower, -shape * scale) / scale + shape))
+    p_value = np.minimum(1.0, 2.0 * np.minimum(above, below))
+    return np.where(variance > 0, p_value, 1.0)
+
+
+def holm(p_values: Floats) -> Floats:
+    """Return p-values corrected for the number of those that are not NaN."""
+    flat = p_values.ravel()
+    order = np.argsort(flat)  # NaN last
+    count = int((~np.isnan(flat)).sum())
+    factors = np.arange(count, 0, -1)
+    adjusted = np.full(flat.shape, np.nan)
+    stepped = np.maximum.accumulate(np.minimum(1.0, flat[order[:count]] * factors))
+    adjusted[order[:count]] = stepped
+    return adjusted.reshape(p_values.shape)
+
+
+def _rank(share: Floats) -> Floats:
+    """Return the ranks along the last axis, from 1; equal values share the lowest, NaN has NaN."""
+    ranks = stats.rankdata(np.nan_to_num(share, nan=np.inf), method="min", axis=-1)
+    return np.where(np.isnan(share), np.nan, ranks)

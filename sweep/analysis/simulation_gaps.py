@@ -1,27 +1,349 @@
-"""Photographs against a simulation: what of the errors in photographs the simulation has."""
+"""Photographs beside their simulation: how much of their errors a simulation has."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
-from sweep.analysis.binning import Bins
-from sweep.analysis.described import describes
-from sweep.analysis.paired_units import PairedUnits, Units, paired_units
-from sweep.analysis.photograph_quantiles import quantile_ends, quantile_of
-from sweep.analysis.photograph_rates import PhotographRate
-from sweep.analysis.resampling import (
+from sweep.analysis.binning import PREFIX, Binning, Bins, image_sides, read_bins
+from sweep.analysis.dataset import (
+    DRAWS,
+    axes_of,
+    configuration_axes,
+    describes,
+    is_fixed,
+    of_photographs,
+    parameter_value,
+    require_poses,
+)
+from sweep.analysis.draws import PhotographRate, quantile_ends, quantile_of
+from sweep.analysis.intervals import (
     MIN_UNITS,
     percentile_interval,
     resampled_quantiles,
     unit_counts,
 )
-from sweep.plan.variable import cf_attributes
-from sweep.typing import Floats, Masks
+from sweep.analysis.poses import ERROR_INPUTS, Poses, norm_squared, pose_arrays
+from sweep.errors import DatasetError
+from sweep.messages import label, shown
+from sweep.plan.parameters import PARAMETERS, SIMULATED, Stage
+from sweep.plan.schema import LABELS, cf_attributes
+from sweep.typing import Floats, Integers, Masks
+
+# --------------------------------------------------------------------------------------------------
+# Two datasets as units of markers: photographs with theirs, and a simulation's scenes.
+
+QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""Shares of the photographs' markers between which the default bins lie."""
+
+SIDE = "side_px"
+
+TRUTH_STD = "truth_std"
+
+SEED = 21
+
+
+@dataclass(frozen=True)
+class Units:
+    """Markers of units, which are drawn together: arrays (configurations, units, rows).
+
+    Attributes
+    ----------
+    looked_for, detected, solved, flipped
+        As in `sweep.analysis.poses.Poses`.
+    rotation_deg, range_percent
+        Absolute rotation error, and depth error with its sign of the true depth.
+    single
+        Whether each unit has one marker.
+    """
+
+    looked_for: Masks
+    detected: Masks
+    solved: Masks
+    flipped: Masks
+    rotation_deg: Floats
+    range_percent: Floats
+    single: bool
+
+    @classmethod
+    def of(cls, arrays: dict[str, NDArray[Any]], *, single: bool) -> Units:
+        """Return the units of arrays (configurations, units, rows, ...) by the names of `Poses`."""
+        poses = Poses(arrays)
+        return cls(
+            poses.looked_for, poses.detected & poses.looked_for, poses.solved, poses.flipped,
+            np.sqrt(norm_squared(poses.rotation_deg)), poses.range_percent[..., 0], single,
+        )
+
+    def within(self, inside: Masks) -> Units:
+        """Return those of the markers (units, rows) that are inside."""
+        masks = {
+            name: getattr(self, name) & inside
+            for name in ("looked_for", "detected", "solved", "flipped")
+        }
+        return dataclasses.replace(self, **masks)
+
+
+@dataclass(frozen=True)
+class PairedUnits:
+    """Photographs and a simulation with the same configurations.
+
+    Attributes
+    ----------
+    first, second
+        Their units; those of the same index belong together if they are ``paired``.
+    paired
+        Whether the simulation is the photographs' twin.
+    configurations, sizes, coordinates
+        Names of the configurations' dimensions, their lengths and coordinates.
+    binning
+        The edges of the bins.
+    binned
+        The photographs' dataset, with what is binned.
+    values
+        What is binned of both: name -> (units, rows).
+    """
+
+    first: Units
+    second: Units
+    paired: bool
+    configurations: tuple[str, ...]
+    sizes: Mapping[str, int]
+    coordinates: Mapping[str, Any]
+    binning: Binning
+    binned: xr.Dataset
+    values: tuple[Mapping[str, Floats], Mapping[str, Floats]]
+
+    def bins(self) -> Iterator[tuple[Masks, Masks]]:
+        """Yield which markers (units, rows) of both lie in each combination of bins."""
+        for index in np.ndindex(*self.binning.shape):
+            first, second = (
+                np.logical_and.reduce(
+                    [np.ones(side.looked_for.shape[1:], dtype=bool)] + [
+                        np.searchsorted(edges, values[name], side="right") - 1 == k
+                        for (name, edges), k in zip(self.binning.edges.items(), index, strict=True)
+                    ]
+                )
+                for side, values in zip((self.first, self.second), self.values, strict=True)
+            )
+            yield first, second
+
+
+def paired_units(
+    photographs: xr.Dataset, simulated: xr.Dataset, bins: Bins | None = None
+) -> PairedUnits:
+    """Return photographs and a simulation as units.
+
+    Raises
+    ------
+    ArgumentError, DatasetError
+        As in `sweep.analysis.simulation_gap`.
+    """
+    if not is_measured(photographs):
+        raise DatasetError(
+            "the first dataset: expected photographs, as `sweep photos` measures them; two "
+            "simulations are compared by sweep.analysis.compare"
+        )
+    for side in (photographs, simulated):
+        require_poses(side)
+    paired = is_twin(simulated)
+    first, second, names = _same_configurations(photographs, simulated, paired=paired)
+    if paired:
+        first, second = _same_scenes(first, second)
+    if bins is None:
+        bins = {} if paired else {SIDE: _quarters(first)}
+    binning, _ = read_bins(first, names, bins)
+    sides: list[tuple[dict[str, NDArray[Any]], bool]] = []
+    for side in (first, second):
+        arrays = pose_arrays(side, ERROR_INPUTS) | {
+            f"{PREFIX}{name}": _binned(side, name) for name in binning.edges
+        }
+        if paired and side is second and TRUTH_STD in side:
+            arrays[TRUTH_STD] = side[TRUTH_STD]
+        single = not of_photographs(side)
+        sides.append((_in_units(side, arrays, names, single=single), single))
+    if paired:
+        trials = _trials_of(first, second)
+        kept = np.flatnonzero((trials >= 0).any(axis=1))
+        sides[0] = ({name: array[:, kept] for name, array in sides[0][0].items()}, False)
+        sides[1] = ({name: _gathered(array, trials[kept]) for name, array in sides[1][0].items()},
+                    False)
+        _blur_truth(sides[1][0])
+    values = [
+        {name: arrays.pop(f"{PREFIX}{name}")[0] for name in binning.edges} for arrays, _ in sides
+    ]
+    units = [Units.of(arrays, single=single) for arrays, single in sides]
+    return PairedUnits(
+        units[0], units[1], paired, names,
+        {name: first.sizes[name] for name in names},
+        {name: first[name].variable for name in names}, binning, first, (values[0], values[1]),
+    )
+
+
+def is_measured(results: xr.Dataset) -> bool:
+    """Return whether a dataset is measured in photographs."""
+    return of_photographs(results) and not is_twin(results)
+
+
+def is_twin(results: xr.Dataset) -> bool:
+    """Return whether a dataset is simulated at the poses of photographs."""
+    return of_photographs(results) and SIMULATED in results.coords and bool(results[SIMULATED])
+
+
+def _same_configurations(
+    first: xr.Dataset, second: xr.Dataset, *, paired: bool
+) -> tuple[xr.Dataset, xr.Dataset, tuple[str, ...]]:
+    """Return both at their common settings, and the names of the axes of these.
+
+    Axes of the scene that twins alone have are kept, too.
+    """
+    names = list(dict.fromkeys([*configuration_axes(first), *configuration_axes(second)]))
+    for name in names:
+        first, second = _with_axis(first, second, name), _with_axis(second, first, name)
+        common = [each for each in first[name].values if each in second[name].values]
+        if not common:
+            raise DatasetError(
+                f"no common {name}: {shown(first[name].values.tolist())} and "
+                f"{shown(second[name].values.tolist())}; measure both with the same settings"
+            )
+        first, second = first.sel({name: common}), second.sel({name: common})
+    if paired:
+        own = [name for name in axes_of(second, Stage.scene)
+               if name not in axes_of(first, Stage.scene)]
+        for name in own:
+            first = first.drop_vars(name, errors="ignore").expand_dims({name: second[name].values})
+        names += own
+    return first, second, tuple(names)
+
+
+def _with_axis(results: xr.Dataset, other: xr.Dataset, name: str) -> xr.Dataset:
+    """Return a dataset with an axis of its one value, if it has none and the other has one."""
+    if name in results.dims:
+        return results
+    value = parameter_value(results, name) if name in PARAMETERS else None
+    if isinstance(value, xr.DataArray):
+        value = value.item()
+    if value is None:
+        raise DatasetError(f"{name}: one of both does not have this axis; measure both with it")
+    if other[name].dtype.kind in "OU":
+        value = label(value)
+    return results.drop_vars(name, errors="ignore").expand_dims({name: [value]})
+
+
+def _same_scenes(first: xr.Dataset, second: xr.Dataset) -> tuple[xr.Dataset, xr.Dataset]:
+    """Return photographs and their twins with the markers that both have."""
+    for name in axes_of(first, Stage.scene):
+        if name == DRAWS or name not in second.dims:
+            continue
+        common = [each for each in first[name].values if each in second[name].values]
+        first, second = first.sel({name: common}), second.sel({name: common})
+    return first, second
+
+
+def _trials_of(first: xr.Dataset, second: xr.Dataset) -> Integers:
+    """Return the indices (photographs, repeats) of the trials of each photograph; -1 for none.
+
+    Raises
+    ------
+    DatasetError
+        If none is of these photographs.
+    """
+    files = [_files(each) for each in (first, second)]
+    trials: dict[tuple[str, str], list[int]] = {each: [] for each in files[0]}
+    for trial, each in enumerate(files[1]):
+        if each in trials:
+            trials[each].append(trial)
+    most = max(map(len, trials.values()))
+    if not most:
+        raise DatasetError("the simulation is the twin of other photographs")
+    return np.array([
+        some + [-1] * (most - len(some)) for some in (trials[each] for each in files[0])
+    ])
+
+
+def _files(results: xr.Dataset) -> list[tuple[str, str]]:
+    columns = [results[name].values if name in results.coords else np.empty(0)
+               for name in ("photograph", "sha256")]
+    return [(str(name), str(digest)) for name, digest in zip(*columns, strict=True)]
+
+
+def _in_units(
+    results: xr.Dataset, arrays: Mapping[str, xr.DataArray], configurations: tuple[str, ...], *,
+    single: bool,
+) -> dict[str, NDArray[Any]]:
+    """Return arrays as (configurations, units, rows, ...)."""
+    scene = [name for name in axes_of(results, Stage.scene) if name not in configurations]
+    if DRAWS in scene:
+        scene = [DRAWS, *(name for name in scene if name != DRAWS)]
+    dims = (*configurations, *scene)
+    count = int(np.prod([results.sizes[name] for name in configurations]))
+    units = int(np.prod([results.sizes[name] for name in (scene if single else scene[:1])]))
+    laid_out = {}
+    for name, array in arrays.items():
+        inner = [str(dim) for dim in array.dims if dim in LABELS]
+        missing = {dim: results.sizes[dim] for dim in dims if dim not in array.dims}
+        values = array.reset_coords(drop=True).drop_vars(array.indexes, errors="ignore")
+        values = values.expand_dims(missing).transpose(*dims, *inner)
+        shape = tuple(values.sizes[dim] for dim in inner)
+        laid_out[name] = np.asarray(values).reshape(count, units, -1, *shape)
+    return laid_out
+
+
+def _blur_truth(arrays: dict[str, NDArray[Any]]) -> None:
+    """Add the truth's random error, as far as it is known, to errors of twins.
+
+    The photographs' errors are differences to a truth that has such an error, the twins' to an
+    exact one. A draw is of a marker, the same for all its configurations.
+    """
+    std = arrays.pop(TRUTH_STD, None)
+    if std is None:
+        return
+    drawn = np.random.default_rng(SEED).normal(size=std.shape[1:]) * np.nan_to_num(std)
+    for name, part in (("rotation_error_rad", drawn[..., :3]),
+                       ("translation_error_m", drawn[..., 3:])):
+        arrays[name] = arrays[name] + part
+
+
+def _gathered(array: NDArray[Any], trials: Integers) -> NDArray[Any]:
+    """Return an array (c, t, rows, ...) of trials as that of photographs (c, p, rows, ...).
+
+    ``trials`` is (p, repeats); of -1 nothing counts, and flags are 0.
+    """
+    taken = array[:, np.maximum(trials, 0)]
+    absent = (trials < 0).reshape(1, *trials.shape, *(1,) * (array.ndim - 2))
+    filler = np.nan if array.dtype.kind == "f" else 0
+    taken = np.where(absent, np.asarray(filler, dtype=array.dtype), taken)
+    return taken.reshape(*taken.shape[:2], -1, *array.shape[3:])
+
+
+def _binned(results: xr.Dataset, name: str) -> xr.DataArray:
+    """Return what is binned of a dataset: a variable, or what follows from others."""
+    if name in results.variables and not is_fixed(results[name]):
+        return results[name].reset_coords(drop=True)
+    if name == SIDE:
+        return image_sides(results, {})
+    if name == "distance_m":
+        return results["true_tvec_m"].isel(xyz=2, drop=True)
+    raise DatasetError(f"{name}: both datasets need it for bins; one has "
+                       f"{', '.join(map(str, results.variables))}")
+
+
+def _quarters(photographs: xr.Dataset) -> list[float]:
+    """Return edges between the quarters of the photographs' sides, of two significant digits."""
+    sides = photographs[SIDE].values
+    edges = np.quantile(sides[np.isfinite(sides)], QUARTERS)
+    rounded = [float(f"{edge:.2g}") for edge in edges]
+    rounded[0], rounded[-1] = float(np.floor(edges[0])), float(np.floor(edges[-1]) + 1)
+    return sorted(set(rounded))
+
+
+# --------------------------------------------------------------------------------------------------
+# Photographs against a simulation: what of the errors in photographs the simulation has.
 
 SOURCES = ("photographs", "simulated")
 
@@ -130,7 +452,7 @@ def simulation_gap(
     than five photographs. Of rates and quantiles they are as in `sweep.analysis.error_statistics`;
     of differences of rates Newcombe's (Statistics in Medicine 17, 1998, method 10), which does not
     count on the pairing. Those of gaps of quantiles are of the bootstrap by photograph
-    (`sweep.analysis.resampling`), in which twins are drawn together with their photographs; scenes
+    (`sweep.analysis.intervals`), in which twins are drawn together with their photographs; scenes
     of other simulations are drawn by themselves.
 
     Examples

@@ -10,6 +10,17 @@ import argparse
 import sys
 from collections.abc import Sequence
 
+from sweep.cli.command import (
+    accept_any_text,
+    flushed,
+    print_error,
+    print_system_error,
+    remember_names,
+)
+from sweep.cli.parser import build_parser, parse
+from sweep.errors import SweepError
+from sweep.installation import check_installation
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return its exit status.
@@ -19,22 +30,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments
         What follows ``sweep`` on the command line; by default that of this process.
     """
-    from sweep.cli.errors import (  # noqa: PLC0415
-        print_error,
-        print_import_error,
-        print_system_error,
-    )
-    from sweep.cli.output import accept_any_text, flushed  # noqa: PLC0415
-    from sweep.cli.parser import build_parser, parse  # noqa: PLC0415
-    from sweep.errors import SweepError  # noqa: PLC0415
-    from sweep.installation import check_installation  # noqa: PLC0415
-
     accept_any_text()
-    parser = build_parser()
+    parser, _ = build_parser()
     options = argparse.Namespace()
     try:
+        given = list(sys.argv[1:] if arguments is None else arguments)
+        remember_names(given)
         options = parse(parser, arguments)
-        options.given = list(sys.argv[1:] if arguments is None else arguments)
+        options.given = given
         if options.command is None:
             print(parser.format_help(), end="")
             return flushed(0)
@@ -42,8 +45,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return flushed(options.command.execute(options))
     except SweepError as error:
         return print_error(error, options)
-    except ImportError as error:
-        return print_import_error(error)
     except KeyboardInterrupt:
         print(getattr(options, "stopped", "stopped"), file=sys.stderr)
         return 130
@@ -52,3 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except (OSError, MemoryError, RuntimeError) as error:
         return print_system_error(error)
+    finally:
+        if arguments is None and "logging" in sys.modules:
+            # What the threads of other packages say while the process ends would stand below.
+            sys.modules["logging"].disable()

@@ -1,10 +1,38 @@
-"""What a command declares: its name, its help, its arguments, and the function that runs it."""
+"""What commands share: their declaration, arguments, printing, and messages of errors."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+import errno
+import io
+import itertools
+import logging
+import os
+import re
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sweep import library
+from sweep.errors import (
+    ArgumentError,
+    OtherExperimentError,
+    PipelineError,
+    PluginError,
+    StoreError,
+    SweepError,
+)
+from sweep.messages import plain, quoted, to_json
+
+if TYPE_CHECKING:
+    from sweep.plan.pipeline import Pipeline
+    from sweep.report.table import Table
+
+
+# --------------------------------------------------------------------------------------------------
+# What a command declares: its name, its help, its arguments, and the function that runs it.
 
 CONTINUES = "stopped; the same command continues"
 """Told after Ctrl-C where it does; a command sets ``options.stopped`` to it."""
@@ -45,3 +73,433 @@ class Command:
     examples: tuple[Example, Example]
     add_arguments: Callable[[argparse.ArgumentParser], None]
     execute: Callable[[argparse.Namespace], int]
+
+
+# --------------------------------------------------------------------------------------------------
+# Arguments that several commands share.
+
+def add_pipeline(parser: argparse.ArgumentParser) -> None:
+    """Add the pipeline file and the settings that replace its values."""
+    parser.add_argument(
+        "pipeline", metavar="PIPELINE",
+        help="TOML file of the experiment, or a store that was made from it",
+    )
+    add_settings(parser, "replace a value of the file by this TOML value; a list makes an axis")
+
+
+def add_precision(parser: argparse.ArgumentParser) -> None:
+    """Add how well quantities are to be known, in the place of a number of trials."""
+    parser.add_argument(
+        "--precision", action="append", default=[], metavar="NAME=WIDTH",
+        help="compute trials until the interval of this quantity is as narrow at each condition: "
+        "half-width of a rate, of another quantity as a share of it, such as "
+        "'detection_rate = 0.02' or 'rotation_error_rmse_deg = 5 %%'; may be repeated",
+    )
+    parser.add_argument(
+        "--max-trials", type=int, metavar="N", help="the most trials of a condition",
+    )
+
+
+def precision_settings(precision: Sequence[str], max_trials: int | None) -> list[str]:
+    """Return settings, as ``--set`` takes them, that say how well quantities are to be known.
+
+    Raises
+    ------
+    ArgumentError
+        If one has not the form of such.
+
+    Examples
+    --------
+    >>> precision_settings(["detection_rate = 2 %"], 2400)
+    ['precision.detection_rate="2 %"', 'precision.max_trials=2400']
+    """
+    settings = []
+    for text in precision:
+        name, equals, width = (part.strip() for part in text.partition("="))
+        if not equals or not name.isidentifier() or not width:
+            raise ArgumentError(
+                "precision", text,
+                "expected a quantity and the half-width of its interval, such as "
+                "'detection_rate = 0.02'",
+            )
+        quoted = width if not width.endswith("%") else f'"{width}"'
+        settings.append(f"precision.{name}={quoted}")
+    if max_trials is not None:
+        settings.append(f"precision.max_trials={max_trials}")
+    return settings
+
+
+def read_pipeline(options: argparse.Namespace) -> Pipeline:
+    """Return the pipeline of a command that takes one.
+
+    Raises
+    ------
+    PipelineError
+        If the file or a setting is invalid.
+    StoreError
+        If it is given as a folder that is no store.
+    """
+    source = plain(options.pipeline)
+    options.settings = [*options.settings, *precision_settings(
+        getattr(options, "precision", ()), getattr(options, "max_trials", None))]
+    try:
+        pipeline = library.lifecycle.read_pipeline(options.pipeline, options.settings)
+    except PipelineError as error:
+        if (
+            options.settings
+            and any(line.endswith(library.sampling.NO_TRIALS) for line in error.faults)
+            and (getattr(options, "precision", ()))
+        ):
+            raise ArgumentError(
+                "max_trials",
+                "",
+                f"expected {library.sampling.NO_TRIALS}, such as 2400; beside --precision",
+            ) from None
+        if texts := library.lifecycle.texts_required(options.pipeline, options.settings):
+
+            library.requirements.check_required(texts, source, error)
+        raise
+    if pipeline.requirements:
+
+        library.requirements.check_required(pipeline.requirements, source)
+    if pipeline.stopping is not None:
+
+        library.rules.make_rule(pipeline)
+    return pipeline
+
+
+def names_of(text: str | None) -> list[str] | None:
+    """Return the names that a flag such as ``--per`` lists, None if it is not given.
+
+    >>> names_of("tilt_deg, distance_m"), names_of("")
+    (['tilt_deg', 'distance_m'], [])
+    """
+    if text is None:
+        return None
+    return [name for part in text.split(",") if (name := part.strip())]
+
+
+def add_store(parser: argparse.ArgumentParser) -> None:
+    """Add the store that is read."""
+    parser.add_argument("store", metavar="STORE", help="path or URL of the store")
+
+
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """Add the number of worker processes."""
+    parser.add_argument(
+        "--workers", type=int, metavar="N",
+        help="number of worker processes (default: one for each processor)",
+    )
+
+
+def add_new_store(parser: argparse.ArgumentParser, default: str = "runs/NAME.zarr") -> None:
+    """Add where a store is written, whether it replaces another one, and the processes."""
+    parser.add_argument(
+        "--store", metavar="STORE", help=f"path or URL of the store (default: {default})"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing store")
+    add_workers(parser)
+
+
+def add_large_run(parser: argparse.ArgumentParser) -> None:
+    """Add the stores whose cells are reused, and the consent to a run that takes long."""
+    parser.add_argument(
+        "--reuse", action="append", default=[], metavar="STORE",
+        help="copy the finished cells that this store shares with the experiment; may be repeated",
+    )
+    parser.add_argument(
+        "--yes", action="store_true",
+        help="run also what would take more than a day, or more than is free on the disk",
+    )
+
+
+def add_settings(parser: argparse.ArgumentParser, meaning: str) -> None:
+    """Add TOML values that replace or give others."""
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
+        help=f"{meaning}; may be repeated",
+    )
+
+
+def add_photographs(parser: argparse.ArgumentParser) -> None:
+    """Add folders of photographs, their camera, and where the truth comes from."""
+    parser.add_argument(
+        "folders", metavar="FOLDER", nargs="+",
+        help="photographs (PNG, JPEG, BMP, PGM) of one camera; with --stereo two folders, or one "
+        "of images whose halves are the left and the right camera's",
+    )
+    parser.add_argument(
+        "--camera", metavar="FILE",
+        help="file of the camera's calibration, or `calibrate`: from the board in the photographs",
+    )
+    parser.add_argument(
+        "--board", metavar="FILE",
+        help="TOML file of the board; the truth of a marker is the pose by all corners but its own",
+    )
+    parser.add_argument(
+        "--poses", metavar="FILE",
+        help="the true poses, CSV as `sweep score` reads it",
+    )
+    parser.add_argument(
+        "--stereo", metavar="FILE",
+        help="calibration of a stereo camera (K1, D1, K2, D2, R, T); the truth is the pose in the "
+        "other camera's image",
+    )
+
+
+def add_cell(parser: argparse.ArgumentParser, meaning: str, *, several: bool = False) -> None:
+    """Add the selection of one cell, or of several."""
+    parser.add_argument(
+        "--at", metavar="NAME=VALUE,...",
+        help=f"{meaning}; an axis that is not named takes its first value"
+        + ("; may be repeated" if several else "; may be repeated, with other names"),
+        action="append", default=[],
+    )
+
+
+def add_picture(parser: argparse.ArgumentParser, default: str | None = None) -> None:
+    """Add where and how one scene is drawn; without a default, nothing is unless asked for."""
+    written = f"default: {default}" if default else "default: no file is written"
+    parser.add_argument(
+        "-o", "--output", default=default, metavar="PNG",
+        help=f"file to write the image to ({written})",
+    )
+    parser.add_argument("--plain", action="store_true", help="draw the image without annotations")
+    parser.add_argument(
+        "--full", action="store_true",
+        help="draw the whole frame instead of the marker's surroundings",
+    )
+
+
+def add_json(parser: argparse._ActionsContainer) -> None:
+    """Add the choice of JSON on standard output."""
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+
+
+def add_form(parser: argparse.ArgumentParser) -> None:
+    """Add the choice of JSON or Markdown on standard output."""
+    form = parser.add_mutually_exclusive_group()
+    add_json(form)
+    form.add_argument("--markdown", action="store_true", help="print Markdown")
+
+
+# --------------------------------------------------------------------------------------------------
+# Output that commands share: lines, JSON, and a picture.
+
+AS_MODULE = ("sweep", "__main__.py")
+"""How the program's path ends if Python was told to run the package."""
+
+MAX_LINES = 50
+"""Lines of each kind that `sweep status` and `sweep verify` print."""
+
+
+OTHER_FORMATS = {
+    ".jpg", ".jpeg", ".svg", ".pdf", ".gif", ".tif", ".tiff", ".bmp", ".webp", ".html", ".toml",
+    ".zarr", ".csv", ".json",
+}
+"""Suffixes of files that a PNG image would not be taken for."""
+
+
+_names: list[str] = []
+"""Parts of the names on the command line that hold control characters, the longest first."""
+
+
+def remember_names(words: Sequence[str]) -> None:
+    """Remember the words of a command line, for :func:`lines_of`."""
+    parts = {Path(part).stem for word in words for part in re.split(r"[/=,]", word)}
+    _names[:] = sorted((part for part in parts if not part.isprintable()), key=len, reverse=True)
+
+
+def lines_of(text: str) -> list[str]:
+    """Return the lines of a text without control characters, whosever names and texts they quote.
+
+    A newline in a name on the command line makes no line of its own.
+    """
+    for name in _names:
+        text = text.replace(name, plain(name, len(name)))
+    return [plain(line, len(line)) for line in text.split("\n")]
+
+
+def say(text: str = "") -> None:
+    """Print lines without control characters."""
+    print("\n".join(lines_of(text)))
+
+
+def print_table(table: Table, options: argparse.Namespace) -> None:
+    """Print a table, as Markdown if that is asked for, and an empty line."""
+    say(table.markdown() if options.markdown else table.text())
+    say()
+
+
+def say_next(command: str, meaning: str = "") -> None:
+    """Print the last line of a command: what to do next."""
+    say(f"next: {command}" + (f"  # {meaning}" if meaning else ""))
+
+
+def command_line(options: argparse.Namespace) -> str:
+    """Return the command line as it was given, quoted for a shell, with how sweep was called."""
+    called = "python -m sweep" if Path(sys.argv[0]).parts[-2:] == AS_MODULE else "sweep"
+    return f"{called} {quoted(*options.given)}"
+
+
+def accept_any_text() -> None:
+    """Print characters that the encoding of the terminal lacks as escapes, instead of failing."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
+
+
+def flushed(status: int) -> int:
+    """Return a status once everything printed is written; OSError if it cannot be."""
+    if sys.stdout is not None:
+        sys.stdout.flush()
+    return status
+
+
+def is_refused_output() -> bool:
+    """Return whether standard output cannot be written; what it holds back is dropped then.
+
+    It is tried with an empty line, in case nothing is held back.
+    """
+    if sys.stdout is None:
+        return False
+    try:
+        print(flush=True)
+    except OSError:
+        # Python would try again when it ends, and say so.
+        nothing = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nothing, sys.stdout.fileno())
+        os.close(nothing)
+        return True
+    return False
+
+
+def quiet_matplotlib() -> None:
+    """Silence what matplotlib says of places for its caches, and drop a choice of windows for it.
+
+    It works without caches, and files need no windows; a choice that it does not know is an error.
+    """
+    os.environ.pop("MPLBACKEND", None)
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
+
+
+def print_json(content: Any) -> None:
+    """Print one JSON object, of a mapping or a dataclass."""
+    print(to_json(content))
+
+
+def check_png(output: str) -> None:
+    """Check that a picture can be written, before it is computed.
+
+    Raises
+    ------
+    ArgumentError
+        If its name is that of another format.
+    StoreError
+        If it cannot be.
+    """
+    if Path(output).suffix.lower() in OTHER_FORMATS:
+        raise ArgumentError("output", output, "expected a file that ends in .png")
+    library.output_file.check_output_file(Path(output))
+
+
+def write_png(output: str, image: Any) -> None:
+    """Write an image (h, w) or (h, w, 3), blue-green-red, as a PNG file.
+
+    Raises
+    ------
+    StoreError
+        If the file cannot be written.
+    """
+    import cv2  # noqa: PLC0415
+
+    _, encoded = cv2.imencode(".png", image)
+    library.output_file.write_output_file(Path(output), encoded.tobytes())
+
+
+# --------------------------------------------------------------------------------------------------
+# Errors as the user of a command reads them: lines that name flags, and an exit status.
+
+MAX_LINE_LENGTH = 2000
+
+ADVICE = {
+    errno.EMFILE: "allow more open files (ulimit -n)",
+    errno.EAGAIN: "allow more processes (ulimit -u)",
+    errno.ENOMEM: "free memory, or allow more (ulimit -v)",
+    errno.ENOSPC: "free space on the disk",
+    errno.EFBIG: "allow larger files (ulimit -f)",
+}
+"""What to change after an error of the system."""
+
+
+OUTPUT_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+"""What writing may end with."""
+
+NO_THREAD = "can't start new thread"
+"""What Python says in a RuntimeError where the system allows no more threads."""
+
+REFUSALS = (ArgumentError, PipelineError, PluginError, StoreError)
+"""Errors of what was asked for (exit status 2); others occur while a command runs (1)."""
+
+
+def print_error(error: SweepError, options: argparse.Namespace) -> int:
+    """Print an error's lines, without terminal control characters; return the exit status.
+
+    An :class:`ArgumentError` names an argument of a Python function, such as ``time_limit_s``; the
+    line names the flag that sets it, ``--time-limit``.
+    """
+    text = str(error)
+    if isinstance(error, ArgumentError):
+        given = f" {error.value}" if str(error.value) else ""
+        text = f"{flag_of(error.argument, options)}{given}: {error.problem}"
+    if isinstance(error, OtherExperimentError) and error.reusable and "reuse" in options:
+        command = _reusing_command(options.given, error.url)
+        text = "\n".join([
+            f"{error.url}: holds another experiment; reuse its cells in a new store: {command}",
+            *(f"  {line}" for line in error.differences)])
+    for line in lines_of(text):
+        print(plain(line, MAX_LINE_LENGTH), file=sys.stderr)
+    return 2 if isinstance(error, REFUSALS) else 1
+
+
+def _reusing_command(given: Sequence[str], url: str) -> str:
+    """Return the command that runs the same into a new store, and reuses the cells of another."""
+    stem = url.removesuffix(".zarr")
+    new = next(name for name in (f"{stem}-{number}.zarr" for number in itertools.count(2))
+               if not library.locations.exists(name))
+    at = [k for k, word in enumerate(given) if word.partition("=")[0] == "--store"]
+    left_out = {*at, *(k + 1 for k in at if "=" not in given[k])}
+    words = [word for k, word in enumerate(given) if k not in left_out]
+    return quoted("sweep", *words, "--store", new, "--reuse", url)
+
+
+def print_system_error(error: OSError | MemoryError | RuntimeError) -> int:
+    """Print one line if the system refused a file, memory, a thread or a process.
+
+    Any other RuntimeError is a defect, and raised.
+    """
+    if isinstance(error, MemoryError):
+        line, number = "out of memory", errno.ENOMEM
+    elif isinstance(error, OSError):
+        if error.filename is None and error.errno in OUTPUT_ERRORS and is_refused_output():
+            cause = "standard output cannot be written"
+        else:
+            cause = str(error.filename or "the system refused a request")
+        line, number = f"{cause}: {error.strerror or error}", error.errno or 0
+    elif str(error) == NO_THREAD:
+        line, number = f"the system refused a request: {error}", errno.EAGAIN
+    else:
+        raise error
+    advice = f"; {ADVICE[number]}" if number in ADVICE else ""
+    print(plain(line + advice, MAX_LINE_LENGTH), file=sys.stderr)
+    return 1
+
+
+def flag_of(argument: str, options: argparse.Namespace) -> str:
+    """Return the flag that sets an argument of a Python function, in the command being run.
+
+    A command declares flags under the names of these arguments (``dest``); an argument without a
+    declared flag is named as a flag usually is, with ``-`` for ``_``.
+    """
+    flags: dict[str, str] = getattr(options, "flags", {})
+    return flags.get(argument, f"--{argument.replace('_', '-')}")

@@ -7,39 +7,80 @@ import re
 from collections.abc import Sequence
 from typing import NoReturn
 
-from sweep.cli.calibration import CALIBRATION
-from sweep.cli.check_detector import CHECK_DETECTOR
-from sweep.cli.command import Command
-from sweep.cli.compare import COMPARE
-from sweep.cli.completion import COMPLETION
-from sweep.cli.environments import ENVIRONMENTS
-from sweep.cli.error_model import ERROR_MODEL
-from sweep.cli.export import EXPORT
-from sweep.cli.fit import FIT
-from sweep.cli.limit import LIMIT
-from sweep.cli.output import flushed
-from sweep.cli.photos import PHOTOS
-from sweep.cli.plan import PLAN
-from sweep.cli.plugins import PLUGINS
-from sweep.cli.report import REPORT
-from sweep.cli.repro import REPRO
-from sweep.cli.require import REQUIRE
-from sweep.cli.run import RUN
-from sweep.cli.score import SCORE
-from sweep.cli.show import SHOW
-from sweep.cli.size import SIZE
-from sweep.cli.status import STATUS
-from sweep.cli.tradeoff import TRADEOFF
-from sweep.cli.verify import VERIFY
-from sweep.messages import nearest
+from sweep.cli.answers import LIMIT, REQUIRE, SIZE
+from sweep.cli.command import Command, Example, flushed
+from sweep.cli.comparisons import CALIBRATION, COMPARE, ERROR_MODEL, REPORT, TRADEOFF
+from sweep.cli.experiments import PLAN, REPRO, RUN, SHOW, STATUS, VERIFY
+from sweep.cli.photographs import FIT, PHOTOS
+from sweep.cli.programs import EXPORT, PLUGINS, SCORE
+from sweep.errors import MissingPackageError
+from sweep.messages import MAX_LINE_LENGTH, nearest, plain
 from sweep.version import __version__
+
+# --------------------------------------------------------------------------------------------------
+# ``sweep completion``: a script by which a shell completes commands, options and files.
+
+SHELLS = ("bash", "zsh", "fish")
+
+FILES = ("PIPELINE", "STORE", "STORE|PIPELINE", "SIMULATION", "FOLDER", "DIR", "FILE", "FIGURE",
+         "PNG")
+"""Arguments for which names of files and folders are offered."""
+
+
+def _add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("shell", metavar="SHELL", choices=SHELLS, help="bash, zsh or fish")
+
+
+def _execute(options: argparse.Namespace) -> int:
+    try:
+        import shtab  # noqa: PLC0415
+    except ImportError:
+        raise MissingPackageError("sweep completion needs shtab: pip install shtab") from None
+    parser, commands = build_parser()
+    for command in commands:
+        for action in command._actions:  # noqa: SLF001  (argparse offers no other list)
+            if action.metavar in FILES:
+                action.complete = shtab.FILE  # type: ignore[attr-defined]
+    print(shtab.complete(parser, options.shell))
+    return 0
+
+
+COMPLETION = Command(
+    "completion", "print a script by which a shell completes commands and files",
+    "pipelines/README.md",
+    (
+        Example("sweep completion bash", "prints it for bash: source <(sweep completion bash)"),
+        Example("sweep completion fish", "prints it for fish: sweep completion fish | source"),
+    ),
+    _add_arguments, _execute,
+)
+
+
+# --------------------------------------------------------------------------------------------------
+# The parser of the command line, assembled from the commands' own declarations.
 
 COMMANDS = (
     RUN, PLAN, SIZE, LIMIT, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, ERROR_MODEL, CALIBRATION,
-    VERIFY, STATUS, EXPORT, SCORE, PHOTOS, FIT, COMPARE, CHECK_DETECTOR, PLUGINS, ENVIRONMENTS,
+    VERIFY, STATUS, EXPORT, SCORE, PHOTOS, FIT, COMPARE, PLUGINS,
     COMPLETION,
 )
 """Every command, in the order in which the help lists them."""
+
+REMOVED = {
+    "check-detector": "`sweep plugins check NAME` tries a detector or a solver",
+    "environments": "to compare versions of OpenCV, run `sweep run` in each virtual environment, "
+    "then `sweep compare A.zarr B.zarr`",
+}
+"""Commands of earlier versions -> what to do instead."""
+
+REMOVED_FLAGS = {
+    "--durable": "blocks are written whole; what a power failure takes, "
+    "`sweep verify STORE --repair` computes again",
+}
+"""Flags of earlier versions -> what does their work."""
+
+INVALID_COMMAND = re.compile(r"argument COMMAND: invalid choice: '([^']*)'")
+"""Beginning of argparse's message for a command that does not exist."""
 
 GUIDES = ("README.md", "sweep/README.md")
 """Pages for all commands: a first answer; architecture, development and the glossary."""
@@ -49,13 +90,22 @@ class Parser(argparse.ArgumentParser):
     """A parser whose errors say what may be meant."""
 
     def error(self, message: str) -> NoReturn:
-        """Print the usage and an error with a hint, and exit with status 2."""
-        super().error(message + _hint(message))
+        """Print the usage and an error with a hint, and exit with status 2.
+
+        A command or flag of earlier versions gives one line that says what to do instead.
+        """
+        chosen = INVALID_COMMAND.match(message)
+        if chosen is not None and chosen[1] in REMOVED:
+            self.exit(2, f"sweep {chosen[1]} is no longer a command; {REMOVED[chosen[1]]}\n")
+        for word in message.removeprefix("unrecognized arguments: ").split():
+            if word in REMOVED_FLAGS:
+                self.exit(2, f"{word} is no longer a flag; {REMOVED_FLAGS[word]}\n")
+        super().error(plain(message + _hint(message), MAX_LINE_LENGTH))
 
 
 def _hint(message: str) -> str:
     """Return what may be meant in place of what argparse refuses; empty if nothing is similar."""
-    if chosen := re.match(r"argument COMMAND: invalid choice: '([^']*)'", message):
+    if chosen := INVALID_COMMAND.match(message):
         if chosen[1] == "help":
             return "; `sweep --help` and `sweep COMMAND --help` print the help"
         return nearest(chosen[1], [command.name for command in COMMANDS])
@@ -68,27 +118,22 @@ def _meant(word: str) -> str:
     if word in ("--dry-run", "--dryrun", "-n"):
         return "; `sweep plan PIPELINE` shows what would run"
     if word.startswith("-"):
-        options = {command.name: _options(command) for command in COMMANDS}
-        flags = {flag: [name for name, listed in options.items() if flag in listed]
-                 for each in options.values() for flag in each if flag.startswith("--")}
-        name = word.partition("=")[0]
-        if name in flags:
-            return f"; {name} is a flag of {', '.join(f'sweep {each}' for each in flags[name])}"
-        return nearest(name, sorted(flags))
+        name, flags = word.partition("=")[0], set[str]()
+        for command in COMMANDS:
+            parser = argparse.ArgumentParser(add_help=False)
+            command.add_arguments(parser)
+            flags.update(_flags(parser).values())
+        return "" if name in flags else nearest(name, sorted(flags))
     if "=" in word:
         return f"; did you mean --set {word}?"
     return "; values are set by --set KEY=VALUE, in quotes if there are spaces in it"
 
 
-def _options(command: Command) -> list[str]:
-    """Return the option strings of a command."""
-    parser = argparse.ArgumentParser(add_help=False)
-    command.add_arguments(parser)
-    return list(parser._option_string_actions)  # noqa: SLF001  (argparse offers no other list)
+def build_parser() -> tuple[argparse.ArgumentParser, list[argparse.ArgumentParser]]:
+    """Return the parser of ``sweep``, and those of the commands.
 
-
-def build_parser() -> argparse.ArgumentParser:
-    """Return the parser of ``sweep``; ``command`` is the chosen :class:`Command`, or None."""
+    Parsed, ``command`` is the chosen :class:`Command`, or None.
+    """
     parser = Parser(
         prog="sweep",
         description="How well will I know the pose? Experiments with fiducial markers.",
@@ -106,7 +151,7 @@ def build_parser() -> argparse.ArgumentParser:
         )
         command.add_arguments(added)
         added.set_defaults(command=command, flags=_flags(added))
-    return parser
+    return parser, list(commands.choices.values())
 
 
 def parse(

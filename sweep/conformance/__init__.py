@@ -1,4 +1,4 @@
-"""Conformance of detectors: whether corners, their order and IDs are what they declare.
+"""Conformance of plug-ins: whether detectors and solvers are what they declare.
 
-A detector is tried in a child process, which it may crash or never return to.
+A plug-in is tried in a child process, which it may crash or never return to.
 """

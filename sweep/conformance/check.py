@@ -1,378 +1,701 @@
-"""The conformance test of a detector: every step in a child process, every finding a line."""
+"""Whether a plug-in does what it declares: six checks of detectors, and of solvers."""
 
 from __future__ import annotations
 
-import statistics
-from collections.abc import Callable, Iterator, Sequence
+import itertools
+import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sweep.conformance import trial
-from sweep.conformance.conventions import Conventions, conventions, offset_fault, order_faults
-from sweep.conformance.scenes import SCENES, trial_pipeline
-from sweep.errors import ArgumentError, MachineFaultError, PipelineError, SweepError
+from sweep.errors import ArgumentError, MachineFaultError, PipelineError, PluginError, SweepError
+from sweep.evaluation.block import detections_for, run_cells
+from sweep.evaluation.opencv_threads import single_threaded
+from sweep.evaluation.results import CellsResult
+from sweep.evaluation.search import search, whole_frames
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
-from sweep.measure.detectors import OPENCV
-from sweep.model.marker import marker_count, missing_package
-from sweep.plan.grid import detector_settings
-from sweep.plan.parameters import PARAMETERS
-from sweep.plugins import DetectorPlugin
-from sweep.plugins.declared import PluginSetting
+from sweep.measure.detectors import OPENCV, AnyDetectorSetting, make_detector
+from sweep.measure.estimators import SOLVERS, build
+from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.model.extent import marker_boxes
+from sweep.model.marker import dictionary_names, marker_count, missing_package
+from sweep.model.renderers import render_all
+from sweep.model.scene import build_scenes
+from sweep.plan.experiment import shows_boards
+from sweep.plan.grid import detector_settings, estimators, scene_values
+from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.schema import VARIABLES
+from sweep.plugins.declared import DeclaredPlugin, PluginSetting, described
+from sweep.typing import Floats, Grey, Integers
 
-DEFAULT_CALLS = 400
-TIME_LIMIT_S = 60.0
+# --------------------------------------------------------------------------------------------------
+# Corners that a detector found against the truth: their order and offset, and the IDs.
 
-MAX_GROWTH_BYTES_A_CALL = 1024
-"""Growth of memory that is reported. An image of 640 x 480 px has 300 times as much."""
+MAX_OFFSET_PX = 0.02
+"""Largest mean offset of a detector that conforms."""
 
-MIN_GROWTH_BYTES = 2 << 20
-"""Growth below which memory is not said to grow: allocators keep some."""
+STANDARD_ERRORS = 4.0
+"""Standard errors of the mean offset that are allowed beside it."""
+
+ORDERS = tuple(itertools.permutations(range(4)))
+
+Found = Sequence[tuple[int, Floats]]
+"""The markers of an image: ID and corners (4, 2) px."""
+
+
+@dataclass(frozen=True)
+class Conventions:
+    """What corners and IDs turn out to be.
+
+    Attributes
+    ----------
+    detected
+        Scenes in which the marker was found.
+    order
+        Index of the found corner that is the true top left one, and so on; None if no order of all
+        scenes puts the corners where the marker is.
+    offset_px
+        (2,) mean of found minus true, in this order.
+    offset_error_px
+        (2,) its standard error.
+    rms_px
+        Root mean square of a corner's distance after the mean offset is taken off.
+    ids
+        Pairs of drawn and found ID that differ.
+    """
+
+    detected: int
+    order: tuple[int, ...] | None
+    offset_px: Floats
+    offset_error_px: Floats
+    rms_px: float
+    ids: tuple[tuple[int, int], ...]
+
+
+def conventions(
+    found: Sequence[Found], marker_id: Integers, corners_px: Floats
+) -> Conventions | None:
+    """Return the conventions that explain what was found in N scenes; None if nothing was.
+
+    Parameters
+    ----------
+    found
+        N: the markers of each image. Of several the one with the right ID counts, or the nearest.
+    marker_id, corners_px
+        (N,) and (N, 4, 2): the truth, the second half of it the point reflection of the first.
+    """
+    rows, ids, corners = [], [], []
+    for row, markers in enumerate(found):
+        if markers:
+            centre = corners_px[row].mean(axis=0)
+            number, quad = min(
+                markers, key=lambda marker: (
+                    marker[0] != marker_id[row],
+                    float(np.linalg.norm(marker[1].mean(axis=0) - centre)),
+                ),
+            )
+            rows.append(row)
+            ids.append((int(marker_id[row]), int(number)))
+            corners.append(quad)
+    if not rows:
+        return None
+    quads, truth = np.array(corners), corners_px[rows]
+    # Offsets are free, so that an order is recognised whatever the centre of the first pixel.
+    spreads = [(quads[:, list(some)] - truth).std(axis=(0, 1)).max() for some in ORDERS]
+    best = int(np.argmin(spreads))
+    side = float(np.linalg.norm(truth - np.roll(truth, 1, axis=1), axis=2).mean())
+    order = ORDERS[best] if spreads[best] < 0.1 * side else None
+    error = quads[:, list(ORDERS[best])] - truth
+    offset = error.mean(axis=(0, 1))
+    half = len(corners_px) // 2
+    means = dict(zip(rows, error.mean(axis=1), strict=True))
+    pairs = np.array([
+        (means[row] + means[row + half]) / 2 for row in range(half)
+        if row in means and row + half in means
+    ])
+    spread = pairs.std(axis=0, ddof=1) / np.sqrt(len(pairs)) if len(pairs) > 1 else np.zeros(2)
+    return Conventions(
+        detected=len(rows), order=order, offset_px=offset, offset_error_px=spread,
+        rms_px=float(np.sqrt(((error - offset) ** 2).sum(axis=2).mean())),
+        ids=tuple(pair for pair in ids if pair[0] != pair[1]),
+    )
+
+
+def order_faults(
+    result: Conventions, declared: Sequence[int] | None, pixel_center: float | None
+) -> list[str]:
+    """Return what is wrong with corners and IDs, a line each, with what to declare instead.
+
+    ``declared`` and ``pixel_center`` are what a plug-in declares; None for OpenCV.
+    """
+    faults = []
+    if result.ids:
+        drawn, found = result.ids[0]
+        steps = {other - one for one, other in result.ids}
+        constant = f", always {steps.pop():+d}" if len(steps) == 1 and len(result.ids) > 1 else ""
+        faults.append(
+            f"IDs are wrong in {len(result.ids)} of {result.detected} scenes{constant}: "
+            f"{found} for marker {drawn}"
+        )
+    if result.order is None:
+        faults.append(
+            "corners are in no fixed order of the marker, or are no pixels of the image: return "
+            "them so that the first is always the same corner of the bitmap, as (x, y), y downwards"
+        )
+        return faults
+    if result.order != (0, 1, 2, 3):
+        faults.append(_order_fault(result.order, declared))
+    if not faults:
+        faults += offset_fault(result, pixel_center)
+    return faults
+
+
+def _order_fault(order: tuple[int, ...], declared: Sequence[int] | None) -> str:
+    quarters = next(
+        (k for k in range(1, 4) if order == tuple((i + k) % 4 for i in range(4))), None
+    )
+    what = {
+        None: "corners run the other way round, or cross", 1: "corners are turned by one",
+        2: "corners are turned by two (180°)", 3: "corners are turned by three",
+    }[quarters]
+    if declared is None:
+        return what
+    wanted = tuple(declared[index] for index in order)
+    return f"{what}: declare corner_order = {wanted}"
+
+
+def offset_fault(result: Conventions, pixel_center: float | None) -> list[str]:
+    """Return the line that says how far corners are off in the mean; none if they are not."""
+    allowed = MAX_OFFSET_PX + STANDARD_ERRORS * result.offset_error_px
+    if (np.abs(result.offset_px) <= allowed).all():
+        return []
+    x, y = result.offset_px
+    line = f"corners are offset by ({x:.2f}, {y:.2f}) px"
+    if pixel_center is None:
+        return [line]
+    for step in (0.5, -0.5, 1.0, -1.0):
+        if (np.abs(result.offset_px - step) < 0.1).all() and -1 <= pixel_center + step <= 1:
+            return [f"{line}: declare pixel_center = {pixel_center + step:g}"]
+    return [f"{line}: no pixel_center is the reason"]
+
+
+# --------------------------------------------------------------------------------------------------
+# The scenes on which plug-ins are tried: free of noise, and each with its point reflection.
+
+SCENES = 32
+WIDTH_PX, HEIGHT_PX, FOCAL_PX = 640, 480, 600.0
+SIDES_PX = (60.0, 150.0)
+TILTS_DEG = (0.0, 45.0)
+MAX_BEARING_DEG = 8.0
+
+SOURCE = "plugins check"
+"""What lines on faults begin with."""
+
+SOLVER = """
+        cornerRefinementMethod = "subpix"
+        [estimator]
+        solver = {}
+"""
+
+BOARD = """
+        [board]
+        kind = "grid"
+        rows = 2
+        columns = 2
+        gap_m = 0.002
+"""
+
+
+@dataclass(frozen=True)
+class TrialScenes:
+    """N scenes, and the detector's setting.
+
+    Attributes
+    ----------
+    setting
+        The one setting of the detector.
+    dictionary
+        Of all markers.
+    marker_id, corners_px
+        (N,) and (N, 4, 2): the truth. Scene i + N/2 is scene i turned by 180° about the image's
+        centre, exactly: errors that belong to the marker cancel in the mean, offsets do not.
+    images
+        (480, 640) each.
+    """
+
+    setting: AnyDetectorSetting
+    dictionary: str
+    marker_id: Integers
+    corners_px: Floats
+    images: list[Grey]
+
+
+def trial_pipeline(
+    detector: str, dictionary: str, settings: Sequence[str], folder: str, count: int = SCENES, *,
+    solver: str | None = None, board: bool = False, tilts: tuple[float, float] = TILTS_DEG,
+) -> Pipeline:
+    """Return the pipeline of ``count`` scenes and one setting of a detector, or of a solver.
+
+    Raises
+    ------
+    PipelineError
+        If there is no such detector or solver, or a setting is not valid.
+    """
+    rng = np.random.default_rng(20)
+    half = count // 2
+    reflected = {
+        "azimuth_deg": rng.uniform(0, 180, half), "roll_deg": rng.uniform(0, 180, half),
+    }
+    drawn = {
+        "tilt_deg": rng.uniform(*tilts, half),
+        "side_px": np.geomspace(*SIDES_PX, half).round(2),
+    }
+    negated = {
+        name: rng.uniform(-MAX_BEARING_DEG, MAX_BEARING_DEG, half)
+        for name in ("bearing_x_deg", "bearing_y_deg")
+    }
+    columns = {name: [*values, *values] for name, values in drawn.items()}
+    columns |= {name: [*values, *(values + 180)] for name, values in reflected.items()}
+    columns |= {name: [*values, *(-values)] for name, values in negated.items()}
+    written = {name: [round(float(value), 6) for value in values] for name, values in
+               columns.items()}
+    known = dictionary in dictionary_names()  # others are refused below
+    ids = rng.integers(marker_count(dictionary) if known else 1, size=half).tolist()
+    if not board:
+        written["marker_id"] = [*ids, *ids]
+    zipped = ", ".join(f"{name} = {json.dumps(values)}" for name, values in written.items())
+    text = f"""
+        title = "Conformance"
+        [camera]
+        width_px = {WIDTH_PX}
+        height_px = {HEIGHT_PX}
+        fx_px = {FOCAL_PX}
+        fy_px = {FOCAL_PX}
+        [marker]
+        dictionary = {json.dumps(dictionary)}
+        [detector]
+        detector = {json.dumps(detector)}
+        {"" if solver is None else SOLVER.format(json.dumps(solver))}
+        {BOARD if board else ""}
+        [axes]
+        trial_scene = {{ zip = {{ {zipped} }} }}
+    """
+    pipeline = Pipeline.from_text(text, settings, source=SOURCE, folder=folder)
+    if len(pipeline.axes) > 1:
+        raise PipelineError([f"{SOURCE}: a plug-in is tried with one setting: no axes"])
+    return pipeline
+
+
+@single_threaded()
+def trial_scenes(pipeline: Pipeline) -> TrialScenes:
+    """Return the scenes of :func:`trial_pipeline`, rendered as whole frames."""
+    (axis,) = pipeline.axes_of(Stage.scene)
+    values = scene_values(pipeline, [np.arange(len(axis))])
+    scenes = build_scenes(values, len(axis))
+    rows = np.arange(len(scenes))
+    frames = np.concatenate([np.zeros_like(scenes.frame), scenes.frame], axis=1)
+    images = render_all(scenes, rows, marker_boxes(scenes), frames)
+    return TrialScenes(
+        detector_settings(pipeline)[0], scenes.dictionary[0], np.array(scenes.marker_id),
+        scenes.corners_px, [np.ascontiguousarray(image) for image in images],
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Six checks of a detector, and of a solver: each a function that returns what it has found.
+#
+# They run in a child process, which the plug-in may end or never leave.
+
+TIME_LIMIT_S = 120.0
+"""Time limit of each check."""
 
 FEWEST_SHARE = 0.75
-"""Share of the scenes in which a detector must find the marker: all are large and sharp."""
+"""Share of the scenes in which a marker must be found, or solved: all are large and sharp."""
 
-LARGE_FAMILY = 20_000
-"""Dictionaries of more IDs are tried only if asked for: AprilTag takes seconds and gigabytes to
-prepare them."""
+MAX_ROTATION_DEG, MAX_POSITION_PERCENT = 5.0, 5.0
+"""Largest median errors of a solver that has the right frames and units."""
 
 PREFERRED = "DICT_APRILTAG_36h11"
 
+OK, NOTE, FAULT = "ok", "note", "fault"
 
-class Verdict(StrEnum):
-    """What a finding means."""
-
-    conforms = "ok"
-    note = "note"
-    fault = "fault"
+Outcome = tuple[str, str] | tuple[str, str, dict[str, Any]]
+"""What a check returns: a verdict, a line, and maybe numbers by name."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the result."""
+    """The result of one check: "ok", "note" or "fault", a line, and numbers by name."""
 
     check: str
-    verdict: Verdict
+    verdict: str
     text: str
+    numbers: dict[str, Any] = field(default_factory=dict)
 
 
-@dataclass
+@dataclass(frozen=True)
 class ConformanceReport:
-    """The result of a conformance test.
+    """The results of all checks of a plug-in.
 
     Attributes
     ----------
-    detector, dictionary
-        What was tried, on which markers.
+    name, kind
+        The plug-in's name, and "detector" or "estimator".
+    dictionary
+        Dictionary of the markers that it was tried on.
     versions
-        Distributions that the detector is made of, with versions.
+        Distributions that it is made of, with versions.
     findings
-        In the order of the checks.
-    detected, scenes
-        Scenes in which the marker was found, and all.
-    offset_px, rms_px, milliseconds
-        Mean offset of corners in x and y; their RMS distance after it; median time of a search.
+        In the order of the checks; those after a crash or a time limit are missing.
     """
 
-    detector: str
+    name: str
+    kind: str
     dictionary: str
     versions: dict[str, str]
-    findings: list[Finding] = field(default_factory=list)
-    detected: int = 0
-    scenes: int = SCENES
-    offset_px: tuple[float, float] | None = None
-    rms_px: float | None = None
-    milliseconds: float | None = None
+    findings: list[Finding]
 
     @property
     def conforms(self) -> bool:
-        """Whether there is no fault."""
-        return all(finding.verdict is not Verdict.fault for finding in self.findings)
+        """Whether no check has found a fault."""
+        return all(finding.verdict != FAULT for finding in self.findings)
 
-    def add(self, check: str, verdict: Verdict, text: str) -> None:
-        """Append a finding."""
-        self.findings.append(Finding(check, verdict, text))
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """What the checks measured: "detected", "offset_px", "rms_px"; "solved"."""
+        return {key: value for each in self.findings for key, value in each.numbers.items()}
 
 
-def check_detector(
-    detector: str, dictionary: str | None = None, settings: Sequence[str] = (), *,
-    folder: str = ".", calls: int = DEFAULT_CALLS, time_limit_s: float = TIME_LIMIT_S,
+def check_plugin(
+    name: str, dictionary: str | None = None, settings: Sequence[str] = (), *,
+    folder: str = ".", time_limit_s: float = TIME_LIMIT_S,
 ) -> ConformanceReport:
-    """Try a detector on 32 noise-free scenes, and on images that it may not expect.
+    """Try a detector or a solver on 32 noise-free scenes, and on some that it may not expect.
 
     Parameters
     ----------
-    detector
-        ``opencv``, the name of an installed plug-in, or ``module:name`` of a file in ``folder``.
+    name
+        ``opencv``, one of our solvers, an installed plug-in, or ``module:name`` of a file in
+        ``folder``.
     dictionary
-        Of the markers; None for DICT_APRILTAG_36h11, or the first that the detector has.
+        Of the markers; None for DICT_APRILTAG_36h11, or the first that a detector has.
     settings
         "key=value" with TOML values, as ``--set`` takes them.
-    calls
-        Searches over which memory is watched.
     time_limit_s
-        A step that takes longer is ended: making a detector and searching all scenes is one.
+        A check that takes longer is ended, and no other follows.
 
     Raises
     ------
     ArgumentError, PipelineError
-        If there is no such detector, dictionary or setting.
+        If there is no such plug-in, dictionary or setting.
     """
-    if calls < 0:
-        raise ArgumentError("calls", calls, "expected at least 0")
     if not 0 < time_limit_s < float("inf"):
         raise ArgumentError("time_limit_s", time_limit_s, "expected seconds above 0")
-    name = PARAMETERS["detector"].declaration.choice(detector) or detector.strip()
-    chosen, known = _dictionary(name, dictionary, folder)
-    pipeline = trial_pipeline(name, chosen, settings, folder)
-    setting = detector_settings(pipeline)[0]
-    record = setting.record() if isinstance(setting, PluginSetting) else None
-    versions = dict(setting.plugin.versions) if isinstance(setting, PluginSetting) else {}
-    report = ConformanceReport(name, chosen, versions)
-    try:
-        with Child("sweep.conformance.trial") as child:
-            _Trial(report, record, child, time_limit_s).run(settings, folder, calls, known)
-    except _EndedError:
-        pass
-    return report
-
-
-def _dictionary(
-    name: str, wanted: str | None, folder: str
-) -> tuple[str, tuple[str, ...]]:
-    """Return the dictionary to try, and all that the detector declares (none if it has all)."""
-    known: tuple[str, ...] = ()
-    if name != OPENCV:
-        from sweep.errors import PluginError  # noqa: PLC0415
-        from sweep.plugins.declared import declare  # noqa: PLC0415
-
+    plugin = _declared(name, folder)
+    kind = "estimator" if name in SOLVERS else "detector" if plugin is None else plugin.kind
+    known = () if plugin is None else plugin.dictionaries
+    if dictionary is None:
+        dictionary = PREFERRED if not known or PREFERRED in known else next(
+            (each for each in known if missing_package(each) is None), known[0])
+    of_boards = plugin is not None and plugin.of_boards
+    arguments = (kind, name, dictionary, tuple(settings), folder, of_boards)
+    _pipeline(*arguments)  # refuses what is wrong with them
+    findings: list[Finding] = []
+    with Child("sweep.conformance.check") as child:
         try:
-            known = declare("detector", name, folder).dictionaries
-        except PluginError as error:
-            raise PipelineError([f"detector {name}: expected {error}"]) from None
-    if wanted is not None:
-        return wanted, known
-    if not known or PREFERRED in known:
-        return PREFERRED, known
-    return next((each for each in known if missing_package(each) is None), known[0]), known
-
-
-class _EndedError(Exception):
-    """The child process ended; nothing more can be tried."""
-
-
-class _Trial:
-    """The checks of one detector, in turn."""
-
-    def __init__(
-        self, report: ConformanceReport, record: DetectorPlugin | None, child: Child,
-        time_limit_s: float,
-    ) -> None:
-        self._report, self._record = report, record
-        self._child, self._limit_s = child, time_limit_s
-
-    def run(
-        self, settings: Sequence[str], folder: str, calls: int, known: Sequence[str]
-    ) -> None:
-        report = self._report
-        opened = self._call(
-            "the scenes", trial.open_trial, report.detector, report.dictionary, tuple(settings),
-            folder,
-        )
-        searched = self._call("32 scenes", trial.search_scenes, range(SCENES))
-        self._returned(searched, opened)
-        self._behaviour(searched)
-        if report.detected:
-            self._history(searched)
-        self._odd_images()
-        self._memory(calls)
-        self._families(known)
-
-    def _call(self, what: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a function in the child; a fault of the child is a finding, and the last."""
-        try:
-            return self._child.call(function, *arguments, limit_s=self._limit_s)
-        except ChildDiedError as death:
-            if death.timed_out:
-                text = f"did not return within {self._limit_s:g} s while it searched {what}"
-                self._report.add("returns", Verdict.fault, text)
-            else:
-                text = f"ended its process ({death}) while it searched {what}"
-                self._report.add("survives", Verdict.fault, text)
-            raise _EndedError from None
-        except ChildRaisedError as error:
-            text = f"raised while it searched {what}: {last_line(error)}"
-            self._report.add("returns", Verdict.fault, text)
-            raise _EndedError from None
+            child.call(_open, arguments, limit_s=time_limit_s)
+            findings.extend(
+                child.call(_run, kind, number, limit_s=time_limit_s)
+                for number in range(len(CHECKS[kind]))
+            )
         except MachineFaultError:
             raise
-        except SweepError as error:
-            self._report.add("returns", Verdict.fault, str(error))
-            raise _EndedError from None
+        except (ChildDiedError, ChildRaisedError, SweepError) as error:
+            findings.append(Finding(_names(kind)[len(findings)], FAULT, _ending(error)))
+    versions = {} if plugin is None else dict(plugin.versions)
+    return ConformanceReport(name, kind, dictionary, versions, findings)
 
-    def _returned(self, searched: trial.Searched, opened: trial.Opened) -> None:
-        """Judge what was returned: faults of the returned values, IDs, order, offset."""
-        report = self._report
-        for fault in searched.faults:
-            report.add("returns", Verdict.fault, fault)
-        result = conventions(searched.found, opened.marker_id, opened.corners_px)
-        if result is None:
-            if not searched.faults:
-                report.add(
-                    "detects", Verdict.fault, f"found no marker of {report.dictionary} in "
-                    f"{report.scenes} scenes with sides of 60 to 150 px",
-                )
-            return
-        self._detected(result)
-        declared = None if self._record is None else self._record.corner_order
-        center = None if self._record is None else self._record.pixel_center
-        lines = order_faults(result, declared, center)
-        known = [] if self._record is not None else offset_fault(result, None)
-        for line in lines:
-            if line in known:
-                report.add(
-                    "conventions", Verdict.note,
-                    f"{line}: OpenCV's own, which stays in its results",
-                )
-            else:
-                report.add("conventions", Verdict.fault, line)
-        if not lines:
-            report.add(
-                "conventions", Verdict.conforms, "IDs, order of corners, no offset above "
-                "0.02 px and 4 standard errors",
-            )
 
-    def _detected(self, result: Conventions) -> None:
-        report = self._report
-        report.detected = result.detected
-        report.offset_px = (float(result.offset_px[0]), float(result.offset_px[1]))
-        report.rms_px = result.rms_px
-        missed = report.scenes - result.detected
-        enough = result.detected >= FEWEST_SHARE * report.scenes
-        if missed:
-            report.add(
-                "detects", Verdict.note if enough else Verdict.fault,
-                f"missed {missed} of {report.scenes} scenes with sides of 60 to 150 px",
-            )
-        else:
-            report.add("detects", Verdict.conforms, f"all {report.scenes} scenes")
+def _declared(name: str, folder: str) -> DeclaredPlugin | None:
+    """Return the detector or solver of a name; None for our own."""
+    if name == OPENCV or name in SOLVERS:
+        return None
+    for each in described(name, folder):
+        if each.kind in CHECKS:
+            return each
+    raise ArgumentError("name", name, "expected a detector or a solver; runs check the others")
 
-    def _behaviour(self, searched: trial.Searched) -> None:
-        """Judge time, output, threads and processes."""
-        report = self._report
-        report.milliseconds = 1e3 * statistics.median(searched.seconds)
-        declared = 1 if self._record is None else self._record.threads
-        # A pool of one thread works while its caller waits.
-        used = max(1, searched.threads)
-        if used > declared or searched.cpu_share > declared + 0.5:
-            report.add(
-                "threads", Verdict.fault,
-                f"starts {searched.threads} threads, {searched.cpu_share:.1f} processors busy; it "
-                f"declares {declared}: a run has a process a processor",
-            )
-        else:
-            report.add("threads", Verdict.conforms, f"{declared}, as declared")
-        if searched.processes:
-            report.add("processes", Verdict.fault, f"leaves {searched.processes} processes running")
-        if searched.printed.strip():
-            line = searched.printed.strip().splitlines()[0]
-            report.add("prints", Verdict.note, f"prints: {line[:80]!r}; runs discard it")
 
-    def _history(self, first: trial.Searched) -> None:
-        """Search in reverse, after images of noise: results must be the same bits."""
-        for index in (2, 4):
-            self._call(trial.ODD_IMAGES[index][2], trial.search_odd_image, index)
-        second = self._call("the scenes in reverse", trial.search_scenes, range(SCENES)[::-1])
-        different, moved = [], 0.0
-        for one, other in zip(first.found, second.found, strict=True):
-            same = [number for number, _ in one] == [number for number, _ in other]
-            if same and one:
-                moved = max(moved, *(
-                    float(np.abs(a - b).max()) for (_, a), (_, b) in zip(one, other, strict=True)
-                ))
-            different.append(not same or any(
-                (a != b).any() for (_, a), (_, b) in zip(one, other, strict=True)
-            ))
-        if any(different):
-            far = f"corners moved by up to {moved:.2g} px" if moved else "other markers"
-            self._report.add(
-                "history", Verdict.fault, f"results depend on what was searched before: "
-                f"{sum(different)} of {SCENES} scenes differ in reverse order ({far})",
-            )
-        else:
-            self._report.add("history", Verdict.conforms, "the same bits in reverse order")
+def _pipeline(
+    kind: str, name: str, dictionary: str, settings: Sequence[str], folder: str, of_boards: bool,
+    tilts: tuple[float, float] = TILTS_DEG,
+) -> Pipeline:
+    if kind == "detector":
+        return trial_pipeline(name, dictionary, settings, folder)
+    return trial_pipeline(
+        OPENCV, dictionary, settings, folder, solver=name, board=of_boards, tilts=tilts)
 
-    def _odd_images(self) -> None:
-        raised = 0
-        for index, (_, _, what) in enumerate(trial.ODD_IMAGES):
-            line = self._call(what, trial.search_odd_image, index)
-            if line:
-                raised += 1
-                self._report.add("odd images", Verdict.note, f"{what}: {line}")
-        if not raised:
-            self._report.add(
-                "odd images", Verdict.conforms, "plain, black, noise, down to 8 x 8 px"
-            )
 
-    def _memory(self, calls: int) -> None:
-        """Search many times: the second half of the calls must not take more memory."""
-        if calls < 2:
-            return
-        for begin, count in self._portions(calls // 2):
-            self._call(f"{begin + count} images", trial.search_again, count)
-        before = after = 0
-        for index, (begin, count) in enumerate(self._portions(calls - calls // 2)):
-            start, after = self._call(f"{begin + count} images more", trial.search_again, count)
-            before = before if index else start
-        grown = after - before
-        each = grown / (calls - calls // 2)
-        if grown > MIN_GROWTH_BYTES and each > MAX_GROWTH_BYTES_A_CALL:
-            self._report.add(
-                "memory", Verdict.fault, f"grows by {each / 1024:.1f} KiB a call over {calls:,}"
-            )
-        else:
-            self._report.add("memory", Verdict.conforms, f"does not grow over {calls:,} calls")
+def _ending(error: ChildDiedError | ChildRaisedError | SweepError) -> str:
+    if isinstance(error, ChildDiedError):
+        return f"did not return: {error}" if error.timed_out else f"ended its process ({error})"
+    return last_line(error) if isinstance(error, ChildRaisedError) else str(error)
 
-    def _portions(self, calls: int) -> Iterator[tuple[int, int]]:
-        """Cut calls so that each portion fits in the time limit."""
-        each_s = max((self._report.milliseconds or 1.0) * 1e-3, 1e-4)
-        size = max(1, int(0.2 * self._limit_s / each_s))
-        for begin in range(0, calls, size):
-            yield begin, min(size, calls - begin)
 
-    def _families(self, known: Sequence[str]) -> None:
-        """Search markers of every other dictionary that is declared, in the same process."""
-        report = self._report
-        others = [each for each in known if each != report.dictionary]
-        large = [each for each in others if marker_count(each) > LARGE_FAMILY]
-        lacking = [each for each in others if missing_package(each) is not None]
-        tried = [each for each in others if each not in large and each not in lacking]
-        wrong = 0
-        for dictionary in tried:
-            opened, found = self._call(
-                f"markers of {dictionary}", trial.search_family, dictionary
-            )
-            ids = [[number for number, _ in markers] for markers in found]
-            if not any(ids):
-                wrong += 1
-                report.add("families", Verdict.note, f"found no marker of {dictionary}")
-                continue
-            result = conventions(found, opened.marker_id, opened.corners_px)
-            if result is None:
-                continue
-            lines = [] if result.order == (0, 1, 2, 3) and not result.ids else order_faults(
-                result, None if self._record is None else self._record.corner_order, None
-            )
-            for line in lines:
-                wrong += 1
-                report.add("families", Verdict.fault, f"{dictionary}: {line}")
-        if tried and not wrong:
-            report.add("families", Verdict.conforms, f"{', '.join(tried)} in the same process")
-        if large:
-            report.add(
-                "families", Verdict.note, f"not tried, since they are large: {', '.join(large)}"
-            )
-        if lacking:
-            report.add("families", Verdict.note, f"cannot be drawn here: {', '.join(lacking)}")
+# In the child process.
+
+_trials: list[Any] = []
+
+
+@single_threaded()
+def _open(arguments: tuple[str, str, str, tuple[str, ...], str, bool]) -> None:
+    """Make the trial whose checks are called next."""
+    pipeline = _pipeline(*arguments)
+    _trials[:] = [
+        DetectorTrial(pipeline) if arguments[0] == "detector"
+        else SolverTrial(pipeline, _pipeline(*arguments, (80.0, 85.0)))
+    ]
+
+
+@single_threaded()
+def _run(kind: str, number: int) -> Finding:
+    """Return what a check finds."""
+    check = CHECKS[kind][number]
+    verdict, text, *numbers = check(_trials[0])
+    return Finding(_names(kind)[number], verdict, text, *numbers)
+
+
+class DetectorTrial:
+    """A detector, the scenes, and what it returns for their images."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self.scenes = trial_scenes(pipeline)
+        self.find = make_detector(self.scenes.setting)
+        setting = detector_settings(pipeline)[0]
+        self.record = setting.record() if isinstance(setting, PluginSetting) else None
+        self.faults: list[str] = []
+        self.first = self.search(range(len(self.scenes.images)))
+
+    def search(self, order: Sequence[int]) -> list[Found]:
+        """Search the scenes in an order; return the markers of each, in the scenes' order."""
+        found: list[Found] = [[] for _ in order]
+        for row in order:
+            try:
+                found[row] = self.markers(self.scenes.images[row])
+            except PluginError as error:
+                self.faults.append(str(error))
+        return found
+
+    def markers(self, image: NDArray[np.uint8]) -> Found:
+        """Return the markers of an image."""
+        corners, ids, _ = self.find(image, self.scenes.dictionary, max(image.shape))
+        numbers = [] if ids is None else np.ravel(ids).tolist()
+        return [
+            (int(number), np.asarray(quad, dtype=np.float64).reshape(4, 2))
+            for number, quad in zip(numbers, corners, strict=True)
+        ]
+
+
+def detector_returns_markers(trial: DetectorTrial) -> Outcome:
+    """Demand right shapes and types; nothing is raised, and no image is changed."""
+    faults = list(dict.fromkeys(trial.faults))
+    return (FAULT, "; ".join(faults)) if faults else (OK, "corners and IDs of the right shapes")
+
+
+def detector_finds_markers(trial: DetectorTrial) -> Outcome:
+    """Demand that large, sharp markers are found."""
+    return _share(sum(map(bool, trial.first)), len(trial.first), "detected", "a marker")
+
+
+def detector_keeps_conventions(trial: DetectorTrial) -> Outcome:
+    """Demand IDs, order of corners and centre of the first pixel as they are declared."""
+    result = conventions(trial.first, trial.scenes.marker_id, trial.scenes.corners_px)
+    if result is None:
+        return FAULT, "no marker was found"
+    record = trial.record
+    declared, center = (None, None) if record is None else (
+        record.corner_order, record.pixel_center)
+    numbers = {"offset_px": result.offset_px.tolist(), "rms_px": result.rms_px}
+    if faults := order_faults(result, declared, center):
+        if record is None and faults == offset_fault(result, None):
+            return NOTE, f"{faults[0]}: OpenCV's own, which stays in its results", numbers
+        return FAULT, "; ".join(faults), numbers
+    x, y = result.offset_px
+    return OK, (
+        f"IDs and order of corners; mean offset ({x:+.3f}, {y:+.3f}) px, RMS beside it "
+        f"{result.rms_px:.3f} px"
+    ), numbers
+
+
+def detector_repeats_itself(trial: DetectorTrial) -> Outcome:
+    """Demand the same bits of the same images."""
+    return _same_markers(trial, trial.search(range(len(trial.first))), "called again")
+
+
+def detector_has_no_memory(trial: DetectorTrial) -> Outcome:
+    """Demand the same bits of the same images in reverse order, after images of noise."""
+    _odd_images(trial)
+    return _same_markers(
+        trial, trial.search(range(len(trial.first))[::-1]), "called in reverse, after noise")
+
+
+def detector_survives_odd_images(trial: DetectorTrial) -> Outcome:
+    """Search plain, black, noisy and small images; what is raised is noted."""
+    lines = _odd_images(trial)
+    return (NOTE, "; ".join(lines)) if lines else (OK, "plain, black, noise, down to 8 x 8 px")
+
+
+def _odd_images(trial: DetectorTrial) -> list[str]:
+    generator = np.random.default_rng(1)
+    lines = []
+    for height, width, low, high in (
+        (480, 640, 128, 129), (480, 640, 0, 1), (480, 640, 0, 256), (241, 319, 0, 256),
+        (37, 53, 0, 256), (8, 8, 0, 256),
+    ):
+        image = generator.integers(low, high, (height, width)).astype(np.uint8)
+        try:
+            trial.markers(image)
+        except PluginError as error:
+            lines.append(f"an image of {width} x {height} px: {error}")
+    return lines
+
+
+def _same_markers(trial: DetectorTrial, second: list[Found], how: str) -> Outcome:
+    different = sum(
+        [number for number, _ in one] != [number for number, _ in other]
+        or any((a != b).any() for (_, a), (_, b) in zip(one, other, strict=True))
+        for one, other in zip(trial.first, second, strict=True)
+    )
+    return _same(different, len(second), how)
+
+
+class SolverTrial:
+    """A solver, and what it makes of the scenes' detections."""
+
+    def __init__(self, pipeline: Pipeline, steep: Pipeline) -> None:
+        self.pipeline, self.steep = pipeline, steep
+        self.first = self.solve(range(SCENES))
+
+    def solve(self, rows: Sequence[int]) -> CellsResult:
+        """Return results of scenes that are solved together."""
+        return run_cells(self.pipeline, [np.array(rows, dtype=np.intp)])
+
+    def column(self, name: str) -> NDArray[Any]:
+        """Return a variable of all scenes."""
+        return self.first.columns[name][0]
+
+    def fault_of_all(self) -> str:
+        """Return what is raised if all single markers are solved in one call; empty for nothing.
+
+        A run solves them one by one then, which takes long and hides it.
+        """
+        values = scene_values(self.pipeline, [np.arange(SCENES)])
+        scenes = build_scenes(values, SCENES)
+        (searched,), _, _ = search(
+            scenes, np.ones((SCENES, 1), dtype=bool), detector_settings(self.pipeline),
+            whole_frames(values, SCENES), [], keep=True,
+        )
+        (setting,) = estimators(self.pipeline)
+        rows = np.flatnonzero(searched.flags == DetectionStatus.detected)
+        try:
+            build(setting)(detections_for(setting, values, scenes, searched, rows))
+        except PluginError as error:
+            return str(error)
+        return ""
+
+    def differing(self, rows: Sequence[int], second: CellsResult) -> int:
+        """Return of how many of some scenes the second results differ by a bit."""
+        differ = np.zeros(len(rows), dtype=bool)
+        for name, (column,) in second.columns.items():
+            if VARIABLES[name].stage is Stage.estimation:
+                first = self.column(name)[list(rows)]
+                unlike = (first != column) & ~((first != first) & (column != column))  # noqa: PLR0124
+                differ |= unlike.reshape(len(rows), -1).any(axis=1)
+        return int(differ.sum())
+
+
+def solver_returns_poses(trial: SolverTrial) -> Outcome:
+    """Demand right shapes, and rotations that are rotations; nothing is raised."""
+    lines = [failure.text.strip().splitlines()[-1] for failure in trial.first.failures]
+    if not lines and not shows_boards(trial.pipeline):
+        lines = [line for line in [trial.fault_of_all()] if line]
+    return (FAULT, "; ".join(dict.fromkeys(lines))) if lines else (
+        OK, "poses of the right shapes, rotations that are rotations")
+
+
+def solver_solves_scenes(trial: SolverTrial) -> Outcome:
+    """Demand poses that reproject to the corners of large, sharp markers."""
+    detected = trial.column("detection") == DetectionStatus.detected
+    solved = trial.column("estimate") == EstimateStatus.solved
+    return _share(
+        int(solved.sum()), int(detected.sum()), "solved", "a pose that reprojects to the corners",
+        "; expected marker to camera, OpenCV's axes, metres")
+
+
+def solver_keeps_frames(trial: SolverTrial) -> Outcome:
+    """Demand poses of the marker in the camera's frame, in metres."""
+    solved = trial.column("estimate") == EstimateStatus.solved
+    if not solved.any():
+        return FAULT, "no pose was solved"
+    turned = float(np.median(trial.column("rotation_error_deg")[solved]))
+    distance = np.linalg.norm(trial.column("true_tvec_m")[solved], axis=1)
+    away = np.linalg.norm(trial.column("translation_error_m")[solved], axis=1)
+    percent = float(np.median(100 * away / distance))
+    text = f"median errors {turned:.2g} deg and {percent:.2g} % of the distance"
+    wrong = turned > MAX_ROTATION_DEG or percent > MAX_POSITION_PERCENT
+    return (FAULT if wrong else OK), text
+
+
+def solver_repeats_itself(trial: SolverTrial) -> Outcome:
+    """Demand the same bits of the same detections."""
+    rows = range(SCENES)
+    return _same(trial.differing(rows, trial.solve(rows)), SCENES, "called again")
+
+
+def solver_ignores_the_batch(trial: SolverTrial) -> Outcome:
+    """Demand the same bits of a detection alone, and among others in another order."""
+    backwards = range(SCENES)[::-1]
+    different = trial.differing(backwards, trial.solve(backwards))
+    alone = sum(trial.differing([row], trial.solve([row])) for row in range(SCENES))
+    return _same(max(different, alone), SCENES, "called alone, or in reverse order")
+
+
+def solver_survives_odd_detections(trial: SolverTrial) -> Outcome:
+    """Solve markers that are seen nearly from the side; what is raised is noted."""
+    result = run_cells(trial.steep, [np.arange(SCENES)])
+    lines = [failure.text.strip().splitlines()[-1] for failure in result.failures]
+    return (NOTE, "; ".join(dict.fromkeys(lines))) if lines else (OK, "tilts of 80 to 85 degrees")
+
+
+def _share(count: int, scenes: int, key: str, what: str, hint: str = "") -> Outcome:
+    text = f"{what} in {count} of {scenes} scenes"
+    if count < max(1, FEWEST_SHARE * scenes):
+        return FAULT, text + hint, {key: count}
+    return OK if count == scenes else NOTE, text, {key: count}
+
+
+def _same(different: int, scenes: int, how: str) -> Outcome:
+    if different:
+        return FAULT, f"{how}, it gives other results in {different} of {scenes} scenes"
+    return OK, f"the same bits, {how}"
+
+
+CHECKS: dict[str, tuple[Callable[[Any], Outcome], ...]] = {
+    "detector": (
+        detector_returns_markers, detector_finds_markers, detector_keeps_conventions,
+        detector_repeats_itself, detector_has_no_memory, detector_survives_odd_images,
+    ),
+    "estimator": (
+        solver_returns_poses, solver_solves_scenes, solver_keeps_frames, solver_repeats_itself,
+        solver_ignores_the_batch, solver_survives_odd_detections,
+    ),
+}
+"""Kind of plug-in -> its checks. A check returns a verdict, a line, and maybe numbers."""
+
+
+def _names(kind: str) -> list[str]:
+    return [check.__name__.partition("_")[2].replace("_", " ") for check in CHECKS[kind]]

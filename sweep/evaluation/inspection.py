@@ -9,25 +9,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import RunError
-from sweep.evaluation.board_search import board_scenes
-from sweep.evaluation.cells import run_cells
-from sweep.evaluation.estimation import assumed_cameras
+from sweep.evaluation.block import assumed_cameras, run_cells
 from sweep.evaluation.opencv_threads import single_threaded
-from sweep.evaluation.recorded_search import recorded_candidates, recording_of
-from sweep.evaluation.search import search_windows, visibility_flags, whole_frames
+from sweep.evaluation.search import (
+    board_scenes,
+    recorded_candidates,
+    recording_of,
+    search_windows,
+    visibility_flags,
+    whole_frames,
+)
 from sweep.measure.detectors import make_detector
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.model.columns import Column
+from sweep.model.camera import Column
 from sweep.model.extent import marker_boxes
 from sweep.model.pose import rotation_of_vector, transform_points
 from sweep.model.renderers import render
 from sweep.model.scene import Scenes, build_scenes
-from sweep.plan.boards import largest_board
-from sweep.plan.experiment import Pipeline
-from sweep.plan.grid import detector_settings, estimators, scene_values
-from sweep.plan.image_keys import image_keys
+from sweep.plan.experiment import largest_board, scene_plugins
+from sweep.plan.grid import detector_settings, estimators, image_keys, scene_values
 from sweep.plan.parameters import Stage
-from sweep.plan.scene_plugins import scene_plugins
+from sweep.plan.pipeline import Pipeline
 from sweep.plan.schema import variables_of
 from sweep.typing import Floats, Grey, Integers, Masks
 

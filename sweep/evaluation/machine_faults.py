@@ -1,8 +1,4 @@
-"""Exceptions that a scene's data cannot cause: faults of the machine, which are never results.
-
-Values that faulty hardware computes without an exception cannot be told from sound ones here;
-`sweep verify` finds those that its sample meets.
-"""
+"""Exceptions that a scene's data cannot cause: faults of the machine, which are never results."""
 
 from __future__ import annotations
 
@@ -15,6 +11,12 @@ from typing import Any
 
 from sweep.errors import MachineFaultError, SweepError
 from sweep.messages import plain
+
+# --------------------------------------------------------------------------------------------------
+# Exceptions that a scene's data cannot cause: faults of the machine, which are never results.
+#
+# Values that faulty hardware computes without an exception cannot be told from sound ones here;
+# `sweep verify` finds those that its sample meets.
 
 MACHINE_FAULTS: tuple[type[Exception], ...] = (
     OSError, MemoryError, ImportError, EOFError, pickle.PickleError,

@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block
 from sweep.plan.parameters import Stage
-from sweep.plan.schema import variables_of
-from sweep.plan.variable import Variable
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.schema import Variable, variables_of
 from sweep.typing import Floats
 
 

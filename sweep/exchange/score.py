@@ -1,8 +1,9 @@
-"""Scoring of others' answers: the experiment of an export with recorded detections as detector."""
+"""Scores of other programs' answers, and hints at wrong conventions."""
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -19,17 +20,91 @@ from sweep.errors import (
     StoreError,
     SweepError,
 )
-from sweep.exchange.answers import Answers, read_answers
-from sweep.exchange.conventions import Conventions
+from sweep.exchange.answers import CORNERS, Answers, Conventions, read_answers
 from sweep.exchange.export import EXPERIMENT, read_mark
-from sweep.exchange.files import write_errors, write_whole
-from sweep.exchange.hints import hints
-from sweep.exchange.image_set import image_batches
+from sweep.exchange.images import image_batch, image_batches, write_errors
 from sweep.messages import plain
-from sweep.plan.experiment import Pipeline
+from sweep.model.polygon import side_lengths
 from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
 from sweep.plugins.recording import REJECTED, SUFFIX, Recording
-from sweep.typing import Integers
+from sweep.store.files import write_whole
+from sweep.typing import Floats, Integers
+
+# --------------------------------------------------------------------------------------------------
+# What may be wrong with the conventions of answers, where the truth fits other ones better.
+
+SAMPLE = 500
+"""Markers that are compared with the truth."""
+
+MIN_MARKERS = 5
+
+
+def hints(
+    pipeline: Pipeline, answers: Answers, numbers: Integers, origins: Integers,
+    conventions: Conventions,
+) -> list[str]:
+    """Return a line for each convention that the truth contradicts in most of the markers.
+
+    Parameters
+    ----------
+    pipeline
+        The export's.
+    answers
+        In what are said to be our conventions.
+    numbers, origins
+        Number of the scene, and (…, 2) first pixel in the frame, of each image.
+    conventions
+        Those that were said.
+    """
+    chosen = np.unique(np.linspace(0, max(len(answers.image) - 1, 0), SAMPLE).astype(np.int64))
+    chosen = chosen[: len(answers.image)]
+    if not len(chosen):
+        return []
+    image = answers.image[chosen]
+    batch = image_batch(pipeline, numbers[image])
+    scenes = batch.scenes
+    right = answers.marker_id[chosen] == np.array(scenes.marker_id)
+    truth = scenes.corners_px - origins[image][:, None]
+    lines = []
+    known = right & np.isfinite(answers.corners[chosen]).all(axis=(1, 2))
+    if known.sum() >= MIN_MARKERS:
+        lines += _of_corners(answers.corners[chosen][known], truth[known], conventions)
+    return lines
+
+
+def _of_corners(corners: Floats, truth: Floats, conventions: Conventions) -> list[str]:
+    """Return the lines of corners (n, 4, 2) beside the truth."""
+    side = side_lengths(truth).mean(axis=1)
+    orders = list(itertools.permutations(range(4)))
+    distance = np.array([
+        np.median(np.linalg.norm(corners[:, order] - truth, axis=2).mean(axis=1) / side)
+        for order in orders
+    ])
+    best = int(np.argmin(distance))
+    lines = []
+    if orders[best] != (0, 1, 2, 3) and distance[best] < 0.2 < distance[0]:
+        # corner k of the truth is corner order[k] of the answers, which they call ...
+        theirs = [""] * 4
+        for k, j in enumerate(orders[best]):
+            theirs[conventions.corner_order.index(CORNERS[j])] = CORNERS[k]
+        lines.append(
+            f'the corners come in the order {" ".join(theirs)}: pass --corner-order '
+            f'"{" ".join(theirs)}"'
+        )
+        corners = corners[:, list(orders[best])]
+    offset = np.median((corners - truth).mean(axis=1), axis=0)
+    if (np.abs(np.abs(offset) - 0.5) < 0.1).all() and offset[0] * offset[1] > 0:
+        center = conventions.pixel_center + round(2 * float(offset[0])) / 2
+        lines.append(
+            f"the corners are offset by {offset[0]:.2f}, {offset[1]:.2f} px: if the program puts "
+            f"the centre of the first pixel at {center:g}, pass --pixel-center {center:g}"
+        )
+    return lines
+
+
+# --------------------------------------------------------------------------------------------------
+# Scoring of others' answers: the experiment of an export with recorded detections as detector.
 
 DOUBLED = ("refuse", "nearest")
 
@@ -95,7 +170,7 @@ def prepare(
     folder
         An export.
     files
-        CSV or JSON Lines files, one a program.
+        CSV files, one a program.
     names
         A name for each program (default: those of the files).
     conventions

@@ -1,4 +1,4 @@
-"""The task of a worker: compute one block, write it, and return its receipt."""
+"""One block as a task: computed and committed by a worker."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import dataclasses
 import socket
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,47 +15,111 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.compilation import processor
 from sweep.errors import MachineFaultError, StoreError, StoreReplacedError
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells, warm_up
 from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.results import CellsResult, to_dataset_layout
-from sweep.evaluation.warm_up import warm_up
 from sweep.execution.limits import TIME_LIMIT_S
-from sweep.execution.needed_scenes import own_cells, with_scenes
-from sweep.execution.reuse import ReusedCells, Source, match, read_cells
-from sweep.isolation.crash_isolation import WHOLE, run_cells_isolated
-from sweep.isolation.repetition import check_repeatable
+from sweep.execution.reuse import LOST, ReusedCells, Source, match, read_cells
+from sweep.isolation.crash_isolation import WHOLE, check_repeatable, run_cells_isolated
 from sweep.isolation.watchdog import ending_after
-from sweep.plan.background_files import file_digest
-from sweep.plan.experiment import Pipeline
-from sweep.plan.grid import Block, block_indices
+from sweep.measure.flags import DetectionStatus
+from sweep.plan.grid import Block, block_indices, scene_axes
 from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
 from sweep.plan.plugins import lacking_plugins
-from sweep.plan.stopping import StoppingRule
-from sweep.plan.variable import Variable
-from sweep.sampling.deciding import Decider, Decision
+from sweep.plan.reader import StoppingRule
+from sweep.plan.rules import file_digest
+from sweep.plan.schema import Variable
+from sweep.processor import processor
+from sweep.sampling.rules import Decider, Decision, by_scene
 from sweep.store.blocks import (
+    RunStore,
     begin_block,
     receipt_of,
     recommit_block,
+    region,
     withdraw_block,
     write_block,
+    write_unneeded,
 )
-from sweep.store.failures import MAX_ROWS, recorded
 from sweep.store.lifecycle import open_store
 from sweep.store.locations import exists
+from sweep.store.outcome import MAX_ROWS, recorded
 from sweep.store.provenance import changes, fingerprint
 from sweep.store.receipt import Receipt
-from sweep.store.run_store import RunStore
-from sweep.store.unneeded import write_unneeded
+from sweep.typing import Masks
+
+# --------------------------------------------------------------------------------------------------
+# Blocks of which not all scenes are needed: what is written of those that are not.
+
+Values = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class OwnCells:
+    """What a committed block holds.
+
+    Attributes
+    ----------
+    values
+        Variable -> values in the dataset's dimensions.
+    needed
+        (N,) scenes that were needed.
+    whole
+        (N,) those of them of which no cell failed or crashed.
+    """
+
+    values: Values
+    needed: Masks
+    whole: Masks
+
+
+def own_cells(store: RunStore, block: Block) -> OwnCells:
+    """Return what a committed block of a store holds."""
+    pipeline = store.pipeline
+    values = {
+        variable.name: np.asarray(store.array(variable.name)[region(variable, pipeline, block)])
+        for variable in store.variables
+    }
+    flags = {
+        variable.name: by_scene(variable, pipeline, block, values[variable.name])
+        for variable in store.variables if variable.name in LOST
+    }
+    needed = (flags["detection"] != DetectionStatus.not_needed).all(axis=1)
+    lost = np.zeros(len(block), dtype=bool)
+    for name, losses in LOST.items():
+        lost |= np.isin(flags[name], losses).any(axis=1)
+    return OwnCells(values, needed, needed & ~lost)
+
+
+def with_scenes(
+    variables: Sequence[Variable], pipeline: Pipeline, block: Block, scenes: Masks,
+    values: Mapping[str, NDArray[Any]], others: Mapping[str, NDArray[Any]] | None = None,
+) -> Values:
+    """Return values of a block with the ``scenes`` (N,) taken from others.
+
+    Without others, they are not needed: their flags say so, and their numbers are NaN.
+    """
+    taken: Values = {}
+    for variable in variables:
+        names = variable.dimensions(pipeline)
+        along = dict(zip((axis.name for axis in scene_axes(pipeline)), block.shape, strict=True))
+        mask = scenes.reshape([along.get(name, 1) for name in names])
+        other = variable.not_needed if others is None else others[variable.name]
+        taken[variable.name] = np.where(mask, other, values[variable.name]).astype(variable.dtype)
+    return taken
+
+
+# --------------------------------------------------------------------------------------------------
+# The task of a worker: compute one block, write it, and return its receipt.
 
 FAILURE_QUOTA: Mapping[str, int] = {"failed": MAX_ROWS, "crashed": MAX_ROWS}
 """Rows of failures that a receipt may hold of each kind."""
 
 
 @lru_cache(maxsize=4)
-def _opened(url: str, run_id: str, durable: bool = False) -> RunStore:
+def _opened(url: str, run_id: str) -> RunStore:
     """Open a store once in each process; check that this process computes the same numbers.
 
     The compiled code that its blocks need is loaded, by computing a scene of known pose.
@@ -73,7 +138,7 @@ def _opened(url: str, run_id: str, durable: bool = False) -> RunStore:
             f"{url}: not found on {socket.gethostname()} by a worker; every machine needs the "
             "store under this path, or choose an s3:// URL"
         )
-    store = open_store(url, "r+", durable=durable)
+    store = open_store(url, "r+")
     if store.run_id != run_id:
         raise StoreReplacedError(f"{url}: replaced by another run while this one was going on")
     for key, value, own_value in changes(store.fingerprint, fingerprint(store.pipeline)):
@@ -102,9 +167,9 @@ def _source(url: str, run_id: str, old: str) -> Source:
 
 
 @lru_cache(maxsize=2)
-def _decider(url: str, run_id: str, durable: bool, rule: StoppingRule) -> Decider:
+def _decider(url: str, run_id: str, rule: StoppingRule) -> Decider:
     """Make the rule by which sampling of a store stops once in each process."""
-    return Decider.of(_opened(url, run_id, durable), rule)
+    return Decider.of(_opened(url, run_id), rule)
 
 
 def compute_blocks(
@@ -115,33 +180,32 @@ def compute_blocks(
     reuse: Sequence[str] = (),
     time_limit_s: float = TIME_LIMIT_S,
     quota: Mapping[str, int] = FAILURE_QUOTA,
-    durable: bool = False,
 ) -> list[Receipt]:
     """Compute blocks as :func:`compute_block` does; return their receipts.
 
     Those of which nothing is needed are written together, and then the others one after another.
     """
-    settled = {} if decision is None else _settled(url, run_id, blocks, decision, durable)
+    settled = {} if decision is None else _settled(url, run_id, blocks, decision)
     return [
         settled.get(block)
-        or compute_block(url, run_id, block, reuse, time_limit_s, quota, durable, decision)
+        or compute_block(url, run_id, block, reuse, time_limit_s, quota, decision)
         for block in blocks
     ]
 
 
 def _settled(
-    url: str, run_id: str, blocks: Sequence[Block], decision: Decision, durable: bool
+    url: str, run_id: str, blocks: Sequence[Block], decision: Decision
 ) -> dict[Block, Receipt]:
     """Commit those blocks of which nothing is needed, unless they were committed before."""
     with _local_faults(url):
-        store = _opened(url, run_id, durable)
-        decider = _decider(url, run_id, durable, decision.rule)
+        store = _opened(url, run_id)
+        decider = _decider(url, run_id, decision.rule)
         unneeded = [
             block for block in blocks
             if not decider.needed(block, decision).any() and receipt_of(store, block) is None
         ]
         return dict(zip(
-            unneeded, write_unneeded(store, unneeded, decision.basis, processor()), strict=True))
+            unneeded, write_unneeded(store, unneeded, decision.basis), strict=True))
 
 
 @contextlib.contextmanager
@@ -163,7 +227,6 @@ def compute_block(
     reuse: Sequence[str] = (),
     time_limit_s: float = TIME_LIMIT_S,
     quota: Mapping[str, int] = FAILURE_QUOTA,
-    durable: bool = False,
     decision: Decision | None = None,
 ) -> Receipt:
     """Compute, write and commit one block; return its receipt, also if it is run twice.
@@ -183,8 +246,6 @@ def compute_block(
         Block timeout in seconds.
     quota
         Rows of failures that the receipt may hold of each kind.
-    durable
-        Flush the block to the disk before it counts as committed.
     decision
         What the needed scenes follow from; all scenes are needed without one. A block that is
         committed on another basis is computed again, its computed scenes taken from itself.
@@ -198,13 +259,13 @@ def compute_block(
         block is committed. Another machine may be able to.
     """
     with _local_faults(url):
-        store = _opened(url, run_id, durable)
+        store = _opened(url, run_id)
         needed, before = np.ones(len(block), dtype=bool), None
         if decision is not None:
             before = receipt_of(store, block)
             if before is not None and before.basis == decision.basis:
                 return before
-            needed = _decider(url, run_id, durable, decision.rule).needed(block, decision)
+            needed = _decider(url, run_id, decision.rule).needed(block, decision)
         begun_before = begin_block(store, block)
         try:
             return _compute_begun(
@@ -267,7 +328,7 @@ def _compute_begun(
     seconds = _NO_SECONDS if cells is None else cells.seconds
     receipt = Receipt(
         run_id=store.run_id,
-        processor=processor(),
+        processors=_processors(cells, before, reused),
         scenes=len(block),
         computed={
             "scenes": len(rows),
@@ -283,6 +344,18 @@ def _compute_begun(
         basis=basis,
     )
     return write_block(store, block, values, receipt)
+
+
+def _processors(
+    cells: CellsResult | None, before: Receipt | None, reused: ReusedCells | None
+) -> tuple[str, ...]:
+    """Return the features of the processors that computed a block's cells, here or before."""
+    found = set() if cells is None else {processor()}
+    if before is not None:
+        found.update(before.processors)
+    if reused is not None:
+        found.update(reused.processors)
+    return tuple(sorted(found))
 
 
 def _compute(

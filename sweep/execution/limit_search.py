@@ -9,19 +9,22 @@ from typing import Any
 
 import xarray as xr
 
-from sweep.analysis.required_pipeline import check_required
-from sweep.analysis.searched_limits import requirement_limits
+from sweep.analysis.limits import requirement_limits
+from sweep.analysis.requirements import check_required
 from sweep.errors import ArgumentError, StoreError
 from sweep.execution.runner import execute
-from sweep.execution.summary import Summary
+from sweep.execution.status import Summary
 from sweep.model.image_file import read_regular
-from sweep.plan.experiment import Pipeline
-from sweep.plan.limit_rule import SECTION, LimitRule, limit_settings
-from sweep.plan.required import texts_in
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.sampling import LIMIT, LimitRule, limit_settings, texts_in
 from sweep.plan.toml_text import MAX_BYTES, read_document
-from sweep.store.lifecycle import open_dataset, open_store
-from sweep.store.stored_pipeline import names_store, read_pipeline
-from sweep.store.unfinished import unfinished_line
+from sweep.store.lifecycle import (
+    names_store,
+    open_dataset,
+    open_store,
+    read_pipeline,
+    unfinished_line,
+)
 
 MAX_TRIALS = 2400
 """The most trials of a cell where nothing says how many."""
@@ -88,7 +91,7 @@ def _with_search(
     if document is None and not isinstance(source, Pipeline):
         return read_pipeline(source, settings)  # it says why
     document = document or {}
-    own = document.get(SECTION, {})
+    own = document.get(LIMIT, {})
     given = {*(own if isinstance(own, dict) else ()), *(
         each.partition("=")[0].partition(".")[2] for each in chosen)}
     more = [] if "max_trials" in given else limit_settings(max_trials=MAX_TRIALS)

@@ -2,12 +2,12 @@
 
 Limits of other packages stay with what they limit: the shares of a block's time that the search
 for a crashing scene may use in :mod:`sweep.isolation.crash_isolation`, the failures that a store
-keeps in :mod:`sweep.store.failures`. This module imports nothing.
+keeps in :mod:`sweep.store.outcome`. This module imports nothing.
 """
 
 from __future__ import annotations
 
-# Blocks in flight (`sweep.execution.in_flight`)
+# Blocks in flight (`sweep.execution.engines`)
 
 BLOCKS_PER_THREAD = 3
 """Blocks in flight per worker thread: enough that none waits, few enough that none pile up."""
@@ -30,7 +30,7 @@ MAX_WORKER_DEATHS = 3
 MAX_FAILED_BLOCKS = 10
 """Failed blocks after which no more are submitted."""
 
-# Small runs (`sweep.execution.small_run`)
+# Small runs (`sweep.execution.engines`)
 
 SMALL_RUN_S = 3.0
 """Work up to which a run needs no cluster, which takes about as long to start and to end."""

@@ -1,44 +1,163 @@
-"""Finished cells of other stores, copied into a new one: grids grow, halves are joined.
-
-A cell is reusable if the fingerprint and all its parameter values agree, and nothing of it failed
-or crashed. Which cells an old store has finished follows from its receipts and flags; the old store
-is only read.
-"""
+"""Cells of other stores that a run can take over."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import StoreError
-from sweep.evaluation.variables import GEOMETRY
-from sweep.execution.grid_match import (
-    MISSING,
-    Group,
-    cells_in,
-    fixed_value,
-    groups,
-    rows_in,
-)
+from sweep.evaluation.block import GEOMETRY
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.scene import build_scenes
-from sweep.plan.axes import TRIAL
-from sweep.plan.experiment import Pipeline
+from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.grid import Block, scene_axes, scene_values
 from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
 from sweep.plan.same_meaning import alike
-from sweep.plan.schema import VARIABLES, variables_of
-from sweep.plan.variable import Variable
-from sweep.store.blocks import committed
+from sweep.plan.schema import VARIABLES, Variable, variables_of
+from sweep.store.blocks import RunStore, check_whole, receipts
 from sweep.store.provenance import changes, fingerprint
-from sweep.store.run_store import RunStore
+
+# --------------------------------------------------------------------------------------------------
+# Where the cells of a new grid lie in an old one: cells agree where all parameter values do.
+#
+# Whether a parameter is fixed, an axis of its own, or goes together with others does not matter.
+# Axes of both grids that share parameters are matched together, along the rows of one axis where
+# each grid has one, and cell by cell where one grid has several.
+
+MISSING = -1
+"""In place of the index of a value that the old grid does not have."""
+
+
+@dataclass(slots=True)
+class Group:
+    """Axes of two grids that share parameters.
+
+    Attributes
+    ----------
+    new, old
+        The axes of either grid.
+    """
+
+    new: list[Axis] = field(default_factory=list)
+    old: list[Axis] = field(default_factory=list)
+
+    @property
+    def parameters(self) -> set[str]:
+        """The parameters of its axes."""
+        return {name for axis in (*self.new, *self.old) for name in axis.columns}
+
+    @property
+    def names(self) -> str:
+        """Its axes in words."""
+        return ", ".join(dict.fromkeys(axis.name for axis in (*self.new, *self.old)))
+
+
+def groups(new: Pipeline, old: Pipeline) -> list[Group]:
+    """Return the axes of two grids, those together that share parameters."""
+    found: list[Group] = []
+    for axis, is_new in [*((a, True) for a in new.axes), *((a, False) for a in old.axes)]:
+        merged = Group([axis] if is_new else [], [] if is_new else [axis])
+        for group in [group for group in found if group.parameters & axis.columns.keys()]:
+            found.remove(group)
+            merged = Group(group.new + merged.new, group.old + merged.old)
+        found.append(merged)
+    return found
+
+
+def fixed_value(pipeline: Pipeline, name: str) -> Any:
+    """Return a fixed parameter's value; of ``trial`` the first."""
+    return 0 if name == TRIAL else pipeline.fixed.get(name)
+
+
+def rows_in(group: Group, new: Pipeline, old: Pipeline) -> NDArray[np.int64]:
+    """Return the index in the old grid of each value along the new axis, or ``MISSING``.
+
+    The group has one new axis at most, and one old one at most. Without a new axis there is one
+    value, the fixed one; without an old axis the index is 0 where the values agree.
+    """
+    names = sorted(group.parameters)
+    ours, theirs = (
+        [_column(axes, pipeline, name) for name in names]
+        for axes, pipeline in ((group.new, new), (group.old, old))
+    )
+    if len(names) == 1:
+        return indices_in(ours[0], theirs[0])
+    return indices_in(_rows(group.new, ours), _rows(group.old, theirs))
+
+
+def _column(axes: Sequence[Axis], pipeline: Pipeline, name: str) -> Sequence[Any]:
+    """Return a parameter's values along the one axis that there may be; else its fixed one."""
+    columns = axes[0].columns if axes else {}
+    return columns.get(name, (fixed_value(pipeline, name),))
+
+
+def _rows(axes: Sequence[Axis], columns: Sequence[Sequence[Any]]) -> list[tuple[Any, ...]]:
+    """Return the combinations of values along the one axis that there may be."""
+    count = len(axes[0]) if axes else 1
+    return list(zip(*(
+        column if len(column) == count else itertools.repeat(column[0], count)
+        for column in columns
+    ), strict=True))
+
+
+def indices_in(new: Sequence[Any], old: Sequence[Any]) -> NDArray[np.int64]:
+    """Return the index in ``old`` of each value of ``new``, or ``MISSING``."""
+    if isinstance(new, range) and isinstance(old, range):
+        low, step = old.start, old.step
+        values = np.arange(new.start, new.stop, new.step, dtype=np.int64)
+        index, remainder = np.divmod(values - low, step)
+        exists = (remainder == 0) & (index >= 0) & (index < len(old))
+        return np.where(exists, index, MISSING)
+    if isinstance(old, range):
+        indices = [old.index(value) if value in old else MISSING for value in new]
+        return np.array(indices, dtype=np.int64)
+    index_of = {value: i for i, value in enumerate(old)}
+    return np.array([index_of.get(value, MISSING) for value in new], dtype=np.int64)
+
+
+def cells_in(
+    group: Group, new: Pipeline, old: Pipeline, along: Sequence[Sequence[int]]
+) -> Iterator[tuple[dict[str, int], dict[str, int]]]:
+    """Yield the cells of a group that both grids have: index along each new and each old axis.
+
+    ``along`` has the indices along each new axis that are looked for.
+    """
+    owner = {name: axis for axis in group.old for name in axis.columns}
+    tables: dict[str, Mapping[tuple[Any, ...], int]] = {
+        axis.name: {row: k for k, row in enumerate(zip(*axis.columns.values(), strict=True))}
+        for axis in group.old
+    }
+    names = sorted(group.parameters)
+    for chosen in itertools.product(*along):
+        values = {name: fixed_value(new, name) for name in names}
+        for axis, index in zip(group.new, chosen, strict=True):
+            values |= axis.at(index)
+        if any(values[name] != fixed_value(old, name) for name in names if name not in owner):
+            continue
+        at = {
+            axis.name: tables[axis.name].get(
+                tuple(values[name] for name in axis.columns), MISSING
+            )
+            for axis in group.old
+        }
+        if MISSING not in at.values():
+            yield {a.name: i for a, i in zip(group.new, chosen, strict=True)}, at
+
+
+# --------------------------------------------------------------------------------------------------
+# Finished cells of other stores, copied into a new one: grids grow, halves are joined.
+#
+# A cell is reusable if the fingerprint and all its parameter values agree, and nothing of it
+# failed or crashed. Which cells an old store has finished follows from its receipts and flags;
+# the old store is only read.
 
 LOST = {
     "detection": (DetectionStatus.failed, DetectionStatus.crashed),
@@ -85,8 +204,8 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
     Raises
     ------
     StoreError
-        If no cell is reusable: another fingerprint, parameters that never agree, or variables that
-        the old store's format does not have.
+        If no cell is reusable: another fingerprint, or parameters that never agree; or if chunks
+        of committed blocks are missing.
     """
     old = store.pipeline
     mine, theirs = fingerprint(pipeline), store.fingerprint
@@ -101,8 +220,7 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
     ]
     present = {variable.name for variable in store.variables}
     faults += [
-        f"{variable.name}: not a variable of the store's format {store.format}"
-        for variable in variables_of(pipeline)
+        f"{variable.name}: not a variable of the store" for variable in variables_of(pipeline)
         if variable.name not in present and not _follows(variable)
     ]
     pipeline, old = alike(pipeline, old)
@@ -114,7 +232,7 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
             and pipeline.fixed[name] != old.fixed[name]
         ):
             faults.append(_difference(pipeline, old, name))
-    source = Source(store, {}, {}, {}, [], frozenset(committed(store)))
+    source = Source(store, {}, {}, {}, [], frozenset(check_whole(store)))
     for group in groups(pipeline, old):
         if group.parameters & (pipeline.distributions.keys() | old.distributions.keys()):
             continue  # a fault that is noted already
@@ -174,10 +292,13 @@ class ReusedCells:
         Variable -> values in the dataset's dimensions; fill values in cells that are missing.
     available
         (N, detector settings, estimators): the cells that need not be computed.
+    processors
+        Features of the processors that computed the blocks which cells come from.
     """
 
     values: dict[str, NDArray[Any]]
     available: NDArray[np.bool_]
+    processors: set[str]
 
 
 def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> ReusedCells:
@@ -201,11 +322,14 @@ def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> R
         for v in variables_of(pipeline)
     }
     available = np.zeros([shape[name] for name in order], dtype=bool)
+    processors: set[str] = set()
     for source in sources:
         for untangled in _untangled(source, pipeline, cuts):
-            _read_from(untangled, pipeline, cuts, order, values, available)
+            read = _read_from(untangled, pipeline, cuts, order, values, available)
+            for _, receipt in receipts(source.store, read):
+                processors.update(receipt.processors)
     searches = pipeline.size(Stage.detection)
-    return ReusedCells(values, available.reshape(len(block), searches, -1))
+    return ReusedCells(values, available.reshape(len(block), searches, -1), processors)
 
 
 def _untangled(source: Source, pipeline: Pipeline, cuts: dict[str, slice]) -> Iterator[Source]:
@@ -236,8 +360,11 @@ def _read_from(
     order: list[str],
     values: dict[str, NDArray[Any]],
     available: NDArray[np.bool_],
-) -> None:
-    """Add an old store's cells to ``values`` and ``available``, of which ``order`` is the axes."""
+) -> set[int]:
+    """Add an old store's cells to ``values`` and ``available``, of which ``order`` is the axes.
+
+    Returns the numbers of the old blocks that they come from.
+    """
     positions: dict[str, NDArray[np.int64]] = {}
     indices: dict[str, NDArray[np.int64]] = {}
     for name in order:
@@ -245,10 +372,10 @@ def _read_from(
         positions[name] = np.flatnonzero(index != MISSING)
         indices[name] = index[positions[name]]
         if len(positions[name]) == 0:
-            return
-    ready = _committed_cells(source, order, positions, indices)
+            return set()
+    ready, numbers = _committed_cells(source, order, positions, indices)
     if not ready.any():
-        return
+        return set()
     variables = variables_of(pipeline)
     present = {variable.name for variable in source.store.variables}
     old = {
@@ -266,7 +393,7 @@ def _read_from(
         fresh &= ~np.isin(_along(order, pipeline, name, old), flags)
     fresh &= ~available[np.ix_(*(positions[name] for name in order))]
     if not fresh.any():
-        return
+        return set()
     available[np.ix_(*(positions[name] for name in order))] |= fresh
     for variable in variables:
         names = [name for name in variable.dimensions(pipeline) if name in positions]
@@ -280,6 +407,7 @@ def _read_from(
         part = target[grid]
         part[chosen] = old[variable.name][chosen]
         target[grid] = part
+    return numbers
 
 
 def _along(
@@ -301,7 +429,7 @@ def _computed(
     pipeline: Pipeline, variables: Sequence[Variable], cuts: dict[str, slice],
     positions: dict[str, NDArray[np.int64]], computed: NDArray[np.bool_],
 ) -> dict[str, NDArray[np.float64]]:
-    """Return variables that the old store's format lacks, NaN where no truth was stored."""
+    """Return variables that the old store lacks, NaN where no truth was stored."""
     if not variables:
         return {}
     along = [
@@ -327,8 +455,11 @@ def _committed_cells(
     order: list[str],
     positions: dict[str, NDArray[np.int64]],
     indices: dict[str, NDArray[np.int64]],
-) -> NDArray[np.bool_]:
-    """Return for each candidate cell (axes ``order``) whether its old block is committed."""
+) -> tuple[NDArray[np.bool_], set[int]]:
+    """Return for each candidate cell (axes ``order``) whether its old block is committed.
+
+    Also returns the numbers of these blocks.
+    """
     store = source.store
     blocks = store.blocks
     along: list[NDArray[np.int64]] = []
@@ -340,14 +471,17 @@ def _committed_cells(
         else:
             names.append(source.renamed[axis.name])
             along.append(indices[names[-1]])
-    numbers = [
+    counts = [
         index // extent for index, extent in zip(along, blocks.extents, strict=True)
     ]
     ready = np.zeros([len(index) for index in along], dtype=bool)
-    for chosen in itertools.product(*(np.unique(number) for number in numbers)):
+    numbers = set()
+    for chosen in itertools.product(*(np.unique(count) for count in counts)):
         starts = tuple(int(c) * e for c, e in zip(chosen, blocks.extents, strict=True))
-        if blocks.number(Block(starts, starts)) in source.done:
-            ready[np.ix_(*(n == c for n, c in zip(numbers, chosen, strict=True)))] = True
+        number = blocks.number(Block(starts, starts))
+        if number in source.done:
+            numbers.add(number)
+            ready[np.ix_(*(n == c for n, c in zip(counts, chosen, strict=True)))] = True
     # Pinned dimensions are dropped; new ones that are fixed in the old store get length 1.
     for k in reversed(range(len(names))):
         if names[k] == PINNED:
@@ -357,7 +491,8 @@ def _committed_cells(
     for k, name in enumerate(order):
         if name not in names:
             full = np.expand_dims(full, k)
-    return np.array(np.broadcast_to(full, [len(positions[name]) for name in order]))
+    cells = np.broadcast_to(full, [len(positions[name]) for name in order])
+    return np.array(cells), numbers
 
 
 def _read(

@@ -1,16 +1,20 @@
-"""A run from a pipeline to a finished store: what is prepared, computed and finished, in order."""
+"""A run from its plan to its finished store: prepared, computed, closed."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib
 import math
 import os
 import time
+import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import tomlkit
 
 from sweep.errors import (
     ArgumentError,
@@ -26,7 +30,8 @@ from sweep.execution.calibration import (
     block_time_limit_s,
     calibrate_isolated,
 )
-from sweep.execution.finalize import close
+from sweep.execution.engines import BlocksInChild
+from sweep.execution.forecast import block_s_of, check_new, check_rest, thread_count_of, work_s
 from sweep.execution.limits import (
     CALIBRATION_S,
     CALIBRATION_SHARE,
@@ -34,34 +39,85 @@ from sweep.execution.limits import (
     SMALL_RUN_S,
     TIME_LIMIT_S,
 )
-from sweep.execution.progress import ProgressReport
-from sweep.execution.retry import Retry, drop_failed, failed_blocks
+from sweep.execution.progress import AnyOrder, InWaves, ProgressReport, Tally, Waiting
 from sweep.execution.reuse import is_reusable, match
-from sweep.execution.small_run import BlocksInChild
-from sweep.execution.summary import Summary, summary_of, summary_of_complete
-from sweep.execution.tally import Tally
-from sweep.execution.tightening import tighten
-from sweep.execution.waiting import AnyOrder, InWaves, Waiting
-from sweep.execution.work_left import block_s_of, check_new, check_rest, thread_count_of, work_s
-from sweep.isolation.child_process import Child
-from sweep.isolation.interrupts import Interrupts
-from sweep.isolation.plugin_check import check_plugins
+from sweep.execution.status import (
+    Retry,
+    Summary,
+    close,
+    drop_failed,
+    failed_blocks,
+    summary_of,
+    summary_of_complete,
+)
+from sweep.isolation.child_process import Child, Interrupts
+from sweep.isolation.crash_isolation import check_plugins
 from sweep.messages import notice
-from sweep.plan.experiment import Pipeline
-from sweep.plan.notes import notes
+from sweep.plan.facts import notes
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.sampling import MAX_TRIALS
 from sweep.sampling.rules import make_rule
-from sweep.store.blocks import committed, drop_block
-from sweep.store.lifecycle import create_store, open_store, read_run_metadata, remove_store
+from sweep.store.blocks import RunStore, committed, drop_block, missing_chunks
+from sweep.store.lifecycle import create_store, open_store, read_run_metadata, remove_store, reopen
 from sweep.store.locations import check_writable, checked_url, exists, is_remote, open_storage
 from sweep.store.lock import locked, refuse_if_held
 from sweep.store.provenance import differences
-from sweep.store.run_store import RunStore
-from sweep.store.snapshot import missing_chunks
 
 if TYPE_CHECKING:
     from distributed import Client
 
     from sweep.execution.cluster import Cluster
+
+
+# --------------------------------------------------------------------------------------------------
+# A store in waves that is continued by a stricter rule: what was computed stays.
+
+def tighten(store: RunStore, pipeline: Pipeline) -> RunStore:
+    """Give a store the rule of a pipeline of the same cells, and return the store as it is then.
+
+    Blocks that were committed under the former rule are decided again when the store is continued,
+    each from what it has.
+
+    Raises
+    ------
+    StoreError
+        If another process writes the store, or it cannot be written.
+    """
+    text = tightened_text(store.pipeline, pipeline)
+    with locked(store):
+        reopen(store, dataclasses.replace(store.pipeline, text=text))
+    return open_store(store.url, "r+")
+
+
+def tightened_text(begun: Pipeline, ours: Pipeline) -> str:
+    r"""Return a pipeline's text with the section by which sampling stops from another pipeline.
+
+    >>> begun, ours = (Pipeline.from_text(
+    ...     "[pose]\nside_px = 20\njitter_px = 1\n[precision]\n"
+    ...     f"max_trials = 90\ndetection_rate = {width}") for width in (0.1, 0.05))
+    >>> print(tightened_text(begun, ours), end="")
+    [pose]
+    side_px = 20
+    jitter_px = 1
+    [precision]
+    detection_rate = 0.05
+    max_trials = 90
+    """
+    if ours.stopping is None:
+        raise TypeError(ours.stopping)
+    section = ours.stopping.section
+    wanted = dict(tomllib.loads(ours.text)[section]) | {MAX_TRIALS: ours.stopping.max_trials}
+    document = tomlkit.parse(begun.text)
+    table = document[section]
+    for key in list(table):  # in its place, whatever it looks like
+        del table[key]
+    for key in sorted(wanted):
+        table[key] = wanted[key]
+    return tomlkit.dumps(document)
+
+
+# --------------------------------------------------------------------------------------------------
+# A run from a pipeline to a finished store: what is prepared, computed and finished, in order.
 
 # `sweep.execution.cluster` and `in_flight` are imported where they are used: Dask is slow to
 # import, and finished stores and small runs need none of it.
@@ -82,7 +138,6 @@ def execute(
     reuse: Sequence[str | os.PathLike[str]] = (),
     overwrite: bool = False,
     retry_failed: bool = False,
-    durable: bool = False,
     yes: bool = False,
     block_s: float | None = None,
     time_limit_s: float | None = None,
@@ -112,8 +167,6 @@ def execute(
         Delete an existing store.
     retry_failed
         Compute the blocks again in which cells failed or crashed, also of a finished store.
-    durable
-        Flush each block to the disk before it counts as committed.
     yes
         Run also what would take more than a day, or more than is free on the disk.
     block_s
@@ -150,8 +203,6 @@ def execute(
         return summary_of_complete(unfinished, started)
     for line in notes(pipeline):
         notice(line)
-    if durable and is_remote(url):
-        notice(f"{url}: nothing to flush: an object store answers once it keeps what was written")
     sources = _matching_sources(url, pipeline, reuse)
     done = set() if unfinished is None else committed(unfinished) - again
     if unfinished is None:
@@ -190,7 +241,7 @@ def execute(
                 raise AssertionError(url)
             unfinished = _new_store(
                 url, pipeline, calibration, connection, block_s, time_limit_s, overwrite,
-                durable=durable, yes=yes or bool(sources), child=child,
+                yes=yes or bool(sources), child=child,
             )
         elif not (yes or sources):
             check_rest(unfinished, done, calibration, connection, child)
@@ -199,8 +250,6 @@ def execute(
             unfinished = tighten(unfinished, pipeline)
         if again:  # once nothing refuses the run
             unfinished, retry = drop_failed(unfinished)
-        if durable:
-            unfinished = open_store(url, "r+", durable=True)
         limit_s = block_time_limit_s(time_limit_s, block_s_of(unfinished, done, calibration))
         with _continuable_errors(without=" without overwrite" if overwrite else ""):
             computed = _compute_and_close(
@@ -289,7 +338,7 @@ def _matching_sources(
 
 def _new_store(
     url: str, pipeline: Pipeline, calibration: Calibration, client: Client | None,
-    block_s: float | None, time_limit_s: float | None, overwrite: bool, *, durable: bool = False,
+    block_s: float | None, time_limit_s: float | None, overwrite: bool, *,
     yes: bool = False, child: Child | None = None,
 ) -> RunStore:
     """Create an empty store whose blocks suit the calibration and the cluster, if there is one."""
@@ -299,7 +348,7 @@ def _new_store(
         check_new(url, pipeline, calibration, threads, extents, child)
     if overwrite and exists(url):
         remove_store(url)
-    return create_store(url, pipeline, extents, durable=durable)
+    return create_store(url, pipeline, extents)
 
 
 # In the child, or on the cluster
@@ -368,7 +417,7 @@ def _compute(
             from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
 
             client = stack.enter_context(connected(store.pipeline))
-        from sweep.execution.in_flight import BlocksInFlight  # noqa: PLC0415  (slow to import)
+        from sweep.execution.engines import BlocksInFlight  # noqa: PLC0415  (slow to import)
 
         BlocksInFlight(
             store, client, url, sources, time_limit_s, interrupts=interrupts

@@ -1,22 +1,359 @@
-"""The status of a store: progress, counts of flags, rate, time left; also while it is written."""
+"""The state of a store's run, its end, its retry, and the summary of a finished one."""
 
 from __future__ import annotations
 
+import math
+import time
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
-from sweep.execution.settled import condition_count
-from sweep.execution.waiting import InWaves
-from sweep.measure.flags import DetectionStatus, EstimateStatus
+import numpy as np
+
+from sweep.evaluation.block import bound_notes
+from sweep.execution.progress import InWaves, condition_count, sampled_conditions
+from sweep.measure.flags import DetectionStatus, EstimateStatus, looked_for
+from sweep.plan.axes import Axis
 from sweep.plan.parameters import Stage
+from sweep.plan.sampling import PrecisionRule
+from sweep.processor import differing_processors
 from sweep.sampling.rules import make_rule
-from sweep.store.blocks import committed, receipts
-from sweep.store.failures import MAX_ROWS, FailedCell, failed_cells
-from sweep.store.lifecycle import open_store
-from sweep.store.lock import holder
-from sweep.store.outcome import FailureGroup, first_cell, outcome_of
-from sweep.store.run_store import RunStore
+from sweep.store.blocks import (
+    RunStore,
+    check_not_replaced,
+    check_whole,
+    committed,
+    drop_block,
+    receipts,
+)
+from sweep.store.lifecycle import finish, open_store, reopen
+from sweep.store.lock import holder, locked
+from sweep.store.outcome import (
+    MAX_ROWS,
+    FailedCell,
+    FailureGroup,
+    failed_cells,
+    failure_table,
+    first_cell,
+    outcome_of,
+    outcome_of_finished,
+)
+from sweep.store.receipt import Receipt
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+# --------------------------------------------------------------------------------------------------
+# Closing a complete store: tables of costs and failures, and counts of flags.
+
+def close(store: RunStore) -> None:
+    """Close a store of which every block is committed.
+
+    Its receipts are summed up in the groups ``cost`` and ``failures``, which may be empty; then it
+    is marked finished.
+
+    Raises
+    ------
+    StoreError
+        If a receipt is damaged, a chunk is missing, or the store cannot be written.
+    """
+    check_not_replaced(store)
+    done = check_whole(store, finished=True)
+    blocks: list[tuple[int, Mapping[str, Sequence[float]]]] = []
+    cells: list[FailedCell] = []
+    kept: Counter[str] = Counter()
+    counts = {"detection": [0] * len(DetectionStatus), "estimate": [0] * len(EstimateStatus)}
+    needed: dict[int, int] = {}
+    processors: Counter[str] = Counter()
+    for number, receipt in receipts(store, done):
+        needed[number] = receipt.scenes_needed
+        processors.update(receipt.processors)
+        if receipt.seconds["scene"]:
+            blocks.append((number, receipt.seconds))
+        for name, flags in (("detection", receipt.detection), ("estimate", receipt.estimate)):
+            for flag, count in enumerate(flags):
+                counts[name][flag] += count
+        for cell in failed_cells(store, number, receipt):
+            kept[cell.kind] += 1
+            if kept[cell.kind] <= MAX_ROWS:
+                cells.append(cell)
+    failures = failure_table(cells, lost(counts["detection"], counts["estimate"]))
+    sampled = sampled_conditions(store, needed)
+    recorded: dict[str, Any] = {**counts, "processors": dict(processors)}
+    if sampled is not None:
+        recorded["sampled"] = sampled.to_json()
+    finish(store, {"cost": _cost(store, blocks), "failures": failures}, recorded)
+
+
+def lost(detection: list[int], estimate: list[int]) -> dict[str, int]:
+    """Return how many cells failed and crashed, from counts by flag.
+
+    Parameters
+    ----------
+    detection, estimate
+        Counts of cells; the flag is the index.
+    """
+    def count(flags: list[int], flag: int) -> int:
+        return flags[flag] if len(flags) > flag else 0
+
+    return {
+        kind: count(detection, DetectionStatus[kind]) + count(estimate, EstimateStatus[kind])
+        for kind in ("crashed", "failed")
+    }
+
+
+def _cost(
+    store: RunStore, blocks: Sequence[tuple[int, Mapping[str, Sequence[float]]]]
+) -> xr.Dataset:
+    """Return the cost group: seconds of each block per stage and configuration."""
+    import xarray as xr  # noqa: PLC0415  (slow to import, and often not needed)
+
+    pipeline = store.pipeline
+    settings = list(pipeline.axes_of(Stage.detection))
+    both = [*settings, *pipeline.axes_of(Stage.estimation)]
+
+    def shaped(values: list[Any], axes: list[Axis]) -> Any:
+        return np.asarray(values, dtype=np.float64).reshape(
+            (len(blocks), *(len(axis) for axis in axes))
+        )
+
+    return xr.Dataset(
+        {
+            "scene_s": (("block",), shaped([s["scene"][0] for _, s in blocks], [])),
+            "detection_s": (
+                ("block", *(axis.name for axis in settings)),
+                shaped([s["detection"] for _, s in blocks], settings),
+            ),
+            "estimation_s": (
+                ("block", *(axis.name for axis in both)),
+                shaped([s["estimation"] for _, s in blocks], both),
+            ),
+        },
+        coords={
+            "block": [number for number, _ in blocks],
+            **{axis.name: axis.coordinates().astype(object)
+               if axis.coordinates().dtype.kind == "T" else axis.coordinates() for axis in both},
+        },
+        attrs={"long_name": "seconds per stage and treatment for each block"},
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Failed cells, tried again: the blocks that hold them are computed as if they never had been.
+
+@dataclass(frozen=True, slots=True)
+class Retry:
+    """Blocks that are computed again.
+
+    Attributes
+    ----------
+    blocks
+        Their numbers.
+    cells
+        How many of their cells had failed or crashed.
+    """
+
+    blocks: tuple[int, ...] = ()
+    cells: int = 0
+
+    def recovered(self, store: RunStore) -> int:
+        """Return how many of the cells neither failed nor crashed again."""
+        return self.cells - sum(_lost(receipt) for _, receipt in receipts(store, self.blocks))
+
+
+def failed_blocks(store: RunStore) -> dict[int, int]:
+    """Return the committed blocks in which cells failed or crashed, and how many did.
+
+    Raises
+    ------
+    StoreError
+        If a receipt is damaged.
+    """
+    return {
+        number: count for number, receipt in receipts(store, committed(store))
+        if (count := _lost(receipt))
+    }
+
+
+def drop_failed(store: RunStore) -> tuple[RunStore, Retry]:
+    """Drop the committed blocks in which cells failed or crashed, so that a run computes them.
+
+    A finished store is marked unfinished before. A kill at any instant leaves a store that another
+    run continues: a block is either as it was, or computed anew as a whole.
+
+    Returns
+    -------
+    The store as it is then, and what was dropped.
+
+    Raises
+    ------
+    StoreError
+        If a receipt is damaged, another process writes the store, or it cannot be written.
+    """
+    with locked(store):
+        failed = failed_blocks(store)
+        if failed:
+            if store.finished:
+                reopen(store)
+            for number in failed:
+                drop_block(store, store.blocks[number])
+    if not failed:
+        return store, Retry()
+    return open_store(store.url, "r+"), Retry(tuple(failed), sum(failed.values()))
+
+
+def _lost(receipt: Receipt) -> int:
+    return sum(lost(list(receipt.detection), list(receipt.estimate)).values())
+
+
+# --------------------------------------------------------------------------------------------------
+# What a run did, in one record.
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What a run did; ``sweep run --json`` prints it.
+
+    Attributes
+    ----------
+    store
+        The store as it was given, or the default.
+    data
+        What ``xarray.open_zarr`` opens.
+    poses
+        Cells of the grid's scene axes.
+    results
+        Estimates: poses times detector settings times estimators.
+    detected, looked_for
+        Markers that were detected, of those that were looked for, over all detector settings: what
+        is not visible, not modelled or not needed is not looked for.
+    blocks
+        Blocks of the store.
+    computed_blocks, computed_scenes, computed_estimates
+        What this run computed; the rest was committed before, or reused from other stores.
+    seconds
+        Duration of this run.
+    crashed, failed
+        Cells that are flagged so.
+    nothing_computed
+        Whether a stage was tried and failed on every cell; ``sweep run`` ends with status 1 then.
+    failed_share
+        Share of the cells that failed or crashed, of those that a stage was tried on.
+    failures
+        The same cells by reason, each with one that ``sweep repro --at`` takes.
+    warnings
+        The lines of ``sweep run`` on failures, and on a run in which nothing was detected.
+    advice
+        The command that recomputes a cell for each reason; empty without warnings.
+    needed, conditions, unsettled
+        Of a run in waves, the poses that were needed, the conditions, and those of them that would
+        need more than ``max_trials``; None of a run of fixed trials.
+    retried, recovered
+        Failed and crashed cells that were tried again, and those that did not fail again.
+    """
+
+    store: str
+    data: str
+    poses: int
+    results: int
+    detected: int
+    looked_for: int
+    blocks: int
+    computed_blocks: int
+    computed_scenes: int
+    computed_estimates: int
+    seconds: float
+    crashed: int = 0
+    failed: int = 0
+    nothing_computed: bool = False
+    failed_share: float = 0.0
+    failures: list[FailureGroup] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    advice: str = ""
+    retried: int = 0
+    recovered: int = 0
+    needed: int | None = None
+    conditions: int | None = None
+    unsettled: int | None = None
+
+    @property
+    def detected_line(self) -> str:
+        """Detections, of what was looked for, in words."""
+        return f"detected {self.detected:,} of {self.looked_for:,} looked for"
+
+
+def summary_of_complete(store: RunStore, started: float) -> Summary:
+    """Return the summary of a run into a store that was finished before it began.
+
+    Raises
+    ------
+    StoreError
+        If blocks, or chunks of them, are missing.
+    """
+    check_whole(store)
+    return summary_of(store, {}, time.perf_counter() - started)
+
+
+def summary_of(
+    store: RunStore, computed: Mapping[str, int], seconds: float, retry: Retry | None = None
+) -> Summary:
+    """Return the summary of a finished store from the counts that it recorded."""
+    retry = retry or Retry()
+    counts = store.run_metadata["counts"]
+    missing = lost(counts["detection"], counts["estimate"])
+    outcome = outcome_of_finished(store)
+    sampled = counts.get("sampled") or {}
+    return Summary(
+        store=store.url,
+        data=store.data_url,
+        poses=store.pipeline.size(Stage.scene),
+        results=math.prod(len(axis) for axis in store.pipeline.axes),
+        detected=counts["detection"][DetectionStatus.detected],
+        looked_for=looked_for(counts["detection"]),
+        blocks=len(store.blocks),
+        computed_blocks=computed.get("blocks", 0),
+        computed_scenes=computed.get("scenes", 0),
+        computed_estimates=computed.get("estimates", 0),
+        seconds=round(seconds, 3),
+        **missing,
+        nothing_computed=outcome.nothing_computed,
+        failed_share=round(outcome.failed_share, 6),
+        failures=outcome.failures,
+        warnings=[
+            *outcome.warnings, *bound_notes(store.pipeline), *_unsettled_lines(store, sampled),
+        ],
+        advice=outcome.advice,
+        retried=retry.cells,
+        recovered=retry.recovered(store),
+        needed=sampled.get("needed"),
+        conditions=sampled.get("conditions"),
+        unsettled=sampled.get("unsettled"),
+    )
+
+
+def _unsettled_lines(store: RunStore, sampled: Mapping[str, Any]) -> list[str]:
+    """Return lines on the conditions that would need more than ``max_trials``; often none.
+
+    A search says itself what it does not know.
+    """
+    count, rule = sampled.get("unsettled"), store.pipeline.stopping
+    if not count or not isinstance(rule, PrecisionRule):
+        return []
+    of = f"{count:,} of {sampled['conditions']:,}"
+    lines = [f"warning: {of} conditions are not settled after all {rule.max_trials:,} trials"]
+    reached = sampled["reached"]
+    lines += [
+        f"  {at or 'all poses together'}{': ' if text else ''}{text}"
+        for at, text in zip(sampled["at"], reached, strict=False)
+    ]
+    if count > len(reached):
+        lines.append(f"  and {count - len(reached):,} more")
+    return lines
+
+
+# --------------------------------------------------------------------------------------------------
+# The status of a store: progress, counts of flags, rate, time left; also while it is written.
 
 RATE_S = 60.0
 """Seconds over which the rate is measured, up to the last block that was written."""
@@ -47,6 +384,8 @@ class Status:
         Sizes of the grid, and how much of it is committed.
     detection, estimate
         Cells by flag; flags without cells are left out.
+    looked_for
+        Cells of the detection that count in its rates, as in `sweep.execution.status.Summary`.
     poses_per_s, seconds_left
         Rate of the run that writes now, over its last minute; time to the end at that rate. Of a
         store that nobody writes, the rate of the last minute of work, and None. None if unknown.
@@ -55,8 +394,11 @@ class Status:
     needed, settled, conditions
         Of a run to a precision, how many of the committed poses were needed, and how many of the
         conditions need no more trials; None of a run of fixed trials.
+    processors
+        Blocks by the features of the processors that computed them: where there are several, the
+        last digits of results differ from those of a uniform run.
     nothing_computed, failed_share, failures, warnings, advice
-        As `sweep.execution.summary.Summary` has them, of the committed blocks.
+        As `sweep.execution.status.Summary` has them, of the committed blocks.
     """
 
     store: str
@@ -67,6 +409,7 @@ class Status:
     blocks_done: int
     poses: int
     poses_done: int
+    looked_for: int
     detection: dict[str, int]
     estimate: dict[str, int]
     poses_per_s: float | None
@@ -81,6 +424,7 @@ class Status:
     needed: int | None = None
     settled: int | None = None
     conditions: int | None = None
+    processors: dict[str, int] = field(default_factory=dict)
 
 
 def status(url: str) -> Status:
@@ -96,11 +440,13 @@ def status(url: str) -> Status:
     estimate: Counter[str] = Counter()
     written: list[WrittenBlock] = []
     cells: dict[str, list[FailedCell]] = {"crashed": [], "failed": []}
+    processors: Counter[str] = Counter()
     done = poses = needed = 0
-    for number, receipt in receipts(store, committed(store)):
+    for number, receipt in receipts(store, check_whole(store)):
         done += 1
         poses += receipt.scenes
         needed += receipt.scenes_needed
+        processors.update(receipt.processors)
         for flags, counts, counter in (
             (DetectionStatus, receipt.detection, detection),
             (EstimateStatus, receipt.estimate, estimate),
@@ -128,6 +474,7 @@ def status(url: str) -> Status:
         blocks_done=done,
         poses=total,
         poses_done=poses,
+        looked_for=looked_for([detection[flag.name] for flag in DetectionStatus]),
         detection={name: count for name, count in detection.items() if count},
         estimate={name: count for name, count in estimate.items() if count},
         poses_per_s=rate,
@@ -139,11 +486,15 @@ def status(url: str) -> Status:
         nothing_computed=outcome.nothing_computed,
         failed_share=round(outcome.failed_share, 6),
         failures=outcome.failures,
-        warnings=outcome.warnings,
+        warnings=[
+            *outcome.warnings, *differing_processors(processors, "blocks"),
+            *bound_notes(store.pipeline),
+        ],
         advice=outcome.advice,
         needed=None if store.pipeline.stopping is None else needed,
         settled=_settled(store),
         conditions=None if store.pipeline.stopping is None else condition_count(store.pipeline),
+        processors=dict(processors),
     )
 
 

@@ -1,22 +1,179 @@
-"""What is fitted of photographs: the pixels of some markers, well spread over each frame."""
+"""What is fitted of photographs: markers spread over the frame, their pixels."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from sweep.fitting.rendering import module_plane, module_points, shares
-from sweep.fitting.scenes import PhotographScenes
+from sweep.compilation import compiled
+from sweep.measure.flags import TruthSource
 from sweep.measure.surroundings import BoardMarker, clear_modules, edges_alone, surroundings
+from sweep.model import coverage
 from sweep.model.board import Board
+from sweep.model.camera import Column
 from sweep.model.coverage import MarkerEdges
+from sweep.model.image_file import photograph_image
+from sweep.model.lens import undistort
 from sweep.model.marker import OUTSIDE, module_count, overhang
-from sweep.model.photograph import photograph_image
-from sweep.model.projection import Optics
-from sweep.model.scene import Scenes
+from sweep.model.polygon import Optics, Projection
+from sweep.model.pose import angles_of_rotation
+from sweep.model.scene import Scenes, build_scenes
+from sweep.photographs.folder import find_corners, reference_detector
+from sweep.photographs.pose_fit import Lens
+from sweep.photographs.truth import board_poses
+from sweep.plan.grid import scene_axes, scene_values
+from sweep.plan.pipeline import Pipeline
 from sweep.typing import Floats, Grey, Integers, Masks
+
+# --------------------------------------------------------------------------------------------------
+# The scenes of photographs: their images, and where their markers are.
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotographScenes:
+    """The scenes of photographs: all markers in all of them, photograph by photograph.
+
+    Attributes
+    ----------
+    scenes
+        The N scenes.
+    trial, source
+        (N,) numbers of the photographs, and where the poses come from
+        (:class:`~sweep.measure.flags.TruthSource`).
+    """
+
+    scenes: Scenes
+    trial: Integers
+    source: NDArray[np.uint8]
+
+    @property
+    def shown(self) -> Masks:
+        """Which scenes have a true pose, (N,)."""
+        return np.asarray(np.isfinite(self.scenes.corners_px).all(axis=(1, 2)))
+
+    @property
+    def frame(self) -> Floats:
+        """Width and height of the photographs in px, (2,)."""
+        return np.asarray(self.scenes.frame[0], dtype=np.float64)
+
+    def lens(self, row: int) -> Lens:
+        """Return the camera of a scene."""
+        cameras = self.scenes.cameras
+        return Lens(cameras.matrix(row), cameras.lenses[row, :14])
+
+
+def photograph_scenes(pipeline: Pipeline, board: Board | None) -> PhotographScenes:
+    """Return the scenes of the pipeline of photographs; of a stereo camera the left one's.
+
+    A board that is in them says better where its markers are than the other camera, whose poses
+    have the error of a single marker.
+    """
+    axes = scene_axes(pipeline)
+    lengths = [1 if axis.name == "stereo_camera" else len(axis) for axis in axes]
+    indices = [each.ravel() for each in np.indices(lengths)]
+    count = len(indices[0])
+    trial = next(
+        (index for axis, index in zip(axes, indices, strict=True) if axis.name == "trial"),
+        np.zeros(count, dtype=np.int64),
+    )
+    values = scene_values(pipeline, indices)
+    taken = PhotographScenes(
+        build_scenes(values, count), trial, values["truth"].broadcast(count, np.uint8)
+    )
+    stereo = (taken.source == TruthSource.stereo_partner).any()
+    return _by_board(taken, values, board) if stereo and board is not None else taken
+
+
+def _by_board(
+    taken: PhotographScenes, values: Mapping[str, Column], board: Board
+) -> PhotographScenes:
+    """Return the scenes with the poses of the board's markers, by its other corners."""
+    find, scenes, count = reference_detector(), taken.scenes, len(taken.trial)
+    rotation, translation = np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan)
+    for number in np.unique(taken.trial).tolist():
+        rows = np.flatnonzero(taken.trial == number)
+        image = photograph_image(str(scenes.background[rows[0]]))
+        poses = board_poses(
+            board, taken.lens(rows[0]), image.shape[::-1], [find_corners(find, image, board)]
+        ).poses
+        for row in rows.tolist():
+            marker = board.marker_ids.index(scenes.marker_id[row])
+            rotation[row] = poses.rotation[0, marker]
+            translation[row] = poses.translation[0, marker]
+    with np.errstate(invalid="ignore"):
+        angles = [np.degrees(each) for each in angles_of_rotation(rotation)]
+    names = "resolved_tilt_deg", "resolved_azimuth_deg", "resolved_roll_deg"
+    known = np.isfinite(translation[:, 2])
+    source = np.where(known, TruthSource.board_without_this_marker, TruthSource.none)
+    posed = {**values, **{
+        name: Column.of(each) for name, each in zip(
+            (*names, "x_m", "y_m", "distance_m"), (*angles, *translation.T), strict=True
+        )
+    }}
+    return PhotographScenes(build_scenes(posed, count), taken.trial, source.astype(np.uint8))
+
+
+# --------------------------------------------------------------------------------------------------
+# The simulator's exact image of what is printed, drawn from the corners of a marker.
+
+@compiled
+def _rays(pixels: Floats, optics: Optics) -> Floats:
+    """Return the undistorted directions x/z, y/z (n, 2) of pixels (n, 2)."""
+    rays = np.empty_like(pixels)
+    fx, fy, cx, cy = optics.intrinsics
+    for k in range(len(pixels)):
+        x, y = (pixels[k, 0] - cx) / fx, (pixels[k, 1] - cy) / fy
+        if optics.distorted:
+            x, y, _ = undistort(x, y, optics.lens)
+        rays[k, 0], rays[k, 1] = x, y
+    return rays
+
+
+def module_plane(corners_px: Floats, modules: int, optics: Optics) -> Floats:
+    """Return a plane (3, 3) that takes a square of modules to four corners (4, 2) in pixels."""
+    rays = _rays(np.ascontiguousarray(corners_px), optics)
+    square = modules * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    rows = []
+    for (u, v), (x, y) in zip(square.tolist(), rays.tolist(), strict=True):
+        rows.append([u, v, 1, 0, 0, 0, -x * u, -x * v])
+        rows.append([0, 0, 0, u, v, 1, -y * u, -y * v])
+    solution = np.linalg.solve(np.array(rows), rays.ravel())
+    return np.append(solution, 1.0).reshape(3, 3)
+
+
+def module_points(plane: Floats, optics: Optics, height: int, width: int) -> Floats:
+    """Return the column and row in modules (2, height, width) of the pixels of a box."""
+    columns, rows = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
+    rays = _rays(np.stack([columns.ravel(), rows.ravel()], axis=1), optics)
+    flat = cv2.perspectiveTransform(rays[None], np.linalg.inv(plane))[0]
+    return np.asarray(flat.T.reshape(2, height, width), dtype=np.float64)
+
+
+def shares(
+    edges: MarkerEdges, values: Floats, plane: Floats, optics: Optics, size: tuple[int, int],
+    blur_px: float, shift: tuple[float, float] = (0.0, 0.0),
+) -> Floats:
+    """Return the image (height, width) of values (3,) of outside, black and white.
+
+    ``shift`` moves it right and down, in px. Beyond the edges is the value of black.
+    """
+    height, width = size
+    intrinsics = optics.intrinsics.copy()
+    intrinsics[2:] += shift
+    cover, image = np.zeros((height, width + 2)), np.empty(size)
+    coverage.accumulate(
+        cover, edges, values, Projection(plane, Optics(intrinsics, optics.lens, optics.distorted)),
+        0, 0, blur_px,
+    )
+    coverage.sum_levels(cover, float(values[1]), image)
+    return image
+
+
+# --------------------------------------------------------------------------------------------------
+# What is fitted of photographs: the pixels of some markers, well spread over each frame.
 
 RING_MODULES = 1.5
 """Widest part of the quiet zone that is fitted, in modules."""

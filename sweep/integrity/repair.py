@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Sequence
 
-from zarr.buffer import cpu, default_buffer_prototype
-
 from sweep.errors import StoreError
-from sweep.execution.finalize import close
 from sweep.execution.runner import recompute
-from sweep.integrity.damage import ArrayDamage, Damage, FileDamage, SampleDamage
-from sweep.integrity.stored_values import computable
-from sweep.integrity.verification import SAMPLE, IntegrityReport, Verification, root_document
+from sweep.execution.status import close
+from sweep.integrity.sample_check import (
+    Damage,
+    FileDamage,
+    NotDeterministic,
+    SampleDamage,
+    computable,
+)
+from sweep.integrity.verification import SAMPLE, IntegrityReport, Verification
 from sweep.store.blocks import drop_block
-from sweep.store.checksums import digest
-from sweep.store.layout import RECEIPTS, PlannedArray, documents
-from sweep.store.lifecycle import open_store
+from sweep.store.files import delete_files, sync, write_files
+from sweep.store.layout import documents, planned_arrays
+from sweep.store.lifecycle import MEASURED, linked_arrays, open_store, write_root
 from sweep.store.locations import translate_errors
 from sweep.store.lock import locked
-from sweep.store.manifest import Manifest, write_manifest
-from sweep.store.run_store import RunStore
-from sweep.store.zarr_sync import sync
-
-MEASURED = ("cost/tradeoff", "cost/renderers")
-"""Groups that no receipt could restore: if damaged, they are deleted, to be measured again."""
 
 
 def repair(
@@ -58,13 +54,14 @@ def repair(
     """
     verification = Verification(url, "r+")
     before = verification.report(sample)
-    if not before.damage and not before.left_over:
+    lasting = [each for each in before.damage if isinstance(each, (SampleDamage, NotDeterministic))]
+    if len(lasting) == len(before.damage) and not before.left_over:
         return before
     numbers = sorted({damage.block for damage in before.damage if damage.block is not None})
-    if any(isinstance(each, ArrayDamage) and each.path == RECEIPTS for each in before.damage):
+    if links := linked_arrays(verification.store):
         raise StoreError(
-            f"{url}: its arrays are of another grid than its pipeline; `sweep run --overwrite` "
-            "computes it again"
+            f"{url}: {links[0]} is a link: nothing is written through it; put the folder in its "
+            "place"
         )
     if numbers:
         computable(verification.store)
@@ -81,7 +78,7 @@ def repair(
     after = Verification(url, "r").report(0)
     after.sampled, after.not_sampled = before.sampled, before.not_sampled
     after.retried = before.retried
-    after.damage += [each for each in before.damage if isinstance(each, SampleDamage)]
+    after.damage += lasting
     remaining = {damage.where for damage in after.damage}
     after.repaired = [damage for damage in before.damage if damage.where not in remaining]
     return after
@@ -91,40 +88,20 @@ def _rewrite_files(
     verification: Verification, damage: Sequence[Damage], left_over: Sequence[str]
 ) -> None:
     """Write the damaged files that belong to no block, and delete those that are left over."""
-    storage = verification.storage
+    storage, store = verification.storage, verification.store
     keys = {each.key for each in damage if isinstance(each, FileDamage) and each.block is None}
-    paths = {each.path for each in damage if isinstance(each, ArrayDamage)}
-    if "zarr.json" in keys and verification.manifest is not None:
-        root = root_document(verification.manifest)
-        sync(storage.set("zarr.json", cpu.Buffer.from_bytes(root)))
-    for key, content in documents(verification.planned).items():
-        if key in keys or key.removesuffix("/zarr.json") in paths:
-            sync(storage.set(key, content))
-    for planned in verification.planned:
-        if planned.values is not None and (planned.path in paths or keys & planned.value_keys()):
-            planned.create(verification.store.group)
+    planned = planned_arrays(store.pipeline, store.blocks.extents)
+    expected = documents(planned)
+    write_files(storage, {
+        key: content.to_bytes() for key, content in expected.items() if key in keys})
+    for array in planned:
+        written = {f"{array.path}/zarr.json", *(chunk for chunk, _, _ in array.pieces())}
+        if array.values is not None and written & keys:
+            array.create(store.group)
     for group in MEASURED:
         if any(key.startswith(f"{group}/") for key in keys):
             sync(storage.delete_dir(group))
     restored = [key for key in keys if key.startswith(("cost/", "failures/"))]
-    for key in (*left_over, *restored):
-        with contextlib.suppress(FileNotFoundError):
-            sync(storage.delete(key))
-    write_manifest(storage, _current_manifest(verification.store, verification.planned))
-
-
-def _current_manifest(store: RunStore, planned: list[PlannedArray]) -> Manifest:
-    """Return the manifest of a store's files as they are."""
-    of_blocks = tuple(f"{array.path}/c" for array in planned if array.values is None)
-
-    async def gather() -> dict[str, int]:
-        files = {}
-        async for key in store.storage.list_prefix(""):
-            if key.startswith((*of_blocks, f"{RECEIPTS}/")) and key != f"{RECEIPTS}/zarr.json":
-                continue
-            content = await store.storage.get(key, default_buffer_prototype())
-            if content is not None:
-                files[key] = digest(content.to_bytes())
-        return files
-
-    return Manifest(dict(store.group.attrs), sync(gather()))
+    delete_files(storage, (*left_over, *restored))
+    if not store.finished:  # a finished one is closed again
+        write_root(store, store.run_metadata)

@@ -12,17 +12,16 @@ from numpy.typing import NDArray
 from sweep.errors import RunError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene, scene_image
 from sweep.evaluation.results import Failure
-from sweep.integrity.stored_values import Values, current_pipeline, stored_cell
-from sweep.integrity.tolerances import compare
+from sweep.integrity.sample_check import StoredValues, compare, current_pipeline, stored_cell
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import nearest, plain, refusal
 from sweep.plan.cell_selection import cell, parse_selection, selection_text
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
 from sweep.plan.parameters import Stage
-from sweep.plan.variable import Variable
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.schema import Variable
 from sweep.store.lifecycle import open_store
 
 
@@ -62,8 +61,8 @@ class Reproduction:
 
     at: str
     variables: tuple[Variable, ...]
-    recomputed: Values
-    stored: Values | None
+    recomputed: StoredValues
+    stored: StoredValues | None
     difference: str
     exact: bool
     seconds: dict[str, float]

@@ -1,8 +1,4 @@
-"""Function calls in a child process, which may crash or never return.
-
-The child reads calls from its standard input and writes results to its standard output. Only what
-these two processes of one program send each other is unpickled.
-"""
+"""Child processes that may crash or hang: started, watched, interrupted."""
 
 from __future__ import annotations
 
@@ -19,12 +15,47 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
-from typing import IO, Any, Self
+from concurrent.futures import Future, wait
+from types import FrameType
+from typing import IO, Any, Self, TypeVar
 
 from sweep.errors import SweepError
 from sweep.evaluation.machine_faults import machine_fault
-from sweep.isolation.machine_memory import be_killed_before_others
-from sweep.processes import OUTSIDE_SIGNALS, SINGLE_THREADED, ending
+from sweep.isolation.machine import be_killed_before_others
+
+# --------------------------------------------------------------------------------------------------
+# Child processes: started on one thread each, and how they ended.
+
+SINGLE_THREADED = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OPENCV_FOR_THREADS_NUM": "1",
+}
+"""Variables of a child process. Parallelism is over blocks: a process computes on one thread."""
+
+OUTSIDE_SIGNALS = ("SIGKILL", "SIGTERM", "SIGBUS", "SIGHUP", "SIGINT", "SIGXCPU")
+"""Signals that the system or its users send, too little memory or space among their reasons: what
+a scene's data may cause is SIGSEGV, SIGABRT, SIGFPE, SIGILL, an exit status."""
+
+
+def ending(code: int) -> str:
+    """Return how a process with a return code of `subprocess` ended.
+
+    >>> ending(-11), ending(3)
+    ('SIGSEGV', 'exit status 3')
+    """
+    if code < 0:
+        with contextlib.suppress(ValueError):
+            return signal.Signals(-code).name
+    return f"exit status {code}"
+
+
+# --------------------------------------------------------------------------------------------------
+# Function calls in a child process, which may crash or never return.
+#
+# The child reads calls from its standard input and writes results to its standard output. Only
+# what these two processes of one program send each other is unpickled.
 
 GRACE_S = 30.0
 """How long after its limit a child that did not end itself is killed."""
@@ -221,3 +252,60 @@ def _message(pipe: IO[bytes]) -> bytes | None:
     (length,) = _LENGTH.unpack(header)
     encoded = pipe.read(length)
     return encoded if len(encoded) == length else None
+
+
+# --------------------------------------------------------------------------------------------------
+# Ctrl-C that stops a run between two steps, never in the middle of one.
+
+Result = TypeVar("Result")
+
+POLL_S = 0.2
+"""How often Ctrl-C is checked while a result is awaited."""
+
+
+def in_main_thread() -> bool:
+    """Return whether this is the thread in which Python handles signals."""
+    return threading.current_thread() is threading.main_thread()
+
+
+class Interrupts:
+    """While this context is entered, Ctrl-C is noted, and raised by :meth:`check`.
+
+    KeyboardInterrupt inside a client's code can leave one of its locks taken, and the process then
+    hangs while it closes the cluster. The second Ctrl-C is raised at once.
+
+    The caller's handler is restored at the end. Nothing is done outside the main thread, where no
+    signals arrive, and if the caller ignores Ctrl-C or handles it outside Python.
+    """
+
+    def __init__(self) -> None:
+        self._noted = False
+        self._before: Any = None
+
+    def __enter__(self) -> Self:
+        if in_main_thread() and signal.getsignal(signal.SIGINT) not in (None, signal.SIG_IGN):
+            self._before = signal.signal(signal.SIGINT, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGINT, self._before)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        if self._noted:
+            raise KeyboardInterrupt
+        self._noted = True
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if Ctrl-C has been noted."""
+        if self._noted:
+            raise KeyboardInterrupt
+
+    def await_result(self, future: Future[Result]) -> Result:
+        """Return a future's result, checking meanwhile."""
+        while not future.done():
+            self.check()
+            wait([future], timeout=POLL_S)
+        self.check()
+        return future.result()

@@ -1,40 +1,58 @@
-"""Scenes that crash their process or never return, isolated in child processes.
-
-The rest of the block is computed all the same. A block has a time limit T; isolating one scene that
-never returns keeps within it:
-
-- T/4: the block in its worker, before that ends itself (:data:`WHOLE`);
-- 3 T/16: pieces of the block in a child, cut in 64 up to three times, T/16 each (:data:`PIECE`);
-- T/8 + T/16 + ... : the parts of the scene that remains, one by one (:data:`PART`): rendering, each
-  detector setting, each estimator; the limit is halved each time one runs out;
-- the rest: the first call in each child has more time (:data:`LOADING`); no limit runs while code
-  is compiled or loaded.
-"""
+"""The cell that ends its process is found: blocks are cut until one scene is left."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.evaluation.cells import run_cells
+from sweep.errors import PluginError
+from sweep.evaluation.block import run_cells
 from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
+from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import CellsResult, Failure, concatenate
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
-from sweep.isolation.machine_memory import explained, memory_kills
+from sweep.isolation.machine import explained, memory_kills
+from sweep.measure.detectors import make_detector
+from sweep.measure.estimators import PluggedEstimatorSetting, build
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.cell_selection import selection_text
-from sweep.plan.experiment import Pipeline
-from sweep.plan.grid import scene_axes
+from sweep.plan.experiment import scene_plugins
+from sweep.plan.grid import detector_settings, estimators, scene_axes
+from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.schema import variables_of
+from sweep.plugins.declared import PluginSetting
+
+# --------------------------------------------------------------------------------------------------
+# Scenes that crash their process or never return, isolated in child processes.
+#
+# The rest of the block is computed all the same. A block has a time limit T; isolating one scene
+# that never returns keeps within it:
+#
+# - T/4: the block in its worker, before that ends itself (:data:`WHOLE`);
+# - 3 T/16: pieces of the block in a child, cut in 64 up to three times, T/16 each
+# (:data:`PIECE`);
+# - T/8 + T/16 + ... : the parts of the scene that remains, one by one (:data:`PART`): rendering,
+# each
+#   detector setting, each estimator; the limit is halved each time one runs out, and such a part
+# is
+#   tried once more;
+# - the rest: the first call in each child has more time (:data:`LOADING`); no limit runs while
+# code
+#   is compiled or loaded.
 
 WHOLE, PIECE, PART = 1 / 4, 1 / 16, 1 / 8
 """Shares of a block's time limit: for the block, for a piece of it, for a part of a scene."""
 
 LOADING, LOADING_S = 1 / 16, 15.0
 """Additional time of the first call in a child: a share of the limit, at most so many seconds."""
+
+DEATHS = 3
+"""How many fresh processes a part of a scene must end, one after another, to be flagged."""
 
 MIN_S = 1.0
 """Least time limit of a part of a scene."""
@@ -65,6 +83,8 @@ class _IsolatedCells:
         self.limit_s = limit_s
         self._child: Child | None = None
         self._kills = memory_kills()
+        self.chances: list[str] = []
+        """Deaths that did not come again when the same part of a scene was repeated."""
 
     def run(self, share: float, *arguments: Any) -> CellsResult:
         """Call ``run_cells`` with a share of the time limit.
@@ -99,14 +119,30 @@ class _IsolatedCells:
 
     def fault(self, death: ChildDiedError, indices: Sequence[NDArray[np.intp]]) -> Exception:
         """Return the machine's fault that ended the child again while it computed one scene."""
-        scene = selection_text({
-            axis.name: axis.values[int(index[0])]
-            for axis, index in zip(scene_axes(self._pipeline), indices, strict=True)
-        })
         return local_fault(
             f"two processes that computed one scene were ended by {explained(death, self._kills)}; "
-            f"it is --at {scene}"
+            f"it is --at {self.selected(indices)}"
         )
+
+    def selected(
+        self, indices: Sequence[NDArray[np.intp]], setting: int | None = None,
+        estimator: int | None = None,
+    ) -> str:
+        """Return a scene, and what of it is computed, in the form that `--at` takes."""
+        pipeline = self._pipeline
+        values = [
+            axis.values[int(index[0])]
+            for axis, index in zip(scene_axes(pipeline), indices, strict=True)
+        ]
+        named = dict(zip((axis.name for axis in scene_axes(pipeline)), values, strict=True))
+        for stage, number in ((Stage.detection, setting), (Stage.estimation, estimator)):
+            axes = pipeline.axes_of(stage)
+            if number is not None and axes:
+                steps = np.unravel_index(number, [len(axis) for axis in axes])
+                named |= {
+                    axis.name: axis.values[int(i)] for axis, i in zip(axes, steps, strict=True)
+                }
+        return selection_text(named)
 
     def close(self) -> None:
         """End the child process."""
@@ -120,11 +156,12 @@ def run_cells_isolated(
     need: NDArray[np.bool_],
     limit_s: float,
 ) -> CellsResult:
-    """Compute cells as `sweep.evaluation.cells.run_cells` does, also if they crash their process.
+    """Compute cells as `sweep.evaluation.block.run_cells` does, also if they crash their process.
 
-    A detection or estimate that crashes a child process is flagged ``crashed``, one that raises
-    ``failed``. A signal from outside, such as the system sends to a process that uses too much
-    memory, is the machine's fault. All others have the same values as in one call, bit for bit.
+    A detection or estimate that ends each of :data:`DEATHS` child processes is flagged ``crashed``,
+    one that raises ``failed``. A signal from outside, such as the system sends to a process that
+    uses too much memory, is the machine's fault. All others have the same values as in one call,
+    bit for bit: what worked alone does not depend on what else its scene has.
 
     Parameters
     ----------
@@ -141,7 +178,8 @@ def run_cells_isolated(
     ------
     MachineFaultError
         If no child process can be started, one raises what no scene's data can cause, or one that
-        computes a single scene is ended twice by a signal from outside.
+        computes a single scene is ended twice by a signal from outside; if something would be
+        flagged ``crashed``, but processes also died by chance.
     """
     isolated = _IsolatedCells(pipeline, limit_s)
     done: dict[int, CellsResult] = {}
@@ -160,7 +198,14 @@ def run_cells_isolated(
                     done[int(rows[0])] = scene.compute()
     finally:
         isolated.close()
-    return concatenate([done[start] for start in sorted(done)])
+    cells = concatenate([done[start] for start in sorted(done)])
+    crashed = sum(failure.crashed for failure in cells.failures)
+    if isolated.chances and crashed:
+        raise local_fault(
+            f"not deterministic: {isolated.chances[0]}; so {crashed} that ended {DEATHS} processes "
+            "may have done so by chance, too"
+        )
+    return cells
 
 
 def _pieces(rows: NDArray[np.intp]) -> list[NDArray[np.intp]]:
@@ -170,8 +215,8 @@ def _pieces(rows: NDArray[np.intp]) -> list[NDArray[np.intp]]:
 class _Scene:
     """One scene that crashes its process, never returns, or raises as a whole.
 
-    Its parts are tried one after another, each in addition to those that it depends on: rendering,
-    each detector setting, each estimator. Those that work are then computed together.
+    Its parts are computed one after another, each in addition to those that it depends on:
+    rendering, each detector setting, each estimator. The results of those that work are joined.
     """
 
     def __init__(
@@ -184,34 +229,65 @@ class _Scene:
         self._need = need
         self._share = PART
         self._failures: list[Failure] = []
+        self._result = CellsResult.not_run(pipeline, 1)
 
     def compute(self) -> CellsResult:
         """Return the scene's cells; those that do not work are flagged."""
-        need = self._need
-        searched, solved = np.zeros_like(need[..., 0]), np.zeros_like(need)
-        rendered = self._works("scene")
-        for k in np.flatnonzero(need[0].any(axis=1)).tolist() if rendered else ():
-            searched[0, k] = self._works("detection", k)
-            for j in np.flatnonzero(need[0, k]).tolist() if searched[0, k] else ():
-                solved[0, k, j] = self._works("estimation", k, j)
-        result = None
-        if rendered:
+        estimators = self._need.shape[2]
+        rendered = self._works(Stage.scene)
+        for k in np.flatnonzero(self._need[0].any(axis=1)).tolist():
+            searched = rendered and self._works(Stage.detection, k)
+            if not searched:
+                self._flag("detection", k, DetectionStatus, k if rendered else None)
+            for j in np.flatnonzero(self._need[0, k]).tolist():
+                number = k * estimators + j
+                if not searched:
+                    self._set("estimate", number, EstimateStatus.no_detection)
+                elif not self._works(Stage.estimation, k, j):
+                    self._flag("estimate", number, EstimateStatus, k, j)
+                else:
+                    continue
+                self._set("flipped", number, Flipped.no_estimate)
+        self._result.failures = self._failures
+        return self._result
+
+    def _works(
+        self, stage: Stage, setting: int | None = None, estimator: int | None = None
+    ) -> bool:
+        """Compute a part of the scene and take its results; else note why it does not work."""
+        solve, search = np.zeros_like(self._need), np.zeros_like(self._need[..., 0])
+        if estimator is not None:
+            solve[0, setting, estimator] = True
+        elif setting is not None:
+            search[0, setting] = True
+        deaths: list[str] = []
+        while True:
             try:
-                # Each part returns, so that together they have all the time.
-                result = self._undisturbed(1.0, solved, searched)
-            except (ChildDiedError, ChildRaisedError) as error:
-                # Each part works alone, but not all of them together.
-                died = isinstance(error, ChildDiedError)
-                self._failures.append(Failure(0, "scene", str(error), crashed=died))
-                rendered, searched[:], solved[:] = False, False, False
-        if result is None:
-            result = CellsResult.not_run(self._pipeline, 1)
-        self._flag(result, searched, solved, rendered=rendered)
-        result.failures += self._failures
-        return result
+                part = self._undisturbed(solve, search)
+            except ChildRaisedError as error:
+                self._failures.append(Failure(0, stage.name, str(error), setting, estimator))
+                return False
+            except ChildDiedError as death:
+                deaths.append(str(death))
+                if death.timed_out:
+                    self._share = max(self._share / 2, MIN_S / self._isolated.limit_s)
+                if len(deaths) == (DEATHS - 1 if death.timed_out else DEATHS):
+                    self._failures.append(
+                        Failure(0, stage.name, deaths[0], setting, estimator, crashed=True)
+                    )
+                    return False
+            else:
+                break
+        if deaths:
+            at = self._isolated.selected(self._indices, setting, estimator)
+            self._isolated.chances.append(
+                f"--at {at} ended a process by {deaths[0]}, and not when it was repeated"
+            )
+        self._take(part, stage, setting, estimator)
+        return True
 
     def _undisturbed(
-        self, share: float, solved: NDArray[np.bool_], searched: NDArray[np.bool_]
+        self, solved: NDArray[np.bool_], searched: NDArray[np.bool_]
     ) -> CellsResult:
         """Compute parts of the scene, again if a signal from outside ends it.
 
@@ -222,57 +298,161 @@ class _Scene:
         """
         for last in (False, True):
             try:
-                return self._isolated.run(share, self._indices, solved, searched)
+                return self._isolated.run(self._share, self._indices, solved, searched)
             except ChildDiedError as death:
                 if not death.from_outside:
                     raise
                 if last:
                     raise self._isolated.fault(death, self._indices) from None
-        raise AssertionError(share)
+        raise AssertionError(solved)
 
-    def _works(self, stage: str, setting: int | None = None, estimator: int | None = None) -> bool:
-        """Return whether a part of the scene can be computed; note why if it cannot."""
-        solve, search = np.zeros_like(self._need), np.zeros_like(self._need[..., 0])
-        if estimator is not None:
-            solve[0, setting, estimator] = True
-        elif setting is not None:
-            search[0, setting] = True
-        for last in (False, True):
-            try:
-                self._undisturbed(self._share, solve, search)
-            except ChildRaisedError as error:
-                self._failures.append(Failure(0, stage, str(error), setting, estimator))
-                return False
-            except ChildDiedError as death:
-                if death.timed_out:
-                    self._share = max(self._share / 2, MIN_S / self._isolated.limit_s)
-                if death.timed_out or last:
-                    self._failures.append(
-                        Failure(0, stage, str(death), setting, estimator, crashed=True)
-                    )
-                    return False
-            else:
-                return True
-        raise AssertionError(stage)
+    def _take(
+        self, part: CellsResult, stage: Stage, setting: int | None, estimator: int | None
+    ) -> None:
+        """Take the columns, seconds and failures of a part that was computed alone."""
+        if stage is Stage.scene:  # of the other stages nothing was run
+            self._result = part
+        else:
+            number = (setting or 0) * (1 if estimator is None else self._need.shape[2])
+            number += estimator or 0
+            for variable in variables_of(self._pipeline):
+                if variable.stage is stage:
+                    column = part.columns[variable.name][number]
+                    self._result.columns[variable.name][number] = column
+            self._result.seconds[stage.name][number] = part.seconds[stage.name][number]
+            self._result.row_seconds += part.row_seconds
+        noted = {(failure.stage, failure.setting, failure.estimator) for failure in self._failures}
+        self._failures += [
+            failure for failure in part.failures
+            if (failure.stage, failure.setting, failure.estimator) not in noted
+        ]
 
     def _flag(
-        self, result: CellsResult, searched: NDArray[np.bool_], solved: NDArray[np.bool_], *,
-        rendered: bool,
+        self, name: str, number: int, flags: type[DetectionStatus | EstimateStatus],
+        setting: int | None, estimator: int | None = None,
     ) -> None:
-        """Flag the needed cells that were not ``searched`` or not ``solved``."""
-        _, _, estimators = self._need.shape
-        crashed = {
-            (failure.setting, failure.estimator): failure.crashed for failure in self._failures
-        }
-        for k in np.flatnonzero(self._need[0].any(axis=1)).tolist():
-            if not searched[0, k]:
-                died = crashed[k, None] if rendered else crashed[None, None]
-                result.columns["detection"][k][:] = (
-                    DetectionStatus.crashed if died else DetectionStatus.failed
-                )
-            for j in np.flatnonzero(self._need[0, k] & ~solved[0, k]).tolist():
-                status = EstimateStatus.no_detection
-                if searched[0, k]:
-                    status = EstimateStatus.crashed if crashed[k, j] else EstimateStatus.failed
-                result.columns["estimate"][k * estimators + j][:] = status
-                result.columns["flipped"][k * estimators + j][:] = Flipped.no_estimate
+        """Flag a cell as the failure of the part that it lacks says."""
+        crashed = any(
+            failure.crashed for failure in self._failures
+            if (failure.setting, failure.estimator) == (setting, estimator)
+        )
+        self._set(name, number, flags["crashed" if crashed else "failed"])
+
+    def _set(self, name: str, number: int, flag: int) -> None:
+        self._result.columns[name][number][:] = flag
+
+
+# --------------------------------------------------------------------------------------------------
+# Scenes that raised are repeated in a fresh process: what it does not raise again is no result.
+
+Part = tuple[int, str, int | None, int | None, bool]
+
+
+def check_repeatable(
+    pipeline: Pipeline,
+    indices: Sequence[NDArray[np.intp]],
+    need: NDArray[np.bool_],
+    cells: CellsResult,
+    limit_s: float,
+) -> None:
+    """Repeat the scenes that raised, all together, in a child process that was started for it.
+
+    Scenes that ended their process are not repeated for that: they did so in two processes.
+
+    Parameters
+    ----------
+    pipeline
+        What was computed.
+    indices, need
+        (N,) indices of the scenes along each scene axis, and which of their cells were computed,
+        as in `sweep.evaluation.block.run_cells`.
+    cells
+        Their results.
+    limit_s
+        Time limit of the repetition in seconds.
+
+    Raises
+    ------
+    MachineFaultError
+        If a scene does not fail again in the same parts, or the machine fails meanwhile.
+    """
+    scenes = sorted({failure.scene for failure in cells.failures if not failure.crashed})
+    if not scenes:
+        return
+    rows = np.array(scenes)
+    again = run_cells_isolated(pipeline, [index[rows] for index in indices], need[rows], limit_s)
+    repeated = {_part(failure, scenes[failure.scene]) for failure in again.failures}
+    for failure in cells.failures:
+        if failure.scene in scenes and _part(failure, failure.scene) not in repeated:
+            raise local_fault(
+                "raised in a scene, but not when that was repeated in another process: "
+                + failure.text.strip().rpartition("\n")[2]
+            )
+
+
+def _part(failure: Failure, scene: int) -> Part:
+    return scene, failure.stage, failure.setting, failure.estimator, failure.crashed
+
+
+# --------------------------------------------------------------------------------------------------
+# Plug-ins are used once before a run: one that cannot work refuses it, and costs no pose.
+
+LIMIT_S = 60.0
+"""Seconds that a plug-in may take to be made, and to search one blank frame."""
+
+MAX_SETTINGS = 16
+"""Settings of a plug-in that are tried."""
+
+
+def check_plugins(child: Child, pipeline: Pipeline, limit_s: float = LIMIT_S) -> None:
+    """Use each of a pipeline's plug-ins in a child process, which goes on to work.
+
+    Raises
+    ------
+    PluginError
+        If one cannot be imported or made, raises on a blank frame, ends its process, or does not
+        return; in one line.
+    """
+    for plugin in pipeline.plugins:
+        name = f"{plugin.kind} {plugin.name}"
+        try:
+            child.call(use, pipeline, plugin.kind, plugin.name, limit_s=limit_s)
+        except ChildDiedError as error:
+            child.restart()
+            raise PluginError(f"{name}: ends its process before the first pose: {error}") from None
+        except ChildRaisedError as error:
+            raise PluginError(f"{name}: {last_line(error)}") from None
+
+
+@single_threaded()
+def use(pipeline: Pipeline, kind: str, name: str) -> None:
+    """Import a plug-in and make it with each of its settings; a detector searches a blank frame.
+
+    Raises
+    ------
+    PluginError
+        If that cannot be done.
+    """
+    if kind == "detector":
+        width, height = (min(pipeline.values_of(side)) for side in ("width_px", "height_px"))
+        blank = np.full((height, width), 128, dtype=np.uint8)
+        settings = [
+            setting for setting in detector_settings(pipeline)
+            if isinstance(setting, PluginSetting) and setting.plugin.name == name
+        ]
+        for setting in _first(settings):
+            search = make_detector(setting)
+            for dictionary in _first(pipeline.values_of("dictionary")):
+                search(blank, dictionary, max(width, height))
+    elif kind == "estimator":
+        for estimator in _first(
+            each for each in estimators(pipeline)
+            if isinstance(each, PluggedEstimatorSetting) and each.solver == name
+        ):
+            build(estimator)
+    else:
+        scene_plugins(pipeline)
+
+
+def _first(values: Iterable[object]) -> list[Any]:
+    return list(dict.fromkeys(values))[:MAX_SETTINGS]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.declaration import parameter
-from sweep.measure.covariance import covariance_elsewhere
+from sweep.measure.estimation import covariance_elsewhere
 from sweep.measure.flags import BoundStatus
 from sweep.measure.likelihood import (
     BACKGROUND_MARGIN_PX,
@@ -29,21 +29,80 @@ from sweep.measure.likelihood import (
     mirrored_state,
     noise_variance,
     plane_of,
+    pose_covariance,
     rotation_of,
     squares,
     state_of,
 )
-from sweep.measure.positive_definite import pose_covariance
-from sweep.measure.solid_bound import solid_covariance
 from sweep.model import coverage
-from sweep.model.beside import beside_pixels
 from sweep.model.board import Board
-from sweep.model.derivatives import POSE, work_space
+from sweep.model.derivatives import (
+    LEVELS,
+    POSE,
+    differentiate,
+    normal_equations,
+    work_space,
+)
 from sweep.model.effects import IN_BOUND, NEUTRAL
-from sweep.model.printed import side_m
-from sweep.model.projection import Projection
+from sweep.model.polygon import Optics, Projection
+from sweep.model.printed import moving_edges, own_sheets, side_m, visible_prints
+from sweep.model.renderers import beside_pixels
 from sweep.model.scene import Scenes
-from sweep.typing import Floats
+from sweep.model.scene_sheet import solid_board, solid_planes
+from sweep.typing import Floats, Integers
+
+# --------------------------------------------------------------------------------------------------
+# The Cramér-Rao bound of the pixels of a target in several planes.
+
+def solid_covariance(
+    scenes: Scenes, row: int, state: Floats, corner: Integers, image: Floats, variance: float,
+    *, spread_free: bool,
+) -> tuple[Floats, bool]:
+    """Return the bound's covariance (6, 6) of one scene, and whether it exists.
+
+    The slopes of all that is seen are summed; an edge at which a sheet hides another moves with
+    the sheet in front. Levels are eliminated, as is the point spread with ``spread_free``.
+
+    Parameters
+    ----------
+    scenes, row
+        The scene.
+    state
+        (16,) its true state, as :mod:`sweep.measure.likelihood` has it.
+    corner, image
+        (2,) the first pixel of a box, and its pixels: NaN for those that are left out.
+    variance
+        Of a pixel, in squared grey levels.
+    """
+    board, planes = solid_board(scenes, row), solid_planes(scenes, row)
+    optics = scenes.cameras.optics(row)
+    local = optics.intrinsics.copy()
+    local[2:] -= corner
+    local_optics = Optics(local, optics.lens, optics.distorted)
+    work, count = work_space(*image.shape), 0
+    for seen in visible_prints(board, planes):
+        if seen.number >= own_sheets(board):
+            continue
+        for edges, plane in moving_edges(seen, planes):
+            count = differentiate(
+                work, edges, state[GREY_LEVELS], Projection(plane, local_optics), state[POSITION],
+                state[SPREAD], count,
+            )
+    free = POSE + 1 if spread_free else POSE
+    matrix, vector = np.empty((free + LEVELS, free + LEVELS)), np.empty(free + LEVELS)
+    normal_equations(image, work, free, matrix, vector)
+    covers = np.flatnonzero(np.diag(matrix)[free:] > 0) + free
+    mixed = matrix[:free, covers]
+    information = matrix[:free, :free] - mixed @ np.linalg.solve(
+        matrix[np.ix_(covers, covers)], mixed.T
+    )
+    covariance, exists = pose_covariance(np.ascontiguousarray(information), variance, 1.0)
+    # Beyond half a turn rounding has made a singular problem a regular one.
+    return covariance, bool(exists) and not (np.diag(covariance)[:3] > np.pi**2).any()
+
+
+# --------------------------------------------------------------------------------------------------
+# The Cramér-Rao bound of the exact image's pixels: the least error of any unbiased estimate.
 
 CLIPPING_DEVIATIONS = 2.0
 """Standard deviations of the noise by which every grey level must stay off the scale's ends."""
@@ -154,6 +213,25 @@ def bound_of_scene(
     return covariance, True, kappa, chi_square
 
 
+def outside_model(scenes: Scenes, row: int) -> BoundStatus:
+    """Return why the model of the bound does not hold for a scene's values; ``given`` if it does.
+
+    The pose does not matter to it.
+    """
+    effects = scenes.effect(row) if scenes.affected[row] else NEUTRAL
+    noise, levels = effects["noise_grey"], scenes.levels[row] * effects["gain"]
+    margin = CLIPPING_DEVIATIONS * noise
+    if isinstance(scenes.background[row], str) or any(
+        name not in IN_BOUND for name in scenes.active(row)
+    ):
+        return BoundStatus.not_in_model
+    if noise < MIN_NOISE:
+        return BoundStatus.no_noise
+    if levels.min() < margin or levels.max() > 255 - margin:
+        return BoundStatus.clipped
+    return BoundStatus.given
+
+
 def bounds(
     scenes: Scenes, rows: NDArray[np.intp], boxes: NDArray[np.int64], unknown_blur: bool
 ) -> Bounds:
@@ -185,16 +263,7 @@ def bounds(
             for name in ("noise_grey", "gain", "blur_px")
         )
         levels = scenes.levels[row] * gain
-        margin = CLIPPING_DEVIATIONS * noise
-        unmodelled = isinstance(scenes.background[row], str) or any(
-            name not in IN_BOUND for name in scenes.active(row)
-        )
-        if unmodelled:
-            status[i] = BoundStatus.not_in_model
-        elif noise < MIN_NOISE:
-            status[i] = BoundStatus.no_noise
-        elif levels.min() < margin or levels.max() > 255 - margin:
-            status[i] = BoundStatus.clipped
+        status[i] = outside_model(scenes, row)
         if status[i] != BoundStatus.given:
             continue
         key = scenes.markers[scenes.marker[row]]

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.measure.detector import DetectorOutput
+from sweep.measure.detectors import DetectorOutput
 from sweep.measure.flags import DetectionStatus
 from sweep.typing import Floats
 

@@ -1,32 +1,541 @@
-"""The detectors: OpenCV's and those of plug-ins, each made from its setting."""
+"""Detectors: OpenCV's on a window and on the whole frame, boards', and those of plug-ins."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple, cast
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sweep.declaration import parameter
-from sweep.environments.interpreters import INSTALLED
 from sweep.errors import PluginError
-from sweep.measure import detector as opencv
-from sweep.measure.board_detector import BoardDetector, BoardDetectorSetting
-from sweep.measure.detector import (
-    UNEVEN_LIGHT_CONSTANT,
-    Detector,
-    DetectorOutput,
-    DetectorSetting,
-    opencv_parameters,
-)
-from sweep.measure.foreign_detector import ForeignDetector, ForeignSetting
-from sweep.measure.plugged_detector import PluggedDetector
+from sweep.model.board import Board
+from sweep.model.marker import opencv_dictionary
 from sweep.plugins import DetectorPlugin
 from sweep.plugins.declared import PluginSetting
+from sweep.plugins.loading import call, real_numbers
 from sweep.plugins.recording import is_recording
+from sweep.typing import Floats, Integers
+
+# --------------------------------------------------------------------------------------------------
+# OpenCV's ArUco detector, on a window as on the whole frame but for place-dependent rounding.
+
+REFINEMENTS = {
+    "none": cv2.aruco.CORNER_REFINE_NONE,
+    "subpix": cv2.aruco.CORNER_REFINE_SUBPIX,
+    "contour": cv2.aruco.CORNER_REFINE_CONTOUR,
+    "apriltag": cv2.aruco.CORNER_REFINE_APRILTAG,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class DetectorSetting:
+    """Every field of ``cv2.aruco.DetectorParameters``, by OpenCV's own name and default."""
+
+    adaptiveThreshWinSizeMin: int = parameter(
+        3, "smallest window of the adaptive threshold", unit="px", low=3, high=9999
+    )
+    adaptiveThreshWinSizeMax: int = parameter(
+        23, "largest window of the adaptive threshold", unit="px", low=3, high=9999
+    )
+    adaptiveThreshWinSizeStep: int = parameter(
+        10, "step between the windows of the adaptive threshold", unit="px", low=1, high=9999
+    )
+    adaptiveThreshConstant: float = parameter(
+        7.0, "constant of the adaptive threshold", unit="grey level"
+    )
+    minMarkerPerimeterRate: float = parameter(
+        0.03, "smallest perimeter of a candidate, relative to the image's larger side", low=0,
+        open_low=True,
+    )
+    maxMarkerPerimeterRate: float = parameter(
+        4.0, "largest perimeter of a candidate, relative to the image's larger side", low=0,
+        high=10_000, open_low=True,
+    )
+    polygonalApproxAccuracyRate: float = parameter(
+        0.03, "accuracy of the polygonal approximation, relative to the perimeter", low=0,
+        open_low=True,
+    )
+    minCornerDistanceRate: float = parameter(
+        0.05, "smallest distance between corners, relative to the perimeter", low=0
+    )
+    minDistanceToBorder: int = parameter(
+        3, "smallest distance of a corner to the image's border", unit="px", low=0, high=9999
+    )
+    minMarkerDistanceRate: float = parameter(
+        0.125, "smallest distance between markers' corners, relative to the perimeter", low=0
+    )
+    minGroupDistance: float = parameter(
+        0.21, "smallest distance between corners in a group of candidates, relative to the "
+        "perimeter", low=0,
+    )
+    cornerRefinementMethod: str = parameter(
+        "none", "refinement of the corners (apriltag also replaces the search for candidates)",
+        choices=tuple(REFINEMENTS), prefix="CORNER_REFINE_", numbers=tuple(REFINEMENTS.items()),
+    )
+    cornerRefinementWinSize: int = parameter(
+        5, "largest half window of the sub-pixel refinement", unit="px", low=1, high=9999
+    )
+    relativeCornerRefinmentWinSize: float = parameter(
+        0.3, "half window of the sub-pixel refinement, relative to the module", low=0,
+        open_low=True,
+    )
+    cornerRefinementMaxIterations: int = parameter(
+        30, "most iterations of the corner refinement", low=1, high=100_000
+    )
+    cornerRefinementMinAccuracy: float = parameter(
+        0.1, "step at which the corner refinement stops", unit="px", low=0, open_low=True
+    )
+    markerBorderBits: int = parameter(
+        1, "width of the border that the detector expects", unit="module", low=1, high=10
+    )
+    perspectiveRemovePixelPerCell: int = parameter(
+        4, "samples along a side of a module", unit="px", low=1, high=1000
+    )
+    perspectiveRemoveIgnoredMarginPerCell: float = parameter(
+        0.13, "margin of a module that is not sampled, relative to the module", low=0, high=0.499
+    )
+    maxErroneousBitsInBorderRate: float = parameter(
+        0.35, "largest share of wrong bits in the border", low=0, high=1
+    )
+    minOtsuStdDev: float = parameter(
+        5.0, "smallest standard deviation at which Otsu's threshold is taken",
+        unit="grey level", low=0,
+    )
+    errorCorrectionRate: float = parameter(
+        0.6, "error correction, relative to the dictionary's maximum", low=0, high=1
+    )
+    aprilTagQuadDecimate: float = parameter(
+        0.0, "apriltag: decimation of the image before the search", low=0, high=64
+    )
+    aprilTagQuadSigma: float = parameter(
+        0.0, "apriltag: Gaussian blur (negative: sharpening) before the search", unit="px",
+        low=-100, high=100,
+    )
+    aprilTagMinClusterPixels: int = parameter(
+        5, "apriltag: smallest cluster of edge pixels", unit="px", low=0, high=10**6
+    )
+    aprilTagMaxNmaxima: int = parameter(
+        10, "apriltag: most corner candidates of a cluster", low=1, high=1000
+    )
+    aprilTagCriticalRad: float = parameter(
+        0.1745329201221466, "apriltag: edges closer than this to straight or to reversal make no "
+        "corner", unit="radian", low=0, high=3.1416,
+    )
+    aprilTagMaxLineFitMse: float = parameter(
+        10.0, "apriltag: largest mean squared error of a line fit", unit="px²", low=0
+    )
+    aprilTagMinWhiteBlackDiff: int = parameter(
+        5, "apriltag: smallest contrast of a tile", unit="grey level", low=0, high=255
+    )
+    aprilTagDeglitch: int = parameter(
+        0, "apriltag: clean up the threshold; only 0: with 1 OpenCV's result depends on the "
+        "images searched before (5-7 of 150 images, in 4.14 and 5.0)", low=0, high=0,
+    )
+    detectInvertedMarker: bool = parameter(False, "also search for white-on-black markers")
+    useAruco3Detection: bool = parameter(
+        False, "the faster search of ArUco 3 (always on the full frame)"
+    )
+    minSideLengthCanonicalImg: int = parameter(
+        32, "ArUco 3: smallest side of a candidate in the canonical image", unit="px", low=1,
+        high=10_000,
+    )
+    minMarkerLengthRatioOriginalImg: float = parameter(
+        0.0, "ArUco 3: smallest marker, relative to the image's larger side", low=0, high=1
+    )
+    validBitIdThreshold: float = parameter(
+        0.49, "share of a module's pixels from which its bit is uncertain", low=0, high=1
+    )
+
+    @classmethod
+    def missing_fields(cls) -> set[str]:
+        """Return the fields that the installed OpenCV does not have."""
+        parameters = cv2.aruco.DetectorParameters()
+        return {f.name for f in dataclasses.fields(cls) if not hasattr(parameters, f.name)}
+
+
+ALIGNMENT_PX = 4
+"""Windows begin and end at multiples of this: the tiles of the apriltag search are 4 px wide."""
+
+MIN_WINDOW_PX = 8
+
+
+def opencv_full_frame_reason(setting: DetectorSetting) -> str | None:
+    """Return why a setting must search the whole frame; None if it can search a window."""
+    if setting.useAruco3Detection:
+        return "useAruco3Detection scales the image by the frame's size"
+    if setting.cornerRefinementMethod == "apriltag" and setting.aprilTagQuadDecimate > 1:
+        return "aprilTagQuadDecimate resamples the frame"
+    if setting.adaptiveThreshConstant < 1:
+        return "adaptiveThreshConstant below 1 turns the plain background into candidates"
+    return None
+
+
+def opencv_margin_px(setting: DetectorSetting) -> int:
+    """Return the width of the border around the marker whose pixels can change the detection.
+
+    Half the largest threshold window and the border in which no corner may lie, plus the
+    contour's own pixel and one to spare; at least the reach of the sub-pixel refinement and of the
+    apriltag search's tiles and blur, if they are used (measured: 2 of 1,500 searches differed at
+    24 px, none from 32). With OpenCV's defaults: 16.
+    """
+    margin = setting.adaptiveThreshWinSizeMax // 2 + setting.minDistanceToBorder + 2
+    if setting.cornerRefinementMethod == "subpix":
+        margin = max(margin, 2 * setting.cornerRefinementWinSize + 3)
+    if setting.cornerRefinementMethod == "apriltag":
+        margin = max(margin, 36 + int(4 * abs(setting.aprilTagQuadSigma)))
+    return margin
+
+
+NOISE_MARGIN_PX = 32
+"""Added to the margin if there is noise: its candidates around the marker affect one another.
+
+Of 3,600 searches with noise of 1 to 32 grey levels 102 flags differed from the full frame's
+without it, 3 with 16 px, none from 32. Coarse noise (correlated, or through JPEG) needs twice as
+much: of 300 searches with noise of 8 to 32, a correlation of 0.7 and quality 1, two flags differed
+with 16 px, one with 32, none with 64.
+"""
+
+
+UNEVEN_LIGHT_CONSTANT = 7.0
+"""The adaptive threshold's constant below which uneven light (at gain 1) is searched on whole
+frames: on a slope the replicated border of a window makes candidates of the background. With
+gradients to 2 of frames from 96 px wide no flag differed at 7, of 400 up to 17 at 1.5."""
+
+
+def windows(
+    boxes: NDArray[np.int64], frame: NDArray[np.int64], margin: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return the windows (N, 4) to search: boxes (N, 4) widened, aligned, clipped at the frame.
+
+    ``margin`` (N, 1) in pixels.
+
+    A side is at least 8 px if the frame allows it. A window reaches the frame's edge exactly if
+    the margin does, since nothing lies beyond.
+    """
+    start = (boxes[:, :2] - margin) // ALIGNMENT_PX * ALIGNMENT_PX
+    stop = -((-boxes[:, 2:] - margin) // ALIGNMENT_PX) * ALIGNMENT_PX
+    start = np.maximum(start, 0)
+    stop = np.maximum(stop, start + MIN_WINDOW_PX)
+    over = stop - np.minimum(stop, frame)
+    start = np.where(
+        (over > 0) & (stop - over - start < MIN_WINDOW_PX),
+        np.maximum(frame - MIN_WINDOW_PX, 0) // ALIGNMENT_PX * ALIGNMENT_PX,
+        start,
+    )
+    return np.concatenate([start, stop - over], axis=1)
+
+
+DetectorOutput = tuple[
+    Sequence[NDArray[np.floating[Any]]], NDArray[np.integer[Any]] | None,
+    Sequence[NDArray[np.floating[Any]]],
+]
+"""Corners (1, 4, 2) each of n decoded markers; their IDs, (n,) or as in OpenCV 4 (n, 1), None if n
+is 0; and corners of the rejected candidates."""
+
+
+SearchFunction = Callable[[NDArray[np.uint8]], DetectorOutput]
+
+
+def perimeter_rates(setting: DetectorSetting, side: int, frame_side: int) -> tuple[float, float]:
+    """Return the perimeter limits for an image of larger side ``side``, a window of a frame.
+
+    OpenCV takes them relative to the image that it is given and turns them into whole pixels: they
+    are passed so that they give the same numbers as on the frame.
+    """
+    low, high = setting.minMarkerPerimeterRate, setting.maxMarkerPerimeterRate
+    if side == frame_side:
+        return low, high
+    return (int(low * frame_side) + 0.5) / side, (int(high * frame_side) + 0.5) / side
+
+
+def opencv_parameters(setting: DetectorSetting) -> cv2.aruco.DetectorParameters:
+    """Return a setting as OpenCV's detectors take it."""
+    parameters = cv2.aruco.DetectorParameters()
+    defaults = DetectorSetting()
+    for field in dataclasses.fields(setting):
+        value = getattr(setting, field.name)
+        if field.name == "cornerRefinementMethod":
+            value = REFINEMENTS[value]
+        elif value == getattr(defaults, field.name):
+            continue
+        setattr(parameters, field.name, value)
+    return parameters
+
+
+class Detector:
+    """One setting of OpenCV's detector in this process; OpenCV's objects cannot be pickled."""
+
+    def __init__(self, setting: DetectorSetting) -> None:
+        self._setting = setting
+        self._parameters = opencv_parameters(setting)
+        self._searches: dict[tuple[str, int, int], SearchFunction] = {}
+
+    def find(self, image: NDArray[np.uint8], dictionary: str, frame_side: int) -> DetectorOutput:
+        """Search an image (h, w): a window of a frame whose larger side is ``frame_side``."""
+        key = dictionary, max(image.shape), frame_side
+        return (self._searches.get(key) or self._search(*key))(image)
+
+    def _search(self, dictionary: str, side: int, frame_side: int) -> SearchFunction:
+        """Return OpenCV's search for images of larger side ``side``; one for each size is kept."""
+        low, high = perimeter_rates(self._setting, side, frame_side)
+        parameters = self._parameters
+        parameters.minMarkerPerimeterRate, parameters.maxMarkerPerimeterRate = low, high
+        detector = cv2.aruco.ArucoDetector(opencv_dictionary(dictionary), parameters)
+        # OpenCV's stubs have neither the element types nor that the IDs may be None.
+        search = cast("SearchFunction", detector.detectMarkers)
+        self._searches[dictionary, side, frame_side] = search
+        return search
+
+
+# --------------------------------------------------------------------------------------------------
+# What OpenCV finds on a board beside its markers: missed markers, and a chessboard's corners.
+
+@dataclass(frozen=True, slots=True)
+class BoardDetectorSetting:
+    """How OpenCV uses what it knows of a board, by its own names and defaults."""
+
+    refineDetectedMarkers: bool = parameter(
+        False, "boards: cv2.aruco.ArucoDetector.refineDetectedMarkers takes rejected candidates "
+        "for the markers that are expected where they lie",
+    )
+    minMarkers: int = parameter(
+        2, "charuco: markers beside a corner of the chessboard that must be detected for it to be "
+        "interpolated", low=0, high=2,
+    )
+
+
+class BoardOutput(NamedTuple):
+    """What is found on a board in one image: markers, and a chessboard's corners.
+
+    Attributes
+    ----------
+    markers
+        The detector's output, with the markers that were found by means of the board.
+    chessboard_ids, chessboard_px
+        (C,) and (C, 2) indices and pixels of the chessboard's corners that were found.
+    """
+
+    markers: DetectorOutput
+    chessboard_ids: Integers
+    chessboard_px: Floats
+
+
+_NO_IDS, _NO_CORNERS = np.zeros(0, dtype=np.int64), np.zeros((0, 2))
+
+
+class BoardDetector:
+    """What OpenCV does with markers when it knows the board, by one setting.
+
+    Parameters
+    ----------
+    setting
+        How it uses the board.
+    parameters
+        Those of the detector of markers, of which it takes the refinement of corners.
+    """
+
+    def __init__(
+        self, setting: BoardDetectorSetting, parameters: cv2.aruco.DetectorParameters
+    ) -> None:
+        self._setting = setting
+        self._parameters = parameters
+        self._refining: dict[str, cv2.aruco.ArucoDetector] = {}
+        self._charuco: dict[Board, cv2.aruco.CharucoDetector] = {}
+
+    def complete(
+        self, image: NDArray[np.uint8], board: Board, markers: DetectorOutput
+    ) -> BoardOutput:
+        """Return what is found on a board in an image (h, w) in which ``markers`` were detected.
+
+        ``cv2.aruco.ArucoDetector.refineDetectedMarkers`` and
+        ``cv2.aruco.CharucoDetector.detectBoard`` are called without a camera: their homographies
+        are local.
+        """
+        corners, ids, rejected = markers
+        if ids is None or not len(ids):
+            return BoardOutput(markers, _NO_IDS, _NO_CORNERS)
+        if self._setting.refineDetectedMarkers and rejected:
+            refine: Any = self._refining_detector(board.dictionary).refineDetectedMarkers
+            corners, ids, rejected, _ = refine(
+                image, _opencv_board(board), list(corners), ids, list(rejected)
+            )
+            markers = list(corners), ids, list(rejected)
+        if board.chessboard is None:
+            return BoardOutput(markers, _NO_IDS, _NO_CORNERS)
+        pixels, found, _, _ = self._charuco_detector(board).detectBoard(
+            image, markerCorners=list(corners), markerIds=ids
+        )
+        if found is None or not len(found):
+            return BoardOutput(markers, _NO_IDS, _NO_CORNERS)
+        return BoardOutput(
+            markers, np.asarray(found, dtype=np.int64).ravel(),
+            np.asarray(pixels, dtype=np.float64).reshape(-1, 2),
+        )
+
+    def _refining_detector(self, dictionary: str) -> cv2.aruco.ArucoDetector:
+        if dictionary not in self._refining:
+            self._refining[dictionary] = cv2.aruco.ArucoDetector(
+                opencv_dictionary(dictionary), self._parameters
+            )
+        return self._refining[dictionary]
+
+    def _charuco_detector(self, board: Board) -> cv2.aruco.CharucoDetector:
+        if board not in self._charuco:
+            parameters = cv2.aruco.CharucoParameters()
+            parameters.minMarkers = self._setting.minMarkers
+            self._charuco[board] = cv2.aruco.CharucoDetector(
+                charuco_board(board), parameters, self._parameters
+            )
+        return self._charuco[board]
+
+
+@lru_cache(maxsize=64)
+def _opencv_board(board: Board) -> Any:
+    ids = np.array(board.marker_ids, dtype=np.int32)
+    if board.chessboard is not None:
+        return charuco_board(board)
+    corners: Any = board.corners_m.astype(np.float32)
+    return cv2.aruco.Board(corners, opencv_dictionary(board.dictionary), ids)
+
+
+def charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
+    """Return a ChArUco board as OpenCV has it; ValueError for another board."""
+    squares = board.chessboard
+    if squares is None:
+        raise ValueError("the board has no chessboard")
+    charuco = cv2.aruco.CharucoBoard(
+        (squares.squares_x, squares.squares_y), squares.square_m, squares.marker_m,
+        opencv_dictionary(board.dictionary), np.array(board.marker_ids, dtype=np.int32),
+    )
+    charuco.setLegacyPattern(squares.legacy_pattern)
+    return charuco
+
+
+# --------------------------------------------------------------------------------------------------
+# A plug-in's detector: its conventions are turned into ours, and what it returns is checked.
+
+MAX_MARKERS = 1000
+"""Markers, or candidates, that are believed of an image with one marker."""
+
+
+class PluggedDetector:
+    """One setting of a plug-in's detector in this process.
+
+    Parameters
+    ----------
+    name
+        The plug-in's, for messages.
+    record
+        Its declaration.
+    settings
+        An instance of its settings; None without.
+    """
+
+    def __init__(self, name: str, record: DetectorPlugin, settings: Any) -> None:
+        self._name = name
+        self._record = record
+        self._settings = settings
+        self._searches: dict[str, Callable[[NDArray[np.uint8]], Any]] = {}
+
+    def find(
+        self, image: NDArray[np.uint8], dictionary: str, frame_side: int  # noqa: ARG002
+    ) -> DetectorOutput:
+        """Search an image (h, w) for markers of a dictionary; the frame's side does not matter.
+
+        Raises
+        ------
+        PluginError
+            If the plug-in raises, or returns what cannot be a detection; in one line.
+        """
+        search = self._searches.get(dictionary) or self.make(dictionary)
+        own = np.array(image, order="C")  # what it does to its image reaches nobody else
+        returned = call(self._name, search, own)
+        if not np.array_equal(own, image):
+            raise PluginError(f"{self._name}: changed the image that it was given; copy it first")
+        return self._checked(returned)
+
+    def make(self, dictionary: str) -> Callable[[NDArray[np.uint8]], Any]:
+        """Return the plug-in's search for markers of a dictionary, made once.
+
+        Raises
+        ------
+        PluginError
+            If it does not have the dictionary, or cannot be made; in one line.
+        """
+        families = self._record.families
+        if families is not None and dictionary not in families:
+            raise PluginError(
+                f"{self._name}: no dictionary {dictionary}; it has {', '.join(families)}"
+            )
+        family = dictionary if families is None else families[dictionary]
+        search = call(self._name, self._record.make, self._settings, family)
+        if not callable(search):
+            raise PluginError(
+                f"{self._name}: make returns a {type(search).__name__}, not a function"
+            )
+        made: Callable[[NDArray[np.uint8]], Any] = search
+        self._searches[dictionary] = made
+        return made
+
+    def _checked(self, returned: Any) -> DetectorOutput:
+        """Return what a plug-in returned in our conventions."""
+        if not isinstance(returned, tuple) or len(returned) not in (2, 3):
+            raise PluginError(
+                f"{self._name}: returned a {type(returned).__name__}; expected a tuple "
+                "(corners, ids), or with rejected quadrilaterals as the third"
+            )
+        corners = self._quadrilaterals("corners", returned[0])
+        rejected = self._quadrilaterals("rejected", returned[2] if len(returned) > 2 else ())
+        try:
+            ids = np.asarray(returned[1])
+        except Exception:
+            raise PluginError(f"{self._name}: returned ids that are no array") from None
+        if ids.size == 0 and len(corners) == 0:
+            return [], None, list(rejected[:, None])
+        if ids.shape != (len(corners),):
+            raise PluginError(
+                f"{self._name}: returned ids of shape {ids.shape}; expected ({len(corners)},), "
+                "one of each marker"
+            )
+        if ids.dtype.kind not in "iu":
+            raise PluginError(
+                f"{self._name}: returned ids of type {ids.dtype}; expected whole numbers"
+            )
+        if np.ma.is_masked(returned[1]):
+            raise PluginError(f"{self._name}: returned ids of which some are masked")
+        if (ids > np.iinfo(np.int64).max).any():
+            raise PluginError(f"{self._name}: returned the ID {ids.max()}; expected below 2^63")
+        if (ids < 0).any():
+            raise PluginError(f"{self._name}: returned the ID {ids.min()}; expected at least 0")
+        return list(corners[:, None]), ids.astype(np.int64), list(rejected[:, None])
+
+    def _quadrilaterals(self, what: str, returned: Any) -> Floats:
+        """Return corners (n, 4, 2) in our order, with pixel centres at whole numbers."""
+        quads = real_numbers(self._name, what, returned)
+        if quads.size == 0 and quads.shape[:1] in ((0,), (1,)):
+            return np.empty((0, 4, 2))
+        if quads.ndim != 3 or quads.shape[1:] != (4, 2):
+            raise PluginError(
+                f"{self._name}: returned {what} of shape {quads.shape}; expected (n, 4, 2)"
+            )
+        if len(quads) > MAX_MARKERS:
+            raise PluginError(
+                f"{self._name}: returned {len(quads):,} {what} for one image; expected at most "
+                f"{MAX_MARKERS:,}"
+            )
+        if not np.isfinite(quads).all():
+            raise PluginError(f"{self._name}: returned {what} that are not finite")
+        return quads[:, self._record.corner_order] - self._record.pixel_center
+
+
+# --------------------------------------------------------------------------------------------------
+# The detectors: OpenCV's and those of plug-ins, each made from its setting.
 
 OPENCV = "opencv"
 """The detector that is no plug-in, ``cv2.aruco.ArucoDetector``."""
@@ -42,13 +551,9 @@ class DetectorChoice:
         "detections that `sweep score` recorded", choices=(OPENCV,),
         plugin="detector",
     )
-    environment: str = parameter(
-        INSTALLED, "the Python whose OpenCV searches: installed, the one that runs this; a name of "
-        "`sweep environments list`; or the path of a Python or of a virtual environment",
-    )
 
 
-AnyDetectorSetting = DetectorSetting | PluginSetting | ForeignSetting
+AnyDetectorSetting = DetectorSetting | PluginSetting
 """A setting of any detector."""
 
 FindFunction = Callable[[NDArray[np.uint8], str, int], DetectorOutput]
@@ -63,13 +568,9 @@ def make_detector(setting: AnyDetectorSetting) -> FindFunction:
     ------
     PluginError
         If a plug-in cannot be used.
-    EnvironmentFaultError
-        If an environment cannot be used.
     """
     if isinstance(setting, DetectorSetting):
         return Detector(setting).find
-    if isinstance(setting, ForeignSetting):
-        return ForeignDetector(setting)
     if is_recording(setting.plugin.name):
         return _find_nothing
     return _kept_plugin(setting).find
@@ -96,16 +597,10 @@ def _kept_plugin(setting: PluginSetting) -> PluggedDetector:
     return PluggedDetector(setting.plugin.name, record, setting.instance())
 
 
-def _of_opencv(setting: AnyDetectorSetting) -> DetectorSetting | PluginSetting:
-    """Return the setting of OpenCV's detector, in whichever environment; a plug-in's as it is."""
-    return setting.setting if isinstance(setting, ForeignSetting) else setting
-
-
 def full_frame_reason(setting: AnyDetectorSetting) -> str | None:
     """Return why a setting must search the whole frame; None if it can search a window."""
-    setting = _of_opencv(setting)
     if isinstance(setting, DetectorSetting):
-        return opencv.full_frame_reason(setting)
+        return opencv_full_frame_reason(setting)
     if _margin_px(setting) is None:
         return f"{setting.plugin.name} declares no margin_px"
     return None
@@ -113,15 +608,13 @@ def full_frame_reason(setting: AnyDetectorSetting) -> str | None:
 
 def margin_px(setting: AnyDetectorSetting) -> int:
     """Return the width of the border around the marker whose pixels can change the detection."""
-    setting = _of_opencv(setting)
     if isinstance(setting, DetectorSetting):
-        return opencv.margin_px(setting)
+        return opencv_margin_px(setting)
     return _margin_px(setting) or 0
 
 
 def uneven_light_needs_frame(setting: AnyDetectorSetting, gain: Any) -> Any:
     """Return whether uneven light, amplified by ``gain`` (...; 0: even), needs whole frames."""
-    setting = _of_opencv(setting)
     if isinstance(setting, DetectorSetting):
         return setting.adaptiveThreshConstant < UNEVEN_LIGHT_CONSTANT * gain
     return np.zeros(np.shape(gain), dtype=bool)

@@ -7,7 +7,7 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from enum import IntEnum
 from typing import Any, Self
 
@@ -179,6 +179,15 @@ def present_values(flags: Iterable[Flag]) -> list[int]:
     [1, 7]
     """
     return [int(member) for member in flags if member.present]
+
+
+def looked_for(counts: Sequence[int]) -> int:
+    """Return how many of the detection stage's cells were looked for; ``counts`` are by flag.
+
+    >>> looked_for([5, 600, 20])
+    620
+    """
+    return sum(count for flag, count in zip(DetectionStatus, counts, strict=False) if flag.counted)
 
 
 def uncounted_values(flags: Iterable[Flag]) -> list[int]:

@@ -1,10 +1,4 @@
-"""The likelihood of a target's pixels: fitted to an image, and how sharp it is at the truth.
-
-Pixels are exact levels plus independent Gaussian noise. The pose (and the point spread, if it is
-free) is moved by Levenberg-Marquardt; the three grey levels enter linearly and are solved for at
-every step (Golub and Pereyra, "The differentiation of pseudo-inverses and nonlinear least
-squares problems whose variables separate", SIAM J. Numer. Anal. 10, 1973).
-"""
+"""The likelihood of a target's pixels: fitted to an image, and how sharp it is at the truth."""
 
 from __future__ import annotations
 
@@ -16,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
-from sweep.measure.positive_definite import solve_positive
 from sweep.model.board import Board
 from sweep.model.coverage import MarkerEdges
 from sweep.model.derivatives import (
@@ -26,10 +19,73 @@ from sweep.model.derivatives import (
     differentiate,
     normal_equations,
 )
+from sweep.model.polygon import Optics, Projection
 from sweep.model.pose import rotations, vectors
 from sweep.model.printed import PrintKey, edges_of, extent_of, target_edges, unit_m
-from sweep.model.projection import Optics, Projection
 from sweep.typing import Floats
+
+# --------------------------------------------------------------------------------------------------
+# Systems of equations with a positive definite matrix, and the covariance of a pose.
+
+@compiled
+def solve_positive(matrix: Floats, right: Floats) -> bool:
+    """Solve matrix · x = right in place; return False if the matrix is not positive definite.
+
+    Scaled to a unit diagonal, then by Cholesky's factors; a pivot must be above 1e-11.
+    """
+    n = matrix.shape[0]
+    scale, factor = np.empty(n), np.empty((n, n))
+    for i in range(n):
+        if not (matrix[i, i] > 0.0 and matrix[i, i] < math.inf):
+            return False
+        scale[i] = 1.0 / math.sqrt(matrix[i, i])
+    for i in range(n):
+        for j in range(i + 1):
+            total = matrix[i, j] * scale[i] * scale[j]
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i > j:
+                factor[i, j] = total / factor[j, j]
+            elif total > 1e-11:
+                factor[i, i] = math.sqrt(total)
+            else:
+                return False
+    for column in range(right.shape[1]):
+        for i in range(n):
+            total = right[i, column] * scale[i]
+            for k in range(i):
+                total -= factor[i, k] * right[k, column]
+            right[i, column] = total / factor[i, i]
+        for i in range(n - 1, -1, -1):
+            total = right[i, column]
+            for k in range(i + 1, n):
+                total -= factor[k, i] * right[k, column]
+            right[i, column] = total / factor[i, i]
+        for i in range(n):
+            right[i, column] *= scale[i]
+    return True
+
+
+@compiled
+def pose_covariance(information: Floats, variance: float, distance: float) -> tuple[Floats, bool]:
+    """Return the covariance (6, 6) of the pose in radians and metres, and whether it exists."""
+    free = information.shape[0]
+    inverse = np.eye(free)
+    exists = solve_positive(information, inverse)
+    for i in range(POSE):
+        for j in range(POSE):
+            unit = (distance if i >= 3 else 1.0) * (distance if j >= 3 else 1.0)
+            inverse[i, j] *= variance * unit
+    return inverse[:POSE, :POSE].copy(), exists
+
+
+# --------------------------------------------------------------------------------------------------
+# The likelihood of a target's pixels: fitted to an image, and how sharp it is at the truth.
+#
+# Pixels are exact levels plus independent Gaussian noise. The pose (and the point spread, if it
+# is free) is moved by Levenberg-Marquardt; the three grey levels enter linearly and are solved
+# for at every step (Golub and Pereyra, "The differentiation of pseudo-inverses and nonlinear
+# least squares problems whose variables separate", SIAM J. Numer. Anal. 10, 1973).
 
 STATE_LENGTH = 16
 ROTATION, POSITION = slice(0, 9), slice(9, 12)

@@ -1,15 +1,4 @@
-"""The model of a photograph of a printed plane: its image, and what cameras do to levels.
-
-The level of a pixel is modelled as
-
-    y = F(b + c m + d p + e m (1 - m)) + gx x + gy y + (hx x + hy y) F(m),
-    F(z) = z + a (z - G(z)),
-
-m is the share of white through a Gaussian point spread, p that of the area outside the modelled
-paper; b, c, d are levels, e is the tone curve, g and h are the light's gradients on black and on
-white, and F is sharpening of an amount a, G being the mean over a Gaussian of ``radius_px``.
-With a c as a parameter in the place of a, all but the pose and the point spread is linear.
-"""
+"""The model of a photograph of a printed plane: its image, and what cameras do to levels."""
 
 from __future__ import annotations
 
@@ -19,12 +8,232 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.compilation import compiled, compiled_inline
+from sweep.measure.estimation import Detections
 from sweep.measure.likelihood import DEPTH, SPREAD, MarkerView, plane_of
-from sweep.measure.photograph_image import Slopes, add_plane, slope_space
+from sweep.measure.surroundings import clear_modules, edges_alone, surroundings
+from sweep.model.coverage import NODES, WEIGHTS, MarkerEdges
 from sweep.model.derivatives import POSE
 from sweep.model.lens import jacobian, undistort
-from sweep.model.projection import Optics, Projection
+from sweep.model.marker import module_count, overhang
+from sweep.model.polygon import (
+    ModuleEdge,
+    Optics,
+    Projection,
+    chord_count,
+    distorted_point,
+    homogeneous_pixel,
+)
 from sweep.typing import Floats, Integers
+
+# --------------------------------------------------------------------------------------------------
+# A printed plane's blurred image and its slopes, as a photograph is fitted by them.
+#
+# The level of a pixel is that of area coverage through a Gaussian point spread, as in
+# :mod:`sweep.model.coverage`. Its slopes along x and along y, and by the point spread's variance,
+# are integrals along the same edges. All edges lie in one plane, so that the image's slope by a
+# parameter of the pose is the slope along x and y times the velocity of the plane's point at the
+# pixel: three numbers a pixel in place of seven, where :mod:`sweep.model.derivatives` is exact.
+# The point spread mixes velocities of neighbouring points, which are the same up to its width
+# over the marker's side; that changes the direction of a step, not the pose at which the fit
+# ends.
+
+REACH = 3.5
+"""Standard deviations at which the point spread is cut off; 5e-4 of it lies beyond."""
+
+PANEL = 2.0
+"""Length of one panel of the quadrature in standard deviations of the point spread: 4e-4 of the
+jump."""
+
+MAX_PANELS = 4096
+"""Most panels of one straight segment."""
+
+_STEPS = 64
+_AT = np.arange(-6 * _STEPS, 6 * _STEPS + 2) / _STEPS
+_DENSITY = np.exp(-0.5 * _AT**2) / math.sqrt(2.0 * math.pi)
+_BELOW = np.array([0.5 * math.erfc(-at / math.sqrt(2.0)) for at in _AT.tolist()])
+_BELOW_SUM = _AT * _BELOW + _DENSITY
+"""The normal distribution, its integral, and the integral of that, in steps of 1/64 standard
+deviations."""
+
+
+class Slopes(NamedTuple):
+    """A box's image and its slopes; all are 0 between calls.
+
+    Attributes
+    ----------
+    rates
+        (height, 4 · (width + 1)): of each pixel the image's step from the pixel before, its
+        slopes by x and by y, and that by the point spread's variance.
+    outside
+        (height, width + 1) steps of the area outside.
+    """
+
+    rates: Floats
+    outside: Floats
+
+
+@compiled
+def slope_space(height: int, width: int) -> Slopes:
+    """Return the scratch space for a box."""
+    return Slopes(np.zeros((height, 4 * (width + 1))), np.zeros((height, width + 1)))
+
+
+@compiled
+def _add_segment(
+    out: Slopes, jump: float, outside: float, sigma: float, shortest: float,
+    xa: float, ya: float, xb: float, yb: float,
+) -> None:
+    """Add a straight segment from (xa, ya) to (xb, yb) px of the box.
+
+    ``jump`` is the image's step across it, ``outside`` that of the area outside.
+    """
+    rates, outsides = out
+    height, width = outsides.shape[0], outsides.shape[1] - 1
+    reach = REACH * sigma + 0.5
+    if min(xa, xb) > width + reach or min(ya, yb) > height + reach or max(ya, yb) < -reach:
+        return
+    panels = min(
+        max(math.ceil(math.hypot(xb - xa, yb - ya) / max(PANEL * sigma, shortest)), 1), MAX_PANELS
+    )
+    dx, dy = (xb - xa) / panels, (yb - ya) / panels
+    most = int(2.0 * reach) + 3
+    basis, along_y, steps = np.empty(4 * most), np.zeros(4 * most), np.empty(most)
+    scale = _STEPS / sigma
+    for panel in range(panels):
+        for node in range(3):
+            t = panel + NODES[node]
+            x, y = xa + t * dx, ya + t * dy
+            first, last = math.floor(x - reach), math.floor(x + reach) + 1
+            top, bottom = max(math.floor(y - reach), 0), min(math.floor(y + reach), height - 1)
+            if first >= width or top > bottom:
+                continue
+            weight_x, weight_y = WEIGHTS[node] * jump * dy, WEIGHTS[node] * jump * dx
+            curved_x, curved_y = 0.5 * weight_x / sigma, 0.5 * weight_y / sigma
+            begin, end = max(first, 0), min(last, width - 1)
+            # Columns left of the box are one step at its first column.
+            passed = before = low = low_sum = low_density = 0.0
+            at = (first - x) * scale + 6.0 * _STEPS
+            if at > 0.0:
+                k = int(at)
+                low, low_sum, low_density = _BELOW[k], sigma * _BELOW_SUM[k], _DENSITY[k]
+            for j in range(first, end + 1):
+                at = (j + 1.0 - x) * scale + 6.0 * _STEPS
+                if at >= 12.0 * _STEPS:
+                    high, high_sum, high_density = 1.0, j + 1.0 - x, 0.0
+                elif at <= 0.0:
+                    high, high_sum, high_density = 0.0, 0.0, 0.0
+                else:
+                    k = int(at)
+                    part = at - k
+                    high = _BELOW[k] + part * (_BELOW[k + 1] - _BELOW[k])
+                    high_sum = sigma * (_BELOW_SUM[k] + part * (_BELOW_SUM[k + 1] - _BELOW_SUM[k]))
+                    high_density = _DENSITY[k] + part * (_DENSITY[k + 1] - _DENSITY[k])
+                share = 1.0 if j == last else high_sum - low_sum
+                if j < 0:
+                    passed += share - before
+                else:
+                    m = j - begin
+                    near = high - low
+                    steps[m] = share - before
+                    basis[4 * m] = weight_x * (share - before)
+                    basis[4 * m + 1] = weight_x * near
+                    basis[4 * m + 2] = -weight_y * near
+                    basis[4 * m + 3] = curved_x * (high_density - low_density)
+                    along_y[4 * m + 3] = curved_y * near
+                before, low, low_sum, low_density = share, high, high_sum, high_density
+            at = (top - y) * scale + 6.0 * _STEPS
+            low, low_density = 0.0, 0.0
+            if at > 0.0:
+                k = int(at)
+                low, low_density = _BELOW[k], _DENSITY[k]
+            count, start = max(end - begin + 1, 0), 4 * begin
+            for i in range(top, bottom + 1):
+                at = (i + 1.0 - y) * scale + 6.0 * _STEPS
+                if at >= 12.0 * _STEPS:
+                    high, high_density = 1.0, 0.0
+                elif at <= 0.0:
+                    high, high_density = 0.0, 0.0
+                else:
+                    k = int(at)
+                    part = at - k
+                    high = _BELOW[k] + part * (_BELOW[k + 1] - _BELOW[k])
+                    high_density = _DENSITY[k] + part * (_DENSITY[k + 1] - _DENSITY[k])
+                share, change = high - low, low_density - high_density
+                low, low_density = high, high_density
+                row = rates[i]
+                for m in range(4 * count):
+                    row[start + m] += share * basis[m] + change * along_y[m]
+                if passed != 0.0:
+                    rates[i, 0] += share * weight_x * passed
+                if outside != 0.0:
+                    factor = share * outside * WEIGHTS[node] * dy
+                    outsides[i, 0] += factor * passed
+                    for m in range(count):
+                        outsides[i, begin + m] += factor * steps[m]
+
+
+@compiled
+def add_plane(
+    out: Slopes, edges: MarkerEdges, values: Floats, projection: Projection, sigma: float,
+    shortest: float,
+) -> None:
+    """Add the edges of a printed plane to ``out``.
+
+    Parameters
+    ----------
+    out
+        A box whose first pixel is (0, 0) of the projection.
+    edges
+        The edges of what is printed, in modules.
+    values
+        (3,) values of the image on the areas outside, black and white.
+    projection
+        The plane, and the camera.
+    sigma
+        The point spread's standard deviation in px, positive.
+    shortest
+        Least length of a panel of the quadrature in px.
+    """
+    intrinsics = projection.optics.intrinsics
+    shift_x, shift_y = intrinsics[2] + 0.5, intrinsics[3] + 0.5
+    ends, sides = edges.ends, edges.sides
+    for e in range(ends.shape[0]):
+        jump = values[sides[e, 1]] - values[sides[e, 0]]
+        outside = 1.0 * (sides[e, 1] == 0) - 1.0 * (sides[e, 0] == 0)
+        if jump == 0.0 and outside == 0.0:
+            continue
+        edge = ModuleEdge(ends[e, 0], ends[e, 1], ends[e, 2], ends[e, 3])
+        if not projection.optics.distorted:
+            x0, y0, z0 = homogeneous_pixel(projection, shift_x, shift_y, edge.column, edge.row)
+            x1, y1, z1 = homogeneous_pixel(
+                projection, shift_x, shift_y, edge.to_column, edge.to_row
+            )
+            _add_segment(
+                out, jump, outside, sigma, shortest, x0 / z0, y0 / z0, x1 / z1, y1 / z1
+            )
+            continue
+        chords = chord_count(projection, edge)
+        x, y = distorted_point(0.0, projection, edge)
+        for chord in range(1, chords + 1):
+            u, v = distorted_point(chord / chords, projection, edge)
+            _add_segment(
+                out, jump, outside, sigma, shortest, x + 0.5, y + 0.5, u + 0.5, v + 0.5
+            )
+            x, y = u, v
+
+
+# --------------------------------------------------------------------------------------------------
+# The model of a photograph of a printed plane: its image, and what cameras do to levels.
+#
+# The level of a pixel is modelled as
+#
+#     y = F(b + c m + d p + e m (1 - m)) + gx x + gy y + (hx x + hy y) F(m),
+#     F(z) = z + a (z - G(z)),
+#
+# m is the share of white through a Gaussian point spread, p that of the area outside the modelled
+# paper; b, c, d are levels, e is the tone curve, g and h are the light's gradients on black and
+# on white, and F is sharpening of an amount a, G being the mean over a Gaussian of ``radius_px``.
+# With a c as a parameter in the place of a, all but the pose and the point spread is linear.
 
 AMOUNT, OUTSIDE_VALUE, TONE = 13, 14, 15
 CONTRAST = 16
@@ -99,7 +308,7 @@ class System(NamedTuple):
     Attributes
     ----------
     slopes
-        As :func:`sweep.measure.photograph_image.slope_space` returns it.
+        As :func:`sweep.measure.photograph_model.slope_space` returns it.
     images
         (8, height, width): the level's slopes by contrast, tone, x, y, the point spread's variance,
         the area outside and the amount of sharpening, all as shares of the contrast; and the share
@@ -348,3 +557,152 @@ def linear_count(nuisances: Nuisances) -> int:
         2 + int(nuisances.outside) + int(nuisances.tone) + int(nuisances.sharpening)
         + 4 * int(nuisances.light)
     )
+
+
+# --------------------------------------------------------------------------------------------------
+# The box of a photograph that is fitted: its pixels, and the same of half the resolution.
+
+RING_MODULES = 1.5
+"""Widest part of the quiet zone that is fitted, in modules: farther out nothing tells the pose."""
+
+PADDING_PX = 2.0
+"""Pixels around the fitted ones in the box, beside the reach of the sharpening."""
+
+PANEL_PX, COARSE_PANEL_PX = 0.4, 0.8
+"""Least length of the pieces in which edges are integrated, in px: of the photograph, and of means
+of 2 x 2 pixels, whose fit is a start."""
+
+MODELLED_PX = 5.0
+"""Pixels around the fitted ones within which print is in the model: what blur carries inwards."""
+
+
+def photograph_view(
+    detections: Detections, i: int, square: Floats, reach: float
+) -> PhotographView | None:
+    """Return what is fitted of one detection, and what is known of it; None if that is nothing.
+
+    The pixels of the marker and of its quiet zone, as far as the detected corners tell: ``square``
+    (3, 3) is the homography of the unit square to them. ``reach`` is how far sharpening carries in
+    px.
+    """
+    padding = PADDING_PX + reach
+    dictionary, _, margin = detections.markers[i]
+    modules = module_count(dictionary)
+    corners = detections.corners[i].tolist()
+    side = 0.25 * sum(math.dist(corners[k - 1], corners[k]) for k in range(4))
+    on_board = None if detections.on_board is None else detections.on_board[i]
+    ring = margin if on_board is None else clear_modules(on_board)
+    ring = min(max(ring, overhang(dictionary) + 0.5), overhang(dictionary) + RING_MODULES)
+    if not np.isfinite(square).all() or np.linalg.det(square) == 0.0:
+        return None
+    to_pixels = square / [modules, modules, 1.0]
+    to_modules = np.asarray(np.linalg.inv(to_pixels), dtype=np.float64)
+    low_end, high_end = -ring, modules + ring
+    outline = to_pixels @ np.array([
+        [low_end, high_end, high_end, low_end], [low_end, low_end, high_end, high_end], [1.0] * 4,
+    ])
+    if not (outline[2] > 0.0).all():
+        return None  # part of it is behind the horizon
+    pixels = (outline[:2] / outline[2]).T
+    image, origin = detections.images[i], detections.origins[i]
+    low = np.floor(pixels.min(axis=0) - padding).astype(np.int64)
+    high = np.ceil(pixels.max(axis=0) + padding).astype(np.int64) + 1
+    # A detection may be much wider in the plane than the image that was searched.
+    low = np.maximum(low, origin - math.ceil(padding))
+    high = np.minimum(high, origin + image.shape[::-1] + math.ceil(padding))
+    width, height = (high - low).tolist()
+    if min(width, height) < 4:
+        return None
+    levels = np.zeros((height, width))
+    start = np.maximum(low, origin)
+    (left, top), (right, bottom) = (start - low).tolist(), (
+        np.minimum(high, origin + image.shape[::-1]) - low
+    ).tolist()
+    (first_column, first_row) = (start - origin).tolist()
+    levels[top:bottom, left:right] = image[
+        first_row : first_row + bottom - top, first_column : first_column + right - left
+    ]
+    optics = detections.cameras.optics(i)
+    local = optics.intrinsics.copy()
+    local[2:] -= low
+    optics = Optics(local, optics.lens, optics.distorted)
+    extent = math.ceil(4.0 * (ring + MODELLED_PX * modules / side)) / 4.0
+    around = (
+        edges_alone(detections.markers[i], extent) if on_board is None
+        else surroundings(on_board, extent)
+    )
+    marker = MarkerView(
+        around, np.repeat([-extent, modules + extent], 2), float(modules),
+        float(detections.size_m[i]), optics, 1.0,
+    )
+    to_modules[:, 2] += to_modules[:, :2] @ low
+    at, spans = _fitted_pixels(
+        to_modules, float(modules), ring, height, width, np.array([left, top, right, bottom])
+    )
+    return PhotographView(marker, levels, spans, rays_of(optics, height, width), at, PANEL_PX)
+
+
+@compiled
+def _fitted_pixels(
+    to_modules: Floats, modules: float, ring: float, height: int, width: int, image: Integers
+) -> tuple[Floats, Integers]:
+    """Return ``at`` and ``spans`` of a view.
+
+    Fitted are pixels up to ``ring`` modules around the square, in the part of the box that is in
+    the image: ``image`` (4,) left, top, right, bottom. A row's pixels are one span: both areas are
+    convex.
+    """
+    at, spans = np.empty((2, height, width)), np.zeros((height, 2), dtype=np.int64)
+    half = 0.5 * modules
+    for i in range(height):
+        first, last = width, 0
+        for j in range(width):
+            x = to_modules[0, 0] * j + to_modules[0, 1] * i + to_modules[0, 2]
+            y = to_modules[1, 0] * j + to_modules[1, 1] * i + to_modules[1, 2]
+            z = to_modules[2, 0] * j + to_modules[2, 1] * i + to_modules[2, 2]
+            inverse = 1.0 / z if z > 0.0 else 0.0
+            right, down = (x * inverse - half) / (half + ring), (y * inverse - half) / (half + ring)
+            at[0, i, j], at[1, i, j] = min(max(right, -2.0), 2.0), min(max(down, -2.0), 2.0)
+            inside = image[0] <= j < image[2] and image[1] <= i < image[3]
+            if inside and z > 0.0 and abs(right) < 1.0 and abs(down) < 1.0:
+                first, last = min(first, j), j + 1
+        if first < last:
+            spans[i, 0], spans[i, 1] = first, last
+    return at, spans
+
+
+@compiled
+def binned_photograph(view: PhotographView) -> PhotographView:
+    """Return the view of the means of 2 x 2 pixels; an odd last row or column is left out."""
+    height, width = view.levels.shape[0] // 2, view.levels.shape[1] // 2
+    intrinsics = np.empty(4)
+    for k in range(2):
+        intrinsics[k] = 0.5 * view.marker.optics.intrinsics[k]
+        intrinsics[2 + k] = 0.5 * (view.marker.optics.intrinsics[2 + k] + 0.5) - 0.5
+    optics = Optics(intrinsics, view.marker.optics.lens, view.marker.optics.distorted)
+    levels, spans = np.empty((height, width)), np.empty((height, 2), dtype=np.int64)
+    at, rays = np.empty((2, height, width)), np.empty((6, height, width))
+    for i in range(height):
+        first = max(view.spans[2 * i, 0], view.spans[2 * i + 1, 0])
+        last = min(view.spans[2 * i, 1], view.spans[2 * i + 1, 1])
+        spans[i, 0] = (first + 1) // 2
+        spans[i, 1] = max(last // 2, spans[i, 0])
+        _halve(view.levels[2 * i], view.levels[2 * i + 1], 0.25, levels[i])
+        for k in range(2):
+            _halve(view.at[k, 2 * i], view.at[k, 2 * i + 1], 0.25, at[k, i])
+        for k in range(6):
+            _halve(
+                view.rays[k, 2 * i], view.rays[k, 2 * i + 1], 0.25 if k < 2 else 0.125, rays[k, i]
+            )
+    marker = MarkerView(
+        view.marker.edges, view.marker.extent, view.marker.modules, view.marker.size_m, optics,
+        view.marker.variance,
+    )
+    return PhotographView(marker, levels, spans, rays, at, COARSE_PANEL_PX)
+
+
+@compiled
+def _halve(row: Floats, other: Floats, share: float, out: Floats) -> None:
+    """Write the sums of 2 x 2 neighbours of two rows, times ``share``."""
+    for j in range(len(out)):
+        out[j] = share * (row[2 * j] + row[2 * j + 1] + other[2 * j] + other[2 * j + 1])

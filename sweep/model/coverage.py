@@ -1,33 +1,17 @@
-"""The exact grey level of every pixel: analytic area coverage of the marker's projected edges.
-
-The method of font rasterisers (Levien, "Inside the fastest font renderer in the world", 2016):
-each edge adds its signed area and cover to the pixels of its rows, and a running sum along each
-row turns them into covered area. An edge carries the jump of the grey level across it, so that
-one pass gives the levels themselves. Errors are those of double precision.
-
-Pixel i covers [i - 0.5, i + 0.5]; the functions below shift coordinates by 0.5, so that it covers
-[i, i + 1].
-"""
+"""The exact grey level of every pixel: analytic area coverage of the projected edges."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
-from sweep.model.point_spread import (
-    MIN_PANEL_PX,
-    NODES,
-    REACH,
-    WEIGHTS,
-    spread_below,
-    spread_below_sum,
-)
-from sweep.model.projection import (
+from sweep.model.polygon import (
     ModuleEdge,
+    Optics,
     Projection,
     chord_count,
     chords_within_tolerance,
@@ -38,6 +22,67 @@ from sweep.model.projection import (
 )
 from sweep.model.sheet import Sheet, piece_count, sheet_pixel
 from sweep.typing import Floats
+
+# --------------------------------------------------------------------------------------------------
+# The Gaussian point spread: its integrals, and the quadrature along an edge seen through it.
+
+REACH = 5.0
+"""Standard deviations at which the point spread is cut off; 6e-7 of it lies beyond."""
+
+MIN_PANEL_PX = 0.015
+"""Shortest piece of an edge that is integrated on its own."""
+
+NODES = (0.1127016653792583, 0.5, 0.8872983346207417)
+WEIGHTS = (0.2777777777777778, 0.4444444444444444, 0.2777777777777778)
+"""Three Gauss-Legendre nodes on [0, 1], and their weights."""
+
+_STEPS = 256
+_AT = np.arange(-6 * _STEPS, 6 * _STEPS + 2) / _STEPS
+_BELOW = np.array([0.5 * math.erfc(-at / math.sqrt(2.0)) for at in _AT.tolist()])
+_BELOW_SUM = _AT * _BELOW + np.exp(-0.5 * _AT**2) / math.sqrt(2.0 * math.pi)
+"""The normal distribution's integral, and the integral of that, in steps of 1/256 standard
+deviations: interpolated linearly they are accurate to 8e-7."""
+
+
+@compiled
+def _interpolated(table: Floats, at: float) -> float:
+    """Return a table's value between its steps."""
+    k = int(at)
+    return float(table[k] + (at - k) * (table[k + 1] - table[k]))
+
+
+@compiled
+def spread_below(t: float, sigma: float) -> float:
+    """Return the share of a Gaussian of standard deviation ``sigma`` that lies below t."""
+    at = (t / sigma + 6.0) * _STEPS
+    if at <= 0.0:
+        return 0.0
+    if at >= 12.0 * _STEPS:
+        return 1.0
+    return _interpolated(_BELOW, at)
+
+
+@compiled
+def spread_below_sum(t: float, sigma: float) -> float:
+    """Return the integral of :func:`spread_below` up to t."""
+    at = (t / sigma + 6.0) * _STEPS
+    if at <= 0.0:
+        return 0.0
+    if at >= 12.0 * _STEPS:
+        return t
+    return sigma * _interpolated(_BELOW_SUM, at)
+
+
+# --------------------------------------------------------------------------------------------------
+# The exact grey level of every pixel: analytic area coverage of the marker's projected edges.
+#
+# The method of font rasterisers (Levien, "Inside the fastest font renderer in the world", 2016):
+# each edge adds its signed area and cover to the pixels of its rows, and a running sum along each
+# row turns them into covered area. An edge carries the jump of the grey level across it, so that
+# one pass gives the levels themselves. Errors are those of double precision.
+#
+# Pixel i covers [i - 0.5, i + 0.5]; the functions below shift coordinates by 0.5, so that it
+# covers [i, i + 1].
 
 ROUNDING_SNAP = 1e-9
 """Levels this close below a half round up, so that the last bits of a sum never decide."""
@@ -387,3 +432,115 @@ def sum_levels(
             cover[i, j] = 0.0
             levels[i, j] = level
         cover[i, levels.shape[1] :] = 0.0
+
+
+# --------------------------------------------------------------------------------------------------
+# Exact images of many scenes on plain backgrounds, drawn in one call.
+
+@compiled
+def sum_grey(cover: Floats, outside: float, grey: NDArray[np.uint8]) -> None:
+    """As ``coverage.sum_levels``, quantised to 8 bits (round half up) and clipped."""
+    for i in range(grey.shape[0]):
+        level = outside
+        rounded = np.uint8(min(max(level + (0.5 + ROUNDING_SNAP), 0.0), 255.0))
+        for j in range(grey.shape[1]):
+            # Most pixels touch no edge: they repeat their neighbour at the cost of a comparison.
+            if cover[i, j] != 0.0:
+                level += cover[i, j]
+                cover[i, j] = 0.0
+                rounded = np.uint8(min(max(level + (0.5 + ROUNDING_SNAP), 0.0), 255.0))
+            grey[i, j] = rounded
+        cover[i, grey.shape[1] :] = 0.0
+
+
+class Canvas(NamedTuple):
+    """The windows of n scenes, which are drawn one after another.
+
+    Attributes
+    ----------
+    images
+        The pixels of all windows in one vector.
+    starts
+        (n,) index of each window's first pixel in ``images``.
+    windows, boxes
+        (n, 4) left, top, right, bottom of the windows and of the pixels that the markers may
+        touch.
+    scratch
+        A vector of zeros of at least (width + 2) · height of the largest box, left as zeros.
+    """
+
+    images: NDArray[np.uint8]
+    starts: NDArray[np.int64]
+    windows: NDArray[np.int64]
+    boxes: NDArray[np.int64]
+    scratch: Floats
+
+
+class DrawnScenes(NamedTuple):
+    """All scenes of a block as far as :func:`draw_greys` needs them.
+
+    Attributes
+    ----------
+    edges, spans
+        The edges of all markers, and (K, 2) the first and past-the-end row of each marker's.
+    marker
+        (N,) index of each scene's marker.
+    levels, plane, intrinsics, lenses, distorted
+        (N, 3), (N, 3, 3), (N, 4), (N, 24), (N,), of each scene as
+        :func:`sweep.model.coverage.accumulate` takes them.
+    """
+
+    edges: MarkerEdges
+    spans: NDArray[np.int64]
+    marker: NDArray[np.int64]
+    levels: Floats
+    plane: Floats
+    intrinsics: Floats
+    lenses: Floats
+    distorted: NDArray[np.bool_]
+
+
+@compiled
+def draw_greys(canvas: Canvas, scenes: DrawnScenes, rows: NDArray[np.int64]) -> None:
+    """Draw scenes ``rows`` (n,) into their windows of ``canvas``, quantised to 8 bits."""
+    for i in range(rows.shape[0]):
+        row = rows[i]
+        window, box = canvas.windows[i], canvas.boxes[i]
+        width, height = window[2] - window[0], window[3] - window[1]
+        image = canvas.images[canvas.starts[i] : canvas.starts[i] + width * height]
+        image[:] = np.uint8(scenes.levels[row, 0] + (0.5 + ROUNDING_SNAP))
+        left, top, right, bottom = box[0], box[1], box[2], box[3]
+        if left == right:
+            continue
+        cover = canvas.scratch[: (bottom - top) * (right - left + 2)].reshape(
+            bottom - top, right - left + 2
+        )
+        first, last = scenes.spans[scenes.marker[row], 0], scenes.spans[scenes.marker[row], 1]
+        accumulate(
+            cover, MarkerEdges(scenes.edges.ends[first:last], scenes.edges.sides[first:last]),
+            scenes.levels[row],
+            Projection(
+                scenes.plane[row],
+                Optics(scenes.intrinsics[row], scenes.lenses[row], scenes.distorted[row]),
+            ),
+            left, top, 0.0,
+        )
+        grey = image.reshape(height, width)[
+            top - window[1] : bottom - window[1], left - window[0] : right - window[0]
+        ]
+        sum_grey(cover, scenes.levels[row, 0], grey)
+
+
+# --------------------------------------------------------------------------------------------------
+# SplitMix64's mixing of bits, from which all random numbers are made.
+
+@compiled
+def mixed(bits: Any) -> Any:
+    """Return 64-bit numbers, a scalar or an array, mixed so that each bit depends on all.
+
+    SplitMix64's finaliser (Steele, Lea and Flood, "Fast splittable pseudorandom number
+    generators", 2014).
+    """
+    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return bits ^ (bits >> np.uint64(31))

@@ -20,10 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
-from sweep.model.coverage import MarkerEdges, accumulate
+from sweep.model.coverage import (
+    MIN_PANEL_PX,
+    NODES,
+    REACH,
+    WEIGHTS,
+    MarkerEdges,
+    accumulate,
+    spread_below,
+)
 from sweep.model.lens import distort, jacobian
-from sweep.model.point_spread import MIN_PANEL_PX, NODES, REACH, WEIGHTS, spread_below
-from sweep.model.projection import (
+from sweep.model.polygon import (
     ModuleEdge,
     Optics,
     Projection,

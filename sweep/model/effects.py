@@ -1,18 +1,171 @@
-"""The effects of camera and surroundings on the ideal image: one record for each.
-
-An effect is absent, at no cost, unless its switch has another value than its neutral one. Its
-record in :data:`EFFECTS` is the only place that declares it; parameters of pipeline files, their
-checks, the list of active parts, random draws, the bound and the windows follow from it.
-"""
+"""The effects of camera and surroundings on the ideal image: one record for each."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from hashlib import sha256
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from sweep.declaration import parameter
-from sweep.model.demosaic import METHODS, PATTERNS
-from sweep.model.effect import Effect, is_coded
+from sweep.errors import PluginError
+from sweep.model.sensor import METHODS, PATTERNS, standard_normals
+from sweep.plugins.loading import call, real_numbers
+from sweep.typing import Floats
+
+# --------------------------------------------------------------------------------------------------
+# What an effect declares, and the pixels that pointwise effects are applied to.
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """The pixels of one scene that a pointwise effect is applied to.
+
+    Attributes
+    ----------
+    values
+        Every parameter of the effects in this scene; NaN if it is not given. Of text and lists
+        the number of the value, 0 for the default.
+    left, top
+        The first pixel's column and row in the frame.
+    frame
+        Width and height of the frame in pixels.
+    intrinsics
+        (4,) fx, fy, cx, cy in pixels.
+    noise_key
+        Key of the scene's random numbers.
+    """
+
+    values: Mapping[str, float]
+    left: int
+    top: int
+    frame: tuple[int, int]
+    intrinsics: Floats
+    noise_key: np.uint64
+
+    def normals(self, stream: str, shape: tuple[int, ...]) -> Floats:
+        """Return standard normal numbers (h, w), a function of scene, stream and pixel alone.
+
+        ``stream`` is a name of the effect's own, such as its switch. Whatever window is rendered,
+        a pixel of the frame has the same number.
+        """
+        normals = np.empty(shape)
+        standard_normals(self.stream_key(stream), 0, self.left, self.top, normals)
+        return normals
+
+    def stream_key(self, stream: str) -> np.uint64:
+        """Return the key of a stream of random numbers of this scene."""
+        own = int.from_bytes(sha256(stream.encode()).digest()[:8], "little")
+        return np.uint64(self.noise_key ^ np.uint64(own))
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """One effect.
+
+    Attributes
+    ----------
+    label
+        Its name in ``sweep plan`` and in tables.
+    step
+        The step of the image chain on which it acts. "edges": on the marker's edges, before
+        pixels (only the renderer ``exact`` has these effects); "light": on the levels of light
+        that falls on the pixels; "signal": on the pixels' signal, with its noise and gain, before
+        quantisation; "readout": on quantisation.
+    parameters
+        Its parameters by name, as :func:`sweep.declaration.parameter` declares them. The
+        first is its switch: the effect is active if that has another value than its default.
+    needs
+        Parameter -> parameters of which one must be given beside it.
+    random
+        Whether it draws random numbers.
+    in_bound
+        Whether the accuracy bound's model of the image has it.
+    widens
+        Whether more than the usual window must be searched: "noise" makes candidates around the
+        marker that reach into one another, "uneven light" makes candidates of a plain background.
+    worsens
+        What it makes worse for the search of windows, where another effect brings it: coarse noise
+        needs twice the margin of noise, steep uneven light the whole frame.
+    apply
+        Of a pointwise effect: a function of levels (h, w) and their :class:`Patch` that returns
+        the levels after it. Applied at its ``step``, "light" or "signal", after the built-in
+        effects of that step, in the order of :data:`sweep.model.effects.EFFECTS`. None for the
+        built-in effects, which renderers and :mod:`sweep.model.renderers` apply.
+    """
+
+    label: str
+    step: Literal["edges", "light", "signal", "readout"]
+    parameters: Mapping[str, Any]
+    needs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    random: bool = False
+    in_bound: bool = False
+    widens: Literal["nothing", "noise", "uneven light"] = "nothing"
+    worsens: tuple[Literal["noise", "uneven light"], ...] = ()
+    apply: Callable[[Floats, Patch], Floats] | None = None
+
+    @property
+    def switch(self) -> str:
+        """The parameter that switches it on."""
+        return next(iter(self.parameters))
+
+    @property
+    def off(self) -> Any:
+        """The value of its switch at which it is absent."""
+        return self.parameters[self.switch].default
+
+    @property
+    def off_text(self) -> str:
+        """The value at which it is absent, in words."""
+        if self.off is None:
+            return "not given"
+        if self.off == ():
+            return "[]"
+        return self.off if isinstance(self.off, str) else f"{self.off:g}"
+
+    def is_on(self, value: Any) -> bool:
+        """Return whether its switch has another value than its neutral one."""
+        return bool(value != self.off)
+
+    def is_active(self, strength: Any) -> Any:
+        """Return whether it is on: numbers (...) as scenes hold them, NaN if not given."""
+        if self.off is None:
+            return ~np.isnan(strength)
+        return strength != (0 if is_coded(self.off) else self.off)
+
+    def applying(self, apply: Callable[[Floats, Patch], Floats]) -> Effect:
+        """Return it as a pointwise effect."""
+        return dataclasses.replace(self, apply=apply)
+
+
+def is_coded(default: Any) -> bool:
+    """Return whether scenes hold a parameter as the number of its value: it is text, or a list.
+
+    Number 0 is the default.
+    """
+    return isinstance(default, (str, tuple))
+
+
+def apply_pointwise(
+    effects: Sequence[Effect], step: str, levels: Floats, patch: Patch
+) -> Floats:
+    """Return levels (h, w) after the active ones of pointwise effects, those of a step."""
+    for effect in effects:
+        if effect.step == step and effect.is_active(patch.values[effect.switch]):
+            assert effect.apply is not None  # noqa: S101  (for the type checker)
+            levels = effect.apply(levels, patch)
+    return levels
+
+
+# --------------------------------------------------------------------------------------------------
+# The effects of camera and surroundings on the ideal image: one record for each.
+#
+# An effect is absent, at no cost, unless its switch has another value than its neutral one. Its
+# record in :data:`EFFECTS` is the only place that declares it; parameters of pipeline files,
+# their checks, the list of active parts, random draws, the bound and the windows follow from it.
 
 VELOCITIES = (
     "velocity_x_m_s", "velocity_y_m_s", "velocity_z_m_s",
@@ -243,7 +396,8 @@ EFFECTS: tuple[Effect, ...] = (
         {
             "noise_correlation": parameter(
                 0.0, "correlation of the grey noise (noise_grey, noise_table) of neighbouring "
-                "pixels; at d px about its power d²; the standard deviation stays",
+                "pixels; two pixels apart 0.025, 0.084, 0.24, 0.66 for 0.3, 0.5, 0.7, 0.9; the "
+                "standard deviation stays",
                 low=0, high=0.99, drawable=True,
             ),
         },
@@ -387,3 +541,120 @@ NEEDS: dict[str, tuple[str, ...]] = {
 
 POINTWISE = tuple(effect for effect in EFFECTS if effect.apply is not None)
 """Effects that are applied by a function of their own."""
+
+
+# --------------------------------------------------------------------------------------------------
+# What plug-ins add to scenes: effects and renderers, whose results are checked.
+
+@dataclass(frozen=True, slots=True)
+class MarkerView:
+    """The marker of one scene, as a plug-in's renderer draws it.
+
+    Attributes
+    ----------
+    modules
+        (m, m) whether a module of the marker is white; row 0 is the marker's top.
+    quiet_zone_modules, black, white
+        Width of the white border beyond them in modules, and the grey levels.
+    plane
+        (3, 3) takes module coordinates (column, row, 1), which start at the top left corner of
+        `modules`, to the camera frame in metres.
+    camera_matrix
+        (3, 3) as OpenCV has it; the centre of the frame's first pixel is (0, 0).
+    distortion
+        (14,) lens coefficients in OpenCV's order; None without a lens.
+    box
+        Left, top, right, bottom of the pixels that the marker may touch, half-open.
+    values
+        Each of the plug-in's settings in this scene.
+    """
+
+    modules: NDArray[np.bool_]
+    quiet_zone_modules: float
+    black: float
+    white: float
+    plane: Floats
+    camera_matrix: Floats
+    distortion: Floats | None
+    box: tuple[int, int, int, int]
+    values: Mapping[str, float]
+
+    @property
+    def homography(self) -> Floats:
+        """(3, 3) takes module coordinates to pixels; ValueError with a lens."""
+        if self.distortion is not None:
+            raise ValueError("this renderer has no lens: expected distortion = []")
+        return np.asarray(self.camera_matrix @ self.plane)
+
+
+Render = Callable[[MarkerView], tuple[Floats, Floats]]
+"""A renderer: levels and shares (h, w) each."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScenePlugins:
+    """The plug-ins of scenes.
+
+    Attributes
+    ----------
+    effects
+        In the order in which they act, after the built-in ones of their step.
+    renderers
+        By the name that pipelines have.
+    settings
+        Names of the renderers' settings.
+    """
+
+    effects: tuple[Effect, ...] = ()
+    renderers: Mapping[str, Render] = field(default_factory=dict)
+    settings: tuple[str, ...] = ()
+
+    @property
+    def all_effects(self) -> tuple[Effect, ...]:
+        """The built-in effects, and those of plug-ins."""
+        return (*EFFECTS, *self.effects)
+
+
+NO_PLUGINS = ScenePlugins()
+
+
+def checked_effect(
+    name: str, apply: Callable[[Any, Any], Any]
+) -> Callable[[Floats, Patch], Floats]:
+    """Return an effect's function that raises PluginError for results that are no levels."""
+
+    def applied(levels: Floats, patch: Patch) -> Floats:
+        returned = real_numbers(name, "levels", call(name, apply, levels.copy(), patch))
+        return _checked(name, "levels", returned, levels.shape)
+
+    return applied
+
+
+def checked_renderer(name: str, render: Callable[[Any], Any]) -> Render:
+    """Return a renderer that raises PluginError for results that are no levels and shares."""
+
+    def rendered(view: MarkerView) -> tuple[Floats, Floats]:
+        left, top, right, bottom = view.box
+        returned = call(name, render, view)
+        if not isinstance(returned, tuple) or len(returned) != 2:
+            raise PluginError(
+                f"{name}: returned a {type(returned).__name__}; expected a tuple (levels, share)"
+            )
+        shape = (bottom - top, right - left)
+        levels, share = (
+            _checked(name, what, real_numbers(name, what, each), shape)
+            for what, each in zip(("levels", "share"), returned, strict=True)
+        )
+        if ((share < 0) | (share > 1)).any():
+            raise PluginError(f"{name}: returned shares outside 0 to 1")
+        return levels, share
+
+    return rendered
+
+
+def _checked(name: str, what: str, array: Floats, shape: tuple[int, ...]) -> Floats:
+    if array.shape != shape:
+        raise PluginError(f"{name}: returned {what} of shape {array.shape}; expected {shape}")
+    if not np.isfinite(array).all():
+        raise PluginError(f"{name}: returned {what} that are not finite")
+    return array

@@ -1,16 +1,24 @@
-"""Image files named by a pipeline: their size is read and checked before they are decoded."""
+"""Image files in place of simulated images and backgrounds: checked before they are decoded."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import stat
 import tempfile
+from enum import StrEnum
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from sweep.messages import nearest_file
+
+# --------------------------------------------------------------------------------------------------
+# Image files named by a pipeline: their size is read and checked before they are decoded.
 
 MAX_PIXELS = 500_000_000
 """Size of the largest image that is read, and of the largest frame that is rendered whole."""
@@ -39,11 +47,17 @@ def read_regular(path: str | Path, most: int) -> bytes:
     Raises
     ------
     OSError, ValueError
-        If the file does not exist, cannot be read, or is not a regular file.
+        If the file does not exist, cannot be read, or is not a regular file; a missing one's
+        reason ends with the most similar name in its folder.
     """
     if len(str(path)) > MAX_PATH_LENGTH:
         raise ValueError("File name too long")
-    if not stat.S_ISREG(Path(path).stat().st_mode):
+    try:
+        mode = Path(path).stat().st_mode
+    except FileNotFoundError as error:
+        reason = f"{error.strerror}{nearest_file(path)}"
+        raise FileNotFoundError(error.errno, reason, str(path)) from None
+    if not stat.S_ISREG(mode):
         raise ValueError("Is a directory" if Path(path).is_dir() else "Not a regular file")
     with Path(path).open("rb") as file:
         return file.read(most + 1)
@@ -133,3 +147,51 @@ def _jpeg_size(header: bytes) -> tuple[int, int] | None:
             return _big(header[at + 7 : at + 9]), _big(header[at + 5 : at + 7])
         at += 1 if kind == 0xFF else 2 + length
     return None
+
+
+# --------------------------------------------------------------------------------------------------
+# Photographs in place of simulated images: an image file, or a half of one, by its digest.
+#
+# Levels are 8-bit grey: colour is converted by OpenCV's weights, 16 bits are divided by 256, and
+# an image is turned as its EXIF tag says.
+
+class Part(StrEnum):
+    """The part of an image that is the photograph: stereo cameras put two side by side."""
+
+    whole = "whole"
+    left = "left"
+    right = "right"
+
+    def of(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the part of an image (height, width)."""
+        half = image.shape[1] // 2
+        if self is Part.whole:
+            return image
+        return image[:, :half] if self is Part.left else image[:, half:]
+
+
+def reference(path: str | Path, digest: str, part: Part) -> str:
+    """Return the text by which a scene names a photograph: part, SHA-256 and path."""
+    return f"{part}:{digest}:{Path(path).resolve()}"
+
+
+@lru_cache(maxsize=16)
+def photograph_image(named: str) -> NDArray[np.uint8]:
+    """Return the grey levels (height, width) of a photograph by its :func:`reference`.
+
+    The array is contiguous and must not be written to.
+
+    Raises
+    ------
+    OSError
+        If the file is not the photograph that was recorded: a fault of the machine, no result.
+    """
+    part, digest, path = named.split(":", 2)
+    try:
+        if hashlib.sha256(read_image(path)).hexdigest() != digest:
+            raise OSError(f"{path}: the photograph has changed since it was recorded")
+        image = np.ascontiguousarray(Part(part).of(decode_grey(path)))
+    except ValueError as error:
+        raise OSError(f"{path}: {error}") from None
+    image.setflags(write=False)
+    return image

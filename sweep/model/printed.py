@@ -1,8 +1,4 @@
-"""What a scene shows in one plane: a marker, or a board of several; its edges and its extent.
-
-Lengths are in units: modules of a marker, those of its first one for a board. Columns count to the
-right and rows downwards, from the top left corner of a marker's square or from a board's origin.
-"""
+"""What a scene shows: markers in one plane, or in several, where some hide others."""
 
 from __future__ import annotations
 
@@ -15,7 +11,8 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.model.board import Board, edges_on_sheet
+from sweep.model.board import Board, Print, edges_on_sheet
+from sweep.model.camera import Cameras
 from sweep.model.coverage import MarkerEdges
 from sweep.model.marker import (
     BLACK,
@@ -26,7 +23,15 @@ from sweep.model.marker import (
     module_count,
     overhang,
 )
-from sweep.typing import Floats
+from sweep.model.polygon import half_plane
+from sweep.typing import Floats, Integers, Masks
+
+# --------------------------------------------------------------------------------------------------
+# What a scene shows in one plane: a marker, or a board of several; its edges and its extent.
+#
+# Lengths are in units: modules of a marker, those of its first one for a board. Columns count to
+# the right and rows downwards, from the top left corner of a marker's square or from a board's
+# origin.
 
 PrintKey: TypeAlias = MarkerKey | Board
 """A marker or a board: it determines what is printed."""
@@ -200,3 +205,299 @@ def occluded_edges(key: PrintKey, occlusion: float, occlusion_deg: float) -> Mar
         ends += parts
         sides += [(OUTSIDE, OCCLUDER)] * len(parts)
     return MarkerEdges(np.array(ends, dtype=np.float64), np.array(sides, dtype=np.int64))
+
+
+# --------------------------------------------------------------------------------------------------
+# Targets that are not in one plane: which markers are seen, and what of them others hide.
+#
+# Each marker has a convex sheet of its own, or all of them one; what stands beside them has its
+# own. The image is the sum of the visible parts of all sheets that face the camera. What a sheet
+# in front hides of another is subtracted: of the part of an area inside a half plane the edges
+# are those inside, and those outside projected onto its line, which enclose the same area (as
+# those under an occluding sheet in :mod:`sweep.model.printed`). Of several sheets in front, by
+# inclusion and exclusion.
+
+_NEGLIGIBLE = 1e-12
+"""Sine of an angle, of rays from the camera, below which sheets only touch in the image."""
+
+
+class _Face(NamedTuple):
+    """A sheet before the camera.
+
+    Attributes
+    ----------
+    number
+        Of :func:`sheets_of` the board.
+    plane
+        (3, 3) takes (column, row, 1) to the camera frame.
+    corners
+        (4, 3) of the sheet, in the camera frame.
+    normals
+        (4, 3) of the planes through the camera and the sheet's sides; inwards.
+    """
+
+    number: int
+    plane: Floats
+    corners: Floats
+    normals: Floats
+
+
+@lru_cache(maxsize=64)
+def sheets_of(board: Board) -> tuple[Print, ...]:
+    """Return what is printed on each sheet: a board's own, or its markers', then distractors'."""
+    of_each = len(board.prints) == len(board)
+    own = board.prints if of_each else (Print(board.edges(), 1.0, 0.0),)
+    return own + board.distractors
+
+
+def sheet_planes(board: Board, rotation: Floats, translation: Floats, scale: float) -> Floats:
+    """Return the planes (P, 3, 3) of a board's sheets, printed ``scale`` times as large."""
+    planes = np.array([each.plane(rotation, translation) for each in sheets_of(board)])
+    planes[:, :, 2] = translation + scale * (planes[:, :, 2] - translation)
+    planes[:, :, :2] *= scale
+    return planes
+
+
+def sheet_corners(each: Print) -> Floats:
+    """Return the corners (4, 3) of a print's sheet as (column, row, 1)."""
+    points = each.edges.ends.reshape(-1, 2)
+    (left, top), (right, bottom) = points.min(axis=0), points.max(axis=0)
+    return np.array([[left, top, 1.0], [right, top, 1.0], [right, bottom, 1.0],
+                     [left, bottom, 1.0]])
+
+
+@lru_cache(maxsize=64)
+def _corners(board: Board) -> tuple[Floats, ...]:
+    """Return the corners (4, 3) of each of a board's sheets."""
+    return tuple(sheet_corners(each) for each in sheets_of(board))
+
+
+@lru_cache(maxsize=64)
+def sheets_m(board: Board) -> Floats:
+    """Return the corners (P, 4, 3) of all sheets in the board's frame."""
+    return np.array([
+        corners @ each.plane(np.eye(3), np.zeros(3)).T
+        for corners, each in zip(_corners(board), sheets_of(board), strict=True)
+    ])
+
+
+def outlines(board: Board, planes: Floats) -> Floats:
+    """Return the corners (P, 4, 3) of all sheets in the camera frame."""
+    return np.array([
+        corners @ plane.T for corners, plane in zip(_corners(board), planes, strict=True)
+    ])
+
+
+def own_sheets(board: Board) -> int:
+    """Return how many of a board's sheets are its own."""
+    return len(sheets_of(board)) - len(board.distractors)
+
+
+def facing(board: Board, planes: Floats) -> Masks:
+    """Return (P,) which sheets show their printed side to the camera, and are not behind it."""
+    # Columns run right and rows down, so that their cross product points away from the viewer.
+    away = np.cross(planes[:, :, 0], planes[:, :, 1])
+    shown = np.einsum("pi,pi->p", away, planes[:, :, 2]) > 0
+    return np.asarray(shown & (outlines(board, planes)[..., 2] > 0).any(axis=1))
+
+
+def _faces(board: Board, planes: Floats) -> list[_Face]:
+    """Return the sheets that face the camera."""
+    numbers = np.flatnonzero(facing(board, planes))
+    around = outlines(board, planes)[numbers]
+    normals = np.cross(around, np.roll(around, -1, axis=1))
+    normals /= np.linalg.norm(normals, axis=2)[..., None]
+    normals *= np.sign(np.einsum("pkj,pj->pk", normals, around.mean(axis=1)))[..., None]
+    return [
+        _Face(k, planes[k], each, inwards)
+        for k, each, inwards in zip(numbers.tolist(), around, normals, strict=True)
+    ]
+
+
+def _common(one: _Face, other: _Face) -> Floats:
+    """Return the corners (n, 3) of that part of a sheet which the other's outline encloses."""
+    polygon = one.corners
+    for normal in other.normals:
+        polygon = half_plane(polygon, polygon @ normal)
+        if len(polygon) < 3:
+            return np.empty((0, 3))
+    return polygon
+
+
+def _hides(front: _Face, behind: _Face) -> bool:
+    """Return whether a sheet hides a part of another."""
+    common = _common(behind, front)
+    if not len(common):
+        return False
+    rays = common / np.linalg.norm(common, axis=1)[:, None]
+    spread = np.cross(rays[1:] - rays[0], np.roll(rays, -1, axis=0)[1:] - rays[0])
+    if not np.abs(spread).max() > _NEGLIGIBLE:
+        return False
+    ray = rays.mean(axis=0)
+    distances = []
+    for face in (front, behind):
+        normal = np.cross(face.plane[:, 0], face.plane[:, 1])
+        distances.append(float(normal @ face.plane[:, 2]) / float(normal @ ray))
+    return distances[0] < distances[1]
+
+
+def _occluders(faces: list[_Face]) -> list[list[_Face]]:
+    """Return for each sheet those that hide a part of it."""
+    if not faces:
+        return []
+    corners = np.array([face.corners for face in faces])
+    before: Masks = np.asarray((corners[..., 2] > 0).all(axis=1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        flat = corners[..., :2] / corners[..., 2:]
+    low, high = (np.where(before[:, None], end, sign * np.inf) for end, sign in (
+        (flat.min(axis=1), -1), (flat.max(axis=1), 1)
+    ))
+    # Without this, sheets that lie far from each other in the image cost most of the time.
+    near: Masks = np.asarray(((low[:, None] <= high) & (high[:, None] >= low)).all(axis=2))
+    np.fill_diagonal(near, val=False)
+    return [
+        [faces[k] for k in np.flatnonzero(near[i]).tolist() if _hides(faces[k], behind)]
+        for i, behind in enumerate(faces)
+    ]
+
+
+class VisiblePrint(NamedTuple):
+    """What is seen of a sheet's print.
+
+    Attributes
+    ----------
+    number
+        Of :func:`sheets_of` the board.
+    edges, plane
+        Its edges, and what takes (column, row, 1) to the camera frame, (3, 3).
+    mover
+        (E,) the number of the sheet with which the image of each edge moves: of an edge at which
+        another sheet hides this one, the other's.
+    """
+
+    number: int
+    edges: MarkerEdges
+    plane: Floats
+    mover: Integers
+
+
+def visible_prints(board: Board, planes: Floats, first: int = 0) -> list[VisiblePrint]:
+    """Return what is seen of the print of each sheet, from number ``first`` on."""
+    seen = []
+    sheets = sheets_of(board)
+    faces = _faces(board, planes)
+    for face, fronts in zip(faces, _occluders(faces), strict=True):
+        if face.number < first:
+            continue
+        outline = sheets[face.number].edges
+        own = np.full(len(outline.ends), face.number)
+        parts, movers = [outline], [own]
+        for count in range(1, len(fronts) + 1):
+            for some in itertools.combinations(fronts, count):
+                part, mover = outline, own
+                for front in some:
+                    for line in front.normals @ face.plane:
+                        part, mover = _within(part, line, mover, front.number)
+                parts.append(
+                    MarkerEdges(part.ends, part.sides[:, ::-1] if count % 2 else part.sides)
+                )
+                movers.append(mover)
+        edges = MarkerEdges(
+            np.concatenate([part.ends for part in parts]),
+            np.concatenate([part.sides for part in parts]),
+        )
+        seen.append(VisiblePrint(face.number, edges, face.plane, np.concatenate(movers)))
+    return seen
+
+
+def moving_edges(seen: VisiblePrint, planes: Floats) -> list[tuple[MarkerEdges, Floats]]:
+    """Return the edges of a print, each in the plane of the sheet that it moves with, and these.
+
+    The image is the same: an edge at which a sheet in front ends lies on the sheet's outline.
+    """
+    groups = []
+    for number in np.unique(seen.mover).tolist():
+        ends, sides = (each[seen.mover == number] for each in seen.edges)
+        if number != seen.number:
+            points = np.column_stack([ends.reshape(-1, 2), np.ones(2 * len(ends))])
+            moved = points @ np.linalg.solve(planes[number], seen.plane).T
+            ends = np.ascontiguousarray((moved[:, :2] / moved[:, 2:]).reshape(-1, 4))
+        groups.append((MarkerEdges(ends, sides), planes[number]))
+    return groups
+
+
+def _within(
+    outline: MarkerEdges, line: Floats, mover: Integers, front: int
+) -> tuple[MarkerEdges, Integers]:
+    """Return the edges of the part of all areas where line · (column, row, 1) is not negative.
+
+    And with which sheet each moves: those on the line with ``front``, others as ``mover`` says.
+    """
+    length = float(line[:2] @ line[:2])
+    if length == 0.0:
+        kept = slice(None) if line[2] >= 0 else slice(0)
+        return MarkerEdges(outline.ends[kept], outline.sides[kept]), mover[kept]
+    start, stop = outline.ends[:, :2], outline.ends[:, 2:]
+    a, b = start @ line[:2] + line[2], stop @ line[:2] + line[2]
+    crossing = (a < 0) != (b < 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cut = np.where(crossing[:, None], start + (a / (a - b))[:, None] * (stop - start), stop)
+
+    def projected(points: Floats, value: Floats) -> Floats:
+        return points - np.minimum(value, 0.0)[:, None] / length * line[:2]
+
+    first = np.hstack([projected(start, a), np.where(
+        crossing[:, None], cut, projected(stop, b)
+    )])
+    second = np.hstack([cut, projected(stop, b)])[crossing]
+    moved = np.where(a < 0, front, mover), np.where(b < 0, front, mover)[crossing]
+    return MarkerEdges(
+        np.concatenate([first, second]),
+        np.concatenate([outline.sides, outline.sides[crossing]]),
+    ), np.concatenate(moved)
+
+
+def unseen_markers(board: Board, planes: Floats) -> Masks:
+    """Return (M,) which markers show their back, or are wholly behind another's sheet."""
+    unseen = np.ones(len(board), dtype=bool)
+    faces = _faces(board, planes)
+    for face, fronts in zip(faces, _occluders(faces), strict=True):
+        for number, square in _squares(board)[face.number]:
+            corners = square @ face.plane.T
+            unseen[number] = any((corners @ front.normals.T >= 0).all() for front in fronts)
+    return unseen
+
+
+@lru_cache(maxsize=64)
+def _squares(board: Board) -> list[list[tuple[int, Floats]]]:
+    """Return the markers of each sheet: number, and corners (4, 3) as (column, row, 1)."""
+    squares: list[list[tuple[int, Floats]]] = [[] for _ in sheets_of(board)]
+    if len(board.prints) > len(board):
+        squares[0] = list(enumerate(board.corners_m * [1.0, -1.0, 0.0] + [0.0, 0.0, 1.0]))
+        return squares
+    for number, printed in enumerate(board.prints):
+        side = 2 * printed.half_m / printed.unit_m
+        squares[number] = [(number, np.array([
+            [0.0, 0.0, 1.0], [side, 0.0, 1.0], [side, side, 1.0], [0.0, side, 1.0]
+        ]))]
+    return squares
+
+
+def boxes_px(
+    board: Board | object, camera: Cameras, rotation: Floats, translation: Floats, scale: float
+) -> Floats:
+    """Return rectangles (2, 4, 2) in px about the images of a solid board's sheets, and of all.
+
+    Of those that face the camera, if any does; NaN if a part of one is not before it.
+    """
+    if not isinstance(board, Board):
+        raise TypeError("a single marker is flat")
+    planes = sheet_planes(board, rotation, translation, scale)
+    boxes = []
+    for count in (own_sheets(board), len(planes)):
+        seen, corners = facing(board, planes)[:count], outlines(board, planes)[:count]
+        corners = corners[seen if seen.any() else slice(None)]
+        pixels = camera.project(np.ascontiguousarray(corners.reshape(1, -1, 3)))[0]
+        low, high = pixels.min(axis=0), pixels.max(axis=0)
+        boxes.append([low, [high[0], low[1]], high, [low[0], high[1]]])
+    return np.array(boxes)

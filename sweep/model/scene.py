@@ -1,8 +1,9 @@
-"""Scenes: cameras, markers, poses and effects put together."""
+"""Scenes: cameras, targets, poses and effects put together."""
 
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -13,18 +14,38 @@ from numpy.typing import NDArray
 from sweep.declaration import parameter
 from sweep.model import lens as lens_model
 from sweep.model.board import Board
-from sweep.model.camera import VIEW_PARAMETERS, Camera, Cameras, intrinsics
-from sweep.model.columns import Column, map_columns
-from sweep.model.effect import Effect
-from sweep.model.effects import CODED, NEUTRAL, PLAIN, VELOCITIES
+from sweep.model.camera import VIEW_PARAMETERS, Camera, Cameras, Column, intrinsics, map_columns
+from sweep.model.effects import CODED, NEUTRAL, NO_PLUGINS, PLAIN, VELOCITIES, Effect, ScenePlugins
 from sweep.model.marker import marker_corners, overhang
-from sweep.model.plugged_scene import NO_PLUGINS, ScenePlugins
+from sweep.model.polygon import Projection
 from sweep.model.pose import rotation_of_angles, transform_points
-from sweep.model.printed import PrintKey, box_corners, extent_of, side_m, sides_m
-from sweep.model.projection import Projection
-from sweep.model.renderer_names import renderer_name
-from sweep.model.solid_board import boxes_px
+from sweep.model.printed import PrintKey, box_corners, boxes_px, extent_of, side_m, sides_m
 from sweep.typing import Floats
+
+# --------------------------------------------------------------------------------------------------
+# The names of the built-in renderers.
+
+SUPERSAMPLE = re.compile(r"supersample-([1-9][0-9]{0,2})(-jittered)?")
+
+RENDERERS = "exact, warp, supersample-N or supersample-N-jittered with N from 1 to 999"
+"""The names in words."""
+
+
+def is_renderer(name: str) -> bool:
+    """Return whether a built-in renderer has the name."""
+    return name in ("exact", "warp") or SUPERSAMPLE.fullmatch(name) is not None
+
+
+def renderer_name(value: Any) -> str:
+    """Return the name of a built-in renderer as it is declared; ValueError if there is none."""
+    name = value.strip().lower() if isinstance(value, str) else ""
+    if not is_renderer(name):
+        raise ValueError(RENDERERS)
+    return name
+
+
+# --------------------------------------------------------------------------------------------------
+# Scenes: cameras, markers, poses and effects put together.
 
 Key = TypeVar("Key")
 Box = tuple[int, int, int, int]

@@ -1,17 +1,22 @@
-"""The sensor, pixel by pixel after the optics: light, noise, gain, quantisation."""
+"""The sensor and the camera's processing, step by step: noise, gain, response, demosaicing."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled, compiled_inline
-from sweep.model.coverage import ROUNDING_SNAP
-from sweep.model.splitmix import mixed
-from sweep.typing import Floats
+from sweep.model.coverage import ROUNDING_SNAP, mixed
+from sweep.typing import Floats, Grey
+
+# --------------------------------------------------------------------------------------------------
+# The sensor, pixel by pixel after the optics: light, noise, gain, quantisation.
 
 _PIXEL_STEP = np.uint64(0x9E3779B97F4A7C15)
 _DRAW_STEP = np.uint64(0xD1342543DE82EF95)
@@ -210,3 +215,227 @@ def standard_normals(key: np.uint64, draw: int, left: int, top: int, normals: Fl
     for i in range(normals.shape[0]):
         for j in range(normals.shape[1]):
             normals[i, j] = _normal(_pixel_key(key, left + j, top + i), draw)
+
+
+# --------------------------------------------------------------------------------------------------
+# Noise that is correlated from pixel to pixel, and noise that is a table over the level.
+
+REACH = 5.0
+"""Standard deviations at which the kernel's Gaussian is cut off."""
+
+
+@lru_cache(maxsize=256)
+def noise_kernel(correlation: float) -> Floats:
+    """Return the weights (2 n + 1,) whose sums of white noise have a correlation at a lag of 1 px.
+
+    A Gaussian exp(-i² / 2 s²), of the width s at which the correlation of neighbours is
+    ``correlation`` to rounding; the squares of its weights sum to 1, so that the variance is kept.
+    The correlation at a lag of d px is the kernel's with itself, sum_i k[i] k[i + d]: with Jacobi's
+    theta functions at the nome q = exp(-1 / s²) it is exp(-d² / 4 s²) at even d, times
+    theta_2(0, q) / theta_3(0, q) at odd d. From a correlation of 0.8 on this is ``correlation`` **
+    d² to 1e-4; below it is more: at two pixels 0.025, 0.084 and 0.24 for 0.3, 0.5 and 0.7.
+    """
+    widest = 0.5 / math.sqrt(-math.log(correlation))
+    reach = math.ceil(REACH * widest) + 2
+
+    def weights(sigma: float) -> list[float]:
+        return [math.exp(-0.5 * (i / sigma) ** 2) for i in range(-reach, reach + 1)]
+
+    def at_lag(kernel: Sequence[float], lag: int) -> float:
+        return math.fsum(a * b for a, b in zip(kernel, kernel[lag:], strict=False))
+
+    low, high = 0.0, 1.5 * widest + 0.1
+    for _ in range(100):
+        middle = (low + high) / 2
+        kernel = weights(middle)
+        if at_lag(kernel, 1) < correlation * at_lag(kernel, 0):
+            low = middle
+        else:
+            high = middle
+    kernel = weights(high)
+    return np.array(kernel) / math.sqrt(at_lag(kernel, 0))
+
+
+@compiled
+def filter_field(white: Floats, kernel: Floats, field: Floats) -> None:
+    """Write the separable sums of ``white`` (h + 2 n, w + 2 n) by ``kernel`` to ``field`` (h, w).
+
+    Each number is summed in the same order, wherever it lies.
+    """
+    taps = len(kernel)
+    height, width = field.shape
+    across = np.zeros((white.shape[0], width))
+    for i in range(white.shape[0]):
+        for k in range(taps):
+            for j in range(width):
+                across[i, j] += kernel[k] * white[i, j + k]
+    for i in range(height):
+        for j in range(width):
+            field[i, j] = 0.0
+        for k in range(taps):
+            for j in range(width):
+                field[i, j] += kernel[k] * across[i + k, j]
+
+
+def normal_field(
+    key: np.uint64, draw: int, left: int, top: int, shape: tuple[int, ...], correlation: float
+) -> Floats:
+    """Return standard normal numbers (h, w), correlated along rows and along columns.
+
+    Each is a function of ``key``, ``draw`` (as of :func:`sweep.model.sensor.standard_normals`) and
+    its pixel's place in the frame, the first of which is (left, top). The correlation of two pixels
+    is the product of those along each axis (:func:`noise_kernel`); with 0 they are independent.
+    """
+    kernel = noise_kernel(correlation) if correlation > 0 else np.ones(1)
+    reach = len(kernel) // 2
+    white = np.empty((shape[0] + 2 * reach, shape[1] + 2 * reach))
+    standard_normals(key, draw, left - reach, top - reach, white)
+    if not reach:
+        return white
+    field = np.empty(shape)
+    filter_field(white, kernel, field)
+    return field
+
+
+def deviations(levels: Floats, table: Sequence[float]) -> Floats:
+    """Return the noise's standard deviation at levels (h, w).
+
+    ``table`` is level, standard deviation, level, standard deviation, ..., ascending in level: it
+    is interpolated linearly and goes on, constant, beyond its ends.
+    """
+    return np.interp(levels, table[::2], table[1::2])
+
+
+# --------------------------------------------------------------------------------------------------
+# A grey scene seen through a colour filter array, and made grey again by OpenCV.
+
+PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
+"""Filters of the frame's first two pixels, then those of the two below them."""
+
+METHODS = {"bilinear": "", "edge_aware": "_EA"}
+"""Demosaicing by name -> the ending of OpenCV's conversion code."""
+
+REACH_PX = 2
+"""Pixels around a pixel that its result depends on: neighbours, and at the frame's border the
+neighbours of the pixel that OpenCV copies there."""
+
+MIN_FRAME_PX = 3
+"""Smallest side of an image that OpenCV demosaics."""
+
+STEPS_PER_LEVEL = 257.0
+"""The raw image has 16 bits: 65535 at level 255."""
+
+
+def demosaiced(
+    levels: Floats, pattern: str, method: str, red_gain: float, blue_gain: float
+) -> Floats:
+    """Return grey levels (h, w) after demosaicing.
+
+    The signal is multiplied by the gain of each pixel's filter (green: 1), quantised to 16 bits
+    over the levels 0 to 255, clipped, converted to colour and from that to grey (0.299 R + 0.587 G
+    + 0.114 B) by OpenCV.
+
+    Parameters
+    ----------
+    levels
+        The signal of a part of the frame that begins at an even column and an even row.
+    pattern, method
+        One of :data:`PATTERNS`, and of :data:`METHODS`.
+    red_gain, blue_gain
+        Of red and blue filters, relative to green.
+    """
+    gains = {"R": red_gain, "G": 1.0, "B": blue_gain}
+    raw = levels.copy()
+    for position, colour in enumerate(pattern):
+        raw[position // 2 :: 2, position % 2 :: 2] *= gains[colour]
+    counts = np.clip(np.floor(raw * STEPS_PER_LEVEL + 0.5), 0, 65535).astype(np.uint16)
+    code = getattr(cv2, f"COLOR_Bayer{pattern}2BGR{METHODS[method]}")
+    grey = cv2.cvtColor(cv2.cvtColor(counts, code), cv2.COLOR_BGR2GRAY)
+    return np.asarray(grey / STEPS_PER_LEVEL)
+
+
+# --------------------------------------------------------------------------------------------------
+# JPEG: an image through the encoder and the decoder that OpenCV has.
+
+BLOCK_PX = 8
+"""Sides of the blocks that a grey image is compressed in, each on its own."""
+
+TILE_PX = 1 << 14
+"""Largest side of an image that is compressed at once, in whole blocks: JPEG ends at 65535."""
+
+
+def compressed(image: Grey, quality: int) -> Grey:
+    """Return an image (h, w) after compression with ``quality`` from 1 to 100.
+
+    Blocks count from the image's first pixel: of a part of a frame they are those of the frame if
+    it begins at multiples of :data:`BLOCK_PX`, and ends at these or with the frame.
+    """
+    result = np.empty_like(image)
+    setting = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    for top in range(0, image.shape[0], TILE_PX):
+        for left in range(0, image.shape[1], TILE_PX):
+            tile = np.s_[top : top + TILE_PX, left : left + TILE_PX]
+            done, code = cv2.imencode(".jpg", image[tile], setting)
+            if not done:
+                raise ValueError("OpenCV's JPEG encoder failed")
+            result[tile] = np.asarray(cv2.imdecode(code, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
+    return result
+
+
+# --------------------------------------------------------------------------------------------------
+# A camera's response: bloom around bright areas, and a monotonic curve of gamma, toe and knee.
+
+MAX_LEVEL = 255.0
+
+BEND = 0.5
+"""The share of the scale, from its end, over which toe and knee act: they never overlap."""
+
+
+def bloomed(levels: Floats, black: float, white: float, bloom: float) -> Floats:
+    """Return levels (h, w) with bright areas grown at their edges.
+
+    A level's share s of the way from the darker to the brighter of ``black`` and ``white`` becomes
+    s + ``bloom`` · s (1 - s); levels outside them stay. The slope in s is 1 + bloom (1 - 2 s), from
+    1 - |bloom| to 1 + |bloom|: the order of levels is kept for ``bloom`` from -1 to 1. Where a
+    straight edge of the two levels crosses a pixel, s (1 - s) is the same on both of its sides, so
+    that the edge moves towards the dark by the integral of bloom · s (1 - s) across it. With equal
+    levels nothing changes.
+    """
+    dark, bright = min(black, white), max(black, white)
+    if bright == dark:
+        return levels
+    share = np.clip((levels - dark) / (bright - dark), 0.0, 1.0)
+    return np.asarray(levels + (bloom * (bright - dark)) * (share * (1.0 - share)))
+
+
+@compiled
+def curve(share: float, gamma: float, toe: float, knee: float) -> float:
+    """Return the response, 0 to 1, to a signal from 0 to 1: toe, knee, then gamma.
+
+    The toe acts on the lower half: at x = 2 · share it takes the part toe · (1 - x)² of the signal,
+    so that the slope is 1 - toe at black and 1 at the middle. The knee does the same to the upper
+    half, seen from white: its slope there is 1 - knee. Gamma is the exponent that follows. Each
+    keeps 0 and 1, and grows strictly in between for toe and knee from -1 to 1: the derivative of
+    x (1 - a (1 - x)²) is 1 - a (1 - x) (1 - 3 x), where (1 - x) (1 - 3 x) lies between -1/3 and 1,
+    and is 1 only at x = 0.
+    """
+    if share <= 0.0:
+        return 0.0
+    if share >= 1.0:
+        return 1.0
+    if share < BEND:
+        rest = 1.0 - share / BEND
+        share -= share * toe * rest * rest
+    else:
+        left = 1.0 - share
+        rest = 1.0 - left / BEND
+        share = 1.0 - (left - left * knee * rest * rest)
+    return float(share**gamma) if gamma != 1.0 else share
+
+
+@compiled
+def apply_tone(levels: Floats, gamma: float, toe: float, knee: float) -> None:
+    """Replace levels (h, w) by the response to them, on the scale from 0 to 255; clipped there."""
+    for i in range(levels.shape[0]):
+        for j in range(levels.shape[1]):
+            levels[i, j] = MAX_LEVEL * curve(levels[i, j] / MAX_LEVEL, gamma, toe, knee)

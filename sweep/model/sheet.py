@@ -13,7 +13,7 @@ import numpy as np
 
 from sweep.compilation import compiled, compiled_inline
 from sweep.model.lens import distort
-from sweep.model.projection import ModuleEdge, Projection
+from sweep.model.polygon import ModuleEdge, Projection
 from sweep.typing import Floats
 
 PIECE_RAD = 0.25
@@ -38,7 +38,7 @@ NO_WAVES = np.zeros((2, 0, 4))
 
 
 class Sheet(NamedTuple):
-    """A sheet in the units of a plane (:class:`sweep.model.projection.Projection`).
+    """A sheet in the units of a plane (:class:`sweep.model.polygon.Projection`).
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Whether photographs show the board that was described; if not, which one fits better."""
+"""Whether photographs, board and camera fit one another; and the camera from the photographs."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import dataclasses
 import itertools
 import tomllib
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +15,22 @@ import cv2
 import numpy as np
 
 from sweep.errors import ArgumentError, SweepError
+from sweep.measure import intrinsics
 from sweep.measure.detectors import FindFunction
+from sweep.measure.flags import CalibrationStatus
 from sweep.messages import plain, shown
 from sweep.model.board import Board
 from sweep.model.marker import opencv_dictionary_names
-from sweep.photographs.corners import detect_markers
-from sweep.photographs.folder import Photograph
-from sweep.plan.board_files import board_of
+from sweep.model.polygon import side_lengths
+from sweep.model.pose import rotation_of_vector
+from sweep.photographs.folder import FoundCorners, Photograph, detect_markers
+from sweep.photographs.pose_fit import Lens
+from sweep.photographs.truth import fitted_board
+from sweep.plan.board_rules import board_of
 from sweep.typing import Floats, Integers
+
+# --------------------------------------------------------------------------------------------------
+# Whether photographs show the board that was described; if not, which one fits better.
 
 MIN_FITTING = 0.8
 """Share of the detected markers that lie where the board has them."""
@@ -101,7 +111,7 @@ def fitting_share(board: Board, seen: Seen) -> float:
         index = {each: k for k, each in enumerate(board.marker_ids)}
         flat = board.corners_m[[index[each] for each in ids[known].tolist()]][..., :2]
         mapped = cv2.perspectiveTransform(flat.reshape(1, -1, 2), transform).reshape(-1, 4, 2)
-        side = np.linalg.norm(np.roll(quads[known], -1, axis=1) - quads[known], axis=2).mean(axis=1)
+        side = side_lengths(quads[known]).mean(axis=1)
         distance = np.linalg.norm(mapped - quads[known], axis=2).max(axis=1)
         fitting += int((distance < FITTING_SHARE * side).sum())
     return fitting / total if total else 0.0
@@ -125,7 +135,7 @@ def measured_side(board: Board, seen: Seen) -> float:
         back = cv2.perspectiveTransform(
             quads[known].reshape(1, -1, 2), np.asarray(transform)
         ).reshape(-1, 4, 2)
-        sides = [np.linalg.norm(np.roll(each, -1, axis=1) - each, axis=2).mean(axis=1)
+        sides = [side_lengths(each).mean(axis=1)
                  for each in (back, flat)]
         ratios += (sides[0] / sides[1]).tolist()
     return float(np.median(ratios)) if ratios else 1.0
@@ -138,7 +148,7 @@ def _homography(board: Board, ids: Integers, quads: Floats) -> tuple[Any, Any]:
     if known.sum() < 2:
         return None, known
     flat = board.corners_m[[index[each] for each in ids[known].tolist()]][..., :2]
-    side = float(np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2).mean())
+    side = float(side_lengths(quads).mean())
     transform, _ = cv2.findHomography(
         flat.reshape(-1, 2), quads[known].reshape(-1, 2), cv2.RANSAC, FITTING_SHARE * side / 2
     )
@@ -173,6 +183,13 @@ def _others(path: Path) -> Iterator[tuple[str, Board]]:
             by_rows = [ids[k * columns : (k + 1) * columns] for k in range(rows)]
             changes.append({"ids": [each for row in by_rows[::-1] for each in row],
                             "first_id": None})
+    elif document.get("kind") == "aprilgrid":
+        rows, columns = document["tagRows"], document["tagCols"]
+        changes = [{"tagRows": columns, "tagCols": rows}]
+        changes += [
+            {"tagRows": rows + y, "tagCols": columns + x}
+            for x, y in itertools.product((-1, 0, 1), repeat=2) if (x, y) != (0, 0)
+        ]
     for change in changes:
         changed = {key: value for key, value in {**document, **change}.items() if value is not None}
         try:
@@ -203,3 +220,168 @@ def _no_marker(
     )
 
 
+# --------------------------------------------------------------------------------------------------
+# Whether a camera's file is of the photographs' resolution, where it does not say.
+
+DOUBTFUL_PX = 0.5
+"""RMS of a board's corners, in the median photograph, from which other resolutions are tried."""
+
+CLEARLY_BETTER = 0.5
+"""Share of that RMS below which another resolution fits."""
+
+MAX_TRIED_VIEWS = 5
+"""Photographs with the most corners in which they are tried."""
+
+SCALES = tuple(map(Fraction, ("1/4", "1/3", "1/2", "2/3", "3/4", "4/3", "3/2", "2", "3", "4")))
+"""Resolutions of photographs over that of a calibration."""
+
+
+def check_resolution(
+    written: str, lens: Lens, size: tuple[int, int], found: Sequence[FoundCorners], rms_px: float
+) -> None:
+    """Refuse a camera of a file that fits the board far better in another resolution.
+
+    Parameters
+    ----------
+    written
+        The file.
+    lens, size
+        The camera, and the photographs' width and height in px.
+    found
+        The board's corners in each photograph.
+    rms_px
+        Their RMS in the median photograph with this camera.
+
+    Raises
+    ------
+    ArgumentError
+        One line.
+    """
+    if rms_px < DOUBTFUL_PX:
+        return
+    best = sorted(found, key=lambda each: -len(each.points))[:MAX_TRIED_VIEWS]
+    own = _median_rms(lens, best)
+    fitting = {scale: _median_rms(scaled(lens, float(scale)), best) for scale in SCALES}
+    scale = min(fitting, key=lambda each: fitting[each])
+    if fitting[scale] < CLEARLY_BETTER * own:
+        raise ArgumentError(
+            "camera", plain(written),
+            f"the board's corners are {own:.2g} px RMS beside it, and {fitting[scale]:.2g} px if "
+            f"its numbers are times {scale}: it is of another resolution; give the calibration of "
+            f"{size[0]} x {size[1]}",
+        )
+
+
+def scaled(lens: Lens, scale: float) -> Lens:
+    """Return the camera of images that are ``scale`` times as large; pixels' edges lie at halves.
+
+    >>> scaled(Lens.of(100.0, 100.0, 9.5, 7.5, ()), 2.0).matrix[0].tolist()
+    [200.0, 0.0, 19.5]
+    """
+    matrix = lens.matrix.copy()
+    matrix[:2] *= scale
+    matrix[:2, 2] += (scale - 1.0) / 2.0
+    return Lens(matrix, lens.distortion)
+
+
+def _median_rms(lens: Lens, found: Sequence[FoundCorners]) -> float:
+    fits = [fitted_board(lens, each) for each in found]
+    return float(np.median([np.inf if fit is None else fit.rms_px for fit in fits]))
+
+
+# --------------------------------------------------------------------------------------------------
+# The camera from the photographs themselves.
+
+MIN_PHOTOGRAPHS = 4
+"""Photographs with a board from which a camera is calibrated."""
+
+MIN_CORNERS = 12
+"""Corners of a board in a photograph that is used."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibratedCamera:
+    """A camera that was calibrated.
+
+    Attributes
+    ----------
+    lens
+        Its numbers.
+    sd
+        Standard deviations of fx, fy, cx, cy (px) and of the five coefficients.
+    covariance
+        Their covariance (9, 9).
+    rms_px
+        Root mean square of the residuals' lengths.
+    photographs
+        How many were used.
+    """
+
+    lens: Lens
+    sd: tuple[float, ...]
+    covariance: Floats
+    rms_px: float
+    photographs: int
+
+
+def calibrate(size: tuple[int, int], found: Sequence[FoundCorners]) -> CalibratedCamera:
+    """Calibrate a camera with five coefficients (:func:`sweep.measure.intrinsics.calibrate`).
+
+    Parameters
+    ----------
+    size
+        Width and height in pixels.
+    found
+        The board's corners in each photograph.
+
+    Raises
+    ------
+    ArgumentError
+        If too few photographs show enough of the board.
+    """
+    used = [each for each in found if len(each.points) >= MIN_CORNERS]
+    if len(used) < MIN_PHOTOGRAPHS:
+        raise ArgumentError(
+            "camera", "calibrate",
+            f"expected {MIN_PHOTOGRAPHS} photographs with at least {MIN_CORNERS} corners of the "
+            f"board, from different sides; there are {len(used)}; take more, or give the file of a "
+            "calibration",
+        )
+    made = intrinsics.calibrate(
+        [each.points for each in used], [each.pixels for each in used], size
+    )
+    if made.status != CalibrationStatus.calibrated:
+        raise ArgumentError(
+            "camera", "calibrate",
+            "OpenCV cannot calibrate from these photographs; take others, from different sides, or "
+            "give the file of a calibration",
+        )
+    fx, fy, cx, cy, *distortion = made.values.tolist()
+    lens = Lens.of(fx, fy, cx, cy, tuple(distortion))
+    return CalibratedCamera(
+        lens, tuple(made.std.tolist()), _covariance(lens, [used[i] for i in made.used], made),
+        made.rms_px, made.views,
+    )
+
+
+def _covariance(lens: Lens, used: Sequence[FoundCorners], made: intrinsics.Intrinsics) -> Floats:
+    """Return the covariance (9, 9) of the camera's numbers beside the photographs' poses.
+
+    That of least squares with the residuals' variance: the inverse of the Schur complement of the
+    poses in the normal equations, as of a bundle adjustment (Triggs et al., 2000, section 6.1).
+    """
+    numbers = len(intrinsics.INTRINSICS)
+    information = np.zeros((numbers, numbers))
+    squares, count = 0.0, 0
+    rotations = rotation_of_vector(made.turns)
+    for found, rotation, shift in zip(used, rotations, made.shifts, strict=True):
+        at = (found.points * [1.0, -1.0, -1.0], rotation, shift)
+        image, by_pose = lens.derivatives(*at)
+        pose, camera = by_pose.reshape(-1, 6), lens.camera_derivatives(*at)
+        cross = pose.T @ camera
+        information += camera.T @ camera - cross.T @ np.linalg.solve(pose.T @ pose, cross)
+        squares += float(((image - found.pixels) ** 2).sum())
+        count += 2 * len(found.points) - 6
+    scale = np.sqrt(np.diag(information))  # the numbers' units differ by many powers of ten
+    scaled = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)
+    return np.asarray(squares / max(count - numbers, 1) * scaled / np.outer(scale, scale))

@@ -17,27 +17,34 @@ from sweep.measure.detectors import FindFunction
 from sweep.measure.flags import TruthSource
 from sweep.messages import plain
 from sweep.model.board import Board
-from sweep.model.photograph import Part
-from sweep.photographs.board_check import check_board
-from sweep.photographs.board_truth import board_poses
-from sweep.photographs.calibrate import CalibratedCamera, calibrate
-from sweep.photographs.camera_check import check_resolution
-from sweep.photographs.cameras import camera_of_file, known_camera, stereo_of_file
-from sweep.photographs.corners import detect_markers, find_corners, reference_detector
-from sweep.photographs.folder import Folder, read_folder
-from sweep.photographs.poses import Poses
-from sweep.photographs.poses_file import poses_of_file
-from sweep.photographs.record_files import (
+from sweep.model.image_file import Part
+from sweep.photographs.board_check import CalibratedCamera, calibrate, check_board, check_resolution
+from sweep.photographs.folder import (
+    Folder,
     KnownCamera,
     Prepared,
     WantedMarkers,
+    detect_markers,
+    find_corners,
     name_of,
+    read_folder,
+    reference_detector,
     setting_name,
     write_record,
 )
-from sweep.photographs.reference_pose import SeenMarkers, own_poses, partner_poses
-from sweep.plan.board_files import board_document, board_of
-from sweep.plan.experiment import Pipeline
+from sweep.photographs.pose_fit import Poses
+from sweep.photographs.truth import (
+    SeenMarkers,
+    board_poses,
+    camera_of_file,
+    known_camera,
+    own_poses,
+    partner_poses,
+    poses_of_file,
+    stereo_of_file,
+)
+from sweep.plan.board_rules import board_document, board_of
+from sweep.plan.pipeline import Pipeline
 from sweep.typing import Floats
 
 PathName = str | os.PathLike[str]

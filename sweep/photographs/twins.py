@@ -13,11 +13,10 @@ from sweep.errors import ArgumentError, PluginError
 from sweep.measure.surroundings import clear_modules
 from sweep.messages import plain
 from sweep.model.image_file import read_regular
-from sweep.plan.alternatives import PHOTOGRAPHS, SIMULATED
 from sweep.plan.axes import TRIAL, parse_distribution
-from sweep.plan.experiment import Pipeline
-from sweep.plan.parameters import PARAMETERS
+from sweep.plan.parameters import PARAMETERS, PHOTOGRAPHS, SIMULATED
 from sweep.plan.photographs import PhotographRecord, read_record, shows_photographs
+from sweep.plan.pipeline import Pipeline
 from sweep.plan.toml_text import MAX_BYTES, read_document
 
 NAME = "{}-twins"

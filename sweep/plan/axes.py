@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -320,7 +320,8 @@ def _checked(parameter: Parameter, value: Any) -> Any:
     try:
         return parameter.check(value)
     except ValueError as error:
-        raise ValueError(f"{error} (not {shown(value)})") from None
+        expected, semicolon, hint = str(error).partition("; did you mean")
+        raise ValueError(f"{expected} (not {shown(value)}){semicolon}{hint}") from None
 
 
 def _bounded(values: Sequence[Any], quota: int) -> Sequence[Any]:
@@ -335,28 +336,17 @@ def _too_many() -> ValueError:
 
 def _expand(form: str, ends: list[Any], quota: int) -> Sequence[Any]:
     """Return the values of a form that generates them."""
-    misuse = ValueError(f"{form} = {AXIS_FORMS[form]}")
-    if not all(isinstance(end, (int, float)) and not isinstance(end, bool) for end in ends):
-        raise misuse
-    if not all(abs(end) < 1e300 for end in ends):
-        raise misuse
+    numbers = all(isinstance(end, (int, float)) and not isinstance(end, bool) and abs(end) < 1e300
+                  for end in ends)
+    sound = numbers and len(ends) in ((2, 3) if form == "range" else (3,))
+    if not sound or not _SOUND[form](*ends):
+        raise ValueError(f"{form} = {AXIS_FORMS[form]}")
     if form == "range":
-        if not all(isinstance(end, int) for end in ends) or len(ends) not in (2, 3):
-            raise misuse
-        if len(ends) == 3 and ends[2] == 0:
-            raise misuse
-        if any(abs(end) > 2**62 for end in ends):
-            raise misuse
-        values = range(*ends)
-        if len(values) > MAX_VALUES:
+        if len(values := range(*ends)) > MAX_VALUES:
             raise ValueError(f"at most {MAX_VALUES:,} values")
         return values
-    if len(ends) != 3:
-        raise misuse
     if form == "arange":
         start, stop, step = (float(end) for end in ends)
-        if step == 0:
-            raise misuse
         steps = (stop - start) / step
         if steps > quota:
             raise _too_many()
@@ -365,15 +355,21 @@ def _expand(form: str, ends: list[Any], quota: int) -> Sequence[Any]:
         if all(isinstance(end, int) for end in ends):
             return range(*ends)
         return [start + step * i for i in range(count)]
-    if not isinstance(ends[2], int) or ends[2] < 1:
-        raise misuse
     if ends[2] > quota:
         raise _too_many()
-    if form == "linspace":
-        return list(map(float, np.linspace(ends[0], ends[1], ends[2])))
-    if not (ends[0] > 0 and ends[1] > 0):
-        raise misuse
-    return list(map(float, np.geomspace(ends[0], ends[1], ends[2])))
+    spaced = np.linspace if form == "linspace" else np.geomspace
+    return list(map(float, spaced(*ends)))
+
+
+_SOUND: dict[str, Callable[..., bool]] = {
+    "range": lambda *ends: ends[2:] != (0,) and all(
+        isinstance(end, int) and abs(end) <= 2**62 for end in ends),
+    "arange": lambda _start, _stop, step: step != 0,
+    "linspace": lambda _first, _last, count: isinstance(count, int) and count >= 1,
+    "geom": lambda first, last, count: (
+        isinstance(count, int) and count >= 1 and first > 0 and last > 0),
+}
+"""Form of an axis -> whether its numbers, as many as it has, can be."""
 
 
 def combinations(axes: Sequence[Axis]) -> list[dict[str, Any]]:

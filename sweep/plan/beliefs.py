@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from sweep.model.calibration_error import CalibrationError
-from sweep.model.camera import VIEW_PARAMETERS, intrinsics
-from sweep.model.columns import Column
+from sweep.model.calibration import CalibrationError
+from sweep.model.camera import VIEW_PARAMETERS, Column, intrinsics
 from sweep.plan.axes import MAX_DEVIATIONS, Distribution
 from sweep.plan.reader import Reading
 from sweep.typing import Floats
@@ -77,32 +76,24 @@ def calibrated_columns(
 
 def beliefs_in_one_way(reading: Reading) -> None:
     """Demand beliefs that do not contradict each other, and a calibration where one is believed."""
-    given = reading.given
-
-    def fault(name: str, expected: str) -> None:
-        reading.fault(f"estimator.{name}", reading.written(name), expected)
-
-    focal = [name for name in ("believed_fx_px", "believed_fy_px") if name in given]
-    if "believed_focal_scale" in given and focal:
-        fault("believed_focal_scale", "a factor or focal lengths, not both; delete it or "
-              f"{', '.join(focal)}")
     known = _calibration_is_sound(reading)
     if "calibration" not in reading.values("believed"):
         return
     if known and not any(reading.fixed[name] for name in STATED):
         where = "camera_file has none" if reading.fixed.get("camera_file") else "or a camera_file"
-        fault("believed", f"a calibration's standard deviations: give calibration_sd under [camera]"
-              f" ({where})")
+        reading.refuse(
+            "believed", f"a calibration's standard deviations: give calibration_sd under [camera] "
+            f"({where})")
     for name in OWN_BELIEFS:
-        if name in given:
-            fault(name, "no other belief about the camera beside believed = calibration; delete "
-                  "one of them")
+        if name in reading.given:
+            reading.refuse(name, "no other belief about the camera beside believed = calibration; "
+                           "delete one of them")
 
 
 def _calibration_is_sound(reading: Reading) -> bool:
     """Note what is wrong with standard deviations or covariance; return whether nothing is."""
     def fault(name: str, expected: str) -> bool:
-        reading.fault(f"camera.{name}", reading.written(name), expected)
+        reading.refuse(name, expected)
         return False
 
     if any(name in reading.given and name not in reading.fixed for name in STATED):

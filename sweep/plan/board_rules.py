@@ -1,17 +1,20 @@
-"""Rules of pipelines that show boards."""
+"""Files that describe a board, and rules of pipelines that show boards."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
-from sweep.environments.interpreters import INSTALLED
+from sweep.declaration import check_table, declared_fields
 from sweep.measure.estimators import SOLVERS
-from sweep.messages import shown
-from sweep.model.board_values import (
+from sweep.messages import nearest, plain, refusal, shown
+from sweep.model.board import Board
+from sweep.model.board_kinds import (
     ARRANGING,
+    KINDS,
     NEEDED,
     SINGLE,
     arranged_board,
@@ -20,13 +23,89 @@ from sweep.model.board_values import (
     used_by,
 )
 from sweep.model.effects import GEOMETRIC
-from sweep.model.renderer_names import RENDERERS, is_renderer
+from sweep.model.image_file import read_regular
 from sweep.model.renderers import MAX_BITMAP_PX, MAX_BITMAP_SIDE, bitmap_shape
-from sweep.plan.alternatives import PHOTOGRAPHS
+from sweep.model.scene import RENDERERS, is_renderer
 from sweep.plan.axes import combinations
-from sweep.plan.parameters import PARAMETERS
+from sweep.plan.parameters import PHOTOGRAPHS
 from sweep.plan.reader import Reading
+from sweep.plan.toml_text import MAX_BYTES, read_document
 from sweep.plugins.recording import is_recording
+
+# --------------------------------------------------------------------------------------------------
+# Files that describe a board, `BOARD.toml`: all faults of one are found at once.
+
+def read_board(path: str | Path) -> Board:
+    """Return the board that a TOML file describes.
+
+    Raises
+    ------
+    PipelineError
+        One line for each fault: the file, the key, its value, and what was expected.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "board.toml"
+    ...     _ = path.write_text('''kind = "grid"
+    ... dictionary = "DICT_4X4_50"
+    ... rows = 2
+    ... columns = 3
+    ... marker_m = 0.04
+    ... gap_m = 0.01''')
+    ...     read_board(path).marker_ids
+    (0, 1, 2, 3, 4, 5)
+    """
+    return board_of(board_document(path), plain(path))
+
+
+def board_document(path: str | Path) -> dict[str, Any]:
+    """Return the tables and values of a board's file, unchecked; as :func:`read_board`."""
+    source = plain(path)
+    try:
+        content = read_regular(Path(path), MAX_BYTES)
+        return read_document(content.decode())
+    except OSError as error:
+        raise refusal([f"{source}: cannot be read: {error.strerror}"]) from None
+    except UnicodeDecodeError:
+        raise refusal([f"{source}: expected a TOML file: not UTF-8"]) from None
+    except ValueError as error:
+        raise refusal([f"{source}: {error}"]) from None
+
+
+def board_of(document: Mapping[str, Any], source: str) -> Board:
+    """Return the board of a document; as :func:`read_board`, lines beginning with ``source``."""
+    kind = document.get("kind")
+    if not isinstance(kind, str) or kind not in KINDS:
+        given = f"kind = {shown(kind)}" if "kind" in document else "kind"
+        hint = nearest(kind, list(KINDS)) if isinstance(kind, str) else ""
+        raise refusal([f"{source}: {given}: expected one of {', '.join(KINDS)}{hint}"])
+    declaring = KINDS[kind]
+    values, faults = check_table(
+        declared_fields(declaring),
+        {key: value for key, value in document.items() if key != "kind"},
+        f"a board of kind {kind}",
+    )
+    if faults:
+        raise refusal([f"{source}: {fault}" for fault in faults])
+    made = declaring(**values)
+    broken = made.faults()
+    if broken:
+        raise refusal([
+            f"{source}: {key} = {shown(value)}: expected {expected}"
+            for key, value, expected in broken
+        ])
+    board = made.board()
+    if not board.is_flat:
+        raise refusal([
+            f"{source}: markers: expected one plane, for photographs: no z_m, no tilt_deg"
+        ])
+    return board
+
+
+# --------------------------------------------------------------------------------------------------
+# Rules of pipelines that show boards.
 
 WARP = "warp"
 
@@ -50,16 +129,18 @@ def boards_can_be_printed(reading: Reading) -> None:
     for name in given if kinds else ():
         if name not in used:
             users = " or ".join(kind for kind in NEEDED if name in used_by(kind))
-            reading.fault(
-                f"board.{name}", reading.written(name),
-                f"kind = {users}, which uses it; kind = {' or '.join(dict.fromkeys(kinds))} "
-                "does not: delete it",
-            )
+            reading.refuse(name, f"kind = {users}, which uses it; kind = "
+                           f"{' or '.join(dict.fromkeys(kinds))} does not: delete it")
     if not _shows_boards(reading):
         return
     if needed or not all(reading.values(name) for name in ARRANGING):
         return
-    for name in ("markers", "distractors"):
+    if "marker_id" in reading.given and any(reading.values("ids")):
+        reading.fault(
+            "board.ids", list(reading.values("ids")[0]), "ids, or marker_id of the first; not both"
+        )
+        return
+    for name in ("ids", "markers", "distractors"):
         if reading.axis_of(name) is not None:
             reading.fault(f"axes.{name}", "...", f"{name} under [board]: they cannot be an axis")
             return
@@ -121,31 +202,17 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
     on_boards = ("points", "refine", "refineDetectedMarkers", "minMarkers")
     plugged = [each.name for each in reading.plugins if each.of_boards]
     if not _shows_boards(reading):
-        for name in reading.values("solver"):
-            if name in plugged:
-                reading.fault(
-                    "estimator.solver", name, "a solver of single markers, or a board: give kind "
-                    "under [board]",
-                )
-        for name in on_boards:
-            if name in reading.given:
-                reading.fault(
-                    f"{reading.parameters[name].section}.{name}", reading.written(name),
-                    "a board: give kind under [board]",
-                )
+        reading.refuse_values("solver", "a solver of single markers, or a board: give kind under "
+                              "[board]", lambda name: name in plugged)
+        for name in reading.given.intersection(on_boards):
+            reading.refuse(name, "a board: give kind under [board]")
         return
     if PHOTOGRAPHS in reading.given:
-        reading.fault("board.kind", reading.written("kind"), "no board beside photographs, whose "
-                      "board `sweep photos` knows; delete it")
-    for name in reading.values("environment"):
-        if name != INSTALLED:
-            reading.fault("detector.environment", name, f"{INSTALLED}, for boards")
-    for name in reading.values("renderer"):
-        if not is_renderer(name):
-            reading.fault("scene.renderer", name, f"{RENDERERS}, for boards")
-    for name in reading.values("detector"):
-        if is_recording(name):
-            reading.fault("detector.detector", name, "a detector that searches images, for boards")
+        reading.refuse("kind", "no board beside photographs, whose board `sweep photos` knows; "
+                       "delete it")
+    reading.refuse_values(
+        "renderer", f"{RENDERERS}, for boards", lambda name: not is_renderer(name))
+    reading.refuse_values("detector", "a detector that searches images, for boards", is_recording)
     if "solver" not in reading.given:
         reading.faults.append(
             f"{reading.source}: estimator.solver: missing; a board needs one of "
@@ -199,19 +266,12 @@ def _several_planes(reading: Reading) -> None:
     """Refuse what sheets in several planes cannot have: solvers for a plane, and effects."""
     target = any(map(is_solid, reading.values("markers")))
     why = f"for {'markers' if target else 'distractors'} with z_m or tilt_deg"
-    for name in reading.values("solver") if target else ():
-        known = SOLVERS.get(name)
-        if known is not None and known.planar_only and any(
-            points in ("markers", "chessboard") for points in reading.values("points")
-        ):
-            reading.fault("estimator.solver", name, f"one of iterative, sqpnp, epnp, {why}")
+    if target and {"markers", "chessboard"}.intersection(reading.values("points")):
+        reading.refuse_values("solver", f"one of iterative, sqpnp, epnp, {why}",
+                              lambda name: name in SOLVERS and SOLVERS[name].planar_only)
     for name in IN_ONE_PLANE:
-        if any(value != PARAMETERS[name].default for value in reading.values(name)) or (
-            name in reading.distributions
-        ):
-            reading.fault(f"scene.{name}", reading.written(name), f"it absent, {why}")
-    for value in reading.values("renderer"):
-        if value != "exact":
-            reading.fault("scene.renderer", value, f"exact, {why}")
+        if reading.is_active(name):
+            reading.refuse(name, f"it absent, {why}")
+    reading.refuse_values("renderer", f"exact, {why}", lambda name: name != "exact")
     if target and any(reading.values("refineDetectedMarkers")):
         reading.fault("detector.refineDetectedMarkers", True, f"false, {why}")

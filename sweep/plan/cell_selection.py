@@ -9,9 +9,8 @@ from typing import Any
 
 from sweep.messages import MAX_FAULTS, label, nearest, plain, refusal
 from sweep.plan.axes import TRIAL, Axis
-from sweep.plan.experiment import Pipeline
-from sweep.plan.overrides import displaced_by
 from sweep.plan.parameters import PARAMETERS, Parameter
+from sweep.plan.pipeline import Pipeline, displaced_by
 from sweep.plan.toml_text import python_boolean, read_value
 
 _PART = re.compile(r"""(?:\[[^\]]*\]?|"[^"]*"?|[^,\["])+""")
@@ -71,29 +70,23 @@ def parse_selection(at: str, pipeline: Pipeline | None = None) -> dict[str, Any]
     together = {axis.name: axis for axis in axes if axis.zipped}
     for part in map(str, _PART.findall(at)):
         name, equals, written = (piece.strip() for piece in part.partition("="))
-        if not equals or not written:
-            faults.append(f"--at {plain(part)}: expected name=value, such as tilt_deg=45")
-        elif (axis := together.get(name)) is not None:
-            try:
-                row = axis.at(_row(axis, written))
-            except ValueError as error:
-                faults.append(f"--at {plain(part)}: expected {error}")
+        try:
+            if not equals or not written:
+                raise ValueError("name=value, such as tilt_deg=45")
+            if name in together:
+                row = together[name].at(_row(together[name], written))
+            elif name == TRIAL or name in parameters:
+                row = {name: _value(parameters.get(name), written)}
+            else:
+                known = [*parameters, TRIAL, *together]
+                hint = nearest(name, known) if len(faults) < MAX_FAULTS else ""
+                faults.append(f"--at {plain(part)}: unknown parameter{hint}")
                 continue
-            faults += [
-                f"--at {plain(part)}: {other} is given twice" for other in row if other in named
-            ]
-            named |= row
-        elif name != TRIAL and name not in parameters:
-            known = [*parameters, TRIAL, *together]
-            hint = nearest(name, known) if len(faults) < MAX_FAULTS else ""
-            faults.append(f"--at {plain(part)}: unknown parameter{hint}")
-        elif name in named:
-            faults.append(f"--at {plain(part)}: {name} is given twice")
-        else:
-            try:
-                named[name] = _value(parameters.get(name), written)
-            except ValueError as error:
-                faults.append(f"--at {plain(part)}: expected {error}")
+        except ValueError as error:
+            faults.append(f"--at {plain(part)}: expected {error}")
+            continue
+        faults += [f"--at {plain(part)}: {other} is given twice" for other in row if other in named]
+        named |= row
     if faults:
         raise refusal(faults)
     return named

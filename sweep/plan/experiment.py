@@ -1,39 +1,31 @@
-"""The pipeline: a checked experiment, as a value."""
+"""The experiment: a checked grid with its fixed values, random draws, boards and plug-ins."""
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+from functools import lru_cache
+from typing import Any, cast
 
-import tomlkit
-
-from sweep.messages import plain, refusal
-from sweep.model.image_file import read_regular
-from sweep.plan.axes import Axis, Distribution
-from sweep.plan.camera_files import read_camera_file
-from sweep.plan.camera_values import resolve_sensor, with_values
-from sweep.plan.overrides import apply_settings, fix_values, parse_settings
+from sweep.messages import plain
+from sweep.model.board_kinds import ARRANGING, SINGLE, Markers, arranged
+from sweep.model.effects import EFFECTS, Effect, ScenePlugins, checked_effect, checked_renderer
+from sweep.plan.axes import Axis, Distribution, combinations
 from sweep.plan.parameters import Parameter, Stage
-from sweep.plan.plugins import EFFECTS_KEY, NAMED_BY, parameters_with, read_plugins
-from sweep.plan.reader import read_keys
-from sweep.plan.required import read_required
-from sweep.plan.rules import check_rules
-from sweep.plan.stopping import SECTIONS, StoppingRule, read_stopping
-from sweep.plan.toml_text import MAX_BYTES, document_text, read_document
+from sweep.plan.plugins import parameters_with
+from sweep.plan.reader import StoppingRule
+from sweep.plugins import EffectPlugin, RendererPlugin
 from sweep.plugins.declared import DeclaredPlugin
 
-MAX_SHOWN_PATH_LENGTH = 400
-
+# --------------------------------------------------------------------------------------------------
+# The experiment: a checked grid with its fixed values and random draws, as a value.
 
 @dataclass(frozen=True, slots=True)
-class Pipeline:
+class Experiment:
     """A checked experiment: the grid, its fixed values and its random draws.
 
-    Made by :meth:`from_toml`, :meth:`from_text` or :meth:`from_dict`, which check it as a whole.
+    :class:`sweep.plan.pipeline.Pipeline` reads it from a document and checks it as a whole.
 
     Attributes
     ----------
@@ -67,15 +59,6 @@ class Pipeline:
         The most milliseconds of a frame, if [require] has a budget.
     source
         What lines on faults begin with: the file, if there is one. It is not compared.
-
-    Examples
-    --------
-    >>> pipeline = Pipeline.from_dict({
-    ...     "marker": {"size_m": 0.05},
-    ...     "axes": {"distance_m": {"geom": [0.1, 1, 20]}, "tilt_deg": [0, 45, 70]},
-    ... })
-    >>> [axis.name for axis in pipeline.axes], pipeline.size(Stage.scene)
-    (['distance_m', 'tilt_deg'], 60)
     """
 
     name: str
@@ -109,159 +92,6 @@ class Pipeline:
     def heading(self) -> str:
         """The title, or without one the name, as it can be printed."""
         return self.title.strip() or plain(self.name)
-
-    @staticmethod
-    def from_toml(path: str | Path, settings: Sequence[str] = ()) -> Pipeline:
-        """Read a pipeline file.
-
-        Parameters
-        ----------
-        path
-            A TOML file.
-        settings
-            "key=value" with TOML values, as ``--set`` takes them: they replace the file's.
-
-        Raises
-        ------
-        PipelineError
-            One line for each fault of the file or of the settings.
-        """
-        path = Path(path)
-        source = plain(path, MAX_SHOWN_PATH_LENGTH)
-        try:
-            encoded = read_regular(path, MAX_BYTES)
-        except (OSError, ValueError) as error:
-            reason = error.strerror if isinstance(error, OSError) else error
-            raise refusal([f"{source}: cannot be read: {reason}{_similar(path)}"]) from None
-        if len(encoded) > MAX_BYTES:
-            raise refusal([f"{source}: expected at most {MAX_BYTES:,} bytes"])
-        try:
-            text = encoded.decode()
-        except UnicodeDecodeError as error:
-            raise refusal([f"{source}: expected UTF-8: byte {error.start} is not"]) from None
-        text = text.removeprefix("\ufeff")
-        return Pipeline.from_text(
-            text, settings, name=path.stem, source=source, folder=path.parent
-        )
-
-    @staticmethod
-    def from_text(
-        text: str,
-        settings: Sequence[str] = (),
-        *,
-        name: str = "pipeline",
-        source: str = "pipeline",
-        folder: str | Path = ".",
-        files: Mapping[str, str] | None = None,
-        camera_files: Mapping[str, str] | None = None,
-        plugins: Sequence[DeclaredPlugin] | None = None,
-    ) -> Pipeline:
-        """Read a pipeline from TOML text.
-
-        Parameters
-        ----------
-        text
-            A pipeline file's text.
-        settings
-            As for :meth:`from_toml`.
-        name
-            What stores are named after.
-        source
-            What the lines of an error begin with.
-        folder
-            Where relative paths start.
-        files
-            Path as written -> SHA-256: used instead of reading the files that the text refers to,
-            as for a store whose files may have moved.
-        camera_files
-            The same of camera files alone: a store's text has their values.
-        plugins
-            The plug-ins that a store has recorded, used instead of importing them.
-
-        Raises
-        ------
-        PipelineError
-            One line for each fault of the text or of the settings.
-        """
-        document = _document(text, source)
-        if settings:
-            parameters = _parameters(document, settings, folder, plugins)
-            chosen = parse_settings(settings, parameters)
-            apply_settings(document, chosen, parameters)
-            # Checked before tomlkit, which keeps the comments, reads it again: tomlkit is slow.
-            _checked(
-                document, text, name, source, Path(folder), files, camera_files, plugins
-            )
-            written = tomlkit.parse(text)
-            apply_settings(written, chosen, parameters)
-            text = tomlkit.dumps(written)
-            document = _document(text, source)
-        return _checked(document, text, name, source, Path(folder), files, camera_files, plugins)
-
-    @staticmethod
-    def from_dict(
-        mapping: Mapping[str, Any],
-        settings: Sequence[str] = (),
-        *,
-        name: str = "pipeline",
-        source: str = "pipeline",
-        folder: str | Path = ".",
-    ) -> Pipeline:
-        """Make a pipeline of nested dictionaries: the document of a pipeline file.
-
-        Parameters
-        ----------
-        mapping
-            Sections and header keys as in a file. Values are what TOML has; tuples and NumPy
-            arrays count as lists, NumPy's numbers as numbers, paths as strings, and a ``range``
-            as ``{"range": [start, stop, step]}``.
-        settings, name, source, folder
-            As for :meth:`from_text`.
-
-        Raises
-        ------
-        PipelineError
-            One line for each fault of the mapping or of the settings, worded as for a file.
-
-        Examples
-        --------
-        >>> pipeline = Pipeline.from_dict({"pose": {"distance_m": 0.3}, "seed": 4})
-        >>> print(pipeline.to_toml())
-        seed = 4
-        <BLANKLINE>
-        [pose]
-        distance_m = 0.3
-        <BLANKLINE>
-        """
-        try:
-            text = document_text(mapping)
-        except ValueError as error:
-            raise refusal([f"{source}: {line}" for line in str(error).split("\n")]) from None
-        return Pipeline.from_text(text, settings, name=name, source=source, folder=folder)
-
-    def to_toml(self) -> str:
-        """Return the pipeline as a file's text, settings included.
-
-        :meth:`from_text` reads an equal pipeline from it, given the same ``name`` and ``folder``.
-        """
-        return self.text
-
-    def fixed_at(self, chosen: Mapping[str, Any], source: str = "--at") -> Pipeline:
-        """Return the pipeline with parameters fixed at chosen values, checked as a file is.
-
-        The axis ``trial`` goes, and what they replace, such as ``side_px`` for ``distance_m``.
-
-        Raises
-        ------
-        PipelineError
-            One line for each fault, beginning with ``source``.
-        """
-        document = _document(self.text, source)
-        fix_values(document, chosen, self.parameters)
-        text = tomlkit.dumps(document)
-        return _checked(
-            document, text, self.name, source, Path(self.folder), None, self.files, self.plugins
-        )
 
     def axis(self, name: str) -> Axis | None:
         """Return an axis by name."""
@@ -301,65 +131,92 @@ class Pipeline:
         return any(condition(value) for value in self.values_of(name) if value is not None)
 
 
-def _similar(path: Path) -> str:
-    """Return the pipeline file that may be meant where there is none; else nothing."""
-    candidates = (
-        path.with_name(f"{path.name}.toml"), path.with_suffix(".toml"),
-        Path("pipelines") / path.name, Path("pipelines") / f"{path.name}.toml",
+# --------------------------------------------------------------------------------------------------
+# The boards of a pipeline: whether its scenes show boards, and how large they are.
+
+_SIZED_BY = ("kind", "rows", "columns", "squares_x", "squares_y", "legacy_pattern", "tagCols",
+             "tagRows", "markers")
+"""The parameters that a board's numbers of markers and corners depend on."""
+
+
+def shows_boards(pipeline: Experiment) -> bool:
+    """Return whether the scenes of a pipeline show boards; single markers count as boards then.
+
+    Markers with something beside them do, too.
+    """
+    return bool(pipeline.values_of("distractors")[0]) or pipeline.any_value(
+        "kind", lambda kind: kind != SINGLE
     )
-    try:
-        similar = [each for each in candidates if each != path and each.is_file()]
-    except (OSError, ValueError):
-        return ""
-    return f"; did you mean {plain(similar[0])}?" if similar and not path.exists() else ""
 
 
-def _document(text: str, source: str) -> dict[str, Any]:
-    try:
-        return read_document(text)
-    except ValueError as error:
-        raise refusal([f"{source}: {error}"]) from None
+def target_word(pipeline: Experiment) -> str:
+    """Return what the scenes of a pipeline show, in a word: marker, board, or target if both."""
+    if not shows_boards(pipeline):
+        return "marker"
+    return "target" if pipeline.any_value("kind", lambda kind: kind == SINGLE) else "board"
 
 
-def _parameters(
-    document: Mapping[str, Any], settings: Sequence[str], folder: str | Path,
-    known: Sequence[DeclaredPlugin] | None,
-) -> Mapping[str, Parameter]:
-    """Return the parameters of a document once the settings that name plug-ins are applied."""
-    naming = {EFFECTS_KEY, *(parameter.name for parameter in NAMED_BY.values())}
-    chosen = parse_settings(
-        [each for each in settings
-         if each.partition("=")[0].strip().rpartition(".")[2] in naming]
+def largest_board(pipeline: Experiment) -> tuple[int, int]:
+    """Return the most markers and the most chessboard corners of a pipeline's boards."""
+    markers, corners = zip(
+        *(arranged(values).counts for values in _arrangements(pipeline, _SIZED_BY)), strict=True
     )
-    changed = copy.deepcopy(dict(document))
-    apply_settings(changed, chosen)
-    plugins, _ = read_plugins(changed, str(folder), known)  # faults are told when it is checked
-    return parameters_with(tuple(plugins))
+    return max(markers), max(corners)
 
 
-def _checked(
-    document: Mapping[str, Any], text: str, name: str, source: str, folder: Path,
-    files: Mapping[str, str] | None, camera_files: Mapping[str, str] | None,
-    plugins: Sequence[DeclaredPlugin] | None,
-) -> Pipeline:
-    """Return the pipeline of a document; PipelineError with all its faults."""
-    reading = read_keys(document, source, folder, files, camera_files, plugins, SECTIONS)
-    read_stopping(reading)
-    read_camera_file(reading)
-    resolve_sensor(reading)
-    check_rules(reading)
-    read_required(reading)
-    if reading.faults:
-        raise refusal(reading.faults)
-    if reading.stated:
-        text = with_values(text, "camera", reading.stated)
-    return Pipeline(
-        name=name, title=reading.title, seed=reading.seed, sampling=reading.sampling,
-        fixed=reading.fixed,
-        given=frozenset(reading.given), distributions=reading.distributions,
-        axes=tuple(reading.axes.values()), text=text, files=reading.files,
-        folder=str(folder.resolve()), plugins=reading.plugins,
-        requirements=reading.requirements, require_per=reading.require_per,
-        stopping=reading.stopping,
-        budget_ms=reading.budget_ms, source=source,
-    )
+def relative_sizes(pipeline: Experiment) -> tuple[float, float]:
+    """Return the least and the largest side of a marker over ``size_m``: listed ones have own."""
+    listed = [
+        each.size_m / values[ARRANGING.index("size_m")]
+        for values in _arrangements(pipeline, ("kind", "size_m", "markers"))
+        if isinstance(board := arranged(values), Markers) for each in board.markers
+    ] if pipeline.any_value("markers", bool) else []
+    return min(listed, default=1.0), max(listed, default=1.0)
+
+
+def _arrangements(pipeline: Experiment, names: Sequence[str]) -> list[list[Any]]:
+    """Return the values of `ARRANGING` of each combination of the axes of some parameters."""
+    any_board = {name: pipeline.values_of(name)[0] for name in ARRANGING}
+    axes = [axis for axis in pipeline.axes if not set(axis.columns).isdisjoint(names)]
+    boards = [any_board | chosen for chosen in combinations(axes)]
+    return [[values[name] for name in ARRANGING] for values in boards]
+
+
+# --------------------------------------------------------------------------------------------------
+# The effects and renderers of a pipeline: the built-in ones, and those of its plug-ins.
+
+def effects_of(plugins: Iterable[DeclaredPlugin]) -> tuple[Effect, ...]:
+    """Return the built-in effects and those of plug-ins, which are not imported for it."""
+    return (*EFFECTS, *(_effect(plugin) for plugin in plugins if plugin.kind == "effect"))
+
+
+def _effect(plugin: DeclaredPlugin) -> Effect:
+    widens: Any = plugin.widens
+    step: Any = plugin.step
+    parameters = {setting.name: setting for setting in plugin.settings}
+    return Effect(plugin.name, step, parameters, random=plugin.random, widens=widens)
+
+
+def scene_plugins(pipeline: Experiment) -> ScenePlugins:
+    """Return what a pipeline's plug-ins add to its scenes, imported.
+
+    Raises
+    ------
+    PluginError
+        If one is not the plug-in that was declared; in one line.
+    """
+    return _imported(pipeline.plugins, pipeline.folder)
+
+
+@lru_cache(maxsize=16)
+def _imported(plugins: tuple[DeclaredPlugin, ...], folder: str) -> ScenePlugins:
+    effects, renderers, settings = [], {}, []
+    for plugin in plugins:
+        if plugin.kind == "effect":
+            record = cast("EffectPlugin", plugin.record(folder))
+            effects.append(_effect(plugin).applying(checked_effect(plugin.name, record.apply)))
+        elif plugin.kind == "renderer":
+            renderer = cast("RendererPlugin", plugin.record(folder))
+            renderers[plugin.name] = checked_renderer(plugin.name, renderer.render)
+            settings += [setting.name for setting in plugin.settings]
+    return ScenePlugins(tuple(effects), renderers, tuple(settings))

@@ -1,4 +1,4 @@
-"""Pieces of the grid: blocks of scene cells, and every parameter's values on them."""
+"""Pieces of the grid: blocks of scene cells, every parameter's values on them."""
 
 from __future__ import annotations
 
@@ -6,34 +6,30 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.environments.interpreters import INSTALLED
-from sweep.measure.board_detector import BoardDetectorSetting
-from sweep.measure.detector import DetectorSetting
-from sweep.measure.detectors import AnyDetectorSetting
+from sweep.measure.bound import BoundSetting
+from sweep.measure.detectors import AnyDetectorSetting, BoardDetectorSetting, DetectorSetting
 from sweep.measure.estimators import EstimatorSetting, PluggedEstimatorSetting
-from sweep.measure.foreign_detector import ForeignSetting
-from sweep.model.board_values import ARRANGING, arranged_board
-from sweep.model.camera import canonical_distortion
-from sweep.model.columns import Column, map_columns
+from sweep.model.board_kinds import ARRANGING, arranged_board
+from sweep.model.camera import Column, canonical_distortion, map_columns
 from sweep.plan.axes import TRIAL, Axis, combinations
 from sweep.plan.beliefs import CALIBRATED, believed_calibration, calibrated_columns
-from sweep.plan.boards import shows_boards
-from sweep.plan.draws import bits, even_uniform, geometry_keys, jointly_drawn, uniform
-from sweep.plan.experiment import Pipeline
+from sweep.plan.draws import bits, even_uniform, geometry_keys, jointly_drawn, resolve_pose, uniform
+from sweep.plan.experiment import Experiment, effects_of, shows_boards
 from sweep.plan.parameters import PARAMETERS, Stage
 from sweep.plan.photographs import is_simulated, recorded_poses, shows_photographs
-from sweep.plan.pose_values import resolve_pose
-from sweep.plan.scene_plugins import effects_of
 from sweep.plugins.declared import DeclaredPlugin, PluginSetting
 from sweep.typing import Floats
 
+# --------------------------------------------------------------------------------------------------
+# Pieces of the grid: blocks of scene cells, and every parameter's values on them.
 
 @dataclass(frozen=True, slots=True, order=True)
 class Block:
@@ -91,11 +87,8 @@ class Blocks:
 
     def __getitem__(self, number: int) -> Block:
         """Return a block by its number; the last axis counts fastest."""
-        index = []
-        for count in reversed(self.counts):
-            number, position = divmod(number, count)
-            index.append(position)
-        starts = tuple(i * e for i, e in zip(reversed(index), self.extents, strict=True))
+        index = np.unravel_index(number, self.counts) if self.counts else ()
+        starts = tuple(int(i) * e for i, e in zip(index, self.extents, strict=True))
         stops = tuple(
             min(start + extent, length)
             for start, extent, length in zip(starts, self.extents, self.lengths, strict=True)
@@ -104,13 +97,12 @@ class Blocks:
 
     def number(self, block: Block) -> int:
         """Return the number of a block."""
-        number = 0
-        for start, extent, count in zip(block.starts, self.extents, self.counts, strict=True):
-            number = number * count + start // extent
-        return number
+        index = [start // extent
+                 for start, extent in zip(block.starts, self.extents, strict=True)]
+        return int(np.ravel_multi_index(index, self.counts)) if index else 0
 
 
-def scene_axes(pipeline: Pipeline) -> tuple[Axis, ...]:
+def scene_axes(pipeline: Experiment) -> tuple[Axis, ...]:
     """Return the axes that blocks are cut along."""
     return pipeline.axes_of(Stage.scene)
 
@@ -127,7 +119,7 @@ def _column(values: Sequence[Any], indices: NDArray[np.intp]) -> Column:
 
 
 def scene_values(
-    pipeline: Pipeline, indices: Sequence[NDArray[np.intp]]
+    pipeline: Experiment, indices: Sequence[NDArray[np.intp]]
 ) -> dict[str, Column]:
     """Return the scene parameters' values for scenes at ``indices`` (N,) along each scene axis.
 
@@ -196,7 +188,7 @@ ANY_MARKER = {
 
 
 def _photographed(
-    pipeline: Pipeline, values: Mapping[str, Column], trials: NDArray[np.int64]
+    pipeline: Experiment, values: Mapping[str, Column], trials: NDArray[np.int64]
 ) -> dict[str, Column]:
     """Return the parameters of scenes at the poses of photographs of numbers ``trials`` (N,)."""
     names = values["photographs"].listed(len(trials))
@@ -220,36 +212,27 @@ def block_indices(block: Block) -> list[NDArray[np.intp]]:
     return [grid.ravel() for grid in grids]
 
 
-def _fixed(pipeline: Pipeline, section: str) -> dict[str, Any]:
-    """Return the fixed values of a section, and the defaults of its parameters that are not."""
-    return {
+def _settings(pipeline: Experiment, section: str, stage: Stage) -> list[dict[str, Any]]:
+    """Return the values of a section at all combinations of a stage's axes, in their order."""
+    fixed = {
         p.name: pipeline.fixed.get(p.name, p.default)
         for p in pipeline.parameters.values() if p.section == section
     }
+    return [fixed | chosen for chosen in combinations(pipeline.axes_of(stage))]
 
 
-def detector_settings(pipeline: Pipeline) -> list[AnyDetectorSetting]:
+def detector_settings(pipeline: Experiment) -> list[AnyDetectorSetting]:
     """Return the detector settings of the grid, in the order of its detection axes."""
     return [
-        _detector_setting(pipeline, {**_fixed(pipeline, "detector"), **chosen})
-        for chosen in combinations(pipeline.axes_of(Stage.detection))
+        DetectorSetting(**{name: values[name] for name in OPENCV_FIELDS})
+        if (plugin := pipeline.plugin("detector", values["detector"])) is None
+        else _plugin_setting(pipeline, plugin, values)
+        for values in _settings(pipeline, "detector", Stage.detection)
     ]
 
 
-def _detector_setting(pipeline: Pipeline, values: Mapping[str, Any]) -> AnyDetectorSetting:
-    """Return the setting of a detector that has these values; it takes those that are its own."""
-    plugin = pipeline.plugin("detector", values["detector"])
-    if plugin is None:
-        setting = DetectorSetting(**{name: values[name] for name in OPENCV_FIELDS})
-        if values["environment"] == INSTALLED:
-            return setting
-        given = pipeline.given.intersection(OPENCV_FIELDS)
-        return ForeignSetting(values["environment"], pipeline.folder, setting, given)
-    return _plugin_setting(pipeline, plugin, values)
-
-
 def _plugin_setting(
-    pipeline: Pipeline, plugin: DeclaredPlugin, values: Mapping[str, Any]
+    pipeline: Experiment, plugin: DeclaredPlugin, values: Mapping[str, Any]
 ) -> PluginSetting:
     own = tuple((setting.name, values[setting.name]) for setting in plugin.settings)
     return PluginSetting(plugin, own, pipeline.folder)
@@ -258,25 +241,24 @@ def _plugin_setting(
 OPENCV_FIELDS = tuple(field.name for field in dataclasses.fields(DetectorSetting))
 
 
-def board_settings(pipeline: Pipeline) -> list[BoardDetectorSetting]:
+def board_settings(pipeline: Experiment) -> list[BoardDetectorSetting]:
     """Return what the detector settings of the grid do with boards, in their order."""
-    fixed = _fixed(pipeline, "detector")
     names = [field.name for field in dataclasses.fields(BoardDetectorSetting)]
     return [
-        BoardDetectorSetting(**{name: {**fixed, **chosen}[name] for name in names})
-        for chosen in combinations(pipeline.axes_of(Stage.detection))
+        BoardDetectorSetting(**{name: values[name] for name in names})
+        for values in _settings(pipeline, "detector", Stage.detection)
     ]
 
 
-def estimators(pipeline: Pipeline) -> list[EstimatorSetting]:
+def estimators(pipeline: Experiment) -> list[EstimatorSetting]:
     """Return the estimators of the grid, in the order of its estimation axes."""
     return [
-        _estimator_setting(pipeline, {**_fixed(pipeline, "estimator"), **chosen})
-        for chosen in combinations(pipeline.axes_of(Stage.estimation))
+        _estimator_setting(pipeline, values)
+        for values in _settings(pipeline, "estimator", Stage.estimation)
     ]
 
 
-def _estimator_setting(pipeline: Pipeline, values: Mapping[str, Any]) -> EstimatorSetting:
+def _estimator_setting(pipeline: Experiment, values: Mapping[str, Any]) -> EstimatorSetting:
     """Return the setting of an estimator that has these values; a plug-in takes its own, too."""
     common = {name: values[name] for name in ESTIMATOR_FIELDS}
     plugin = pipeline.plugin("estimator", values["solver"])
@@ -286,3 +268,73 @@ def _estimator_setting(pipeline: Pipeline, values: Mapping[str, Any]) -> Estimat
 
 
 ESTIMATOR_FIELDS = tuple(field.name for field in dataclasses.fields(EstimatorSetting))
+
+
+# --------------------------------------------------------------------------------------------------
+# A key of each image: a function of its scene's own parameters and draws, not of the grid.
+#
+# By it an image that was exported is recognised again: on another grid that has the same scene,
+# or as a single cell. Keys are hashes of the texts of all parameters that change the image,
+# sorted by name, defaults left out, numbers rounded to 12 significant digits, mixed with the seed
+# and the trial.
+
+NOT_IN_IMAGE = {
+    "window", "camera_file", "calibration_sd", "calibration_covariance",
+    *(field.name for field in dataclasses.fields(BoundSetting)),
+}
+"""Parameters of the scene's stage that do not change its image."""
+
+
+def image_keys(pipeline: Experiment, indices: Sequence[NDArray[np.intp]]) -> NDArray[np.uint64]:
+    """Return the keys (N,) of the images of scenes at ``indices`` (N,) along each scene axis."""
+    axes, parameters = scene_axes(pipeline), pipeline.parameters
+    count = len(indices[0]) if axes else 1
+    values = {
+        name: Column(value, constant=True) for name, value in pipeline.fixed.items()
+        if parameters[name].stage is Stage.scene
+    }
+    for axis, index in zip(axes, indices, strict=True):
+        for name, along in axis.columns.items():
+            values[name] = Column.of([along[i] for i in index.tolist()])
+    trials = values.pop(TRIAL, Column(0, constant=True)).broadcast(count, np.int64)
+    texts = [
+        _texts(pipeline, name, values[name])
+        for name in sorted(values.keys() - NOT_IN_IMAGE - pipeline.distributions.keys())
+    ]
+    texts += [
+        Column.of(f"{name}={distribution}")
+        for name, distribution in sorted(pipeline.distributions.items())
+        if parameters[name].stage is Stage.scene
+    ]
+    used = [column for column in texts if column.differs_from("")]
+    joined = map_columns(lambda *each: "|".join(filter(None, each)), used) if used \
+        else Column.of("")
+    keys = joined.map(_hash).broadcast(count, np.uint64)
+    return bits(pipeline.seed, f"image {pipeline.sampling}", keys, trials)
+
+
+def _texts(pipeline: Experiment, name: str, column: Column) -> Column:
+    """Return "name=value" of each value, empty where it is the default."""
+    default = pipeline.parameters[name].default
+
+    @cache
+    def text(value: Any) -> str:
+        if value is None or value == default:
+            return ""
+        if name == "background" and isinstance(value, str):
+            return f"{name}={pipeline.files.get(value) or value}"
+        return f"{name}={_text(value)}"
+
+    return column.map(text)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, tuple):
+        return ",".join(_text(item) for item in value)
+    return str(value) if isinstance(value, (str, bool)) else f"{float(value) + 0.0:.12g}"
+
+
+@cache
+def _hash(text: str) -> np.uint64:
+    """Return 64 bits of a text's BLAKE2b hash."""
+    return np.uint64(int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little"))

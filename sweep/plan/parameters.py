@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Collection
 from dataclasses import dataclass
 from enum import IntEnum
 
 from sweep.declaration import Declared, declared_fields
-from sweep.measure.board_detector import BoardDetectorSetting
 from sweep.measure.bound import BoundSetting
-from sweep.measure.detector import DetectorSetting
-from sweep.measure.detectors import DetectorChoice
+from sweep.measure.detectors import BoardDetectorSetting, DetectorChoice, DetectorSetting
 from sweep.measure.estimators import EstimatorSetting
-from sweep.model.board_values import BoardValues
+from sweep.model.board_kinds import BoardValues
 from sweep.model.camera import Camera
 from sweep.model.effects import Effects
 from sweep.model.marker import Marker
-from sweep.model.pose import Pose
+from sweep.model.pose import Pose, WorldPose
 from sweep.model.scene import Scene
-from sweep.model.world import WorldPose
 
+# --------------------------------------------------------------------------------------------------
+# Every parameter of every section, gathered from where it is declared.
 
 class Stage(IntEnum):
     """The stages of the core loop; a parameter belongs to the first stage that it affects."""
@@ -66,3 +66,88 @@ def _gather() -> dict[str, Parameter]:
 
 PARAMETERS: dict[str, Parameter] = _gather()
 """Every parameter by its name; names are unique over all sections."""
+
+REMOVED = {
+    "environment": "to compare versions of OpenCV, run `sweep run` in each virtual environment, "
+    "then `sweep compare A.zarr B.zarr`",
+}
+"""Parameters of earlier versions -> what to do instead."""
+
+
+# --------------------------------------------------------------------------------------------------
+# Parameters that say the same in different ways: one of the ways is given, not two.
+
+WORLD = tuple(
+    f"{whose}_{name}" for whose in ("camera", "marker")
+    for name in ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
+)
+"""Parameters that place the camera and the marker in the world."""
+
+IN_CAMERA = tuple(
+    p.name for p in PARAMETERS.values()
+    if p.section == "pose" and p.name not in (*WORLD, "jitter_px")
+)
+"""Parameters that place the marker in the camera's frame."""
+
+FOCAL_LENGTHS = ("fx_px", "fy_px")
+SENSOR_SIDES = ("sensor_width_mm", "sensor_height_mm")
+IN_MM = (*SENSOR_SIDES, "focal_length_mm", "pixel_size_um")
+FIELDS_OF_VIEW = ("hfov_deg", "vfov_deg", "dfov_deg")
+
+CHOICES: tuple[tuple[tuple[str, ...], ...], ...] = (
+    (("distance_m",), ("side_px",)),
+    (("bearing_x_deg",), ("x_m",), ("frame_x",)),
+    (("bearing_y_deg",), ("y_m",), ("frame_y",)),
+    (("tilt_deg",), ("view_angle_deg",), ("yaw_deg", "pitch_deg")),
+    (("azimuth_deg",), ("yaw_deg", "pitch_deg")),
+    (FOCAL_LENGTHS, IN_MM, *((name,) for name in FIELDS_OF_VIEW)),
+    (SENSOR_SIDES, ("pixel_size_um",)),
+    (("believed_focal_scale",), ("believed_fx_px", "believed_fy_px")),
+)
+"""The ways, each of one or more parameters, in which a quantity of the pose in the camera's frame,
+of the camera, or of what is believed of it is given: one of them, not two."""
+
+PHOTOGRAPHS = "photographs"
+"""The parameter that takes poses and images from a record of photographs."""
+
+SIMULATED = "simulated"
+"""The parameter that takes from such a record the poses alone."""
+
+RIVALS: dict[str, frozenset[str]] = {
+    name: frozenset(
+        other for ways in CHOICES for way in ways
+        if name not in way and any(name in each for each in ways) for other in way
+    )
+    for choice in CHOICES for each in choice for name in each
+}
+"""Parameter of one of the ways -> those of the other ways.
+
+>>> sorted(RIVALS["yaw_deg"])
+['azimuth_deg', 'tilt_deg', 'view_angle_deg']
+"""
+
+
+def superseded(given: Collection[str]) -> set[str]:
+    """Return the parameters that have no meaning beside those that are given.
+
+    >>> sorted(superseded({"view_angle_deg", "distance_m"}))
+    ['pitch_deg', 'side_px', 'tilt_deg', 'yaw_deg']
+    """
+    if PHOTOGRAPHS in given:
+        return {*IN_CAMERA, *WORLD, "jitter_px"}
+    if any(name in given for name in WORLD):
+        return set(IN_CAMERA)
+    return {rival for name in given for rival in RIVALS.get(name, ())}
+
+
+def contradictions(given: Collection[str]) -> list[tuple[list[str], list[str]]]:
+    """Return pairs of ways, as the parameters given, of which only one can be, for each quantity.
+
+    >>> contradictions({"hfov_deg", "fx_px", "fy_px", "tilt_deg"})
+    [(['fx_px', 'fy_px'], ['hfov_deg'])]
+    """
+    pairs = []
+    for choice in CHOICES:
+        ways = [names for way in choice if (names := [name for name in way if name in given])]
+        pairs += [(ways[0], other) for other in ways[1:]]
+    return pairs

@@ -6,10 +6,7 @@ and the poses are those of the record; with ``simulated`` the images are not the
 
 from __future__ import annotations
 
-import hashlib
-import io
 import json
-import zipfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -23,26 +20,26 @@ from sweep.errors import PluginError, SweepError
 from sweep.measure.surroundings import BoardMarker
 from sweep.messages import plain
 from sweep.model.board import Board
-from sweep.model.photograph import Part, reference
+from sweep.model.image_file import Part, reference
+from sweep.model.pose import angles_of_rotation
 from sweep.model.renderers import PHOTOGRAPH
-from sweep.model.rotations import angles_of_rotation
-from sweep.plan.alternatives import PHOTOGRAPHS, SIMULATED
 from sweep.plan.axes import TRIAL, Axis
-from sweep.plan.board_files import board_of
+from sweep.plan.board_rules import board_of
+from sweep.plan.parameters import PHOTOGRAPHS, SIMULATED
+from sweep.plugins.array_file import array_file, read_arrays
 from sweep.typing import Floats, Integers, Masks
 
 if TYPE_CHECKING:
-    from sweep.plan.experiment import Pipeline
+    from sweep.plan.experiment import Experiment
 
 SUFFIX = ".photographs.npz"
 """End of the name of a record's file."""
 
 VERSION = 2
-"""Since 2 a record has the board."""
 
 POSE = 6
 
-_ARRAYS = ("paths", "digests", "part", "size", "marker_id", "rotation", "translation", "std",
+_ARRAYS = ("paths", "digests", "part", "marker_id", "rotation", "translation", "std",
            "source", "board")
 
 
@@ -104,19 +101,9 @@ class PhotographRecord:
 
     def content(self) -> bytes:
         """Return the content of its file: the same bytes for the same record."""
-        arrays: dict[str, Any] = {
-            name: getattr(self, name) for name in _ARRAYS if name != "size"
-        }
-        arrays["size"] = np.array([self.width_px, self.height_px])
-        file = io.BytesIO()
-        with zipfile.ZipFile(file, "w") as archive:
-            for name, values in {"version": VERSION, **arrays}.items():
-                member = io.BytesIO()
-                np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
-                info = zipfile.ZipInfo(f"{name}.npy")  # of a fixed date
-                info.compress_type = zipfile.ZIP_DEFLATED
-                archive.writestr(info, member.getvalue())
-        return file.getvalue()
+        size = np.array([self.width_px, self.height_px])
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        return array_file({"version": VERSION, **arrays, "size": size})
 
 
 def read_record(path: str | Path) -> tuple[PhotographRecord, str]:
@@ -139,20 +126,17 @@ def read_record(path: str | Path) -> tuple[PhotographRecord, str]:
 
 @lru_cache(maxsize=8)
 def _read(path: str, modified_ns: int, size: int) -> tuple[PhotographRecord, str]:  # noqa: ARG001
-    content = Path(path).read_bytes()
+    arrays, digest = read_arrays(path)
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            version = int(archive["version"])
-            if not 1 <= version <= VERSION:
-                raise ValueError("of another version")
-            arrays = {name: archive[name] for name in _ARRAYS if version > 1 or name != "board"}
+        if int(arrays["version"]) != VERSION:
+            raise ValueError("of another version")
         record = PhotographRecord(
             tuple(map(str, arrays["paths"])), tuple(map(str, arrays["digests"])),
             Part(str(arrays["part"])), int(arrays["size"][0]), int(arrays["size"][1]),
             arrays["marker_id"], arrays["rotation"], arrays["translation"], arrays["std"],
-            arrays["source"], str(arrays.get("board", "")),
+            arrays["source"], str(arrays["board"]),
         )
-    except (KeyError, IndexError, TypeError, EOFError, AttributeError, zipfile.BadZipFile):
+    except (KeyError, IndexError, TypeError, AttributeError):
         raise ValueError("it is none") from None
     grid = (len(record.paths), len(record.marker_id))
     shapes = {
@@ -166,7 +150,7 @@ def _read(path: str, modified_ns: int, size: int) -> tuple[PhotographRecord, str
         record.on_board(record.marker_id)
     except (SweepError, AttributeError, KeyError, TypeError, ValueError):
         raise ValueError("damaged: board") from None
-    return record, hashlib.sha256(content).hexdigest()
+    return record, digest
 
 
 @lru_cache(maxsize=8)
@@ -180,12 +164,12 @@ def along_photographs(axes: Iterable[Axis]) -> list[bool]:
     return [axis.name == TRIAL or PHOTOGRAPHS in axis.columns for axis in axes]
 
 
-def shows_photographs(pipeline: Pipeline) -> bool:
+def shows_photographs(pipeline: Experiment) -> bool:
     """Return whether the images of a pipeline are photographs, not simulated at their poses."""
     return PHOTOGRAPHS in pipeline.given and not is_simulated(pipeline)
 
 
-def is_simulated(pipeline: Pipeline) -> bool:
+def is_simulated(pipeline: Experiment) -> bool:
     """Return whether a pipeline's images are simulated at the poses of photographs."""
     return pipeline.fixed.get(SIMULATED) is True
 

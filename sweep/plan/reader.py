@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, ClassVar, Protocol
 
-from sweep.declaration import TablesError
+from sweep.declaration import Declaration, Declared, TablesError
 from sweep.messages import MAX_FAULTS, nearest, plain, shown
 from sweep.plan.axes import (
     MAX_LISTED,
@@ -20,7 +20,7 @@ from sweep.plan.axes import (
     zipped_axis,
 )
 from sweep.plan.draws import SAMPLINGS
-from sweep.plan.parameters import PARAMETERS, SECTIONS, Parameter
+from sweep.plan.parameters import PARAMETERS, REMOVED, SECTIONS, Parameter
 from sweep.plan.plugins import (
     EFFECTS_KEY,
     NAMED_BY,
@@ -30,16 +30,45 @@ from sweep.plan.plugins import (
 )
 from sweep.plugins.declared import DeclaredPlugin
 
-if TYPE_CHECKING:
-    from sweep.plan.stopping import StoppingRule
-
 MAX_TITLE_LENGTH = 200
+
+MAX_HOMES = 3
+"""Keys of an unknown section whose own sections are named."""
 
 HEADER = ("title", "seed", "sampling", EFFECTS_KEY)
 """Keys that stand above the sections."""
 
 REQUIRE = "require"
-"""The section of what the results must fulfil (`sweep.plan.required`)."""
+"""The section of what the results must fulfil (`sweep.plan.sampling`)."""
+
+
+class StoppingRule(Protocol):
+    """What a section says: a frozen dataclass of plain values.
+
+    Attributes
+    ----------
+    section
+        The section's name.
+    max_trials
+        The most trials of a condition; the length of the axis ``trial``.
+    """
+
+    section: ClassVar[str]
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    def __hash__(self) -> int:
+        """Return the hash of a frozen dataclass."""
+
+    @property
+    def max_trials(self) -> int:
+        """The most trials of a condition."""
+
+    def looser(self, begun: Any) -> str:
+        """Return why a store that was begun under another rule of the section cannot be continued.
+
+        Empty if this rule asks for at least as much of every condition, so that nothing that was
+        computed is in vain.
+        """
 
 
 @dataclass(slots=True)
@@ -61,11 +90,11 @@ class Reading:
     known_plugins
         The plug-ins that a store has recorded, used instead of importing them; None to import.
     title, seed, sampling, fixed, distributions, axes, files
-        As :class:`sweep.plan.experiment.Pipeline` has them; ``axes`` by name.
+        As :class:`sweep.plan.experiment.Experiment` has them; ``axes`` by name.
     given
         Names of the parameters that the document has, even with a value that cannot be.
     requirements, require_per, budget_ms, stopping
-        As :class:`sweep.plan.experiment.Pipeline` has them.
+        As :class:`sweep.plan.experiment.Experiment` has them.
     plugins, parameters
         The plug-ins that the document names, and every parameter by its name, theirs included.
     unread
@@ -105,10 +134,43 @@ class Reading:
         """Note a fault of a key's value."""
         self.faults.append(f"{self.source}: {plain(key)} = {shown(value)}: expected {expected}")
 
+    def refuse(self, name: str, expected: str) -> None:
+        """Note a fault of a parameter as the document has it."""
+        path = next(iter(self.places(name)), f"{self.parameters[name].section}.{name}")
+        self.fault(path, self.written(name), expected)
+
+    def refuse_values(self, name: str, expected: str, wrong: Callable[[Any], bool]) -> None:
+        """Note a fault of each value of a parameter on the grid that is wrong."""
+        for value in dict.fromkeys(filter(wrong, self.values(name))):
+            self.fault(f"{self.parameters[name].section}.{name}", value, expected)
+
     def unknown(self, key: str, problem: str, word: str, known: Sequence[str]) -> None:
         """Note an unknown key, with the nearest known one if the line will be printed."""
         hint = nearest(word, known) if len(self.faults) < MAX_FAULTS else ""
+        if (removed := key.rpartition(".")[2]) in REMOVED:
+            hint = f"; {REMOVED[removed]}"
         self.faults.append(f"{self.source}: {plain(key)}: {problem}{hint}")
+
+    def unknown_key(self, section: str, key: str, known: Sequence[str], expected: str = "") -> None:
+        """Note a key that a section does not have, with the section where it or a similar one is.
+
+        ``known`` are the section's keys; ``expected`` says so in words.
+        """
+        start = f"{self.source}: {plain(f'{section}.{key}')}: unknown key{expected}"
+        if len(self.faults) >= MAX_FAULTS or key in REMOVED:
+            self.faults.append(f"{start}; {REMOVED[key]}" if key in REMOVED else start)
+            return
+        homes = dict.fromkeys(known, "")
+        for name in (*self.parameters, TRIAL):
+            homes.setdefault(name, f"under [{section_of(name, self.parameters)}]")
+        for name in HEADER:
+            homes.setdefault(name, "at the top, above the sections")
+        if home := homes.get(key, ""):
+            self.faults.append(f"{start}; it belongs {home}")
+            return
+        hint = nearest(key, list(homes), 0.8) or nearest(key, known)
+        home = homes.get(hint.removeprefix("; did you mean ").removesuffix("?"), "")
+        self.faults.append(f"{start}{hint[:-1]} {home}?" if home else f"{start}{hint}")
 
     def values(self, name: str) -> Sequence[Any]:
         """Return the values of a parameter on the grid; empty if it is drawn or at fault."""
@@ -120,6 +182,11 @@ class Reading:
     def axis_of(self, name: str) -> Axis | None:
         """Return the axis along which a parameter varies, alone or together with others."""
         return next((axis for axis in self.axes.values() if name in axis.columns), None)
+
+    def is_active(self, switch: str) -> bool:
+        """Return whether a switch has, or was meant to have, another than its neutral value."""
+        values, off = self.values(switch), self.parameters[switch].default
+        return any(value != off for value in values) if values else switch in self.given
 
     def names_axis(self, name: str) -> bool:
         """Return whether the table [axes] has a key, be it an axis or a fault."""
@@ -136,16 +203,19 @@ class Reading:
         else:
             yield self.values(a), self.values(b)
 
+    def places(self, name: str) -> dict[str, Any]:
+        """Return the value of each place of the document that gives a parameter, by its path."""
+        axes, section = self.document.get("axes"), self.parameters[name].section
+        tables = {section: self.document.get(section), "axes": axes} | {
+            f"axes.{key}": value["zip"]
+            for key, value in (axes if isinstance(axes, dict) else {}).items() if is_zip(value)
+        }
+        return {f"{key}.{name}": table[name] for key, table in tables.items()
+                if isinstance(table, dict) and name in table}
+
     def written(self, name: str) -> Any:
         """Return the value that the document gives a parameter, for messages."""
-        for section in (*SECTIONS, "axes"):
-            table = self.document.get(section)
-            if isinstance(table, dict) and name in table:
-                return table[name]
-            for given in table.values() if section == "axes" and isinstance(table, dict) else ():
-                if is_zip(given) and name in given["zip"]:
-                    return given["zip"][name]
-        return self.fixed.get(name)
+        return next(iter(self.places(name).values()), self.fixed.get(name))
 
 
 def read_keys(
@@ -167,11 +237,17 @@ def read_keys(
         if key == "axes" or key in SECTIONS:
             if not isinstance(value, dict):
                 reading.fault(key, value, f"a table: [{key}]")
-        elif key in reading.parameters:
-            reading.fault(key, value, f"it under [{reading.parameters[key].section}]")
+        elif home := section_of(key, reading.parameters):
+            reading.fault(key, value, f"it under [{home}]")
         else:
             kind = "a section" if isinstance(value, dict) else "a key"
-            reading.unknown(key, f"unknown; expected {kind} of {', '.join(known)}", key, known)
+            homes = [f"{name} belongs under [{section_of(name, reading.parameters)}]"
+                     for name in (value if isinstance(value, dict) else ())
+                     if section_of(name, reading.parameters)][:MAX_HOMES]
+            if nearest(key, known):
+                homes = []
+            reading.unknown(key, "; ".join([
+                f"unknown; expected {kind} of {', '.join(known)}", *homes]), key, known)
     for section in SECTIONS:
         _read_section(reading, section)
     _read_axes(reading)
@@ -181,25 +257,26 @@ def read_keys(
     return reading
 
 
+def _title(value: Any) -> str:
+    if not isinstance(value, str) or len(value) > MAX_TITLE_LENGTH or not value.isprintable():
+        raise ValueError(f"a string: one line of at most {MAX_TITLE_LENGTH} characters")
+    return value
+
+
+_HEADER = (
+    Declared("title", (str,), "", Declaration("title", reads=_title)),
+    Declared("seed", (int,), 0, Declaration("seed of all draws", low=0, high=2**63 - 1)),
+    Declared("sampling", (str,), SAMPLINGS[0], Declaration("sampling", choices=SAMPLINGS)),
+)
+
+
 def _read_header(reading: Reading) -> None:
-    line = f"a string: one line of at most {MAX_TITLE_LENGTH} characters"
-    title = reading.document.get("title", "")
-    if not isinstance(title, str) or len(title) > MAX_TITLE_LENGTH or not title.isprintable():
-        reading.fault("title", title, line)
-    else:
-        reading.title = title
-    seed = reading.document.get("seed", 0)
-    if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**63:
-        reading.fault("seed", seed, "a whole number from 0 to 2^63 - 1")
-    else:
-        reading.seed = seed
-    sampling = reading.document.get("sampling", SAMPLINGS[0])
-    if isinstance(sampling, str):
-        sampling = sampling.strip().lower()
-    if sampling not in SAMPLINGS:
-        reading.fault("sampling", sampling, f"one of {', '.join(SAMPLINGS)}")
-    else:
-        reading.sampling = sampling
+    for declared in _HEADER:
+        value = reading.document.get(declared.name, declared.default)
+        try:
+            setattr(reading, declared.name, declared.check(value))
+        except ValueError as error:
+            reading.fault(declared.name, value, str(error))
     effects = reading.document.get(EFFECTS_KEY, [])
     if (
         not isinstance(effects, list) or len({*map(str, effects)}) < len(effects)
@@ -230,11 +307,12 @@ def _read_section(reading: Reading, section: str) -> None:
     for key, value in table.items():
         path = f"{section}.{key}"
         if key not in names:
-            home = section_of(key, reading.parameters)
-            if section in reading.unread and not home:
+            if section in reading.unread and not section_of(key, reading.parameters):
                 continue
-            hint = f"; it belongs under [{home}]" if home else ""
-            reading.unknown(path, f"unknown key{hint}", "" if home else key, names)
+            if is_zip(value):
+                reading.fault(path, value, "parameters that go together under [axes]")
+            else:
+                reading.unknown_key(section, key, names)
             continue
         parameter = reading.parameters[key]
         reading.given.add(key)
@@ -247,7 +325,9 @@ def _read_section(reading: Reading, section: str) -> None:
             reading.faults += [f"{reading.source}: {path}{line}" for line in error.lines]
         except ValueError as error:
             if key not in reading.unread:
-                reading.fault(path, value, str(error))
+                axis = "; several values are an axis: they go under [axes]" if (
+                    isinstance(value, list) and tuple not in parameter.types) else ""
+                reading.fault(path, value, f"{error}{axis}")
 
 
 def section_of(name: str, parameters: Mapping[str, Parameter] = PARAMETERS) -> str:
@@ -291,11 +371,13 @@ def _read_axis(reading: Reading, key: str, value: Any, quota: int, table: str = 
                 path, value, "parameters that go together as "
                 "{ zip = { fx_px = [600, 800], fy_px = [600, 805] } }, with nothing beside zip",
             )
+        elif key in HEADER:
+            reading.unknown_key("axes", key, ())
         elif key not in reading.parameters:
             if not reading.unread:
                 reading.unknown(path, "unknown parameter", key, [*reading.parameters, TRIAL])
         elif key in reading.given:
-            other = _other_path(reading, key, path)
+            other = next((other for other in reading.places(key) if other != path), "it")
             reading.fault(path, value, f"it once: {other} is given too; delete one of them")
         else:
             reading.given.add(key)
@@ -304,19 +386,6 @@ def _read_axis(reading: Reading, key: str, value: Any, quota: int, table: str = 
         if key not in reading.unread:
             reading.fault(path, value, str(error))
     return None
-
-
-def _other_path(reading: Reading, name: str, path: str) -> str:
-    """Return where else than at ``path`` a document gives a parameter, for messages."""
-    section = reading.parameters[name].section
-    tables = {section: reading.document.get(section), "axes": reading.document.get("axes")}
-    tables |= {
-        f"axes.{key}": value["zip"]
-        for key, value in reading.document.get("axes", {}).items() if is_zip(value)
-    }
-    paths = [f"{key}.{name}" for key, table in tables.items()
-              if isinstance(table, dict) and name in table]
-    return next((other for other in paths if other != path), "it")
 
 
 def is_zip(value: Any) -> bool:

@@ -1,44 +1,182 @@
-"""Rules across the keys of a pipeline: each is a function that adds its faults to a reading.
-
-A parameter whose own value is at fault is passed over: its fault is known already.
-"""
+"""Rules across the keys of a pipeline: each is a function that adds its faults to a reading."""
 
 from __future__ import annotations
 
-import dataclasses
+import hashlib
 import itertools
 import math
-from collections.abc import Callable, Iterator
-from typing import Any
+import os
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 
-from sweep.environments.identity import identify
-from sweep.environments.interpreters import INSTALLED
-from sweep.errors import EnvironmentFaultError
-from sweep.measure.detector import DetectorSetting
-from sweep.measure.detectors import OPENCV
+from sweep.errors import PluginError
+from sweep.measure.detectors import OPENCV, DetectorSetting
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
+from sweep.messages import plain, shown
 from sweep.model.effects import GEOMETRIC, NEEDS, RANDOM
-from sweep.model.image_file import MAX_PIXELS
+from sweep.model.image_file import MAX_PIXELS, image_size, read_image
 from sweep.model.marker import (
     has_circles,
     marker_count,
-    markers_digest,
     missing_package,
     opencv_dictionary_names,
 )
-from sweep.plan.alternatives import IN_CAMERA, PHOTOGRAPHS, WORLD, contradictions
+from sweep.model.renderers import background_image
+from sweep.model.sensor import MAX_LEVEL, MIN_FRAME_PX
 from sweep.plan.axes import TRIAL
-from sweep.plan.background_files import check_backgrounds
 from sweep.plan.beliefs import beliefs_in_one_way
 from sweep.plan.board_rules import boards_are_searched_and_solved, boards_can_be_printed
-from sweep.plan.camera_values import one_camera
-from sweep.plan.effect_values import mosaics_have_room, noise_tables_ascend
-from sweep.plan.parameters import PARAMETERS, SECTIONS, Stage
-from sweep.plan.photograph_rules import photographs_alone
+from sweep.plan.draws import REPLICATES, SAMPLINGS
+from sweep.plan.parameters import (
+    IN_CAMERA,
+    PHOTOGRAPHS,
+    RIVALS,
+    SECTIONS,
+    SIMULATED,
+    WORLD,
+    Stage,
+    contradictions,
+)
+from sweep.plan.photographs import PhotographRecord, read_record
 from sweep.plan.reader import HEADER, Reading
-from sweep.plan.schema import VARIABLES
-from sweep.plan.sobol import REPLICATES
-from sweep.plan.variable import LABELS
+from sweep.plan.sampling import STOPPING_SECTIONS
+from sweep.plan.schema import LABELS, VARIABLES
+
+# --------------------------------------------------------------------------------------------------
+# Background images that a pipeline names: that they can be read, their size, their digests.
+
+def check_backgrounds(reading: Reading) -> None:
+    """Note the digests of a reading's background images, and the faults of those that cannot be."""
+    for value in reading.values("background"):
+        if not isinstance(value, str):
+            continue
+        if not value.isprintable():
+            reading.fault("scene.background", value, "a path without control characters")
+            continue
+        if reading.known_files is not None:
+            reading.files[value] = reading.known_files.get(value, "")
+            continue
+        path = os.path.join(reading.folder, value)  # noqa: PTH118  (it may be of any length)
+        try:
+            width, height = image_size(path)
+            problem = _wrong_size(reading, value, width, height)
+            if problem is None or _wrong_size(reading, value, height, width) is None:
+                # Its EXIF tag may turn it.
+                height, width = background_image(str(Path(path).resolve())).shape
+                problem = _wrong_size(reading, value, width, height)
+                reading.files[value] = file_digest(Path(path)) or ""
+        except ValueError as error:
+            reading.fault("scene.background", value, f"a level or an image file ({error})")
+            continue
+        if problem is not None:
+            reading.fault("scene.background", value, problem)
+
+
+def _wrong_size(reading: Reading, background: str, width: int, height: int) -> str | None:
+    """Return the expectation that a background of a size in pixels misses; None if it fits."""
+    for name, length in (("width_px", width), ("height_px", height)):
+        frames = {
+            frame for backgrounds, frames in reading.together("background", name)
+            if background in backgrounds for frame in frames
+        }
+        if frames - {length}:
+            return (
+                f"an image of exactly the frame's size: it is {width} x {height}, but "
+                f"{name} = {shown(reading.written(name))}"
+            )
+    return None
+
+
+def file_digest(path: Path) -> str | None:
+    """Return the SHA-256 of an image file; None if it cannot be read."""
+    try:
+        return hashlib.sha256(read_image(str(path))).hexdigest()
+    except ValueError:
+        return None
+
+
+# --------------------------------------------------------------------------------------------------
+# Rules of pipelines whose scenes are photographs.
+
+def photographs_alone(reading: Reading) -> None:
+    """Demand the photographs' own poses and images, their markers, and their files unchanged.
+
+    Of images that are simulated at their poses, the poses and the markers alone.
+    """
+    simulated = any(reading.values(SIMULATED))
+    if PHOTOGRAPHS not in reading.given:
+        if simulated:
+            reading.refuse(SIMULATED, f"{PHOTOGRAPHS} beside it, whose poses are taken")
+        return
+    if reading.axis_of(SIMULATED) is not None:
+        reading.refuse(SIMULATED, "one value")
+        return
+    for name in sorted(reading.given):
+        section = reading.parameters[name].section
+        if section == "pose" or (
+            section == "scene" and not simulated and name not in (PHOTOGRAPHS, SIMULATED)
+        ):
+            reading.refuse(name, "nothing beside photographs, which have their own "
+                           f"poses{'' if simulated else ' and light'}; delete it")
+    for name in reading.distributions if not simulated else ():
+        reading.refuse(name, "a value: photographs are not drawn")
+    reading.refuse_values(
+        "believed", "truth, for photographs", lambda name: name == "calibration")
+    if reading.sampling != SAMPLINGS[0]:
+        reading.fault("sampling", reading.sampling, f"{SAMPLINGS[0]}, for photographs")
+    for name in STOPPING_SECTIONS:
+        if name in reading.document:
+            reading.fault(name, reading.document[name], "no such section: photographs are given")
+    if reading.known_files is not None:
+        reading.files.update(reading.known_files)
+        return
+    for name in dict.fromkeys(reading.values(PHOTOGRAPHS)):
+        _check_record(reading, name, simulated)
+
+
+def _check_record(reading: Reading, name: str, simulated: bool) -> None:
+    path = Path(reading.folder) / name
+    try:
+        record, digest = read_record(path)
+    except PluginError as error:
+        reading.fault(f"scene.{PHOTOGRAPHS}", name, str(error))
+        return
+    reading.files[name] = digest
+    for expected in _mismatches(reading, name, record, simulated):
+        reading.fault(f"scene.{PHOTOGRAPHS}", name, expected)
+    for relative, known in zip(record.paths, record.digests, strict=True):
+        found = known if simulated else file_digest(path.parent / relative)
+        if found != known:
+            reading.faults.append(
+                f"{reading.source}: {plain(relative)}: "
+                + ("the photograph cannot be read" if found is None else
+                   "the photograph is not the one that was recorded: its SHA-256 differs")
+            )
+        reading.files[relative] = known
+
+
+def _mismatches(
+    reading: Reading, name: str, record: PhotographRecord, simulated: bool
+) -> Iterator[str]:
+    """Yield what the pipeline asks of a record that it does not have."""
+    trials = len(reading.axes[TRIAL]) if TRIAL in reading.axes else 1
+    largest = reading.axes[TRIAL].values[-1] + 1 if TRIAL in reading.axes else 1
+    if largest > len(record.paths) and not simulated:
+        yield f"trial = {len(record.paths)} at most: its photographs; there are {trials} trials"
+    ids = set(record.marker_id.tolist())
+    unknown = [each for each in reading.values("marker_id") if each not in ids]
+    if unknown:
+        yield f"markers that it has: {shown(sorted(ids))}; marker_id = {unknown[0]} is none of them"
+    for key, length in (("width_px", record.width_px), ("height_px", record.height_px)):
+        for names, lengths in reading.together(PHOTOGRAPHS, key):
+            if name in names and any(each != length for each in lengths):
+                yield f"{key} = {length}, that of its photographs"
+
+
+# --------------------------------------------------------------------------------------------------
+# Rules across the keys of a pipeline: each is a function that adds its faults to a reading.
+#
+# A parameter whose own value is at fault is passed over: its fault is known already.
 
 MAX_POSES = 10**12
 """The largest grid."""
@@ -47,22 +185,20 @@ MAX_CONFIGURATIONS = 10_000
 """The most configurations: they are listed, and each has its share of every block."""
 
 
-def pose_in_one_way(reading: Reading) -> None:
-    """Demand a distance, and each quantity of the pose in one way."""
-    if PHOTOGRAPHS in reading.given:
+def each_in_one_way(reading: Reading) -> None:
+    """Demand a distance, and each quantity of pose, camera and beliefs in one way."""
+    has_poses = PHOTOGRAPHS in reading.given
+    given = reading.given - reading.stated.keys() - (set(IN_CAMERA) if has_poses else set())
+    for first, other in contradictions(given):
+        reading.refuse(
+            other[0], f"{', '.join(first)} or {', '.join(other)}, not both; delete one of them")
+    if has_poses:
         return
-    for first, other in contradictions(reading.given):
-        reading.fault(
-            other, reading.written(other), f"{first} or {other}, not both; delete one of them"
-        )
     world = [name for name in WORLD if name in reading.given]
     in_camera = [name for name in IN_CAMERA if name in reading.given]
     if world and in_camera:
-        reading.fault(
-            world[0], reading.written(world[0]),
-            "a pose in the world or in the camera's frame, not both; delete "
-            f"{', '.join(world)}, or {', '.join(in_camera)}",
-        )
+        reading.refuse(world[0], "a pose in the world or in the camera's frame, not both; delete "
+                       f"{', '.join(world)}, or {', '.join(in_camera)}")
     if not world and not {"distance_m", "side_px"} & reading.given:
         reading.faults.append(
             f"{reading.source}: pose: expected distance_m or side_px, fixed or under [axes]"
@@ -78,10 +214,7 @@ def ids_in_dictionary(reading: Reading) -> None:
             counts = {dictionary: marker_count(dictionary) for dictionary in dictionaries}
             too_few |= {name: count for name, count in counts.items() if largest >= count}
     for dictionary, count in too_few.items():
-        reading.fault(
-            "marker_id", reading.written("marker_id"),
-            f"IDs from 0 to {count - 1}, which is what {dictionary} has",
-        )
+        reading.refuse("marker_id", f"IDs from 0 to {count - 1}, which is what {dictionary} has")
 
 
 def dictionaries_can_be_drawn(reading: Reading) -> None:
@@ -89,47 +222,57 @@ def dictionaries_can_be_drawn(reading: Reading) -> None:
 
     A store's pipeline can be read without them.
     """
-    for dictionary in reading.values("dictionary"):
-        missing = missing_package(dictionary)
-        if missing is not None and reading.known_files is None:
-            reading.fault("dictionary", dictionary, missing)
+    for dictionary in reading.values("dictionary") if reading.known_files is None else ():
+        if (missing := missing_package(dictionary)) is not None:
+            reading.fault("marker.dictionary", dictionary, missing)
     for dictionaries, renderers in reading.together("dictionary", "renderer"):
         if any(map(has_circles, dictionaries)) and any(name != "exact" for name in renderers):
-            reading.fault(
-                "scene.renderer", reading.written("renderer"),
-                "exact for STag's markers, which have circles",
-            )
+            reading.refuse("renderer", "exact for STag's markers, which have circles")
             break
 
 
-def is_active(reading: Reading, switch: str) -> bool:
-    """Return whether a switch has, or was meant to have, another than its neutral value."""
-    values = reading.values(switch)
-    if not values:
-        return switch in reading.given
-    off = reading.parameters[switch].default
-    return any(value != off for value in values)
+PARTNERS = {"fy_px": ("fx_px",), "pixel_size_um": ("focal_length_mm",), **NEEDS}
+"""Parameter -> those of which one must be given beside it."""
 
 
-def effects_need_partners(reading: Reading) -> None:
-    """Demand the parameters without which an effect's parameter has no meaning."""
-    for name, others in NEEDS.items():
-        values, off = reading.values(name), PARAMETERS[name].default
-        wanted = any(value != off for value in values) if values else name in reading.given
-        if wanted and not reading.given.intersection(others):
+def partners_are_given(reading: Reading) -> None:
+    """Demand the parameters without which another has no meaning; not those of a rival way."""
+    for name, others in PARTNERS.items():
+        if reading.is_active(name) and not reading.given.intersection(
+                (*others, *RIVALS.get(name, ()))):
             partner = " or ".join(others) if len(others) < 3 else f"one of {', '.join(others)}"
-            reading.fault(f"scene.{name}", reading.written(name), f"{partner} beside it")
+            reading.refuse(name, f"{partner} beside it")
 
 
 def effects_need_the_exact_renderer(reading: Reading) -> None:
     """Demand the renderer ``exact`` for effects that act on edges."""
     others = [name for name in reading.values("renderer") if name != "exact"]
     for name in GEOMETRIC:
-        if others and is_active(reading, name):
-            reading.fault(
-                f"scene.{name}", reading.written(name),
-                f"renderer = exact; {others[0]} does not have it",
-            )
+        if others and reading.is_active(name):
+            reading.refuse(name, f"renderer = exact; {others[0]} does not have it")
+
+
+def noise_tables_ascend(reading: Reading) -> None:
+    """Demand noise tables whose levels ascend on the scale, with deviations of at least 0."""
+    def wrong(table: Sequence[float]) -> bool:
+        levels, deviations = table[::2], table[1::2]
+        return (
+            any(a >= b for a, b in itertools.pairwise(levels))
+            or not all(0 <= level <= MAX_LEVEL for level in levels)
+            or not all(0 <= deviation <= 1e6 for deviation in deviations)
+        )
+
+    reading.refuse_values("noise_table", "level, standard deviation, level, standard deviation, "
+                          f"...: levels that ascend from 0 to {MAX_LEVEL:g}, deviations of at "
+                          "least 0", wrong)
+
+
+def mosaics_have_room(reading: Reading) -> None:
+    """Demand frames that can be demosaiced."""
+    for name in ("width_px", "height_px"):
+        if min(reading.values(name), default=MIN_FRAME_PX) < MIN_FRAME_PX and any(
+                value != "none" for value in reading.values("bayer")):
+            reading.refuse(name, f"at least {MIN_FRAME_PX}, for bayer to be demosaiced")
 
 
 def threshold_windows_in_order(reading: Reading) -> None:
@@ -139,15 +282,13 @@ def threshold_windows_in_order(reading: Reading) -> None:
         smallest and largest and max(smallest) > min(largest)
         for smallest, largest in reading.together(low, high)
     ):
-        reading.fault(high, reading.written(high), f"at least {low}")
+        reading.refuse(high, f"at least {low}")
 
 
 def fields_of_the_installed_opencv(reading: Reading) -> None:
     """Demand detector fields that the installed OpenCV has."""
     for name in reading.given & DetectorSetting.missing_fields():
-        reading.fault(
-            f"detector.{name}", reading.written(name), "a field that the installed OpenCV has"
-        )
+        reading.refuse(name, "a field that the installed OpenCV has")
 
 
 def dictionaries_of_detectors(reading: Reading) -> None:
@@ -171,72 +312,15 @@ def dictionaries_of_detectors(reading: Reading) -> None:
             reading.fault("dictionary", dictionary, expected)
 
 
-OPENCV_FIELDS = {field.name for field in dataclasses.fields(DetectorSetting)}
-
-
-def environments_of_detectors(reading: Reading) -> None:
-    """Demand environments that can be used, with the fields and the markers of the pipeline.
-
-    What a store has recorded is not looked for.
-    """
-    if reading.known_plugins is not None:
-        return
-    defaults = DetectorSetting()
-    for environment in dict.fromkeys(reading.values("environment")):
-        if environment == INSTALLED:
-            continue
-
-        def beside(name: str, environment: str = environment) -> Iterator[Any]:
-            return (value for environments, values in reading.together("environment", name)
-                    if environment in environments for value in values)
-
-        if any(value != OPENCV for value in beside("detector")):
-            reading.fault(
-                "detector.environment", environment,
-                f"{INSTALLED} for detectors other than {OPENCV}; let both axes go together by zip",
-            )
-        try:
-            identity = identify(environment, str(reading.folder))
-        except EnvironmentFaultError as error:
-            reading.fault(
-                "detector.environment", environment, f"an environment for a detector: {error}"
-            )
-            continue
-        own = f"OpenCV {identity.opencv} of environment {environment}"
-        for name in sorted(OPENCV_FIELDS & reading.given - identity.fields.keys()):
-            if any(value != getattr(defaults, name) for value in beside(name)):
-                reading.fault(
-                    f"detector.{name}", reading.written(name), f"a field that {own} has"
-                )
-        for dictionary in dict.fromkeys(beside("dictionary")):
-            if dictionary not in identity.dictionaries:
-                reading.fault("dictionary", dictionary, f"one that {own} has")
-            elif identity.dictionaries[dictionary] != markers_digest(dictionary):
-                reading.fault(
-                    "dictionary", dictionary, f"one with the same markers in {own}: these differ"
-                )
-
-
-def names_of_settings(reading: Reading) -> None:
-    """Demand names that nothing else of the dataset has for settings of plug-ins."""
-    for plugin in reading.plugins:
-        reading.faults += [
-            f"{reading.source}: {plugin.name}: expected another name for its setting "
-            f"{setting.name}: the dataset or its analyses have this one"
-            for setting in plugin.settings
-            if setting.name in RESERVED or setting.name.startswith("_")
-        ]
-
-
 def something_random_to_repeat(reading: Reading) -> None:
     """Demand a random quantity if there is more than one trial."""
     if PHOTOGRAPHS in reading.given:
         return
     trials = len(reading.axes[TRIAL]) if TRIAL in reading.axes else 1
     jitter = reading.values("jitter_px")
-    noisy = any(is_active(reading, name) for name in RANDOM)
+    noisy = any(reading.is_active(name) for name in RANDOM)
     noisy = noisy or any(
-        is_active(reading, plugin.settings[0].name)
+        reading.is_active(plugin.settings[0].name)
         for plugin in reading.plugins if plugin.kind == "effect" and plugin.random
     )
     noisy = noisy or "calibration" in reading.values("believed")
@@ -267,14 +351,16 @@ def trials_fill_replicates(reading: Reading) -> None:
         )
 
 
-def names_of_axes(reading: Reading) -> None:
-    """Demand names that nothing else of the dataset has for axes of parameters that go together."""
-    for axis in reading.axes.values():
-        if axis.zipped and (axis.name in RESERVED or axis.name.startswith("_")):
-            reading.faults.append(
-                f"{reading.source}: axes.{axis.name}: expected another name: the dataset or its "
-                "analyses have this one"
-            )
+def names_are_free(reading: Reading) -> None:
+    """Demand names that nothing else of the dataset has for plug-ins' settings and joint axes."""
+    names = [(plugin.name, f"name for its setting {setting.name}", setting.name)
+             for plugin in reading.plugins for setting in plugin.settings]
+    names += [(f"axes.{axis.name}", "name", axis.name)
+              for axis in reading.axes.values() if axis.zipped]
+    reading.faults += [
+        f"{reading.source}: {start}: expected another {what}: the dataset or its analyses have "
+        "this one" for start, what, name in names if name in RESERVED or name.startswith("_")
+    ]
 
 
 RESERVED = {
@@ -315,33 +401,26 @@ def size_of_whole_frames(reading: Reading) -> None:
     )
     if frame <= MAX_PIXELS:
         return
-    if "full" in reading.values("window"):
-        reading.fault(
-            "scene.window", reading.written("window"),
-            f"auto, for a frame of more than {MAX_PIXELS:,} pixels",
-        )
     for name, is_whole in (
+        ("window", lambda value: value == "full"),
         ("useAruco3Detection", bool),
         ("adaptiveThreshConstant", lambda value: value < 1),
         ("aprilTagQuadDecimate", lambda value: value > 1),
     ):
         if any(is_whole(value) for value in reading.values(name)):
-            reading.fault(
-                f"detector.{name}", reading.written(name),
-                f"what needs no whole frame, for one of more than {MAX_PIXELS:,} pixels",
-            )
+            reading.refuse(
+                name, f"what needs no whole frame, for one of more than {MAX_PIXELS:,} pixels")
 
 
 RULES: tuple[Callable[[Reading], None], ...] = (
     photographs_alone,
-    pose_in_one_way,
-    one_camera,
+    each_in_one_way,
     beliefs_in_one_way,
     ids_in_dictionary,
     dictionaries_can_be_drawn,
     boards_can_be_printed,
     boards_are_searched_and_solved,
-    effects_need_partners,
+    partners_are_given,
     effects_need_the_exact_renderer,
     noise_tables_ascend,
     mosaics_have_room,
@@ -349,11 +428,9 @@ RULES: tuple[Callable[[Reading], None], ...] = (
     check_backgrounds,
     fields_of_the_installed_opencv,
     dictionaries_of_detectors,
-    environments_of_detectors,
-    names_of_settings,
     something_random_to_repeat,
     trials_fill_replicates,
-    names_of_axes,
+    names_are_free,
     size_of_the_grid,
     size_of_whole_frames,
 )

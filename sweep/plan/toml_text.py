@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime as dt
-import json
 import os
 import re
 import tomllib
@@ -11,6 +10,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import tomlkit
+import tomlkit.items
 
 from sweep.messages import plain
 
@@ -24,8 +25,9 @@ _PART = r"""(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(
     rf"(?<![A-Za-z0-9_\\-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MAX_PARTS}}}"
 )
-_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
-_BARE = re.compile(r"[A-Za-z][A-Za-z0-9_.+-]*(/[A-Za-z0-9_.+-]+)*(:[A-Za-z_][A-Za-z0-9_]*)?")
+_BARE = re.compile(
+    r"(?=.*[A-Za-z])[A-Za-z0-9][A-Za-z0-9_.+-]*(/[A-Za-z0-9_.+-]+)*(:[A-Za-z_][A-Za-z0-9_]*)?"
+)
 
 
 def read_document(text: str) -> dict[str, Any]:
@@ -74,8 +76,16 @@ def python_boolean(written: str) -> str:
 
 
 def quoted_if_bare(written: str) -> str:
-    """Return a bare word, such as a solver's name, as a TOML string; anything else as it is."""
-    if _BARE.fullmatch(written) and written not in ("true", "false", "inf", "nan"):
+    """Return a bare word, such as a solver's name, as a TOML string; anything else as it is.
+
+    >>> quoted_if_bare("ippe"), quoted_if_bare("36h11"), quoted_if_bare("1e3")
+    ('"ippe"', '"36h11"', '1e3')
+    """
+    if not _BARE.fullmatch(written):
+        return written
+    try:
+        read_value(written)
+    except ValueError:
         return f'"{written}"'
     return written
 
@@ -94,39 +104,46 @@ def document_text(mapping: Mapping[str, Any]) -> str:
     Examples
     --------
     >>> document_text({"seed": 1, "axes": {"trial": 3, "marker_id": range(5)}})
-    'seed = 1\n\n[axes]\ntrial = 3\nmarker_id = { range = [0, 5, 1] }\n'
+    'seed = 1\n\n[axes]\ntrial = 3\nmarker_id = {range = [0, 5, 1]}\n'
     """
     faults: list[str] = []
-    head: list[str] = []
-    tables: list[str] = []
+    document = tomlkit.document()
+    tables: dict[str, tomlkit.items.Table] = {}
     for key, value in mapping.items():
         if isinstance(value, Mapping):
-            lines = [_line(f"{key}.", name, item, faults) for name, item in value.items()]
-            tables += ["", f"[{key_text(str(key))}]", *lines]
+            table = tables[str(key)] = tomlkit.table()
+            for name, item in value.items():
+                _add(table, f"{key}.", name, item, faults)
         else:
-            head.append(_line("", key, value, faults))
+            _add(document, "", key, value, faults)
+    document.update(tables)
     if faults:
         raise ValueError("\n".join(faults))
-    return "\n".join(head + tables if head else tables[1:]) + "\n"
+    return tomlkit.dumps(document)
 
 
-def _line(table: str, key: Any, value: Any, faults: list[str]) -> str:
-    """Return "key = value"; add a fault if there is no such line in TOML."""
-    path = plain(f"{table}{key}")
+def _add(
+    table: tomlkit.TOMLDocument | tomlkit.items.Table, home: str, key: Any, value: Any,
+    faults: list[str],
+) -> None:
+    """Add a key to a table; add a fault if TOML has no such key or value."""
+    path = plain(f"{home}{key}")
     if not isinstance(key, str):
         faults.append(f"{path}: expected a string as key")
-        return ""
+        return
     try:
-        return f"{key_text(key)} = {_value_text(value)}"
-    except TypeError as error:
-        faults.append(f"{path} = {plain(repr(value))}: expected {error}")
+        table[key] = _item(value)
+    except TypeError:
+        faults.append(f"{path} = {plain(repr(value))}: expected a string, a number, true, false, "
+                      "a list or a table")
+    except ValueError:
+        faults.append(f"{path}: expected a number of fewer digits")
     except RecursionError:
         faults.append(f"{path}: nested too deeply")
-    return ""
 
 
-def _value_text(value: Any) -> str:
-    """Return a value as TOML; TypeError with the expectation if TOML has no such value."""
+def _item(value: Any) -> tomlkit.items.Item:
+    """Return a value as tomlkit's, tables in one line; TypeError if TOML has no such value."""
     if isinstance(value, (np.generic, np.ndarray)):
         value = value.tolist()
     if isinstance(value, os.PathLike):
@@ -134,37 +151,13 @@ def _value_text(value: Any) -> str:
     if isinstance(value, range):
         value = {"range": [value.start, value.stop, value.step]}
     if isinstance(value, Mapping):
-        pairs = [f"{key_text(str(key))} = {_value_text(item)}" for key, item in value.items()]
-        return f"{{ {', '.join(pairs)} }}"
+        inline = tomlkit.inline_table()
+        inline.update({str(key): _item(item) for key, item in value.items()})
+        return inline
     if isinstance(value, (list, tuple)):
-        return f"[{', '.join(map(_value_text, value))}]"
-    if isinstance(value, str):
-        return string_text(value)
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, int):
-        # Python writes no more than 4300 decimal digits.
-        return str(int(value)) if value.bit_length() < 10_000 else f"{value:#x}"
-    if isinstance(value, float):
-        return repr(float(value))
-    if isinstance(value, (dt.date, dt.time)):
-        return value.isoformat()
-    raise TypeError("a string, a number, true, false, a list or a table")
-
-
-def string_text(text: str) -> str:
-    r"""Return text as a basic string of TOML.
-
-    >>> print(string_text('C:\\a "b"'))
-    "C:\\a \"b\""
-    """
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def key_text(key: str) -> str:
-    """Return a key of TOML, bare if it can be.
-
-    >>> key_text("tilt_deg"), key_text("a key")
-    ('tilt_deg', '"a key"')
-    """
-    return key if _BARE_KEY.fullmatch(key) else string_text(key)
+        # Made at once: tomlkit's arrays take time that grows with the square of what is appended.
+        parts = [part for item in value for part in (tomlkit.ws(", "), _item(item))]
+        return tomlkit.items.Array(parts[1:], tomlkit.items.Trivia())
+    if isinstance(value, (str, bool, int, float, dt.date, dt.time)):
+        return tomlkit.item(value)
+    raise TypeError(type(value).__name__)

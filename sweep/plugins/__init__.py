@@ -214,7 +214,7 @@ class RendererPlugin(Plugin):
     Attributes
     ----------
     render
-        A function of a :class:`sweep.model.plugged_scene.MarkerView` that returns two arrays
+        A function of a :class:`sweep.model.effects.MarkerView` that returns two arrays
         (h, w) of the view's box: the marker's levels before quantisation, where the part of a pixel
         that the marker does not cover counts as 0, and the marker's share of each pixel.
     """

@@ -1,9 +1,10 @@
-"""A plug-in as pipelines and stores know it: all that can be said of it without importing it."""
+"""What pipelines and stores know of plug-ins without importing them."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
+import importlib.metadata
 import math
 import typing
 from collections.abc import Iterator, Mapping
@@ -12,11 +13,14 @@ from functools import partial
 from typing import Any
 
 from sweep.declaration import Declaration, Declared, plain_types
-from sweep.errors import PluginError
+from sweep.errors import ArgumentError, PluginError
+from sweep.messages import nearest
 from sweep.plugins import RECORDS, DetectorPlugin, Plugin
-from sweep.plugins.calls import call
-from sweep.plugins.loading import file_of, load, read_source, versions_of
+from sweep.plugins.loading import call, file_of, group_of, load, read_source, versions_of
 from sweep.plugins.recording import RecordedDetector
+
+# --------------------------------------------------------------------------------------------------
+# A plug-in as pipelines and stores know it: all that can be said of it without importing it.
 
 TYPES: dict[str, type] = {"float": float, "int": int, "bool": bool, "str": str}
 """Types that a setting may have."""
@@ -250,3 +254,42 @@ def _settings(record: Plugin) -> Iterator[Setting]:
         if default is not None and type(default) is int and kinds == (float,):
             default = float(default)
         yield Setting(field.name, kinds, default, declaration)
+
+
+# --------------------------------------------------------------------------------------------------
+# Which plug-ins are installed, and what one declares.
+
+def installed() -> list[dict[str, str]]:
+    """Return kind, name and distribution of each installed plug-in; none is imported."""
+    return [
+        {"kind": kind, "name": name, "distribution": distribution}
+        for kind in RECORDS
+        for name, distribution in sorted({
+            (entry.name, entry.dist.name if entry.dist else "")
+            for entry in importlib.metadata.entry_points(group=group_of(kind))
+        })
+    ]
+
+
+def described(name: str, folder: str = ".") -> list[DeclaredPlugin]:
+    """Import the plug-ins of a name, of whichever kinds, and return what they declare.
+
+    Raises
+    ------
+    ArgumentError
+        If there is none, or one cannot be used.
+    """
+    listed = installed()
+    kinds = [each["kind"] for each in listed if each["name"] == name]
+    if file_of(name) is None and not kinds:
+        hint = nearest(name, [each["name"] for each in listed]) or "; `sweep plugins` lists them"
+        raise ArgumentError("name", name, f"no such plug-in{hint}")
+    found, faults = [], []
+    for kind in kinds or RECORDS:
+        try:
+            found.append(declare(kind, name, folder))
+        except PluginError as error:
+            faults.append(str(error))
+    if not found or (kinds and faults):
+        raise ArgumentError("name", name, f"expected {faults[0]}")
+    return found

@@ -1,8 +1,4 @@
-"""Plug-ins by name: entry points, whose names are read without importing, and files.
-
-A file is executed from the bytes whose digest is taken. It is a module of its own: one that imports
-others beside it is refused, so that the digest says all of it.
-"""
+"""Plug-ins: found by entry point or file, loaded, and called."""
 
 from __future__ import annotations
 
@@ -10,20 +6,58 @@ import contextlib
 import hashlib
 import importlib.metadata
 import importlib.util
+import os
+import signal
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from importlib.metadata import EntryPoint, PackageNotFoundError
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
+
 from sweep.errors import PluginError
-from sweep.messages import nearest, plain
+from sweep.messages import nearest, nearest_file, plain
 from sweep.plugins import FACTORY, RECORDS, Plugin
-from sweep.plugins.printing import printing_to_stderr
 from sweep.plugins.recording import is_recording, recorded_detector
+from sweep.typing import Floats
+
+# --------------------------------------------------------------------------------------------------
+# What plug-ins print goes to the standard error: the standard output is that of the command.
+
+@contextlib.contextmanager
+def printing_to_stderr() -> Iterator[None]:
+    """Turn the standard output of the process into its standard error, also for compiled code.
+
+    It holds for all threads, so it is not for every call: Python's own prints are redirected there
+    (:func:`sweep.plugins.loading.call`).
+    """
+    with contextlib.redirect_stdout(sys.stderr):
+        try:
+            kept = os.dup(1)
+        except OSError:  # there is none
+            yield
+            return
+        try:
+            with contextlib.suppress(OSError, ValueError, AttributeError):
+                if sys.__stdout__ is not None:
+                    sys.__stdout__.flush()
+            with contextlib.suppress(OSError):
+                os.dup2(2, 1)
+            yield
+        finally:
+            os.dup2(kept, 1)
+            os.close(kept)
+
+
+# --------------------------------------------------------------------------------------------------
+# Plug-ins by name: entry points, whose names are read without importing, and files.
+#
+# A file is executed from the bytes whose digest is taken. It is a module of its own: one that
+# imports others beside it is refused, so that the digest says all of it.
 
 OWN_DISTRIBUTION = "fiducial-sweep"
 """Its adapters' results change with the version of the numbers, which is recorded in any case."""
@@ -107,6 +141,7 @@ def read_source(file: str, folder: str) -> bytes:
         return path.read_bytes()
     except (OSError, ValueError) as error:
         reason = (error.strerror if isinstance(error, OSError) else None) or error
+        reason = f"{reason}{nearest_file(Path(folder) / file)}"
         raise PluginError(
             f"the file {plain(file)} in {plain(folder)} ({reason}); packages offer plug-ins by "
             "entry points"
@@ -232,3 +267,72 @@ def versions_of(kind: str, name: str, record: Plugin) -> tuple[tuple[str, str], 
         if owner is not None and owner.name != OWN_DISTRIBUTION:
             versions[owner.name] = owner.version
     return tuple(sorted(versions.items()))
+
+
+# --------------------------------------------------------------------------------------------------
+# Calls of plug-ins: whatever one raises is an error of its own, in one line.
+
+_forks = 0
+"""How often this process was forked by Python's own function."""
+
+
+def _count_fork() -> None:
+    global _forks  # noqa: PLW0603  (the process has one count)
+    _forks += 1
+
+
+os.register_at_fork(after_in_parent=_count_fork)
+
+
+def call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function of the plug-in ``name``; what it prints goes to stderr.
+
+    A copy of this process that it leaves running ends here, before it does our work a second time.
+
+    Raises
+    ------
+    PluginError
+        For whatever it raises, also for an attempt to exit, and if it forks; not if memory runs
+        out, or the user interrupts. Workers ignore interrupts: there it raised that itself.
+    """
+    process, forks = os.getpid(), _forks
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            returned = function(*arguments)
+    except MemoryError:
+        raise
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt) and not _ignores_interrupts():
+            raise  # the user's
+        raise PluginError(f"{name}: raises {exception_line(error)}") from error
+    finally:
+        if os.getpid() != process:
+            os._exit(1)
+    if forks != _forks:
+        raise PluginError(f"{name}: forks the process that it runs in; start a program instead")
+    return returned
+
+
+def _ignores_interrupts() -> bool:
+    return signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+
+
+def real_numbers(name: str, what: str, returned: Any) -> Floats:
+    """Return what a plug-in returned as a new array of real numbers.
+
+    Raises
+    ------
+    PluginError
+        If it is none; also for what NumPy would make numbers of by leaving something away, or by
+        guessing: complex numbers, texts, masked values.
+    """
+    try:
+        array = np.asarray(returned)
+    except Exception:
+        raise PluginError(f"{name}: returned {what} that are no array of numbers") from None
+    if np.ma.is_masked(returned):
+        raise PluginError(f"{name}: returned {what} of which some are masked; expected NaN or none")
+    if array.dtype.kind not in "biuf":
+        raise PluginError(
+            f"{name}: returned {what} of type {array.dtype}; expected real numbers")
+    return np.array(array, dtype=np.float64)

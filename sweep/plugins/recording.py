@@ -7,9 +7,6 @@ exported.
 
 from __future__ import annotations
 
-import hashlib
-import io
-import zipfile
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -21,6 +18,7 @@ from numpy.typing import NDArray
 from sweep.errors import PluginError
 from sweep.messages import plain
 from sweep.plugins import Plugin
+from sweep.plugins.array_file import array_file, read_arrays
 from sweep.typing import Floats
 
 SUFFIX = ".npz"
@@ -81,16 +79,8 @@ class Recording:
 
     def content(self) -> bytes:
         """Return the content of its file: the same bytes for the same detections."""
-        file = io.BytesIO()
-        with zipfile.ZipFile(file, "w") as archive:
-            for name in ("version", *_ARRAYS):
-                values = np.int64(VERSION) if name == "version" else getattr(self, name)
-                member = io.BytesIO()
-                np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
-                info = zipfile.ZipInfo(f"{name}.npy")  # of a fixed date
-                info.compress_type = zipfile.ZIP_DEFLATED
-                archive.writestr(info, member.getvalue())
-        return file.getvalue()
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        return array_file({"version": np.int64(VERSION), **arrays})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -144,14 +134,12 @@ def recorded_detector(name: str, folder: str) -> RecordedDetector:
 @lru_cache(maxsize=8)
 def _read(path: str, modified_ns: int, size: int) -> RecordedDetector:  # noqa: ARG001  (the key)
     """Return a file's detector; OSError or ValueError if there is none."""
-    content = Path(path).read_bytes()
-    try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            if int(archive["version"]) != VERSION:
-                raise ValueError("of another version")
-            arrays = {name: archive[name] for name in _ARRAYS}
-    except (KeyError, TypeError, EOFError, AttributeError, zipfile.BadZipFile):
-        raise ValueError("it is none") from None
+    read, digest = read_arrays(path)
+    if not read.keys() >= {"version", *_ARRAYS}:
+        raise ValueError("it is none")
+    if read["version"].size != 1 or int(read["version"]) != VERSION:
+        raise ValueError("of another version")
+    arrays = {name: read[name] for name in _ARRAYS}
     for name, (kind, shape) in _ARRAYS.items():
         values = arrays[name]
         rows = len(arrays["exported" if name == "exported" else "image"])
@@ -161,5 +149,5 @@ def _read(path: str, modified_ns: int, size: int) -> RecordedDetector:  # noqa: 
             raise ValueError(f"damaged: {name}")
     return RecordedDetector(
         meaning="detections that another program made", recording=Recording(**arrays),
-        digest=hashlib.sha256(content).hexdigest(),
+        digest=digest,
     )

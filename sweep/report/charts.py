@@ -1,37 +1,387 @@
-"""Charts on matplotlib's axes: lines, dots with intervals, maps with numbers, stacked bars.
-
-Lines differ in colour, marker and dash at once, so that the colour-blind, and readers of a black
-and white print, can distinguish them.
-"""
+"""Charts on matplotlib's axes: scales, colours, lines with intervals, maps; as inline SVG."""
 
 from __future__ import annotations
 
+import io
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
+from markupsafe import Markup
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
-from matplotlib.ticker import NullLocator
+from matplotlib.axis import Axis
+from matplotlib.colors import Colormap, LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from matplotlib.transforms import offset_copy
 from numpy.typing import NDArray
 
 from sweep.report.formatting import brief_number, coordinates, shortened
-from sweep.report.scales import (
-    Series,
-    clipped_intervals,
-    colour_ends,
-    colour_scale,
-    grow_by_factors,
-    plain_ticks,
-    readable_on,
-    spans,
-    value_limits,
-    value_scale,
-)
-from sweep.report.theme import COLOURS, DASHES, FAINT, INK, PAPER, REFERENCE_DASHES, SHAPES
 from sweep.typing import Floats
+
+# --------------------------------------------------------------------------------------------------
+# The colours, shapes and matplotlib settings of all figures, and the colours of the page.
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+"""The palette of Okabe and Ito, distinguishable by the colour-blind; without its yellow, which is
+too faint for a line."""
+
+SHAPES = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
+INK, FAINT, RULE, STRIP, PAPER = "#282828", "#7a7a7a", "#e6e6e6", "#f3f3f3", "#ffffff"
+"""Text; secondary text and lines; grid lines; shaded areas; background."""
+
+REFERENCE_DASHES = (0, (5, 3))
+"""Of lines that mark a reference, such as a bound."""
+
+DASHES: tuple[Any, ...] = (
+    "-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)), (0, (8, 3)), (0, (3, 1.5)), "-",
+)
+"""Of the lines of a figure; the last stands with black."""
+
+MATPLOTLIB_STYLE: Any = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "sweep",
+    "text.parse_math": False,
+    "axes.edgecolor": FAINT, "axes.labelcolor": INK, "axes.titlecolor": INK,
+    "axes.titlesize": 9.5, "axes.titlelocation": "left", "axes.titleweight": "bold",
+    "axes.labelsize": 8.5, "axes.linewidth": 0.7, "axes.axisbelow": True,
+    "axes.spines.top": False, "axes.spines.right": False,
+    "xtick.labelsize": 8.5, "ytick.labelsize": 8.5, "xtick.color": FAINT, "ytick.color": FAINT,
+    "xtick.labelcolor": INK, "ytick.labelcolor": INK,
+    "grid.color": RULE, "grid.linewidth": 0.7, "text.color": INK,
+    "legend.frameon": False, "legend.fontsize": 8.5, "legend.labelcolor": INK,
+    "font.size": 8.5, "lines.linewidth": 1.5, "figure.constrained_layout.use": True,
+}
+"""Settings of matplotlib in which every panel is drawn."""
+
+THEME: dict[str, tuple[str, str]] = {
+    "ink": (INK, "#e4e2dd"), "faint": (FAINT, "#99968f"), "rule": (RULE, "#34363a"),
+    "strip": (STRIP, "#26282c"), "paper": (PAPER, "#17181b"),
+    "c1": (COLOURS[0], "#4ba3e3"), "c2": (COLOURS[1], "#f08a45"), "c3": (COLOURS[2], "#2fc196"),
+    "c4": (COLOURS[3], "#e0a3c6"), "c5": (COLOURS[4], "#8ed0f7"), "c6": (COLOURS[5], "#f2bd4c"),
+    "c7": (COLOURS[6], "#ffffff"),
+}
+"""CSS variable -> its colour on light paper and in dark mode."""
+
+
+def css_variables(*, dark: bool) -> str:
+    """Return the CSS declarations of the colours, on light paper or in dark mode.
+
+    >>> css_variables(dark=False)[:29]
+    '--ink: #282828; --faint: #7a7'
+    """
+    return " ".join(f"--{name}: {colours[dark]};" for name, colours in THEME.items())
+
+
+# --------------------------------------------------------------------------------------------------
+# Scales of charts: whether logarithmic, between which ends, with which ticks and colours.
+
+LOGARITHMIC_FROM = 6
+"""Values that span a larger ratio are drawn on a logarithmic scale."""
+
+
+FLOOR_RATIO = 1e-6
+"""Values below this part of the largest are drawn at the lower edge of a logarithmic axis: errors
+of rounding would compress all others."""
+
+FLOOR_NOTE = "Errors below a millionth of the largest are drawn at the lower edge."
+
+
+class Series(NamedTuple):
+    """Values (n,) of a line, or of rows of dots, with the ends of their intervals or NaN."""
+
+    label: str
+    x: Floats
+    y: Floats
+    low: Floats
+    high: Floats
+
+
+# Values.
+
+def spans(values: Floats, ratio: float) -> bool:
+    """Return whether no value is below 0 and the positive ones span more than a ratio."""
+    finite = values[np.isfinite(values)]
+    positive = finite[finite > 0]
+    return bool(positive.size and finite.min() >= 0 and positive.max() > ratio * positive.min())
+
+
+def below_floor(values: Floats) -> bool:
+    """Return whether any value is too small, or 0, to be drawn at its place beside the largest."""
+    finite = values[np.isfinite(values)]
+    return bool(finite.size and finite.min() < FLOOR_RATIO * finite.max())
+
+
+def grow_by_factors(values: Floats) -> bool:
+    """Return whether distinct positive values lie more evenly on a logarithmic scale."""
+    steps, factors = (np.diff(each) for each in (np.unique(values), np.log(np.unique(values))))
+    return bool(np.std(factors) / np.mean(factors) <= np.std(steps) / np.mean(steps))
+
+
+def value_limits(values: Floats, *, logarithmic: bool, margin: float) -> tuple[float, float]:
+    """Return the ends of an axis with the finite values on it, and a margin (share of its length).
+
+    On a logarithmic axis, values that are not positive are left out.
+    """
+    finite = values[np.isfinite(values) & ((values > 0) | (not logarithmic))]
+    if not finite.size:
+        return 0.0, 1.0
+    if logarithmic:
+        low, high = np.log10(finite.min()), np.log10(finite.max())
+        spare = margin * max(high - low, 0.3)
+        return 10.0 ** (low - spare), 10.0 ** (high + spare)
+    low, high = float(finite.min()), float(finite.max())
+    spare = margin * (high - low) or 0.5 * abs(high) or 0.5
+    return low - spare, high + spare
+
+
+def value_scale(
+    series: Sequence[Series], *, share: bool, level: float | None = None
+) -> tuple[bool, tuple[float, float]]:
+    """Return whether the axis of a chart's values is logarithmic, and its ends.
+
+    Parameters
+    ----------
+    series
+        Values with their intervals.
+    share
+        Whether the values are shares in percent, whose axis is always the same.
+    level
+        A reference that must lie on the axis, too; with 0 the axis is linear.
+    """
+    if share:
+        return False, (-3.0, 103.0)
+    values = np.concatenate([line.y for line in series])
+    ends = np.concatenate([line.low for line in series] + [line.high for line in series])
+    if level is not None:
+        values = np.append(values, level)
+    positive = values[np.isfinite(values) & (values > 0)]
+    logarithmic = spans(values, LOGARITHMIC_FROM) and (level is None or level > 0)
+    if logarithmic:
+        values = values[values >= FLOOR_RATIO * positive.max()]
+        # Long intervals are cut off, so that they do not compress everything else.
+        lowest = max(positive.min(), FLOOR_RATIO * positive.max())
+        held = ends[(ends > lowest / 10) & (ends < positive.max() * 10)]
+    else:
+        held = ends
+    everything = np.concatenate([values, held])
+    low, high = value_limits(everything, logarithmic=logarithmic, margin=0.08)
+    if not logarithmic and everything[np.isfinite(everything)].min(initial=0) >= 0:
+        low = 0.0
+    return logarithmic, (low, high)
+
+
+def clipped_intervals(line: Series, limits: tuple[float, float]) -> tuple[Floats, Floats]:
+    """Return the ends (n,) and (n,) of intervals, clipped to the ends of the axis.
+
+    If only one end is known, the other lies beyond all draws: it is clipped, too.
+    """
+    low = np.where(np.isnan(line.low) & ~np.isnan(line.high), -np.inf, line.low)
+    high = np.where(np.isnan(line.high) & ~np.isnan(line.low), np.inf, line.high)
+    return np.clip(low, *limits), np.clip(high, *limits)
+
+
+def plain_ticks(axis: Axis, *, logarithmic: bool, share: bool = False) -> None:
+    """Give an axis few ticks at round values, written without powers of ten."""
+    if share:
+        axis.set_ticks([0, 25, 50, 75, 100])
+    if not logarithmic:
+        return
+    low, high = axis.get_view_interval()
+    subs = (1, 2, 5) if high < 60 * low else (1, 3) if high < 1000 * low else (1,)
+    axis.set_major_locator(LogLocator(subs=subs))
+    axis.set_minor_locator(NullLocator())
+    formatter: Callable[[float, Any], str] = lambda value, _: f"{value:g}"  # noqa: E731
+    axis.set_major_formatter(FuncFormatter(formatter))
+
+
+# Colours of maps.
+
+def colour_scale(values: Floats, *, share: bool) -> Normalize:
+    """Return the scale of a map's colours; ``share``: values are shown from 0 to 100 %."""
+    if share:
+        return Normalize(0, 100)
+    finite = values[np.isfinite(values)]
+    if spans(finite, LOGARITHMIC_FROM):
+        return LogNorm(finite[finite > 0].min(), finite.max(), clip=True)
+    low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
+    return Normalize(min(low, 0.0), high if high > low else low + 1.0)
+
+
+def colour_ends(norm: Normalize) -> tuple[float, float]:
+    """Return the values at the two ends of a colour scale."""
+    return float(norm.vmin or 0.0), float(norm.vmax or 1.0)
+
+
+def readable_on(colours: Colormap, norm: Normalize, value: float) -> str:
+    """Return black or white, whichever has more contrast with a cell; ink on an empty cell.
+
+    The luminance is that of sRGB (IEC 61966-2-1).
+    """
+    if not np.isfinite(value):
+        return INK
+    red, green, blue = colours(float(norm(value)))[:3]
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4
+              for c in (red, green, blue)]
+    luminance = 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+    # Near black and near white: black and white themselves are replaced on a page.
+    return "#050505" if luminance > 0.18 else "#fefefe"
+
+
+# --------------------------------------------------------------------------------------------------
+# Panels of figures as inline SVG, whose colours the page chooses, and as files.
+#
+# A panel is drawn once, in the colours of light paper. On a page these are replaced by the page's
+# CSS variables, so that one drawing serves light, dark and print; files keep them.
+
+WIDTH, HEIGHT = 4.4, 3.2
+"""Inches of a panel; a wide panel has twice the width."""
+
+COLUMNS = 2
+DOTS_PER_INCH = 150
+
+_VARIABLES = {light.lower(): f"var(--{name})" for name, (light, _) in THEME.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """One panel of a figure.
+
+    Attributes
+    ----------
+    title
+        Stands above it.
+    alt
+        Its content in words, for readers who cannot see it.
+    draw
+        Draws it on empty axes.
+    wide
+        Whether it takes the whole width of the page.
+    height
+        In inches.
+    """
+
+    title: str
+    alt: str
+    draw: Callable[[Axes], None]
+    wide: bool = False
+    height: float = HEIGHT
+
+
+def panel_svg(panel: Panel, prefix: str) -> Markup:
+    """Return a panel as inline SVG; ``prefix`` makes its identifiers unique on the page."""
+    with mpl.rc_context(MATPLOTLIB_STYLE):
+        figure = Figure((2 * WIDTH if panel.wide else WIDTH, panel.height))
+        _draw(panel, figure.add_subplot())
+        return inline_svg(_svg(figure), panel.alt, prefix)
+
+
+def write_panels(panels: Sequence[Panel], stem: Path) -> None:
+    """Write a figure of all panels as ``stem``.svg and ``stem``.png."""
+    for suffix in (".svg", ".png"):
+        stem.with_suffix(suffix).write_bytes(panels_file(panels, suffix))
+
+
+def panels_file(panels: Sequence[Panel], suffix: str) -> bytes:
+    """Return a figure of all panels as the content of a file: ".svg" or ".png"."""
+    columns = 1 if any(panel.wide for panel in panels) else min(len(panels), COLUMNS)
+    rows = math.ceil(len(panels) / columns)
+    heights = [
+        max(panel.height for panel in panels[row * columns : (row + 1) * columns])
+        for row in range(rows)
+    ]
+    width = columns * WIDTH * (2 if any(panel.wide for panel in panels) else 1)
+    with mpl.rc_context(MATPLOTLIB_STYLE):
+        figure = Figure((width, sum(heights)))
+        grid = figure.add_gridspec(rows, columns, height_ratios=heights)
+        for k, panel in enumerate(panels):
+            _draw(panel, figure.add_subplot(grid[k // columns, k % columns]))
+        encoded = io.BytesIO()
+        metadata = {"Date": None} if suffix == ".svg" else {}
+        figure.savefig(encoded, format=suffix[1:], metadata=metadata, dpi=DOTS_PER_INCH)
+        return encoded.getvalue()
+
+
+def _draw(panel: Panel, axes: Axes) -> None:
+    panel.draw(axes)
+    axes.set_title(panel.title, pad=6 + _legend_height(axes))
+
+
+def _legend_height(axes: Axes) -> float:
+    """Return the height in points of a legend between the axes and the title."""
+    legend = axes.get_legend()
+    if legend is None:
+        return 0.0
+    entries, columns = len(legend.get_texts()), int(getattr(legend, "_ncols", 1))
+    return 8 + 12.5 * math.ceil(entries / columns)
+
+
+def _svg(figure: Figure) -> str:
+    encoded = io.StringIO()
+    metadata = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+    figure.savefig(encoded, format="svg", transparent=True, metadata=metadata)
+    return encoded.getvalue()
+
+
+def inline_svg(svg: str, alt: str, prefix: str, *, clipped: bool = False) -> Markup:
+    """Return matplotlib's SVG as a self-contained part of a page.
+
+    Parameters
+    ----------
+    svg
+        What matplotlib wrote.
+    alt
+        The drawing in words.
+    prefix
+        Makes its identifiers unique on the page.
+    clipped
+        Whether parts that leave their axes must be cut off there; clip paths are large.
+    """
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", svg, flags=re.DOTALL)
+    svg = svg.replace("xlink:href", "href")
+    if not clipped:
+        svg = re.sub(r'\s*clip-path="url\(#[^"]*\)"', "", svg)
+        svg = re.sub(r"<defs>\s*<clipPath.*?</defs>", "", svg, flags=re.DOTALL)
+    svg = _with_theme(_with_prefix(svg, prefix))
+    # Hundredths of a point are enough.
+    svg = re.sub(
+        r'\bd="[^"]*"', lambda match: re.sub(r"(\.\d\d)\d+", r"\1", match[0]), svg)
+    svg = re.sub(r"\n\s*", "\n", svg)
+    box = re.search(r'viewBox="[^"]*"', svg)
+    opening = Markup(
+        '<svg role="img" aria-label="{}" {} preserveAspectRatio="xMidYMid meet">'
+    ).format(alt, Markup(box[0] if box else ""))  # noqa: S704  (matplotlib's)
+    return opening + Markup(svg[svg.index(">") + 1 :])  # noqa: S704
+
+
+def _with_prefix(svg: str, prefix: str) -> str:
+    """Return SVG whose identifiers, and the references to them, begin with ``prefix``."""
+    svg = re.sub(r'\bid="([^"]*)"', rf'id="{prefix}-\1"', svg)
+    svg = re.sub(r'href="#([^"]*)"', rf'href="#{prefix}-\1"', svg)
+    return re.sub(r"url\(#([^)]*)\)", rf"url(#{prefix}-\1)", svg)
+
+
+def _with_theme(svg: str) -> str:
+    """Return SVG with the page's font and CSS variables in place of matplotlib's."""
+    svg = re.sub(r"font: ([\d.a-z ]*?)'[^;\"]*", r"font: \1var(--sans)", svg)
+    svg = re.sub(r"font-family: [^;\"]*", "font-family: var(--sans)", svg)
+    return re.sub(
+        r"((?:fill|stroke|stop-color):\s*)(#[0-9a-fA-F]{6})",
+        lambda match: match[1] + _VARIABLES.get(match[2].lower(), match[2]), svg,
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Charts on matplotlib's axes: lines, dots with intervals, maps with numbers, stacked bars.
+#
+# Lines differ in colour, marker and dash at once, so that the colour-blind, and readers of a
+# black and white print, can distinguish them.
 
 MANY_POINTS = 18
 """A line of more points has a band in place of bars for its intervals."""
@@ -118,7 +468,7 @@ def draw_lines(
     axes.set_ylabel(labels[1])
     _exclude_from_layout(axes)
     if len(series) > 1:
-        _legend(axes, [line.label for line in series])
+        legend_above(axes, [line.label for line in series])
 
 
 def _exclude_from_layout(axes: Axes) -> None:
@@ -257,7 +607,7 @@ def draw_stack(
     axes.set_xlabel(label)
     axes.grid(visible=True, axis="y")
     if parts:
-        _legend(axes, list(parts))
+        legend_above(axes, list(parts))
 
 
 OUTCOME_COLOURS = {
@@ -276,13 +626,17 @@ def _outcome_style(outcome: str, outcomes: Sequence[str]) -> tuple[str, str | No
     return COLOURS[others.index(outcome) % len(COLOURS)], "////"
 
 
-def _legend(axes: Axes, labels: list[str]) -> None:
-    """Put the legend above the axes, in as few lines as it needs."""
-    widest = max(map(len, labels)) + 6
-    columns = max(1, min(len(labels), LINE_WIDTH_CHARS // widest))
+def legend_above(
+    axes: Axes, labels: Sequence[str] = (), *, columns: int = 0, handles: Any = None
+) -> None:
+    """Put the legend above the axes, in ``columns`` or in as few lines as the labels need."""
+    if not columns:
+        widest = max(map(len, labels)) + 6
+        columns = max(1, min(len(labels), LINE_WIDTH_CHARS // widest))
     axes.legend(
         loc="lower left", bbox_to_anchor=(-0.02, 1.02), ncols=columns, borderaxespad=0,
         handlelength=2.2, columnspacing=1.1, handletextpad=0.5, labelspacing=0.25, borderpad=0.2,
+        **({} if handles is None else {"handles": handles}),
     )
 
 

@@ -1,76 +1,75 @@
-"""Error models as files: JSON, C++, Python, Java, and covariances for ROS."""
+"""Error models of a store: their table and their JSON."""
 
 from __future__ import annotations
 
-import dataclasses
-import json
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from sweep.analysis.dimensions import axes_of
-from sweep.analysis.error_model_bins import PREDICTORS
-from sweep.analysis.error_model_sums import QUANTITIES
-from sweep.analysis.error_model_values import cell_edges, model_covariance
-from sweep.analysis.error_models import UNITS, WORDS, Use, error_models, is_kept
+from sweep.analysis.error_model_fit import CONDITIONS, PREDICTORS, QUANTITIES, VARIES
+from sweep.analysis.error_models import UNITS, WORDS, Use, cell_edges, error_models, model_errors
 from sweep.errors import ArgumentError
-from sweep.plan.camera_facts import camera_facts
-from sweep.plan.cell_selection import parse_selection
+from sweep.messages import to_json
+from sweep.plan.facts import camera_facts
+from sweep.report.formatting import interval_text, number
 from sweep.report.output_file import check_output_file, write_output_file
 from sweep.report.report_data import ReportData
+from sweep.report.table import Table
 from sweep.version import __version__
 
-SCHEMA = "sweep-error-model/1"
-
-FORMATS = {".json": "json", ".hpp": "cpp", ".h": "cpp", ".py": "python", ".java": "java",
-           ".yaml": "ros", ".yml": "ros"}
-"""Suffix of a file -> what is written into it."""
+SCHEMA = "sweep-error-model/2"
 
 FRAME = (
     "sight frame: the camera's frame (x right, y down, z forward), turned by the shortest way so "
     "that z is the line of sight to the marker's centre"
 )
-INTERPOLATION = (
-    "ln(sigma) and bias are linear between knots in ln(distance_m), ln(side_px) and "
-    "viewing_angle_deg; biases of x, y, z are interpolated as bias / distance_m. No extrapolation."
-)
+FORMULA = {
+    "u": "(ln(distance_m), ln(side_px), viewing_angle_deg, bearing_deg)",
+    "region": "u was seen if low <= sum of weights * u <= high for every direction, and if seen is "
+              "true for its cell (boundaries lie between cells); elsewhere there is no answer",
+    "weight": "product of hat functions of u at knots_u: 1 at its knot, 0 at the others, linear "
+              "between",
+    "sigma": "exp(sum over knots of weight * ln_sigma)",
+    "bias": "sum over knots of weight * bias_u; of x, y, z times distance_m",
+    "use": "of the cell of u (cells_u lie between cells)",
+    "covariance": "Q diag(sigma^2) Q^T along and about the camera's axes, Q bias its bias, for "
+                  "x, y, z and the rotation each. With the unit vector (a, b, c) to the marker "
+                  "and k = 1 / (1 + c): Q = [[1 - k a^2, -k a b, a], [-k a b, 1 - k b^2, b], "
+                  "[-a, -b, c]]",
+}
+"""How the numbers of the file are used."""
+
 RULE_M = 0.02
 """Of the usual rule for one tag: sigma = 0.02 d² metres."""
 
-
 ALWAYS = (
     "sigma is of poses that are not flipped: where flips are not rejected, flip_rate counts too",
-    "azimuth, roll and bearing are the store's, pooled; other cameras, markers and light differ",
+    "azimuth, roll and direction of the bearing are pooled; other cameras, markers, light differ",
 )
 """Warnings of every model."""
 
-MAX_CODE = 20_000
-"""Standard deviations at knots up to which they are written as code."""
 
-
-def check_error_model_file(path: str) -> str:
-    """Return the format of a file by its suffix.
+def check_error_model_file(path: str) -> None:
+    """Check that a file is to hold JSON.
 
     Raises
     ------
     ArgumentError
-        If it is none of `FORMATS`.
+        If its name ends in another suffix.
     """
-    form = FORMATS.get(Path(path).suffix.lower())
-    if form is None:
-        raise ArgumentError("error_model", path, f"expected a file that ends in {_suffixes()}")
-    if form == "java" and not Path(path).stem.isidentifier():
-        raise ArgumentError("error_model", path, "expected the name of a Java class, such as "
-                            "ErrorModel.java")
-    return form
+    if Path(path).suffix.lower() != ".json":
+        raise ArgumentError(
+            "error_model", path, "expected a file that ends in .json: the model is its formula and "
+            "coefficients, for any language; sweep/analysis/README.md has a reader of 20 lines in "
+            "Python, and sweep.analysis.model_covariance gives covariances for ROS")
 
 
-def error_model_text(models: xr.Dataset, facts: Mapping[str, Any], path: str) -> str:
+def error_model_text(models: xr.Dataset, facts: Mapping[str, Any]) -> str:
     """Return the content of a file.
 
     Parameters
@@ -78,66 +77,35 @@ def error_model_text(models: xr.Dataset, facts: Mapping[str, Any], path: str) ->
     models
         As `sweep.analysis.error_models` returns them.
     facts
-        What the models are of: ``store``, ``title``, ``fingerprint``, ``camera``, ``marker``.
-    path
-        The file: its suffix says which format.
+        What the models are of: ``store``, ``title``, ``fingerprint``, ``camera``, ``pipeline``.
     """
-    form = check_error_model_file(path)
-    if form != "json" and models["sigma"].size > MAX_CODE:
-        raise ArgumentError("error_model", path, f"{models['sigma'].size:,} numbers are too many "
-                            "for code; choose a configuration, or write JSON")
-    if form == "json":
-        return json.dumps(document(models, facts), indent=1, allow_nan=False) + "\n"
-    flat = stacked(models)
-    edges = {name: cell_edges(models, name).tolist() for name in PREDICTORS}
-    shape = [flat.sizes[name] for name in PREDICTORS]
-    distance = flat["distance_m"].values[None, None, :, None, None]
-    position = np.arange(len(QUANTITIES))[None, :, None, None, None] < 3
-    template = _environment().get_template(f"error_model.{form}.jinja")
-    return template.render(
-        facts=facts, version=__version__, name=Path(path).stem, frame=FRAME,
-        interpolation=INTERPOLATION, flags=list(Use), predictors=list(PREDICTORS),
-        quantities=list(QUANTITIES), configurations=configuration_names(models),
-        count=flat.sizes["model"], shape=shape,
-        cells=[len(each) - 1 for each in edges.values()],
-        knots=[(np.log(flat[name].values) if logarithmic else flat[name].values).tolist()
-               for name, logarithmic in PREDICTORS.items()],
-        edges=list(edges.values()),
-        focal_size=math.nan if models.attrs["focal_size_varies"] else models.attrs[
-            "focal_size_px_m"],
-        log_sigma=_flat(np.log(flat["sigma"].values)),
-        bias=_flat(np.where(position, flat["bias"].values / distance, flat["bias"].values)),
-        use=flat["use"].values.ravel().tolist(),
-        flip_rate=_flat(flat["flip_rate"].values), solved_rate=_flat(flat["solved_rate"].values),
-        covariances=list(_covariances(flat)) if form == "ros" else [],
-        warnings=warnings_of(models),
-    )
+    return to_json(document(models, facts), indent=1) + "\n"
 
 
 def document(models: xr.Dataset, facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of the JSON file; what is not a number is null."""
+    """Return the content of the file; what is not a number is null."""
     flat = stacked(models)
     edges = {name: cell_edges(models, name).tolist() for name in PREDICTORS}
     return {
         "schema": SCHEMA, "sweep": __version__, **facts,
-        "frame": FRAME, "interpolation": INTERPOLATION,
+        "frame": FRAME, "formula": FORMULA,
         "errors": "estimated minus true; rotations as rotation vector of R_est R_trueᵀ; poses that "
                   "are solved and not flipped",
-        "units": {"distance_m": "m", "side_px": "px", "viewing_angle_deg": "degree",
-                  **{name: "m" if k < 3 else "radian" for k, name in enumerate(QUANTITIES)}},
-        "predictors": dict(WORDS),
-        "side_px": None if models.attrs["focal_size_varies"] else
-        f"{models.attrs['focal_size_px_m']!r} / distance_m",
-        "domain": {name: [ends[0], ends[-1]] for name, ends in edges.items()}
-        | {"bearing_deg": [0.0, models.attrs["max_bearing_deg"]]},
+        "units": UNITS,
+        "conditions": dict(WORDS),
         "flags": {each.name: each.meaning for each in Use},
         "warnings": warnings_of(models),
         "models": [
             {
                 "configuration": configuration,
+                "side_px_times_distance_m": None if models.attrs["focal_size_varies"] else
+                models.attrs["focal_size_px_m"],
+                "region": _region(flat.isel(model=k)),
                 "knots": {name: flat[name].values.tolist() for name in PREDICTORS},
+                "knots_u": [_logarithms(name, flat[name].values) for name in PREDICTORS],
                 "cells": edges,
-                **{name: _nulls(flat[name].isel(model=k).values)
+                "cells_u": [_logarithms(name, ends[1:-1]) for name, ends in edges.items()],
+                **{name: flat[name].isel(model=k).values.tolist()
                    for name in ("looked_for", "solved_rate", "flip_rate", "judged")},
                 "quantities": {
                     quantity: _quantity(flat.isel(model=k).sel(quantity=quantity))
@@ -150,18 +118,40 @@ def document(models: xr.Dataset, facts: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def _region(model: xr.Dataset) -> dict[str, Any]:
+    """Return the joint region of a model: ends along directions, and cells with poses."""
+    ends = zip(*(model[name].values.tolist()
+                 for name in ("direction_weight", "region_low", "region_high")), strict=True)
+    return {
+        "directions": [dict(zip(("weights", "low", "high"), each, strict=True)) for each in ends],
+        "boundaries": [_logarithms(name, model[f"region_{name}"].values[1:])
+                       for name in CONDITIONS],
+        "seen": model["region_seen"].values.tolist(),
+    }
+
+
+def _logarithms(name: str, values: Any) -> Any:
+    """Return values of a condition as they stand in u."""
+    return (np.log(values) if CONDITIONS[name] else np.asarray(values)).tolist()
+
+
 def _quantity(model: xr.Dataset) -> dict[str, Any]:
     names = [Use(value).name for value in model["use"].values.ravel()]
+    metres = str(model["quantity"].item()) in QUANTITIES[:3]
+    scale = model["distance_m"].values[:, None, None] if metres else 1.0
     return {
-        "sigma": _nulls(model["sigma"].values),
-        "sigma_interval": [_nulls(model[f"sigma_{end}"].values) for end in ("low", "high")],
-        "bias": _nulls(model["bias"].values),
-        "bias_interval": [_nulls(model[f"bias_{end}"].values) for end in ("low", "high")],
+        "unit": "m" if metres else "radian",
+        "ln_sigma": (np.log(model["sigma"].values)).tolist(),
+        "bias_u": (model["bias"].values / scale).tolist(),
+        "sigma": model["sigma"].values.tolist(),
+        "sigma_interval": [model[f"sigma_{end}"].values.tolist() for end in ("low", "high")],
+        "bias": model["bias"].values.tolist(),
+        "bias_interval": [model[f"bias_{end}"].values.tolist() for end in ("low", "high")],
         "knots_needed": model["knots"].values.tolist(),
-        "exponent": _nulls(model["exponent"].values),
-        "exponent_interval": [_nulls(model[f"exponent_{end}"].values) for end in ("low", "high")],
-        "coverage": _nulls(model["coverage"].values),
-        "camera_coverage": _nulls(model["camera_coverage"].values),
+        "exponent": model["exponent"].values.tolist(),
+        "exponent_interval": [model[f"exponent_{end}"].values.tolist() for end in ("low", "high")],
+        "coverage": model["coverage"].values.tolist(),
+        "camera_coverage": model["camera_coverage"].values.tolist(),
         "use": np.reshape(np.array(names, dtype=object), model["use"].shape).tolist(),
     }
 
@@ -170,7 +160,7 @@ def _rule(model: xr.Dataset) -> dict[str, Any]:
     """Return how the usual rule for one tag compares with sigma of z at the knots."""
     rule = RULE_M * model["distance_m"] ** 2
     ratio = (rule / model["sigma"].sel(quantity="z")).transpose(*PREDICTORS)
-    return {"rule": "sigma = 0.02 d² m", "ratio_to_sigma_of_z": _nulls(ratio.values)}
+    return {"rule": "sigma = 0.02 d² m", "ratio_to_sigma_of_z": ratio.values.tolist()}
 
 
 def stacked(models: xr.Dataset) -> xr.Dataset:
@@ -179,7 +169,7 @@ def stacked(models: xr.Dataset) -> xr.Dataset:
     flat = models.drop_vars([name for name in kept if name in models.coords])
     flat = flat.stack(model=kept, create_index=False) if kept else flat.expand_dims("model")
     return flat.transpose("model", "quantity", *PREDICTORS, *(f"cell_{n}" for n in PREDICTORS),
-                          "predictor")
+                          *(f"region_{n}" for n in CONDITIONS), "direction", ...)
 
 
 def kept_of(models: xr.Dataset) -> list[str]:
@@ -219,78 +209,12 @@ def warnings_of(models: xr.Dataset) -> list[str]:
             value = float(models[name][0])
             lines.append(f"{name} did not vary ({value:.4g} {UNITS[name]}): the models hold "
                          "there alone")
+    bearing = models["direction_weight"].values[:, list(CONDITIONS).index("bearing_deg")] == 1
+    low, high = (float(extreme(models[f"region_{end}"].values[..., bearing]))
+                 for end, extreme in (("low", np.min), ("high", np.max)))
+    lines.append(f"bearings from {low:.4g} to {high:.4g} {UNITS['bearing_deg']}: the models hold "
+                 "there alone")
     return [*lines, *ALWAYS]
-
-
-def _covariances(flat: xr.Dataset) -> Any:
-    """Yield (model, distance, side, angle, use, bias, 36 numbers) of each knot on the axis."""
-    for k in range(flat.sizes["model"]):
-        model, varies = flat.isel(model=k), flat.attrs["focal_size_varies"]
-        for z in model["distance_m"].values:
-            for angle in model["viewing_angle_deg"].values:
-                sides = model["side_px"].values if varies else [model.attrs["focal_size_px_m"] / z]
-                for side in sides:
-                    pose = model_covariance(model, [0.0, 0.0, z], angle, side).isel(pose=0)
-                    yield {
-                        "model": k, "distance_m": float(z), "viewing_angle_deg": float(angle),
-                        "side_px": float(side),
-                        "use": [Use(each).name for each in pose["use"].values],
-                        "bias": pose["bias"].values.tolist(),
-                        "covariance": pose["covariance"].values.ravel().tolist(),
-                    }
-
-
-def _nulls(values: Any) -> Any:
-    """Return an array as nested lists, NaN and infinity as None."""
-    array = np.array(values)
-    if array.dtype.kind == "f":
-        finite, array = np.isfinite(array), array.astype(object)
-        array[~finite] = None
-    return array.tolist()
-
-
-def _flat(values: Any) -> list[float]:
-    return [float(value) for value in np.ravel(values)]
-
-
-def _suffixes() -> str:
-    return ", ".join(sorted(FORMATS))
-
-
-def _environment() -> Environment:
-    environment = Environment(
-        loader=PackageLoader("sweep.report"), undefined=StrictUndefined,
-        autoescape=False,  # noqa: S701  (source code, not HTML)
-        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-    )
-    environment.filters |= {
-        "numbers": _number_lines, "identifier": _identifier, "text": _one_line,
-        "string": json.dumps,
-    }
-    return environment
-
-
-def _one_line(text: Any) -> str:
-    """Return text that cannot end a comment or a line."""
-    plain = " ".join(str(text).split()).replace("*/", "* /")
-    return plain.encode("ascii", "replace").decode().replace("\\", "/")
-
-
-def _identifier(text: str) -> str:
-    """Return a name that code may have.
-
-    >>> _identifier("2 tags-v1")
-    '_2_tags_v1'
-    """
-    name = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in text)
-    return name if name[:1].isalpha() else f"_{name}"
-
-
-def _number_lines(values: Any, nan: str = "NaN", indent: int = 4) -> str:
-    """Return numbers as source code, six a line."""
-    texts = [nan if isinstance(v, float) and math.isnan(v) else repr(v) for v in values]
-    lines = [", ".join(texts[k : k + 6]) for k in range(0, len(texts), 6)]
-    return (",\n" + " " * indent).join(lines)
 
 
 def written_error_models(data: ReportData, paths: Sequence[str]) -> xr.Dataset:
@@ -301,13 +225,12 @@ def written_error_models(data: ReportData, paths: Sequence[str]) -> xr.Dataset:
     data
         The store.
     paths
-        Files, each in the format that its suffix says: ``.json``, ``.hpp`` or ``.h`` (C++17),
-        ``.py``, ``.java``, ``.yaml`` (covariances for ROS).
+        Files whose names end in ``.json``.
 
     Raises
     ------
     ArgumentError
-        If a suffix is of no format.
+        If one ends in another suffix.
     StoreError
         If a file cannot be written.
     DatasetError
@@ -317,9 +240,9 @@ def written_error_models(data: ReportData, paths: Sequence[str]) -> xr.Dataset:
         check_error_model_file(path)
         check_output_file(Path(path))
     models = models_of(data)
-    texts = [error_model_text(models, facts_of(data), path) for path in paths]
-    for path, text in zip(paths, texts, strict=True):
-        write_output_file(Path(path), text.encode("utf-8", errors="replace"))
+    content = error_model_text(models, facts_of(data)).encode()
+    for path in paths:
+        write_output_file(Path(path), content)
     return models
 
 
@@ -338,31 +261,121 @@ def facts_of(data: ReportData) -> dict[str, Any]:
     }
 
 
-def selected(data: ReportData, at: Sequence[str]) -> ReportData:
-    """Return the data at some values of axes that keep models apart: ``solver=ippe``.
+# The table.
 
-    Raises
-    ------
-    ArgumentError
-        For a name that is no such axis, or a value that the axis does not have.
-    PipelineError
-        For what is no name with a value.
-    """
-    results = data.results
-    kept = [name for name in axes_of(results) if is_kept(name, results)]
-    chosen: dict[str, Any] = {}
-    for text in at:
-        chosen |= parse_selection(text)
-    for name, value in chosen.items():
-        if name not in kept:
-            raise ArgumentError("at", name, "models are kept apart by "
-                                f"{', '.join(kept) or 'nothing'}; the others are pooled")
-        values = results[name].values.tolist()
-        equal = [k for k, each in enumerate(values) if each == value or (
-            isinstance(value, float) and isinstance(each, float)
-            and math.isclose(each, value, rel_tol=1e-9))]
-        if not equal:
-            raise ArgumentError("at", f"{name}={value}",
-                                f"expected one of {', '.join(map(str, values))}")
-        results = results.isel({name: equal})
-    return dataclasses.replace(data, results=results) if chosen else data
+CAPTION = (
+    "Standard deviation (95 % interval) and bias of the error of poses without flips, in the sight "
+    "frame: z along the line of sight"
+)
+MAX_DISTANCES, MAX_SIDES = 4, 3
+ANGLES_DEG = (0.0, 30.0, 60.0)
+"""The table has the knots nearest to these."""
+
+
+def error_model_tables(data: ReportData) -> tuple[Table, ...]:
+    """Return the table of a store's error models if they were made, as `--error-model` does."""
+    models = data.known(error_models.__name__)
+    return () if models is None else (error_model_table(models),)
+
+
+def error_model_table(models: xr.Dataset) -> Table:
+    """Return a table with a row for some distances and viewing angles of each configuration."""
+    names, flat = configuration_names(models), stacked(models)
+    rows = []
+    for k, name in enumerate(names):
+        model = flat.isel(model=k)
+        label = [name] if len(names) > 1 else []
+        rows += [[*label, *row] for at in _points(model) if (row := _row(model, at))]
+    several = ["configuration"] if len(names) > 1 else []
+    sided = ["side, px"] if models.sizes["side_px"] > 1 else []
+    headings = [
+        *several, "distance, m", *sided, "viewing angle, deg",
+        "held-out check", "x, mm", "y, mm", "z, mm",
+        "rotation x, deg", "rotation y, deg", "rotation z, deg",
+        "bias of z, mm", "0.02 d² / sigma z",
+    ]
+    return Table.of(CAPTION, headings, rows, stub=len(several) + 2 + len(sided))
+
+
+def exponent_lines(models: xr.Dataset) -> list[str]:
+    """Return, for each configuration, with which power of the distance sigma of z goes."""
+    flat = stacked(models)
+    lines = []
+    for k, name in enumerate(configuration_names(models)):
+        z = flat.isel(model=k).sel(quantity="z")
+        power, low, high = (float(z[f"exponent{end}"]) for end in ("", "_low", "_high"))
+        if not np.isfinite(power):
+            continue
+        fits = int(z["knots"].sel(predictor="distance_m")) <= 2 and (
+            int(z["knots"].sel(predictor="side_px")) <= 2)
+        of = "distance" if models.sizes["distance_m"] > 1 else "side"
+        lines.append(
+            f"{name}: sigma of z goes with the {of} to the power {number(power)} "
+            f"({interval_text(low, high)})"
+            + ("" if fits else "; a power law does not describe it, the knots do"))
+    return lines
+
+
+def _points(model: xr.Dataset) -> list[dict[str, int]]:
+    """Return indices of the knots that the table has: of the seen ones if those are few."""
+    angles = model["viewing_angle_deg"].values
+    some = [
+        _spread(model.sizes["distance_m"], MAX_DISTANCES),
+        _spread(model.sizes["side_px"], MAX_SIDES),
+        sorted({int(np.abs(angles - each).argmin()) for each in ANGLES_DEG}),
+    ]
+    points = [dict(zip(PREDICTORS, index, strict=True)) for index in itertools.product(*some)]
+    if any(_row(model, at) for at in points):
+        return points
+    every = [dict(zip(PREDICTORS, index, strict=True))
+             for index in np.ndindex(*(model.sizes[name] for name in PREDICTORS))]
+    seen = [at for at in every if _row(model, at)]
+    return [seen[k] for k in _spread(len(seen), MAX_DISTANCES * MAX_SIDES)] if seen else []
+
+
+def _spread(count: int, most: int) -> list[int]:
+    return sorted({round(float(each)) for each in np.linspace(0, count - 1, min(count, most))})
+
+
+def _row(model: xr.Dataset, at: dict[str, int]) -> list[str]:
+    """Return the texts of a knot, none if the store has no poses there."""
+    point = model.isel(at)
+    distance, angle = (float(point[name]) for name in ("distance_m", "viewing_angle_deg"))
+    side = float(point["side_px"]) if model.attrs["focal_size_varies"] else None
+    use = model_errors(model, _held(model, "distance_m", distance), _held(
+        model, "viewing_angle_deg", angle), side)["use"].values[0]
+    if (use == Use.no_poses).all():
+        return []
+    texts = []
+    for k, name in enumerate(QUANTITIES):
+        scale = 1e3 if k < 3 else float(np.degrees(1.0))
+        sigma, low, high = (
+            scale * float(point[f"sigma{end}"].sel(quantity=name)) for end in ("", "_low", "_high"))
+        texts.append(f"{number(sigma)} ({interval_text(low, high)})")
+    sided = [number(float(point["side_px"]))] if model.sizes["side_px"] > 1 else []
+    bias = 1e3 * float(point["bias"].sel(quantity="z"))
+    ratio = RULE_M * distance**2 / float(point["sigma"].sel(quantity="z"))
+    return [number(distance), *sided, number(angle), _use(use), *texts, number(bias), number(ratio)]
+
+
+def _held(model: xr.Dataset, name: str, value: float) -> float:
+    """Return a knot, moved into the model's region if it is another model's end beside it."""
+    k = list(CONDITIONS).index(name)
+    low, high = (float(model[f"region_{end}"][k]) for end in ("low", "high"))
+    if CONDITIONS[name]:
+        low, high = math.exp(low), math.exp(high)
+        near = low / VARIES[name] < value < high * VARIES[name]
+    else:
+        near = low - VARIES[name] < value < high + VARIES[name]
+    return min(max(value, low), high) if near else value
+
+
+def _use(use: Iterable[int]) -> str:
+    """Return whether the models of a cell hold, and of which errors they do not."""
+    by_flag: dict[int, list[str]] = {}
+    for flag, name in zip(use, QUANTITIES, strict=True):
+        by_flag.setdefault(int(flag), []).append(name.replace("_", " "))
+    if len(by_flag) == 1:
+        return Use(next(iter(by_flag))).name.replace("_", " ")
+    return "; ".join(f"{', '.join(names)} {Use(flag).name.replace('_', ' ')}"
+                     for flag, names in by_flag.items() if flag != Use.holds)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from sweep.tradeoff.labels import digits
+from sweep.tradeoff.pareto import digits
 
 MAX_SHORT = 5
 """Characters of a number that needs no rounding to be short."""

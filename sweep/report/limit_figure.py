@@ -1,12 +1,12 @@
-"""The figure of limits: each against the first axis of conditions, and which cells are met."""
+"""Limits along an axis: their table and figure."""
 
 from __future__ import annotations
 
 import itertools
-import tempfile
+import math
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -14,16 +14,197 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.patches import Patch
 
-from sweep.analysis.farthest import Reach
+from sweep.analysis.limits import Reach
 from sweep.analysis.requirements import Decision
-from sweep.report.charts import draw_dots, draw_lines, rows_height
-from sweep.report.formatting import coordinate, coordinates
-from sweep.report.grouping import axis_label
-from sweep.report.limit_table import dimensions
-from sweep.report.scales import Series, grow_by_factors, plain_ticks, spans
-from sweep.report.svg import Panel, write_panels
-from sweep.report.theme import COLOURS, INK, PAPER, REFERENCE_DASHES, STRIP
+from sweep.report.charts import (
+    COLOURS,
+    INK,
+    PAPER,
+    REFERENCE_DASHES,
+    STRIP,
+    Panel,
+    Series,
+    draw_dots,
+    draw_lines,
+    grow_by_factors,
+    legend_above,
+    plain_ticks,
+    rows_height,
+    spans,
+)
+from sweep.report.formatting import coordinate, coordinates, number, plural, short_coordinate
+from sweep.report.report_data import axis_label
+from sweep.report.table import Table
 from sweep.typing import Floats
+
+# --------------------------------------------------------------------------------------------------
+# Limits that requirements have along an axis, as a table for a terminal, a page, or JSON.
+
+UNITS = {"degree": "\u00b0", "1": "", "": ""}
+
+
+def limit_table(limits: xr.Dataset) -> Table:
+    """Return a row for each configuration and condition of `sweep.analysis.requirement_limits`."""
+    along, dims = str(limits.attrs["along"]), dimensions(limits)
+    rows = []
+    for index in np.ndindex(*(limits.sizes[name] for name in dims)):
+        one = limits.isel(dict(zip(dims, index, strict=True)))
+        rows.append([*(coordinate(one[name].item()) for name in dims), limit_text(one),
+                     interval_text(one), cause_text(one), beyond_text(one),
+                     f"{int(one['poses']):,}"])
+    required = " and ".join(map(str, limits.attrs["require"]))
+    return Table.of(
+        f"How far along {along}: {required}",
+        [*dims, "met", "95 % interval", "fails first", "beyond", "poses"], rows,
+        stub=len(dims), words=True)
+
+
+def dimensions(limits: xr.Dataset) -> list[str]:
+    """Return the dimensions of the limits: conditions, then configurations."""
+    configurations = limits.attrs["configuration_dims"]
+    return [*(name for name in limits["value"].dims if name not in configurations),
+            *configurations]
+
+
+def limit_text(one: xr.Dataset) -> str:
+    """Return up to where requirements are met in one condition: ``up to 1.2 m``.
+
+    What is not decided is called so, whatever the estimates are.
+    """
+    text = _estimate_text(one)
+    if bool(one["settled"]) or Reach(int(one["reach"])) is Reach.not_run:
+        return text
+    if not is_met_to_value(one):
+        return f"not decided: {text}"
+    return text if Reach(int(one["reach"])) is Reach.always else f"{text}, not decided beyond"
+
+
+def is_met_to_value(one: xr.Dataset) -> bool:
+    """Return whether all values up to the limit are decided to be met."""
+    return float(one["value"]) == met_to(one)
+
+
+def met_to(one: xr.Dataset) -> float:
+    """Return the value up to which all is decided to be met; infinite for none."""
+    return float(one["low" if one.attrs["harder"] == "upwards" else "high"])
+
+
+def _estimate_text(one: xr.Dataset) -> str:
+    reach = Reach(int(one["reach"]))
+    if reach is Reach.not_run:
+        return "nothing to judge"
+    if reach is Reach.never:
+        return "at no value"
+    upwards = one.attrs["harder"] == "upwards"
+    bound = "up to" if upwards else "down to"
+    value = with_unit(one, float(one["value"]))
+    if reach is Reach.always:
+        return f"at all values, {bound} {value}"
+    start = float(one["start"])
+    if reach is Reach.within and start == float(one["value"]):
+        return f"only at {value}"
+    if reach is Reach.within:
+        low, high = sorted((start, float(one["value"])))
+        return f"{_short(one, low)} to {with_unit(one, high)}"
+    return f"{bound} {value}"
+
+
+def interval_text(one: xr.Dataset) -> str:
+    """Return the interval of the limit: ``1.1 to 1.3``; an open end is that of the grid."""
+    low, high = float(one["low"]), float(one["high"])
+    if math.isnan(low) or math.isnan(high):
+        return "none"
+    values = np.sort(one[one.attrs["along"]].values)
+    least, most = _short(one, float(values[0])), _short(one, float(values[-1]))
+    if low == high and math.isfinite(low):
+        return f"{_short(one, low)}"
+    ends = [f"below {least}" if low == -math.inf else
+            f"beyond {most}" if low == math.inf else _short(one, low),
+            f"beyond {most}" if high == math.inf else
+            f"below {least}" if high == -math.inf else _short(one, high)]
+    return ends[0] if ends[0] == ends[1] else " to ".join(ends)
+
+
+def cause_text(one: xr.Dataset) -> str:
+    """Return what fails first beyond: ``1.3 m: detection_rate 0.874 (tilt_deg = 60)``."""
+    name = str(one["limited_by"].item())
+    if not name:
+        return ""
+    where = str(one["fails_where"].item())
+    return (f"{with_unit(one, float(one['fails_at']))}: {name.split(maxsplit=1)[0]} "
+            f"{number(float(one['failing_value']))}{f' ({where})' if where else ''}")
+
+
+def beyond_text(one: xr.Dataset) -> str:
+    """Return whether the estimates keep all limits again beyond: then there may be a dip."""
+    count = int(np.nan_to_num(float(one["met_beyond"])))
+    if not count:
+        return ""
+    return f"kept again by estimate, farthest at {with_unit(one, float(one['farthest_beyond']))}"
+
+
+def summary_lines(limits: xr.Dataset) -> list[str]:
+    """Return sentences on all limits together."""
+    reach, settled = limits["reach"].values, limits["settled"].values
+    count = reach.size
+    along, upwards = limits.attrs["along"], limits.attrs["harder"] == "upwards"
+    met = limits["value"].values == limits["low" if upwards else "high"].values
+    decided = settled | (reach == Reach.not_run) | ((reach == Reach.always) & met)
+    lines = []
+    for flag, words in ((Reach.always, f"met at every value of {along}: the limit may lie beyond"),
+                        (Reach.never, f"met at no value of {along}"),
+                        (Reach.not_run, "nothing to judge")):
+        if number_of := int(((reach == flag) & decided).sum()):
+            lines.append(f"{plural(number_of, 'limit') if number_of < count else 'all'}: {words}")
+    dips = int((limits["met_beyond"].values > 0).sum())
+    if dips:
+        lines.append(f"{plural(dips, 'condition')} with a dip: beyond it the estimates keep all "
+                     "limits again, which the limit does not count")
+    if wide := int((~settled).sum()):
+        lines.append(f"{plural(wide, 'limit')} of {count:,} {'is' if wide == 1 else 'are'} not "
+                     "decided to one value of the grid: see the intervals; more --max-trials "
+                     "decide more, unless a rate is all but the limit")
+    easy = "small" if upwards else "large"
+    lines.append(f"limits are read from {easy} to {'large' if upwards else 'small'} values of "
+                 f"{along}")
+    return lines
+
+
+def with_unit(one: xr.Dataset, value: float) -> str:
+    """Return a value of the axis with its unit."""
+    units = str(one[one.attrs["along"]].attrs.get("units", ""))
+    unit = UNITS.get(units, f" {units}")
+    return f"{_short(one, value)}{unit}"
+
+
+def _short(one: xr.Dataset, value: float) -> str:
+    return short_coordinate(value, one[one.attrs["along"]].values.tolist())
+
+
+def as_json(limits: xr.Dataset) -> dict[str, Any]:
+    """Return limits as JSON values: a list with the fields of each condition.
+
+    ``value`` and ``reach`` are by the estimates; ``met_to`` is the value up to which all is decided
+    to be met, ``decided`` whether the interval is that single value.
+    """
+    dims = dimensions(limits)
+    names = ("value", "low", "high", "start", "fails_at", "failing_value", "limited_by",
+             "fails_where", "met_beyond", "farthest_beyond", "settled", "poses")
+    listed = []
+    for index in np.ndindex(*(limits.sizes[name] for name in dims)):
+        one = limits.isel(dict(zip(dims, index, strict=True)))
+        listed.append({
+            "condition": {name: one[name].item() for name in dims},
+            "reach": Reach(int(one["reach"])).name,
+            "decided": bool(one["settled"]), "met_to": met_to(one),
+            **{name: one[name].item() for name in names}})
+    return {"along": limits.attrs["along"], "harder": limits.attrs["harder"],
+            "require": list(limits.attrs["require"]), "at_all": list(limits.attrs["at_all"]),
+            "units": str(limits[limits.attrs["along"]].attrs.get("units", "")), "limits": listed}
+
+
+# --------------------------------------------------------------------------------------------------
+# The figure of limits: each against the first axis of conditions, and which cells are met.
 
 MAX_LINES = 6
 """Lines of one panel; more conditions have rows in place of lines."""
@@ -134,11 +315,8 @@ def draw_cells(axes: Axes, limits: xr.Dataset, axis: str) -> None:
             matplotlib_axis.set_ticks(list(values), labels=coordinates(values.tolist()))
     axes.set_xlabel(axis_label(limits, axis))
     axes.set_ylabel(axis_label(limits, along))
-    axes.legend(
-        handles=[Patch(facecolor=colour, alpha=alpha, label=word)
-                 for colour, alpha, word in FILLS.values()],
-        loc="lower left", bbox_to_anchor=(-0.02, 1.02), ncols=3, borderaxespad=0,
-        columnspacing=1.1, handletextpad=0.5, borderpad=0.2)
+    legend_above(axes, columns=3, handles=[Patch(facecolor=colour, alpha=alpha, label=word)
+                 for colour, alpha, word in FILLS.values()])
 
 
 def _is_logarithmic(values: Floats) -> bool:
@@ -163,11 +341,3 @@ def _edge(edges: Floats, values: Floats, limit: float, *, upwards: bool) -> floa
     if np.isinf(limit):
         return float(edges[-1 if limit > 0 else 0])
     return float(edges[int(np.argmin(np.abs(values - limit))) + (1 if upwards else 0)])
-
-
-def figure_bytes(limits: xr.Dataset, suffix: str) -> bytes:
-    """Return the figure as a file of ".svg" or ".png"."""
-    with tempfile.TemporaryDirectory() as folder:
-        stem = Path(folder) / "limits"
-        write_panels(limit_panels(limits), stem)
-        return stem.with_suffix(suffix).read_bytes()

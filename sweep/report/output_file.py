@@ -10,12 +10,12 @@ import contextlib
 import os
 import stat
 import sys
-import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
 from sweep.errors import StoreError
 from sweep.messages import plain
+from sweep.store.files import check_folder_writable, write_whole
 from sweep.store.locations import reason_of
 
 FIGURE_SUFFIXES = (".png", ".svg")
@@ -48,9 +48,7 @@ def check_output_file(path: Path) -> None:
     """
     with write_errors_explained(path):
         if _is_replaced(path):
-            temporary = _beside(_target(path))
-            temporary.touch(exist_ok=False)
-            temporary.unlink()
+            check_folder_writable(_target(path).parent)
         else:
             os.close(_opened(path))
 
@@ -68,15 +66,7 @@ def write_output_file(path: Path, content: bytes) -> None:
             with os.fdopen(_opened(path), "wb") as file:
                 file.write(content)
             return
-        real = _target(path)
-        temporary = _beside(real)
-        try:
-            temporary.write_bytes(content)
-            if real.exists():
-                temporary.chmod(stat.S_IMODE(real.stat().st_mode))
-            temporary.replace(real)
-        finally:
-            temporary.unlink(missing_ok=True)
+        write_whole(_target(path), content)
 
 
 def is_standard_stream(path: Path) -> bool:
@@ -140,7 +130,3 @@ def _target(path: Path) -> Path:
     if not target.parent.is_dir():
         raise StoreError(f"{path}: cannot be written: folder {target.parent} not found")
     return target
-
-
-def _beside(path: Path) -> Path:
-    return path.with_name(f".sweep-{uuid.uuid4().hex}")

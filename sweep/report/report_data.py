@@ -1,42 +1,178 @@
-"""The data of a report: a store's results, the roles of its axes, and analyses computed once."""
+"""The data of a report: results, roles of axes, analyses computed once, groups."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import functools
+import itertools
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
-from sweep.analysis.conditions import conditions
+from sweep.analysis import error_statistics
 from sweep.analysis.detection_limits import SIZE_AXES
-from sweep.analysis.requirements import parse_requirements
+from sweep.analysis.requirements import conditions, parse_requirements
 from sweep.errors import StoreError, SweepError
+from sweep.evaluation.block import bound_notes
 from sweep.measure.flags import DetectionStatus, uncounted_values
 from sweep.model.camera import VIEW_PARAMETERS
-from sweep.plan.alternatives import WORLD
-from sweep.plan.axes import TRIAL
-from sweep.plan.experiment import Pipeline
-from sweep.plan.parameters import Stage
-from sweep.report.grouping import (
-    ANGLES,
-    AREA,
-    Grouping,
-    area_bins,
-    axis_label,
-    bins_of,
-    chosen_of,
-    drawn_bins,
-    is_numeric,
-)
-from sweep.store.lifecycle import open_dataset, open_store
+from sweep.plan.axes import TRIAL, Axis, Distribution
+from sweep.plan.parameters import WORLD, Stage
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.same_meaning import distinct, used_settings, wrong_configurations
+from sweep.report.formatting import bin_text, coordinates, plural
+from sweep.store.lifecycle import open_dataset, open_store, unfinished_line
 from sweep.store.outcome import outcome_of_finished
-from sweep.store.snapshot import snapshot
-from sweep.store.unfinished import unfinished_line
+from sweep.tradeoff.pareto import WRONG, configuration_label
+from sweep.typing import Floats
+
+# --------------------------------------------------------------------------------------------------
+# Groups of poses that a figure compares, and the labels of groups.
+
+AREA = "marker_area_px"
+ANGLES = {"tilt_deg": "tilt", "view_angle_deg": "viewing angle"}
+"""Axes along which the marker is turned away, and their names in sentences."""
+
+IDS = "marker_id"
+CONFIGURATION = "configuration"
+"""Dimension of tables that have a row for each configuration."""
+
+AREA_BINS = 24
+
+DRAWN_BINS = 10
+"""Bins of a drawn parameter."""
+
+
+@dataclass(frozen=True, slots=True)
+class Grouping:
+    """How the poses are grouped.
+
+    Attributes
+    ----------
+    per
+        Axes whose values are groups.
+    bins
+        Axes, or the area, with the edges of bins that are groups.
+    chosen
+        Axes of which only the values at these indices are kept.
+    notes
+        Sentences for the reader about bins and chosen values.
+    """
+
+    per: tuple[str, ...] = ()
+    bins: tuple[tuple[str, tuple[float, ...]], ...] = ()
+    chosen: tuple[tuple[str, tuple[int, ...]], ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        """Dimensions of an analysis of these groups."""
+        return self.per + tuple(name for name, _ in self.bins)
+
+    def __add__(self, other: Grouping) -> Grouping:
+        return Grouping(
+            self.per + other.per, self.bins + other.bins, self.chosen + other.chosen,
+            self.notes + other.notes,
+        )
+
+
+def area_bins(low: float, high: float) -> Grouping:
+    """Return the grouping by bins of the area, of equal ratio, between two areas in px²."""
+    areas = np.geomspace(low, high, AREA_BINS + 1)
+    areas[[0, -1]] = low, np.nextafter(high, np.inf)
+    return Grouping(
+        bins=((AREA, tuple(areas.tolist())),),
+        notes=(f"Areas are grouped into {AREA_BINS} bins of equal ratio.",),
+    )
+
+
+def drawn_bins(name: str, distribution: Distribution) -> Grouping:
+    """Return the grouping of a drawn parameter by bins of equal probability."""
+    edges = distribution.at(np.arange(1, DRAWN_BINS) / DRAWN_BINS)
+    ends = (-np.inf, np.inf)
+    if distribution.kind == "uniform":
+        ends = (distribution.a, float(np.nextafter(distribution.b, np.inf)))
+    note = f"The draws of {name} are grouped into {DRAWN_BINS} bins of equal probability."
+    return Grouping(bins=((name, (ends[0], *edges.tolist(), ends[1])),), notes=(note,))
+
+
+def equal_bins(name: str, low: float, high: float, width: float) -> Grouping:
+    """Return the grouping by bins of equal width between multiples of it, around two values."""
+    first, last = np.floor(low / width), max(np.ceil(high / width), np.floor(low / width) + 1)
+    edges = width * np.arange(first, last + 1)
+    edges[-1] = max(edges[-1], np.nextafter(high, np.inf))
+    return Grouping(bins=((name, tuple(edges.tolist())),))
+
+
+def bins_of(name: str, values: Floats, most: int) -> Grouping:
+    """Return the grouping of an axis' values (n,) into ``most`` bins of about as many each."""
+    groups = np.array_split(np.sort(values), most)
+    between = [float(a[-1] + b[0]) / 2 for a, b in itertools.pairwise(groups)]
+    edges = (float(groups[0][0]), *between, float(np.nextafter(groups[-1][-1], np.inf)))
+    note = f"The {len(values):,} values of {name} are grouped into {len(edges) - 1} bins."
+    return Grouping(bins=((name, edges),), notes=(note,))
+
+
+def chosen_of(name: str, length: int, most: int) -> Grouping:
+    """Return the grouping by ``most`` of the ``length`` values of an axis, evenly spaced."""
+    chosen = tuple(np.linspace(0, length - 1, most).round().astype(int).tolist())
+    note = f"{most} of the {length:,} values of {name} are shown."
+    return Grouping((name,), chosen=((name, chosen),), notes=(note,))
+
+
+def is_numeric(axis: Axis) -> bool:
+    """Return whether an axis' values are numbers, and not labels or switches."""
+    return not axis.labelled and not isinstance(axis.values[0], bool)
+
+
+def axis_label(results: xr.Dataset, name: str) -> str:
+    """Return the name of a coordinate or variable in words, with its unit: ``distance, m``."""
+    names = {AREA: "area of the marker", "side_px": "side of the marker"}
+    units = str(results[name].attrs.get("units", "")) if name in results.variables else ""
+    words = names.get(name, name)
+    for ending in ("_deg", "_m", "_px", "_s", "_mm", "_e", "_m_s"):
+        if units and words == name and name.endswith(ending):
+            words = name.removesuffix(ending)
+    unit = {"px2": "px²", "degree": "deg"}.get(units, units)
+    words = words.replace("_", " ")
+    return f"{words}, {unit}" if unit else words
+
+
+def group_labels(table: xr.Dataset, name: str) -> list[str]:
+    """Return the values of a dimension as text; of bins their ends."""
+    if f"{name}_low" in table.coords:
+        ends = zip(table[f"{name}_low"].values, table[f"{name}_high"].values, strict=True)
+        return [bin_text(low, high) for low, high in ends]
+    return coordinates(table[name].values.tolist())
+
+
+def by_configuration(
+    pipeline: Pipeline, table: xr.Dataset, dims: Sequence[str]
+) -> tuple[list[str], xr.Dataset]:
+    """Return the labels of all combinations of the settings ``dims``, and the table by them.
+
+    In the table the dimension ``configuration`` stands in place of ``dims``; without any it has
+    one row. Combinations that differ in settings alone which they do not use are one.
+    """
+    values = [table[dim].values.tolist() for dim in dims]
+    combinations = [dict(zip(dims, chosen, strict=True)) for chosen in itertools.product(*values)]
+    kept = distinct(pipeline, combinations)
+    labels = [configuration_label(used_settings(pipeline, combinations[k])) for k in kept]
+    stacked = table.stack({CONFIGURATION: list(dims)}, create_index=False) if dims else (
+        table.expand_dims(CONFIGURATION))
+    stacked = stacked.isel({CONFIGURATION: kept}).drop_vars([*dims], errors="ignore")
+    stacked = stacked.assign_coords({CONFIGURATION: labels})
+    return labels, stacked.transpose(CONFIGURATION, ...)
+
+
+# --------------------------------------------------------------------------------------------------
+# The data of a report: a store's results, the roles of its axes, and analyses computed once.
 
 MAX_LOADED_BYTES = 600_000_000
 """Results up to this size are loaded at once: many figures read the same values, and many small
@@ -287,7 +423,7 @@ def read_report_data(
         Path or URL of the store.
     require, per
         What is required, by default by the pipeline, and the dimensions whose values are
-        conditions, by default those of `sweep.analysis.conditions`.
+        conditions, by default those of `sweep.analysis.requirements`.
     command
         The command line that asked for the report.
 
@@ -305,14 +441,177 @@ def read_report_data(
     with store_errors(store.url):
         if "cost/tradeoff" in store.group:
             trade = xr.open_zarr(
-                snapshot(store), group="cost/tradeoff", consolidated=False, zarr_format=3
+                store.storage, group="cost/tradeoff", consolidated=False, zarr_format=3
             ).load()
         results = open_dataset(store.url)
     required = tuple(require) or store.pipeline.requirements
     return ReportData(
         store.url, results, store.pipeline, store.run_metadata, trade,
-        tuple(outcome_of_finished(store).warnings),
+        (*outcome_of_finished(store).warnings, *bound_notes(store.pipeline)),
         tuple(each.text for each in parse_requirements(required)) if required else (),
         conditions(results, per, store.pipeline.require_per),
         command,
     )
+
+
+# --------------------------------------------------------------------------------------------------
+# The configurations of a store, their order, and the beliefs that are not the truth.
+#
+# A configuration is a combination of detector and estimator settings. They are compared, never
+# pooled; of a store with very many some are chosen.
+
+MAX_CONFIGURATIONS = 30
+"""Configurations that a table or a figure of all of them compares."""
+
+MAX_LINES = 7
+"""Configurations that have a line of their own in a chart."""
+
+BOTH = (Stage.detection, Stage.estimation)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Combinations of the values of some axes of settings.
+
+    Attributes
+    ----------
+    axes
+        Axis -> indices of its values.
+    grouping
+        Of analyses that keep them apart.
+    kept
+        Which of all combinations, the last axis fastest, are configurations of their own: the first
+        of those that differ in settings alone which they do not use.
+    """
+
+    axes: dict[str, tuple[int, ...]]
+    grouping: Grouping
+    kept: tuple[int, ...]
+
+    @property
+    def combinations(self) -> list[dict[str, int]]:
+        """The index along each axis, of every configuration; one that is empty without axes."""
+        every = list(itertools.product(*self.axes.values()))
+        return [dict(zip(self.axes, every[k], strict=True)) for k in self.kept]
+
+
+def settings_of(
+    data: ReportData, stages: Sequence[Stage] = BOTH, without: Sequence[str] = (),
+    most: int = MAX_CONFIGURATIONS, also: Sequence[str] = (),
+) -> Settings:
+    """Return the combinations of the settings of some stages, about ``most`` if there are more.
+
+    Then values of the longest axes are chosen, evenly spaced. ``without`` are axes that are left
+    out, since a figure is along them; ``also`` are further axes, as of targets.
+    """
+    lengths = {name: data.length(name) for name in also} | {
+        axis.name: len(axis) for axis in data.pipeline.axes_of(*stages)
+        if len(axis) > 1 and axis.name not in without
+    }
+    chosen = dict(lengths)
+    while math.prod(chosen.values()) > most and max(chosen.values()) > 2:
+        chosen[max(chosen, key=lambda name: chosen[name])] -= 1
+    axes, grouping = {}, Grouping()
+    for name, length in chosen.items():
+        part = data.along(name, length, binned=False)
+        axes[name] = dict(part.chosen).get(name, tuple(range(length)))
+        grouping += part
+    values = [[data.results[name].values.tolist()[k] for k in some] for name, some in axes.items()]
+    kept = distinct(data.pipeline, [
+        dict(zip(axes, each, strict=True)) for each in itertools.product(*values)])
+    return Settings(axes, grouping, tuple(kept))
+
+
+@dataclass(frozen=True, eq=False)
+class Configurations:
+    """The configurations that a report compares.
+
+    Attributes
+    ----------
+    settings
+        What tells them apart.
+    names
+        Their n labels.
+    wrong
+        (n,) whether the estimator believes what is known not to be true; nowhere if that holds for
+        all of them.
+    summary
+        `sweep.analysis.error_statistics` by configuration (n,).
+    order
+        (n,) indices: right beliefs first, of these the smallest median rotation error first.
+    """
+
+    settings: Settings
+    names: list[str]
+    wrong: NDArray[np.bool_]
+    summary: xr.Dataset
+    order: tuple[int, ...]
+
+    @property
+    def several(self) -> bool:
+        """Whether there is more than one."""
+        return len(self.names) > 1
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on values of settings that are not shown."""
+        return self.settings.grouping.notes
+
+
+def configurations(data: ReportData) -> Configurations:
+    """Return the configurations of a store, in order."""
+    return data.remembered("configurations", lambda: _configurations(data))
+
+
+def _configurations(data: ReportData) -> Configurations:
+    settings = settings_of(data)
+    names, summary = by_configuration(
+        data.pipeline, data.analysed(error_statistics, settings.grouping), settings.grouping.dims)
+    axes = [axis for axis in data.pipeline.axes_of(*BOTH) if axis.name in settings.axes]
+    flags = np.array(wrong_configurations(data.pipeline, axes)).reshape(
+        [len(axis) for axis in axes])
+    wrong = flags[np.ix_(*settings.axes.values())].reshape(-1) if axes else flags.reshape(-1)
+    wrong = wrong[list(settings.kept)]
+    names = [name + WRONG * bool(flag) for name, flag in zip(names, wrong, strict=True)]
+    median = summary["rotation_median_deg"].values.astype(np.float64)
+    solved = np.nan_to_num(summary["solved_rate"].values.astype(np.float64))
+    order = np.lexsort((-solved, np.where(np.isnan(median), np.inf, median), wrong))
+    return Configurations(settings, names, wrong, summary, tuple(order.tolist()))
+
+
+def most_exact_first(data: ReportData, settings: Settings) -> list[int]:
+    """Return the combinations of some settings in the order of their best configurations."""
+    known = configurations(data)
+    all_of_them = known.settings.combinations
+
+    def rank_of(each: dict[str, int]) -> int:
+        return next((
+            rank for rank, k in enumerate(known.order)
+            if all(all_of_them[k].get(name, index) == index for name, index in each.items())
+        ), len(known.order))
+
+    ranks = [rank_of(each) for each in settings.combinations]
+    return sorted(range(len(ranks)), key=lambda k: (ranks[k], k))
+
+
+def shown_lines(data: ReportData, settings: Settings, most: int = MAX_LINES) -> list[int]:
+    """Return which combinations a chart shows: the first in order, as they stand in the grid."""
+    return sorted(most_exact_first(data, settings)[:most])
+
+
+def shown_note(shown: Sequence[int], count: int) -> str:
+    """Return a sentence that says which of the configurations a chart shows, if not all."""
+    if len(shown) == count:
+        return ""
+    return (f"Drawn: the {len(shown):,} of {plural(count, 'configuration')} with the smallest "
+            "median rotation error; the table has all.")
+
+
+def first_detector(data: ReportData) -> tuple[dict[str, int], str]:
+    """Return the detector's settings of the first configuration in order, and their label."""
+    known = configurations(data)
+    best = known.settings.combinations[known.order[0]]
+    names = {axis.name for axis in data.pipeline.axes_of(Stage.detection)}
+    index = {name: k for name, k in best.items() if name in names}
+    values = {name: data.results[name].values.tolist()[k] for name, k in index.items()}
+    return index, configuration_label(used_settings(data.pipeline, values)) if index else ""

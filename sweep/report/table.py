@@ -1,35 +1,43 @@
-"""Tables of a report: their cells as text, and as Markdown."""
+"""Tables: data frames of texts with headings, units and intervals, and their printers."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
+from sweep.messages import columns, plain
 from sweep.report.formatting import interval_text, number
-from sweep.report.grouping import axis_label, group_labels
+from sweep.report.report_data import axis_label, group_labels
 from sweep.tradeoff.pareto import interval
 
 MAX_ROWS = 300
 """Rows of a table that a page shows."""
 
+MAX_WIDTH, GAP = 140, "  "
+"""Characters of a line of plain text, and between columns."""
+
 MAX_LINE_CHARS = 28
 """Characters of a cell that stand in one line."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Table:
-    """A table of text.
+    """A table of text, and its printers: plain text, Markdown, JSON; a template makes HTML.
 
     Attributes
     ----------
     caption
-        What the table holds.
-    headings, rows
-        Text of the columns' headings and of the cells.
+        Subject of the table.
+    frame
+        Texts of the cells; the columns' names are headings with units, values have their intervals
+        behind them.
     stub
         Number of leading columns that name a row.
     words
@@ -37,35 +45,70 @@ class Table:
     """
 
     caption: str
-    headings: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    frame: pd.DataFrame
     stub: int = 1
     words: bool = False
 
+    @classmethod
+    def of(
+        cls, caption: str, headings: Sequence[str], rows: Sequence[Sequence[str]], *,
+        stub: int = 1, words: bool = False,
+    ) -> Table:
+        """Return a table of rows."""
+        return cls(caption, pd.DataFrame(
+            [list(row) for row in rows], columns=list(headings), dtype=object), stub, words)
+
     @property
-    def shown_rows(self) -> Sequence[Sequence[str]]:
+    def headings(self) -> list[str]:
+        """The columns' headings."""
+        return list(map(str, self.frame.columns))
+
+    @property
+    def rows(self) -> list[list[str]]:
+        """The texts of all rows."""
+        rows: list[list[str]] = self.frame.to_numpy().tolist()
+        return rows
+
+    @property
+    def shown_rows(self) -> list[list[str]]:
         """The rows that a page shows."""
         return self.rows[:MAX_ROWS]
 
     @property
     def full_caption(self) -> str:
         """The caption, with the number of rows if not all are shown."""
-        if len(self.rows) <= MAX_ROWS:
+        if len(self.frame) <= MAX_ROWS:
             return self.caption
-        return f"{self.caption} (the first {MAX_ROWS} of {len(self.rows):,} rows)"
+        return f"{self.caption} (the first {MAX_ROWS} of {len(self.frame):,} rows)"
 
     @property
     def column_classes(self) -> list[str]:
         """CSS class of each column: ``n`` numbers, ``text`` long words, empty for others."""
-        return [self._column_class(k) for k in range(len(self.headings))]
+        return ["" if k < self.stub else "n" if not self.words else
+                "text" if any(len(row[k]) > MAX_LINE_CHARS for row in self.rows) else ""
+                for k in range(len(self.headings))]
 
-    def _column_class(self, column: int) -> str:
-        if column < self.stub:
-            return ""
-        if not self.words:
-            return "n"
-        long = any(len(row[column]) > MAX_LINE_CHARS for row in self.rows)
-        return "text" if long else ""
+    def text(self) -> str:
+        """Return it in aligned columns below its caption, for a terminal.
+
+        Empty columns are left out; those beyond a line of `MAX_WIDTH` characters stand below,
+        again beside the columns that name a row.
+        """
+        lines = [[plain(cell, len(cell)) for cell in row]
+                 for row in (self.headings, *self.shown_rows)]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        used = [k for k in range(len(widths)) if k < self.stub or any(row[k] for row in lines[1:])]
+        stub = used[: self.stub]
+        parts = [stub[:]]
+        for k in used[self.stub :]:
+            width = sum(widths[j] + len(GAP) for j in parts[-1]) + widths[k]
+            if width > MAX_WIDTH and len(parts[-1]) > len(stub):
+                parts.append(stub[:])
+            parts[-1].append(k)
+        left = [k for k in range(len(widths)) if k < self.stub or self.words]
+        return "\n\n".join([plain(self.full_caption, len(self.full_caption)), *(
+            columns([[row[k] for k in part] for row in lines], gap=GAP,
+                    right=[j for j, k in enumerate(part) if k not in left]) for part in parts)])
 
     def markdown(self) -> str:
         """Return it as a Markdown table behind its caption."""
@@ -76,6 +119,11 @@ class Table:
         ]
         table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
         return f"{markdown_text(self.full_caption)}\n\n{table}"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return caption, headings and rows, with the minus sign of ASCII."""
+        return {"caption": self.caption, "headings": self.headings,
+                "rows": [[cell.replace("\u2212", "-") for cell in row] for row in self.rows]}
 
 
 def markdown_text(text: str) -> str:
@@ -94,7 +142,7 @@ def _markdown_cell(text: str) -> str:
 
 def table_of(
     summary: xr.Dataset, caption: str, dims: Sequence[str],
-    columns: Mapping[str, tuple[str, float]], sources: xr.Dataset | None = None,
+    wanted: Mapping[str, tuple[str, float]], sources: xr.Dataset | None = None,
 ) -> Table:
     """Return a table with a row for each combination of ``dims``.
 
@@ -106,24 +154,26 @@ def table_of(
         What the table holds.
     dims
         Dimensions of ``summary``, all of them.
-    columns
+    wanted
         Heading -> variable and the factor that it is multiplied by; a variable that ``summary``
         lacks is left out.
     sources
         A dataset with the units of ``dims``, if ``summary`` has none.
     """
-    present = {heading: column for heading, column in columns.items() if column[0] in summary}
     labels = [group_labels(summary, dim) for dim in dims]
-    texts = [
-        cells(summary.transpose(*dims, ...), name, scale) for name, scale in present.values()
-    ]
-    rows = [
-        [*(names[k] for names, k in zip(labels, index, strict=True)),
-         *(column[position] for column in texts)]
-        for position, index in enumerate(np.ndindex(*(len(names) for names in labels)))
-    ]
+    names = list(itertools.product(*labels))
+    texts = column_texts(summary.transpose(*dims, ...), wanted)
     headings = [axis_label(sources if sources is not None else summary, dim) for dim in dims]
-    return Table(caption, [*headings, *present], rows, stub=len(dims))
+    rows = [[*name, *values] for name, *values in zip(names, *texts.values(), strict=True)]
+    return Table.of(caption, [*headings, *texts], rows, stub=len(dims))
+
+
+def column_texts(
+    summary: xr.Dataset, wanted: Mapping[str, tuple[str, float]]
+) -> dict[str, list[str]]:
+    """Return the cells of columns by heading, without variables that ``summary`` lacks."""
+    return {heading: cells(summary, name, scale)
+            for heading, (name, scale) in wanted.items() if name in summary}
 
 
 def cells(summary: xr.Dataset, name: str, scale: float = 1.0) -> list[str]:
@@ -131,6 +181,8 @@ def cells(summary: xr.Dataset, name: str, scale: float = 1.0) -> list[str]:
     values = summary[name]
     if values.dtype.kind == "b":
         return ["yes" if value else "no" for value in np.ravel(values)]
+    if values.dtype.kind in "OU":
+        return [str(value) for value in np.ravel(values)]
     if values.dtype.kind in "iu":
         return [f"{value:,}" for value in np.ravel(values).tolist()]
     low, high = interval(summary, name)

@@ -1,32 +1,342 @@
-"""Writing a report: completely, or not at all."""
+"""The report written: one HTML page, or Markdown with its figures beside it."""
 
 from __future__ import annotations
 
+import base64
 import contextlib
+import hashlib
+import json
 import os
+import shlex
 import shutil
+import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
 import xarray as xr
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from sweep.analysis.dataset import sampling_text
 from sweep.errors import ArgumentError, StoreError
 from sweep.measure.flags import DetectionStatus
+from sweep.messages import label
+from sweep.plan.axes import TRIAL, Axis
+from sweep.plan.facts import camera_facts, camera_notes
 from sweep.report.answer import Answer, answer
-from sweep.report.figures import figure_kinds
-from sweep.report.gallery import scenes_of
-from sweep.report.grouping import AREA
-from sweep.report.markdown import markdown, write_figure
+from sweep.report.charts import css_variables, panel_svg, write_panels
+from sweep.report.comparison_figures import (
+    AMBIGUITY,
+    BOUND,
+    COMPARED,
+    CONFIGURATIONS,
+    PRECISION,
+    RANKING,
+)
+from sweep.report.figure import FigureKind, RenderedFigure
+from sweep.report.formatting import coordinates
 from sweep.report.output_file import (
     check_output_file,
     write_errors_explained,
     write_output_file,
 )
-from sweep.report.page import page
-from sweep.report.provenance_facts import provenance
-from sweep.report.report_data import ReportData, store_errors
+from sweep.report.report_data import AREA, ReportData, store_errors
+from sweep.report.scene_figures import (
+    BIAS,
+    DETECTION,
+    ERRORS_BY_SIZE,
+    FAILURES,
+    FLIPS,
+    FRAME,
+    MAPS,
+    effect_of,
+)
+from sweep.report.scenes import (
+    CHESSBOARD_LEGEND,
+    LEGEND,
+    Scene,
+    css_colour,
+    pipeline_file,
+    scenes_of,
+)
+from sweep.report.table import Table, markdown_text
+from sweep.report.tradeoff_figure import TRADE
 from sweep.store.locations import enclosing_store, is_remote
+
+# --------------------------------------------------------------------------------------------------
+# The kinds of figures of a report, in the order in which they stand.
+
+KINDS: tuple[FigureKind, ...] = (
+    DETECTION, ERRORS_BY_SIZE, BIAS, CONFIGURATIONS, COMPARED, TRADE, MAPS, FLIPS, AMBIGUITY,
+    FAILURES, FRAME, RANKING, BOUND, PRECISION,
+)
+"""Add a kind of figure here; what no kind covers of axes and draws gets a figure of its effect."""
+
+
+def figure_kinds(data: ReportData) -> Iterator[FigureKind]:
+    """Yield the kinds of figures of a store, such that one shows each axis and drawn parameter."""
+    covered: set[str] = set()
+    for kind in KINDS:
+        if kind.applies(data):
+            covered.update(kind.covers(data))
+            yield kind
+    for name in (*data.scene_axes, *data.setting_axes, *data.drawn_parameters):
+        if name not in covered:
+            yield effect_of(name)
+
+
+# --------------------------------------------------------------------------------------------------
+# Origin of a report's numbers: versions, dates, axes, and the commands that reproduce it.
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """Origin of a report's numbers.
+
+    Attributes
+    ----------
+    facts
+        Name -> fact, as text.
+    commands
+        Command lines that reproduce the store and the report.
+    axes
+        Table of the grid's axes; None for a single pose.
+    drawn
+        The distributions of drawn parameters, as text.
+    pipeline, file
+        Text of the pipeline, and the name of its file.
+    """
+
+    facts: Mapping[str, str]
+    commands: tuple[str, ...]
+    axes: Table | None
+    drawn: str
+    pipeline: str
+    file: str
+
+
+def provenance(data: ReportData, output: str) -> Provenance:
+    """Return the origin of a store's numbers; ``output`` is the report's own file."""
+    fingerprint: dict[str, Any] = dict(data.run_metadata.get("fingerprint", {}))
+    environment: dict[str, Any] = dict(data.run_metadata.get("environment", {}))
+    versions = ", ".join(
+        f"{name} {value}" for name, value in (
+            ("sweep", environment.get("sweep")), ("OpenCV", fingerprint.get("opencv")),
+            ("NumPy", fingerprint.get("numpy")), ("Numba", fingerprint.get("numba")),
+            ("Python", environment.get("python")),
+        ) if value
+    )
+    files = dict(fingerprint.get("files", {}))
+    digest = hashlib.sha256(json.dumps(fingerprint, sort_keys=True).encode()).hexdigest()
+    facts = {
+        "Store": data.store,
+        "Camera": "; ".join([camera_facts(data.pipeline).line(), *camera_notes(data.pipeline)]),
+        "Run": _dates(data.run_metadata),
+        **({"Sampling": sampling} if (sampling := sampling_text(data.results)) else {}),
+        "Versions": versions,
+        "Processor": str(environment.get("cpu", "unknown")),
+        "Seed": str(fingerprint.get("seed", data.pipeline.seed)),
+        "Fingerprint": f"{digest[:16]} (numbers {fingerprint.get('numbers', '?')})",
+        **({"Files": ", ".join(f"{name} (SHA-256 {sha256[:12]}\u2026)"
+                               for name, sha256 in files.items())} if files else {}),
+        "Report": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
+    }
+    store = shlex.quote(data.store)
+    trade = [f"sweep tradeoff {store}{_per(data)}"] if data.trade is not None else []
+    return Provenance(
+        facts,
+        (f"sweep run {pipeline_file(data.pipeline)} --store {store}", *trade,
+         data.command or f"sweep report {store} -o {shlex.quote(output)}"),
+        _axes(data),
+        "; ".join(f"{name} {distribution}"
+                  for name, distribution in data.pipeline.distributions.items()),
+        data.pipeline.text,
+        f"{data.pipeline.name}.toml",
+    )
+
+
+def _dates(run_metadata: Mapping[str, Any]) -> str:
+    created, finished = (
+        str(run_metadata.get(name, default)).replace("T", " ").replace("Z", " UTC")
+        for name, default in (("created", "unknown"), ("finished_at", ""))
+    )
+    return f"begun {created}" + (f", finished {finished}" if finished else "")
+
+
+def _per(data: ReportData) -> str:
+    """Return the options of `sweep tradeoff` that give the trade its conditions."""
+    if data.trade is None:
+        return ""
+    return "".join(
+        f" --per {name}" for name in map(str, data.trade["cost_ms"].dims) if name != "treatment"
+    )
+
+
+def _axes(data: ReportData) -> Table | None:
+    if not data.pipeline.axes:
+        return None
+    rows = [
+        [axis.name, f"{len(axis):,}", _values(axis), axis.unit,
+         _section(axis), _meaning(axis)]
+        for axis in data.pipeline.axes
+    ]
+    return Table.of("Axes of the grid", ["axis", "values", "which", "unit", "of", "meaning"], rows,
+                 words=True)
+
+
+def _section(axis: Axis) -> str:
+    """Return the sections of an axis' parameters."""
+    names = [name for name in axis.columns if name != TRIAL]
+    return ", ".join(dict.fromkeys(axis.parameter(name).section for name in names)) or "draws"
+
+
+def _meaning(axis: Axis) -> str:
+    """Return an axis' meaning; of one that explains each choice, only the axis' own choices."""
+    choices = [
+        text for text in axis.meaning.split("; ")
+        if text.partition(": ")[0] in map(str, axis.values)
+    ]
+    return "; ".join(choices) or axis.meaning
+
+
+def _values(axis: Axis) -> str:
+    """Return an axis' values as text; of many the first three and the last."""
+    if len(axis) <= 7:
+        return ", ".join(_texts(axis.values))
+    texts = _texts([*axis.values[:3], axis.values[-1]])
+    return f"{', '.join(texts[:3])}, \u2026, {texts[-1]}"
+
+
+def _texts(values: Sequence[Any]) -> list[str]:
+    return coordinates([label(v) if isinstance(v, (tuple, str)) else v for v in values])
+
+
+# --------------------------------------------------------------------------------------------------
+# The report as Markdown, with its figures and scenes as files in a folder beside it.
+
+def write_figure(figure: RenderedFigure, folder: Path) -> None:
+    """Write a figure as NAME.svg and NAME.png into a folder."""
+    if figure.write is not None:
+        for suffix in ("svg", "png"):
+            figure.write(str(folder / f"{figure.name}.{suffix}"))
+    else:
+        write_panels(figure.panels, folder / figure.name)
+
+
+def markdown(
+    title: str, answer: Answer, provenance: Provenance, figures: Sequence[RenderedFigure],
+    scenes: Iterable[Scene], folder: Path, link_folder: str, require: Sequence[str] = (),
+) -> str:
+    """Return the report as Markdown; pictures of scenes are written into ``folder``.
+
+    ``link_folder`` is the name of the folder with figures and pictures in the links of the text.
+    """
+    base = quote(link_folder)
+    parts = [
+        f"# {markdown_text(title)}", f"**{markdown_text(answer.headline)}**",
+        *([f"Required: {markdown_text('; '.join(require))}."] if require else []),
+        markdown_text(answer.paragraph),
+        *(table.markdown() for table in answer.tables),
+        *([f"With {markdown_text(answer.of)}, over the whole grid:"] if answer.of else []),
+        "\n".join(
+            f"- {markdown_text(tile.heading)}: **{markdown_text(tile.value)}**"
+            + (f" ({markdown_text(tile.detail)})" if tile.detail else "")
+            for tile in answer.tiles
+        ),
+    ]
+    parts.append("## Figures")
+    for figure in figures:
+        parts += [
+            f"### {markdown_text(figure.title)}",
+            f"![{markdown_text(figure.title)}]({base}/{quote(figure.name)}.png)",
+            markdown_text(figure.caption),
+            _folded("The numbers", figure.table.markdown()),
+        ]
+    for number, scene in enumerate(scenes):
+        if number == 0:
+            parts.append("## Scenes")
+        parts.append("### " + ", ".join(markdown_text(text.capitalize()) for text in scene.titles))
+        if scene.picture is not None:
+            name = f"scene-{number + 1}.png"
+            (folder / name).write_bytes(scene.picture)
+            parts.append(f"![{markdown_text(scene.alt)}]({base}/{name})")
+        parts += [
+            markdown_text(text) for text in (scene.result, scene.coordinates, scene.problem) if text
+        ]
+        parts.append(_code(scene.command, "sh"))
+    parts += ["## More numbers", *(table.markdown() for table in answer.details)]
+    parts += _origin(provenance)
+    return "\n\n".join(parts) + "\n"
+
+
+def _origin(provenance: Provenance) -> list[str]:
+    """Return the origin of the numbers, and the commands that make them again."""
+    parts = [
+        "## Origin of the numbers",
+        "\n".join(f"- {name}: {markdown_text(text)}" for name, text in provenance.facts.items()),
+        "Commands that reproduce the store and this report:",
+        _code("\n".join(provenance.commands), "sh"),
+        _folded(f"The pipeline, {provenance.file}", _code(provenance.pipeline, "toml")),
+    ]
+    if provenance.axes is not None:
+        parts.append(provenance.axes.markdown())
+    if provenance.drawn:
+        parts.append(f"Drawn in each trial: {markdown_text(provenance.drawn)}.")
+    return parts
+
+
+def _code(text: str, language: str) -> str:
+    fence = "```"
+    while fence in text:
+        fence += "`"
+    return f"{fence}{language}\n{text.rstrip()}\n{fence}"
+
+
+def _folded(summary: str, content: str) -> str:
+    return f"<details><summary>{markdown_text(summary)}</summary>\n\n{content}\n\n</details>"
+
+
+# --------------------------------------------------------------------------------------------------
+# The report as one self-contained HTML page: no network, no script, no other file.
+
+POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+"""Content security policy: a browser refuses and logs every request of the page."""
+
+
+def page(
+    title: str, answer: Answer, provenance: Provenance, figures: Sequence[RenderedFigure],
+    scenes: Iterable[Scene], require: Sequence[str] = (),
+) -> str:
+    """Return the report as HTML, from the templates beside this module; all text is escaped."""
+    scenes = list(scenes)
+    legend = (*LEGEND, *([CHESSBOARD_LEGEND] if any(scene.chessboard for scene in scenes) else []))
+    return _environment().get_template("page.html").render(
+        policy=POLICY, title=title, answer=answer, provenance=provenance, figures=figures,
+        scenes=scenes, require=require,
+        legend=[(text, css_colour(colour)) for text, colour in legend],
+    )
+
+
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("sweep.report"), autoescape=True, undefined=StrictUndefined,
+    )
+    environment.filters |= {
+        "base64": _base64, "panel_svg": panel_svg, "sentence_case": str.capitalize,
+    }
+    environment.globals["css_variables"] = css_variables
+    return environment
+
+
+def _base64(content: bytes | str) -> str:
+    encoded = content.encode() if isinstance(content, str) else content
+    return base64.b64encode(encoded).decode()
+
+
+# --------------------------------------------------------------------------------------------------
+# Writing a report: completely, or not at all.
 
 FORMATS = ("html", "md")
 PICTURES = (".svg", ".png")

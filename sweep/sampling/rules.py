@@ -1,25 +1,243 @@
-"""The rule that samples, by what the pipeline says."""
+"""Which trials are needed, decided from committed results: waves and their rules."""
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
-from collections.abc import Mapping
-from typing import cast
+import math
+from bisect import bisect_right
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Any, Protocol, cast
 
-from sweep.plan.choice_rule import ChoiceRule
-from sweep.plan.experiment import Pipeline
-from sweep.plan.limit_rule import LimitRule
-from sweep.plan.precision_rule import PrecisionRule
-from sweep.sampling.stopping import Stopping
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.errors import StoreError
+from sweep.measure.flags import DetectionStatus
+from sweep.plan.axes import TRIAL, Axis
+from sweep.plan.grid import Block, Blocks, scene_axes
+from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.reader import StoppingRule
+from sweep.plan.sampling import ChoiceRule, LimitRule, PrecisionRule
+from sweep.plan.schema import VARIABLES, Variable
+from sweep.store.blocks import RunStore, region
+from sweep.typing import Masks
+
+# --------------------------------------------------------------------------------------------------
+# What a rule of stopping is: a pure function of the results of the trials of earlier waves.
+#
+# Trials come in waves that end at fixed numbers, ``ends``. Before each wave but the first, which
+# is computed whole, a rule says for every scene of a group whether the wave's trials of it are
+# needed. All configurations of a needed scene are computed, so that they stay paired.
+#
+# A group is what is decided together: all cells along the ``coupled`` axes, and for the sake of
+# speed some values of the others, which must not influence each other. A part of a group of which
+# no cell is needed in a wave is settled for good.
+
+FIRST_DRAWS = 50
+"""Draws of a condition in the first wave, about: all pooled cells together."""
+
+
+def unit_of(pooled: int) -> int:
+    """Return the trials in the unit of waves where a condition pools so many cells.
+
+    At least two: a single one does not tell how far results are chance.
+
+    >>> unit_of(1), unit_of(12), unit_of(500)
+    (50, 5, 2)
+    """
+    return max(2, math.ceil(FIRST_DRAWS / pooled))
+
+
+def block_unit(ends: Sequence[int]) -> int:
+    """Return the largest number of trials that divides the ends of all waves but the last.
+
+    >>> block_unit((50, 100, 120)), block_unit((30,))
+    (50, 30)
+    """
+    return math.gcd(*ends[:-1]) if len(ends) > 1 else ends[0]
+
+
+def condition_axes(pipeline: Pipeline) -> tuple[Axis, ...]:
+    """Return the axes of the scene except ``trial``, in the pipeline's order."""
+    return tuple(axis for axis in scene_axes(pipeline) if axis.name != TRIAL)
+
+
+@dataclass(frozen=True, slots=True)
+class GroupResults:
+    """The results of a group of scenes, of all trials of earlier waves.
+
+    Attributes
+    ----------
+    pipeline
+        The experiment.
+    starts, stops
+        The group's half-open ranges of indices along `condition_axes`: whole along coupled ones.
+    wave
+        Number of the wave that is decided, from 1.
+    trials
+        Trials of the earlier waves: ``ends[wave - 1]``.
+    values
+        Variable -> values in the dimensions (condition axes, trial, detection axes, estimation
+        axes, inner), as far as the variable has them. Trials of a scene that were not needed are
+        flagged ``not_needed``, and NaN.
+    """
+
+    pipeline: Pipeline
+    starts: tuple[int, ...]
+    stops: tuple[int, ...]
+    wave: int
+    trials: int
+    values: Mapping[str, NDArray[Any]]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Lengths of the group along `condition_axes`."""
+        return tuple(b - a for a, b in zip(self.starts, self.stops, strict=True))
+
+
+class Stopping(Protocol):
+    """A rule of stopping for one pipeline; a frozen dataclass may have the properties as fields.
+
+    Modules of rules are imported when a run starts: what is slow to import is imported in `needed`.
+    """
+
+    @property
+    def ends(self) -> tuple[int, ...]:
+        """Numbers of trials at which waves end, increasing; the last one is ``max_trials``."""
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """The dataset's variables that it reads."""
+
+    @property
+    def coupled(self) -> tuple[str, ...]:
+        """Names of the scene axes, not ``trial``, along which cells are decided together.
+
+        Those that are pooled, or searched along.
+        """
+
+    def needed(self, results: GroupResults) -> Masks:
+        """Return for each scene of a group, shape ``results.shape``, whether it is needed.
+
+        It must be a function of the results alone, the same in every process, and of one value
+        along an axis that is not coupled whatever the group's others are.
+        """
+
+
+# --------------------------------------------------------------------------------------------------
+# How the blocks of a store make groups and waves.
+
+@dataclass(frozen=True, slots=True)
+class Waves:
+    """The groups of a grid of blocks, and the waves of each.
+
+    A group is all blocks that share their cut of the axes that are neither coupled nor ``trial``.
+
+    Attributes
+    ----------
+    blocks
+        The grid, cut along ``trial`` so that every end but the last is an end of blocks.
+    trial
+        Position of ``trial`` among the scene axes.
+    coupled
+        Positions of the coupled axes.
+    ends
+        Numbers of trials at which waves end.
+    """
+
+    blocks: Blocks
+    trial: int
+    coupled: tuple[int, ...]
+    ends: tuple[int, ...]
+
+    @staticmethod
+    def of(pipeline: Pipeline, rule: Stopping, blocks: Blocks) -> Waves:
+        """Return the groups and waves of a pipeline's blocks; ValueError if they do not fit."""
+        names = [axis.name for axis in scene_axes(pipeline)]
+        trial = names.index(TRIAL)
+        if any(end % blocks.extents[trial] for end in rule.ends[:-1]):
+            raise ValueError(f"blocks of {blocks.extents[trial]} trials, waves at {rule.ends}")
+        coupled = tuple(k for k, name in enumerate(names) if name in rule.coupled)
+        return Waves(blocks, trial, coupled, rule.ends)
+
+    @property
+    def free(self) -> tuple[int, ...]:
+        """Positions of the axes that are neither coupled nor ``trial``."""
+        return tuple(
+            k for k in range(len(self.blocks.lengths)) if k not in self.coupled and k != self.trial
+        )
+
+    @property
+    def groups(self) -> int:
+        """The number of groups."""
+        counts = self.blocks.counts
+        return math.prod(counts[k] for k in self.free)
+
+    def index(self, number: int) -> tuple[int, ...]:
+        """Return a block's index along each scene axis."""
+        index = []
+        for count in reversed(self.blocks.counts):
+            number, position = divmod(number, count)
+            index.append(position)
+        return tuple(reversed(index))
+
+    def group(self, number: int) -> int:
+        """Return the number of the group that a block belongs to."""
+        index, counts, group = self.index(number), self.blocks.counts, 0
+        for k in self.free:
+            group = group * counts[k] + index[k]
+        return group
+
+    def wave(self, number: int) -> int:
+        """Return the number of the wave that a block belongs to, from 0."""
+        start = self.index(number)[self.trial] * self.blocks.extents[self.trial]
+        return bisect_right(self.ends, start)
+
+    def numbers(self, group: int, first: int, last: int | None = None) -> Iterator[int]:
+        """Yield the numbers of a group's blocks in the waves ``first`` to ``last``.
+
+        ``last`` is ``first`` if it is left out; earlier trials come first.
+        """
+        counts, extent = self.blocks.counts, self.blocks.extents[self.trial]
+        at: dict[int, int] = {}
+        for k in reversed(self.free):
+            group, at[k] = divmod(group, counts[k])
+        start = self.ends[first - 1] // extent if first else 0
+        stop = -(-self.ends[first if last is None else last] // extent)
+        for trial in range(start, stop):
+            for along in product(*(range(counts[k]) for k in self.coupled)):
+                index = {**at, self.trial: trial, **dict(zip(self.coupled, along, strict=True))}
+                number = 0
+                for k, count in enumerate(counts):
+                    number = number * count + index[k]
+                yield number
+
+    def span(self, block: Block) -> Block:
+        """Return the box of a block's group, of all its trials."""
+        whole = {*self.coupled, self.trial}
+        lengths = self.blocks.lengths
+        return Block(
+            tuple(0 if k in whole else start for k, start in enumerate(block.starts)),
+            tuple(lengths[k] if k in whole else stop for k, stop in enumerate(block.stops)),
+        )
+
+
+# --------------------------------------------------------------------------------------------------
+# The rule that samples, by what the pipeline says.
 
 RULES: Mapping[type, str] = {
-    ChoiceRule: "sweep.sampling.choice:choice_sampling",
-    LimitRule: "sweep.sampling.limit:limit_sampling",
+    ChoiceRule: "sweep.sampling.searches:choice_sampling",
+    LimitRule: "sweep.sampling.searches:limit_sampling",
     PrecisionRule: "sweep.sampling.precision:precision_sampling",
 }
 """Class of what a section says -> module and function that make its rule, of a pipeline and that.
 
-The sections are in `sweep.plan.stopping.SECTIONS`. The function raises PipelineError with a line
+The sections are in `sweep.plan.sampling.SECTIONS`. The function raises PipelineError with a line
 for each name that it does not know. Its module is imported on use: runs of fixed trials need none.
 """
 
@@ -37,3 +255,197 @@ def make_rule(pipeline: Pipeline) -> Stopping | None:
     module, _, name = RULES[type(pipeline.stopping)].partition(":")
     make = getattr(importlib.import_module(module), name)
     return cast("Stopping", make(pipeline, pipeline.stopping))
+
+
+# --------------------------------------------------------------------------------------------------
+# Which scenes of a block are needed: a rule applied to what is committed of earlier waves.
+
+HELD_BYTES = 200_000_000
+"""Results of groups that a process keeps, so that each wave reads only the one before it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What the scenes of a block follow from.
+
+    Attributes
+    ----------
+    rule
+        What the pipeline's section says.
+    wave
+        The number of the block's wave, from 1.
+    bases
+        For each wave from 1 to that of the block, a digest of the rule and of the results before
+        it: two decisions on the same bases are the same.
+    settled
+        Whether nothing was needed in an earlier wave, so that nothing is.
+    """
+
+    rule: StoppingRule
+    wave: int
+    bases: tuple[int, ...]
+    settled: bool = False
+
+    @property
+    def basis(self) -> int:
+        """The digest of the rule and of all results that the decision follows from."""
+        return self.bases[-1]
+
+
+@dataclass(slots=True)
+class _Held:
+    """Values of a group: those of the waves before the last of ``bases``, and what they decide."""
+
+    bases: tuple[int, ...]
+    values: dict[str, NDArray[Any]]
+    needed: Masks | None = None
+
+    @property
+    def bytes(self) -> int:
+        return sum(values.nbytes for values in self.values.values())
+
+
+@dataclass(slots=True)
+class Decider:
+    """Applies a rule to a store's committed results.
+
+    Attributes
+    ----------
+    store, pipeline
+        The store, and its pipeline with the section of the rule.
+    rule, waves
+        The rule, and the waves of the store's blocks.
+    """
+
+    store: RunStore
+    pipeline: Pipeline
+    rule: Stopping
+    waves: Waves
+    _held: OrderedDict[tuple[int, ...], _Held] = field(default_factory=OrderedDict)
+
+    @staticmethod
+    def of(store: RunStore, rule: StoppingRule) -> Decider:
+        """Return what decides by a rule on the blocks of a store."""
+        pipeline = dataclasses.replace(store.pipeline, stopping=rule)
+        sampling = make_rule(pipeline)
+        if sampling is None:
+            raise TypeError(rule)
+        return Decider(store, pipeline, sampling, Waves.of(pipeline, sampling, store.blocks))
+
+    def needed(self, block: Block, decision: Decision) -> Masks:
+        """Return for each of a block's scenes (N,) whether it is needed.
+
+        Raises
+        ------
+        StoreError
+            If results of an earlier wave are missing.
+        """
+        if decision.settled:
+            return np.zeros(len(block), dtype=bool)
+        whole = self.of_group(self.waves.span(block), decision)
+        trial = self.waves.trial
+        part = tuple(
+            slice(start - first, stop - first)
+            for k, (start, stop, first) in enumerate(zip(
+                block.starts, block.stops, self.waves.span(block).starts, strict=True
+            )) if k != trial
+        )
+        mask = np.expand_dims(whole[part], trial)
+        return np.broadcast_to(mask, block.shape).reshape(-1)
+
+    def of_group(self, span: Block, decision: Decision) -> Masks:
+        """Return for each scene of a group, along the condition axes, whether a wave needs it."""
+        held = self._held.get(span.starts)
+        if held is not None and held.bases == decision.bases and held.needed is not None:
+            return held.needed  # of another block of the wave
+        values = self._values(span, decision)
+        kept = [k for k in range(len(span.starts)) if k != self.waves.trial]
+        results = GroupResults(
+            self.pipeline,
+            tuple(span.starts[k] for k in kept), tuple(span.stops[k] for k in kept),
+            decision.wave, self.waves.ends[decision.wave - 1],
+            {name: values[name] for name in self.rule.variables},
+        )
+        mask = np.array(self.rule.needed(results), dtype=bool)
+        if mask.shape != results.shape:
+            raise ValueError(f"a rule gave {mask.shape} for scenes {results.shape}")
+        mask &= ~self._settled(values["detection"], kept)
+        if span.starts in self._held:
+            self._held[span.starts].needed = mask
+        return mask
+
+    def _settled(self, detection: NDArray[Any], kept: list[int]) -> Masks:
+        """Return which scenes are settled: nothing along the coupled axes was needed before."""
+        last = np.take(detection, -1, axis=len(kept))
+        unneeded = (last == DetectionStatus.not_needed).reshape((*last.shape[: len(kept)], -1))
+        coupled = tuple(at for at, k in enumerate(kept) if k in self.waves.coupled)
+        settled = unneeded.all(axis=-1).all(axis=coupled, keepdims=True)
+        return np.asarray(settled)
+
+    def _values(self, span: Block, decision: Decision) -> Mapping[str, NDArray[Any]]:
+        """Return the values of a group before a wave, of the rule's variables and of detection."""
+        held = self._held.pop(span.starts, None)
+        at = 0 if held is None else len(held.bases)
+        if held is None or held.bases != decision.bases[:at]:
+            held, at = _Held((), {}), 0
+        names = dict.fromkeys(("detection", *self.rule.variables))
+        first = self.waves.ends[at - 1] if at else 0
+        last = self.waves.ends[decision.wave - 1]
+        if first < last:
+            axis = len(span.starts) - 1
+            for name in names:
+                new = self._read(name, span, first, last)
+                held.values[name] = (
+                    np.concatenate([held.values[name], new], axis=axis) if at else new
+                )
+            if (held.values["detection"] == DetectionStatus.not_run).any():
+                raise StoreError(
+                    f"{self.store.url}: trials below {last} of group {span} are not committed"
+                )
+        held.bases, held.needed = decision.bases, None
+        self._held[span.starts] = held
+        while len(self._held) > 1 and sum(e.bytes for e in self._held.values()) > HELD_BYTES:
+            self._held.popitem(last=False)
+        return held.values
+
+    def _read(self, name: str, span: Block, first: int, last: int) -> NDArray[Any]:
+        """Return a variable's values of trials [first, last) in the dimensions of the results."""
+        pipeline, trial = self.pipeline, self.waves.trial
+        variable = next(each for each in self.store.variables if each.name == name)
+        starts = tuple(first if k == trial else start for k, start in enumerate(span.starts))
+        stops = tuple(last if k == trial else stop for k, stop in enumerate(span.stops))
+        part = region(variable, pipeline, Block(starts, stops))
+        return in_order_of_results(pipeline, variable, np.asarray(self.store.array(name)[part]))
+
+
+def in_order_of_results(
+    pipeline: Pipeline, variable: Variable, values: NDArray[Any]
+) -> NDArray[Any]:
+    """Return values in the dataset's dimensions in those of `GroupResults`."""
+    names = variable.dimensions(pipeline)
+    scene = [axis.name for axis in scene_axes(pipeline) if axis.name != TRIAL]
+    order = [
+        *scene, TRIAL,
+        *(axis.name for axis in pipeline.axes_of(Stage.detection)),
+        *(axis.name for axis in pipeline.axes_of(Stage.estimation)), *variable.inner,
+    ]
+    return values.transpose([names.index(each) for each in order if each in names])
+
+
+def by_scene(
+    variable: Variable, pipeline: Pipeline, block: Block, values: NDArray[Any]
+) -> NDArray[Any]:
+    """Return a block's values of a variable in the dimensions (N, configurations)."""
+    names = variable.dimensions(pipeline)
+    scene = [axis.name for axis in scene_axes(pipeline)]
+    order = [*(names.index(name) for name in scene),
+             *(k for k, name in enumerate(names) if name not in scene)]
+    return values.transpose(order).reshape(len(block), -1)
+
+
+def scenes_needed(store: RunStore, block: Block) -> Masks:
+    """Return which of a committed block's scenes (N,) were needed, as its flags say."""
+    variable, pipeline = VARIABLES["detection"], store.pipeline
+    values = np.asarray(store.array(variable.name)[region(variable, pipeline, block)])
+    flags = by_scene(variable, pipeline, block, values)
+    return np.asarray((flags != DetectionStatus.not_needed).all(axis=1))

@@ -1,37 +1,150 @@
-"""Blocks of a store: begun, written, committed by their receipts, and dropped.
-
-A block's values are written first and its receipt last, so that a block is either complete or
-absent. The receipts are the checkpoint; that a chunk exists says nothing.
-"""
+"""The blocks of a store: values first, flags, and the receipt last."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import os
 import time
-from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
+from collections.abc import AsyncIterator, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, cast
 
-import numpy as np
+import zarr
 from numpy.typing import NDArray
-from zarr.buffer import default_buffer_prototype
+from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
 from sweep.errors import StoreError, StoreReplacedError
-from sweep.plan.experiment import Pipeline
-from sweep.plan.grid import Block, scene_axes
-from sweep.plan.schema import VARIABLES
-from sweep.plan.variable import Variable
-from sweep.store.checksums import DigestingStore
-from sweep.store.durability import DurableStore
-from sweep.store.layout import RECEIPTS
+from sweep.plan.grid import Block, Blocks, scene_axes
+from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.schema import VARIABLES, Variable, variables_of
+from sweep.store.chunks import Chunks, receipt_key
+from sweep.store.files import (
+    absent_files,
+    delete_files,
+    read_files,
+    read_json,
+    sync,
+    write_document,
+    write_files,
+)
+from sweep.store.layout import RECEIPTS, checksum_of
 from sweep.store.locations import is_remote, open_group, remote_run_id, translate_errors
-from sweep.store.manifest import put
-from sweep.store.receipt import NAMING_FORMAT, Receipt
-from sweep.store.receipt_text import decoded, is_decodable
-from sweep.store.run_store import RunStore
-from sweep.store.zarr_sync import sync
+from sweep.store.receipt import STAGES, Receipt, decoded, encoded
+
+# --------------------------------------------------------------------------------------------------
+# An open store: where it lies, the pipeline that it belongs to, its arrays and its metadata.
+
+@dataclass(frozen=True)
+class RunStore:
+    """An open store: where it lies, its pipeline, and how its grid is cut into blocks.
+
+    Attributes
+    ----------
+    url
+        As the user gave it.
+    group
+        The root group.
+    pipeline
+        What the store was created for.
+    run_id
+        The run that created it.
+    blocks
+        The blocks of the grid; each is one chunk of every variable.
+    """
+
+    url: str
+    group: zarr.Group
+    pipeline: Pipeline
+    run_id: str
+    blocks: Blocks
+    _arrays: dict[str, zarr.Array[Any]] = field(default_factory=dict, repr=False, compare=False)
+
+    @property
+    def storage(self) -> Store:
+        """The storage that holds the store's files."""
+        return self.group.store
+
+    @cached_property
+    def variables(self) -> tuple[Variable, ...]:
+        """The variables of the pipeline."""
+        return variables_of(self.pipeline)
+
+    @cached_property
+    def variable_names(self) -> frozenset[str]:
+        """The names of the variables."""
+        return frozenset(variable.name for variable in self.variables)
+
+    @cached_property
+    def flag_names(self) -> frozenset[str]:
+        """The names of the variables that are flags."""
+        return frozenset(variable.name for variable in self.variables if variable.flags is not None)
+
+    @cached_property
+    def chunks(self) -> Chunks:
+        """The chunks of the variables."""
+        return Chunks(self.pipeline, self.blocks)
+
+    @cached_property
+    def configurations(self) -> tuple[int, int]:
+        """How many detector settings there are, and how many estimators for each."""
+        return self.pipeline.size(Stage.detection), self.pipeline.size(Stage.estimation)
+
+    @property
+    def data_url(self) -> str:
+        """The URL that a user opens with ``xarray.open_zarr``."""
+        return f"{self.url}/{self.run_id}" if is_remote(self.url) else self.url
+
+    def array(self, name: str) -> zarr.Array[Any]:
+        """Return an array by its path; its metadata is read once.
+
+        Chunks are written even if they hold nothing but the fill value: the missing chunk of a
+        committed block is a deleted one.
+        """
+        if name not in self._arrays:
+            array = cast("zarr.Array[Any]", self.group[name])
+            self._arrays[name] = array.with_config({"write_empty_chunks": True})
+        return self._arrays[name]
+
+    @property
+    def finished(self) -> bool:
+        """Whether every block is committed and the store is closed."""
+        return bool(self.run_metadata["finished"])
+
+    @property
+    def fingerprint(self) -> dict[str, Any]:
+        """The fingerprint of the run that created the store."""
+        return dict(self.run_metadata["fingerprint"])
+
+    @property
+    def run_metadata(self) -> dict[str, Any]:
+        """The metadata of the run: format, run id, fingerprint, environment, dates."""
+        root = read_json(self.storage, "zarr.json") or {}
+        return run_metadata_in(root["attributes"])
+
+
+def run_metadata_in(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a run's metadata from the attributes of its store, where they are a text of JSON.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        If there are none.
+    """
+    metadata = attributes["sweep"]
+    # Up to format 5 they were an object, which netCDF cannot hold.
+    return dict(json.loads(metadata) if isinstance(metadata, str) else metadata)
+
+
+# --------------------------------------------------------------------------------------------------
+# Blocks of a store: begun, written, committed by their receipts, and dropped.
+#
+# A block's values are written first and its receipt last, so that a block is either complete or
+# absent. The receipts are the checkpoint; that a chunk exists says nothing.
 
 BEGUN = f"{RECEIPTS}/begun"
 """Folder of a mark for each block that was begun and is not committed."""
@@ -54,23 +167,6 @@ def region(variable: Variable, pipeline: Pipeline, block: Block) -> tuple[slice,
     return tuple(slices.get(name, slice(None)) for name in variable.dimensions(pipeline))
 
 
-def chunk_key(store: RunStore, variable: Variable, block: Block) -> str:
-    """Return the key of a variable's one chunk that holds a block."""
-    array = store.array(variable.name)
-    position = tuple(
-        (part.start or 0) // extent
-        for part, extent in zip(
-            region(variable, store.pipeline, block), array.chunks, strict=True
-        )
-    )
-    return f"{variable.name}/{array.metadata.encode_chunk_key(position)}"
-
-
-def receipt_key(number: int) -> str:
-    """Return the key of a block's receipt."""
-    return f"{RECEIPTS}/c/{number}"
-
-
 def begin_block(store: RunStore, block: Block) -> bool:
     """Mark a block as begun; return whether it had been begun before."""
     with translate_errors(store.url, "written"):
@@ -78,7 +174,7 @@ def begin_block(store: RunStore, block: Block) -> bool:
         key = f"{BEGUN}/{store.blocks.number(block)}"
         if sync(store.storage.exists(key)):
             return True
-        put(store.storage, key, {"pid": os.getpid(), "at": time.time()})
+        write_document(store.storage, key, {"pid": os.getpid(), "at": time.time()})
     return False
 
 
@@ -91,7 +187,7 @@ def withdraw_block(store: RunStore, block: Block) -> None:
 def write_block(
     store: RunStore, block: Block, values: Mapping[str, NDArray[Any]], receipt: Receipt
 ) -> Receipt:
-    """Write a block's values, then commit them by its receipt; return it with the digests.
+    """Write a block's values, then commit them by its receipt; return it with their checksums.
 
     A block that is committed on the same basis stays as it is; on another one, it is replaced. Of a
     block of which nothing was needed, only the flags are written: its numbers are fill values.
@@ -105,33 +201,27 @@ def write_block(
                 # Another worker was given it too, perhaps of another processor.
                 return receipt_of(store, block) or receipt
             if receipt.any_needed:
-                sync(store.storage.delete(receipt_key(number)))
+                delete_files(store.storage, [receipt_key(number)])
             else:
                 drop_block(store, block)
-        written = [v for v in store.variables if receipt.any_needed or v.flags is not None]
-        for variable in in_writing_order(written):
-            array = store.array(variable.name)
-            array[region(variable, store.pipeline, block)] = values[variable.name]
+        checksums = {}
+        for variable in in_writing_order(store.variables):
+            if receipt.any_needed or variable.flags is not None:
+                content = store.chunks.encoded(variable.name, number, values[variable.name])
+                write_files(store.storage, {store.chunks.key(variable.name, number): content})
+                checksums[variable.name] = checksum_of(content)
         check_not_replaced(store)
-        keys = {variable.name: chunk_key(store, variable, block) for variable in written}
-        digests = {name: _take_digest(store, key) for name, key in keys.items()}
-        if isinstance(store.storage.below, DurableStore):
-            store.storage.below.flush(keys.values())
-        receipt = dataclasses.replace(receipt, digests=digests, block=number)
+        receipt = dataclasses.replace(receipt, checksums=checksums, block=number)
         _commit(store, receipt)
     return receipt
 
 
 def _commit(store: RunStore, receipt: Receipt) -> None:
     """Write a receipt, in the place of another if there is one."""
-    number = receipt.block
-    if number is None:
+    if receipt.block is None:
         raise AssertionError(receipt)
-    text = receipt.to_json(store.format)
-    store.array(RECEIPTS)[number : number + 1] = np.array([text], dtype=object)
-    store.storage.digests.pop(receipt_key(number), None)
-    with contextlib.suppress(FileNotFoundError):
-        sync(store.storage.delete(f"{BEGUN}/{number}"))
+    write_files(store.storage, {receipt_key(receipt.block): encoded(receipt.to_json())})
+    delete_files(store.storage, [f"{BEGUN}/{receipt.block}"])
 
 
 def recommit_block(store: RunStore, receipt: Receipt) -> None:
@@ -169,23 +259,13 @@ def in_writing_order(variables: Iterable[Variable]) -> list[Variable]:
     return sorted(variables, key=lambda v: (v.flags is not None, v.name in GOVERNING))
 
 
-def _take_digest(store: RunStore, key: str) -> int:
-    """Return the digest of the content that was written under a key, and forget it."""
-    if key not in store.storage.digests:
-        # The same block was written twice at once in this process.
-        sync(store.storage.get(key, default_buffer_prototype()))
-    return store.storage.digests.pop(key)
-
-
 def drop_block(store: RunStore, block: Block) -> None:
     """Delete a block's receipt and its chunks, so that it is computed again."""
-    last_first = reversed(in_writing_order(store.variables))
-    keys = [receipt_key(store.blocks.number(block))]
-    keys += [chunk_key(store, variable, block) for variable in last_first]
+    number = store.blocks.number(block)
+    names = [variable.name for variable in in_writing_order(store.variables)]
+    keys = [store.chunks.key(name, number) for name in reversed(names)]
     with translate_errors(store.url, "written"):
-        for key in keys:
-            with contextlib.suppress(FileNotFoundError):
-                sync(store.storage.delete(key))
+        delete_files(store.storage, [receipt_key(number), *keys])
 
 
 def check_not_replaced(store: RunStore) -> None:
@@ -195,9 +275,8 @@ def check_not_replaced(store: RunStore) -> None:
         current = remote_run_id(store.url)
     else:
         try:
-            storage = DigestingStore(LocalStore(store.url, read_only=True))
-            group = open_group(storage, "r")
-            current = cast("dict[str, Any]", group.attrs["sweep"])["run_id"]
+            group = open_group(LocalStore(store.url, read_only=True), "r")
+            current = run_metadata_in(dict(group.attrs))["run_id"]
         except (KeyError, FileNotFoundError):
             current = None
     if current != store.run_id:
@@ -246,14 +325,11 @@ def receipts(store: RunStore, numbers: Iterable[int]) -> Iterable[tuple[int, Rec
 
 def receipt_texts(store: RunStore, numbers: Sequence[int]) -> list[str]:
     """Return the texts of committed blocks' receipts; ValueError if one is missing or damaged."""
-    array = store.array(RECEIPTS)
-    if not is_decodable(array):
-        return cast("list[str]", np.asarray(array.oindex[np.array(numbers)]).tolist())
     keys = [receipt_key(number) for number in numbers]
     texts = []
-    for key, content in zip(keys, store.storage.contents(keys), strict=True):
+    for key, content in zip(keys, read_files(store.storage, keys), strict=True):
         if content is None:
-            raise ValueError(f"{key}: {store.storage.unreadable(key) or 'missing'}")
+            raise ValueError(f"{key}: missing")
         texts.append(decoded(content))
     return texts
 
@@ -263,10 +339,137 @@ def parsed_receipt(store: RunStore, number: int, text: str) -> Receipt:
     receipt = Receipt.from_json(text)
     if receipt.run_id != store.run_id:
         raise ValueError("of another run")
-    if receipt.block != (number if store.format >= NAMING_FORMAT else None):
+    if receipt.block != number:
         raise ValueError(f"block {number} has the receipt of block {receipt.block}")
     settings, estimators = store.configurations
     receipt.check(len(store.blocks[number]), settings, settings * estimators)
-    if receipt.digests.keys() != names_written(store, receipt):
-        raise ValueError("digests of other variables than the store's")
+    if receipt.checksums.keys() != names_written(store, receipt):
+        raise ValueError("checksums of other variables than the store's")
     return receipt
+
+
+def missing_chunks(store: RunStore, numbers: Iterable[int]) -> dict[int, str]:
+    """Return those of the committed blocks of which chunks are missing, each with the key of one.
+
+    A copy that was made while the store was written has such blocks, for instance.
+
+    Raises
+    ------
+    StoreError
+        If the receipt of a block without chunks is damaged.
+    """
+    missing = _missing(store, numbers, store.variable_names)
+    if store.pipeline.stopping is None or not missing:
+        return missing
+    # Blocks of which nothing was needed have chunks of flags alone.
+    flags = [number for number, receipt in receipts(store, missing) if not receipt.any_needed]
+    lacking = _missing(store, flags, store.flag_names)
+    return {number: key for number, key in missing.items() if number not in set(flags)} | lacking
+
+
+def _missing(store: RunStore, numbers: Iterable[int], names: Collection[str]) -> dict[int, str]:
+    """Return those of the blocks that lack a chunk of these variables, each with its key."""
+    missing: dict[int, str] = {}
+    left = list(numbers)
+    for name in sorted(names):
+        keys = {store.chunks.key(name, number): number for number in left}
+        lacking = {keys[key]: key for key in absent_files(store.storage, keys, f"{name}/c")}
+        missing |= lacking
+        left = [number for number in left if number not in lacking]
+    return missing
+
+
+def check_whole(store: RunStore, *, finished: bool | None = None) -> set[int]:
+    """Return the committed blocks, of which all chunks are there; of a finished store, all blocks.
+
+    Raises
+    ------
+    StoreError
+        If receipts of a finished store, or chunks of committed blocks, are missing.
+    """
+    for _ in range(3):
+        done = committed(store)
+        missing = missing_chunks(store, done)
+        # A writer may have begun to compute a block again in between.
+        if not missing.keys() & committed(store):
+            break
+    finished = store.finished if finished is None else finished
+    uncommitted = set(range(len(store.blocks))) - done if finished else set()
+    if not (missing or uncommitted):
+        return done
+    names = ", ".join(sorted({key.partition("/c")[0] for key in missing.values()})[:3])
+    examples = [f"{key} of block {number}" for number, key in sorted(missing.items())]
+    examples += [f"{receipt_key(number)} of block {number}" for number in sorted(uncommitted)]
+    raise StoreError(
+        f"{store.url}: damaged: {len(missing) + len(uncommitted):,} of {len(store.blocks):,} "
+        f"blocks lack chunks of {names or 'all variables'}, such as {', '.join(examples[:2])}; "
+        "`sweep verify --repair` computes them again"
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Blocks of which nothing was needed, written together: flags alone, of few different contents.
+
+def write_unneeded(store: RunStore, blocks: Sequence[Block], basis: int) -> list[Receipt]:
+    """Write blocks that are not committed and of which nothing is needed; return their receipts.
+
+    The values of all are written first, then their receipts. No block is marked as begun: nothing
+    is computed that might end the process.
+
+    Parameters
+    ----------
+    store
+        A store whose sampling stops by a rule.
+    blocks
+        The blocks.
+    basis
+        What it follows from that nothing is needed.
+    """
+    if not blocks:
+        return []
+    begun = time.perf_counter()
+    flags = in_writing_order(v for v in store.variables if v.flags is not None)
+    with translate_errors(store.url, "written"):
+        check_not_replaced(store)
+        numbers = [store.blocks.number(block) for block in blocks]
+        contents: dict[str, bytes] = {}
+        filled: dict[tuple[str, tuple[int, ...]], bytes] = {}
+        checksums: dict[int, dict[str, int]] = {number: {} for number in numbers}
+        for number, block in zip(numbers, blocks, strict=True):
+            for variable in flags:
+                kind = variable.name, block.shape
+                if kind not in filled:
+                    filled[kind] = store.chunks.encoded(
+                        variable.name, number, int(variable.not_needed))
+                content = filled[kind]
+                contents[store.chunks.key(variable.name, number)] = content
+                checksums[number][variable.name] = checksum_of(content)
+        write_files(store.storage, contents)
+        wall_s = (time.perf_counter() - begun) / len(blocks)
+        receipts = [
+            Receipt(
+                run_id=store.run_id, processors=(), scenes=len(block),
+                computed={"scenes": 0, "detections": 0, "estimates": 0},
+                detection=_counts(store, "detection", block),
+                estimate=_counts(store, "estimate", block),
+                seconds={stage: [] for stage in STAGES}, failures=(), wall_s=wall_s,
+                written=time.time(), checksums=checksums[number], block=number, basis=basis,
+            )
+            for number, block in zip(numbers, blocks, strict=True)
+        ]
+        check_not_replaced(store)
+        write_files(store.storage, {
+            receipt_key(number): encoded(receipt.to_json())
+            for number, receipt in zip(numbers, receipts, strict=True)
+        })
+        marks = {f"{BEGUN}/{number}" for number in numbers}
+        delete_files(store.storage, marks.difference(absent_files(store.storage, marks, BEGUN)))
+    return receipts
+
+
+def _counts(store: RunStore, name: str, block: Block) -> list[int]:
+    """Return how often each value of a flag occurs in a block where nothing was needed."""
+    variable = VARIABLES[name]
+    counts = [0] * (int(variable.not_needed) + 1)
+    counts[-1] = len(block) * variable.configurations(store.pipeline)
+    return counts

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
@@ -20,26 +19,25 @@ from zarr.dtype import parse_dtype
 from zarr.storage import MemoryStore
 
 from sweep.model.image_file import IMAGE_SUFFIXES
-from sweep.plan.alternatives import PHOTOGRAPHS
-from sweep.plan.attributes import with_description
 from sweep.plan.axes import TRIAL, Axis
-from sweep.plan.coordinates import FixedValue, fixed_values
-from sweep.plan.experiment import Pipeline
+from sweep.plan.draws import DISTANCE_PARAMETERS, distance_of_side
 from sweep.plan.grid import Blocks, scene_axes
+from sweep.plan.parameters import PHOTOGRAPHS
 from sweep.plan.photographs import is_simulated
-from sweep.plan.pose_values import DISTANCE_PARAMETERS, distance_of_side
-from sweep.plan.schema import DRAWN_FORMAT, VARIABLES, variables_of
-from sweep.plan.variable import LABELS, Variable
-from sweep.store.zarr_sync import sync
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.schema import (
+    LABELS,
+    VARIABLES,
+    FixedValue,
+    Variable,
+    fixed_values,
+    variables_of,
+    with_description,
+)
+from sweep.store.files import sync
 
-FORMAT = 5
-"""Version of the layout of the stores that are created."""
-
-FORMATS = range(2, FORMAT + 1)
-"""Versions that can be read and continued; 2 is that of sweep 0.5, 3 of 0.6, 5 of 0.7.
-
-A store keeps its format; it lacks the variables that a later format introduced.
-"""
+FORMAT = 6
+"""Version of the layout of stores; another one is refused."""
 
 RECEIPTS = "commits/receipt"
 """Array of the blocks' receipts by number, JSON, a chunk each; empty unless committed."""
@@ -72,8 +70,6 @@ class PlannedArray:
         blocks or receipts are written later.
     coordinate
         Whether it is a coordinate that is no dimension.
-    optional
-        Whether a store may lack it: that of a version which did not have the parameter.
     """
 
     path: str
@@ -85,12 +81,12 @@ class PlannedArray:
     attributes: dict[str, Any] = field(default_factory=dict)
     values: Callable[[int, int], NDArray[Any]] | None = None
     coordinate: bool = False
-    optional: bool = False
 
     def create(self, group: zarr.Group) -> None:
         """Create the array and write its values."""
-        array = self.create_empty(group)
-        for part, values in self.pieces():
+        # Also what equals the fill value, such as a tilt of 0: a missing chunk is a deleted one.
+        array = self.create_empty(group).with_config({"write_empty_chunks": True})
+        for _, part, values in self.pieces():
             array[part] = values
 
     def create_empty(self, group: zarr.Group) -> zarr.Array[Any]:
@@ -98,30 +94,24 @@ class PlannedArray:
         options = {} if self.fill is None else {"fill_value": self.fill}
         return group.create_array(
             self.path, shape=self.shape, chunks=self.chunks, dtype=_dtype(self.dtype),
-            dimension_names=self.dimensions, compressors=_codecs(), attributes=self.attributes,
+            dimension_names=self.dimensions, compressors=codecs(), attributes=self.attributes,
             overwrite=True, **options,
         )
 
-    def pieces(self) -> Iterator[tuple[Any, NDArray[Any]]]:
-        """Yield an index and the values there, chunk by chunk along the first dimension."""
-        if self.values is None:
-            return
-        if not self.shape:
-            yield ..., self.values(0, 0)
-            return
-        for start in range(0, self.shape[0], self.chunks[0]):
-            stop = min(start + self.chunks[0], self.shape[0])
-            yield slice(start, stop), self.values(start, stop)
+    def pieces(self) -> Iterator[tuple[str, Any, NDArray[Any]]]:
+        """Yield the key of each chunk whose values follow from the pipeline, its index, and them.
 
-    def value_keys(self) -> set[str]:
-        """Return the keys of the chunks whose values follow from the pipeline."""
+        The array is cut along its first dimension alone.
+        """
         if self.values is None:
-            return set()
+            return
         if not self.shape:
-            return {f"{self.path}/c"}
+            yield f"{self.path}/c", ..., self.values(0, 0)
+            return
         rest = "/0" * (len(self.shape) - 1)
-        count = -(-self.shape[0] // self.chunks[0])
-        return {f"{self.path}/c/{k}{rest}" for k in range(count)}
+        for number, start in enumerate(range(0, self.shape[0], self.chunks[0])):
+            stop = min(start + self.chunks[0], self.shape[0])
+            yield f"{self.path}/c/{number}{rest}", slice(start, stop), self.values(start, stop)
 
     def misfit(self, array: zarr.Array[Any]) -> str:
         """Return how a stored array differs from this one; empty if it does not.
@@ -137,17 +127,16 @@ class PlannedArray:
             "chunks": self.chunks,
             "dtype": np.dtype(_dtype(self.dtype).to_native_dtype()),
             "dimensions": self.dimensions,
-            "codecs": [codec.to_dict() for codec in _codecs()],
+            "codecs": [codec.to_dict() for codec in codecs()],
             "chunk keys": ("default", "/"),
         }
-        codecs = [codec.to_dict() for codec in metadata.codecs[1:]]
         keys = metadata.chunk_key_encoding.to_dict()
         stored = {
             "shape": array.shape,
             "chunks": array.chunks if not array.shards else ("shards", array.shards),
             "dtype": array.dtype,
             "dimensions": tuple(metadata.dimension_names or ()),
-            "codecs": codecs,
+            "codecs": [codec.to_dict() for codec in metadata.codecs[1:]],
             "chunk keys": (
                 keys["name"], cast("dict[str, Any]", keys.get("configuration", {})).get("separator")
             ),
@@ -180,9 +169,14 @@ def _equal(a: Any, b: Any) -> bool:
     return bool(a == b or (a != a and b != b))  # noqa: PLR0124  (NaN)
 
 
-def _codecs() -> list[Any]:
+def codecs() -> list[Any]:
     """Return the codecs of every array; a damaged chunk fails its checksum when it is read."""
     return [ZstdCodec(level=ZSTD_LEVEL), Crc32cCodec()]
+
+
+def checksum_of(content: bytes) -> int:
+    """Return the CRC-32C that Zarr wrote at a chunk's end."""
+    return int.from_bytes(content[-4:], "little")
 
 
 def decoded_chunk(content: bytes, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
@@ -193,8 +187,8 @@ def decoded_chunk(content: bytes, dtype: np.dtype[Any], shape: tuple[int, ...]) 
     ValueError, RuntimeError
         If it fails its checksum, or is of another size.
     """
-    body, checksum = content[:-4], content[-4:]
-    if google_crc32c.value(body) != int.from_bytes(checksum, "little"):
+    body = content[:-4]
+    if google_crc32c.value(body) != checksum_of(content):
         raise ValueError("checksum")
     values = np.empty(shape, dtype=dtype.newbyteorder("<"))
     # Into memory of the right size, whatever size the content declares.
@@ -211,11 +205,9 @@ def encoded_chunk(values: NDArray[Any]) -> bytes:
     return body + checksum.to_bytes(4, "little")
 
 
-def planned_arrays(
-    pipeline: Pipeline, extents: tuple[int, ...], store_format: int = FORMAT
-) -> list[PlannedArray]:
+def planned_arrays(pipeline: Pipeline, extents: tuple[int, ...]) -> list[PlannedArray]:
     """Return the arrays of a pipeline's store whose chunks are blocks of ``extents``."""
-    variables = variables_of(pipeline, store_format)
+    variables = variables_of(pipeline)
     scene_extent = dict(zip((axis.name for axis in scene_axes(pipeline)), extents, strict=True))
     planned = [each for axis in pipeline.axes for each in _axis(axis)]
     used = {
@@ -228,8 +220,7 @@ def planned_arrays(
     ]
     planned += _distance(pipeline)
     planned += _photographs(pipeline)
-    if store_format >= DRAWN_FORMAT:
-        planned += [_fixed(each) for each in fixed_values(pipeline) if each.name not in VARIABLES]
+    planned += [_fixed(each) for each in fixed_values(pipeline) if each.name not in VARIABLES]
     planned += [_variable(variable, pipeline, scene_extent) for variable in variables]
     planned = [dataclasses.replace(each, attributes=with_description(each.path, each.attributes))
                for each in planned]
@@ -238,19 +229,6 @@ def planned_arrays(
         PlannedArray(RECEIPTS, (len(Blocks(lengths, extents)),), (1,), "string", ("block",))
     )
     return planned
-
-
-def chunk_limits(
-    pipeline: Pipeline, extents: tuple[int, ...], store_format: int
-) -> dict[str, int]:
-    """Return the most bytes that a chunk of each variable may have when it is compressed."""
-    scene_extent = dict(zip((axis.name for axis in scene_axes(pipeline)), extents, strict=True))
-    limits = {}
-    for variable in variables_of(pipeline, store_format):
-        planned = _variable(variable, pipeline, scene_extent)
-        size = math.prod(planned.chunks) * np.dtype(variable.dtype).itemsize
-        limits[variable.name] = size + size // 128 + 1024
-    return limits
 
 
 def _variable(
@@ -362,7 +340,6 @@ def _photographs(pipeline: Pipeline) -> list[PlannedArray]:
     return [
         dataclasses.replace(
             _labels(TRIAL, values, {"long_name": meaning}), path=name, coordinate=True,
-            optional=True,
         )
         for name, (values, meaning) in columns.items()
     ]
@@ -375,7 +352,7 @@ def _fixed(fixed: FixedValue) -> PlannedArray:
     return PlannedArray(
         fixed.name, (), (), "string" if text else value.dtype.str.lstrip("<>|="), (), None,
         dict(fixed.attributes), lambda start, stop: value,  # noqa: ARG005  (it has no dimension)
-        coordinate=True, optional=True,
+        coordinate=True,
     )
 
 

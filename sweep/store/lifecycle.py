@@ -1,38 +1,50 @@
-"""The life of a store: created, opened, finished, removed.
-
-A local store is created and deleted beside its path and renamed, so that a kill leaves no partial
-store; a remote one exists once its URL points to it.
-"""
+"""The life of a store: created, continued, opened, closed."""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import glob
 import json
 import os
 import shutil
 import time
 import uuid
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Self
+from zlib import crc32
 
+import numpy as np
 import zarr
 import zarr.errors
-from zarr.abc.store import Store
-from zarr.storage import LocalStore
+from zarr.abc.buffer import Buffer, BufferPrototype
+from zarr.abc.store import ByteRequest, Store
+from zarr.api import asynchronous
+from zarr.storage import LocalStore, WrapperStore
 
-from sweep.errors import StoreError
-from sweep.plan.attributes import with_descriptions
-from sweep.plan.camera_facts import camera_facts, notes
-from sweep.plan.camera_values import stored_text
-from sweep.plan.experiment import Pipeline
+from sweep.errors import PipelineError, StoreError
+from sweep.messages import plain, refusal
+from sweep.model.image_file import read_regular
+from sweep.plan.facts import camera_facts, camera_notes
 from sweep.plan.grid import Blocks, scene_axes
-from sweep.plan.schema import PHOTOGRAPH_SCHEMA, VARIABLES
+from sweep.plan.pipeline import Pipeline, apply_settings, parse_settings
+from sweep.plan.sampling import texts_in
+from sweep.plan.schema import PHOTOGRAPH_SCHEMA, VARIABLES, with_descriptions
+from sweep.plan.toml_text import MAX_BYTES, read_document
 from sweep.plugins.declared import RECORDED, recorded_plugins
-from sweep.store.checksums import DigestingStore
-from sweep.store.direct_reading import read_directly
-from sweep.store.durability import DurableStore, flush, flush_tree
-from sweep.store.layout import FORMAT, FORMATS, chunk_limits, planned_arrays
+from sweep.store.blocks import BEGUN, RunStore, check_whole, committed, run_metadata_in
+from sweep.store.chunks import Chunks
+from sweep.store.files import (
+    absent_files,
+    delete_files,
+    list_folder,
+    read_json,
+    sync,
+    write_document,
+)
+from sweep.store.layout import FORMAT, RECEIPTS, PlannedArray, codecs, planned_arrays
 from sweep.store.locations import (
     POINTER,
     check_writable,
@@ -46,18 +58,141 @@ from sweep.store.locations import (
     storage_at,
     translate_errors,
 )
-from sweep.store.lock import hold
-from sweep.store.manifest import Manifest, put, read_manifest, write_manifest
+from sweep.store.lock import hold, holder
 from sweep.store.provenance import environment, fingerprint
 from sweep.store.receipt import are_counts
-from sweep.store.run_store import RunStore
-from sweep.store.schema_check import schema_faults
-from sweep.store.snapshot import snapshot
-from sweep.store.tidying import beside, tidy_beside
-from sweep.store.zarr_sync import sync
 
 if TYPE_CHECKING:
     import xarray as xr
+
+
+# --------------------------------------------------------------------------------------------------
+# Whether a store's arrays are those that its pipeline asks for.
+
+GROUPS = ("commits", "cost", "failures")
+"""The groups of a store."""
+
+
+def schema_faults(store: RunStore) -> dict[str, str]:
+    """Return the faults of a store's arrays by name: missing, unknown, or of another schema."""
+    planned = {
+        array.path: array
+        for array in planned_arrays(store.pipeline, store.blocks.extents)
+    }
+    faults: dict[str, str] = {}
+    present: set[str] = set()
+    with warnings.catch_warnings():
+        # Zarr warns of files that are not its own; they are no fault.
+        warnings.simplefilter("ignore")
+        keys = sync(list_folder(store.storage, ""))
+        names = sorted({key for key in keys if not key.startswith(".")} | {RECEIPTS})
+        for name, member in zip(names, sync(_members(store, names)), strict=True):
+            if isinstance(member, KeyError):
+                continue
+            present.add(name)
+            if isinstance(member, BaseException):
+                # A damaged or forged document may raise anything.
+                faults[name] = f"unreadable: {reason_of(member)}"
+            elif isinstance(member, zarr.AsyncGroup):
+                if name not in GROUPS:
+                    faults[name] = "not a group of a sweep store"
+            elif name not in planned:
+                faults[name] = "not an array of a sweep store"
+            elif misfit := _misfit(planned[name], zarr.Array(member)):
+                faults[name] = misfit
+    faults.update(dict.fromkeys(linked_arrays(store), "a link; a store holds its files itself"))
+    faults.update({name: "missing" for name in planned if name not in present})
+    return faults
+
+
+async def _members(store: RunStore, names: Sequence[str]) -> list[Any]:
+    """Return the root group's members, or what reading them raises; all at once."""
+    group = await asynchronous.open_group(
+        store.storage, mode="r", zarr_format=3, use_consolidated=False
+    )
+    return await asyncio.gather(*map(group.getitem, names), return_exceptions=True)
+
+
+def linked_arrays(store: RunStore) -> list[str]:
+    """Return the arrays of a local store whose folder leads elsewhere, where nothing is written."""
+    if not isinstance(store.storage, LocalStore):
+        return []
+    root = Path(store.storage.root)
+    names = [each.path for each in planned_arrays(store.pipeline, store.blocks.extents)]
+    return [
+        name for name in names
+        if any(Path(root, *part).is_symlink() for part in (
+            name.split("/")[:1], name.split("/"), [name, "c"]))
+    ]
+
+
+def _misfit(planned: PlannedArray, array: zarr.Array[Any]) -> str:
+    try:
+        return planned.misfit(array)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        return f"unreadable: {reason_of(error)}"
+
+
+# --------------------------------------------------------------------------------------------------
+# What readers see of a store: its committed blocks, and coordinates as its pipeline has them.
+
+class CommittedBlocks(WrapperStore[Store]):
+    """A storage without the chunks of blocks that were not committed when it was made.
+
+    A writer may be at any block meanwhile, or may have been killed in the midst of one. It holds
+    only what can be pickled, so that a dataset on it can be sent to other processes.
+    """
+
+    def __init__(self, store: Store, chunks: Chunks, committed: bytes) -> None:
+        super().__init__(store)
+        self._chunks, self._committed = chunks, committed
+
+    def _with_store(self, store: Store) -> Self:
+        return type(self)(store, self._chunks, self._committed)
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether two show the same blocks of the same storage."""
+        return super().__eq__(other) and self._committed == getattr(other, "_committed", None)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    async def get(
+        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
+        """Return a key's content; None if it is of a block that was not committed."""
+        number = self._chunks.number(key)
+        if number is not None and not self._committed[number]:
+            return None
+        return await super().get(key, prototype, byte_range)
+
+
+def as_committed(store: RunStore, committed: Collection[int]) -> Store:
+    """Return the storage of a store with the chunks of these blocks alone."""
+    shown = np.zeros(len(store.blocks), dtype=np.uint8)
+    shown[list(committed)] = 1
+    return CommittedBlocks(store.storage, store.chunks, shown.tobytes())
+
+
+def changed_coordinate(store: RunStore) -> str:
+    """Return the key of a coordinate's chunk that is missing or changed; empty if there is none.
+
+    Coordinates that are drawn for each scene are variables of the blocks.
+    """
+    for planned in planned_arrays(store.pipeline, store.blocks.extents):
+        for key, part, values in planned.pieces():
+            if any(absent_files(store.storage, [key], planned.path)):
+                return key
+            stored = np.asarray(store.array(planned.path)[part])
+            if stored.shape != values.shape or not (stored == values).all():
+                return key
+    return ""
+
+
+# --------------------------------------------------------------------------------------------------
+# The life of a store: created, opened, finished, removed.
+#
+# A local store is created and deleted beside its path and renamed, so that a kill leaves no
+# partial store; a remote one exists once its URL points to it.
 
 UNREADABLE = (
     AttributeError, KeyError, TypeError, ValueError, RecursionError, OSError,
@@ -72,8 +207,11 @@ RUN_METADATA = {
 """What every store records of its run, and the types; a newer version may record more."""
 
 
-def open_store(url: str, mode: str = "r", *, durable: bool = False) -> RunStore:
-    """Open a store that :func:`create_store` made; ``durable``: one that flushes what it writes.
+NEW_RUN = "run its pipeline into a new store: `sweep run PIPELINE --store NEW`"
+
+
+def open_store(url: str, mode: str = "r") -> RunStore:
+    """Open a store that :func:`create_store` made.
 
     Raises
     ------
@@ -81,18 +219,8 @@ def open_store(url: str, mode: str = "r", *, durable: bool = False) -> RunStore:
         If there is no store, or something else, or its arrays are not those of its pipeline.
     """
     url = checked_url(url)
-    storage = open_storage(url, mode, durable=durable)
-    try:
-        attributes = dict(open_group(storage, mode).attrs)
-    except PermissionError as error:
-        raise StoreError(f"{url}: cannot be read: {reason_of(error)}") from None
-    except UNREADABLE:
-        if read_manifest(storage)[0] is None:
-            raise StoreError(not_a_store(url)) from None
-        raise StoreError(
-            f"{url}: damaged: zarr.json; `sweep verify --repair` repairs it"
-        ) from None
-    store = store_of(url, storage, attributes, mode)
+    storage = open_storage(url, mode)
+    store = store_of(url, storage, read_attributes(url, storage), mode)
     faults = schema_faults(store)
     if faults:
         name, fault = next(iter(faults.items()))
@@ -102,14 +230,40 @@ def open_store(url: str, mode: str = "r", *, durable: bool = False) -> RunStore:
     return store
 
 
+def read_attributes(url: str, storage: Store) -> dict[str, Any]:
+    """Return the attributes of a storage's root.
+
+    Raises
+    ------
+    StoreError
+        If there are none.
+    """
+    try:
+        root = read_json(storage, "zarr.json") or {}
+        return dict(root["attributes"])
+    except PermissionError as error:
+        raise StoreError(f"{url}: cannot be read: {reason_of(error)}") from None
+    except UNREADABLE:
+        if sync(list_folder(storage, RECEIPTS)):
+            raise StoreError(
+                f"{url}: damaged: without its zarr.json, its pipeline is lost; {NEW_RUN}"
+            ) from None
+        raise StoreError(not_a_store(url)) from None
+
+
 def store_of(
-    url: str, storage: DigestingStore, attributes: Mapping[str, Any], mode: str = "r"
+    url: str, storage: Store, attributes: Mapping[str, Any], mode: str = "r"
 ) -> RunStore:
     """Return the store that has these root attributes; StoreError if they are no store's."""
     try:
-        metadata = dict(attributes["sweep"])
-        if refused := _refused_format(metadata["format"]):
-            raise StoreError(f"{url}: {refused}")
+        metadata = run_metadata_in(attributes)
+        if metadata["format"] != FORMAT:
+            raise StoreError(
+                f"{url}: store format {metadata['format']!r}, this version of sweep has format "
+                f"{FORMAT} alone; {NEW_RUN}"
+            )
+        if attributes.get(CHECKSUM) != _checksum(attributes):
+            raise StoreError(f"{url}: damaged: zarr.json was changed; {NEW_RUN}")
         for key, kind in RUN_METADATA.items():
             if not isinstance(metadata[key], kind):
                 raise TypeError(key)
@@ -118,7 +272,7 @@ def store_of(
                 if not are_counts(metadata["counts"][name]):
                     raise TypeError(name)
         pipeline = Pipeline.from_text(
-            stored_text(str(attributes["pipeline"]), metadata["format"]), name=metadata["name"],
+            str(attributes["pipeline"]), name=metadata["name"],
             source=f"{url} (its pipeline)", folder=metadata["folder"],
             files=metadata["fingerprint"]["files"], plugins=recorded_plugins(metadata),
         )
@@ -130,38 +284,15 @@ def store_of(
             raise ValueError(extents)
         if not is_run_id(metadata["run_id"]):
             raise ValueError(metadata["run_id"])
-        storage.chunk_limits.update(chunk_limits(pipeline, extents, metadata["format"]))
-        if isinstance(storage.below, DurableStore):
-            storage.below.deferred = frozenset(storage.chunk_limits)
         return RunStore(
-            url, open_group(storage, mode), pipeline, metadata["run_id"],
-            Blocks(lengths, extents), metadata["format"],
+            url, open_group(storage, mode), pipeline, metadata["run_id"], Blocks(lengths, extents)
         )
     except UNREADABLE:
         raise StoreError(not_a_store(url)) from None
 
 
-def _refused_format(recorded: object) -> str:
-    """Return why a store of a format cannot be opened; empty if it can."""
-    if type(recorded) is int and recorded in FORMATS:
-        return ""
-    if isinstance(recorded, int) and recorded > FORMAT:
-        return (
-            f"store format {recorded} is newer than this version of sweep, which reads formats "
-            f"{FORMATS[0]} to {FORMAT}; install a newer version"
-        )
-    return (
-        f"store format {recorded}: this version of sweep reads formats {FORMATS[0]} to {FORMAT}; "
-        "run its pipeline into a new store"
-    )
-
-
-def create_store(
-    url: str, pipeline: Pipeline, extents: tuple[int, ...], *, durable: bool = False
-) -> RunStore:
+def create_store(url: str, pipeline: Pipeline, extents: tuple[int, ...]) -> RunStore:
     """Create an empty store for a pipeline, its chunks equal to blocks of ``extents``.
-
-    If it is ``durable``, it is complete after a power failure if it is there.
 
     Raises
     ------
@@ -173,24 +304,33 @@ def create_store(
         if is_remote(url):
             _lay_out(storage_at(f"{url}/{run_id}", read_only=False), pipeline, extents, run_id)
             # The URL points to it once it is complete.
-            put(storage_at(url, read_only=False), "zarr.json", {
+            write_document(storage_at(url, read_only=False), "zarr.json", {
                 "zarr_format": 3, "node_type": "group", "attributes": {POINTER: run_id},
             })
         else:
             check_writable(url)
-            tidy_beside(url)
-            building = beside(url, "new")
+            _remove_deleted(url)
+            building = _beside(url, "new")
             try:
                 _lay_out(LocalStore(building), pipeline, extents, run_id)
-                if durable:
-                    flush_tree(building)
                 building.rename(Path(url).resolve())
-                if durable:
-                    flush(building.parent)
             except BaseException:
                 _remove_unfinished(building)
                 raise
-    return open_store(url, "r+", durable=durable)
+    return open_store(url, "r+")
+
+
+def _beside(url: str, ending: str) -> Path:
+    """Return an unused path in the folder of a local store, which may lie behind a link."""
+    path = Path(url).resolve()
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.{ending}")
+
+
+def _remove_deleted(url: str) -> None:
+    """Delete what killed processes left of stores that they were deleting here."""
+    path = Path(url).resolve()
+    for doomed in path.parent.glob(f".{glob.escape(path.name)}.*.deleted"):
+        shutil.rmtree(doomed, ignore_errors=True)
 
 
 def _remove_unfinished(folder: Path) -> None:
@@ -208,39 +348,53 @@ def _remove_unfinished(folder: Path) -> None:
         time.sleep(0.02)
 
 
-def _lay_out(to: Store, pipeline: Pipeline, extents: tuple[int, ...], run_id: str) -> None:
-    """Write a store's coordinates, its empty arrays, its attributes, and its manifest."""
-    storage = DigestingStore(to)
+def _lay_out(storage: Store, pipeline: Pipeline, extents: tuple[int, ...], run_id: str) -> None:
+    """Write a store's coordinates, its empty arrays, and its attributes."""
     group = open_group(storage, "w-")
-    planned = planned_arrays(pipeline, extents, FORMAT)
+    planned = planned_arrays(pipeline, extents)
     for array in planned:
         array.create(group)
+    metadata = {
+        "format": FORMAT,
+        "name": pipeline.name,
+        "folder": pipeline.folder,
+        "run_id": run_id,
+        "block": list(extents),
+        "fingerprint": fingerprint(pipeline),
+        "environment": environment(),
+        **(
+            {RECORDED: [plugin.to_json() for plugin in pipeline.plugins]}
+            if pipeline.plugins else {}
+        ),
+        "created": utc_now(),
+        "finished": False,
+    }
+    group.attrs.update(root_attributes(pipeline, planned, metadata))
+
+
+CHECKSUM = "checksum"
+"""Attribute of the root: the CRC-32 of the pipeline's text and of the run's metadata."""
+
+
+def root_attributes(
+    pipeline: Pipeline, planned: Iterable[PlannedArray], metadata: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the attributes of a store's root: texts and numbers, which netCDF can hold."""
     coordinates = [array.path for array in planned if array.coordinate]
-    surprising = notes(pipeline)
-    attributes: dict[str, Any] = {
+    surprising = camera_notes(pipeline)
+    attributes = {
         "title": pipeline.heading,
         "pipeline": pipeline.text,
         **camera_facts(pipeline).attributes(),
         **({"camera_notes": "; ".join(surprising)} if surprising else {}),
         **({"coordinates": " ".join(coordinates)} if coordinates else {}),
-        "sweep": {
-            "format": FORMAT,
-            "name": pipeline.name,
-            "folder": pipeline.folder,
-            "run_id": run_id,
-            "block": list(extents),
-            "fingerprint": fingerprint(pipeline),
-            "environment": environment(),
-            **(
-                {RECORDED: [plugin.to_json() for plugin in pipeline.plugins]}
-                if pipeline.plugins else {}
-            ),
-            "created": utc_now(),
-            "finished": False,
-        },
+        "sweep": json.dumps(metadata),
     }
-    group.attrs.update(attributes)
-    write_manifest(storage, Manifest(attributes, dict(storage.digests)))
+    return {**attributes, CHECKSUM: _checksum(attributes)}
+
+
+def _checksum(attributes: Mapping[str, Any]) -> str:
+    return f"{crc32(attributes['pipeline'].encode() + attributes['sweep'].encode()):08x}"
 
 
 def utc_now() -> str:
@@ -262,17 +416,17 @@ def remove_store(url: str) -> None:
         if is_remote(url):
             pointer = storage_at(url, read_only=False)
             with hold(url, storage):
-                sync(pointer.delete("zarr.json"))
+                delete_files(pointer, ["zarr.json"])
             sync(pointer.delete_dir(str(metadata["run_id"])))
             return
         # Renamed at once, then deleted: a kill in between leaves no partial store.
-        doomed = beside(url, "deleted")
+        doomed = _beside(url, "deleted")
         with hold(url, storage):
             Path(url).resolve().rename(doomed)
         shutil.rmtree(doomed, ignore_errors=True)
 
 
-def read_run_metadata(url: str, storage: DigestingStore) -> dict[str, Any]:
+def read_run_metadata(url: str, storage: Store) -> dict[str, Any]:
     """Return the run's metadata of a store that may be damaged or of another format.
 
     Raises
@@ -280,10 +434,8 @@ def read_run_metadata(url: str, storage: DigestingStore) -> dict[str, Any]:
     StoreError
         If it is not a store.
     """
-    manifest, _ = read_manifest(storage)
     try:
-        attributes = open_group(storage, "r").attrs if manifest is None else manifest.attributes
-        return dict(cast("dict[str, Any]", attributes["sweep"]))
+        return run_metadata_in(read_attributes(url, storage))
     except UNREADABLE:
         raise StoreError(not_a_store(url)) from None
 
@@ -299,20 +451,18 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
     store = open_store(os.fspath(url))
     import xarray as xr  # noqa: PLC0415  (slow to import, and workers do without)
 
-    if not is_remote(store.url):
-        for planned in planned_arrays(store.pipeline, store.blocks.extents, store.format):
-            for key in planned.value_keys():
-                if reason := store.storage.unreadable(key):
-                    raise StoreError(
-                        f"{store.url}: damaged: {key} is {reason}; `sweep verify --repair` repairs "
-                        "it"
-                    )
+    finished = store.finished
+    done = check_whole(store, finished=finished)
     try:
+        if key := changed_coordinate(store):
+            raise StoreError(
+                f"{store.url}: damaged: {key} is not as its pipeline has it; "
+                "`sweep verify --repair` repairs it"
+            )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)  # of files not its own
-            storage = snapshot(store)
+            storage = store.storage if finished else as_committed(store, done)
             dataset: xr.Dataset = xr.open_zarr(storage, consolidated=False, zarr_format=3)
-            dataset = read_directly(dataset, store, storage)
             # Short, and asked for one by one.
             together = [name for axis in store.pipeline.axes for name, _ in axis.zipped]
             dataset = dataset.assign_coords({name: dataset[name].compute() for name in together})
@@ -323,10 +473,160 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
         raise StoreError(
             f"{store.url}: damaged ({reason_of(error)}); `sweep verify --repair` repairs it"
         ) from None
-    # Text, as netCDF needs it.
-    dataset.attrs["sweep"] = json.dumps(dataset.attrs["sweep"])
     ordered = [
         each.name for each in (*VARIABLES.values(), *PHOTOGRAPH_SCHEMA)
         if each.name in dataset.data_vars
     ]
     return with_descriptions(dataset.assign_coords(texts)[ordered])
+
+
+# --------------------------------------------------------------------------------------------------
+# The end of a run in its store: groups beside the results, and the mark "finished".
+
+MEASURED = ("cost/tradeoff", "cost/renderers")
+"""Groups within groups that no receipt could restore."""
+
+
+def finish(store: RunStore, groups: Mapping[str, xr.Dataset], counts: dict[str, Any]) -> None:
+    """Close a complete store: write its groups, consolidate the metadata, mark it finished."""
+    metadata = {
+        **store.run_metadata, "finished": True, "finished_at": utc_now(), "counts": counts,
+    }
+    _write_groups(store, groups, metadata)
+
+
+def reopen(store: RunStore, pipeline: Pipeline | None = None) -> None:
+    """Mark a finished store unfinished, so that blocks of it can be computed again.
+
+    Its groups go, since they sum the blocks up. A ``pipeline`` of the same cells is its own from
+    then on. A kill at any instant leaves a store with one of the two.
+    """
+    metadata = {
+        key: value for key, value in store.run_metadata.items()
+        if key not in ("finished_at", "counts")
+    }
+    with translate_errors(store.url, "written"):
+        write_root(store, {**metadata, "finished": False}, pipeline)
+        for name in ("cost", "failures"):
+            sync(store.storage.delete_dir(name))
+
+
+def write_group(store: RunStore, name: str, content: xr.Dataset) -> None:
+    """Write a dataset to a group of a finished store, and consolidate the metadata again."""
+    _write_groups(store, {name: content}, store.run_metadata)
+
+
+def write_root(
+    store: RunStore, metadata: Mapping[str, Any], pipeline: Pipeline | None = None
+) -> None:
+    """Write the root's document, with a copy of the others' metadata if the store is finished.
+
+    Consolidated metadata is not part of the Zarr 3 specification; xarray reads it, and warns if it
+    is missing.
+    """
+    pipeline = pipeline or store.pipeline
+    planned = planned_arrays(pipeline, store.blocks.extents)
+    root: dict[str, Any] = {
+        "zarr_format": 3, "node_type": "group",
+        "attributes": root_attributes(pipeline, planned, metadata),
+    }
+    if metadata["finished"]:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
+            zarr.consolidate_metadata(store.storage, zarr_format=3)
+        written = read_json(store.storage, "zarr.json") or {}
+        root["consolidated_metadata"] = written["consolidated_metadata"]
+    # Written last: a kill before it leaves a store that is closed again.
+    write_document(store.storage, "zarr.json", root)
+
+
+def _write_groups(
+    store: RunStore, groups: Mapping[str, xr.Dataset], metadata: Mapping[str, Any]
+) -> None:
+    with translate_errors(store.url, "written"):
+        sync(store.storage.delete_dir(BEGUN))
+        for name, content in groups.items():
+            for child in sync(list_folder(store.storage, name)):
+                if f"{name}/{child}" not in MEASURED:
+                    with contextlib.suppress(ValueError):  # a file, such as the group's zarr.json
+                        sync(store.storage.delete_dir(f"{name}/{child}"))
+            # Zarr 3 specifies strings of variable length, none of a fixed one.
+            texts = [label for label in content.variables if content[label].dtype.kind == "U"]
+            content.assign({label: content[label].astype(object) for label in texts}).to_zarr(
+                store.storage, group=name, mode="a", zarr_format=3, consolidated=False,
+                encoding={label: {"compressors": codecs()} for label in content.variables},
+                write_empty_chunks=True,
+            )
+        write_root(store, metadata)
+
+
+# --------------------------------------------------------------------------------------------------
+# What to say of a store that is not finished: who writes it, or how to continue it.
+
+def unfinished_line(store: RunStore) -> str:
+    """Return a line on a store that is not finished: its blocks, and what to do.
+
+    A store that a living client holds is being written; any other is continued by a run.
+    """
+    done, blocks = len(committed(store)), len(store.blocks)
+    writer = holder(store.storage)
+    after = "`sweep run` continues it" if writer is None else (
+        f"it is being written by {writer['host']}, process {writer['pid']}: wait until it is "
+        "finished")
+    return f"{store.url}: unfinished: {done:,} of {blocks:,} blocks; {after}"
+
+
+def open_finished(url: str) -> RunStore:
+    """Open a store; StoreError if it is not finished."""
+    store = open_store(url)
+    if not store.finished:
+        raise StoreError(unfinished_line(store))
+    return store
+
+
+# --------------------------------------------------------------------------------------------------
+# A pipeline by the path of its file, or of a store that was made from it.
+
+def names_store(path: str | os.PathLike[str]) -> bool:
+    """Return whether a path or URL leads to a folder or a server, where no pipeline file is."""
+    return "://" in os.fspath(path) or Path(path).is_dir()
+
+
+def read_pipeline(path: str | os.PathLike[str], settings: Sequence[str] = ()) -> Pipeline:
+    """Return the pipeline of a TOML file, or that of a store.
+
+    Parameters
+    ----------
+    path
+        A TOML file, or the path or URL of a store.
+    settings
+        "key=value" with TOML values, as ``--set`` takes them.
+
+    Raises
+    ------
+    PipelineError
+        If the file or a setting is invalid, or a folder is no store.
+    StoreError
+        If the store cannot be read.
+    """
+    if not names_store(path):
+        return Pipeline.from_toml(os.fspath(path), settings)
+
+    url = os.fspath(path)
+    if "://" not in url and not (Path(url) / "zarr.json").exists():
+        raise refusal([f"{plain(url)}: a folder that is no store; expected a TOML file or a store"])
+    stored = open_store(url).pipeline
+    return Pipeline.from_text(
+        stored.text, settings, name=stored.name, source=f"{url} (its pipeline)",
+        folder=stored.folder, camera_files=stored.files,
+    )
+
+
+def texts_required(path: str | os.PathLike[str], settings: Sequence[str] = ()) -> list[str]:
+    """Return what a TOML file that has faults requires; nothing if it is no file of TOML."""
+    try:
+        document = read_document(read_regular(os.fspath(path), MAX_BYTES).decode())
+        apply_settings(document, parse_settings(settings))
+    except (OSError, ValueError, PipelineError):
+        return []
+    return texts_in(document)

@@ -1,35 +1,97 @@
-"""Where stores lie: their URLs, the folder that a run holds, and a remote store's pointer.
-
-No path is written by two runs. On this machine, a run holds its store by the folder that it
-opened, wherever that is moved; a remote store's data lie under the run's id, to which the store's
-URL points.
-"""
+"""Where stores are: local paths and URLs, and how Zarr reaches them."""
 
 from __future__ import annotations
 
 import contextlib
+import gc
+import json
 import os
 import re
-import stat
+import sys
 import tempfile
 import uuid
+import warnings
 import weakref
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
+from typing import Any, Self
 from urllib.parse import unquote, urlsplit
 
+import numpy as np
 import zarr
 import zarr.errors
 from zarr.abc.store import Store
-from zarr.storage import FsspecStore, LocalStore
+from zarr.buffer import default_buffer_prototype
+from zarr.storage import FsspecStore, LocalStore, MemoryStore
 
 from sweep.errors import StoreError
-from sweep.messages import plain
-from sweep.store.checksums import DigestingStore
-from sweep.store.durability import DurableStore
-from sweep.store.manifest import put
-from sweep.store.zarr_settings import check_zarr
-from sweep.store.zarr_sync import sync
+from sweep.messages import nearest_file, plain
+from sweep.store.files import delete_files, sync, write_document
+
+# --------------------------------------------------------------------------------------------------
+# Whether Zarr works as it is configured: what it cannot read is else taken for a damaged store.
+
+def check_zarr() -> None:
+    """Check that Zarr reads what it writes.
+
+    Raises
+    ------
+    StoreError
+        If Python runs without assertions, or the user's configuration of Zarr makes that fail.
+    """
+    if sys.flags.optimize:
+        raise StoreError(
+            "Zarr cannot read groups where Python leaves out assertions; unset PYTHONOPTIMIZE, and "
+            "run Python without -O"
+        )
+    if reason := _failure():
+        given = [f"{name}={os.environ[name]}" for name in os.environ if name.startswith("ZARR_")]
+        raise StoreError(plain(
+            f"Zarr does not work with its configuration ({', '.join(given) or '~/.config/zarr'}): "
+            f"{reason}; correct it, or take it away", 600,
+        ))
+
+
+@cache
+def _failure() -> str:
+    """Return why a configuration that is not Zarr's own does not work, empty if it does."""
+    configuration: Any = zarr.config
+    if [configuration.config] == configuration.defaults:
+        return ""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of coroutines that were never begun
+        reason = ""
+        try:
+            _write_and_read()
+        except Exception as error:
+            reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        gc.collect()
+    return reason
+
+
+def _write_and_read() -> None:
+    storage = MemoryStore()
+    group = zarr.create_group(storage, zarr_format=3)
+    numbers = group.create_array("numbers", shape=(4,), chunks=(2,), dtype="float64")
+    texts = group.create_array("texts", shape=(2,), chunks=(1,), dtype=str)
+    numbers[:] = np.arange(4)
+    texts[:] = np.array(["a", "b"], dtype=object)
+    document = sync(storage.get("zarr.json", default_buffer_prototype()))
+    json.loads(document.to_bytes() if document is not None else b"")
+    again = zarr.open_group(storage, mode="r", zarr_format=3)
+    for name, wanted in (("numbers", [0, 1, 2, 3]), ("texts", ["a", "b"])):
+        array = again[name]
+        if not isinstance(array, zarr.Array) or np.asarray(array[:]).tolist() != wanted:
+            raise ValueError(f"an array of {name} is read with other values than it was written")
+
+
+# --------------------------------------------------------------------------------------------------
+# Where stores lie: their URLs, the folder that a run holds, and a remote store's pointer.
+#
+# No path is written by two runs. On this machine, a run holds its store by the folder that it
+# opened, wherever that is moved; a remote store's data lie under the run's id, to which the
+# store's URL points.
 
 POINTER = "sweep_run"
 """Attribute at a remote store's URL: the id of the run whose data are the store's."""
@@ -120,7 +182,8 @@ def storage_at(url: str, *, read_only: bool) -> Store:
     """Return the Zarr storage at a URL, whatever lies there."""
     check_zarr()
     if not is_remote(url):
-        return LocalStore(url, read_only=read_only)
+        # Absolute: a lazy dataset may be read by another process, in another working folder.
+        return LocalStore(Path(url).absolute(), read_only=read_only)
     try:
         # Without a cache of listings: others write the store at the same time.
         return FsspecStore.from_url(
@@ -128,7 +191,8 @@ def storage_at(url: str, *, read_only: bool) -> Store:
         )
     except ImportError as error:
         raise StoreError(f"{url}: {error}") from None
-    except ValueError as error:
+    except Exception as error:
+        # Each protocol's library raises its own: of github:// a TypeError without a repository.
         raise StoreError(f"{url}: cannot be reached: {reason_of(error)}") from None
 
 
@@ -147,6 +211,8 @@ def remote_run_id(url: str) -> str | None:
             pointer = open_group(storage_at(url, read_only=True), "r")
         except (FileNotFoundError, zarr.errors.GroupNotFoundError):
             return None
+        except (TypeError, ValueError, AttributeError, NotImplementedError) as error:
+            raise StoreError(f"{url}: cannot be reached: {reason_of(error)}") from None
     run_id = pointer.attrs.get(POINTER)
     if not isinstance(run_id, str) or not is_run_id(run_id):
         raise StoreError(not_a_store(url))
@@ -170,6 +236,8 @@ def exists(url: str) -> bool:
         return remote_run_id(url) is not None
     try:
         os.lstat(url)
+        with contextlib.suppress(FileNotFoundError):  # a link to nothing lies there, too
+            os.stat(url)  # noqa: PTH116  (as os.lstat)
     except (FileNotFoundError, NotADirectoryError):
         return False
     except OSError as error:
@@ -177,11 +245,11 @@ def exists(url: str) -> bool:
     return True
 
 
-def open_storage(url: str, mode: str = "r", *, durable: bool = False) -> DigestingStore:
+def open_storage(url: str, mode: str = "r") -> Store:
     """Return the storage that holds a store's files.
 
     With ``mode`` "r+" a local store is held by its folder: writes go to that folder even if
-    another store has since taken its path. ``durable``: a local one flushes what it writes.
+    another store has since taken its path.
 
     Raises
     ------
@@ -192,18 +260,16 @@ def open_storage(url: str, mode: str = "r", *, durable: bool = False) -> Digesti
     if not exists(url):
         raise StoreError(f"{url}: store not found{_similar(url)}")
     if is_remote(url):
-        return DigestingStore(storage_at(f"{url}/{remote_run_id(url)}", read_only=mode == "r"))
-    check_zarr()
-    kind = DurableStore if durable else LocalStore
+        return storage_at(f"{url}/{remote_run_id(url)}", read_only=mode == "r")
     try:
-        if not stat.S_ISDIR(Path(url).stat().st_mode):
+        if not Path(url).is_dir():
             raise StoreError(not_a_store(url))
         if mode == "r" or not Path("/proc/self/fd").is_dir():
-            return DigestingStore(kind(url, read_only=mode == "r"))
-        folder = _HeldFolder(url)
+            return storage_at(url, read_only=mode == "r")
+        check_zarr()
+        return _HeldStore(_HeldFolder(url))
     except OSError as error:
         raise StoreError(f"{url}: cannot be read: {reason_of(error)}") from None
-    return DigestingStore(kind(f"/proc/self/fd/{folder.descriptor}"), folder)
 
 
 def _similar(url: str) -> str:
@@ -212,6 +278,8 @@ def _similar(url: str) -> str:
         for other in (f"{url}.zarr", f"runs/{Path(url).name}", f"runs/{Path(url).name}.zarr"):
             if (Path(other) / "zarr.json").is_file():
                 return f"; did you mean {plain(other)}?"
+        if similar := nearest_file(url) or nearest_file(Path("runs") / Path(url).name):
+            return similar
     return "; create one with `sweep run`"
 
 
@@ -221,6 +289,18 @@ class _HeldFolder:
     def __init__(self, path: str) -> None:
         self.descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
         weakref.finalize(self, os.close, self.descriptor)
+
+
+class _HeldStore(LocalStore):
+    """A local storage that holds its folder."""
+
+    def __init__(self, folder: _HeldFolder, *, read_only: bool = False) -> None:
+        super().__init__(f"/proc/self/fd/{folder.descriptor}", read_only=read_only)
+        self._folder = folder
+
+    def with_read_only(self, read_only: bool = False) -> Self:
+        """Return the same folder's storage, to be read only."""
+        return type(self)(self._folder, read_only=read_only)
 
 
 def enclosing_store(path: Path) -> Path | None:
@@ -247,8 +327,8 @@ def check_writable(url: str) -> None:
         trial = f".sweep-{uuid.uuid4().hex}"
         with translate_errors(url, "written"):
             storage = storage_at(url, read_only=False)
-            put(storage, trial, {})
-            sync(storage.delete(trial))
+            write_document(storage, trial, {})
+            delete_files(storage, [trial])
         return
     with translate_errors(url, "written"):
         around = enclosing_store(Path(url).absolute().parent)

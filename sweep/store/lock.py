@@ -1,13 +1,9 @@
-"""The lock of a store: one writer at a time; a stale lock is replaced.
-
-A writer renews its lock every few seconds. Whether it lives is judged without comparing clocks of
-two machines: on the same boot of a kernel by the process and the kernel's clock, at once; elsewhere
-by watching whether the lock changes.
-"""
+"""The lock of a store: who lives, and who wins."""
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import math
 import os
@@ -19,15 +15,158 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from zarr.abc.store import Store
+from zarr.buffer import cpu
+from zarr.storage import FsspecStore, LocalStore
+
 from sweep.errors import StoreError
 from sweep.messages import notice, plain
-from sweep.store.checksums import DigestingStore
+from sweep.store.blocks import RunStore
+from sweep.store.files import encoded, read_files, sync
 from sweep.store.layout import RECEIPTS
 from sweep.store.locations import translate_errors
-from sweep.store.lock_file import LockFile
-from sweep.store.manifest import encoded
-from sweep.store.run_store import RunStore
-from sweep.store.tidying import tidy
+
+# --------------------------------------------------------------------------------------------------
+# The lock's file, changed only by comparison: a new content replaces the one that was expected.
+#
+# Of several processes that expect the same content, one succeeds. On a local file system the
+# comparison and the change are made under an exclusive `flock` of the store's folder, which the
+# kernel releases if the process dies. An S3 server compares (``If-None-Match``, ``If-Match``).
+# Elsewhere (network file systems without `flock` of folders, other object stores, servers that
+# ignore these headers) a new file is linked exclusively, or written, and read again after a
+# while.
+
+SETTLE_S = 1.0
+"""Seconds after which a lock is read again where the change itself excludes nobody."""
+
+BUSY_S = 10.0
+"""Seconds that a process waits for another one that is changing the lock."""
+
+
+REFUSED_CODES = {
+    "PreconditionFailed", "ConditionalRequestConflict", "NoSuchKey", "404", "409", "412",
+}
+"""What an S3 server answers if the content is not the expected one."""
+
+
+class LockFile:
+    """The content of the lock's key in a storage."""
+
+    def __init__(self, storage: Store, key: str) -> None:
+        self._storage, self._key = storage, key
+
+    def read(self) -> bytes | None:
+        """Return the content; None if there is none."""
+        return read_files(self._storage, [self._key])[0]
+
+    def exchange(self, expected: bytes | None, content: bytes | None) -> bool:
+        """Replace the content if it is the expected one; None stands for no file.
+
+        Returns whether it was replaced.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written, or another process has been changing it for long.
+        """
+        storage = self._storage
+        if isinstance(storage, LocalStore):
+            with _exclusive(storage.root) as alone:
+                return self._compare_and_write(expected, content, alone=alone)
+        if isinstance(storage, FsspecStore) and hasattr(storage.fs, "_call_s3"):
+            done = sync(self._exchange_on_s3(storage, expected, content))
+            if done is False or content is None:
+                return bool(done)
+            if done:  # also true of a server that ignores the condition
+                return self._is_still(content)
+        return self._compare_and_write(expected, content, alone=False)
+
+    def _compare_and_write(
+        self, expected: bytes | None, content: bytes | None, *, alone: bool
+    ) -> bool:
+        if self.read() != expected:
+            return False
+        if content is None:
+            with contextlib.suppress(FileNotFoundError):
+                sync(self._storage.delete(self._key))
+            return True
+        buffer = cpu.Buffer.from_bytes(content)
+        if alone:
+            sync(self._storage.set(self._key, buffer))
+            return True
+        write = self._storage.set if expected is not None else self._storage.set_if_not_exists
+        sync(write(self._key, buffer))
+        return self._is_still(content)
+
+    def _is_still(self, content: bytes) -> bool:
+        time.sleep(SETTLE_S)
+        return self.read() == content
+
+    async def _exchange_on_s3(
+        self, store: FsspecStore, expected: bytes | None, content: bytes | None
+    ) -> bool | None:
+        """Have the server compare and write; None if it cannot."""
+        system: Any = store.fs
+        call = system._call_s3  # noqa: SLF001  (nothing public awaits with conditions)
+        bucket, key, _ = system.split_path(f"{store.path}/{self._key}")
+        where = {"Bucket": bucket, "Key": key}
+        condition = {"IfNoneMatch": "*"}
+        if expected is not None:
+            try:
+                answer = await call("get_object", **where)
+                if await answer["Body"].read() != expected:
+                    return False
+            except FileNotFoundError:
+                return False
+            condition = {"IfMatch": answer["ETag"]}
+        if content is None:
+            await call("delete_object", **where)
+            return True
+        try:
+            await call("put_object", **where, Body=content, **condition)
+        except Exception as error:
+            answer = getattr(error.__cause__ or error, "response", None) or {}
+            code = answer.get("Error", {}).get("Code")
+            if code in REFUSED_CODES:
+                return False
+            if code == "NotImplemented" or isinstance(error, NotImplementedError):
+                return None
+            raise
+        return True
+
+
+@contextlib.contextmanager
+def _exclusive(folder: Path) -> Iterator[bool]:
+    """Exclude other processes and threads by a `flock`; gives False where there is none."""
+    if fcntl is None:
+        yield False
+        return
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        deadline = time.monotonic() + BUSY_S
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    raise TimeoutError(0, "another process is changing its lock") from None
+                time.sleep(0.002)
+                continue
+            except OSError:
+                yield False
+                return
+            yield True
+            return
+    finally:
+        os.close(descriptor)
+
+
+# --------------------------------------------------------------------------------------------------
+# The lock of a store: one writer at a time; a stale lock is replaced.
+#
+# A writer renews its lock every few seconds. Whether it lives is judged without comparing clocks
+# of two machines: on the same boot of a kernel by the process and the kernel's clock, at once;
+# elsewhere by watching whether the lock changes.
 
 KEY = f"{RECEIPTS}/lock.json"
 
@@ -106,7 +245,7 @@ class HeldLock:
 
 @contextlib.contextmanager
 def locked(store: RunStore) -> Iterator[HeldLock]:
-    """Hold a store for writing, and delete what killed writers left in it.
+    """Hold a store for writing.
 
     Raises
     ------
@@ -114,12 +253,11 @@ def locked(store: RunStore) -> Iterator[HeldLock]:
         If another client holds it, or it cannot be written.
     """
     with hold(store.url, store.storage) as lock:
-        tidy(store)
         yield lock
 
 
 @contextlib.contextmanager
-def hold(url: str, storage: DigestingStore) -> Iterator[HeldLock]:
+def hold(url: str, storage: Store) -> Iterator[HeldLock]:
     """Hold the lock of a storage, whatever else it holds.
 
     Raises
@@ -138,7 +276,7 @@ def hold(url: str, storage: DigestingStore) -> Iterator[HeldLock]:
         lock.release()
 
 
-def refuse_if_held(url: str, storage: DigestingStore) -> None:
+def refuse_if_held(url: str, storage: Store) -> None:
     """Raise StoreError if a living client holds the store.
 
     It takes up to :data:`SILENCE_S` if the lock is of another machine, or of another boot.
@@ -147,7 +285,7 @@ def refuse_if_held(url: str, storage: DigestingStore) -> None:
         _free(url, LockFile(storage, KEY))
 
 
-def holder(storage: DigestingStore) -> Content | None:
+def holder(storage: Store) -> Content | None:
     """Return the host and pid of the client that seems to hold a store, None if nobody does.
 
     It answers at once: for another machine by its clock, which is enough to show.
@@ -215,13 +353,8 @@ def _parsed(content: bytes | None) -> Content | None:
 
 def _alive(lock: Content) -> bool | None:
     """Return whether a lock's process lives and renews it; None if it cannot be known from here."""
-    if "boot" not in lock:  # of version 0.6 or before
-        if lock["host"] != socket.gethostname():
-            return None
-        if not _exists(lock["pid"]):
-            return False
-        return True if abs(time.time() - lock["beat"]) < SILENCE_S else None
-    if not lock["boot"] or (lock["boot"], lock.get("namespace")) != (_boot(), _namespace()):
+    boot = lock.get("boot")
+    if not boot or (boot, lock.get("namespace")) != (_boot(), _namespace()):
         return None
     started = _started(lock["pid"]) or (lock.get("started") if _exists(lock["pid"]) else None)
     if lock.get("started") != started:

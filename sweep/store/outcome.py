@@ -1,18 +1,147 @@
-"""The outcome of a run in words: what failed and why, and whether anything was computed."""
+"""What became of a run's cells: counts of flags, and failures."""
 
 from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag
 from sweep.messages import plain
+from sweep.plan.axes import Axis
 from sweep.plan.cell_selection import selection_text
-from sweep.store.blocks import committed, receipts
-from sweep.store.failures import FailedCell, failed_cells
-from sweep.store.run_store import RunStore
+from sweep.plan.grid import Block, scene_axes
+from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
+from sweep.processor import differing_processors
+from sweep.store.blocks import RunStore, committed, receipts
+from sweep.store.receipt import Receipt, RecordedFailure
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+# --------------------------------------------------------------------------------------------------
+# Cells whose computation raised or whose process died: their coordinates, and the reason.
+
+MAX_ROWS = 1000
+"""Rows of each kind (failed, crashed) that a store keeps; the flags count all of them."""
+
+MAX_PER_BLOCK = 100
+
+MAX_CHARACTERS = 4000
+"""Characters that are kept of a traceback: its end."""
+
+
+@dataclass(frozen=True, slots=True)
+class FailedCell:
+    """One row of the table of failures: a scene, or a scene with a configuration.
+
+    Attributes
+    ----------
+    at
+        Its coordinates, as ``sweep repro --at`` takes them.
+    kind
+        "failed" (it raised) or "crashed" (its process died).
+    stage
+        "scene", "detection" or "estimation".
+    text
+        The traceback, or how the process died.
+    """
+
+    at: str
+    kind: str
+    stage: str
+    text: str
+
+    @property
+    def reason(self) -> str:
+        """The first line of the exception's message in a traceback; of other texts the last."""
+        lines = self.text.strip().splitlines()
+        frames = [number for number, line in enumerate(lines) if line.startswith('  File "')]
+        raised = (line for line in lines[frames[-1] + 1 :] if not line[:1].isspace()) \
+            if frames else iter(())
+        return next(raised, lines[-1] if lines else "")
+
+
+def recorded(
+    failures: Sequence[Any], rows: Sequence[int], quota: Mapping[str, int]
+) -> tuple[RecordedFailure, ...]:
+    """Return the failures that a block's receipt keeps: at most ``quota`` of each kind.
+
+    ``rows`` gives the number within the block of each scene that was computed.
+    """
+    kept: list[RecordedFailure] = []
+    left = {kind: min(count, MAX_PER_BLOCK) for kind, count in quota.items()}
+    for failure in failures:
+        kind = "crashed" if failure.crashed else "failed"
+        if left[kind] <= 0:
+            continue
+        left[kind] -= 1
+        kept.append(RecordedFailure(
+            int(rows[failure.scene]), kind, failure.stage, failure.setting, failure.estimator,
+            failure.text[-MAX_CHARACTERS:],
+        ))
+    return tuple(kept)
+
+
+def failed_cells(store: RunStore, number: int, receipt: Receipt) -> Iterator[FailedCell]:
+    """Yield the failures that a block's receipt holds."""
+    if not receipt.failures:
+        return
+    block = store.blocks[number]
+    for failure in receipt.failures:
+        coordinates = _coordinates(store.pipeline, block, failure)
+        yield FailedCell(selection_text(coordinates), failure.kind, failure.stage, failure.text)
+
+
+def _coordinates(
+    pipeline: Pipeline, block: Block, failure: RecordedFailure
+) -> dict[str, Any]:
+    """Return the values that vary, in the order of the axes, of a failure's cell."""
+    indices = {
+        axis.name: index
+        for axis, index in zip(scene_axes(pipeline), block.cell(failure.scene), strict=True)
+    }
+    for number, stage in (
+        (failure.setting, Stage.detection), (failure.estimator, Stage.estimation),
+    ):
+        if number is not None:
+            indices |= _configuration(pipeline.axes_of(stage), number)
+    return pipeline.cell_at(indices)
+
+
+def _configuration(axes: Sequence[Axis], number: int) -> dict[str, int]:
+    """Return the index along each axis of a configuration."""
+    if not axes:
+        return {}
+    index = np.unravel_index(number, [len(axis) for axis in axes])
+    return {axis.name: int(i) for axis, i in zip(axes, index, strict=True)}
+
+
+def failure_table(cells: Sequence[FailedCell], counts: Mapping[str, int]) -> xr.Dataset:
+    """Return the table of failures, with the total number of cells of each kind."""
+    import xarray as xr  # noqa: PLC0415  (slow to import)
+
+    def column(name: str) -> tuple[tuple[str], Any]:
+        return ("failure",), np.array([getattr(cell, name) for cell in cells], dtype=object)
+
+    return xr.Dataset(
+        {name: column(name) for name in ("at", "kind", "stage", "text")},
+        attrs={
+            "long_name": "scenes that raised or ended their process",
+            "rows_kept": f"at most {MAX_ROWS} of each kind, and {MAX_PER_BLOCK} of a block",
+            **{f"{kind}_cells": count for kind, count in counts.items()},
+        },
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# The outcome of a run in words: what failed and why, and whether anything was computed.
 
 LOUD_SHARE = 0.1
 """Share of the cells that were tried, above which failures are told first."""
@@ -156,7 +285,10 @@ def outcome_of_finished(store: RunStore) -> Outcome:
         for flags, counts in ((DetectionStatus, detection), (EstimateStatus, estimate))
     )
     cells = _recorded_failures(store) if any_lost else ()
-    return outcome_of(store.url, detection, estimate, cells, first_cell(store))
+    found = outcome_of(store.url, detection, estimate, cells, first_cell(store))
+    processors = store.run_metadata["counts"].get("processors") or {}
+    found.warnings.extend(differing_processors(processors, "blocks"))
+    return found
 
 
 def first_cell(store: RunStore) -> str:

@@ -4,44 +4,33 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
-import itertools
 import json
 import platform
 import runpy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from sweep.environments.identity import identify
-from sweep.environments.interpreters import INSTALLED
-from sweep.errors import EnvironmentFaultError
-from sweep.installation import check_installation, check_loaded_opencv
-from sweep.measure.foreign_detector import provenance
-from sweep.model.camera import VIEW_PARAMETERS, intrinsics
+from sweep.installation import check_installation
 from sweep.plan.draws import SAMPLINGS
-from sweep.plan.experiment import Pipeline
-from sweep.plan.stopping import not_continued
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.sampling import not_continued
 from sweep.version import __version__
 
-NUMBERS_VERSION = 4
+NUMBERS_VERSION = 5
 """Raised whenever the numbers change; a test with golden digests fails if it is not."""
-
-NEAR_NUMBERS_VERSION = 3
-"""The version where no marker is far: version 4 changed guarded solvers at sides below 1/800 of
-the focal length (`sweep.measure.solver`), and nothing else."""
-
-NEAR_FOCAL_PX = 4000.0
-"""Up to this focal length such sides are below 5 px, where no marker is detected."""
 
 
 def versions() -> dict[str, str]:
     """Return the versions that the numbers of this process depend on."""
-    packages = {
-        "opencv": "opencv-contrib-python-headless", "numpy": "numpy", "numba": "numba",
+    import cv2  # noqa: PLC0415  (slow to import)
+
+    return {
+        "opencv": cv2.__version__,
+        **{name: importlib.metadata.version(name) for name in ("numpy", "numba")},
     }
-    return {name: importlib.metadata.version(package) for name, package in packages.items()}
 
 
 @cache
@@ -51,14 +40,13 @@ def builds() -> dict[str, str]:
     Raises
     ------
     StoreError
-        If OpenCV is installed in a way that makes it uncertain which one is used.
+        If OpenCV cannot be used.
     """
     check_installation()
     import cv2  # noqa: PLC0415  (slow to import)
     import llvmlite  # noqa: PLC0415
     import numpy as np  # noqa: PLC0415
 
-    check_loaded_opencv(cv2.__version__)
     config: dict[str, Any] = {**np.show_config(mode="dicts")}
     for dependency in config["Build Dependencies"].values():
         for path in ("include directory", "lib directory", "pc file directory"):
@@ -92,10 +80,10 @@ def fingerprint(pipeline: Pipeline) -> dict[str, Any]:
     Raises
     ------
     StoreError
-        If OpenCV is installed in a way that makes it uncertain which one is used.
+        If OpenCV cannot be used.
     """
     return {
-        "numbers": numbers_version(pipeline),
+        "numbers": NUMBERS_VERSION,
         **versions(),
         "builds": dict(builds()),
         "seed": pipeline.seed,
@@ -103,20 +91,7 @@ def fingerprint(pipeline: Pipeline) -> dict[str, Any]:
         "files": dict(sorted(pipeline.files.items())),
         **({"plugins": versions_used} if (versions_used := plugin_versions(pipeline)) else {}),
         **({"effects": effects} if (effects := effects_in_order(pipeline)) else {}),
-        **({"environments": others} if (others := environment_versions(pipeline)) else {}),
     }
-
-
-def environment_versions(pipeline: Pipeline) -> dict[str, str]:
-    """Return what the results of each of a pipeline's environments depend on, or why it is none."""
-    versions_of = {}
-    for name in pipeline.values_of("environment"):
-        if name != INSTALLED:
-            try:
-                versions_of[name] = provenance(identify(name, pipeline.folder), pipeline.given)
-            except EnvironmentFaultError as error:
-                versions_of[name] = f"none ({error})"
-    return versions_of
 
 
 def effects_in_order(pipeline: Pipeline) -> list[str]:
@@ -129,24 +104,11 @@ def plugin_versions(pipeline: Pipeline) -> dict[str, dict[str, str]]:
     return {each.name: dict(each.versions) for each in pipeline.plugins if each.versions}
 
 
-def numbers_version(pipeline: Pipeline) -> int:
-    """Return the version of the numbers of a pipeline: the earliest with the same ones."""
-    ends = [_ends(pipeline.values_of(name)) for name in VIEW_PARAMETERS]
-    focal_px = max(max(intrinsics(*values)[:2]) for values in itertools.product(*ends))
-    return NUMBERS_VERSION if focal_px > NEAR_FOCAL_PX else NEAR_NUMBERS_VERSION
-
-
-def _ends(values: Sequence[Any]) -> Sequence[Any]:
-    """Return the smallest and the largest value; focal lengths are monotonous in each."""
-    numbers = [value for value in values if value is not None]
-    return (min(numbers), max(numbers)) if len(numbers) > 1 else (numbers or [None])
-
-
 def changes(stored: dict[str, Any], own: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
     """Yield name, stored and own value of each entry in which two fingerprints differ.
 
-    Builds are compared one by one; stores up to format 3 may have none, and are not refused. Files
-    are compared by their contents: a pipeline's values have their paths, where these matter.
+    Builds are compared one by one. Files are compared by their contents: a pipeline's values have
+    their paths, where these matter.
 
     Examples
     --------
@@ -155,20 +117,10 @@ def changes(stored: dict[str, Any], own: dict[str, Any]) -> Iterator[tuple[str, 
     """
     for key in sorted({*stored, *own}):
         theirs, mine = stored.get(key), own.get(key)
-        if key == "builds" and key not in stored:
-            continue
         if key == "builds" and isinstance(theirs, dict) and isinstance(mine, dict):
             yield from (
                 (f"{key}.{name}", theirs.get(name), mine.get(name))
                 for name in sorted({*theirs, *mine}) if theirs.get(name) != mine.get(name)
-            )
-        elif key == "environments":
-            # Cells of an environment that only one of them has are not compared.
-            stored_ones, own_ones = theirs or {}, mine or {}
-            yield from (
-                (f"{key}.{name}", stored_ones[name], own_ones[name])
-                for name in sorted(stored_ones.keys() & own_ones.keys())
-                if stored_ones[name] != own_ones[name]
             )
         elif key == "files" and _contents(theirs) == _contents(mine):
             continue

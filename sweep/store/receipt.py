@@ -1,9 +1,4 @@
-"""The receipt of a block: what commits it, counts its flags, and holds its chunks' digests.
-
-A receipt is the last thing that is written of a block, as JSON. Stores of format 2 (sweep 0.5)
-list the digests by position, in the order of that format's variables; later ones name them. From
-format 4 on, a receipt names its block, so that it commits no other one.
-"""
+"""What commits a block: its receipt."""
 
 from __future__ import annotations
 
@@ -12,18 +7,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+import google_crc32c
+import numpy as np
+from numcodecs.vlen import VLenUTF8
+from numcodecs.zstd import Zstd
+
 from sweep.measure.flags import DetectionStatus
-from sweep.plan.schema import schema_of
+from sweep.store.layout import ZSTD_LEVEL, checksum_of
 
-POSITIONAL_FORMAT = 2
-"""The store format whose receipts list digests by position."""
-
-NAMING_FORMAT = 4
-"""The store format from which on receipts name their block."""
+# --------------------------------------------------------------------------------------------------
+# The receipt of a block: what commits it, counts its flags, and lists its chunks' checksums.
+#
+# A receipt is the last thing that is written of a block, as JSON. It names its block, so that it
+# commits no other one.
 
 REQUIRED = {
-    "run_id", "processor", "scenes", "detection", "estimate", "seconds", "failures", "written",
-    "digests",
+    "run_id", "processors", "scenes", "computed", "detection", "estimate", "seconds", "failures",
+    "wall_s", "written", "checksums", "block",
 }
 """Keys that every receipt has."""
 
@@ -85,8 +85,9 @@ class Receipt:
     ----------
     run_id
         The run that the store belongs to.
-    processor
-        Features of the processor that computed the block.
+    processors
+        Features of the processors that computed its cells, in order: several where cells were
+        taken from other stores, or computed on another basis before.
     scenes
         Number of scenes of the block.
     computed
@@ -101,17 +102,17 @@ class Receipt:
         Seconds from the block's start to its receipt.
     written
         Time at which it was computed, seconds since 1970.
-    digests
-        Variable -> CRC-32 of its chunk.
+    checksums
+        Variable -> the CRC-32C at the end of its chunk.
     block
-        The block's number; None in stores of formats before 4.
+        The block's number; None until it is written.
     basis
         A digest of what the block's needed scenes follow from: the rule by which sampling stops,
         and the results of earlier waves; None where all scenes are needed.
     """
 
     run_id: str
-    processor: str
+    processors: Sequence[str]
     scenes: int
     computed: Mapping[str, int]
     detection: Sequence[int]
@@ -120,7 +121,7 @@ class Receipt:
     failures: Sequence[RecordedFailure]
     wall_s: float
     written: float
-    digests: Mapping[str, int] = field(default_factory=dict)
+    checksums: Mapping[str, int] = field(default_factory=dict)
     block: int | None = None
     basis: int | None = None
 
@@ -135,22 +136,16 @@ class Receipt:
         """Whether any of its scenes was needed; if none was, it has chunks of flags alone."""
         return self.basis is None or self.scenes_needed > 0
 
-    def to_json(self, store_format: int) -> str:
-        """Return the text that a store of a format holds."""
+    def to_json(self) -> str:
+        """Return the text that a store holds."""
         content = asdict(self)
-        if store_format == POSITIONAL_FORMAT:
-            content["digests"] = [
-                self.digests[variable.name] for variable in schema_of(store_format)
-            ]
-        if store_format < NAMING_FORMAT:
-            del content["block"]
         if self.basis is None:
             del content["basis"]
         return json.dumps(content, separators=(",", ":"))
 
     @classmethod
     def from_json(cls, text: str) -> Receipt:
-        """Return the receipt that a text holds, of whatever format.
+        """Return the receipt that a text holds.
 
         Raises
         ------
@@ -165,32 +160,35 @@ class Receipt:
             raise ValueError("incomplete")
         valid = (
             isinstance(content["run_id"], str)
-            and isinstance(content["processor"], str)
+            and isinstance(content["processors"], list)
+            and all(isinstance(each, str) for each in content["processors"])
             and _is_count(content["scenes"])
             and are_counts(content["detection"])
             and are_counts(content["estimate"])
             and _are_seconds(content["seconds"])
             and isinstance(content["failures"], list)
             and _is_number(content["written"])
-            and _is_number(content.get("wall_s", 0.0))
-            and (content.get("block") is None or _is_count(content["block"]))
+            and _is_number(content["wall_s"])
+            and _are_named_counts(content["computed"])
+            and _are_named_counts(content["checksums"])
+            and _is_count(content["block"])
             and (content.get("basis") is None or _is_count(content["basis"]))
         )
         if not valid:
             raise ValueError("a value of a wrong type")
         return cls(
             run_id=content["run_id"],
-            processor=content["processor"],
+            processors=tuple(content["processors"]),
             scenes=content["scenes"],
-            computed=_computed(content.get("computed", {})),
+            computed=content["computed"],
             detection=content["detection"],
             estimate=content["estimate"],
             seconds={stage: content["seconds"][stage] for stage in STAGES},
             failures=tuple(RecordedFailure.from_dict(each) for each in content["failures"]),
-            wall_s=content.get("wall_s", 0.0),
+            wall_s=content["wall_s"],
             written=content["written"],
-            digests=_digests(content["digests"]),
-            block=content.get("block"),
+            checksums=content["checksums"],
+            block=content["block"],
             basis=content.get("basis"),
         )
 
@@ -237,19 +235,30 @@ def _are_seconds(values: Any) -> bool:
     )
 
 
-def _computed(values: Any) -> dict[str, int]:
-    if not isinstance(values, dict) or not all(_is_count(value) for value in values.values()):
-        raise ValueError("computed: expected counts")
-    return values
+def _are_named_counts(values: Any) -> bool:
+    return isinstance(values, dict) and all(_is_count(value) for value in values.values())
 
 
-def _digests(values: Any) -> dict[str, int]:
-    """Return the digests by variable."""
-    if isinstance(values, list):
-        names = [variable.name for variable in schema_of(POSITIONAL_FORMAT)]
-        if len(values) != len(names):
-            raise ValueError("digests: another number of variables")
-        values = dict(zip(names, values, strict=True))
-    if not isinstance(values, dict) or not all(_is_count(value) for value in values.values()):
-        raise ValueError("digests: expected a CRC-32 for each variable")
-    return values
+# --------------------------------------------------------------------------------------------------
+# The text of a receipt from the bytes of its chunk, and back.
+#
+# Zarr decodes each chunk in a thread of its own: for 10^5 receipts that takes half a minute of
+# processor time, four times what the same codecs take when they are called one after another.
+
+def decoded(content: bytes) -> str:
+    """Return the text that a chunk holds; ValueError if it is damaged."""
+    body = content[:-4]
+    if google_crc32c.value(body) != checksum_of(content):
+        raise ValueError("a receipt's checksum differs")
+    try:
+        (text,) = VLenUTF8().decode(Zstd().decode(body))
+    except RuntimeError as error:
+        raise ValueError(str(error)) from None
+    return str(text)
+
+
+def encoded(text: str) -> bytes:
+    """Return the content of a chunk that holds a text, the same bytes as Zarr writes."""
+    body = bytes(Zstd(ZSTD_LEVEL).encode(VLenUTF8().encode(np.array([text], dtype=object))))
+    checksum: int = google_crc32c.value(body)
+    return body + checksum.to_bytes(4, "little")

@@ -1,10 +1,10 @@
-"""A requirement in, a decision out: the search for the choice of a pipeline's section [choose]."""
+"""The search of the cheapest choice, and what it costs."""
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,19 +12,128 @@ import numpy as np
 import xarray as xr
 
 from sweep.analysis.choices import Answer, answers
-from sweep.analysis.dimensions import DRAWS
+from sweep.analysis.dataset import DRAWS
+from sweep.analysis.draws import computed_scenes
 from sweep.analysis.requirements import Decision
-from sweep.analysis.stopped_sampling import computed_scenes
 from sweep.execution.progress import ProgressReport, StageReport
 from sweep.execution.runner import execute
-from sweep.isolation.child_process import Child
+from sweep.isolation.child_process import Child, Interrupts
 from sweep.messages import refusal
-from sweep.plan.choice_rule import SECTION, ChoiceRule
-from sweep.plan.experiment import Pipeline
-from sweep.sampling.choice import store_cells
+from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.sampling import CHOOSE, ChoiceRule
+from sweep.sampling.searches import store_cells
 from sweep.store.lifecycle import open_dataset
-from sweep.tradeoff.choice_costs import Cost, choice_costs
+from sweep.tradeoff.costs import measure, median_interval, sample_scenes
 from sweep.tradeoff.pareto import pareto_front
+
+# --------------------------------------------------------------------------------------------------
+# What each alternative of a choice costs: the time of a frame at its answer, measured in turns.
+
+MAX_CONDITIONS = 24
+"""Conditions of each answer that are measured; of more, so many from all over the grid."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """The time of a frame, detection and estimation, at the condition where it is longest.
+
+    Attributes
+    ----------
+    ms, low, high
+        The median, and the ends of its 95 % interval, in milliseconds.
+    condition
+        Values by axis.
+    """
+
+    ms: float
+    low: float
+    high: float
+    condition: Mapping[str, Any]
+
+
+def choice_costs(
+    pipeline: Pipeline, rule: ChoiceRule, found: Sequence[Answer], limit_s: float,
+    report: StageReport,
+) -> list[Cost | None]:
+    """Return the cost of each alternative, at its answer; None for one without an answer.
+
+    Where no value is sought along an axis, those that meet nothing are measured, too: an answer is
+    the cheapest then, and they are what is cheaper.
+
+    Parameters
+    ----------
+    pipeline, rule
+        The experiment and what is chosen.
+    found
+        The answers, in the order of the combinations of the axes ``rule.among``.
+    limit_s
+        Seconds of the measurement, about.
+    report
+        Called with what is being done, and the share of it that is done.
+    """
+    axes = {axis.name: axis for axis in pipeline.axes}
+    conditions = _conditions(pipeline, rule)
+    samples: dict[tuple[tuple[str, int], ...], list[int]] = {}
+    for k, answer in enumerate(found):
+        if rule.along and answer.value is None:
+            continue
+        scene = {name: _position(axes[name].values, value)
+                 for name, value in answer.alternative.items()
+                 if axes[name].stage is Stage.scene}
+        if rule.along:
+            scene[rule.along] = _position(axes[rule.along].values, answer.value)
+        samples.setdefault(tuple(scene.items()), []).append(k)
+    if not samples:
+        return [None] * len(found)
+    count = len(samples) * len(conditions)
+    drawn = [sample_scenes(pipeline, {**dict(scene), **condition}, count)
+             for scene in samples for condition in conditions]
+    words = f"measuring the cost of {len(found):,} alternative{'s' if len(found) > 1 else ''}"
+    report(words, 0.0)
+    with Interrupts() as interrupts:
+        costs = measure(
+            pipeline, drawn, limit_s, interrupts, lambda share: report(words, share))
+    # (conditions, detector settings * estimators)
+    ends = [np.asarray(end).reshape(count, -1) for end in median_interval(1e3 * costs.total)]
+    settings = [axis.name for stage in (Stage.detection, Stage.estimation)
+                for axis in pipeline.axes_of(stage)]
+    lengths = [len(axes[name]) for name in settings]
+    out: list[Cost | None] = [None] * len(found)
+    for number, members in enumerate(samples.values()):
+        rows = slice(number * len(conditions), (number + 1) * len(conditions))
+        for k in members:
+            index = [_position(axes[name].values, found[k].alternative[name]) for name in settings]
+            column = int(np.ravel_multi_index(index, lengths)) if settings else 0
+            ms = ends[0][rows, column]
+            if np.isnan(ms).all():
+                continue
+            worst = int(np.nanargmax(ms))
+            at = conditions[worst]
+            median, low, high = (float(end[rows, column][worst]) for end in ends)
+            out[k] = Cost(
+                median, low, high, {name: axes[name].values[i] for name, i in at.items()})
+    return out
+
+
+def _position(values: Sequence[Any], value: Any) -> int:
+    """Return the index of a value, which a dataset may have as another type of number."""
+    return next(k for k, each in enumerate(values) if each == value)
+
+
+def _conditions(pipeline: Pipeline, rule: ChoiceRule) -> list[dict[str, int]]:
+    """Return the indices along the axes of conditions, of all, or of some from all over them."""
+    lengths = {axis.name: len(axis) for axis in pipeline.axes if axis.name in rule.per}
+    total = math.prod(lengths.values())
+    count = min(total, MAX_CONDITIONS)
+    numbers = (k * (total - 1) // max(count - 1, 1) for k in range(count))
+    return [
+        dict(zip(lengths, map(int, np.unravel_index(k, tuple(lengths.values()))), strict=True))
+        if lengths else {} for k in numbers]
+
+
+# --------------------------------------------------------------------------------------------------
+# A requirement in, a decision out: the search for the choice of a pipeline's section [choose].
 
 SECONDS = 20.0
 """Time limit of the measurement of costs, in seconds."""
@@ -78,10 +187,28 @@ class Choice:
 
     @property
     def is_undecided(self) -> bool:
-        """Whether no choice is known to meet the requirements, and one is not known not to."""
-        return not any(answer.met for answer in self.answers) and any(
-            answer.next_cause is not None and answer.next_cause.decision is Decision.undecided
-            for answer in self.answers)
+        """Whether it is undecided what the answer is: a better one may meet the requirements."""
+        return any(map(self.may_be_better, range(len(self.answers))))
+
+    @property
+    def decision(self) -> Decision:
+        """Whether the answer is decided (met), there is surely none (not met), or neither."""
+        if self.is_undecided:
+            return Decision.undecided
+        return Decision.not_met if self.best is None else Decision.met
+
+    def may_be_better(self, k: int) -> bool:
+        """Return whether an alternative may be better than the answer, which is undecided."""
+        answer, cost, budget = self.answers[k], self.costs[k], self.budget_ms
+        too_dear = cost is not None and budget is not None and cost.low > budget
+        open_cost = answer.met and not self.within_budget(k)
+        if too_dear or not (answer.is_open or open_cost):
+            return False
+        if self.best is None:
+            return True
+        value = answer.possible if answer.is_open else answer.value
+        chosen = _rank(self.answers[self.best].value, self.costs[self.best], self.rule)
+        return _rank(value, cost, self.rule) < chosen
 
     def within_budget(self, k: int) -> bool:
         """Return whether an alternative's cost is within the budget, with its interval."""
@@ -130,7 +257,7 @@ def search_choice(
     good = [k for k, answer in enumerate(found) if answer.met and (
         pipeline.budget_ms is None
         or ((cost := costs[k]) is not None and cost.high <= pipeline.budget_ms))]
-    best = min(good, key=lambda k: _rank(found[k], costs[k], rule), default=None)
+    best = min(good, key=lambda k: _rank(found[k].value, costs[k], rule), default=None)
     return Choice(
         summary.store, rule, pipeline.budget_ms, cells.decision.shape[2], found, tuple(costs), best,
         _next(found, costs, rule, best), _front(found, costs, rule), poses, count, most,
@@ -143,27 +270,27 @@ def chosen_by(pipeline: Pipeline) -> ChoiceRule:
     if isinstance(rule, ChoiceRule):
         return rule
     example = 'smallest = "size_m", max_trials = 5000'
-    raise refusal([f"{pipeline.source}: expected what is chosen: [{SECTION}] {example}"])
+    raise refusal([f"{pipeline.source}: expected what is chosen: [{CHOOSE}] {example}"])
 
 
-def _rank(answer: Answer, cost: Cost | None, rule: ChoiceRule) -> tuple[float, float]:
+def _rank(value: float | None, cost: Cost | None, rule: ChoiceRule) -> tuple[float, float]:
     """Return what is smaller for a better answer: the value that is sought, then the cost."""
-    value = 0.0 if answer.value is None else -answer.value if rule.largest else answer.value
+    value = 0.0 if value is None else -value if rule.largest else value
     return value, math.inf if cost is None else cost.ms
 
 
 def _next(
     found: Sequence[Answer], costs: Sequence[Cost | None], rule: ChoiceRule, best: int | None
 ) -> int | None:
-    """Return the alternative whose next value fails nearest to the answer."""
+    """Return the alternative whose next value fails, or is undecided, nearest to the answer."""
     if best is None:
         return None
     if rule.along:
         return best if found[best].next is not None else None
-    chosen = _rank(found[best], costs[best], rule)
+    chosen = _rank(found[best].value, costs[best], rule)
     cheaper = [k for k, answer in enumerate(found)
-               if not answer.met and _rank(answer, costs[k], rule) < chosen]
-    return max(cheaper, key=lambda k: _rank(found[k], costs[k], rule), default=None)
+               if not answer.met and _rank(answer.value, costs[k], rule) < chosen]
+    return max(cheaper, key=lambda k: _rank(found[k].value, costs[k], rule), default=None)
 
 
 def _front(
@@ -173,7 +300,7 @@ def _front(
     known = [(k, cost) for k, cost in enumerate(costs) if found[k].met and cost is not None]
     if not known:
         return ()
-    values = np.array([_rank(found[k], cost, rule)[0] for k, cost in known])
+    values = np.array([_rank(found[k].value, cost, rule)[0] for k, cost in known])
     on_front = pareto_front(np.array([cost.ms for _, cost in known]), values - values.min() + 1.0)
     return tuple(k for (k, _), is_on in zip(known, on_front, strict=True) if is_on)
 

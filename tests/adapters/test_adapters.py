@@ -11,7 +11,7 @@ import pytest
 import sweep
 from support.here import Here
 from sweep import Pipeline, PipelineError
-from sweep.conformance.check import check_detector
+from sweep.conformance.check import check_plugin
 from sweep.evaluation.inspection import scene_image
 from sweep.isolation.child_process import Child
 from sweep.plan.cell_selection import cell
@@ -58,9 +58,9 @@ def test_an_adapter_conforms(detector):
     # may die when it ends.
     child = Child if detector == "pupil-apriltags" else Here
     with mock.patch("sweep.conformance.check.Child", child):
-        report = check_detector(detector, calls=0)
+        report = check_plugin(detector)
     assert report.conforms, report.findings
-    assert max(map(abs, report.offset_px)) < 0.02
+    assert max(map(abs, report.numbers["offset_px"])) < 0.02
 
 
 @pytest.mark.long
@@ -69,8 +69,7 @@ def test_all_families_of_an_adapter_come_in_our_order(detector):
         if family in ("tagCircle49h12", "tagCustom48h12", "tagStandard52h13"):
             continue  # seconds and gigabytes each
         with mock.patch("sweep.conformance.check.Child", Here):
-            report = check_detector(detector, family, calls=0)
-        assert report.detected >= 24, family
+            report = check_plugin(detector, family)
         assert report.conforms, (family, report.findings)
 
 
@@ -78,7 +77,7 @@ def test_all_families_of_an_adapter_come_in_our_order(detector):
 @pytest.mark.parametrize("family", ["tagCircle49h12", "tagCustom48h12", "tagStandard52h13"])
 def test_large_families_come_in_our_order(family):
     pytest.importorskip("pyapriltags")
-    report = check_detector("pyapriltags", family, calls=0, time_limit_s=300)
+    report = check_plugin("pyapriltags", family, time_limit_s=300)
     assert report.conforms, report.findings
 
 

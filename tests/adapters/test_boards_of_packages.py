@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from sweep.errors import PipelineError
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 from tests.adapters.test_adapters import MODULES
 
 BOARD = """

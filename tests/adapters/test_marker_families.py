@@ -10,10 +10,17 @@ import pytest
 
 from sweep import Pipeline, PipelineError
 from sweep.evaluation.inspection import scene_image
-from sweep.model import stag, tag_families
-from sweep.model.marker import edges, marker_count, module_count, modules, overhang
-from sweep.model.stag import STAG_LIBRARIES
-from sweep.model.tag_families import TAG_FAMILIES
+from sweep.model import marker as stag
+from sweep.model import marker as tag_families
+from sweep.model.marker import (
+    STAG_LIBRARIES,
+    TAG_FAMILIES,
+    edges,
+    marker_count,
+    module_count,
+    modules,
+    overhang,
+)
 
 TEXT = """
 title = "A marker"
@@ -82,7 +89,7 @@ def test_modules_of_tag_families_are_those_that_apriltag_draws(family):
 
 CODES = """
 import sys
-from sweep.model import tag_families
+from sweep.model import marker as tag_families
 tag_families.PACKAGES = (sys.argv[1],)
 for family in tag_families.TAG_FAMILIES:
     print(family, [part.tolist() for part in tag_families._codes(family)])
@@ -114,7 +121,7 @@ def test_stag_reads_the_markers_that_are_drawn(library):
 def test_codes_of_stag_are_as_far_apart_as_their_name_says():
     pytest.importorskip("stag")
     for name in ("STAG_HD17", "STAG_HD19", "STAG_HD21", "STAG_HD23"):
-        codes = stag._codes(name)
+        codes = stag._stag_codes(name)
         distances = np.bitwise_count(codes[:, None] ^ codes[None])
         assert distances[~np.eye(len(codes), dtype=bool)].min() >= int(name[-2:])
 
@@ -149,7 +156,7 @@ def test_stag_image_is_that_of_many_samples():
     level = np.where(across <= 5, 255.0, 90.0)
     level[across <= 4] = 0
     level[np.hypot(x - 4, y - 4) <= stag.CIRCLE_RADIUS] = 255
-    code = int(stag._codes(dictionary)[marker_id])
+    code = int(stag._stag_codes(dictionary)[marker_id])
     for bit, (centre_x, centre_y) in enumerate(stag.dot_centres()):
         if code >> bit & 1:
             level[np.hypot(x - centre_x, y - centre_y) <= stag.DOT_RADIUS] = 0
@@ -187,16 +194,9 @@ def test_a_dictionary_whose_package_is_missing_is_refused_with_what_to_install(m
         assert f"for its codes: pip install 'fiducial-sweep[{extra}]'" in faults_of(dictionary, 1)
 
 
-def test_an_id_beyond_a_family_is_refused():
-    faults = faults_of("tagCircle21h7", 38)
-    assert "IDs from 0 to 37, which is what tagCircle21h7 has" in faults
-
-
-def test_circles_need_the_exact_renderer():
-    assert "exact for STag's markers" in faults_of("STAG_HD21", 1, 'renderer = "warp"\n')
-
-
-def test_opencv_has_only_its_own_dictionaries():
-    text = text_of("tagCircle21h7", 1).replace('detector = "pyapriltags"', "")
-    with pytest.raises(PipelineError, match="one of OpenCV's for its detector"):
-        Pipeline.from_text(text)
+@pytest.mark.parametrize(("dictionary", "marker_id", "extra", "named"), [
+    ("tagCircle21h7", 38, "", "IDs from 0 to 37, which is what tagCircle21h7 has"),
+    ("STAG_HD21", 1, 'renderer = "warp"\n', "exact for STag's markers"),
+])
+def test_what_a_family_lacks_is_refused(dictionary, marker_id, extra, named):
+    assert named in faults_of(dictionary, marker_id, extra)

@@ -11,7 +11,7 @@ from sweep.analysis import ambiguity
 from sweep.analysis.ambiguities import THRESHOLDS, ThresholdChoice
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.variable import XYZ
+from sweep.plan.schema import XYZ
 
 
 def poses_of(ratio, flipped, solved=None, axes=("tilt_deg", "trial", "solver")):

@@ -6,10 +6,10 @@ import xarray as xr
 
 from sweep.analysis import (
     detection_rate,
-    environment_differences,
     error_statistics,
     per_marker,
     renderer_bias,
+    store_differences,
 )
 from sweep.errors import DatasetError
 from sweep.measure.flags import DetectionStatus, uncounted_values
@@ -67,13 +67,10 @@ def test_estimates_are_not_those_of_markers() -> None:
         per_marker(_boards().drop_vars("marker_detection"))
 
 
-@pytest.mark.parametrize(("axis", "differences"), [
-    ("renderer", renderer_bias), ("environment", environment_differences),
-])
-def test_corners_of_boards_are_paired_where_both_found_them(axis, differences) -> None:
+def test_corners_of_boards_are_paired_where_both_found_them() -> None:
     rng = np.random.default_rng(7)
     names = ["exact", "other"]
-    boards = xr.concat([_boards(), _boards()], dim=axis).assign_coords({axis: names})
+    boards = xr.concat([_boards(), _boards()], dim="renderer").assign_coords(renderer=names)
     errors = boards["marker_corner_error_px"].to_numpy()
     errors[1] += rng.normal(scale=0.1, size=errors[1].shape).astype(np.float32)
     errors[1][rng.random(errors.shape[1:4]) < 0.3] = np.nan  # markers that the second lost
@@ -81,16 +78,19 @@ def test_corners_of_boards_are_paired_where_both_found_them(axis, differences) -
     solved = boards["detection"].to_numpy() == DetectionStatus.detected
     zeros = np.zeros((*solved.shape, 3), dtype=np.float32)
     dims = boards["detection"].dims
-    table = differences(boards.assign(
+    made = boards.assign(
         estimate=(dims, solved.astype(np.uint8)), flipped=(dims, solved.astype(np.uint8)),
         rotation_error_rad=((*dims, "xyz"), zeros), translation_error_m=((*dims, "xyz"), zeros),
-    )).compute()
+    )
+    table = renderer_bias(made).compute()
     shift = np.square(errors[1].astype(float) - errors[0])
     found = np.isfinite(shift).any(axis=(2, 3, 4)) & solved[0]
     each = np.nanmean(shift[found], axis=(1, 2, 3))
-    other = table.sel({axis: "other"})
+    other = table.sel(renderer="other")
     assert other["corner_shift_rms_px"] == pytest.approx(np.sqrt(each.mean()), rel=1e-9)
-    if axis == "environment":
-        differ = ~np.isclose(errors[0], errors[1], rtol=0, atol=0, equal_nan=True)
-        assert other["moved"] == (differ.any(axis=(2, 3, 4)) & solved[0]).sum()
-        assert other["detected_in_both"] == solved[0].sum()
+    table = store_differences(*(made.sel(renderer=name, drop=True) for name in names))
+    found = [np.isfinite(each).all(axis=-1) for each in errors]
+    assert table["corners_compared"] == (found[0] & found[1]).sum()
+    assert table["corners_found_once"] == (found[0] ^ found[1]).sum()
+    assert table["corners_differing"] == (
+        (errors[0] != errors[1]).any(axis=-1) & found[0] & found[1]).sum()

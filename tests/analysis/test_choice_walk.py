@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sweep.analysis.choice_walk import error_shares, needed, value_decisions, walk
-from sweep.analysis.requirements import Decision
+from sweep.analysis.choices import error_shares, needed, walk
+from sweep.analysis.requirements import Decision, combined_decision
 
 ENDS = (50, 100, 150, 200, 250, 300, 350, 450, 550, 700, 850, 1050, 1300, 1650, 2050, 2550, 3200,
          4000, 5000)
@@ -73,7 +73,8 @@ def test_an_answer_truly_fails_in_at_most_one_of_twenty_searches(limit, alternat
         walks = [walk(*each) for each in zip(decision, keeps, strict=True)]
         wrong += any(not truth[: found.answer + 1].all()
                      for truth, found in zip(truly, walks, strict=True))
-        falsely_failing += bool((truly & (value_decisions(decision) == Decision.not_met)).any())
+        failing = combined_decision(decision, -1) == Decision.not_met
+        falsely_failing += bool((truly & failing).any())
         trials, hardest = trials + n.sum(), hardest + n.max() * n.size
     assert wrong <= allowed
     assert falsely_failing <= allowed
@@ -117,9 +118,15 @@ def test_a_condition_that_fails_spares_the_others():
     assert not needed(column([FAILED, OPEN, OPEN]), np.ones((1, 3), bool)).any()
 
 
-def test_conditions_that_cannot_be_judged_neither_meet_nor_fail():
-    assert value_decisions(column([MET, NONE], [NONE, NONE], [OPEN, NONE])).tolist() == [
-        MET, FAILED, OPEN]
+def test_what_cannot_be_judged_is_left_out():
+    """Of conditions, and of values: sizes that do not fit into the image end no search."""
+    decision = column([NONE, NONE], [MET, NONE], [NONE, NONE], [MET, MET], [OPEN, NONE])
+    assert combined_decision(decision, -1).tolist() == [NONE, MET, NONE, MET, OPEN]
+    keeps = decision == MET
+    assert (walk(decision, keeps).answer, walk(decision, keeps).next) == (3, 4)
+    assert needed(decision, keeps).nonzero()[0].tolist() == [4]
+    nothing = column([NONE], [NONE])
+    assert (walk(nothing, nothing == MET).answer, walk(nothing, nothing == MET).next) == (-1, 2)
 
 
 def test_all_met_has_no_next_and_none_met_has_no_answer():

@@ -1,6 +1,7 @@
 """Error models against the laws that made the errors, plain NumPy, SciPy and real stores."""
 
 import itertools
+import json
 import math
 
 import numpy as np
@@ -9,14 +10,23 @@ from scipy import optimize
 
 import sweep
 from support.here import calls_here
-from support.pose_errors import FX, SIZE_M, minimal_turn, poses_with_law, power_law
+from support.pose_errors import (
+    FX,
+    SIZE_M,
+    minimal_turn,
+    poses_with_law,
+    power_law,
+    reader_of_the_guide,
+)
 from support.stores import by_hand
 from sweep.analysis import error_models, model_covariance, model_errors
+from sweep.analysis.error_model_fit import focal_size_of
 from sweep.analysis.error_models import Use
-from sweep.analysis.sight_frame import in_sight_frame, sight_rotation
+from sweep.analysis.poses import in_sight_frame, sight_rotation, viewing_angle_of
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
+from sweep.report.error_model_file import error_model_text
 
 SIX = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
 GRID = {"distance_m": [1.0, 1.5, 2.2, 3.3, 5.0], "tilt_deg": [0.0, 20.0, 40.0, 60.0]}
@@ -218,21 +228,103 @@ def test_configurations_are_not_pooled_and_chunks_do_not_matter():
     np.testing.assert_allclose(ratio, 3.0, rtol=0.5)
     alone = error_models(results.isel(solver=[1]))
     lazy = error_models(results.chunk({"distance_m": 1, "trial": 50}))
-    for name in ("coverage", "use", "judged", "exponent"):
+    for name in ("coverage", "use", "judged", "exponent", "region_low", "region_seen"):
         np.testing.assert_allclose(lazy[name], models[name], rtol=1e-7)
         np.testing.assert_allclose(
             alone[name].isel(solver=0), models[name].isel(solver=1), rtol=1e-7)
 
 
-def test_outside_the_domain_nothing_is_told(models):
-    for distance, angle in ((0.9, 20.0), (5.1, 20.0), (2.0, 61.0), (-2.0, 20.0), (np.nan, 20.0)):
-        out = model_errors(models, distance, angle)
-        assert np.isnan(out.sigma).all()
-        assert np.isnan(out.bias).all()
-        assert (out.use == Use.no_poses).all()
-        assert np.isnan(out.flip_rate).all()
-    assert np.isfinite(model_errors(models, [1.0, 5.0], [0.0, 60.0]).sigma).all()
-    assert float(FX * SIZE_M / 1.0) == pytest.approx(models.attrs["focal_size_px_m"])
+def seen_in(results, mask):
+    """Return the poses of a mask over the scene; no others were looked for."""
+    return results.assign(detection=results["detection"].where(mask, DetectionStatus.not_run))
+
+
+def stores_of_regions():
+    """Yield names, results, conditions seen and not: distance, angle, side (or none), bearing."""
+    trials = {"trial": list(range(300))}
+    grid = {"distance_m": [1.0, 2.0, 4.0], "tilt_deg": [0.0, 30.0, 60.0]} | trials
+    on_axis = poses_with_law(11, grid, power_law)
+    yield ("grid", on_axis, [(1, 0, None, 0), (1.4, 45, None, 0), (4, 60, FX * SIZE_M / 4, 0)],
+           [(1, 30, 50, 0), (4, 30, 100, 0), (2, 30, None, 20), (2, 30, None, 63)])
+    zipped = 30 * np.log2(on_axis["distance_m"]) == on_axis["tilt_deg"]
+    yield ("zipped", seen_in(on_axis, zipped), [(1, 0, None, 0), (2, 30, None, 0),
+           (4, 60, None, 0), (1.5, 17.5, None, 0)],
+           [(1, 60, None, 0), (4, 0, None, 0), (1, 30, None, 0), (2, 0, None, 0),
+            (2.5, 60, None, 0)])
+    yield ("zigzag", seen_in(on_axis, (on_axis["distance_m"] == 2) == (on_axis["tilt_deg"] == 60)),
+           [(1, 0, None, 0), (2, 60, None, 0), (4, 30, None, 0)],
+           [(1, 60, None, 0), (2, 0, None, 0), (4, 60, None, 0)])
+    bearings = poses_with_law(12, grid, power_law, bearing_deg=15.0)
+    yield ("bearings", bearings, [(2, 30, None, 0), (2, 30, None, 14), (1, 0, None, 10)],
+           [(2, 30, None, 30), (2, 30, None, 63), (2, 30, None, 120), (1, 30, 50, 5)])
+    far = bearings["true_tvec_m"].isel(xyz=[0, 1])
+    bearing = np.degrees(np.arctan2(np.hypot(far[..., 0], far[..., 1]), bearings["distance_m"]))
+    narrow = seen_in(bearings, (bearings["distance_m"] == 1) | (bearing < 4))
+    yield ("narrow", narrow, [(1, 30, None, 14), (4, 30, None, 2)], [(4, 30, None, 14)])
+    sizes = poses_with_law(13, {"distance_m": [1.0, 2.0, 4.0], "tilt_deg": [30.0],
+                                "size_m": [0.1, 0.2]} | trials, power_law)
+    yield ("sizes", sizes, [(1, 30, 90, 0), (1, 30, 135, 0), (4, 30, 22.5, 0), (3, 30, 45, 0)],
+           [(1, 30, 45, 0), (1, 30, 70, 0), (4, 30, 90, 0), (2, 30, 30, 0)])
+    paired = seen_in(sizes, (sizes["size_m"] == 0.1) == (sizes["distance_m"] == 1))
+    yield ("paired", paired, [(1, 30, 90, 0), (4, 30, 45, 0)],
+           [(1, 30, 180, 0), (4, 30, 22.5, 0), (2, 30, 45, 0)])
+
+    def correlated(rng, shape):
+        side = np.exp(rng.uniform(np.log(40), np.log(160), shape))
+        size = rng.uniform(0.1, 0.2, shape)
+        return {"size_m": size, "distance_m": FX * size / side,
+                "tilt_deg": rng.uniform(0, 60, shape)}
+
+    yield ("drawn", poses_with_law(14, {"trial": list(range(4000))}, power_law, drawn=correlated),
+           [(1, 30, 130, 0), (3.5, 30, 45, 0), (1.5, 50, 100, 0), (1.5, 5, 80, 0)],
+           [(1, 30, 60, 0), (3, 30, 110, 0), (1, 30, 230, 0), (1.5, 75, 100, 0),
+            (1.5, 30, 100, 20)])
+
+    def tied(rng, shape):
+        share = rng.uniform(0, 1, shape)
+        return {"distance_m": 1 + 3 * share,
+                "tilt_deg": np.clip(60 * share + rng.normal(0, 3, shape), 0, 60)}
+
+    yield ("tied", poses_with_law(15, {"trial": list(range(4000))}, power_law, drawn=tied),
+           [(1.3, 6, None, 0), (2.5, 30, None, 0), (3.8, 57, None, 0)],
+           [(1.2, 55, None, 0), (3.8, 5, None, 0), (2, 55, None, 0)])
+
+
+@pytest.fixture(scope="module")
+def regions():
+    return {name: rest for name, *rest in stores_of_regions()}
+
+
+@pytest.mark.parametrize("name", [
+    "grid", "zipped", "zigzag", "bearings", "narrow", "sizes", "paired", "drawn", "tied"])
+def test_a_model_answers_only_in_the_joint_region_that_was_seen(name, regions):
+    results, seen, unseen = regions[name]
+    models = error_models(results)
+    position = results["true_tvec_m"].values.reshape(-1, 3)
+    angles = viewing_angle_of(results["true_rvec"].values.reshape(-1, 3), position)
+    focal = focal_size_of(results).broadcast_like(results["detection"]).transpose(
+        *results["detection"].dims).values.ravel()
+    own = model_covariance(models, position, angles, focal / position[:, 2])
+    looked_for = (results["detection"] == DetectionStatus.detected).values.ravel()
+    assert np.isfinite(own.covariance.values[looked_for, 0, 0]).all()
+    document, read_errors = json.loads(error_model_text(models, {})), reader_of_the_guide()
+    for conditions, expected in ((seen, True), (unseen, False)):
+        for distance, angle, side, bearing in conditions:
+            if bearing < 90:
+                x = distance * math.tan(math.radians(bearing))
+                position = (0.6 * x, -0.8 * x, distance)
+            else:
+                position = (0.0, distance, -0.1)
+            pose = model_covariance(models, position, angle, side)
+            where = (distance, angle, side, bearing)
+            assert bool(np.isfinite(pose.covariance.values[0, 2, 2])) is expected, where
+            assert bool((pose.use != Use.no_poses).all()) is expected, where
+            if bearing in (0, 20):
+                errors = model_errors(models, distance, angle, side, bearing)
+                assert bool(np.isfinite(errors.sigma).all()) is expected, where
+            read = read_errors(document["models"][0], *position, angle, side)
+            assert all(math.isfinite(each["sigma"]) is expected for each in read.values()), where
+            assert all(each["use"] != "no_poses" for each in read.values()) is expected, where
 
 
 @pytest.mark.parametrize(("change", "words"), [
@@ -248,11 +340,6 @@ def test_what_cannot_be_modelled_says_so_in_a_line(results, change, words):
     with pytest.raises(DatasetError, match=words) as caught:
         error_models(change(results))
     assert "\n" not in str(caught.value)
-
-
-def test_several_models_cannot_be_asked_at_once(models):
-    with pytest.raises(ArgumentError, match="choose one with models"):
-        model_errors(models.expand_dims(solver=["a"]), 2.0, 20.0)
 
 
 STORE = """
@@ -297,7 +384,6 @@ def test_models_of_a_store_hold_for_another_store_where_they_say_so(tmp_path):
     other = stored(tmp_path, 1500, seed=4)
     position = other["true_tvec_m"].values.reshape(-1, 3)
     rvec = other["true_rvec"].values.reshape(-1, 3)
-    from sweep.analysis.sight_frame import viewing_angle_of  # noqa: PLC0415
     angle = viewing_angle_of(rvec, position)
     said = model_errors(models, position[:, 2], angle)
     turn = minimal_turn(position / np.linalg.norm(position, axis=-1, keepdims=True))
@@ -349,4 +435,3 @@ def test_intervals_hold_the_law_as_often_as_they_say():
         print(shares)
         # The six errors of a simulation are independent: 1,800 intervals at least.
         assert all(0.92 < share < 0.975 for share in shares.values()), shares
-

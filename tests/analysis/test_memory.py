@@ -1,4 +1,4 @@
-"""Memory of the analyses does not grow with the store."""
+"""Memory of the analyses grows with the columns that are sorted, and with nothing else."""
 
 import pytest
 
@@ -19,5 +19,5 @@ def test_ten_million_poses_are_analysed_below_a_gigabyte(stores, name):
           f"{large['peak'] / 1e6:.0f} MB at {stores[1][1]:,}; "
           f"{small['compute_s']:.1f} and {large['compute_s']:.1f} s")
     assert large["peak"] < 1e9
-    # The poses themselves are 350 MB more; tallies of 200 groups are 100 MB when full.
-    assert large["peak"] - small["peak"] < 200e6
+    # The poses themselves are 350 MB more, the values of three columns 220 MB, twice while merged.
+    assert large["peak"] - small["peak"] < (500e6 if "error_statistics" in name else 200e6)

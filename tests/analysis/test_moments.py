@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mpmath import mp, mpf
 
 from support.lengths import lengths
-from sweep.analysis.moments import Moments
+from sweep.analysis.statistic import Moments
 
 # offset, spread: what is left of the spread is exact in the doubles, be it only three bits.
 SCALES = [(1e9, 1e-3), (0.0, 1.0), (-3e5, 1e-9), (1e9, 1e9), (1e15, 1.0), (1e-100, 1e-110)]

@@ -3,22 +3,20 @@
 The references are plain NumPy on all poses at once.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 
+from support.guide_tables import statistics_table
 from support.small_datasets import mixed
-from sweep.analysis import error_statistics, registry
-from sweep.analysis.groups import group_numbers
+from sweep.analysis import error_statistics, quantiles
+from sweep.analysis import summaries as registry
 from sweep.analysis.means import PositiveMean
 from sweep.analysis.quantiles import Quantiles
-from sweep.analysis.radix_histogram import LowerTally, bits
-from sweep.analysis.registry import ErrorStatistic
-from sweep.analysis.states import BlockState
 from sweep.analysis.statistic import Output
+from sweep.analysis.summaries import ErrorStatistic
+from sweep.errors import DatasetError
 from sweep.measure.flags import EstimateStatus
-from sweep.report.answer import _errors_table
+from sweep.report.scene_figures import errors_table
 
 SIZES = {"marker_id": 2, "tilt_deg": 2, "noise_grey": 2, "trial": 30, "solver": 2}
 RESULTS = mixed(SIZES, 7)
@@ -35,38 +33,16 @@ MEAN_ABSOLUTE_ERROR = ErrorStatistic(
         lambda poses: quantity.norm(poses)[..., None], lambda poses: poses.solved))
 
 
-# A statistic with a state of its own: the mean of the errors up to their median.
-@dataclass(frozen=True)
-class LowerHalf(BlockState["LowerHalf"]):
-    below: np.ndarray
-    """Sum of the errors in the bins below the median's, (groups,)."""
-    count: np.ndarray
-    """Their number."""
-    lower: LowerTally
-    """Errors in the median's bin."""
-
-    def fold(self):
-        return self
-
-
+# A statistic of its own, of a state that exists: the mean of the errors up to their median.
 class TrimmedMean(Quantiles):
     def outputs(self):
         return [Output(self.name, self.meaning, self.units)]
 
-    def second_pass(self, poses, known):
-        groups, errors = self._grouped_errors(poses, self.used(poses))
-        bins = known.bins[:, 0, :1]
-        inside = bits(errors) >> 16 < bins[groups, 0]
-        below, count = (np.bincount(groups[inside], weights, len(bins))
-                        for weights in (errors[inside], None))
-        return LowerHalf(below, count, LowerTally.of(groups, errors, bins))
-
-    def finish(self, known, second):
-        bins, rank = known.bins[:, 0, 0], known.ranks[:, 0, 0]
-        groups = group_numbers(bins)
-        rest = [sum(second.lower.values_at(groups[g:g + 1], bins[g:g + 1], np.array([k + 1]))[0]
-                    for k in range(rank[g])) for g in groups]
-        return {self.name: (second.below + rest) / (second.count + rank)}
+    def result(self, state):
+        median = -(-state.sample.n // 2)
+        ranks = np.arange(1, median.max() + 1) * np.ones((len(median), 1), int)
+        values = state.values.values_at(np.where(ranks <= median[:, None], ranks, 0))
+        return {self.name: np.nanmean(values, axis=1)}
 
 
 TRIMMED_MEAN = ErrorStatistic(
@@ -102,7 +78,7 @@ def test_an_added_statistic_is_that_of_plain_numpy_in_any_chunks(chunks):
         here = table.isel(solver=solver)
         assert here["rotation_mae_deg"] == pytest.approx(errors.mean(), rel=1e-12)
         assert here["rotation_mae_deg_low"] < errors.mean() < here["rotation_mae_deg_high"]
-        # Those in the bin of the last rank are rounded to single precision.
+        # Values are rounded to single precision.
         half = errors[:-(-len(errors) // 2)].mean()
         assert here["rotation_trimmed_deg"] == pytest.approx(half, rel=6e-8)
 
@@ -115,6 +91,14 @@ def test_an_added_statistic_has_attributes_and_a_row_in_every_table():
         for name in names:
             assert table[name].attrs["units"] == unit
             assert "mean absolute" in table[name].attrs["description"]
-    assert "| `*_mae_*` | error: mean absolute error of the solved |" in registry.guide_table()
-    rows = _errors_table(table, "").rows
+    assert "| `*_mae_*` | error: mean absolute error of the solved |" in statistics_table()
+    rows = errors_table(table, "").rows
     assert "mean of the smaller half of the errors" in [row[0] for row in rows]
+
+
+@pytest.mark.parametrize("chunks", [None, {"trial": 7}])
+def test_a_column_that_cannot_be_sorted_at_once_is_told_how_to_divide(chunks, monkeypatch):
+    monkeypatch.setattr(quantiles, "MAX_VALUES", 100)
+    results = RESULTS if chunks is None else RESULTS.chunk(chunks)
+    with pytest.raises(DatasetError, match="expected at most 100; divide them: keep an axis apart"):
+        error_statistics(results).compute(scheduler="synchronous")

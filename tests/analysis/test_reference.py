@@ -45,7 +45,7 @@ from support.small_datasets import (
 from sweep.analysis import detection_rate, error_statistics, failure_composition, flip_rate
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 
 
 def is_unflipped(pose):

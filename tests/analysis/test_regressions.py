@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from support.small_datasets import perfect
-from sweep.analysis.regressions import MARGIN, regressions
+from sweep.analysis.comparisons import MARGIN, regressions
 from sweep.errors import DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 

@@ -18,9 +18,14 @@ from support.small_datasets import (
     perfect,
     poses,
 )
-from sweep.analysis.farthest import Reach, farthest_met
-from sweep.analysis.requirements import Decision, check_requirements, parse_requirements
-from sweep.analysis.verdicts import combined, verdicts
+from sweep.analysis.limits import Reach, farthest_met
+from sweep.analysis.requirements import (
+    Decision,
+    check_requirements,
+    combined,
+    parse_requirements,
+    verdicts,
+)
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
@@ -54,7 +59,11 @@ def student(values, drawn, level, *, root=False):
     reach = stats.t.ppf(1.0 - (1.0 - level) / 2.0, len(values) - 1) * error
     if root:
         factor = math.exp(reach / mean)
-        return tuple(math.sqrt(each) for each in (mean, mean / factor, mean * factor))
+        # Of so many draws none is of a kind that makes this share: twice the largest, at most.
+        unseen = 1.0 - ((1.0 - level) / 2.0) ** (1.0 / len(values))
+        high = (1.0 - unseen) * mean * factor + unseen * 4.0 * max(values)
+        return tuple(math.sqrt(each) for each in (
+            mean, mean / factor, max(mean * factor, high)))
     return mean, mean - reach, mean + reach
 
 

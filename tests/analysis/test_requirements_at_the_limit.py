@@ -11,11 +11,23 @@ from scipy import stats
 
 from support.small_datasets import perfect
 from sweep.analysis.requirements import ERROR_PROBABILITY, Decision, check_requirements
+from sweep.execution.runner import execute
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.plan.pipeline import Pipeline
+from sweep.store.lifecycle import open_dataset
 
 pytestmark = pytest.mark.long
 
 SIMULATIONS = 2000
+
+TILTS = """
+seed = 7
+camera = { width_px = 640, height_px = 480, hfov_deg = 60 }
+marker = { size_m = 0.06, dictionary = "DICT_4X4_50" }
+pose = { jitter_px = 0.5, tilt_deg = { uniform = [15, 60] } }
+detector = { cornerRefinementMethod = "subpix" }
+axes = { distance_m = [1.0, 2.0, 2.5], trial = 3000 }
+"""
 CHANCE = 1e-6
 
 
@@ -89,6 +101,67 @@ def test_a_root_mean_square_at_the_limit_is_rarely_met(name, draws):
         count = count_of(Decision.met, results, text, f"{text}, {name} errors, {draws} draws")
         assert count <= at_most(ERROR_PROBABILITY)
         assert count < ERROR_PROBABILITY * SIMULATIONS
+
+
+def outliers(share, of_squares):
+    """Return what draws normal errors of which a share makes a part of the mean square."""
+    size = np.sqrt(of_squares / (1.0 - of_squares) * (1.0 - share) / share)
+    return lambda rng, shape: rng.normal(size=shape) * np.where(
+        rng.random(shape) < share, size, 1.0)
+
+
+@pytest.fixture(scope="module")
+def drawn_tilts(tmp_path_factory):
+    """Return range errors in percent of rendered poses whose tilt is drawn."""
+    pipeline = Pipeline.from_text(TILTS, name="tilts")
+    store = str(tmp_path_factory.mktemp("tilts") / "tilts.zarr")
+    execute(pipeline, store)
+    results = open_dataset(store)
+    errors = 100.0 * results["translation_error_m"].isel(xyz=2) / results["true_tvec_m"].isel(xyz=2)
+    return [one[np.isfinite(one)] for one in errors.values]
+
+
+TAILS = {
+    "t4": (lambda rng, shape: rng.standard_t(4, shape), np.sqrt(2.0)),
+    "lognormal": (lambda rng, shape: rng.lognormal(0.0, 0.8, shape), np.exp(0.64)),
+    "1 % makes 46 %": (outliers(0.01, 0.46), np.sqrt(0.99 / 0.54)),
+    "2 % makes 30 %": (outliers(0.02, 0.3), np.sqrt(0.98 / 0.7)),
+}
+
+
+def of_rmse(draw, limit, draws, name):
+    """Check that a root mean square at its limit is rarely met, on either side of it."""
+    rng = np.random.default_rng(12)
+    position = np.zeros((1, draws, SIMULATIONS, 3))
+    position[..., 0] = draw(rng, position.shape[:-1])
+    results = simulated(draws, position=position)
+    for text in (f"position_rmse_m <= {limit:.12g}", f"position_rmse_m >= {limit:.12g}"):
+        count = count_of(Decision.met, results, text, f"{text}, {name}, {draws} draws")
+        assert count < ERROR_PROBABILITY * SIMULATIONS
+
+
+@pytest.mark.parametrize("draws", [50, 100, 400])
+@pytest.mark.parametrize("name", [*TAILS])
+def test_a_root_mean_square_of_heavy_tails_is_rarely_met_at_its_limit(name, draws):
+    of_rmse(*TAILS[name], draws, name)
+
+
+@pytest.mark.parametrize("draws", [50, 100, 400])
+def test_a_root_mean_square_of_drawn_tilts_is_rarely_met_at_its_limit(drawn_tilts, draws):
+    for errors in drawn_tilts:
+        of_rmse(lambda rng, shape, errors=errors: rng.choice(errors, shape),
+                np.sqrt(np.mean(errors**2)), draws, "drawn tilts")
+
+
+def test_normal_errors_far_from_the_limit_are_decided_with_100_draws():
+    position = np.random.default_rng(13).normal(size=(1, 100, SIMULATIONS, 3))
+    position[..., 1:] = 0.0
+    results = simulated(100, position=position)
+    for text, decision in (("position_rmse_m <= 2", Decision.met),
+                           ("position_rmse_m >= 0.75", Decision.met),
+                           ("position_rmse_m <= 0.75", Decision.not_met),
+                           ("position_rmse_m >= 2", Decision.not_met)):
+        assert count_of(decision, results, text, text) > 0.9 * SIMULATIONS
 
 
 @pytest.mark.parametrize(("name", "draws"), [

@@ -12,11 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from support.small_datasets import ALL, mixed, perfect
 from sweep.analysis import error_statistics
-from sweep.analysis.quantities import SIGNED
-from sweep.analysis.signed_errors import SignedErrors, wrapped_deg
+from sweep.analysis.poses import SIGNED, SignedErrors, wrapped_deg
 from sweep.errors import ArgumentError
 from sweep.measure.flags import EstimateStatus, Flipped
-from sweep.model.rotations import rotation_of_yaw_pitch_roll
+from sweep.model.pose import rotation_of_yaw_pitch_roll
 
 UPRIGHT = Rotation.from_rotvec([math.pi, 0, 0])
 NAMES = [quantity.name for group in SIGNED.values() for quantity in group]

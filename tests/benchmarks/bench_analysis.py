@@ -17,11 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 from sweep.plan.schema import SCHEMA
 from sweep.store.blocks import region
-from sweep.store.closing import finish
-from sweep.store.lifecycle import create_store
+from sweep.store.lifecycle import create_store, finish
 
 GRID = """
 seed = 1

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from sweep.analysis.intervals import wilson
-from sweep.conformance.scenes import trial_pipeline, trial_scenes
+from sweep.conformance.check import trial_pipeline, trial_scenes
 from sweep.isolation.child_process import Child, ChildDiedError
 from sweep.measure.detectors import make_detector
 
@@ -91,13 +91,14 @@ def main():
             if options.only in name:
                 with Child("bench_detectors") as child:
                     try:
-                        results = child.call(
+                        errors, seconds = child.call(
                             bench_detectors.searched, name, options.scenes, noise, limit_s=3600
                         )
                     except ChildDiedError as death:
                         print(f"| {name} | ended its process: {death} |")
                     else:
-                        print(line(name, *results, np.random.default_rng(4)), flush=True)
+                        rng = np.random.default_rng(4)
+                        print(line(name, errors, seconds, rng), flush=True)
 
 
 if __name__ == "__main__":

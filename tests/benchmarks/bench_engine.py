@@ -9,6 +9,7 @@ Each part works for about SECONDS (default 60) on all cores; ratios within one r
 import importlib.util
 import itertools
 import json
+import math
 import multiprocessing
 import os
 import resource
@@ -21,13 +22,13 @@ from pathlib import Path
 
 import numpy as np
 
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells
 from sweep.execution.calibration import calibrate
 from sweep.execution.cluster import default_workers
 from sweep.execution.forecast import forecast
 from sweep.execution.runner import execute
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices, scene_axes
+from sweep.plan.pipeline import Pipeline
 
 GRID = """
 seed = 1
@@ -38,23 +39,37 @@ jitter_px = 0.5
 [scene]
 background = 128
 [axes]
-marker_id = {{ range = [0, 10] }}
+marker_id = {{ range = [0, {markers}] }}
 tilt_deg = [0, 20, 40, 60]
-distance_m = {{ geom = [0.2, 2.0, 20] }}
+distance_m = {{ geom = [0.2, 2.0, {distances}] }}
 trial = {trials}
 """
 
-SHARED = GRID + """
+SETTINGS = """
 cornerRefinementMethod = ["none", "subpix", "contour", "apriltag"]
 solver = ["ippe_square", "ippe", "iterative", "sqpnp", "p3p"]
 """
 
+MARKERS, DISTANCES = 10, 20
+START_S = 8.0
+"""Seconds that independent processes have to start."""
+REPEATS = 3
+COUNT = 20_000
+"""Poses of the comparison with other tools."""
+
+
+def grid(trials):
+    """Return the text of a pipeline, and its scenes a trial."""
+    text = GRID.format(trials=trials, markers=MARKERS, distances=DISTANCES)
+    return text, 4 * MARKERS * DISTANCES
+
 
 def grid_for(seconds, workers):
     """Return a pipeline that keeps ``workers`` busy for about ``seconds``."""
-    one = Pipeline.from_text(GRID.format(trials=2))
-    trials = max(int(seconds * workers / (calibrate(one, 2.0).scene_s * 800)), 2)
-    return Pipeline.from_text(GRID.format(trials=trials)), trials
+    text, scenes = grid(2)
+    one = Pipeline.from_text(text)
+    trials = max(int(seconds * workers / (calibrate(one, min(2.0, seconds)).scene_s * scenes)), 8)
+    return Pipeline.from_text(grid(trials)[0]), trials
 
 
 def bare(text, start, stop, seconds, at):
@@ -68,8 +83,9 @@ def bare(text, start, stop, seconds, at):
     done = 0
     for trial in range(start, stop):
         lengths = tuple(len(axis) for axis in axes)
-        run_cells(pipeline, block_indices(Block((0, 0, 0, trial), (*lengths[:3], trial + 1))))
-        done += 800
+        block = Block((0, 0, 0, trial), (*lengths[:3], trial + 1))
+        run_cells(pipeline, block_indices(block))
+        done += len(block)
     seconds.put((done, time.perf_counter() - begun))
 
 
@@ -78,7 +94,7 @@ def two_processes(text, trials, workers):
     context = multiprocessing.get_context("spawn")
     queue = context.Queue()
     cuts = np.linspace(0, trials, workers + 1).astype(int)
-    at = time.time() + 8
+    at = time.time() + START_S
     processes = [
         context.Process(target=bare, args=(text, int(a), int(b), queue, at))
         for a, b in itertools.pairwise(cuts)
@@ -94,16 +110,16 @@ def two_processes(text, trials, workers):
 def engine_against_processes(seconds):
     workers = default_workers()
     pipeline, trials = grid_for(seconds, workers)
-    expected = forecast(pipeline, workers).seconds
+    expected = forecast(pipeline, workers)[0].seconds
     rates = []
-    for _ in range(3):
+    for _ in range(REPEATS):
         bare_rate = two_processes(pipeline.text, trials, workers)
         with tempfile.TemporaryDirectory() as folder:
             begun = time.perf_counter()
             first = []
             summary = execute(
                 pipeline, f"{folder}/s.zarr", workers=workers,
-                on_progress=lambda p, first=first: first.append((time.perf_counter(), p.done)),
+                progress=lambda p, first=first: first.append((time.perf_counter(), p.done)),
             )
             total = time.perf_counter() - begun
         # Between a block of each worker's and the last of all, none is coming or going.
@@ -125,12 +141,12 @@ def engine_against_processes(seconds):
 
 def shared_work():
     """Compare 4 refinements x 5 solvers in one sweep with 20 separate sweeps."""
-    text = SHARED.format(trials=1)
+    text = grid(1)[0] + SETTINGS
     together = Pipeline.from_text(text)
     axes = scene_axes(together)
     indices = [g.ravel() for g in np.indices([len(axis) for axis in axes])]
     ratios = []
-    for _ in range(3):
+    for _ in range(REPEATS):
         begun = time.perf_counter()
         one = run_cells(together, indices)
         joint = time.perf_counter() - begun
@@ -189,12 +205,13 @@ if __name__ == "__main__":
     print(json.dumps([count / (time.perf_counter() - begun), peak]))
 """
 
-_ONE = {}
+_ONE: dict = {}
 
 
 def setup():
     if not _ONE:
-        pipeline = Pipeline.from_text(GRID.format(trials=25))
+        scenes = grid(1)[1]
+        pipeline = Pipeline.from_text(grid(max(COUNT // scenes, 1))[0])
         _ONE["pipeline"] = pipeline
         _ONE["shape"] = [len(axis) for axis in pipeline.axes]
     return _ONE["pipeline"], _ONE["shape"]
@@ -214,13 +231,13 @@ def one_dict(i):
 
 
 def what_one_would_pick():
-    workers, count = default_workers(), 20_000
+    workers, count = default_workers(), COUNT
     pipeline, _ = setup()
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         begun = time.perf_counter()
         execute(pipeline, f"{folder}/s.zarr", workers=workers)
-        rate = count / (time.perf_counter() - begun)
+        rate = math.prod(len(axis) for axis in pipeline.axes) / (time.perf_counter() - begun)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         rows.append(("sweep", rate, peak, "Zarr, labelled, resumable"))
         for name, body in OTHERS.items():

@@ -1,6 +1,6 @@
 """How often intervals of `sweep fit` hold the truth, and how often it finds what is not there.
 
-    python tests/benchmarks/bench_fit.py [repetitions] [photographs] [first seed]
+    python -m tests.benchmarks fit [repetitions] [photographs] [first seed]
 
 Photographs are rendered with known effects, first with all of them, then with blur and white noise
 alone. An interval of 95 % should hold the truth in 93-97 % of 200 repetitions; effects that are
@@ -31,7 +31,7 @@ def repeated(effects, repetitions, photographs, first):
         yield terms | {each.name: each for each in found.found.terms if "noise on" in each.name}
 
 
-def main(repetitions=200, photographs=8, first=1000):
+def cover(repetitions=200, photographs=8, first=1000):
     truth = {name: value for name, value in TRUTH.items() if name != "background"}
     truth |= {"noise on black": 2.0, "noise on white": 2.0}
     held, values = defaultdict(int), defaultdict(list)
@@ -56,5 +56,10 @@ def main(repetitions=200, photographs=8, first=1000):
                   + ", ".join(f"{name} {alarms[name] / count:.3f}" for name in ABSENT), flush=True)
 
 
+def main():
+    """Run with the numbers of the command line."""
+    cover(*map(int, sys.argv[1:]))
+
+
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    main()

@@ -12,17 +12,17 @@ from unittest import mock
 import cv2
 import numpy as np
 
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search_windows, visibility_flags, whole_frames
-from sweep.measure.detector import Detector
+from sweep.measure.detectors import Detector
 from sweep.measure.flags import DetectionStatus
-from sweep.model import drawing
+from sweep.model import coverage as drawing
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render_all
 from sweep.model.scene import build_scenes
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings, scene_values
+from sweep.plan.pipeline import Pipeline
 
 SIZES = ((640, 480), (1920, 1080), (4000, 3000))
 POSES = {640: 1000, 1920: 400, 4000: 150}

@@ -1,6 +1,6 @@
 """Limits at rates of 0.9 and 0.99 on 24 conditions: searches against a dense scan.
 
-`python tests/benchmarks/bench_limit.py [TRIALS] [REPETITIONS]` runs the dense scan, 24 conditions
+`python -m tests.benchmarks limit [TRIALS] [REPETITIONS]` runs the dense scan, 24 conditions
 (dictionary, tilt, noise) of 10 sides, into runs/limit-dense.zarr, and both searches. The rates of
 the dense scan are then the truth of simulated searches, whose coverage and cost it prints, beside
 equally many trials everywhere of the same mean width of the interval.
@@ -39,7 +39,7 @@ def full_scan(curves, values, rate, trials, rng):
     return near, far
 
 
-def main(trials=2400, repetitions=20, most=2400):
+def compare(trials=2400, repetitions=20, most=2400):
     dense = sweep.run(
         {**EXPERIMENT, "axes": {**EXPERIMENT["axes"], "trial": trials}},
         store="runs/limit-dense.zarr", yes=True)
@@ -77,5 +77,10 @@ def main(trials=2400, repetitions=20, most=2400):
               f"{(fixed or most) * curves.size / np.mean(poses):.1f} times as many poses")
 
 
+def main():
+    """Run with the numbers of the command line."""
+    compare(*map(int, sys.argv[1:]))
+
+
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    main()

@@ -1,6 +1,6 @@
 """Time of a pose by ``photometric_real`` on boards: levels and blur alone, and all nuisances.
 
-python tests/benchmarks/bench_photograph.py
+python -m tests.benchmarks photograph
 """
 
 import sys
@@ -29,6 +29,7 @@ WEBCAM = EFFECTS | {
     "sharpening": 0.8, "sharpening_px": 1.0, "tone_gamma": 0.9, "illumination_gradient": 0.2,
 }
 PHOTOGRAPHS = 6
+SIDES = (20, 50, 100)
 
 
 def detections(side, effects):
@@ -62,7 +63,7 @@ def main():
     """Print the table."""
     print("| side, px | levels and blur, ms | light, tone and sharpening too, ms | solved, % |")
     print("| --- | --- | --- | --- |")
-    for side in (20, 50, 100):
+    for side in SIDES:
         row, solved = [], []
         for every, effects in ((False, EFFECTS), (True, WEBCAM)):
             found = detections(side, effects)

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 
-from sweep.evaluation.estimation import detections_for
+from sweep.evaluation.block import detections_for
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search, whole_frames
 from sweep.measure.bound import bound_of_scene
@@ -18,17 +18,19 @@ from sweep.measure.likelihood import BACKGROUND_MARGIN_PX, marker_view, noise_va
 from sweep.measure.photometric import Photometric
 from sweep.model.extent import marker_boxes
 from sweep.model.scene import build_scenes
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings, estimators, scene_values
+from sweep.plan.pipeline import Pipeline
 
 SCENES = 120
-TEXT = f"""
+SIDES = (20, 50, 100, 150)
+TILTS = (0, 15, 30, 45, 60, 75)
+TEXT = """
 [marker]
 size_m = 0.05
 [pose]
 jitter_px = 0.5
-azimuth_deg = {{ uniform = [0, 360] }}
-roll_deg = {{ uniform = [0, 360] }}
+azimuth_deg = { uniform = [0, 360] }
+roll_deg = { uniform = [0, 360] }
 side_px = SIDE
 tilt_deg = TILT
 [scene]
@@ -39,7 +41,7 @@ noise_grey = 2
 [detector]
 cornerRefinementMethod = "subpix"
 [axes]
-trial = {SCENES}
+trial = SCENES
 """
 
 
@@ -56,7 +58,8 @@ def best_ms(call, count, repeats=5):
 
 def measured(side, tilt):
     """Return ms of the bound, of two starts and of four, a scene."""
-    pipeline = Pipeline.from_text(TEXT.replace("SIDE", str(side)).replace("TILT", str(tilt)))
+    pipeline = Pipeline.from_text(
+        TEXT.replace("SIDE", str(side)).replace("TILT", str(tilt)).replace("SCENES", str(SCENES)))
     values = scene_values(pipeline, [np.arange(SCENES)])
     scenes = build_scenes(values, SCENES)
     box = marker_boxes(scenes)[0] + BACKGROUND_MARGIN_PX * np.array([-1, -1, 1, 1])
@@ -65,6 +68,7 @@ def measured(side, tilt):
     )
     state = state_of(scenes.rotation[0], scenes.translation[0], 0.0, scenes.levels[0])
     width, height = (box[2:] - box[:2]).tolist()
+    image = np.zeros((height, width))
     found, _, _ = search(
         scenes, np.ones((SCENES, 1), dtype=bool), detector_settings(pipeline),
         whole_frames(values, SCENES), [], keep=True,
@@ -72,7 +76,7 @@ def measured(side, tilt):
     rows = np.flatnonzero(found[0].flags == DetectionStatus.detected)
     seen = detections_for(estimators(pipeline)[0], values, scenes, found[0], rows)
     return (
-        best_ms(lambda: bound_of_scene(state, view, height, width, False), 1, 50),
+        best_ms(lambda: bound_of_scene(state, view, image, False), 1, 50),
         *(best_ms(lambda k=k: Photometric(k, spread_free=False)(seen), len(rows))
           for k in (False, True)),
     )
@@ -83,8 +87,8 @@ def main():
     """Print the table."""
     print("| side, px | bound, ms | photometric, two starts, ms | four starts, ms |")
     print("| --- | --- | --- | --- |")
-    for side in (20, 50, 100, 150):
-        each = np.median([measured(side, tilt) for tilt in (0, 15, 30, 45, 60, 75)], axis=0)
+    for side in SIDES:
+        each = np.median([measured(side, tilt) for tilt in TILTS], axis=0)
         print(f"| {side} | " + " | ".join(f"{value:.3g}" for value in each) + " |")
 
 

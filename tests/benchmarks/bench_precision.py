@@ -13,10 +13,9 @@ from pathlib import Path
 
 from sweep.execution.block_task import compute_blocks
 from sweep.execution.calibration import block_extents, calibrate
-from sweep.execution.waiting import InWaves
-from sweep.plan.experiment import Pipeline
-from sweep.sampling.deciding import Decider
-from sweep.sampling.rules import make_rule
+from sweep.execution.progress import InWaves
+from sweep.plan.pipeline import Pipeline
+from sweep.sampling.rules import Decider, make_rule
 from sweep.store.lifecycle import create_store
 
 TEXT = """

@@ -38,23 +38,20 @@ from numcodecs.vlen import VLenUTF8
 from numcodecs.zstd import Zstd
 
 import sweep
-from sweep.execution import in_flight
+from sweep.execution import engines as in_flight
 from sweep.execution.calibration import block_work_s
 from sweep.execution.cluster import QUIET_DASK_CONFIG
-from sweep.execution.finalize import close
-from sweep.execution.status import status
-from sweep.execution.tally import Tally
+from sweep.execution.progress import Tally
+from sweep.execution.status import close, status
 from sweep.integrity.verification import verify
-from sweep.isolation.interrupts import Interrupts
+from sweep.isolation.child_process import Interrupts
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
-from sweep.store.blocks import chunk_key, committed, receipts, region
-from sweep.store.checksums import digest
-from sweep.store.layout import RECEIPTS
+from sweep.plan.pipeline import Pipeline
+from sweep.store.blocks import committed, missing_chunks, receipts
+from sweep.store.layout import RECEIPTS, checksum_of
 from sweep.store.lifecycle import create_store, open_store
 from sweep.store.receipt import Receipt
-from sweep.store.snapshot import missing_chunks
 
 HISTORY = Path(__file__).with_name("scale_history.csv")
 PROCESSES = 2
@@ -81,14 +78,14 @@ def receipt_text(store, number, wall_s, idle_s=0.0):
     """Return the text of a receipt of a block whose poses were all detected and solved."""
     scenes = len(store.blocks[number])
     receipt = Receipt(
-        run_id=store.run_id, processor="simulated", scenes=scenes,
+        run_id=store.run_id, processors=["simulated"], scenes=scenes,
         computed={"scenes": scenes, "detections": scenes, "estimates": scenes},
         detection=[0, scenes], estimate=[0, scenes],
         seconds={"scene": [idle_s], "detection": [0.0], "estimation": [0.0]}, failures=[],
         wall_s=wall_s, written=time.time(), block=number,
-        digests={variable.name: 123456789 for variable in store.variables},
+        checksums={variable.name: 123456789 for variable in store.variables},
     )
-    return receipt, receipt.to_json(store.format)
+    return receipt, receipt.to_json()
 
 
 @lru_cache(maxsize=1)
@@ -233,34 +230,29 @@ def encoded(text):
 
 def fill(store, chunks):
     """Write all receipts of a store past Zarr, and with ``chunks`` a chunk for each variable."""
-    root, count = Path(open_store(store.url).storage.below.root), len(store.blocks)
-    contents, digests = {}, {variable.name: 123456789 for variable in store.variables}
+    root, count = Path(store.url), len(store.blocks)
+    contents, checksums = {}, {variable.name: 123456789 for variable in store.variables}
     if chunks:
-        first = store.blocks[0]
         for variable in store.variables:
-            part = region(variable, store.pipeline, first)
-            array = store.array(variable.name)
             flag = variable.present_when.flag if variable.present_when else ""
             there = variable.stage is Stage.scene and flag != "bound"
             empty = 0.0 if there else variable.fill
-            array[part] = empty if variable.flags is None else SOUND.get(variable.name, 0)
-            key = chunk_key(store, variable, first)
-            contents[variable.name] = (root / key).read_bytes()
-            digests[variable.name] = digest(contents[variable.name])
+            value = empty if variable.flags is None else SOUND.get(variable.name, 0)
+            content = store.chunks.encoded(variable.name, 0, value)
+            contents[variable.name], checksums[variable.name] = content, checksum_of(content)
     (root / RECEIPTS / "c").mkdir(parents=True, exist_ok=True)
     for number in range(count):
         receipt, _ = receipt_text(store, number, 2.0)
         scenes = receipt.scenes
         text = dataclasses.replace(
-            receipt, digests=digests, detection=[0] * SOUND["detection"] + [scenes],
+            receipt, checksums=checksums, detection=[0] * SOUND["detection"] + [scenes],
             estimate=[0] * SOUND["estimate"] + [scenes],
-        ).to_json(store.format)
+        ).to_json()
         (root / RECEIPTS / "c" / str(number)).write_bytes(encoded(text))
     for name, content in contents.items():
-        variable = next(each for each in store.variables if each.name == name)
         source = None
-        for links, block in enumerate(store.blocks):
-            path = root / chunk_key(store, variable, block)
+        for links in range(count):
+            path = root / store.chunks.key(name, links)
             path.parent.mkdir(parents=True, exist_ok=True)
             if links % MAX_LINKS == 0:
                 path.write_bytes(content)

@@ -19,8 +19,8 @@ import numpy as np
 
 import sweep
 from sweep.analysis.requirements import Decision, check_requirements
-from sweep.cli.size_lines import sentences
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
+from sweep.report.answer_tables import headline
 from sweep.tradeoff.choice_search import search_choice
 
 SIZES = Path(__file__).parents[2] / "pipelines" / "sizes"
@@ -56,7 +56,7 @@ def decisions(results, rule):
 def compared(name, folder):
     """Search, run the grid, and print whether they agree; return whether they do."""
     choice, seconds = searched(name, folder)
-    print(f"\n{name}: {seconds:.0f} s", *sentences(choice), sep="\n  ", flush=True)
+    print(f"\n{name}: {seconds:.0f} s", headline(choice), sep="\n  ", flush=True)
     results, grid_seconds = brute_force(name, choice, folder)
     table, rule, agreed = decisions(results, choice.rule), choice.rule, True
     poses = math.prod(results.sizes[dim] for dim in results["true_tvec_m"].dims if dim != "xyz")
@@ -85,7 +85,7 @@ def compared(name, folder):
     return agreed
 
 
-def main(folder, *names):
+def compare(folder, *names):
     """Compare the files."""
     agreed = [compared(name, folder) for name in names or (
         "dip", "cheapest", "smallest_marker", "farthest", "dictionary")]
@@ -93,10 +93,15 @@ def main(folder, *names):
     return int(not all(agreed))
 
 
-if __name__ == "__main__":
+def main():
+    """Compare the files that the command line names; return 1 if one disagrees."""
     given = sys.argv[1:]
     if given:
         Path(given[0]).mkdir(parents=True, exist_ok=True)
-        sys.exit(main(Path(given[0]), *given[1:]))
+        return compare(Path(given[0]), *given[1:])
     with tempfile.TemporaryDirectory() as made:
-        sys.exit(main(Path(made)))
+        return compare(Path(made))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -23,7 +23,7 @@ import numpy as np
 import sweep
 from sweep.analysis import error_statistics, precision_reached
 from sweep.analysis.intervals import wilson
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 
 PIPELINES = Path(__file__).parents[2] / "pipelines"
 CASES = {
@@ -65,7 +65,7 @@ def fixed_draws(results, table, name, width):
 def known_rates(table, width):
     """Return the poses that suffice if each rate is known, by Wald's interval."""
     rates = table["value"].values
-    return int((1.96**2 * rates * (1 - rates) / width**2).sum())
+    return max(int((1.96**2 * rates * (1 - rates) / width**2).sum()), 1)
 
 
 def main():

@@ -16,12 +16,12 @@ import xarray as xr
 
 from sweep.evaluation.results import CellsResult
 from sweep.execution import block_task as task
-from sweep.execution.finalize import close
+from sweep.execution.status import close
 from sweep.integrity.verification import verify
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
-from sweep.plan.schema import SCHEMA
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.schema import variables_of
 from sweep.store.lifecycle import create_store
 
 GRID = """
@@ -32,6 +32,7 @@ marker_id = { range = [0, 50] }
 distance_m = { linspace = [0.1, 2, 200] }
 trial = 100
 """
+EXTENTS = (1, 200, 50)
 ROUNDS = 7
 
 
@@ -48,7 +49,7 @@ def noisy_cells(pipeline, indices, need=None):  # noqa: ARG001
     }
     absent = ("bound_", "mirror", "predicted", "nees", "residual")
     columns = {}
-    for variable in SCHEMA:
+    for variable in variables_of(pipeline):
         if variable.flags is not None:
             values = flags[variable.name]
         else:
@@ -83,7 +84,7 @@ def main():
         url, path = f"{folder}/large.zarr", Path(folder) / "large.toml"
         path.write_text(GRID)
         pipeline = Pipeline.from_toml(path)
-        store = create_store(url, pipeline, (1, 200, 50))
+        store = create_store(url, pipeline, EXTENTS)
         for block in store.blocks:
             task.compute_block(url, store.run_id, block)
         close(store)

@@ -106,7 +106,6 @@ ANALYSES = {
     "detection_limit": analysis.detection_limit,
     "detection_rate": analysis.detection_rate,
     "efficiency": analysis.efficiency,
-    "environment_differences": analysis.environment_differences,
     "error_models": analysis.error_models,
     "error_statistics": analysis.error_statistics,
     "failure_composition": analysis.failure_composition,
@@ -118,6 +117,7 @@ ANALYSES = {
     "renderer_bias": analysis.renderer_bias,
     "requirement_limits": lambda each: analysis.requirement_limits(
         each, ["detection >= 0.5"], along="distance_m"),
+    "store_differences": lambda each: analysis.store_differences(each, each),
     "decode_flags": sweep.decode_flags,
 }
 

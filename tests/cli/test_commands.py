@@ -2,21 +2,21 @@
 
 import argparse
 import ast
-import dataclasses
-import importlib
 import re
 import shlex
 import subprocess
 import sys
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
 import pytest
 
 import sweep
 from support.here import calls_here
 from sweep import cli, installation
-from sweep.cli.errors import flag_of, print_error
+from sweep.cli.command import flag_of, print_error
 from sweep.cli.parser import COMMANDS, GUIDES, build_parser
 from sweep.errors import ArgumentError, PipelineError, RunError, StoreError
 from sweep.execution.progress import Progress
@@ -107,7 +107,7 @@ def test_every_example_is_a_command_that_the_parser_takes(command):
     for example in command.examples:
         program, *arguments = shlex.split(example.line)
         assert program == "sweep"
-        options = build_parser().parse_args(arguments)
+        options = build_parser()[0].parse_args(arguments)
         assert options.command is command
         for value in arguments:
             if value.startswith("pipelines/"):
@@ -147,7 +147,7 @@ def test_every_guide_that_a_help_names_exists(guide):
 # Messages.
 
 def test_an_argument_is_named_by_its_flag(capsys):
-    options = build_parser().parse_args(["run", "file.toml"])
+    options = build_parser()[0].parse_args(["run", "file.toml"])
     error = ArgumentError("time_limit_s", 0, "expected seconds above 0")
     assert print_error(error, options) == 2
     assert capsys.readouterr().err == "--time-limit 0: expected seconds above 0\n"
@@ -162,7 +162,7 @@ def test_an_argument_is_named_by_its_flag(capsys):
         ("verify", "some_other"): "--some-other",
     }
     for (command, argument), flag in flags.items():
-        chosen = build_parser().parse_args([command, "x"])
+        chosen = build_parser()[0].parse_args([command, "x"])
         assert flag_of(argument, chosen) == flag
 
 
@@ -172,12 +172,12 @@ def test_an_argument_is_named_by_its_flag(capsys):
      (StoreError("s"), 2), (RunError("r"), 1)],
 )
 def test_exit_status_says_whether_a_command_was_refused(error, status, capsys):
-    assert print_error(error, build_parser().parse_args(["status", "x"])) == status
+    assert print_error(error, build_parser()[0].parse_args(["status", "x"])) == status
     assert capsys.readouterr().err.count("\n") == len(getattr(error, "faults", ["one"]))
 
 
 def test_control_characters_do_not_reach_the_terminal(capsys):
-    print_error(StoreError("x\x1b[2J"), build_parser().parse_args(["status", "x"]))
+    print_error(StoreError("x\x1b[2J"), build_parser()[0].parse_args(["status", "x"]))
     assert capsys.readouterr().err == "x\\u001b[2J\n"
 
 
@@ -225,54 +225,53 @@ def refused(capsys):
     return err
 
 
-def test_two_distributions_of_opencv_are_refused_with_the_command_that_removes_them(
-    capsys, monkeypatch
-):
-    installed(monkeypatch, opencv_contrib_python_headless=Installed("5.0.0"),
-              opencv_python_headless=Installed("4.11.0"))
-    assert refused(capsys) == (
-        "several distributions of OpenCV are installed and overwrite each other: "
-        "opencv-contrib-python-headless 5.0.0 and opencv-python-headless 4.11.0; "
-        "`pip uninstall opencv-contrib-python-headless opencv-python-headless`, then "
-        "`pip install opencv-contrib-python-headless`\n"
-    )
-
-
-def test_another_distribution_of_opencv_is_refused(capsys, monkeypatch):
-    installed(monkeypatch, opencv_python=Installed("5.0.0"))
-    assert refused(capsys) == (
-        "opencv-python 5.0.0 is installed in place of opencv-contrib-python-headless: "
-        "`pip uninstall opencv-python`, then `pip install opencv-contrib-python-headless`\n"
-    )
+@pytest.mark.parametrize("distributions", [
+    {"opencv_python": "4.14.0"},
+    {"opencv_contrib_python_headless": "5.0.0", "opencv_python_headless": "4.11.0"},
+    {"opencv_contrib_python_headless": "5.0.0", "opencv_contrib_python": "5.0.0",
+     "opencv_python": "5.0.0"},
+    {},
+])
+def test_another_distribution_of_opencv_is_warned_of_once(distributions, capsys, monkeypatch):
+    installed(monkeypatch, **{name: Installed(each) for name, each in distributions.items()})
+    installation._warn_of_other_opencv.cache_clear()
+    _, _, err = told(capsys, "status", "none.zarr")
+    warning, _ = err.splitlines()
+    assert warning.startswith("warning: ")
+    assert f"OpenCV {cv2.__version__} is loaded" in warning
+    for name, version in distributions.items():
+        assert name.replace("_", "-") in warning
+        assert version in warning
+    assert "warning" not in refused(capsys)
 
 
 def test_the_required_opencv_is_accepted(capsys, monkeypatch):
     installed(monkeypatch, opencv_contrib_python_headless=Installed("5.0.0"))
+    installation._warn_of_other_opencv.cache_clear()
     assert "OpenCV" not in refused(capsys)
 
 
-@pytest.mark.parametrize("distributions", [
-    {}, {"opencv_contrib_python_headless": Installed("5.0.0")}])
-def test_a_missing_opencv_is_refused_in_one_line(distributions, capsys, monkeypatch):
-    installed(monkeypatch, **distributions)
-    monkeypatch.setattr(installation.importlib.util, "find_spec", lambda _: None)
-    assert refused(capsys) == (
-        "OpenCV is missing: `pip install --force-reinstall opencv-contrib-python-headless`\n")
+@pytest.mark.parametrize(("loaded", "named"), [
+    (None, "OpenCV cannot be imported: "),
+    (SimpleNamespace(__version__="4.14.0"), "OpenCV 4.14.0 is loaded, which has no cv2.aruco"),
+    (SimpleNamespace(__version__="4.6.0", aruco=SimpleNamespace()),
+     "OpenCV 4.6.0 is loaded, which has no cv2.aruco.ArucoDetector"),
+    (SimpleNamespace(), "which has no cv2.aruco"),
+])
+def test_an_opencv_without_aruco_is_refused_in_one_line(loaded, named, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", loaded)
+    line = refused(capsys)
+    assert line.startswith(named) or named in line
+    assert "`pip install --force-reinstall opencv-contrib-python-headless`" in line
 
 
-def test_an_opencv_that_cannot_be_imported_is_told_in_one_line(capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "cv2", None)
-
-    def execute(_):
-        importlib.import_module("cv2")
-
-    monkeypatch.setattr("sweep.cli.parser.COMMANDS", tuple(
-        dataclasses.replace(command, execute=execute) for command in COMMANDS))
-    monkeypatch.setattr(installation, "_problems", lambda: iter(()))
-    code, _, err = told(capsys, "status", "none.zarr")
-    assert code == 2
-    assert err.startswith("OpenCV cannot be imported: ")
-    assert "`pip install --force-reinstall opencv-contrib-python-headless`" in err
+def test_an_opencv_without_aruco_is_refused_in_one_line_by_the_library():
+    done = python(
+        "import sys, types\nsys.modules['cv2'] = types.SimpleNamespace(__version__='4.14.0')\n"
+        "import sweep\ntry:\n    sweep.Pipeline\n"
+        "except sweep.StoreError as error:\n    print(error)"
+    )
+    assert "OpenCV 4.14.0 is loaded, which has no cv2.aruco.ArucoDetector" in done.stdout
 
 
 def test_the_other_project_s_package_is_refused_and_an_older_one_of_ours_is_not(

@@ -13,8 +13,9 @@ from support.here import calls_here
 from support.photograph_results import results_of, twins
 from sweep import cli
 from sweep.analysis import simulation_gap
-from sweep.report.gap_figure import figure_bytes, gap_panels
-from sweep.report.gap_table import gap_lines, gap_records, gap_table
+from sweep.messages import to_json
+from sweep.report.charts import panels_file
+from sweep.report.gap_figure import gap_lines, gap_panels, gap_records, gap_table
 
 
 def told(capsys, *arguments):
@@ -43,8 +44,7 @@ def test_the_table_has_a_row_for_each_statistic_configuration_and_bin():
 def test_json_has_the_same_numbers_and_null_where_there_is_none():
     rng = np.random.default_rng(2)
     gap = simulation_gap(results_of(rng, 3), twins(rng))
-    records = gap_records(gap)
-    assert json.loads(json.dumps(records, allow_nan=False)) == records
+    records = json.loads(to_json({"rows": gap_records(gap)}))["rows"]
     median = next(each for each in records if each["statistic"] == "rotation_median_deg")
     assert median["compared_by"] == "ratio"
     assert median["cornerRefinementMethod"] == "none"
@@ -68,20 +68,56 @@ def test_the_figure_has_the_distributions_of_both_sources():
     assert np.allclose(real.get_xdata(), angles)
     assert np.allclose(real.get_ydata()[[0, -1]], [100 / len(angles), 100])
     assert np.median(simulated.get_xdata()) < np.median(angles)
-    assert b"<svg" in figure_bytes(panels[:1], ".svg")
+    assert b"<svg" in panels_file(panels[:1], ".svg")
 
 
 @pytest.mark.parametrize(("arguments", "expected"), [
     (["-o", "gap.gif"], "expected a file that ends in .png or .svg"),
     (["--bins", "side_px"], "--bins side_px: expected a variable and increasing edges"),
     (["--bins", "side_px=a,b"], "--bins side_px=a,b: expected"),
-    (["--json", "--markdown"], "expected one of --markdown and --json"),
     ([], "runs/none.zarr"),
 ])
 def test_a_fault_is_one_line(arguments, expected, capsys):
     code, out, err = told(capsys, "compare", "runs/none.zarr", "scene.toml", *arguments)
     assert (code, out) == (2, "")
     assert expected in err
+    assert err.count("\n") == 1
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory):
+    """Two stores of one pipeline, one of them with another seed, and one of two refinements."""
+    text = "[pose]\nside_px = 40\njitter_px = 0.5\n[axes]\ntrial = 2\n"
+    refined = text + 'cornerRefinementMethod = ["none", "subpix"]\n'
+    folder = tmp_path_factory.mktemp("stores")
+    with calls_here():
+        for name, made in (("a", text), ("b", text), ("c", "seed = 2\n" + text), ("d", refined)):
+            sweep.run(sweep.Pipeline.from_text(made), store=folder / f"{name}.zarr")
+    return folder
+
+
+def test_two_stores_of_a_pipeline_are_compared(stores, capsys):
+    code, out, err = told(capsys, "compare", stores / "a.zarr", stores / "b.zarr", "--json")
+    assert (code, err) == (0, "")
+    said = json.loads(out)
+    assert said["fingerprint"] == []
+    (one,) = said["detection"]
+    assert (one["detections_compared"], one["detections_differing"]) == (2, 0)
+    assert one["corners_compared"] == 8
+    assert one["corner_shift_px"] == {"median": None, "p99": None, "worst": None}
+    code, out, _ = told(capsys, "compare", stores / "a.zarr", stores / "b.zarr")
+    assert code == 0
+    assert "next: sweep report" in out
+
+
+@pytest.mark.parametrize(("other", "flags", "named"), [
+    ("c.zarr", [], "seeds 0 and 2"), ("d.zarr", [], "cornerRefinementMethod"),
+    ("none.zarr", [], "none.zarr"), ("b.zarr", ["--bins", "side_px=1,2"], "--bins"),
+])
+def test_stores_that_are_no_pair_are_refused_in_one_line(other, flags, named, stores, capsys):
+    code, out, err = told(capsys, "compare", stores / "a.zarr", stores / other, *flags)
+    assert (code, out) == (2, "")
+    assert named in err
     assert err.count("\n") == 1
 
 

@@ -1,79 +1,30 @@
-"""Shell completion: what a shell offers behind what was typed."""
+"""Shell completion: the shells read the scripts, which name every command and option."""
 
 import shutil
 import subprocess
+import sys
 
 import pytest
 
 from sweep import cli
-from sweep.cli.completion import SHELLS, completions
-from sweep.cli.parser import COMMANDS
-from sweep.plan.parameters import PARAMETERS
-
-ASK = """
-source "$1"
-compopt() { :; }
-COMP_LINE=$2 COMP_POINT=${#2}
-_sweep
-printf '%s\\n' "${COMPREPLY[@]}"
-"""
+from sweep.cli.parser import build_parser
 
 
-def script(shell, capsys):
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_each_script_is_one_of_its_shell_and_has_every_command_and_option(shell, capsys, tmp_path):
+    pytest.importorskip("shtab")
     assert cli.main(["completion", shell]) == 0
-    return capsys.readouterr().out
+    text = capsys.readouterr().out
+    for parser in build_parser()[1]:
+        assert parser.prog.removeprefix("sweep ") in text
+        for option in parser._option_string_actions:
+            assert option.lstrip("-") in text
+    if shutil.which(shell) is not None:
+        (tmp_path / "script").write_text(text)
+        subprocess.run([shell, "-n", tmp_path / "script"], check=True)
 
 
-@pytest.mark.parametrize("shell", SHELLS)
-def test_every_command_option_and_parameter_is_in_each_script(shell, capsys):
-    text = script(shell, capsys)
-    for each in completions(COMMANDS):
-        assert each.command in text
-        for option in each.options:
-            assert (option if shell != "fish" else option.lstrip("-")) in text
-    for name in (*PARAMETERS, "trial"):
-        assert f"{name}=" in text
-
-
-@pytest.mark.parametrize(("shell", "check"), [("bash", "-n"), ("zsh", "-n"), ("fish", "-n")])
-def test_each_script_is_one_of_its_shell(shell, check, capsys, tmp_path):
-    if shutil.which(shell) is None:
-        pytest.skip(f"{shell} is not installed")
-    (tmp_path / "script").write_text(script(shell, capsys))
-    subprocess.run([shell, check, tmp_path / "script"], check=True)
-
-
-@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
-@pytest.mark.parametrize(
-    ("line", "offered"),
-    [
-        ("sweep r", ["run", "repro", "report", "require"]),
-        ("sweep plan sm", ["small.toml"]),
-        ("sweep plan ", ["runs", "small.toml"]),
-        ("sweep report runs/", ["runs/small.zarr"]),
-        ("sweep run small.toml --re", ["--reuse", "--retry-failed"]),
-        ("sweep run small.toml --set til", ["tilt_deg="]),
-        ("sweep run small.toml --set tilt_deg=", []),
-        ("sweep show small.toml --at roll", ["roll_deg="]),
-        # Of a word with equals signs, readline replaces what follows the last one.
-        ("sweep show small.toml --at tilt_deg=3,roll", ["3,roll_deg="]),
-        ("sweep report runs/small.zarr --format ", ["html", "md"]),
-        ("sweep run small.toml --workers ", []),
-        ("sweep limit small.toml --along distan", ["distance_m"]),
-        ("sweep limit small.toml --per tilt_deg,roll", ["tilt_deg,roll_deg"]),
-        ("sweep run small.toml --prec", ["--precision"]),
-        ("sweep completion ", ["bash", "zsh", "fish"]),
-    ],
-)
-def test_bash_offers_what_may_follow(line, offered, capsys, tmp_path):
-    (tmp_path / "script").write_text(script("bash", capsys))
-    work = tmp_path / "work"
-    (work / "runs/small.zarr").mkdir(parents=True)
-    (work / "small.toml").touch()
-    (work / "other.txt").touch()
-    done = subprocess.run(
-        ["bash", "-c", ASK, "bash", tmp_path / "script", line], cwd=work, capture_output=True,
-        text=True, check=True,
-    )
-    assert sorted(done.stdout.split()) == sorted(offered)
-    assert done.stderr == ""
+def test_without_its_package_the_remedy_is_one_line(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    assert cli.main(["completion", "bash"]) == 1
+    assert capsys.readouterr().err.strip().endswith("pip install shtab")

@@ -12,9 +12,9 @@ from support.here import calls_here
 from support.stores import by_hand
 from sweep import cli
 from sweep.errors import SweepError
-from sweep.execution.affordability import Demand, FreeDisk, objections
-from sweep.execution.finalize import close
-from sweep.plan.experiment import Pipeline
+from sweep.execution.forecast import Demand, FreeDisk, objections
+from sweep.execution.status import close
+from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import open_store
 from sweep.store.lock import locked
 
@@ -51,6 +51,18 @@ def told(capsys, line):
     return code, *capsys.readouterr()
 
 
+@pytest.mark.parametrize(("line", "instead"), [
+    ("environments list", "`sweep compare A.zarr B.zarr`"),
+    ("check-detector opencv --calls 3", "`sweep plugins check NAME`"),
+    ("run small.toml --durable", "`sweep verify STORE --repair`"),
+])
+def test_a_removed_command_or_flag_says_in_one_line_what_to_do_instead(line, instead, capsys):
+    code, out, err = told(capsys, line)
+    assert (code, out) == (2, "")
+    assert instead in err
+    assert err.count("\n") == 1
+
+
 @pytest.mark.usefixtures("folder")
 @pytest.mark.parametrize(
     ("line", "hint"),
@@ -65,6 +77,7 @@ def told(capsys, line):
         ("run other", "did you mean pipelines/other.toml?"),
         ("plan other.toml", "did you mean pipelines/other.toml?"),
         ("run runs", "runs: a folder that is no store; expected a TOML file or a store"),
+        ("run small.toml --set environment=other", "then `sweep compare A.zarr B.zarr`"),
         ("run small.toml --set Tilt_Deg=3", "did you mean tilt_deg?"),
         ("run small.toml --set tilt_deg=0,45", "such as [0, 45]"),
         ("run small.toml --set cornerRefinementMethod=1", "OpenCV's constant 1 is subpix"),
@@ -130,7 +143,7 @@ def test_every_command_ends_with_what_to_do_next(line, command, capsys):
     assert code == 0
     last = out.splitlines()[-1]
     assert last.partition("  #")[0] == f"next: {command}"
-    assert cli.parser.build_parser().parse_args(shlex.split(command)[1:]).command is not None
+    assert cli.parser.build_parser()[0].parse_args(shlex.split(command)[1:]).command is not None
 
 
 @pytest.mark.usefixtures("folder")
@@ -224,7 +237,7 @@ def test_a_run_that_is_too_large_is_refused_in_a_line_unless_it_is_confirmed(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "small.toml").write_text(TEXT)
     monkeypatch.setattr(
-        "sweep.execution.affordability.free_disk", lambda _url: FreeDisk(100, None))
+        "sweep.execution.forecast.free_disk", lambda _url: FreeDisk(100, None))
     code, out, err = told(capsys, "run small.toml")
     assert (code, out) == (2, "")
     assert ("before compression, and 100 bytes are free; make it smaller, or confirm it with "

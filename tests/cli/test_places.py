@@ -12,8 +12,8 @@ from sweep import cli
 from sweep.errors import MachineFaultError, StoreError
 from sweep.execution.block_task import compute_block
 from sweep.execution.runner import execute
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block
+from sweep.plan.pipeline import Pipeline
 from sweep.store.locations import check_writable, checked_url, exists
 
 PIPELINE = """
@@ -82,6 +82,9 @@ def test_a_place_without_a_store_is_told_as_what_it_is_by_every_command(place, f
         *((place, PLACES[place]) for place in (
             "loop.zarr", "x" * 300, "file:/a/b.zarr", "memory://x.zarr", "~/x.zarr", "a\0b")),
         ("http://127.0.0.1:9/x.zarr", "cannot be reached"),
+        *((f"{protocol}://a/x.zarr", f"{protocol}://a/x.zarr: ") for protocol in (
+            "github", "gist", "data", "dbfs", "reference", "jupyter", "generic", "asyncwrapper",
+            "zip", "dir", "simplecache", "sftp", "foo", "S3")),
         ("small.toml", "not a sweep store, but a pipeline file"),
         ("group.zarr/inner.zarr", "cannot be written: it is inside the store {}/group.zarr"),
         ("group.zarr/deep/inner.zarr", "cannot be written: it is inside the store {}/group.zarr"),
@@ -160,7 +163,7 @@ def test_what_the_system_refuses_is_told_in_one_line(error, monkeypatch):
     def refused():
         raise error
 
-    monkeypatch.setattr("sweep.installation.check_installation", refused)
+    monkeypatch.setattr("sweep.cli.check_installation", refused)
     assert command("status", "x") == (1, "", ERRORS[error] + "\n")
 
 
@@ -168,7 +171,7 @@ def test_a_defect_is_not_taken_for_the_system(monkeypatch):
     def broken():
         raise RuntimeError("some defect")
 
-    monkeypatch.setattr("sweep.installation.check_installation", broken)
+    monkeypatch.setattr("sweep.cli.check_installation", broken)
     with pytest.raises(RuntimeError, match="some defect"):
         cli.main(["status", "x"])
 
@@ -203,6 +206,6 @@ def test_characters_that_a_terminal_lacks_are_printed_as_escapes(tmp_path):
 @pytest.mark.parametrize("optimize", [1, 2])
 def test_without_assertions_no_store_is_touched(optimize, monkeypatch, tmp_path):
     flags = type("Flags", (), {"optimize": optimize})
-    monkeypatch.setattr("sweep.store.zarr_settings.sys.flags", flags)
+    monkeypatch.setattr("sweep.store.locations.sys.flags", flags)
     with pytest.raises(StoreError, match="unset PYTHONOPTIMIZE"):
         check_writable(str(tmp_path / "x.zarr"))

@@ -40,7 +40,7 @@ def test_a_search_says_what_it_knows_once_and_names_the_command_that_goes_on(cap
     search = ["limit", "folder/marker.toml", *SEARCH]
     status, out, err = told(capsys, *search, "--max-trials", "12")
     assert status == 0
-    assert "2 limits of 2 are not known to one value of the grid" in out
+    assert "2 limits of 2 are not decided to one value of the grid" in out
     assert "conditions" not in err  # the answer says it, of the limits themselves
     _, out, _ = told(capsys, "status", "runs/marker-limit-side_px.zarr")
     assert ", of 72 with all trials" in out
@@ -80,7 +80,6 @@ def test_a_choice_into_another_store_is_told_the_command_that_reuses_it(capsys):
     (["limit", "--require", "detektion >= 0.1", "--along", "side_px"],
      'folder/marker.toml: limit.require = "detektion >= 0.1": '),
     (["size"], "folder/marker.toml: expected what is chosen: [choose]"),
-    (["run", "--output", "x.png"], "--output is a flag of sweep limit, sweep show, "),
 ])
 def test_a_fault_is_one_line_that_begins_with_the_file_or_the_flag(words, line, capsys):
     status, _, err = told(capsys, words[0], "folder/marker.toml", *words[1:])

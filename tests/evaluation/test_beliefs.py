@@ -40,14 +40,14 @@ from scipy import stats
 
 from support.blocks import run_block
 from support.lengths import lengths
-from sweep.evaluation.estimation import assumed_cameras
-from sweep.measure.accuracy import pose_error
+from sweep.evaluation.block import assumed_cameras
+from sweep.measure.estimation import pose_error
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.measure.solver import OPENCV_SOLVERS, estimate
 from sweep.model.scene import build_scenes
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices, estimators, scene_axes, scene_values
 from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
 from sweep.plan.schema import SCHEMA
 
 GUARDED = tuple(name for name in OPENCV_SOLVERS if name != "epnp")  # epnp cannot be guarded
@@ -228,18 +228,6 @@ def test_wrong_principal_point_moves_a_parallel_marker_sideways_and_does_not_tur
         assert_translation(found.translation, shifted, off_px)
 
 
-@lengths(3, 100)
-def test_all_beliefs_together_follow_the_law_of_a_parallel_marker(count):
-    rng = np.random.default_rng(7)
-    for _ in range(count):
-        focal, size = np.exp(rng.uniform(-0.3, 0.3, 2)).tolist()
-        cx, cy = (np.array([319.5, 239.5]) + rng.uniform(-100, 100, 2)).tolist()
-        assert_parallel_law(Estimated(PARALLEL, [
-            f"believed_fx_px={600 * focal!r}", f"believed_fy_px={550 * focal!r}",
-            f"believed_cx_px={cx!r}", f"believed_cy_px={cy!r}", f"believed_size_m={0.1 * size!r}",
-        ]))
-
-
 def test_axes_of_beliefs_give_what_each_value_gives_on_its_own():
     axes = {"believed_cx_px": [300.0, 319.5, 330.25], "believed_size_m": [0.09, 0.11]}
     estimated = Estimated(PARALLEL, [f"{name}={values}" for name, values in axes.items()])
@@ -297,35 +285,6 @@ def test_lens_that_is_not_believed_scales_the_distance_of_a_centred_marker(lens)
         assert error.rotation_angle_rad.max() < ROTATION_RAD, estimator
 
 
-@pytest.mark.parametrize("lens", RADIAL.values(), ids=RADIAL)
-def test_lens_that_is_believed_only_scales_it_the_other_way(lens):
-    """The radius r' within the believed lens is chosen, and the marker put where it comes to it."""
-    inside = 0.35
-    radius = inside * radial(lens, inside)
-    distance = float(0.1 / np.sqrt(2) / radius)
-    estimated = Estimated(CENTRED, [f"distance_m={distance!r}", f"believed_distortion={lens}"])
-    for estimator, found, error in estimated:
-        expected = np.tile([0, 0, distance * radius / inside], (4, 1))
-        assert_translation(found.translation, expected, estimator)
-        assert error.rotation_angle_rad.max() < ROTATION_RAD, estimator
-
-
-def test_wrong_lens_scales_the_distance_by_the_ratio_of_the_radii():
-    """Both have k1; the believed one is chosen so that its inverse has the radius 0.3."""
-    radius, inside = float(0.1 / np.sqrt(2) / 0.2), 0.3
-    true_k1 = -0.25
-    believed_k1 = (radius * (1 + true_k1 * radius**2) / inside - 1) / inside**2
-    estimated = Estimated(CENTRED, [
-        "distance_m=0.2", f"distortion=[{true_k1}, 0, 0, 0]",
-        f"believed_distortion=[[{true_k1}, 0, 0, 0], [{believed_k1!r}, 0, 0, 0]]",
-    ])
-    for estimator, found, error in estimated:
-        right = estimator.believed_distortion[0] == true_k1
-        expected = np.tile([0, 0, 0.2 * (1.0 if right else radius / inside)], (4, 1))
-        assert_translation(found.translation, expected, estimator)
-        assert error.rotation_angle_rad.max() < ROTATION_RAD, estimator
-
-
 @pytest.mark.parametrize("distance", [0.15, 0.3])
 @pytest.mark.parametrize("lens", [(1e-4, 0.0), (0.0, 1e-4), (1e-4, -2e-4)], ids=str)
 def test_tangential_lens_that_is_not_believed_turns_and_shifts_the_marker(lens, distance):
@@ -364,88 +323,8 @@ def test_tangential_lens_that_is_not_believed_turns_and_shifts_the_marker(lens, 
 
 # 5. Pixels that are believed to have another shape.
 
-@pytest.mark.parametrize("distance", [0.12, 0.3])
-@pytest.mark.parametrize("error", [-1e-2, -1e-4, 1e-4, 1e-2])
-def test_wrong_fx_alone_is_shared_by_least_squares_and_tilts_what_ippe_sees(error, distance):
-    estimated = Estimated(
-        CENTRED, [f"distance_m={distance}", f"believed_fx_px={600 * (1 + error)!r}"]
-    )
-    ratio = min(1 + error, 1 / (1 + error))
-    for estimator, found, miss in estimated:
-        assert (found.status == EstimateStatus.solved).all()
-        if estimator.solver in LEAST_SQUARES:
-            # To first order: the rest is at most error².
-            expected = np.tile([0, 0, distance * (1 + error / 2)], (4, 1))
-            assert_translation(found.translation, expected, estimator, error**2 + TRANSLATION)
-            assert miss.rotation_angle_rad.max() < ROTATION_RAD, estimator
-        if estimator.solver in IPPE:
-            assert np.isfinite(found.alternative_reprojection_px).all()  # IPPE's, not the guard's
-            np.testing.assert_allclose(
-                miss.rotation_angle_rad, np.arccos(ratio), atol=ROTATION_RAD
-            )
-            np.testing.assert_allclose(
-                found.translation[:, 2], distance * min(1, 1 + error), rtol=1e-9
-            )
-
 
 # 6. Tilted markers.
-
-TILTED = f"""
-[marker]
-size_m = 0.1
-[camera]
-fx_px = 600
-[axes]
-tilt_deg = [30, 60]
-azimuth_deg = [0, 50, 90, 200]
-roll_deg = [0, 70]
-solver = {list(GUARDED)}
-"""
-
-
-def first_order(scenes):
-    """Return what (N,) the perspective of a tilted marker may add to law 6, as a share of it.
-
-    The image's mismatch is a share (s/z)² of the calibration error, and a turn of the marker shows
-    in it with s/z·sin(tilt).
-    """
-    tilt = np.arccos(-scenes.rotation[:, 2, 2])
-    return scenes.size_m / scenes.translation[:, 2] / np.sin(tilt)
-
-
-@pytest.mark.parametrize("distance", [1, 10])
-@pytest.mark.parametrize("off_px", [-1.0, 0.5])
-def test_wrong_principal_point_turns_the_whole_pose_of_a_small_tilted_marker(off_px, distance):
-    estimated = Estimated(
-        TILTED, [f"distance_m={distance}", f"believed_cx_px={319.5 + off_px}"]
-    )
-    angle = off_px / 600
-    # Beside the perspective: the second order of the angle.
-    allowed = abs(angle) * (first_order(estimated.scenes) + 2 * abs(angle))
-    for estimator, found, error in estimated:
-        turned = np.linalg.norm(error.rotation_rad - [0, -angle, 0], axis=1)
-        assert (turned < allowed + ROTATION_RAD).all(), estimator
-        moved = (found.translation - estimated.scenes.translation) / distance
-        astray = np.linalg.norm(moved - [-angle, 0, 0], axis=1)
-        assert (astray < allowed + TRANSLATION).all(), estimator
-
-
-@pytest.mark.parametrize("distance", [1, 10])
-@pytest.mark.parametrize("error", [-0.03, 0.01])
-def test_wrong_focal_length_hardly_turns_a_small_tilted_marker(error, distance):
-    """The homography is scaled along x and y: its Jacobian, all that IPPE looks at, by a factor.
-
-    So IPPE's rotation is exact at any distance, and the other solvers' to first order.
-    """
-    estimated = Estimated(TILTED, [f"distance_m={distance}", *(
-        f"believed_f{axis}_px={600 * (1 + error)!r}" for axis in "xy"
-    )])
-    allowed = abs(error) * first_order(estimated.scenes)
-    for estimator, found, miss in estimated:
-        exact = estimator.solver in IPPE
-        assert (miss.rotation_angle_rad < (0 if exact else allowed) + ROTATION_RAD).all()
-        astray = np.abs(found.translation / distance - [0, 0, 1 + error]).max(axis=1)
-        assert (astray < allowed + TRANSLATION).all(), estimator
 
 
 # As distributions.
@@ -490,50 +369,6 @@ def test_spread_of_the_size_is_that_of_the_distance(count):
         expected = estimated.scenes.translation * (drawn / 0.1)[:, None]
         assert_translation(found.translation, expected, estimator)
         assert_spread(found.translation[:, 2] - 0.25, 0.25 * 0.002 / 0.1)
-
-
-@lengths(100, 5000)
-def test_spread_of_the_principal_point_is_that_of_the_marker_sideways(count):
-    estimated = Estimated(DRAWN, [
-        f"trial={count}", "believed_cx_px={normal=[319.5, 2]}", "believed_cy_px={normal=[239.5, 5]}"
-    ])
-    for estimator, found, error in estimated:
-        expected = parallel_law(
-            estimated.scenes, 600, 600, estimated.values["believed_cx_px"].values,
-            estimated.values["believed_cy_px"].values, 0.1,
-        )
-        assert_translation(found.translation, expected, estimator)
-        assert error.rotation_angle_rad.max() < ROTATION_RAD, estimator
-        assert_spread(found.translation[:, 0], 0.25 * 2 / 600)
-        assert_spread(found.translation[:, 1], 0.25 * 5 / 600)
-        # Two quantities, two streams.
-        correlation = np.corrcoef(found.translation[:, 0], found.translation[:, 1])[0, 1]
-        assert abs(correlation) < stats.norm.isf(LUCK / 2) / np.sqrt(count)
-
-
-@lengths(100, 5000)
-def test_spread_of_the_focal_lengths_is_that_of_the_distance(count):
-    """fx' and fy' are drawn on their own, and law 5 takes their mean: z·sd/f over √2.
-
-    Of IPPE the smaller counts, so that its distances are too short on average: by z·sd/(f·√π), the
-    mean of the smaller of two normal numbers.
-    """
-    deviation = 600 * 1e-3
-    estimated = Estimated(DRAWN, [f"trial={count}", *(
-        f"believed_f{axis}_px={{normal=[600, {deviation}]}}" for axis in "xy"
-    )])
-    x, y = (estimated.values[f"believed_f{axis}_px"].values / 600 - 1 for axis in "xy")
-    for estimator, found, _ in estimated:
-        z = found.translation[:, 2] / 0.25 - 1
-        if estimator.solver in LEAST_SQUARES:
-            # 5 deviations, squared: what is beyond the first order.
-            np.testing.assert_allclose(z, (x + y) / 2, atol=2 * (5e-3) ** 2)
-            assert_spread(z, 1e-3 / np.sqrt(2))
-        if estimator.solver in IPPE:
-            np.testing.assert_allclose(z, np.minimum(x, y), atol=TRANSLATION)
-            # The variance of the smaller of two is 1 - 1/π; the sum of many is nearly normal.
-            bound = stats.norm.isf(LUCK / 2) * 1e-3 * np.sqrt((1 - 1 / np.pi) / count)
-            assert abs(z.mean() + 1e-3 / np.sqrt(np.pi)) < bound
 
 
 def test_drawn_beliefs_are_the_same_for_all_solvers_and_independent_of_one_another():
@@ -616,22 +451,6 @@ def test_beliefs_move_detected_markers_as_they_move_exact_ones(count):
                 np.testing.assert_allclose(ratio[:, k], min(fx, fy) / 600 - 1, atol=1e-3)
 
 
-@lengths(40, 400)
-def test_drawn_size_spreads_the_distance_of_detected_markers(count):
-    axes = f"trial = {count}\nsolver = {list(GUARDED)}\n"
-    plain, _ = translations(run(SEEN.replace("side_px = 300", "side_px = 60") + axes))
-    drawn, truth = translations(run(
-        SEEN.replace("side_px = 300", "side_px = 60") + axes
-        + "[estimator]\nbelieved_size_m = { normal = [0.1, 0.002] }\n"
-    ))
-    ratio = drawn / plain
-    # One draw a trial for all solvers and all coordinates; errors are float32: 6e-8 of 1 m.
-    z = ratio[:, :1, 2:]
-    np.testing.assert_allclose(ratio[..., 2:], np.broadcast_to(z, ratio[..., 2:].shape), rtol=1e-6)
-    np.testing.assert_allclose(drawn, plain * z, atol=1e-6 * truth[:, 2].max())
-    assert_spread(z.ravel() - 1, 0.02)
-
-
 # What beliefs must not touch.
 
 EVERYTHING = """
@@ -676,23 +495,6 @@ def test_believing_the_truth_gives_the_bits_of_believing_nothing(belief, unset):
     assert (unset["estimate"] == EstimateStatus.solved).any()
     for name, expected in unset.items():
         np.testing.assert_array_equal(believing[name], expected, err_msg=name)
-
-
-def test_unset_beliefs_follow_the_truth_from_scene_to_scene():
-    cameras = EVERYTHING.replace("fx_px = 610.1\n", "").replace("fy_px = 598.7\n", "").replace(
-        "size_m = 0.0731\n", ""
-    )
-    axes = ["fx_px=[500.0, 610.1]", "size_m=[0.05, 0.0731]"]
-    axes.append("trial=3")
-    following = run(cameras, axes)
-    believing = run(cameras, [*axes, "believed_fx_px=610.1", "believed_fy_px=610.1",
-                              "believed_size_m=0.0731"])
-    # The axes of settings are the last ones, but for x, y, z.
-    for at, same in ((0, False), (1, True)):
-        ours, theirs = (
-            grid["translation_error_m"][..., at, at, :] for grid in (following, believing)
-        )
-        assert np.array_equal(ours, theirs, equal_nan=True) == same
 
 
 BELIEFS = {

@@ -5,14 +5,14 @@ import pytest
 
 import sweep
 from sweep.errors import PipelineError, StoreError
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells
 from sweep.execution.reuse import match
 from sweep.execution.runner import execute
 from sweep.measure.flags import EstimateStatus
-from sweep.plan.camera_facts import notes
-from sweep.plan.experiment import Pipeline
+from sweep.plan.facts import camera_notes
 from sweep.plan.grid import scene_axes, scene_values
 from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import create_store, open_store
 from tests.support.here import calls_here
 
@@ -64,24 +64,6 @@ def test_100_000_draws_have_the_calibration_s_covariance(kind):
     second = normal @ normal.T / DRAWS
     spread = np.where(np.eye(count, dtype=bool), np.sqrt(2), 1.0) / np.sqrt(DRAWS)
     assert (np.abs(second - np.eye(count)) < SIGMAS * spread).all()
-
-
-def test_a_singular_covariance_is_drawn_from():
-    # fx and fy have one error; the rest has none.
-    matrix = np.zeros((9, 9))
-    matrix[:2, :2] = 0.25
-    beliefs = drawn(pipeline({"calibration_covariance": matrix.ravel().tolist()}, trials=1000))
-    assert np.std(beliefs[0]) == pytest.approx(0.5, rel=0.15)  # 6.7 standard errors
-    np.testing.assert_allclose(beliefs[0] - 600, beliefs[1] - 601, atol=1e-12)
-    assert (beliefs[2:] == np.array([*VIEW.values(), *LENS])[2:, None]).all()
-
-
-@pytest.mark.parametrize("fixed", [0, 1])
-def test_a_focal_length_without_deviation_keeps_its_aspect_ratio(fixed):
-    sd = [0.0 if k == fixed else deviation for k, deviation in enumerate(SD)]
-    beliefs = drawn(pipeline({"calibration_sd": sd}, trials=100))
-    assert np.ptp(beliefs[0]) > 0.5
-    np.testing.assert_allclose(beliefs[1] / beliefs[0], 601 / 600, rtol=1e-14)
 
 
 def test_draws_of_a_calibration_change_no_other_draw_and_follow_the_cell():
@@ -152,20 +134,6 @@ def test_a_believed_focal_scale_scales_the_distance_of_a_frontal_marker():
     np.testing.assert_array_equal(run_cells(both, []).columns["translation_error_m"][0], columns[2])
 
 
-def test_a_drawn_focal_scale_is_in_the_dataset_and_in_the_distance(tmp_path):
-    chosen = Pipeline.from_dict({
-        "camera": {"fx_px": 600}, "marker": {"size_m": 0.1}, "pose": {"distance_m": 0.5},
-        **FRONTAL, "estimator": {"believed_focal_scale": {"normal": [1, 0.01]}},
-        "axes": {"trial": 20},
-    })
-    with calls_here():
-        execute(chosen, tmp_path / "s.zarr")
-    results = sweep.open(tmp_path / "s.zarr").load()
-    ratio = (0.5 + results["translation_error_m"].sel(xyz="z")) / results["believed_focal_scale"]
-    assert np.ptp(results["believed_focal_scale"].values) > 0.01
-    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-6)
-
-
 # What is refused and what is told.
 
 @pytest.mark.parametrize(("camera", "estimator", "line"), [
@@ -190,8 +158,7 @@ def test_a_drawn_focal_scale_is_in_the_dataset_and_in_the_distance(tmp_path):
     ({"calibration_covariance": [1, 0.5, 0, 0, 0, 1, *[0] * 10]}, {}, "expected a symmetric"),
     ({"calibration_covariance": [-1, *[0] * 15]}, {}, "expected a covariance: no variance below 0"),
     ({}, {"believed_focal_scale": 1.01, "believed_fx_px": 600},
-     ("believed_focal_scale = 1.01: expected a factor or focal lengths, not both; delete it or "
-     "believed_fx_px")),
+     "believed_fx_px = 600: expected believed_focal_scale or believed_fx_px, not both"),
 ])
 def test_beliefs_that_contradict_each_other_are_refused(camera, estimator, line):
     with pytest.raises(PipelineError) as refused:
@@ -199,12 +166,6 @@ def test_beliefs_that_contradict_each_other_are_refused(camera, estimator, line)
     told = str(refused.value).split("\n")
     assert len(told) == 1
     assert line in told[0]
-
-
-def test_trials_without_a_believed_calibration_need_something_random():
-    with pytest.raises(PipelineError, match="something random to repeat"):
-        pipeline({"calibration_sd": SD}, {"believed": "truth"})
-    assert pipeline({"calibration_sd": SD}).size(Stage.scene) == DRAWS
 
 
 @pytest.mark.parametrize(("camera", "estimator", "line"), [
@@ -215,8 +176,8 @@ def test_trials_without_a_believed_calibration_need_something_random():
      "the calibration's numbers are drawn independently of each other"),
 ])
 def test_beliefs_that_may_surprise_are_told(camera, estimator, line):
-    assert [each for each in notes(pipeline(camera, estimator, 1)) if line in each]
-    assert not notes(pipeline({}, {"believed_fx_px": 606, "believed_fy_px": 606}, 1))
+    assert [each for each in camera_notes(pipeline(camera, estimator, 1)) if line in each]
+    assert not camera_notes(pipeline({}, {"believed_fx_px": 606, "believed_fy_px": 606}, 1))
 
 
 # Reuse.

@@ -5,18 +5,16 @@ import numpy as np
 import pytest
 
 from support.lengths import lengths
-from sweep.evaluation.board_search import board_scenes
-from sweep.evaluation.cells import run_cells
-from sweep.evaluation.search import search, search_windows, visibility_flags
-from sweep.measure.board_detector import BoardDetectorSetting
-from sweep.measure.detector import DetectorSetting
+from sweep.evaluation.block import run_cells
+from sweep.evaluation.search import board_scenes, search, search_windows, visibility_flags
+from sweep.measure.detectors import BoardDetectorSetting, DetectorSetting
 from sweep.measure.flags import DetectionStatus
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
-from sweep.plan.boards import largest_board
-from sweep.plan.experiment import Pipeline
+from sweep.plan.experiment import largest_board
 from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
+from sweep.plan.pipeline import Pipeline
 
 DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
 GRID = {"kind": "grid", "rows": 2, "columns": 2, "gap_m": 0.01}

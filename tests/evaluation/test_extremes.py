@@ -4,24 +4,20 @@ The regimes are the files of pipelines/extremes; ``python tests/benchmarks/extre
 what every refinement and solver does there.
 """
 
-import os
 
 import numpy as np
 import pytest
 
 from benchmarks.extremes import (
     FILES,
-    REFINEMENTS,
     SOLVERS,
-    all_that_is_printed,
     broken_promises,
     measured,
 )
 from support.lengths import lengths
-from sweep.evaluation.results import Failure
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
 
 PATHS = {path.stem: path for path in FILES}
 MAX_SCENES = 300
@@ -49,37 +45,6 @@ def along(result, variable, axis):
 @pytest.mark.parametrize("name", PATHS)
 def test_all_that_is_detected_or_solved_is_finite_and_nothing_is_raised_or_printed(name, count):
     assert broken_promises(measured(Pipeline.from_toml(PATHS[name]), count)) == []
-
-
-@pytest.mark.parametrize("name", PATHS)
-def test_every_regime_is_small_and_has_every_refinement_and_every_solver(name):
-    pipeline = Pipeline.from_toml(PATHS[name])
-    assert pipeline.title
-    assert pipeline.size(Stage.scene) <= MAX_SCENES
-    assert pipeline.values_of("cornerRefinementMethod") == REFINEMENTS
-    assert pipeline.values_of("solver") == SOLVERS
-
-
-@pytest.mark.parametrize("nonsense", [np.nan, np.inf])
-@pytest.mark.parametrize(
-    "variable", ["true_tvec_m", "corner_error_px", "rotation_error_rad", "reprojection_error_px"]
-)
-def test_a_number_that_is_not_finite_would_be_told(variable, nonsense):
-    result = measured(Pipeline.from_toml(PATHS["tilt_zero"]), 1)
-    assert broken_promises(result) == []
-    result.values[variable].flat[0] = nonsense
-    assert broken_promises(result)
-
-
-def test_what_is_printed_or_raised_would_be_told():
-    result = measured(Pipeline.from_toml(PATHS["zero_contrast"]), 1)
-    with all_that_is_printed() as lines:
-        os.write(2, b"a warning of a library\n")
-        print("one of Python")
-    assert lines == ["a warning of a library", "one of Python"]
-    result.printed = lines
-    result.failures.append(Failure(0, "detection", "Traceback\nValueError: why"))
-    assert len(broken_promises(result)) == 3
 
 
 FLAGS = {
@@ -144,10 +109,6 @@ FLAGS = {
     ],
 }
 """Regime -> settings, and all the flags that its searches then give."""
-
-
-def test_every_regime_has_its_flags():
-    assert FLAGS.keys() == PATHS.keys()
 
 
 @pytest.mark.parametrize(

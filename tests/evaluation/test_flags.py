@@ -10,8 +10,8 @@ import pytest
 from support.blocks import run_block
 from sweep.measure.classify import classify
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
+from sweep.plan.pipeline import Pipeline
 from sweep.plan.schema import SCHEMA
 
 PLAIN = """
@@ -86,15 +86,6 @@ SCENES = {
 )
 def test_flag_is_reached_by_a_real_scene(expected, settings):
     assert flags(*settings) == [expected]
-
-
-def test_every_flag_of_detection_has_a_scene():
-    of_no_scene = {
-        DetectionStatus.not_run, DetectionStatus.failed, DetectionStatus.crashed,
-        DetectionStatus.not_needed, DetectionStatus.not_in_photograph,
-        DetectionStatus.not_on_board,
-    }
-    assert {*SCENES} | of_no_scene == {*DetectionStatus}
 
 
 def test_marker_misread_with_much_error_correction_is_a_wrong_id():
@@ -240,12 +231,6 @@ def classified(*found, truth=SQUARE, marker_id=7):
     return DetectionStatus(flag[0]), corners[0]
 
 
-def test_nothing_found_is_no_candidate():
-    flag, corners = classified()
-    assert flag == DetectionStatus.no_candidate
-    assert np.isnan(corners).all()
-
-
 def test_right_marker_is_detected_with_its_own_corners():
     flag, corners = classified((7, SQUARE + 0.5))
     assert flag == DetectionStatus.detected
@@ -271,17 +256,6 @@ def test_other_id_there_is_a_wrong_id_and_outweighs_a_rejected_candidate():
     assert classified((3, SQUARE))[0] == DetectionStatus.wrong_id
     assert classified((3, SQUARE), (REJECTED_ID, SQUARE))[0] == DetectionStatus.wrong_id
     assert classified((REJECTED_ID, SQUARE), (3, SQUARE))[0] == DetectionStatus.wrong_id
-
-
-def test_rejected_candidate_there_is_rejected():
-    assert classified((REJECTED_ID, SQUARE))[0] == DetectionStatus.rejected
-    assert classified((REJECTED_ID, SQUARE), (7, SQUARE + 50))[0] == DetectionStatus.rejected
-
-
-def test_right_marker_outweighs_everything_else_there():
-    others = [(3, SQUARE), (REJECTED_ID, SQUARE), (7, np.roll(SQUARE, 1, axis=0))]
-    for found in ([(7, SQUARE), *others], [*others, (7, SQUARE)]):
-        assert classified(*found)[0] == DetectionStatus.detected
 
 
 def test_of_two_right_ones_the_nearest_counts():

@@ -3,15 +3,14 @@
 import hashlib
 
 import numpy as np
-import pytest
 
 from sweep.measure.solver import estimate
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_values
-from sweep.store.provenance import NEAR_NUMBERS_VERSION, NUMBERS_VERSION, numbers_version
+from sweep.plan.pipeline import Pipeline
+from sweep.store.provenance import NUMBERS_VERSION
 
 TEXT = """
 seed = 11
@@ -76,6 +75,7 @@ GOLDEN = {
     3: ("444ab255354eab6c", "d3a2eb2642834a07", "762609d8f161cf15", "c7da5a2c73d279de"),
 }
 GOLDEN[4] = GOLDEN[3]  # these scenes have no far marker
+GOLDEN[5] = GOLDEN[4]  # nor corners so coarse that a solver ends beside the least error
 
 
 def digest(array):
@@ -109,23 +109,3 @@ def test_numbers_change_only_with_their_version():
         digest(posed), images, digest(estimated), drawn(EFFECTS)[1]
     )
     assert made == GOLDEN[NUMBERS_VERSION], made
-
-
-@pytest.mark.parametrize(("camera", "near"), [
-    ("", True),
-    ("fx_px = 4000", True),
-    ("fx_px = 4001", False),
-    ("fx_px = 600\nfy_px = 4001", False),
-    ("focal_length_mm = 50", False),  # 6667 px
-    ("focal_length_mm = 50\nsensor_width_mm = 36\nsensor_height_mm = 24", True),
-    ("hfov_deg = 1", False),
-])
-def test_stores_whose_numbers_did_not_change_keep_their_version(camera, near):
-    pipeline = Pipeline.from_text(f"[camera]\n{camera}\n[axes]\ndistance_m = [1, 2]")
-    assert numbers_version(pipeline) == (NEAR_NUMBERS_VERSION if near else NUMBERS_VERSION)
-
-
-def test_the_longest_focal_length_of_the_grid_decides_about_the_version():
-    for values, near in (("[300, 4000, 900]", True), ("[300, 90000, 900]", False)):
-        pipeline = Pipeline.from_text(f"[pose]\ndistance_m = 1\n[axes]\nfx_px = {values}")
-        assert numbers_version(pipeline) == (NEAR_NUMBERS_VERSION if near else NUMBERS_VERSION)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells
 from sweep.measure.flags import BoundStatus, DetectionStatus
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 
 TEXT = """
 [camera]

@@ -11,9 +11,8 @@ from numba.core.errors import TypingError
 import sweep
 from support import machine_faults
 from sweep.errors import MachineFaultError, StoreError
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells, warm_up
 from sweep.evaluation.machine_faults import machine_fault
-from sweep.evaluation.warm_up import warm_up
 
 PIPELINE = sweep.Pipeline.from_dict(
     {"pose": {"side_px": 40, "jitter_px": 0.5}, "axes": {"trial": 4}}
@@ -51,13 +50,6 @@ def test_what_data_may_cause_is_no_fault_of_the_machine():
     assert machine_fault(hidden) is None
 
 
-def test_fault_keeps_its_words_in_another_process():
-    fault = machine_fault(OSError(errno.ENOSPC, "No space left on device\nmore"))
-    again = pickle.loads(pickle.dumps(fault))  # noqa: S301
-    assert (str(again), again.fault, again.machine) == (str(fault), fault.fault, fault.machine)
-    assert "\n" not in str(fault)
-
-
 @pytest.mark.parametrize("place", [place for place in machine_faults.PLACES if place != "set"])
 @pytest.mark.parametrize("fault", ["disk", "memory", "import", "compiler", "opencv memory"])
 def test_no_scene_is_flagged_failed_by_a_fault_of_the_machine(fault, place):
@@ -77,7 +69,7 @@ def test_solver_of_a_user_that_meets_a_fault_of_the_machine_raises_it(monkeypatc
         def __call__(self, _):
             raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("sweep.evaluation.cells.build", lambda _: Solver())
+    monkeypatch.setattr("sweep.evaluation.block.build", lambda _: Solver())
     with pytest.raises(MachineFaultError, match="No space left on device"):
         run_cells(PIPELINE, [np.arange(4)])
 
@@ -91,16 +83,6 @@ def test_machine_that_cannot_compute_a_standard_scene_is_told_before_any_block(p
             warm_up(PIPELINE)
     finally:
         machine_faults.clear()
-
-
-def test_machine_that_computes_a_standard_scene_wrongly_is_at_fault(monkeypatch):
-    def white(*arguments):
-        return [np.full((y1 - y0, x1 - x0), 255, np.uint8)
-                for x0, y0, x1, y1 in arguments[-1].tolist()]
-
-    monkeypatch.setattr("sweep.evaluation.search.render_all", white)
-    with pytest.raises(MachineFaultError, match="computed wrongly"):
-        warm_up(PIPELINE)
 
 
 @pytest.mark.parametrize("renderer", [

@@ -12,8 +12,8 @@ from support.lengths import lengths
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
+from sweep.plan.pipeline import Pipeline
 
 DICTIONARIES = {"DICT_4X4_50": cv2.aruco.DICT_4X4_50, "DICT_6X6_250": cv2.aruco.DICT_6X6_250}
 IDS = (0, 7, 42)

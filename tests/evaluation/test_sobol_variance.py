@@ -5,8 +5,8 @@ import pytest
 from scipy import stats
 
 import sweep
-from sweep.evaluation.cells import run_cells
-from sweep.plan.sobol import REPLICATES
+from sweep.evaluation.block import run_cells
+from sweep.plan.draws import REPLICATES
 
 PIPELINE = {
     "camera": {"fx_px": 600},

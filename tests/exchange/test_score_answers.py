@@ -2,7 +2,6 @@
 
 import codecs
 import csv
-import json
 import re
 import subprocess
 import sys
@@ -16,15 +15,15 @@ from support.here import calls_here
 from support.stores import by_hand
 from sweep import cli
 from sweep.errors import ArgumentError, PipelineError, StoreError
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells
 from sweep.evaluation.inspection import inspect_scene
-from sweep.exchange.conventions import Conventions, frame_axes, right_handed_frames
+from sweep.exchange.answers import Conventions
 from sweep.exchange.export import export
-from sweep.exchange.image_set import scene_indices
+from sweep.exchange.images import scene_indices
 from sweep.exchange.score import prepare
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.plan.cell_selection import cell
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import open_store
 
 TEXT = """
@@ -179,7 +178,7 @@ def test_others_conventions_are_turned_into_ours(exported, ran, tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("form", ["rvec", "quaternion", "jsonl"])
+@pytest.mark.parametrize("form", ["rvec", "quaternion"])
 def test_poses_alone_are_scored_as_they_are(form, exported, tmp_path):
     generator = np.random.default_rng(3)
     rows, wanted = [], {}
@@ -196,19 +195,12 @@ def test_poses_alone_are_scored_as_they_are(form, exported, tmp_path):
         angle = np.linalg.norm(numbers)
         quaternion = -np.array([np.cos(angle / 2), *(np.sin(angle / 2) * numbers / angle)])
         row = {"image": truth["image"], "id": int(truth["id"])}
-        if form == "jsonl":
-            row |= {"rvec": numbers.tolist(), "tvec": (tvec + shift).tolist()}
-        else:
-            names = ("rx", "ry", "rz") if form == "rvec" else ("qw", "qx", "qy", "qz")
-            values = numbers if form == "rvec" else quaternion
-            row |= dict(zip(names, map(repr, values.tolist()), strict=True))
-            row |= dict(zip(("tx", "ty", "tz"), map(repr, (tvec + shift).tolist()), strict=True))
+        names = ("rx", "ry", "rz") if form == "rvec" else ("qw", "qx", "qy", "qz")
+        values = numbers if form == "rvec" else quaternion
+        row |= dict(zip(names, map(repr, values.tolist()), strict=True))
+        row |= dict(zip(("tx", "ty", "tz"), map(repr, (tvec + shift).tolist()), strict=True))
         rows.append(row)
-    if form == "jsonl":
-        path = tmp_path / "poses.jsonl"
-        path.write_text("\n".join(json.dumps(row) for row in rows))
-    else:
-        path = write(tmp_path / "poses.csv", rows)
+    path = write(tmp_path / "poses.csv", rows)
     ready = prepare(exported, [path], names=[f"poses-{form}"],
                     conventions=Conventions.of("0", "TL TR BR BL", "right,down,in"))
     results = results_of(ready.pipeline, tmp_path / "poses.zarr")
@@ -218,8 +210,6 @@ def test_poses_alone_are_scored_as_they_are(form, exported, tmp_path):
     angles = np.array([each for _, each in wanted.values()]).reshape(2, 2, 2, 3)
     np.testing.assert_allclose(results.translation_error_m.values, shifts, atol=1e-9)
     np.testing.assert_allclose(np.radians(results.rotation_error_deg), angles, atol=1e-7)
-    told = prepare(exported, [path], names=[f"wrong-{form}"]).lines
-    assert any('pass --frame "right down in"' in line for line in told)
 
 
 def test_poses_behind_the_camera_or_far_from_their_corners_are_never_solved(exported, tmp_path):
@@ -305,14 +295,7 @@ BAD = {
     "half a pose": ("image,id,rx,ry,rz\n{0},0,1,2,3\n", "line 1: no column tx, ty, tz"),
     "a quaternion of length 2": (
         "image,id,qw,qx,qy,qz,tx,ty,tz\n{0},0,2,0,0,0,0,0,1\n", "a quaternion of length 2"),
-    "a JSON line that is none": ('{"image": "{0}"\n', "line 1: not JSON; expected one object"),
-    "three corners": ('{"image": "{0}", "id": 0, "corners": [[1, 2], [3, 4], [5, 6]]}',
-                      "expected 4 pairs of finite numbers"),
-    "NaN in JSON": ('{"image": "{0}", "id": 0, "rvec": [NaN, 0, 0], "tvec": [0, 0, 1]}',
-                    "rvec = [nan, 0, 0]: expected 3 finite numbers"),
-    "a position without a rotation": ('{"image": "{0}", "id": 0, "tvec": [0, 0, 1]}',
-                                      "half a pose; expected tvec, and rvec or quaternion"),
-    "a number as a line": ("[1]", "expected an object such as"),
+    "JSON": ('{"image": "{0}", "id": 0}', "line 1: JSON; expected CSV"),
     "binary data": ("\0\1", "not text: a zero byte"),
 }
 
@@ -419,11 +402,3 @@ def test_refused_answers_leave_no_recording(exported, scored, capsys):
     assert "holds another experiment" in capsys.readouterr().err
     assert cli.main([*arguments, "--set", "solver=nothing"]) == 2
     assert sorted((exported / "experiment").iterdir()) == before
-
-
-def test_frames_are_rotations():
-    assert len(right_handed_frames()) == 24
-    for words in right_handed_frames():
-        axes = frame_axes(words)
-        assert np.linalg.det(axes) == pytest.approx(1)
-        assert (axes @ axes.T == np.eye(3)).all()

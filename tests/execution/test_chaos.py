@@ -20,8 +20,8 @@ from support.lengths import lengths
 from support.stores import by_hand, same
 from sweep.errors import StoreError
 from sweep.execution.block_task import compute_block
-from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
 from sweep.store.blocks import committed, receipts
 from sweep.store.lifecycle import create_store, open_store
 
@@ -70,7 +70,7 @@ largest = "distance_m"
 CLIENT = """
 import sys
 from sweep.execution.runner import execute
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 
 if __name__ == "__main__":
     pipeline, store, scheduler = sys.argv[1:]
@@ -600,21 +600,6 @@ def test_new_store_on_a_full_disk_is_told_and_leaves_nothing(small, disk):
 
 
 @pytest.mark.long
-def test_new_run_on_a_full_disk_is_told_in_a_line(small, disk, tmp_path):
-    pipeline, path, reference = small
-    url = str(disk.path / "small.zarr")
-    arguments = ("run", path, "--store", url, "--workers", 2)
-    for left in (0, 3, 20, 50):
-        disk.leave(left * PAGE)
-        told_in_a_line(command(*arguments, cwd=tmp_path), FULL, {1, 2})
-    disk.clear()
-    disk.remount("size=64m")
-    ran = command(*arguments, cwd=tmp_path)
-    assert (ran.returncode, ran.stderr) == (0, "")
-    whole(url, pipeline, reference)
-
-
-@pytest.mark.long
 @pytest.mark.parametrize("blocks_done", ["some", "all"])
 def test_disk_that_is_full_to_any_page_is_told_in_a_line(blocks_done, small, disk, tmp_path):
     """The lock, the marks, a block's variables, its receipt, and the closing: each hits the end."""
@@ -640,27 +625,3 @@ def test_disk_that_is_full_to_any_page_is_told_in_a_line(blocks_done, small, dis
         subprocess.run(["rm", "-r", url], check=True)
     print(f"{failed} runs met a full disk")
     assert failed > 5
-
-
-@pytest.mark.long
-def test_disk_that_becomes_read_only_during_a_run_is_told_in_a_line(disk, tmp_path):
-    pipeline, path, reference = prepared(tmp_path, GRID % SHORT_TRIALS, "long")
-    url = str(disk.path / "long.zarr")
-    disk.remount("size=256m")
-    store = create_store(url, pipeline, (1, 1, 10))
-    with started(
-        ["-m", "sweep", "run", path, "--store", url, "--workers", 2],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path,
-    ) as running:
-        deadline = time.monotonic() + 120
-        while len(committed(store)) < 5:
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-        disk.remount("ro")
-        out, err = running.communicate(timeout=120)
-    ended = subprocess.CompletedProcess(running.args, running.returncode, out, err)
-    told_in_a_line(ended, "Read-only file system", {1, 2})
-    disk.remount("rw")
-    ran = command("run", path, "--store", url, "--workers", 2)
-    assert (ran.returncode, ran.stderr) == (0, "")
-    whole(url, pipeline, reference)

@@ -4,7 +4,11 @@ import contextlib
 import copy
 import itertools
 import logging
+import os
+import signal
 import socket
+import subprocess
+import sys
 import time
 
 import dask
@@ -13,17 +17,19 @@ import pytest
 from distributed import Client, LocalCluster
 
 import sweep
+from support.commands import started
 from sweep.errors import ArgumentError, RunError
 from sweep.execution import cluster as clusters
-from sweep.execution import in_flight, stall, worker_versions
-from sweep.execution.cluster import borrowed, embedded
-from sweep.execution.distributed_internals import worker_states
-from sweep.execution.in_flight import BlocksInFlight
+from sweep.execution import cluster as worker_versions
+from sweep.execution import engines as stall
+from sweep.execution.cluster import borrowed, embedded, worker_states
+from sweep.execution.engines import BlocksInFlight
+from sweep.execution.progress import Tally
 from sweep.execution.runner import execute
-from sweep.execution.tally import Tally
-from sweep.isolation import machine_memory
-from sweep.isolation.interrupts import Interrupts
-from sweep.store.lifecycle import create_store
+from sweep.isolation import machine as machine_memory
+from sweep.isolation.child_process import Interrupts
+from sweep.plan.pipeline import Pipeline
+from sweep.store.lifecycle import create_store, open_store
 from sweep.store.lock import locked
 from sweep.store.provenance import fingerprint
 
@@ -67,6 +73,55 @@ def test_cluster_that_cannot_start_is_told_in_a_line(monkeypatch):
     )
 
 
+MASK = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))"
+
+
+def test_ctrl_c_while_workers_start_reaches_this_process_and_none_of_them():
+    with Interrupts() as interrupts:
+        with clusters._interrupts_held_back():
+            os.kill(os.getpid(), signal.SIGINT)
+            child = subprocess.run([sys.executable, "-c", MASK], capture_output=True, check=True)
+        assert child.stdout == b"True\n"
+        with pytest.raises(KeyboardInterrupt):
+            interrupts.check()
+
+
+@pytest.mark.long
+def test_process_ends_quietly_without_its_scheduler_and_where_ctrl_c_is_ignored(tmp_path):
+    """Workers end with their client, whatever signals it inherited; nothing stands below its line.
+    """
+    (tmp_path / "long.toml").write_text(
+        "[pose]\njitter_px = 0.5\nside_px = 50\n[axes]\ntrial = 40000\n")
+    create_store(str(tmp_path / "runs" / "long.zarr"), Pipeline.from_toml(tmp_path / "long.toml"),
+                 (500,))
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as of `nohup`
+    try:
+        with local_cluster() as cluster, started(
+            ["-m", "sweep", "run", "long.toml", "--scheduler", cluster.scheduler_address],
+            stderr=subprocess.PIPE, text=True, cwd=tmp_path,
+        ) as lost, started(
+            ["-m", "sweep", "run", "long.toml", "--store", "own.zarr", "--workers", 2],
+            stderr=subprocess.PIPE, text=True, cwd=tmp_path,
+        ) as own:
+            deadline = time.monotonic() + 120
+            while not (any(tmp_path.glob("runs/long.zarr/commits/receipt/c/*"))
+                       and any(tmp_path.glob("own.zarr/commits/receipt/c/*"))):
+                assert time.monotonic() < deadline
+                time.sleep(0.1)
+            workers = psutil.Process(own.pid).children(recursive=True)
+            own.send_signal(signal.SIGINT)
+            own.terminate()
+            assert own.wait(timeout=30) == -signal.SIGTERM
+            psutil.wait_procs(workers, timeout=60)
+            assert not any(worker.is_running() for worker in workers)
+            cluster.close()
+            assert lost.wait(timeout=60) == 1
+            (*_, line) = lost.stderr.read().splitlines()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert line == "the scheduler went away; run it again to continue"
+
+
 @contextlib.contextmanager
 def local_cluster(workers=1, **options):
     with LocalCluster(
@@ -105,7 +160,8 @@ def test_workers_that_are_threads_of_the_caller_are_refused():
 
 def test_workers_with_other_versions_are_refused(tmp_path, monkeypatch):
     async def elsewhere(_, given):
-        return {"tcp://worker": ({**fingerprint(given), "opencv": "0.0"}, ("elsewhere", 1), [])}
+        return {"tcp://worker": worker_versions.WorkerIdentity(
+            {**fingerprint(given), "opencv": "0.0"}, ("elsewhere", 1), [], "AVX2")}
 
     monkeypatch.setattr(worker_versions, "_worker_identities", elsewhere)
     with local_cluster(1, processes=False, protocol="tcp://") as cluster:
@@ -207,13 +263,6 @@ def test_embedded_cluster_computes_whatever_dask_is_configured_to_do(monkeypatch
     assert dask.config.config == before
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", HOSTILE)
-def test_embedded_cluster_computes_with_each_hostile_setting_alone(name):
-    with dask.config.set({name: HOSTILE[name]}):
-        assert computes()
-
-
 class Identity:
     """A client whose scheduler tells what workers do."""
 
@@ -283,18 +332,6 @@ def test_run_whose_workers_die_again_and_again_ends_in_a_line(monkeypatch):
             check_until(watch, time.monotonic() + 10)
 
 
-@pytest.mark.parametrize(("dying", "line"), [
-    (False, "there have been no workers for 0 s; start some"),
-    (True, "there have been no workers for 0 s: they died; if by SIGKILL, as where memory runs"),
-])
-def test_run_that_has_lost_its_workers_says_whether_they_died(dying, line, monkeypatch):
-    monkeypatch.setattr(in_flight, "NO_WORKERS_TIMEOUT_S", -1.0)
-    monkeypatch.setattr(in_flight, "thread_count", lambda _: 0)
-    with pytest.raises(RunError) as raised:
-        in_flight.InFlightLimit(Identity(dying=dying)).blocks()
-    assert str(raised.value).replace("-1 s", "0 s").startswith(line)
-
-
 @pytest.mark.long
 def test_run_whose_workers_are_all_paused_ends_in_a_line(monkeypatch, tmp_path):
     monkeypatch.setattr(stall, "STALL_S", 1.0)
@@ -315,3 +352,29 @@ def test_run_whose_workers_are_all_paused_ends_in_a_line(monkeypatch, tmp_path):
             )
     (line,) = str(raised.value).splitlines()
     assert "1 of 1 workers are paused by Dask" in line
+
+
+@pytest.mark.long
+def test_workers_whose_processors_differ_are_named_before_and_after_the_run(tmp_path, capfd):
+    pipeline = Pipeline.from_text(
+        '[pose]\nside_px = 60\n[detector]\ncornerRefinementMethod = "subpix"\n[axes]\ntrial = 4\n'
+        "tilt_deg = [0, 20]\n[scene]\nnoise_grey = 1\n")
+    older = os.environ | {"OPENCV_CPU_DISABLE": "AVX2,AVX512-SKX", "OPENCV_IPP": "disabled"}
+    with (
+        local_cluster() as cluster,
+        started(["-m", "distributed.cli.dask_worker", cluster.scheduler_address, "--nthreads", "1",
+                 "--no-dashboard"], env=older, stderr=subprocess.DEVNULL),
+        Client(cluster, set_as_default=False) as client,
+    ):
+        client.wait_for_workers(2, timeout=60)
+        capfd.readouterr()
+        store = create_store(str(tmp_path / "mixed.zarr"), pipeline, (1, 1))
+        summary = execute(pipeline, store.url, client=client)
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith("warning: processors with 2 different sets of features: last digits ")
+    assert "(1 workers: " in line
+    assert line.count("no IPP") == 1
+    counts = open_store(store.url).run_metadata["counts"]["processors"]
+    assert (len(counts), sum(counts.values())) == (2, len(open_store(store.url).blocks))
+    assert sum("no IPP" in name for name in counts) == 1
+    assert any(warning.startswith("processors with 2") for warning in summary.warnings)

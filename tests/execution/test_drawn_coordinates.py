@@ -8,10 +8,9 @@ from scipy.spatial.transform import Rotation
 import sweep
 from sweep.analysis import compare, detection_rate, error_statistics
 from sweep.execution.block_task import compute_block
-from sweep.execution.finalize import close
+from sweep.execution.status import close
 from sweep.integrity.reproduction import reproduce
 from sweep.integrity.verification import verify
-from sweep.plan.schema import variables_of
 from sweep.store.lifecycle import create_store
 from tests.support.here import calls_here
 
@@ -144,38 +143,6 @@ def test_blocks_that_were_not_computed_have_no_draws(tmp_path):
         xr.testing.assert_identical(
             half[name].sel(azimuth_deg=30), sweep.open(other)[name].sel(azimuth_deg=30)
         )
-
-
-@pytest.mark.long
-def test_cells_of_an_older_format_are_reused_and_their_draws_recomputed(tmp_path, monkeypatch):
-    pipeline = sweep.Pipeline.from_dict(PIPELINE)
-    old, new = str(tmp_path / "old.zarr"), str(tmp_path / "new.zarr")
-    with monkeypatch.context() as then:
-        then.setattr("sweep.store.lifecycle.FORMAT", 4)
-        store = create_store(old, pipeline, (2, 40))
-    compute_block(old, store.run_id, store.blocks[0])
-    close(store)
-    assert verify(old, 0).damage == []
-    assert not DRAWN & set(sweep.open(old).variables)
-    assert {variable.name for variable in variables_of(pipeline)} >= DRAWN
-    store = create_store(new, pipeline, (1, 20))
-    computed = [compute_block(new, store.run_id, block, (old,)) for block in store.blocks]
-    assert sum(receipt.computed["scenes"] for receipt in computed) == 0
-    close(store)
-    assert verify(new, 0).damage == []
-    assert all(np.isfinite(sweep.open(new)[name]).all() for name in DRAWN)
-
-
-def test_a_fixed_parameter_of_a_later_version_is_missed_by_no_check(tmp_path, monkeypatch):
-    from sweep.plan import coordinates  # noqa: PLC0415
-
-    store = str(tmp_path / "older.zarr")
-    with monkeypatch.context() as then:
-        then.setattr(coordinates, "ALWAYS_GIVEN", ("marker",))
-        with calls_here():
-            sweep.run({"pose": {"distance_m": 0.5}}, store=store, progress=False)
-    assert "roll_deg" not in sweep.open(store).variables
-    assert verify(store, 0).damage == []
 
 
 def test_tables_leave_out_what_is_fixed(results):

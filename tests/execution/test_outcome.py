@@ -8,11 +8,10 @@ import pytest
 from support.commands import command
 from support.poison import Poison, poisoned
 from sweep.cli import main
-from sweep.execution.progress import Progress, ProgressLines, progress_display
+from sweep.execution.progress import Progress, ProgressLines
 from sweep.execution.status import WrittenBlock, poses_per_second
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.store.failures import FailedCell
-from sweep.store.outcome import failure_groups, outcome_of
+from sweep.store.outcome import FailedCell, failure_groups, outcome_of
 
 TEXT = """
 pose = { jitter_px = 0.5 }
@@ -96,13 +95,6 @@ def test_what_failed_is_said_first_and_loudest(detection, estimate, nothing, sha
     assert found.advice == f"sweep repro 'a b.zarr' {expected}"
 
 
-def test_few_reasons_are_listed_and_the_others_counted():
-    cells = [failed(f"Error{letter}: x", f"trial={n}") for n, letter in enumerate("abcdefgh")]
-    found = outcome({"detected": 92, "failed": 8}, {"solved": 92}, cells)
-    assert found.warnings[-1] == "  3 x for 3 other reasons"
-    assert found.advice.count("--at") == 5
-
-
 @pytest.mark.long
 def test_solver_that_raises_on_every_scene_ends_with_status_1_and_one_command(tmp_path, capsys):
     path, url = tmp_path / "bad.toml", str(tmp_path / "bad.zarr")
@@ -158,12 +150,6 @@ def test_rate_of_a_continued_run_is_not_that_of_a_faster_one_before():
     assert poses_per_second([*before, *run], 109.0) == pytest.approx(40, rel=0.2)
 
 
-def test_rate_is_unknown_until_the_run_has_written_a_block():
-    before = blocks(2, 10, begin=0.0)
-    assert poses_per_second(before, 100.0) is None
-    assert poses_per_second([]) is None
-
-
 # Progress.
 
 def test_lines_tell_poses_rate_and_time_left_of_this_run_alone():
@@ -173,14 +159,3 @@ def test_lines_tell_poses_rate_and_time_left_of_this_run_alone():
     assert lines.line(40.0) == "500,000 of 1,000,000 poses"
     lines.report(Progress(515_000, 1_000_000, 0), 40.0)
     assert lines.line(40.0) == "515,000 of 1,000,000 poses (52 %), 500 poses/s, 16.2 min left"
-
-
-def test_a_line_comes_every_interval_even_if_no_block_is_finished(monkeypatch, capsys):
-    monkeypatch.setattr("sweep.execution.progress.LINE_INTERVAL_S", 0.02)
-    with progress_display() as display:
-        display(Progress(0, 10, 0))
-        import time  # noqa: PLC0415
-        time.sleep(0.2)
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) >= 3
-    assert set(lines) <= {"starting", "0 of 10 poses"}

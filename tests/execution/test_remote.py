@@ -24,13 +24,12 @@ from support.blocks import run_block
 from sweep.cli import main
 from sweep.errors import ArgumentError, StoreError
 from sweep.execution.cluster import external
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, scene_axes
+from sweep.plan.pipeline import Pipeline
 from sweep.store.blocks import committed
-from sweep.store.checksums import DigestingStore
 from sweep.store.lifecycle import open_store
 from sweep.store.locations import storage_at
-from sweep.store.lock_file import LockFile
+from sweep.store.lock import LockFile
 
 TIMEOUT_S = 240.0
 
@@ -56,7 +55,7 @@ RUN = """
 import sys
 from sweep.execution.runner import execute
 from sweep.errors import StoreError, SweepError
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 
 if __name__ == "__main__":
     path, store, scheduler = sys.argv[1:]
@@ -226,11 +225,11 @@ def _account():
 
 @pytest.mark.usefixtures("bucket")
 def test_server_lets_one_of_many_take_or_replace_a_lock(monkeypatch):
-    monkeypatch.setattr("sweep.store.lock_file.SETTLE_S", 0.0)
+    monkeypatch.setattr("sweep.store.lock.SETTLE_S", 0.0)
     url = "s3://bucket/lock.zarr"
 
     def race(expected, names):
-        files = [LockFile(DigestingStore(storage_at(url, read_only=False)), "lock.json")
+        files = [LockFile(storage_at(url, read_only=False), "lock.json")
                  for _ in names]
         with ThreadPoolExecutor(len(names)) as pool:
             got = list(pool.map(lambda f, n: f.exchange(expected, n), files, names))
@@ -524,7 +523,7 @@ def test_tls_scheduler_that_refuses_is_told_in_a_line(certificates, tmp_path):
 
 
 def test_server_that_never_answers_is_given_up(monkeypatch):
-    monkeypatch.setattr("sweep.execution.scheduler_connection.ANSWER_S", 0.5)
+    monkeypatch.setattr("sweep.execution.cluster.ANSWER_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
         with pytest.raises(ArgumentError, match="no answer within"), external(

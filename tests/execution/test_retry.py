@@ -10,14 +10,12 @@ from support.poison import Poison, poisoned
 from support.stores import by_hand, same
 from sweep.cli import main
 from sweep.errors import ArgumentError, StoreError
-from sweep.execution.affordability import FreeDisk
 from sweep.execution.block_task import compute_block
-from sweep.execution.finalize import close
-from sweep.execution.retry import drop_failed
+from sweep.execution.forecast import FreeDisk
 from sweep.execution.runner import execute
-from sweep.execution.status import status
+from sweep.execution.status import close, drop_failed, status
 from sweep.integrity.verification import verify
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 from sweep.store.blocks import begin_block, committed
 from sweep.store.lifecycle import create_store, open_store
 
@@ -99,7 +97,7 @@ def test_what_fails_again_stays_as_it_was(pipeline, failed, copied, tmp_path, mo
 @pytest.mark.long
 def test_retry_that_is_refused_leaves_the_store_as_it_was(pipeline, failed, copied, monkeypatch):
     free = FreeDisk(bytes=1, files=None)
-    monkeypatch.setattr("sweep.execution.affordability.free_disk", lambda _: free)
+    monkeypatch.setattr("sweep.execution.forecast.free_disk", lambda _: free)
     with calls_here(), pytest.raises(StoreError, match="confirm it with `--yes`"):
         execute(pipeline, copied, retry_failed=True)
     assert open_store(copied).finished

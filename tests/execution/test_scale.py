@@ -12,9 +12,9 @@ import pytest
 import xarray as xr
 from zarr.storage import LocalStore, WrapperStore
 
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks, scene_axes
 from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
 
 HERE = Path(__file__).parents[1] / "support"
 
@@ -32,7 +32,7 @@ import json, sys
 import synthetic
 synthetic.install()
 from sweep.execution.runner import execute
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 import sweep.execution.runner as engine
 engine.block_extents = lambda *_: (1, 200, max(int(sys.argv[4]) // 50, 1))
 summary = execute(Pipeline.from_toml(sys.argv[1]), sys.argv[2], scheduler=sys.argv[3])

@@ -10,12 +10,11 @@ from distributed import Client
 from support.here import Here
 from support.stores import by_hand, same
 from sweep.errors import MachineFaultError, RunError, StoreReplacedError
-from sweep.execution import small_run
+from sweep.execution import engines as small_run
+from sweep.execution.progress import Tally
 from sweep.execution.runner import execute, recompute
-from sweep.execution.tally import Tally
-from sweep.isolation.child_process import Child, ChildRaisedError
-from sweep.isolation.interrupts import Interrupts
-from sweep.plan.experiment import Pipeline
+from sweep.isolation.child_process import Child, ChildRaisedError, Interrupts
+from sweep.plan.pipeline import Pipeline
 from sweep.store.blocks import drop_block
 from sweep.store.lifecycle import open_store
 from sweep.store.lock import locked

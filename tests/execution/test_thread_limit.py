@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 
 from sweep.errors import RunError
-from sweep.execution import thread_limit
-from sweep.execution.thread_limit import check_threads, threads_left
-from sweep.isolation import control_groups as groups
-from sweep.isolation.machine_memory import memory_kills, memory_limit_bytes
+from sweep.execution import cluster as thread_limit
+from sweep.execution.cluster import check_threads, threads_left
+from sweep.isolation import machine as groups
+from sweep.isolation.machine import memory_kills, memory_limit_bytes
 
 TOP = Path(__file__).parents[2]
 
 LEFT = """
-from sweep.execution import thread_limit
+from sweep.execution import cluster as thread_limit
 {change}
 print(thread_limit.threads_left())
 """

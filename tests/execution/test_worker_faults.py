@@ -10,13 +10,12 @@ import sweep
 from support import machine_faults
 from support.stores import by_hand, same
 from sweep.errors import MachineFaultError, RunError, StoreError
-from sweep.execution import worker_faults
+from sweep.execution import engines as worker_faults
 from sweep.execution.block_task import compute_block
-from sweep.execution.finalize import close
-from sweep.execution.in_flight import BlocksInFlight
-from sweep.execution.tally import Tally
-from sweep.execution.worker_faults import WorkerFaults
-from sweep.isolation.interrupts import Interrupts
+from sweep.execution.engines import BlocksInFlight, WorkerFaults
+from sweep.execution.progress import Tally
+from sweep.execution.status import close
+from sweep.isolation.child_process import Interrupts
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.store.blocks import committed
 from sweep.store.lifecycle import create_store, open_store

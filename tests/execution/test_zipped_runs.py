@@ -7,8 +7,8 @@ import sweep
 from sweep.analysis import compare, detection_rate, error_statistics, marker_ranking
 from sweep.errors import DatasetError, StoreError
 from sweep.execution.block_task import compute_block
-from sweep.execution.finalize import close
 from sweep.execution.reuse import match
+from sweep.execution.status import close
 from sweep.store.lifecycle import create_store, open_dataset, open_store
 from sweep.store.provenance import differences
 

@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from scipy import stats
 
 import sweep
-from support.fitted_photographs import EFFECTS, PLAIN, TRUTH, fitted, taken, terms_of
+from support.fitted_photographs import EFFECTS, PLAIN, TRUTH, fitted, terms_of
 from sweep import cli
 from sweep.errors import ArgumentError
-from sweep.fitting.estimates import estimate, jackknife
 
 
 @pytest.fixture(scope="module")
@@ -67,12 +65,6 @@ def test_one_photograph_gives_values_without_intervals(tmp_path):
     assert "from 4 on" in one.found.lines[0]
 
 
-def test_saturated_white_is_one_line(tmp_path):
-    folders, options = taken(tmp_path, PLAIN | {"white": 255.0, "black": 120.0}, 3, 1)
-    with pytest.raises(ArgumentError, match="saturated in all photographs: expose less"):
-        sweep.fit(*folders, **options)
-
-
 @pytest.mark.parametrize(("change", "message"), [
     ({"markers": 0}, "markers = 0: expected a whole number from 1 to 1000"),
     ({}, "expected photographs"),
@@ -80,19 +72,3 @@ def test_saturated_white_is_one_line(tmp_path):
 def test_bad_arguments_are_one_line(change, message, tmp_path):
     with pytest.raises(ArgumentError, match=message):
         sweep.fit(tmp_path, camera="calibrate", **change)
-
-
-def test_the_interval_of_a_mean_is_students():
-    values = np.random.default_rng(1).normal(3.0, 0.5, 9)
-    one = estimate(values, np.full(9, 0.04))
-    low, high = stats.t.interval(0.95, 8, values.mean(), stats.sem(values))
-    assert np.allclose([one.value, one.low, one.high], [values.mean(), low, high])
-    assert one.spread == pytest.approx(np.sqrt(values.var(ddof=1) - 0.04))
-    assert estimate(values, np.full(9, 0.5)).spread == 0.0
-    assert np.isnan(estimate(values[:3]).low)
-
-
-def test_the_jackknife_of_a_mean_is_that_mean():
-    values = np.random.default_rng(2).normal(size=7)
-    without = np.array([np.delete(values, k).mean() for k in range(7)])
-    assert np.allclose(jackknife(values.mean(), without), values)

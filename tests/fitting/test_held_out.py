@@ -7,7 +7,7 @@ import xarray as xr
 import sweep
 from support.fitted_photographs import EFFECTS, taken, terms_of
 from sweep.analysis.simulation_gaps import QUANTILES, RATES
-from sweep.fitting.held_out import REPEATS, gap_size, is_moved
+from sweep.fitting.folders import REPEATS, is_moved
 
 
 def gap(value, shift=0.1):
@@ -33,13 +33,6 @@ def test_an_effect_moves_errors_if_one_statistic_leaves_its_interval():
     other[QUANTILES[0].name][1, 1] = 1.6
     assert is_moved(full, other)
     assert not is_moved(gap(np.nan), gap(1.0))  # statistics that do not exist say nothing
-
-
-def test_the_size_of_a_gap_is_in_half_widths_of_its_intervals():
-    full = gap(1.0)
-    assert gap_size(full, full) == pytest.approx(0.5)
-    assert gap_size(gap(1.0, -0.3), full) == pytest.approx(1.5)
-    assert np.isnan(gap_size(full, gap(1.0, np.nan)))
 
 
 @pytest.mark.long

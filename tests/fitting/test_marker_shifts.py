@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sweep.fitting.geometry import LENGTHS, Residuals, shifts_of
+from sweep.fitting.fit import LENGTHS, Residuals, shifts_of
 
 WIDTH_PX, SIZE_PX, LENGTH_PX = 360.0, 0.15, 40.0
 PAIRS = 8

@@ -12,7 +12,7 @@ import pytest
 
 from sweep.errors import PipelineError, StoreError
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 
 
 def test_child_calls_functions_and_tells_what_they_raise():

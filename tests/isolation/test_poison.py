@@ -15,9 +15,9 @@ from support.poison import RAISES, Poison, poisoned
 from support.stores import by_hand
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.cell_selection import cell as cell_at
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes
 from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
 from sweep.plan.schema import SCHEMA
 from sweep.store.blocks import committed
 from sweep.store.lifecycle import create_store, open_store
@@ -227,9 +227,9 @@ def run_poisoned(tmp_path, text, poisons, *options, timeout=300):
 INERT = """
 import hashlib, sys
 import numpy as np
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells
 from sweep.plan.grid import Block, block_indices
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 
 pipeline = Pipeline.from_text(open(sys.argv[1]).read())
 block = Block((0, 0, 0), (1, 1, 20))

@@ -9,11 +9,9 @@ from scipy.spatial.transform import Rotation
 from support.exact_image import add_clipped, values
 from sweep.measure.bound import BACKGROUND_MARGIN_PX, bounds
 from sweep.measure.flags import BoundStatus
-from sweep.model.board_kinds import Charuco
-from sweep.model.distractors import with_distractors
+from sweep.model.board_kinds import BoardMarker, Charuco, Markers, with_distractors
 from sweep.model.effects import NEUTRAL
 from sweep.model.extent import marker_boxes
-from sweep.model.marker_table import BoardMarker, Markers
 from sweep.model.scene import build_scenes
 
 OPENCV = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from sweep.errors import PipelineError
-from sweep.evaluation.cells import run_cells
-from sweep.measure.board_photometric import BoardPhotometric
+from sweep.evaluation.block import run_cells
 from sweep.measure.flags import BoundStatus, EstimateStatus
-from sweep.plan.experiment import Pipeline
+from sweep.measure.photometric import BoardPhotometric
+from sweep.plan.pipeline import Pipeline
 
 CHARUCO = 'kind = "charuco"\nsquares_x = 5\nsquares_y = 4\nsquare_m = 0.03'
 GRID = 'kind = "grid"\nrows = 3\ncolumns = 3\ngap_m = 0.01'

@@ -7,14 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.lengths import lengths
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells
 from sweep.measure.board_solver import BOARD_METHODS, BoardDetections, BoardPoints, BoardSolver
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.board_kinds import Charuco
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.pose import rotation_of_angles
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 
 BOARD = Charuco(
     dictionary="DICT_5X5_100", squares_x=5, squares_y=4, square_m=0.03, marker_m=0.02

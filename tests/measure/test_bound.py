@@ -12,7 +12,6 @@ import collections
 import dataclasses
 import itertools
 import math
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -23,17 +22,16 @@ from scipy.special import ndtr
 
 from support.exact_image import DICTIONARIES, LENSES, modules_of, values, visible
 from support.lengths import lengths
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import visibility_flags
 from sweep.measure.bound import BACKGROUND_MARGIN_PX, MAX_MIRROR_DISTANCE, bounds
 from sweep.measure.flags import BoundStatus, DetectionStatus
-from sweep.measure.likelihood import plane_of, state_of
 from sweep.model.coverage import MarkerEdges, accumulate, sum_levels
 from sweep.model.effects import Effects
 from sweep.model.extent import marker_boxes
-from sweep.model.projection import Optics, Projection
+from sweep.model.polygon import Optics, Projection
 from sweep.model.scene import build_scenes
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 
 NEUTRAL = {field.name: field.default for field in dataclasses.fields(Effects)}
 LENS_BY_COUNT = {len(lens): lens for lens in LENSES}
@@ -322,19 +320,6 @@ def test_bound_lies_above_that_of_the_whole_frame_by_what_the_background_beyond_
         assert 1e-4 < worst[kind] < most
 
 
-def test_drawn_scenes_are_of_every_kind():
-    scenes = drawn(24, 1)
-    assert {value["quiet_zone_modules"] for value in scenes} == {0, 1, 1.5}
-    assert len({value["dictionary"] for value in scenes}) > 3
-    assert any(value["background"] == value["white"] for value in scenes)
-    assert any(value["tilt_deg"] == 0 for value in scenes)
-    assert max(value["tilt_deg"] for value in scenes) > 60
-    cut = [Drawing(value) for value in scenes]
-    assert any(
-        (drawing.boxes[0] == [0, 0, 320, 240]).any() and known(drawing.value) for drawing in cut
-    )
-
-
 def smooth_difference(value, unknown_blur, moved_px):
     drawing = Drawing(value, unknown_blur)
     found = drawing.found()
@@ -357,19 +342,6 @@ def test_bound_under_a_lens_is_that_of_differences_of_the_exact_image(count, coe
     ]
     worst = max(sharp_difference(value, LENS_TOLERANCE / 2) for value in scenes)
     row(f"lens of {coefficients}", len(scenes), worst, LENS_TOLERANCE)
-
-
-@pytest.mark.parametrize("coefficients", [4, 14])
-def test_bound_under_a_lens_of_a_marker_cut_at_the_left_or_the_top(coefficients):
-    lens = LENS_BY_COUNT[coefficients]
-    scenes = [
-        value for value in drawn(20, 2, max_tilt=70, distortion=lens)
-        if Drawing(value).low.min() == 0 and known(value)
-    ]
-    if len(scenes) < 3:
-        raise ValueError("too few scenes are cut")
-    worst = max(sharp_difference(value, LENS_TOLERANCE / 2) for value in scenes)
-    row(f"lens of {coefficients}, cut", len(scenes), worst, LENS_TOLERANCE)
 
 
 BLUR_TOLERANCE = 1e-3
@@ -434,13 +406,6 @@ def test_kappa_is_its_formula_of_the_references_covariance(count):
         tilting = np.trace(covariance[:3, :3]) - axis @ covariance[:3, :3] @ axis
         expected = drawing.translation[2] * tilting / (4 * math.sqrt(covariance[5, 5]))
         assert found.kappa[0] == pytest.approx(expected, rel=1e-4)
-
-
-def test_kappa_of_a_frontal_marker_is_that_of_its_two_tilts():
-    value = scene(side_px=20.0, roll_deg=17.0)
-    std, kappa = Drawing(value).found().std[0], Drawing(value).found().kappa[0]
-    expected = value["distance_m"] * (std[0] ** 2 + std[1] ** 2) / (4 * std[5])
-    assert kappa == pytest.approx(expected, rel=1e-9)
 
 
 def mirror_reference(drawing):
@@ -644,13 +609,6 @@ def test_every_flag_stands_beside_its_scenes_and_a_number_beside_given_only(
         assert all(np.isnan(number).all() for number in numbers)
 
 
-def test_bound_is_not_run_unless_asked_for():
-    for settings in ([], ["bound=none"], ["bound=none", "bearing_x_deg=40"]):
-        flag, *numbers = told("noise_grey=2", *settings)
-        assert BoundStatus(flag) == BoundStatus.not_run
-        assert all(np.isnan(number).all() for number in numbers)
-
-
 def test_bound_on_a_background_image_is_not_in_its_model(tmp_path):
     path = tmp_path / "grey.png"
     cv2.imwrite(str(path), np.full((480, 640), 120, dtype=np.uint8))
@@ -674,27 +632,6 @@ def test_bounds_of_a_grid_are_those_of_its_cells_one_by_one():
         settings = [f"{name}={value}" for name, value in zip(axes, choice, strict=True)]
         for name, expected in zip(("bound", *COLUMNS), told(*settings), strict=True):
             np.testing.assert_array_equal(grid.columns[name][0][n], expected)
-
-
-def test_bound_after_a_gain_is_that_of_the_levels_after_it():
-    plain = scene(side_px=40.0, tilt_deg=40.0, black=20.0, white=110.0, background=60.0, gain=2.0)
-    other = plain | {"black": 40.0, "white": 220.0, "background": 120.0, "gain": 1.0}
-    a, b = asked(plain), asked(other)
-    np.testing.assert_array_equal(a.std, b.std)
-    np.testing.assert_array_equal(a.mirror_distance, b.mirror_distance)
-
-
-def test_bound_grows_as_the_noise_and_its_rounding():
-    quiet, loud = (asked(scene(side_px=40.0, tilt_deg=40.0, noise_grey=n)) for n in (0.5, 8.0))
-    ratio = math.sqrt((64 + 1 / 12) / (0.25 + 1 / 12))
-    np.testing.assert_allclose(loud.std, ratio * quiet.std, rtol=1e-12)
-
-
-def test_estimating_the_blur_costs_something_and_gains_nothing():
-    for value in drawn(12, 8, sides=(10, 25), blur_px=0.7):
-        known_blur, unknown_blur = asked(value), asked(value, unknown_blur=True)
-        if known_blur.status[0] == unknown_blur.status[0] == BoundStatus.given:
-            assert (unknown_blur.std >= known_blur.std * (1 - 1e-9)).all()
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 40.0])
@@ -746,14 +683,6 @@ def test_extremes_are_given_or_flagged_without_a_warning(given, unknown_blur):
     checked(asked(scene(**({"roll_deg": 13.0, "azimuth_deg": 20.0} | given)), unknown_blur))
 
 
-def test_vanishing_blur_is_none():
-    sharp = asked(scene(side_px=60.0, tilt_deg=30.0))
-    for blur_px in (1e-9, 1e-4):
-        found = asked(scene(side_px=60.0, tilt_deg=30.0, blur_px=blur_px))
-        # Three nodes on each 0.015 px of an edge fall on one side of a pixel's border or another.
-        np.testing.assert_allclose(found.std, sharp.std, rtol=3e-3)
-
-
 def test_fewer_pixels_than_unknowns_give_no_bound():
     """A frame of 2 x 3 px has six levels for six numbers of a pose and two or three of levels."""
     rng = np.random.default_rng(1)
@@ -783,17 +712,3 @@ def test_pose_that_hangs_on_a_level_seen_in_two_pixels_has_no_bound():
     ))
     assert np.sqrt(np.diag(drawing.covariance(5e-6)))[:3].min() > 1000
     assert checked(drawing.found()) == BoundStatus.no_contrast
-
-
-def test_plane_of_a_state_is_what_places_the_marker():
-    for value in drawn(10, 9):
-        drawing = Drawing(value)
-        state = state_of(drawing.rotation, drawing.translation, 0.0, drawing.levels)
-        size, n = value["size_m"], len(modules_of(value)) - 2
-        view = SimpleNamespace(size_m=size, modules=float(n), optics=None)
-        corners = np.array([[0, 0], [n, 0], [n, n], [0, n]], dtype=float)
-        plane = plane_of.py_func(state, view)
-        flat = np.column_stack([corners, np.ones(4)]) @ plane.T
-        signs = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
-        expected = (size / 2 * signs) @ drawing.rotation.T + drawing.translation
-        np.testing.assert_allclose(flat, expected, rtol=1e-12, atol=1e-12)

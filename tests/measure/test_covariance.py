@@ -10,11 +10,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
 from support.exact_image import LENSES
-from sweep.measure.covariance import corner_covariance, squared_deviations
-from sweep.measure.likelihood import mirrored_state, solve_positive, state_of, turn_between
+from sweep.measure.estimation import corner_covariance, squared_deviations
+from sweep.measure.likelihood import solve_positive, state_of, turn_between
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
-from sweep.model.pose import mirrored
 
 CORNERS = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5, -0.5, 0]])
 
@@ -67,11 +66,6 @@ def slopes_of(rotation, translation, size_m, view, lens):
         )
         slopes[:, k] = (8 * near - far) / (12 * step[k])
     return slopes
-
-
-def scaled(covariance, size_m):
-    unit = np.repeat([1.0, size_m], 3)
-    return covariance / np.outer(unit, unit)
 
 
 def off(found, expected):
@@ -130,39 +124,6 @@ def test_covariance_is_that_of_mpmaths_derivatives():
             assert off(found[n], expected) < 1e-9
 
 
-def test_covariance_is_symmetric_positive_definite_and_grows_with_the_noise():
-    rotation, translation, view = drawn_poses(50, 3)
-    size_m = np.full(50, 0.1)
-    one = corner_covariance(rotation, translation, cameras_of(view), size_m, 1.0)
-    assert off(one, np.swapaxes(one, 1, 2)) < 1e-9
-    assert all(np.linalg.eigvalsh(scaled(matrix, 0.1)).min() > 0 for matrix in one)
-    half = corner_covariance(rotation, translation, cameras_of(view), size_m, 0.5)
-    np.testing.assert_allclose(half, one / 4, rtol=1e-12)
-    none = corner_covariance(rotation, translation, cameras_of(view), size_m, 0.0)
-    assert (none == 0).all()
-
-
-@pytest.mark.parametrize("size_m", [1e-9, 1e-3, 1.0, 1e3, 1e9])
-def test_covariance_of_equal_images_scales_with_the_markers_size(size_m):
-    rotation, translation, view = drawn_poses(20, 4)
-    for lens in ((), LENSES[2]):
-        cameras = cameras_of(view, lens)
-        base = corner_covariance(rotation, translation, cameras, np.full(20, 0.1), 0.2)
-        found = corner_covariance(
-            rotation, translation * (size_m / 0.1), cameras, np.full(20, size_m), 0.2
-        )
-        # Up to a condition of 1e7 times the last bits of what is scaled.
-        assert off(scaled(found, size_m / 0.1), base) < 1e-8
-
-
-def test_no_poses_have_no_covariances():
-    found = corner_covariance(
-        np.empty((0, 3, 3)), np.empty((0, 3)), cameras_of(np.empty((0, 4))), np.empty(0), 1.0
-    )
-    assert found.shape == (0, 6, 6)
-    assert squared_deviations(np.empty((0, 3)), np.empty((0, 3)), found).shape == (0,)
-
-
 def test_covariance_is_nan_where_the_pose_is_or_where_nothing_tells_it():
     rotation, translation, view = drawn_poses(6, 5)
     alone = corner_covariance(rotation, translation, cameras_of(view), np.full(6, 0.1), 1.0)
@@ -203,39 +164,6 @@ def test_squared_deviations_are_those_of_extended_precision():
             spread = np.sqrt(np.diag(covariance[n]))
             condition = np.linalg.cond(covariance[n] / np.outer(spread, spread))
             assert found[n] == pytest.approx(expected, rel=1e-15 * condition + 1e-12)
-
-
-def test_squared_deviations_are_known_where_the_covariance_is_diagonal():
-    covariance = np.diag([1.0, 4, 9, 1e-6, 1e-12, 1e6])[None]
-    error = np.array([[1.0, 2, 6, 1e-3, 3e-6, 0]])
-    found = squared_deviations(error[:, :3], error[:, 3:], covariance)
-    assert found[0] == pytest.approx(1 + 1 + 4 + 1 + 9)
-
-
-def test_squared_deviations_are_nan_where_an_input_is_and_nowhere_else():
-    covariance, factor = random_covariances(7, 3)
-    error = factor[:, :, 0].copy()
-    alone = squared_deviations(error[:, :3], error[:, 3:], covariance)
-    error[1, 0] = error[2, 5] = np.nan
-    covariance[3] = np.nan
-    covariance[4, 2, 1] = np.nan
-    found = squared_deviations(error[:, :3], error[:, 3:], covariance)
-    assert np.isnan(found[[1, 2, 3, 4]]).all()
-    np.testing.assert_allclose(found[[0, 5, 6]], alone[[0, 5, 6]], rtol=1e-9)
-    nothing = squared_deviations(error[1:4, :3], error[1:4, 3:], covariance[1:4])
-    assert np.isnan(nothing).all()
-
-
-def test_squared_deviations_of_gaussian_errors_are_chi_square_of_six():
-    covariance, factor = random_covariances(20_000, 4)
-    rng = np.random.default_rng(5)
-    error = (factor @ rng.normal(size=(20_000, 6, 1)))[..., 0]
-    spread = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    correlation = covariance / (spread[:, :, None] * spread[:, None, :])
-    sound = np.linalg.cond(correlation) < 1e8
-    assert sound.mean() > 0.99
-    found = squared_deviations(error[sound, :3], error[sound, 3:], covariance[sound])
-    assert kstest(found, chi2(6).cdf).pvalue > 0.01
 
 
 def test_corners_with_gaussian_errors_give_poses_whose_deviations_are_chi_square_of_six():
@@ -283,39 +211,6 @@ def test_positive_definite_systems_are_solved_whatever_their_scale():
         assert np.abs(found - expected).max() < bound
 
 
-def test_inverse_of_a_positive_definite_matrix_is_its_solution_of_the_identity():
-    rng = np.random.default_rng(9)
-    factor = rng.normal(size=(6, 12))
-    inverse = np.eye(6)
-    assert solve_positive(factor @ factor.T, inverse)
-    np.testing.assert_allclose(inverse, np.linalg.inv(factor @ factor.T), rtol=1e-9, atol=1e-12)
-
-
-NOT_POSITIVE = {
-    "zero": np.zeros((3, 3)),
-    "one row of zeros": np.diag([1.0, 0.0, 1.0]),
-    "negative": -np.eye(3),
-    "indefinite": np.array([[1.0, 2.0], [2.0, 1.0]]),
-    "singular": np.ones((4, 4)),
-    "of rank two": np.array([[1.0, 0, 1], [0, 1, 1], [1, 1, 2]]),
-    "singular and small": np.ones((4, 4)) * 1e-200,
-    "all but singular": np.array([[1.0, 1.0], [1.0, 1.0 + 1e-14]]),
-    "NaN": np.full((3, 3), np.nan),
-    "NaN on the diagonal": np.diag([1.0, np.nan, 1.0]),
-    "NaN beside the diagonal": np.array([[1.0, np.nan], [np.nan, 1.0]]),
-    "infinite": np.diag([1.0, np.inf]),
-    "infinite beside the diagonal": np.array([[1.0, np.inf], [np.inf, 1.0]]),
-}
-
-
-@pytest.mark.parametrize("matrix", NOT_POSITIVE.values(), ids=NOT_POSITIVE)
-def test_what_is_not_positive_definite_is_told_and_not_solved(matrix):
-    right = np.arange(2.0 * len(matrix)).reshape(-1, 2)
-    before = right.copy()
-    assert not solve_positive(matrix.copy(), right)
-    np.testing.assert_array_equal(right, before)
-
-
 # Rotations.
 
 def state(rotation, translation=(0.0, 0.0, 1.0)):
@@ -343,34 +238,3 @@ def test_turn_between_two_states_is_the_angle_that_one_was_turned_by():
             # Matrices are right to some 1e-16 each, whatever the angle.
             assert turn_between(second, first) == pytest.approx(angle, abs=2e-15)
             assert turn_between(first, second) == pytest.approx(angle, abs=2e-15)
-
-
-def test_mirrored_state_is_the_mirrored_pose_and_twice_mirrored_the_pose():
-    rotation, translation, _ = drawn_poses(50, 11)
-    expected = mirrored(rotation, translation)
-    for n in range(50):
-        before = state_of(rotation[n], translation[n], 0.7, np.array([1.0, 2.0, 3.0]))
-        given = before.copy()
-        found = mirrored_state(given)
-        np.testing.assert_array_equal(given, before)
-        np.testing.assert_allclose(found[:9].reshape(3, 3), expected[n], atol=1e-15)
-        np.testing.assert_array_equal(found[9:], before[9:])
-        np.testing.assert_allclose(mirrored_state(found), before, atol=1e-15)
-
-
-def test_mirrored_state_is_a_rotation_whose_normal_is_reflected_at_the_line_of_sight():
-    rotation, translation, _ = drawn_poses(50, 12)
-    for n in range(50):
-        found = mirrored_state(state(rotation[n], translation[n]))[:9].reshape(3, 3)
-        np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-14)
-        assert np.linalg.det(found) == pytest.approx(1)
-        sight = translation[n] / np.linalg.norm(translation[n])
-        before, after = rotation[n][:, 2], found[:, 2]
-        # Equally far from the line of sight, on its other side.
-        assert after @ sight == pytest.approx(before @ sight)
-        np.testing.assert_allclose(
-            after - (after @ sight) * sight, -(before - (before @ sight) * sight), atol=1e-14
-        )
-        # The corners' first-order image at the centre, across the line of sight, is the same.
-        across = np.eye(3) - np.outer(sight, sight)
-        np.testing.assert_allclose(across @ found[:, :2], across @ rotation[n][:, :2], atol=1e-14)

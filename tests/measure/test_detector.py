@@ -1,7 +1,6 @@
 """OpenCV's detector is set as asked, sees the right window, and keeps its known conventions."""
 
 import dataclasses
-import json
 
 import cv2
 import numpy as np
@@ -11,13 +10,12 @@ from hypothesis import strategies as st
 
 from support.blocks import run_block
 from support.lengths import lengths
-from sweep.measure.detector import (
+from sweep.measure.detectors import (
     ALIGNMENT_PX,
     MIN_WINDOW_PX,
     REFINEMENTS,
     Detector,
     DetectorSetting,
-    margin_px,
     windows,
 )
 from sweep.measure.flags import DetectionStatus
@@ -25,8 +23,8 @@ from sweep.model.extent import marker_boxes
 from sweep.model.marker import marker_count, module_count, opencv_dictionary_names
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
-from sweep.plan.experiment import Pipeline
-from sweep.plan.grid import Block, block_indices, detector_settings, scene_axes, scene_values
+from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
+from sweep.plan.pipeline import Pipeline
 
 FIELDS = {field.name: field.default for field in dataclasses.fields(DetectorSetting)}
 
@@ -102,22 +100,6 @@ def test_field_that_is_set_reaches_opencv_and_no_other_changes(handed_over, name
     assert handed_over == [expected_of(setting)]
 
 
-@pytest.mark.parametrize("refinement", REFINEMENTS)
-def test_every_refinement_reaches_opencv(handed_over, refinement):
-    setting = DetectorSetting(cornerRefinementMethod=refinement)
-    Detector(setting).find(np.full((48, 64), 128, dtype=np.uint8), "DICT_4X4_50", 64)
-    assert handed_over == [expected_of(setting)]
-
-
-def test_every_field_is_read_from_a_pipeline():
-    chosen = {name: value for name, value in OTHER.items() if name != "aprilTagDeglitch"}
-    pipeline = Pipeline.from_text(
-        "[pose]\nside_px = 40\n[detector]\n"
-        + "\n".join(f"{name} = {json.dumps(value)}" for name, value in chosen.items())
-    )
-    assert detector_settings(pipeline) == [DetectorSetting(**chosen)]
-
-
 @given(
     rates=st.tuples(st.floats(0.001, 0.5), st.floats(0.5, 8.0)),
     frame_side=st.integers(8, 8000),
@@ -156,19 +138,6 @@ def test_corners_of_an_upright_square_follow_opencvs_known_conventions(refinemen
     a, b = CONVENTIONS[refinement]
     # 0.01 px: contour's float32 line fit, and the two digits of subpix' convention.
     np.testing.assert_allclose(corners[0][0], [[a, a], [b, a], [b, b], [a, b]], atol=0.01)
-
-
-@pytest.mark.parametrize("refinement", REFINEMENTS)
-def test_corner_errors_of_the_dataset_are_found_minus_true_in_those_conventions(refinement):
-    # 102 px about the centre of a frame of 640 x 480: 268.5..370.5 by 188.5..290.5.
-    pipeline = Pipeline.from_text(
-        f'[marker]\ndictionary = "DICT_4X4_50"\n[pose]\nside_px = 102\n'
-        f'[scene]\nbackground = 255\n[detector]\ncornerRefinementMethod = "{refinement}"'
-    )
-    error = run_block(pipeline, Block((), ())).values["corner_error_px"].reshape(4, 2)
-    low, high = CONVENTIONS[refinement][0] - 99.5, CONVENTIONS[refinement][1] - 201.5
-    expected = [[low, low], [high, low], [high, high], [low, high]]
-    np.testing.assert_allclose(error, expected, atol=0.01)  # as above
 
 
 def ids_of(dictionary):
@@ -236,15 +205,3 @@ def test_windows_hold_the_box_and_its_margin_and_stay_in_the_frame(count):
         assert (stop - start < np.maximum(wanted + 2 * ALIGNMENT_PX, smallest)).all()
 
     check()
-
-
-def test_margin_is_16_px_by_default_and_covers_what_a_setting_reaches():
-    assert margin_px(DetectorSetting()) == 16
-    for name, value in (("adaptiveThreshWinSizeMax", 61), ("minDistanceToBorder", 20)):
-        assert margin_px(DetectorSetting(**{name: value})) > 16
-    for refinement, wider in (
-        ("subpix", {"cornerRefinementWinSize": 20}), ("apriltag", {"aprilTagQuadSigma": 5.0}),
-        ("apriltag", {"aprilTagQuadSigma": -5.0}),
-    ):
-        narrow = DetectorSetting(cornerRefinementMethod=refinement)
-        assert margin_px(dataclasses.replace(narrow, **wider)) > margin_px(narrow) >= 16

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import doctest
 import pickle
 
 import pytest
 
-from sweep.measure import flags
-from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped, outcomes
+from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 
 STORED = {
     DetectionStatus: "not_run detected wrong_id rejected no_candidate not_visible not_modelled "
@@ -36,18 +34,3 @@ def test_every_flag_says_in_one_sentence_what_it_means(kind):
     assert kind(0).name == "not_run"
     assert not kind(0).counted
     assert all(member.counted for member in kind if member.present)
-
-
-def test_outcomes_are_where_a_pose_ends():
-    assert outcomes(counted=True) == (
-        "solved", "wrong_id", "rejected", "no_candidate", "solver_failed", "not_converged",
-        "not_explained", "too_few_points", "failed", "crashed",
-    )
-    assert outcomes(counted=False) == (
-        "not_visible", "not_modelled", "not_in_photograph", "not_on_board", "not_run",
-        "not_needed",
-    )
-
-
-def test_examples_in_the_docstrings():
-    assert doctest.testmod(flags).failed == 0

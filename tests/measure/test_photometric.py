@@ -20,9 +20,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2, norm
 
-import sweep.evaluation.cells
-from support.lengths import first_of
-from sweep.evaluation.cells import run_cells
+import sweep.evaluation.block
+from sweep.evaluation.block import run_cells
 from sweep.measure.estimation import Detections, Estimates
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.measure.likelihood import (
@@ -35,7 +34,7 @@ from sweep.measure.likelihood import (
 )
 from sweep.measure.photometric import Photometric, _windows, explains
 from sweep.model.derivatives import LEVELS, POSE, work_space
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 
 ALARM = 1e-8
 """False alarm probability of one comparison; the short tests have less than a hundred."""
@@ -171,7 +170,7 @@ class Kept:
 def kept(monkeypatch, inner):
     """Put an estimator in the place of those that pipelines ask for; return it, recording."""
     keeper = Kept(inner)
-    monkeypatch.setattr(sweep.evaluation.cells, "build", lambda _: keeper)
+    monkeypatch.setattr(sweep.evaluation.block, "build", lambda _: keeper)
     return keeper
 
 
@@ -262,22 +261,6 @@ def test_the_bound_is_attained_through_a_lens():
     assert_converged(cells)
 
 
-MARKERS = {
-    "DICT_4X4_50": 3, "DICT_6X6_250": 100, "DICT_7X7_1000": 900, "DICT_ARUCO_ORIGINAL": 77,
-    "DICT_APRILTAG_36h11": 500,
-}
-
-
-def test_the_bound_is_attained_with_other_dictionaries():
-    cells = [
-        Cell(25, "side_px=40", f"dictionary={name}", f"marker_id={number}", seed=5)
-        for name, number in MARKERS.items()
-    ]
-    assert all(len(cell.deviations) >= 23 for cell in cells)
-    assert_gaussian(cells)
-    assert_converged(cells)
-
-
 def test_the_bound_is_attained_at_the_frame_s_edge():
     # The square has 3 px to the frame, which ends at 639.5 px; the quiet zone goes to 644 px.
     cell = Cell(
@@ -292,24 +275,6 @@ def test_the_bound_is_attained_where_blur_is_estimated():
     cell = Cell(60, *BLUR_UNKNOWN, "side_px=20", "tilt_deg=30", seed=7)
     assert_gaussian([cell])
     assert_converged([cell])
-
-
-def test_a_known_blur_is_no_model_error():
-    cell = Cell(60, "side_px=25", "blur_px=0.7", seed=8)
-    assert_gaussian([cell])
-    assert (cell.estimate == EstimateStatus.solved).mean() > 0.98
-
-
-def test_more_starts_find_no_higher_minimum():
-    result = run(150, "side_px=20", "noise_grey=4", "refined_starts=[false, true]", seed=9)
-    two, four = result.columns["residual_variance_ratio"]
-    both = np.isfinite(two) & np.isfinite(four)
-    assert both.sum() > 100
-    # A fit ends within 1e-4 of its minimum's chi-square, of some hundred degrees of freedom.
-    assert (four[both] <= two[both] + 1e-6).all()
-    estimates = result.columns["estimate"]
-    failed = [np.count_nonzero(flags == EstimateStatus.not_converged) for flags in estimates]
-    assert max(failed) <= binom.isf(ALARM, len(two), 0.005)
 
 
 def test_estimates_are_the_lowest_minima(monkeypatch):
@@ -438,33 +403,6 @@ def test_a_wrong_belief_of_noise_is_flagged_and_costs_no_pose():
         assert np.abs(away / columns["bound_std"][0][:, :3]).max() < 0.03
 
 
-def test_a_wrong_belief_of_the_size_scales_the_range_and_is_explained():
-    columns = run(60, "believed_size_m=[0.05, 0.0505]", seed=15).columns
-    assert (columns["estimate"][0] == columns["estimate"][1]).all()
-    assert (columns["estimate"][1] == EstimateStatus.solved).sum() > 57
-    right, wrong = (part + columns["true_tvec_m"][0] for part in columns["translation_error_m"])
-    assert wrong == pytest.approx(1.01 * right, rel=1e-9, abs=1e-9)
-    assert columns["rotation_error_rad"][1] == pytest.approx(
-        columns["rotation_error_rad"][0], abs=1e-8
-    )
-    std = columns["predicted_std"]
-    assert std[1] == pytest.approx(std[0] * np.repeat([1, 1.01], 3), rel=1e-5)
-
-
-def test_a_wrong_belief_of_the_blur_can_be_estimated_away():
-    columns = run(
-        20, "side_px=20", "tilt_deg=30", "blur_px=0.5", "believed_blur_px=[0, 0.3, 1.0]",
-        "estimate_blur=true", seed=16,
-    ).columns
-    for estimate in columns["estimate"]:
-        assert (estimate == EstimateStatus.solved).sum() >= 19
-    first = columns["translation_error_m"][0]
-    std = columns["predicted_std"][0][:, 3:]
-    for other in columns["translation_error_m"][1:]:
-        close = np.abs(other - first) < 0.05 * std
-        assert close.all(axis=1).sum() >= 18
-
-
 @pytest.mark.parametrize("freedom", [100, 1000, 100_000])
 def test_residuals_are_explained_as_chi_square_s_law_has_it(freedom):
     for share in (1e-4, 0.1, 0.9, 1 - 1e-4):
@@ -479,23 +417,6 @@ def test_residuals_are_explained_as_chi_square_s_law_has_it(freedom):
     ))
     assert explains(0.0, freedom, 0.4)
     assert explains(0.0, freedom, 0.0)
-
-
-def test_residuals_are_explained_to_five_of_chi_square_s_deviations():
-    for freedom in (50, 400, 20_000):
-        deviation = chi2.std(freedom)
-        for sign in (-1, 1):
-            assert explains(freedom + sign * 4.999 * deviation, freedom, 0.5)
-            assert not explains(freedom + sign * 5.001 * deviation, freedom, 0.5)
-        assert explains(freedom - 5.001 * deviation, freedom, 0.49)
-        assert not explains(freedom + 5.001 * deviation, freedom, 0.49)
-        drawn = chi2.rvs(freedom, size=2000, random_state=freedom)
-        # The law's own tail beyond five deviations: 1.3e-5 at 50 degrees of freedom.
-        outside = sum(not explains(float(one), freedom, 1.0) for one in drawn)
-        tail = chi2.sf(freedom + 5 * deviation, freedom) + chi2.cdf(
-            freedom - 5 * deviation, freedom
-        )
-        assert outside <= binom.isf(ALARM, 2000, tail)
 
 
 # One scene, and its neighbours.
@@ -525,29 +446,9 @@ def pieces(cuts, need=None):
     }
 
 
-def assert_same_columns(some, others):
-    for name, columns in some.items():
-        assert len(columns) == len(others[name])
-        for one, other in zip(columns, others[name], strict=True):
-            assert same(one, other), name
-
-
-def test_scenes_do_not_depend_on_how_many_are_computed_in_one_call(whole):
-    assert_same_columns(pieces([1, 7, 8, 31]), whole.columns)
-
-
-@pytest.mark.parametrize("frames", first_of([3.5, 0.5, 1, 39], 1))
-def test_scenes_do_not_depend_on_how_many_images_are_kept(whole, frames, monkeypatch):
-    monkeypatch.setattr(sweep.evaluation.cells, "KEPT_PX", int(frames * 640 * 480))
-    result = run(40, *MIXED, seed=17)
-    assert_same_columns(result.columns, whole.columns)
-    assert result.row_seconds.shape == (40,)
-    assert [len(part) for part in result.seconds.values()] == [1, 2, 4]
-
-
 @pytest.mark.parametrize("kept_px", [1 << 26, 5 * 640 * 480])
 def test_scenes_do_not_depend_on_which_others_are_needed(whole, kept_px, monkeypatch):
-    monkeypatch.setattr(sweep.evaluation.cells, "KEPT_PX", kept_px)
+    monkeypatch.setattr(sweep.evaluation.block, "KEPT_PX", kept_px)
     need = np.random.default_rng(18).random((40, 2, 2)) < 0.4
     need[10:16] = False
     columns = pieces([12], need)
@@ -566,15 +467,6 @@ def test_scenes_do_not_depend_on_which_others_are_needed(whole, kept_px, monkeyp
         assert (columns["detection"][k][~asked] == DetectionStatus.not_run).all()
 
 
-def test_a_treatment_does_not_depend_on_the_others(whole):
-    for k, (size, solver) in enumerate(itertools.product((23, 53), ("ippe", "photometric"))):
-        alone = run(
-            40, f"solver={solver}", f"adaptiveThreshWinSizeMax={size}", "side_px=25", seed=17
-        )
-        for name in ("estimate", "translation_error_m", "nees", "reprojection_error_px"):
-            assert same(alone.columns[name][0], whole.columns[name][k])
-
-
 def test_a_mixture_of_scenes_is_as_each_of_them():
     sides = (18, 60)
     mixed = pipeline("side_px=[18, 60]", "noise_grey=[0, 3]", "trial=10", seed=19)
@@ -590,12 +482,6 @@ def test_a_mixture_of_scenes_is_as_each_of_them():
         alone = run(10, f"side_px={side}", f"noise_grey={noise}", seed=19)
         for name in ("estimate", "translation_error_m", "bound_std", "nees"):
             assert same(alone.columns[name][0], columns[name][0][rows]), (name, side, noise)
-
-
-def test_scenes_without_a_marker_found_have_no_estimate():
-    columns = run(10, "side_px=3", seed=21).columns
-    assert (columns["detection"][0] != DetectionStatus.detected).all()
-    assert (columns["estimate"][0] == EstimateStatus.no_detection).all()
 
 
 # Estimators of one's own.
@@ -655,40 +541,6 @@ def test_an_estimator_of_one_s_own_gets_what_is_believed_and_seen(monkeypatch):
         assert inside.all()
 
 
-def test_beliefs_are_the_truth_unless_told(monkeypatch):
-    keeper = kept(monkeypatch, Nothing(needs_images=True))
-    run(6, "blur_px={uniform=[0.3, 0.6]}", "noise_grey={uniform=[1, 3]}", seed=23)
-    seen, = keeper.seen
-    assert len(set(seen.blur_px)) == len(set(seen.noise_grey)) == len(seen.corners)
-    assert ((seen.blur_px > 0.3) & (seen.blur_px < 0.6)).all()
-    assert ((seen.noise_grey > 1) & (seen.noise_grey < 3)).all()
-    keeper.seen.clear()
-    run(6, "noise_grey=0", seed=23)
-    seen, = keeper.seen
-    assert (seen.blur_px == 0).all()
-    assert (seen.noise_grey == 0).all()
-
-
-def test_images_are_for_estimators_that_ask_for_them(monkeypatch):
-    keeper = kept(monkeypatch, Nothing(needs_images=False))
-    run(5, seed=24)
-    assert keeper.seen[0].images == []
-    assert keeper.seen[0].take(np.array([1])).images == []
-
-
-def test_sightings_are_taken_with_all_that_belongs_to_them(monkeypatch):
-    keeper = kept(monkeypatch, Nothing(needs_images=True))
-    run(6, "noise_grey={uniform=[1, 3]}", seed=25)
-    seen, = keeper.seen
-    rows = np.array([4, 1])
-    taken = seen.take(rows)
-    for name in ("corners", "size_m", "noise_grey", "blur_px", "origins"):
-        assert np.array_equal(getattr(taken, name), getattr(seen, name)[rows])
-    assert [id(image) for image in taken.images] == [id(seen.images[row]) for row in rows]
-    assert taken.markers == [seen.markers[row] for row in rows]
-    assert np.array_equal(taken.cameras.view, seen.cameras.view[rows])
-
-
 class Superstitious:
     """Photometric, but that it raises where a corner is at one abscissa."""
 
@@ -705,14 +557,14 @@ class Superstitious:
 
 @pytest.mark.parametrize("frames", [200, 4])
 def test_an_estimator_that_raises_costs_one_scene_only(monkeypatch, frames):
-    monkeypatch.setattr(sweep.evaluation.cells, "KEPT_PX", frames * 640 * 480)
+    monkeypatch.setattr(sweep.evaluation.block, "KEPT_PX", frames * 640 * 480)
     settings = ("side_px=25",)
     keeper = kept(monkeypatch, Photometric(refined=False, spread_free=False))
     healthy = run(15, *settings, seed=26).columns
     abscissae = np.concatenate([seen.corners[:, 0, 0] for seen in keeper.seen])
     rows = np.flatnonzero(healthy["detection"][0] == DetectionStatus.detected)
     victim = rows[9]
-    monkeypatch.setattr(sweep.evaluation.cells, "build", lambda _: Superstitious(abscissae[9]))
+    monkeypatch.setattr(sweep.evaluation.block, "build", lambda _: Superstitious(abscissae[9]))
     result = run_cells(pipeline(*settings, seed=26), [np.arange(15)])
     failure, = result.failures
     assert (failure.scene, failure.stage) == (victim, "estimation")

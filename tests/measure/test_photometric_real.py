@@ -7,24 +7,23 @@ from scipy.ndimage import gaussian_filter
 from scipy.stats import chi2
 
 from support.board_scenes import BoardPose, board_scene, levels_of
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells
 from sweep.measure.estimation import Detections
 from sweep.measure.flags import EstimateStatus
-from sweep.measure.photograph import PhotometricReal
-from sweep.measure.photograph_box import photograph_view
+from sweep.measure.photograph import PhotometricReal, from_unit_square
 from sweep.measure.photograph_model import (
     STATE_LENGTH,
     Nuisances,
     draw,
+    photograph_view,
     system,
 )
-from sweep.measure.quadrilaterals import from_unit_square
 from sweep.measure.surroundings import BoardMarker, clear_modules, surroundings
 from sweep.model.board_kinds import Charuco, Grid
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.marker import WHITE
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 
 ALARM = 1e-7
 CHARUCO = Charuco(
@@ -215,42 +214,6 @@ def test_poses_on_boards_have_the_errors_that_they_expect(board, numbers, lens, 
     assert squared < chi2.isf(ALARM, 6 * len(numbers))
     assert np.degrees(np.abs(errors[:, :3])).max() < 1.0
     assert (estimates.misfit_px < 0.05).all()
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("solver", "effects", "limits"),
-    [
-        (PLAIN, {}, (5.3, 6.5)),
-        (EVERYTHING, {"light": 0.2, "tone": 0.3, "amount": 0.8}, (5.3, 6.5)),
-        (EVERYTHING, {"light": 0.2, "tone": 0.3, "amount": 0.8, "correlation": 0.5}, (5.0, 7.0)),
-    ],
-)
-def test_nees_of_many_photographs(solver, effects, limits):
-    """Mean NEES of some 600 poses, standard error 0.14: no mean of 6 leaves the limits by chance.
-
-    Limits are five standard errors, or what the model of the correlation leaves.
-    """
-    rng = np.random.default_rng(4)
-    numbers = [3, 5, 6, 8]
-    squared = []
-    for _ in range(150):
-        pose = BoardPose(
-            rotation(rng.uniform(15, 60), rng.uniform(0, 360), rng.uniform(0, 360)),
-            np.array([0.0, 0.0, rng.uniform(0.35, 0.5)]),
-        )
-        image = photograph(CHARUCO, pose, rng, **effects)
-        found = detections(CHARUCO, numbers, image, pose, rng)
-        estimates = solver(found)
-        solved = estimates.status == EstimateStatus.solved
-        assert solved.mean() >= 0.75
-        errors = errors_of(CHARUCO, numbers, estimates, pose)
-        squared += [
-            error @ np.linalg.solve(covariance, error)
-            for error, covariance in zip(errors[solved], estimates.covariance[solved], strict=True)
-        ]
-    print(f"NEES {np.mean(squared):.2f} of {len(squared)} poses")
-    assert limits[0] < np.mean(squared) < limits[1]
 
 
 @pytest.mark.long

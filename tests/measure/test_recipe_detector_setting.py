@@ -8,7 +8,7 @@ import re
 
 import pytest
 
-from sweep.measure.detector import DetectorSetting
+from sweep.measure.detectors import DetectorSetting
 from tests.support.recipes import added, printed_by
 
 NAME = "minOtsuStdDev"
@@ -17,9 +17,9 @@ SCRIPT = '''
 import json
 import numpy as np
 from sweep.errors import PipelineError
-from sweep.evaluation.cells import run_cells
-from sweep.plan.experiment import Pipeline
-from sweep.plan.reference import TABLES
+from sweep.evaluation.block import run_cells
+from sweep.plan.pipeline import Pipeline
+from support.guide_tables import TABLES
 
 TEXT = """
 [marker]
@@ -56,7 +56,7 @@ def test_setting_is_one_field(tmp_path):
     source = inspect.getsource(DetectorSetting)
     field = re.search(rf"    {NAME}: float = parameter\(.*?\n    \)\n", source, re.DOTALL)[0]
     without = added(tmp_path / "without")
-    file = without / "sweep" / "measure" / "detector.py"
+    file = without / "sweep" / "measure" / "detectors.py"
     file.write_text(file.read_text().replace(field, ""))
     before = printed_by(without, SCRIPT)
     assert f"axes.{NAME}" in before["message"]

@@ -19,13 +19,13 @@ from types import SimpleNamespace
 import numpy as np
 import xarray as xr
 from sweep.analysis import failure_composition
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells
 from sweep.evaluation.results import to_dataset_layout
-from sweep.integrity.consistency import contradiction
+from sweep.integrity.verification import contradiction
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 from sweep.plan.grid import Block, block_indices
-from sweep.plan.reference import TABLES
+from support.guide_tables import TABLES
 from sweep.plan.schema import SCHEMA, VARIABLES
 
 pipeline = Pipeline.from_text("[marker]\\nsize_m = 0.05\\n[axes]\\ndistance_m = [0.3, 0.5, 1e3]")
@@ -67,7 +67,7 @@ print(json.dumps({
 @pytest.mark.long
 def test_flag_is_one_member(tmp_path):
     (last,) = (flag for flag in EstimateStatus if flag == VALUE - 1)
-    anchor = f'"{last.meaning}",\n        present=True,\n    )\n'
+    anchor = f'"{last.meaning}")\n'
     result = printed_by(added(tmp_path, ("measure/flags.py", anchor, MEMBER)), SCRIPT)
     assert result["attributes"]["flag_values"] == list(range(VALUE + 1))
     assert result["attributes"]["flag_meanings"].split()[-1] == "unlikely"

@@ -43,10 +43,10 @@ SCRIPT = '''
 import json
 import numpy as np
 from sweep.errors import PipelineError
-from sweep.evaluation.cells import run_cells
-from sweep.plan.active_parts import parts
-from sweep.plan.experiment import Pipeline
-from sweep.plan.reference import TABLES
+from sweep.evaluation.block import run_cells
+from sweep.plan.facts import parts
+from sweep.plan.pipeline import Pipeline
+from support.guide_tables import TABLES
 
 TEXT = """
 [marker]
@@ -81,7 +81,7 @@ def test_solver_is_one_class_and_one_record(tmp_path):
     folder = added(
         tmp_path,
         ("measure/frontal.py", None, SOLVER),
-        (file, "from sweep.measure.estimation import PoseEstimator\n",
+        (file, "    PoseEstimator,\n    corner_covariance,\n    point_covariance,\n)\n",
          "from sweep.measure.frontal import FrontalSolver\n"),
         (file, "SOLVERS: dict[str, Solver] = {", RECORD),
     )

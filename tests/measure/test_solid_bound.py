@@ -6,15 +6,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.exact_image import add_clipped
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells
 from sweep.measure.bound import BACKGROUND_MARGIN_PX, bounds
 from sweep.measure.flags import BoundStatus
 from sweep.model.coverage import sum_levels
 from sweep.model.extent import marker_boxes
 from sweep.model.scene import build_scenes
-from sweep.model.solid_scene import accumulate_solid
-from sweep.plan.experiment import Pipeline
+from sweep.model.scene_sheet import accumulate_solid
 from sweep.plan.grid import scene_values
+from sweep.plan.pipeline import Pipeline
 
 OPENCV = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
 LEVELS = np.array([120.0, 40.0, 200.0])

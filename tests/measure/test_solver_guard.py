@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.lengths import first_of, lengths
-from sweep.measure.accuracy import pose_error
+from sweep.measure.estimation import pose_error
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.solver import OPENCV_SOLVERS, estimate
 from sweep.model.camera import Cameras
@@ -110,9 +110,9 @@ def test_guarded_solvers_are_right_where_plain_calls_fail(count, bearing, size_m
 class FarView:
     """Poses (N,) so far away that the perspective across the marker is 1e-3 to 1e-6 px."""
 
-    def __init__(self, count, focal_px, seed):
+    def __init__(self, count, focal_px, seed, smallest_px=20):
         rng = np.random.default_rng(seed)
-        side_px = np.geomspace(20, 100, count)
+        side_px = np.geomspace(smallest_px, 100, count)
         # To 33 degrees off the axis at the shortest focal length: none is seen from behind.
         steepest = 85 if focal_px > 1e3 else 50
         tilt, azimuth, roll = rng.uniform(0, [[steepest], [360], [360]], (3, count))
@@ -158,16 +158,6 @@ def test_guarded_solvers_are_right_at_any_focal_length(count, focal_px):
         assert (relative / view.translation[:, 2]).max() < 2e-5, solver
 
 
-@pytest.mark.parametrize("solver", RELIABLE)
-def test_far_solutions_are_no_worse_than_twice_ippe_under_noise(solver):
-    view = FarView(300, 1e6, seed=4)
-    estimates, ippe = view.estimates(solver, 0.1), view.estimates("ippe", 0.1)
-    # Three corners' exact solution has twice the least error; IPPE's is not always the least.
-    assert (estimates.reprojection_px <= 4.0 * ippe.reprojection_px).all()
-    if solver not in ("ippe", "ippe_square"):
-        assert np.isnan(estimates.alternative_reprojection_px).all()
-
-
 @lengths(45, 15)
 def test_epnp_is_unreliable_and_says_so(count):
     view = View(count, (0.0, 0.0), 0.1)
@@ -205,6 +195,41 @@ def test_relative_errors_are_the_same_at_millimetres_and_kilometres(solver):
         np.testing.assert_allclose(estimates.reprojection_px, middle.reprojection_px, atol=1e-6)
 
 
+def least_errors_px(view, corners):
+    """Return the least RMS reprojection errors (N,): from the truth and from its mirror."""
+    matrix = np.array([[FOCAL_PX, 0, 319.5], [0, FOCAL_PX, 239.5], [0, 0, 1.0]])
+    least = np.full(len(corners), np.inf)
+    for i, (pixels, position) in enumerate(zip(corners, view.translation, strict=True)):
+        sight = position / np.linalg.norm(position)
+        mirror = np.eye(3) - 2 * np.outer(sight, sight)
+        objects = view.size_m[i] * SQUARE
+        for start in (view.rotation[i], mirror @ view.rotation[i] @ np.diag([1, 1, -1])):
+            _, rvec, tvec = cv2.solvePnP(
+                objects, pixels, matrix, None, Rotation.from_matrix(start).as_rotvec()[:, None],
+                position[:, None].copy(), useExtrinsicGuess=True, flags=cv2.SOLVEPNP_ITERATIVE,
+            )
+            off = cv2.projectPoints(objects, rvec, tvec, matrix, None)[0][:, 0] - pixels
+            least[i] = min(least[i], np.sqrt((off**2).sum(axis=1).mean()))
+    return least
+
+
+@lengths(400, 4000)
+@pytest.mark.parametrize("solver", RELIABLE)
+def test_guarded_solvers_find_the_least_error_of_coarse_corners(count, solver):
+    """Before it was compared, iterative ended at up to 26 times the least error in 1-3 %."""
+    view = FarView(count, FOCAL_PX, seed=1, smallest_px=12)
+    for corners in (np.round(view.corners), view.corners + np.random.default_rng(2).normal(
+            0, 0.3, view.corners.shape)):
+        estimates = estimate(corners, view.cameras, view.size_m, solver, True, 0.25)
+        side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(axis=1)
+        ratio = estimates.reprojection_px / np.maximum(least_errors_px(view, corners), 1e-3 * side)
+        print(f"\n{solver}: {(ratio > 1.1).sum()} of {count} above 1.1, worst {ratio.max():.1f}")
+        # iterative minimises the error; ippe does not; p3p and ap3p fit three corners of four, and
+        # give way to ippe at 4 times its error.
+        most = {"iterative": 1.1, "p3p": 10, "ap3p": 10}.get(solver, 2.5)
+        assert (ratio <= most).all()
+
+
 @pytest.mark.parametrize("solver", OPENCV_SOLVERS)
 def test_other_planar_solution_is_there_for_the_solvers_that_give_both(solver):
     view = View(37, (12.0, -9.0))  # no multiple of a right angle: the guard needs no fallback
@@ -218,18 +243,6 @@ def test_other_planar_solution_is_there_for_the_solvers_that_give_both(solver):
         off = degrees_between(estimates.alternative_rotation, view.mirrored())
         assert off.max() < 1e-3
         assert (estimates.alternative_reprojection_px >= estimates.reprojection_px - 1e-6).all()
-
-
-@lengths(45, 15)
-@pytest.mark.parametrize("solver", ["ippe", "ippe_square"])
-def test_other_planar_solution_is_seldom_lost_to_the_fallback_on_the_axis(count, solver):
-    view = View(count, (0.0, 0.0))
-    present = np.isfinite(view.estimates(solver, guarded=True).alternative_reprojection_px)
-    tilted = view.rotation[:, 2, 2] > -0.99  # else both solutions are one
-    print(f"\n{solver}: the other solution is missing for {(~present & tilted).sum()} of "
-          f"{tilted.sum()} tilted poses and {(~present & ~tilted).sum()} of {(~tilted).sum()} "
-          "squarely facing ones")
-    assert present[tilted].mean() > 0.95
 
 
 def test_an_estimate_is_flipped_when_it_is_the_mirror():

@@ -6,7 +6,6 @@ table under ``pytest -s``: the worst error, and where the function stops being t
 
 import itertools
 
-import cv2
 import numpy as np
 import pytest
 from mpmath import mp, mpf
@@ -23,11 +22,12 @@ from support.fifty_digits import (
     values,
 )
 from support.lengths import lengths
-from sweep.measure.accuracy import pose_error
+from sweep.measure.estimation import pose_error
 from sweep.model import lens
 from sweep.model.camera import Cameras
 from sweep.model.coverage import MarkerEdges, accumulate, sum_levels
-from sweep.model.marker import edges, marker_corners
+from sweep.model.marker import marker_corners
+from sweep.model.polygon import Optics, Projection
 from sweep.model.pose import (
     angle_between,
     mirrored,
@@ -36,7 +36,6 @@ from sweep.model.pose import (
     transform_points,
     vector_of_rotation,
 )
-from sweep.model.projection import Optics, Projection
 from sweep.model.scene import build_scenes
 
 ROUNDING = 2.0**-53
@@ -206,16 +205,6 @@ def test_placed_corners_are_projected_to_the_bar(count, table):
     assert by_bar.max() <= 1
     # Measured 0.1 to 0.16: there f = 1e5 px magnifies the roundings of z beyond the bar.
     assert stop is None or stop < 0.35
-
-
-@lengths(30, 500)
-def test_corner_just_before_the_camera_is_off_by_the_last_bits_of_its_pose(count, table):
-    # Measured 0.9: the sum of three products is rounded as if their factors were, by 1.1e-16.
-    rng = np.random.default_rng(3)
-    worst = max(corner_errors(rng, count, 10.0**-power)[1].max() for power in range(1, 10))
-    table.append(("Cameras.project", "z from 1e-9 to 0.1 of the distance", 9 * count,
-                  f"{worst:.2f} of what rounding the pose's doubles moves", "z ≤ 0: NaN"))
-    assert worst < 3
 
 
 @pytest.mark.xfail(
@@ -500,34 +489,6 @@ def test_plane_and_its_image_put_module_corners_on_the_bar(count, table):
     assert worst.max() <= 1
 
 
-@lengths(20, 500)
-def test_inverse_of_the_plane_finds_modules_and_samples(count, table):
-    # 1e-9 px is 7e-8 modules of the least marker here. Measured 5e-12 px and 4e-10 modules: both
-    # grow towards edge on, modules also as the marker shrinks.
-    rng = np.random.default_rng(10)
-    worst = np.max([
-        homography_errors(homography_value(rng, rng.uniform(0, 89.9), 10.0 ** rng.uniform(-4, -1)))
-        for _ in range(count)
-    ], axis=0)[2:]
-
-    # Without bearing the tilt is from the line of sight; with it a plane may be on edge earlier.
-    grazing = first_failure(10.0 ** np.arange(-2, -9, -0.5), lambda angle: max(
-        homography_errors(homography_value(rng, 90 - angle, 0.1)
-                          | {"bearing_x_deg": 0.0, "bearing_y_deg": 0.0})[3]
-        for _ in range(5)) > 1e-9)
-    speck = first_failure(10.0 ** np.arange(-4, -13, -0.5), lambda size: max(
-        homography_errors(homography_value(rng, 45.0, size))[2] for _ in range(5)) > 1e-9)
-    table.append(("np.linalg.inv(plane)", "tilts to 89.9°, sides of 0.1 to 100 px, f = 1000 px",
-                  count, f"{worst[0]:.1e} modules, {worst[1]:.1e} px",
-                  told(grazing, "{:.0e}° from edge on (beyond 1e-9 px)") + ", "
-                  + told(speck and 1e3 * speck,
-                         "sides of {:.0e} px (beyond 1e-9 modules, though not 1e-9 px)")))
-    assert worst[0] < 1e-8
-    assert worst[1] < 1e-9
-    assert grazing is None or grazing < 1e-2
-    assert speck is None or speck < 1e-4
-
-
 # Coverage.
 
 OUTLINE = np.array([[0.0, 0, 0, 1], [1, 0, 1, 1], [0, 0, 1, 0], [0, 1, 1, 1]])
@@ -730,42 +691,6 @@ def test_coverage_is_the_exactly_clipped_area(count, family, table):
     # Corners of a marker of 8000 px lie up to 16,000 px off, wherever the box is.
     assert worst[0] < (1e-11 if huge else 1e-12)
     assert worst[1] < 1e-9
-
-
-@lengths(4, 40)
-def test_coverage_of_a_marker_is_that_of_its_modules(count, table):
-    # Edges that end on the middle of others: runs of modules, whose ends are not on one line of
-    # doubles. Measured 5e-15.
-    rng = np.random.default_rng(12)
-    worst = 0.0
-    for _ in range(count):
-        marker_id = int(rng.integers(50))
-        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-        white = np.pad(cv2.aruco.generateImageMarker(dictionary, marker_id, 6) > 127, 1,
-                       constant_values=True)
-        where = drawn_point(rng, 10)
-        plane, view = perspective_square(rng, where, 12.0)
-        outline = edges("DICT_4X4_50", marker_id, 1.0)
-        # The unit square of the drawn plane is the marker with its quiet zone, 8 modules wide.
-        plane = plane @ np.array([[1 / 8, 0, 1 / 8], [0, 1 / 8, 1 / 8], [0, 0, 1]])
-        box = box_about(where, 4, 5)
-        found = covered(plane, view, box, outline.ends, outline.sides, (0.0, 0.0, 1.0))
-        truth = [[mpf(0)] * found.shape[1] for _ in found]
-        for i, j in np.argwhere(white).tolist():
-            square = [(column - 1, line - 1)
-                      for column, line in ((j, i), (j + 1, i), (j + 1, i + 1), (j, i + 1))]
-            image = exact_image(plane, view, square)
-            low = [int(mp.floor(min(point[k] for point in image))) for k in range(2)]
-            high = [int(mp.ceil(max(point[k] for point in image))) for k in range(2)]
-            left, top = (max(low[k], box[k]) for k in range(2))
-            right, bottom = (min(high[k], box[2 + k]) for k in range(2))
-            if left < right and top < bottom:
-                for v, u, share in exact_shares(image, (left, top, right, bottom)):
-                    truth[v + top - box[1]][u + left - box[0]] += share
-        worst = max(worst, *(error_of(found[i, j], truth[i][j])
-                             for i, j in np.ndindex(found.shape)))
-    table.append(("coverage", "whole markers of 12 px", count, f"{worst:.1e} px", "—"))
-    assert worst < 1e-12
 
 
 @lengths(1, 8)

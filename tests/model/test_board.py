@@ -4,9 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sweep.model.board_kinds import Charuco, Grid
-from sweep.model.board_overlap import first_overlap
-from sweep.model.marker_table import BoardMarker, Markers
+from sweep.model.board import first_overlap
+from sweep.model.board_kinds import AprilGrid, BoardMarker, Charuco, Grid, Markers
 
 DICTIONARY = "DICT_4X4_250"
 OPENCV = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
@@ -162,3 +161,34 @@ def test_a_board_that_cannot_be_is_a_value_error_with_every_fault():
     )
     with pytest.raises(ValueError, match=r"marker_m = 0.01: .*\n.*IDs from 0 to 49"):
         wrong.board()
+
+
+def test_an_april_grid_in_kalibrs_words_is_what_kalibr_prints():
+    """IDs from the bottom left, upwards; codes turned by 180 degrees against OpenCV's dictionary.
+
+    That is what kalibr_create_target_pdf draws of its codes (rotation=2): of ID 0,
+    0xd5d628584, bit 6 i + j is row i, column j of a matrix turned by 180 degrees.
+    """
+    board = AprilGrid(
+        dictionary="DICT_APRILTAG_36h11", tagCols=4, tagRows=3, tagSize=0.016, tagSpacing=0.25,
+    ).board()
+    assert board.marker_ids == tuple(range(12))
+    corners = board.corners_m
+    assert corners[0, :, :2].max() < 0  # at the bottom left
+    assert np.allclose(corners[1] - corners[0], [0.02, 0, 0])
+    assert np.allclose(corners[4] - corners[0], [0, 0.02, 0])
+    middle = np.array([0.038, 0.028])
+    low = -middle - 0.004
+    image = painted(board, low, -low, 1000)  # 2 px a module
+    expected = np.full(image.shape, 255.0)
+    theirs = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    code = np.array([[0xD5D628584 >> (6 * i + j) & 1 for j in range(6)] for i in range(6)])
+    assert (cv2.aruco.generateImageMarker(theirs, 0, 8)[1:7, 1:7] // 255 == code).all()
+    for up in range(4):
+        for column in range(5):
+            y, x = image.shape[0] - 20 * up, 20 * column
+            expected[y - 4 : y, x : x + 4] = 0
+            if up < 3 and column < 4:
+                tag = cv2.aruco.generateImageMarker(theirs, 4 * up + column, 16)
+                expected[y - 20 : y - 4, x + 4 : x + 20] = tag[::-1, ::-1]
+    assert (image == expected).all()

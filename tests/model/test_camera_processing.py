@@ -9,15 +9,14 @@ import pytest
 from support.exact_image import clipped_image, values
 from support.lengths import lengths
 from support.small_scenes import SMALL, image_of, scenes_of
-from sweep.errors import PipelineError
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import search_windows
-from sweep.measure.detector import DetectorSetting
+from sweep.measure.detectors import DetectorSetting
 from sweep.measure.flags import BoundStatus
 from sweep.model.extent import marker_boxes
-from sweep.model.jpeg import compressed
-from sweep.plan.active_parts import parts
-from sweep.plan.experiment import Pipeline
+from sweep.model.sensor import compressed
+from sweep.plan.facts import parts
+from sweep.plan.pipeline import Pipeline
 
 EVERYTHING = [
     "blur_px=0.6", "sharpening=1", "sharpening_px=1.5", "bloom=0.2", "tone_gamma=0.8",
@@ -131,14 +130,6 @@ def test_demosaicing_is_opencvs_on_the_whole_frame(pattern, method):
     assert np.abs(image - expected).max() <= 0.5 + 0.02
 
 
-def test_even_scene_of_equal_gains_stays_as_it_is():
-    for background in (0, 1, 77, 128, 254, 255):
-        settings = [f"background={background}", "distance_m=10", "quiet_zone_modules=0"]
-        for method in ("bilinear", "edge_aware"):
-            image = image_of([*settings, "bayer=RGGB", f"demosaic={method}"])
-            assert (image[:15] == background).all()
-
-
 # Windows.
 
 COMBINATIONS = {
@@ -180,48 +171,7 @@ def test_window_has_the_pixels_of_the_whole_frame(count, name):
             np.testing.assert_array_equal(image, frame[top:bottom, left:right])
 
 
-@pytest.mark.parametrize(
-    "settings", [["sharpening=1", "sharpening_px=2"], ["bayer=RGGB"], ["jpeg_quality=30"]],
-    ids=["sharpening", "bayer", "JPEG"],
-)
-def test_nothing_of_the_marker_lies_beyond_its_box(settings):
-    for bearing in (-20, 0, 13, 25):
-        given = [*settings, "distance_m=0.8", f"bearing_x_deg={bearing}"]
-        left, top, right, bottom = marker_boxes(scenes_of(given))[0].tolist()
-        image = image_of(given).copy()
-        outside = np.ones(image.shape, dtype=bool)
-        outside[top:bottom, left:right] = False
-        # The background goes through the same chain: it has one level.
-        assert len(np.unique(image[outside])) <= 1
-
-
 # Extremes.
-
-EXTREMES = [
-    ["distance_m=8"], ["black=90.4", "white=90.4"], ["black=255", "white=0", "background=255"],
-    ["jpeg_quality=1", "sharpening=100", "sharpening_px=20"], ["noise_correlation=0.99"],
-    ["sharpening_px=20", "sharpening=-1"], ["sharpening_px=1000", "blur_px=0"],
-    ["tone_gamma=0.1", "tone_toe=1", "tone_knee=-1"], ["tone_gamma=10", "bloom=-1"],
-    ["bayer_red=100", "bayer_blue=0"], ["noise_table=[0, 1e6]"], ["gain=1e6"], ["gain=1e-300"],
-    ["width_px=3", "height_px=3"], ["width_px=8", "height_px=1000"], ["full_well_e=1"],
-    ["bit_depth=16", "tone_knee=1"], ["vignetting=100", "illumination_gradient=2"],
-]
-
-
-@pytest.mark.parametrize("given", EXTREMES, ids=",".join)
-def test_extremes_of_all_together_end_without_a_warning(given):
-    image = image_of([*EVERYTHING, *given])
-    frame = scenes_of([*EVERYTHING, *given]).frame[0]
-    assert image.shape == (frame[1], frame[0])
-    assert image.dtype == np.uint8
-
-
-def test_levels_of_one_value_stay_one_value():
-    image = image_of([
-        "black=90", "white=90", "background=90", "sharpening=9", "sharpening_px=4", "bloom=1",
-        "bayer=RGGB", "jpeg_quality=100",
-    ])
-    assert (image == 90).all()
 
 
 # What follows from the declarations.
@@ -249,61 +199,6 @@ trial = 2
     assert reasons["sharpening"] == "sharpening is 0.5"
     assert "tone_toe is drawn" in reasons["toe"]
     assert "random draws" in reasons
-
-
-def test_effects_off_leave_the_bound_given():
-    text = SMALL + 'bound = "known_blur"\nnoise_grey = 2\nbayer = "none"\njpeg_quality = 0\n'
-    cells = run_cells(Pipeline.from_text(text), [])
-    assert np.asarray(cells.columns["bound"][0]).item() == BoundStatus.given
-
-
-BROKEN = {
-    "quality": ("jpeg_quality = 101", "jpeg_quality = 101: expected a whole number from 0 to 100"),
-    "half a quality": ("jpeg_quality = 0.5", "expected a whole number from 0 to 100"),
-    "drawn quality": ("jpeg_quality = { uniform = [1, 9] }", "expected a fixed value"),
-    "pattern": ('bayer = "RGBG"', "expected one of none, RGGB, BGGR, GRBG, GBRG"),
-    "method alone": ('demosaic = "edge_aware"', "expected bayer beside it"),
-    "gain alone": ("bayer_red = 0.5", "scene.bayer_red = 0.5: expected bayer beside it"),
-    "gamma": ("tone_gamma = 0", "tone_gamma = 0: expected a number from 0.1 to 10"),
-    "toe": ("tone_toe = 1.5", "tone_toe = 1.5: expected a number from -1 to 1"),
-    "radius alone": ("sharpening_px = 2", "expected sharpening beside it"),
-    "no radius": (
-        "sharpening = 1\nsharpening_px = 0", "sharpening_px = 0: expected a number above 0",
-    ),
-    "correlation": ("noise_grey = 1\nnoise_correlation = 1", "expected a number from 0 to 0.99"),
-    "correlation of nothing": (
-        "noise_correlation = 0.5", "expected noise_grey or noise_table beside it",
-    ),
-    "odd table": ("noise_table = [0, 1, 2]", "expected a list of an even number of finite numbers"),
-    "table that descends": (
-        "noise_table = [9, 1, 2, 1]", "levels that ascend from 0 to 255, deviations of at least 0",
-    ),
-    "negative deviation": ("noise_table = [9, -1]", "deviations of at least 0"),
-    "sharpening of the warp": (
-        'renderer = "warp"\nsharpening = 1', "expected renderer = exact; warp does not have it",
-    ),
-    "frame of 2 px": ('bayer = "RGGB"', "camera.width_px = 2: expected at least 3"),
-}
-
-
-@pytest.mark.parametrize("name", BROKEN)
-def test_effect_that_cannot_be_is_said_in_one_line(name):
-    lines, expected = BROKEN[name]
-    text = SMALL + lines
-    if "2 px" in name:
-        text = text.replace("width_px = 57", "width_px = 2")
-    with pytest.raises(PipelineError) as raised:
-        Pipeline.from_text(text, source="broken.toml")
-    faults = str(raised.value).splitlines()
-    assert len(faults) == 1, faults
-    assert expected in faults[0]
-
-
-def test_all_faults_of_effects_come_at_once():
-    lines = 'jpeg_quality = 101\nbayer = "X"\ntone_gamma = 0\nnoise_table = [9, 1, 2, 1]\n'
-    with pytest.raises(PipelineError) as raised:
-        Pipeline.from_text(SMALL + lines)
-    assert len(str(raised.value).splitlines()) == 4
 
 
 def test_coarse_noise_is_searched_in_wider_windows_and_steep_light_on_whole_frames():

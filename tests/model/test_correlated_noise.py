@@ -4,15 +4,16 @@ A correct sensor passes each statistical test with a probability of at least 1 -
 """
 
 import math
+import re
 
 import mpmath
 import numpy as np
 import pytest
-from scipy import stats
 
 from support.lengths import lengths
 from support.small_scenes import image_of
-from sweep.model.correlated_noise import deviations, noise_kernel, normal_field
+from sweep.model.sensor import noise_kernel, normal_field
+from sweep.plan.parameters import PARAMETERS
 
 FAR = 5.5
 """Standard deviations that a normal number exceeds with a probability of 4e-8."""
@@ -41,8 +42,17 @@ def test_weights_have_the_correlation_of_the_closed_form(correlation):
     for lag in (2, 3, 4):
         # Cut off at 5 standard deviations: exp(-12.5) = 4e-6 of the largest weight.
         assert at[lag] == pytest.approx(float(theta_ratio(sigma, lag)), abs=1e-5)
-        if correlation >= 0.3:
-            assert at[lag] == pytest.approx(correlation ** (lag**2), abs=0.03)
+
+
+def test_correlation_two_pixels_apart_is_what_the_parameter_states():
+    stated, values = re.search(
+        r"two pixels apart ([0-9., ]+) for ([0-9., ]+);",
+        PARAMETERS["noise_correlation"].declaration.meaning,
+    ).groups()
+    for number, correlation in zip(stated.split(", "), values.split(", "), strict=True):
+        kernel = noise_kernel(float(correlation))
+        digits = len(number) - 2
+        assert round(math.fsum(kernel[:-2] * kernel[2:]), digits) == float(number), correlation
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 0.5, 0.9])
@@ -67,15 +77,6 @@ def test_field_has_mean_variance_and_correlations_of_the_weights(count, correlat
         assert abs(product.mean() - expected) < FAR * deviation, (down, right)
 
 
-@pytest.mark.parametrize("correlation", [0.5, 0.95])
-def test_field_is_normal(correlation):
-    field = normal_field(np.uint64(5), 0, 0, 0, (1200, 1200), correlation)
-    # Pixels that share no white number are independent.
-    step = len(noise_kernel(correlation))
-    independent = field[::step, ::step].ravel()
-    assert stats.kstest(independent, "norm").pvalue > 1e-6
-
-
 def test_number_of_a_pixel_depends_on_the_pixel_alone():
     for correlation in (0.0, 0.5, 0.99):
         whole = normal_field(np.uint64(3), 2, 0, 0, (90, 110), correlation)
@@ -84,13 +85,6 @@ def test_number_of_a_pixel_depends_on_the_pixel_alone():
                 np.uint64(3), 2, left, top, (bottom - top, right - left), correlation
             )
             np.testing.assert_array_equal(part, whole[top:bottom, left:right])
-
-
-def test_no_correlation_is_the_limit_of_little_correlation():
-    settings = ["noise_grey=20"]
-    np.testing.assert_array_equal(image_of([*settings, "noise_correlation=0"]), image_of(settings))
-    little = image_of([*settings, "noise_correlation=1e-9"]).astype(int)
-    assert np.abs(little - image_of(settings)).max() <= 1
 
 
 # In images: levels, table, quantisation.
@@ -136,8 +130,3 @@ def test_noise_over_the_level_is_the_table(table, correlation):
         # Clipping takes less than 1e-4 of a normal number's variance beyond 4 deviations.
         theory = math.sqrt(spread**2 + 1 / 12)
         assert noise.std() == pytest.approx(theory, rel=FAR / math.sqrt(2 * pixels) + 2e-4)
-
-
-def test_deviations_go_on_beyond_the_table():
-    levels = np.array([[-20.0, 10.0, 15.0, 20.0, 300.0]])
-    assert deviations(levels, (10.0, 1.0, 20.0, 3.0)).tolist() == [[1.0, 1.0, 2.0, 3.0, 3.0]]

@@ -18,7 +18,6 @@ from scipy.special import ndtr
 from support.exact_image import (
     LENSES,
     add_part,
-    clipped_image,
     modules_of,
     plane_of,
     values,
@@ -26,18 +25,15 @@ from support.exact_image import (
     visible,
 )
 from support.lengths import first_of, lengths
-from sweep.errors import PipelineError
-from sweep.evaluation.cells import run_cells
-from sweep.evaluation.inspection import inspect_scene
+from sweep.evaluation.block import run_cells
 from sweep.measure.flags import DetectionStatus
-from sweep.model.effects import SWITCHES, Effects
+from sweep.model.effects import Effects
 from sweep.model.exposure import defocus_px, marker_exposure
 from sweep.model.extent import marker_boxes, not_modelled
 from sweep.model.renderers import marker_levels, render_all
 from sweep.model.scene import build_scenes
-from sweep.plan.cell_selection import cell
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_values
+from sweep.plan.pipeline import Pipeline
 
 NEUTRAL = {field.name: field.default for field in dataclasses.fields(Effects)}
 WIDTH, HEIGHT, FOCAL = 64, 48, 80.0
@@ -201,22 +197,6 @@ def test_blur_is_the_gaussian_of_the_exact_marker(count, sigma):
     row(f"blur {sigma} px", "scan lines by quadrature", count, worst, BLUR_TOLERANCE)
 
 
-@pytest.mark.parametrize("sigma", [1e-6, 1e-3, 3e-3, 0.01, 0.03])
-@lengths(1, 5)
-def test_blur_of_a_small_part_of_a_pixel_is_near_the_exact_image(count, sigma):
-    # The Gaussian moves 2 · 0.4 sigma of a pixel across each edge: at most 255 · 0.8 · 0.03 = 6
-    # levels at the widest; from 3e-3 px that is compared, below it vanishes (1e-3: 0.2 levels).
-    # 0.5 level is the quantisation that follows.
-    worst = 0.0
-    for value in poses(count, 2, sides=(4, 9), blur_px=sigma):
-        levels, share = clipped_image(value)
-        expected = levels + (1 - share) * value["background"]
-        if sigma >= 3e-3:
-            expected = blurred(value, sigma)
-        worst = max(worst, np.abs(frame_of(value) - expected).max())
-    row(f"blur {sigma:g} px", "clipped area", count, worst, 0.5)
-
-
 def test_blur_of_a_long_edge_is_its_closed_form():
     """A box of a pixel along the edge's normal is a trapezoid; three integrals of a Gaussian."""
     def twice(t, sigma):
@@ -282,16 +262,6 @@ def test_blur_is_scipys_filter_of_a_finer_image_also_through_a_lens(count, lens)
             worst = max(worst, np.abs(frame_of(value) - fine).max())
     print(f"\nreference at s = 8 and 16 differs by {refinement:.2g}")
     row(f"blur, lens {lens}", "gaussian_filter at s = 16", 3 * count, worst, 0.3)
-
-
-@pytest.mark.parametrize("sigma", [0.3, 2.0, 30.0])
-def test_blur_keeps_a_level_that_is_everywhere_and_lies_between_the_levels(sigma):
-    flat = scene(side_px=4000.0, black=255.0, blur_px=sigma)
-    assert np.abs(frame_of(flat) - 255).max() < 1e-3  # 6e-7 of 255 lie beyond the reach, each side
-    for value in poses(5, 4, blur_px=sigma):
-        frame = frame_of(value)
-        levels = [value[name] for name in ("background", "black", "white")]
-        assert min(levels) - 0.05 < frame.min() <= frame.max() < max(levels) + 0.05
 
 
 # Defocus: each pixel at the point spread of the marker's depth in its direction.
@@ -361,11 +331,6 @@ def test_defocus_of_a_marker_parallel_to_the_image_is_a_blur():
         sigma = confusion_px(value, 0, 0)
         worst = np.abs(frame_of(value) - blurred(value, sigma)).max()
         row(f"defocus {sigma:.2g} px", "scan lines by quadrature", 1, worst, BLUR_TOLERANCE)
-
-
-def test_marker_in_focus_is_the_sharp_one():
-    value = scene(aperture_mm=20.0, focus_distance_m=FOCAL * 0.1 / 25.0)
-    assert np.abs(frame_of(value) - sharp_of(value, whole(value))).max() < 1e-9
 
 
 # Motion: the mean of exact frames of a marker that is moved here.
@@ -534,17 +499,6 @@ def test_truth_of_a_rolling_shutter_is_the_pose_at_the_middle_row():
     np.testing.assert_array_equal(scenes.plane, build_scenes(value | NEUTRAL, 1).plane)
 
 
-@pytest.mark.parametrize("rows_per_row", [-3.0, -1.0, 0.5, 0.9, 1.1, 3.0])
-@pytest.mark.parametrize("offset_px", [-15.0, 0.0, 15.0])
-def test_marker_as_fast_as_the_shutter_is_where_its_rows_see_it(rows_per_row, offset_px):
-    """Its image is stretched, or mirrored where it overtakes the rows, and elsewhere in the frame
-    than the truth."""
-    value = scene(side_px=12.0, shift_v_px=offset_px, row_time_s=1e-3)
-    value["velocity_y_m_s"] = rows_per_row * 1e3 * value["distance_m"] / FOCAL
-    worst = np.abs(frame_of(value) - mean_of_frames(value, 1)).max()
-    row(f"rolling shutter, {rows_per_row} px a row", "rows of exact frames", 1, worst, 1e-9)
-
-
 # What a marker touches lies in its box.
 
 BOXED = {
@@ -708,13 +662,6 @@ def test_sheet_comes_from_the_side_that_is_declared():
     assert hidden[24].sum() == pytest.approx(0.3 * 25 + 25 / 7, abs=1)
 
 
-def test_sheet_also_hides_a_quiet_zone_on_a_background_of_its_own_level():
-    """Such a quiet zone cannot be seen, but the sheet on it can."""
-    value = scene(occlusion=0.3, background=255.0, occluder=100.0)
-    worst = np.abs(frame_of(value) - occluded_image(value)).max()
-    row("occlusion, white background", "polygon clipping", 1, worst, 255e-9)
-
-
 @lengths(3, 40)
 def test_occluded_marker_is_blurred_and_moved_with_its_sheet(count):
     worst = 0.0
@@ -799,12 +746,6 @@ background = 100
 side_px = [12, 30, 60]
 trial = 3
 """
-NAMED = [
-    "occlusion=0", "occlusion_deg=30", "occluder=7", "illumination_gradient=0",
-    "illumination_deg=45", "exposure_s=0", "row_time_s=0", "velocity_x_m_s=0",
-    "rotation_z_deg_s=0", "blur_px=0", "vignetting=0", "read_noise_e=0", "gain=1", "noise_grey=0",
-    "bit_depth=8",
-]
 
 
 def images(text, settings=()):
@@ -818,22 +759,6 @@ def images(text, settings=()):
     windows = np.concatenate([np.zeros_like(scenes.frame), scenes.frame], axis=1)
     frames = np.stack(render_all(scenes, np.arange(count), marker_boxes(scenes), windows))
     return frames.reshape(*shape, *frames.shape[1:]), [axis.name for axis in axes], scenes
-
-
-@pytest.mark.parametrize("distortion", ["[]", "[-0.2, 0.05, 0, 0]"])
-@pytest.mark.parametrize("renderer", ["exact", "warp", "supersample-2"])
-def test_effects_that_are_named_but_neutral_change_no_bit(renderer, distortion):
-    common = [f"renderer={renderer}", f"distortion={distortion}"]
-    before, _, _ = images(PLAIN, common)
-    after, _, scenes = images(PLAIN, common + NAMED)
-    assert np.array_equal(before, after)
-    assert scenes.effects is None
-    results = [
-        run_cells(Pipeline.from_text(PLAIN, given), [np.repeat(range(3), 3), np.tile(range(3), 3)])
-        for given in (common, common + NAMED)
-    ]
-    for name, columns in results[0].columns.items():
-        np.testing.assert_array_equal(results[1].columns[name], columns, err_msg=name)
 
 
 @pytest.mark.parametrize(
@@ -852,11 +777,6 @@ def test_neutral_entry_of_an_axis_is_the_image_without_it_bit_for_bit(axis, neut
     assert np.array_equal(np.take(after, neutral, axis=position), before)
     if not axis.startswith("bit_depth"):
         assert not np.array_equal(np.take(after, 1 - neutral, axis=position), before)
-
-
-def test_every_switch_is_neutral_at_its_declared_default():
-    for name, off in SWITCHES.items():
-        assert NEUTRAL[name] == off
 
 
 # Extremes: each ends, within seconds, without a warning.
@@ -934,77 +854,6 @@ def test_extreme_ends_within_seconds_without_a_warning(name):
 
 # Files that cannot be run.
 
-BROKEN = {
-    "negative blur": ("blur_px = -1", "scene.blur_px = -1: expected a number from 0 to 1000"),
-    "blur that is no number": ("blur_px = nan", "scene.blur_px = nan: expected a number"),
-    "blur of 1001 px": ("blur_px = 1001", "scene.blur_px = 1001: expected a number from 0 to 1000"),
-    "exposure without a velocity": (
-        "exposure_s = 0.1",
-        "scene.exposure_s = 0.1: expected one of velocity_x_m_s, velocity_y_m_s",
-    ),
-    "rows without a velocity": (
-        "row_time_s = 1e-3",
-        "scene.row_time_s = 0.001: expected one of velocity_x_m_s, velocity_y_m_s",
-    ),
-    "a velocity without an exposure": (
-        "velocity_x_m_s = 1",
-        "scene.velocity_x_m_s = 1: expected exposure_s or row_time_s beside it",
-    ),
-    "negative exposure": (
-        "exposure_s = -0.1\nvelocity_x_m_s = 1",
-        "scene.exposure_s = -0.1: expected a number from 0",
-    ),
-    "an aperture of 0": (
-        "aperture_mm = 0\nfocus_distance_m = 1", "scene.aperture_mm = 0: expected a number above 0",
-    ),
-    "an aperture without a focus": (
-        "aperture_mm = 2", "scene.aperture_mm = 2: expected focus_distance_m beside it",
-    ),
-    "a focus without an aperture": (
-        "focus_distance_m = 2", "scene.focus_distance_m = 2: expected aperture_mm beside it",
-    ),
-    "a focus at 0": (
-        "aperture_mm = 2\nfocus_distance_m = 0",
-        "scene.focus_distance_m = 0: expected a number above 0",
-    ),
-    "blur by the paper's renderer": (
-        'blur_px = 1\nrenderer = "warp"',
-        "scene.blur_px = 1: expected renderer = exact; warp does not have it",
-    ),
-    "occlusion by samples": (
-        'occlusion = 0.5\nrenderer = "supersample-2"',
-        "scene.occlusion = 0.5: expected renderer = exact; supersample-2 does not have it",
-    ),
-    "more than all hidden": (
-        "occlusion = 1.5", "scene.occlusion = 1.5: expected a number from 0 to 1",
-    ),
-    "negative vignetting": ("vignetting = -1", "scene.vignetting = -1: expected a number from 0"),
-    "an endless velocity": (
-        "velocity_x_m_s = inf\nexposure_s = 1", "scene.velocity_x_m_s = inf: expected a number",
-    ),
-    "an effect of another section": (
-        "", "pose.blur_px: unknown key; it belongs under [scene]",
-    ),
-    "a misspelt effect": ("blurr_px = 1", "scene.blurr_px: unknown key; did you mean blur_px?"),
-    "a string for a number": ('blur_px = "much"', 'scene.blur_px = "much": expected a number'),
-    "an axis with a negative blur": (
-        "[axes]\nblur_px = [0, -1]", "axes.blur_px = [0, -1]: expected a number from 0 to 1000",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", BROKEN)
-def test_effect_that_cannot_be_said_in_one_line(name):
-    lines, expected = BROKEN[name]
-    misplaced = "blur_px = 1\n" if not lines else ""
-    text = f"[pose]\ndistance_m = 1\n{misplaced}[scene]\n{lines}\n"
-    with pytest.raises(PipelineError) as raised:
-        Pipeline.from_text(text, source="broken.toml")
-    faults = str(raised.value).splitlines()
-    assert len(faults) == 1, faults
-    assert faults[0].startswith("broken.toml: ")
-    assert expected in faults[0]
-
 
 def test_flags_tell_a_pose_whose_motion_has_no_image():
     text = "[pose]\nside_px = 40\n[scene]\nvelocity_z_m_s = -1\nexposure_s = 10\n"
@@ -1037,15 +886,3 @@ blur_px = [0, 0.8]
         alone = run_cells(pipeline, [index[k : k + 1] for index in indices]).columns
         for name, (column,) in alone.items():
             np.testing.assert_array_equal(column[0], together[name][0][k], err_msg=name)
-
-
-def test_every_cell_of_a_grid_with_an_exposure_of_0_can_be_looked_at():
-    pipeline = Pipeline.from_text("""
-[pose]
-side_px = 40
-[scene]
-velocity_x_m_s = 0.1
-[axes]
-exposure_s = [0, 0.01]
-""")
-    assert inspect_scene(cell(pipeline, "")).detection is DetectionStatus.detected

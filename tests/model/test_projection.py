@@ -8,7 +8,6 @@ import pytest
 from mpmath import mp, mpf
 
 from support.fifty_digits import (
-    AXES,
     INVERTED,
     LENSES,
     doubles,
@@ -16,18 +15,13 @@ from support.fifty_digits import (
     exact_distortion,
     exact_pixels,
     exact_pose,
-    rotation_about,
     values,
 )
 from support.lengths import lengths
 from sweep.model import lens
 from sweep.model.extent import areas_px
 from sweep.model.pose import (
-    angle_between,
     mirrored,
-    rotation_of_angles,
-    rotation_of_vector,
-    vector_of_rotation,
 )
 from sweep.model.scene import build_scenes
 
@@ -95,16 +89,6 @@ def test_pose_is_what_fifty_digits_say(count):
     assert worst.max() < 2e-15
 
 
-def test_tiny_tilt_is_not_lost():
-    # Relative: 1 - cos(tilt) is taken as 2 sin², so that even its third order survives.
-    tilt = 1e-12
-    rotation = rotation_of_angles(tilt, 0.3, 0.0)[0]
-    axis = mp.cos(mpf(0.3)), mp.sin(mpf(0.3)), 0
-    exact = rotation_about(axis, mpf(tilt)) * mp.diag([1, -1, -1])
-    assert rotation[2, :2] == pytest.approx(doubles(exact)[2, :2], rel=1e-15)
-    assert rotation[0, 1] == pytest.approx(float(exact[0, 1]), rel=1e-12)
-
-
 # The lens.
 
 @pytest.mark.parametrize("coefficients", [(), *LENSES.values()], ids=[0, *LENSES])
@@ -140,21 +124,6 @@ def test_distortion_and_its_jacobian_are_those_of_fifty_digits(coefficients):
     # Measured 2.2e-16 and 3.3e-16: roundings.
     assert worst[0] < 1e-14
     assert worst[1] < 1e-13
-
-
-@pytest.mark.parametrize("coefficients", INVERTED.values(), ids=INVERTED)
-def test_undistortion_inverts_the_lens(coefficients):
-    packed = lens.pack(coefficients)
-    radius = np.linspace(0, min(0.98 * packed[23], 1.0), 5000)[:, None]
-    turns = np.radians([0, 50, 100, 200, 290])
-    points = np.stack([radius * np.cos(turns), radius * np.sin(turns)], axis=-1)
-    packed = np.repeat(packed[None], len(points), axis=0)
-    found = lens.undistort_points(lens.distort_points(points, packed), packed)
-    lost = np.isnan(found).any(axis=2)
-    print(f"{lost.sum()} of {lost.size} not found, worst {np.nanmax(np.abs(found - points)):.1e}")
-    assert not lost.any()
-    # Measured 2.8e-15: near a fold the inverse has a slope of some tens.
-    assert np.abs(found - points).max() < 1e-13
 
 
 def test_undistortion_of_a_point_outside_the_lens_image_is_not_found():
@@ -220,65 +189,6 @@ def test_fold_by_tangential_terms_is_told():
 
 
 # Rotations.
-
-
-@pytest.mark.parametrize("axis", AXES, ids=str)
-def test_rotation_vector_keeps_its_digits_from_tiny_angles_to_pi(axis):
-    # The matrix is rounded from 50 digits: its antisymmetric part holds small angles, and its
-    # symmetric part angles near pi, to about 1e-16 relative, so the vector can be as good.
-    # Measured 3.6e-16 of the angle; pi less 1e-12 is told from pi.
-    unit = mp.matrix(axis) / mp.norm(mp.matrix(axis))
-    worst = 0.0
-    small = [mpf(10) ** -power for power in range(13)]
-    for angle in (*small, mpf(2), mpf(3), *(mp.pi - angle for angle in small[3:])):
-        rotation = doubles(rotation_about(unit, angle))
-        truth = doubles(angle * unit)[:, 0]
-        miss = np.linalg.norm(vector_of_rotation(rotation) - truth) / float(angle)
-        worst = max(worst, miss)
-        assert np.abs(rotation_of_vector(truth) - rotation).max() < 1e-15
-    print(f"worst vector {worst:.1e} of its angle")
-    assert worst < 1e-12
-
-
-@pytest.mark.parametrize("axis", AXES, ids=str)
-def test_half_turn_has_one_of_its_two_vectors(axis):
-    unit = mp.matrix(axis) / mp.norm(mp.matrix(axis))
-    vector = vector_of_rotation(doubles(2 * unit * unit.T - mp.eye(3)))
-    truth = doubles(mp.pi * unit)[:, 0]
-    assert min(np.abs(vector - truth).max(), np.abs(vector + truth).max()) < 1e-15
-
-
-def test_no_rotation_has_the_zero_vector_and_back():
-    assert np.array_equal(vector_of_rotation(np.eye(3)), np.zeros(3))
-    assert (rotation_of_vector(np.zeros((2, 3))) == np.eye(3)).all()
-
-
-@lengths(200, 5000)
-def test_rotation_vector_and_matrix_are_inverse(count):
-    rng = np.random.default_rng(8)
-    vectors = rng.normal(size=(count, 3))
-    vectors *= (rng.uniform(0, np.pi, count) / np.linalg.norm(vectors, axis=1))[:, None]
-    again = vector_of_rotation(rotation_of_vector(vectors))
-    worst = np.abs(again - vectors).max()
-    print(f"{count} vectors: worst entry {worst:.1e}")
-    assert worst < 1e-14  # measured 9e-16
-
-
-@pytest.mark.parametrize("size", [1e-12, 1e-8, 1e-4, 1.0])
-def test_angle_between_vectors_is_stable_near_zero_and_pi(size):
-    # (1, 0, 0) and (±1, size, 0) are doubles, so the angle is atan(size) or pi minus it.
-    along, near = np.array([1.0, 0.0, 0.0]), np.array([1.0, size, 0.0])
-    angle = mp.atan(mpf(size))
-    assert angle_between(along, near) == pytest.approx(float(angle), rel=1e-15)
-    assert angle_between(along, -near) == pytest.approx(float(mp.pi - angle), rel=1e-15)
-    # Of any direction: a cross product of unit vectors is off by 1e-16, an acos by 1e-8.
-    rng = np.random.default_rng(9)
-    for a, change in rng.normal(size=(20, 2, 3)):
-        b = a + size * change
-        x, y = mp.matrix(a.tolist()), mp.matrix(b.tolist())
-        cosine = (x.T * y)[0] / mp.norm(x) / mp.norm(y)
-        assert angle_between(a, b) == pytest.approx(float(mp.acos(cosine)), abs=1e-15)
-        assert angle_between(a, -b) == pytest.approx(float(mp.acos(-cosine)), abs=1e-15)
 
 
 @lengths(40, 300)

@@ -4,15 +4,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sweep.model.pose import rotation_of_angles
-from sweep.model.rotations import (
+from sweep.model.pose import (
     ABOUT_X_180,
     angles_of_rotation,
+    orientation,
+    pose_in_camera,
+    rotation_of_angles,
     rotation_of_view_angle,
     rotation_of_yaw_pitch_roll,
     towards,
 )
-from sweep.model.world import orientation, pose_in_camera
 
 TOLERANCE = 4e-15
 """Of an element: some ten roundings of sines, cosines and their products, each of 1.1e-16."""
@@ -33,17 +34,6 @@ def test_yaw_pitch_and_roll_are_scipys_intrinsic_y_x_z_angles():
     np.testing.assert_allclose(found, expected @ ABOUT_X_180, atol=TOLERANCE)
     upright = rotation_of_yaw_pitch_roll(*np.zeros((3, 1)))[0]
     np.testing.assert_array_equal(upright, np.diag([1, -1, -1]))  # faces the camera
-
-
-@pytest.mark.parametrize(
-    ("angles", "corner", "direction"),
-    [((30, 0, 0), (0, 0, 1), (-0.5, 0, -np.sqrt(0.75))),   # its face turns to the image's left
-     ((0, 30, 0), (0, 0, 1), (0, 0.5, -np.sqrt(0.75))),    # its face turns down
-     ((0, 0, 30), (1, 0, 0), (np.sqrt(0.75), 0.5, 0))],    # clockwise in the image
-)
-def test_the_senses_of_yaw_pitch_and_roll(angles, corner, direction):
-    rotation = rotation_of_yaw_pitch_roll(*np.radians(angles)[:, None])[0]
-    np.testing.assert_allclose(rotation @ corner, direction, atol=TOLERANCE)
 
 
 def test_tilt_azimuth_and_roll_of_a_rotation_are_those_that_make_it():

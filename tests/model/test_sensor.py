@@ -11,17 +11,16 @@ from scipy import stats
 
 from support.lengths import lengths
 from support.windows import outcomes_elsewhere
-from sweep.errors import PipelineError
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search, search_windows, visibility_flags
-from sweep.measure.detector import REFINEMENTS, DetectorSetting
+from sweep.measure.detectors import REFINEMENTS, DetectorSetting
 from sweep.measure.flags import DetectionStatus
 from sweep.model import sensor
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import marker_levels, render_all
 from sweep.model.scene import build_scenes
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes, scene_values
+from sweep.plan.pipeline import Pipeline
 
 UNLIKELY = 1e-6
 FAR = 5.5
@@ -182,18 +181,6 @@ def test_noise_is_that_of_the_scene_whatever_renderer_window_and_levels(noise):
     assert np.array_equal(flat(128, *noise, seed=1, trial=0), image)
 
 
-def test_noise_of_other_levels_and_strengths_is_the_same_noise():
-    image = flat(128, "noise_grey=10").astype(int)
-    assert np.array_equal(flat(120, "noise_grey=10") + 8, image)
-    twice = flat(128, "noise_grey=20").astype(int)
-    # Each is rounded once: 2 · 0.5 + 0.5.
-    assert np.abs(twice - 128 - 2 * (image - 128)).max() <= 1.5
-    read = flat(128, "full_well_e=1e9", "read_noise_e=4e7").astype(float)
-    stronger = flat(128, "full_well_e=1e9", "read_noise_e=8e7").astype(float)
-    inside = (stronger > 0) & (stronger < 255)
-    assert np.abs(stronger - 128 - 2 * (read - 128))[inside].max() <= 1.51
-
-
 @pytest.mark.parametrize("noise", ["noise_grey=20", "full_well_e=300"])
 def test_noise_of_a_pixel_does_not_depend_on_the_window(noise):
     rng = np.random.default_rng(8)
@@ -249,15 +236,6 @@ def test_full_well_and_saturation_clip():
     assert (flat(0, "full_well_e=1000", "gain=2") == 0).all()
 
 
-def test_brightness_is_kept_and_read_noise_is_not_clipped_before_it_is_read_out():
-    # Full wells and read noise: electrons below 0 are negative voltages, clipped by quantisation.
-    image = flat(0, "full_well_e=1000", "read_noise_e=40").astype(float)
-    deviation = 40 * 255 / 1000
-    upper = stats.norm.cdf((np.arange(256) + 0.5) / deviation)
-    counts = np.bincount(image.astype(int).ravel(), minlength=256)
-    assert chi_square(counts, np.diff(upper, prepend=0.0), image.size) > UNLIKELY
-
-
 # Quantisation.
 
 def test_quantisation_is_rounding_half_up_clipped_and_seen_in_8_bits():
@@ -292,35 +270,7 @@ background = 90.4
     row("gain, 8-16 bits, clipping", "integers of NumPy", cases, worst, 0)
 
 
-def test_finer_bits_follow_the_levels_more_closely_than_8():
-    # 8 bits are what OpenCV sees: of more bits, only levels near a half may come out otherwise.
-    eight = flat(100.4999, "gain=1.00001")
-    assert (eight == 101).all()
-    assert (flat(100.49, "bit_depth=16") == 100).all()
-
-
 # Extremes.
-
-@pytest.mark.parametrize(
-    "given",
-    [
-        ["full_well_e=1"], ["full_well_e=1e9"], ["full_well_e=1e9", "read_noise_e=1e9"],
-        ["noise_grey=1e6"], ["noise_grey=1e6", "gain=1e6"], ["gain=1e6"], ["gain=1e-300"],
-        ["full_well_e=1.5", "gain=1e6", "noise_grey=1e6", "bit_depth=16", "read_noise_e=1e9"],
-        ["noise_grey=1e-300"], ["full_well_e=2", "read_noise_e=1e-300"],
-        ["full_well_e=1e9", "illumination_gradient=2", "vignetting=100", "white=0", "black=0"],
-    ],
-    ids=",".join,
-)
-@pytest.mark.parametrize("size", [(1, 1), (8, 8), (640, 480)])
-def test_extreme_noise_ends_without_a_warning(given, size):
-    text = "[pose]\nside_px = 12\n[scene]\nbackground = 77.7\n"
-    settings = [*given, f"width_px={size[0]}", f"height_px={size[1]}"]
-    image = image_of(Pipeline.from_text(text, settings))
-    assert image.shape == size[::-1]
-    if given == ["noise_grey=1e6"] and size[0] == 640:
-        # Black or white, nearly all of it.
-        assert np.isin(image, (0, 255)).mean() > 0.99
 
 
 # Windows.
@@ -393,54 +343,3 @@ def test_window_finds_what_the_frame_holds_under_noise(count, refinement):
 
 
 # Files that cannot be run.
-
-BROKEN = {
-    "7 bits": ("bit_depth = 7", "scene.bit_depth = 7: expected a whole number from 8 to 16"),
-    "17 bits": ("bit_depth = 17", "scene.bit_depth = 17: expected a whole number from 8 to 16"),
-    "half a bit": ("bit_depth = 8.5", "scene.bit_depth = 8.5: expected a whole number from 8 to"),
-    "read noise without a full well": (
-        "read_noise_e = 3", "scene.read_noise_e = 3: expected full_well_e beside it",
-    ),
-    "negative read noise": (
-        "full_well_e = 9\nread_noise_e = -3", "scene.read_noise_e = -3: expected a number from 0",
-    ),
-    "no gain": ("gain = 0", "scene.gain = 0: expected a number above 0"),
-    "negative gain": ("gain = -1", "scene.gain = -1: expected a number above 0"),
-    "no full well": ("full_well_e = 0", "scene.full_well_e = 0: expected a number from 1"),
-    "noise that is no number": ("noise_grey = nan", "scene.noise_grey = nan: expected a number"),
-    "endless noise": ("noise_grey = inf", "scene.noise_grey = inf: expected a number from 0"),
-    "negative noise": ("noise_grey = -1", "scene.noise_grey = -1: expected a number from 0"),
-    "drawn bits": (
-        "bit_depth = { uniform = [8, 16] }", "expected a fixed value; only these can be drawn",
-    ),
-    "trials of nothing random": (
-        "gain = 2\n[axes]\ntrial = 2", "axes.trial = 2: expected something random to repeat",
-    ),
-    "trials of noise of strength 0": (
-        "noise_grey = 0\n[axes]\ntrial = 2", "axes.trial = 2: expected something random to repeat",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", BROKEN)
-def test_sensor_that_cannot_be_is_said_in_one_line(name):
-    lines, expected = BROKEN[name]
-    with pytest.raises(PipelineError) as raised:
-        Pipeline.from_text(
-            f"[pose]\ndistance_m = 1\n[scene]\n{lines}\n", source="broken.toml"
-        )
-    faults = str(raised.value).splitlines()
-    assert len(faults) == 1, faults
-    assert faults[0].startswith("broken.toml: ")
-    assert expected in faults[0]
-
-
-@pytest.mark.parametrize(
-    "lines",
-    ["noise_grey = 1", "full_well_e = 1000", "full_well_e = { uniform = [100, 1000] }",
-     "noise_grey = { uniform = [0, 5] }", "blur_px = { uniform = [0, 2] }"],
-)
-def test_trials_of_noise_or_of_a_drawn_effect_are_run(lines):
-    text = f"[pose]\nside_px = 40\n[scene]\n{lines}\n[axes]\ntrial = 2\n"
-    pipeline = Pipeline.from_text(text)
-    assert (image_of(pipeline, 0) != image_of(pipeline, 1)).any()

@@ -84,13 +84,6 @@ def test_sharpening_of_a_long_edge_is_its_closed_form(amount, radius):
     assert (image == image[22]).all()
 
 
-def test_amount_zero_and_a_radius_of_next_to_nothing_change_no_pixel():
-    blurred = image_of(["blur_px=0.8"])
-    np.testing.assert_array_equal(image_of(["blur_px=0.8", "sharpening=0"]), blurred)
-    tiny = image_of(["blur_px=0.8", "sharpening=1", "sharpening_px=1e-4"])
-    np.testing.assert_array_equal(tiny, blurred)
-
-
 def test_sharpening_leaves_the_noise_as_it_is_and_follows_gain_and_light():
     plain = "black=100", "white=140", "background=90", "blur_px=0.6"
     sharp = *plain, "sharpening=1", "sharpening_px=1.5"

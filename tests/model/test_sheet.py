@@ -10,9 +10,9 @@ from support.exact_image import LENSES, modules_of, plane_of, values
 from sweep.model.effects import NEUTRAL
 from sweep.model.exposure import marker_exposure
 from sweep.model.extent import areas_px, hidden, marker_boxes, not_modelled
-from sweep.model.image_shift import shift_waves
-from sweep.model.renderers import marker_levels, render
+from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
+from sweep.model.scene_sheet import shift_waves
 
 LEVELS = {"black": 10.0, "white": 240.0, "background": 100.0}
 
@@ -148,14 +148,6 @@ def test_area_of_a_bent_marker_is_that_of_its_curved_outline(bend, curvature, di
     u, v = (flat * value["fx_px"]).T
     area = abs(np.sum(u * np.roll(v, -1) - v * np.roll(u, -1))) / 2
     assert abs(found - area) < 100 * 1e-4
-
-
-def test_a_bend_of_nothing_is_the_flat_marker():
-    value, scenes = scenes_of(curvature_per_m=1e-12, tilt_deg=50.0, roll_deg=20.0)
-    flat = build_scenes(value | {"curvature_per_m": 0.0}, 1)
-    levels, share = marker_levels(flat, 0, (0, 0, 48, 44))
-    expected = levels + (1 - share) * value["background"]
-    assert np.abs(exact_frame(scenes, value) - expected).max() < 0.01
 
 
 def test_true_pose_and_corners_are_those_of_the_tangent_plane():

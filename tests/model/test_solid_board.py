@@ -7,15 +7,14 @@ from scipy.spatial.transform import Rotation
 
 from support.solid_pictures import traced
 from sweep.errors import PipelineError
-from sweep.evaluation.board_search import board_scenes
-from sweep.evaluation.cells import run_cells
-from sweep.evaluation.search import visibility_flags
+from sweep.evaluation.block import run_cells
+from sweep.evaluation.search import board_scenes, visibility_flags
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.renderers import marker_levels
 from sweep.model.scene import build_scenes
-from sweep.plan.boards import largest_board
-from sweep.plan.experiment import Pipeline
+from sweep.plan.experiment import largest_board
 from sweep.plan.grid import scene_values
+from sweep.plan.pipeline import Pipeline
 
 LEVELS = 120.0, 10.0, 230.0
 

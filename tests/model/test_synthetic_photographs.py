@@ -4,12 +4,9 @@ import json
 
 import cv2
 import numpy as np
-import pytest
 
-from support.photographs import WEBCAM, photographs, save
+from support.photographs import photographs, save
 from sweep.model.board_kinds import Charuco
-from sweep.model.calibration import calibration_of
-from sweep.model.structured_text import read_tree
 
 BOARD = Charuco(
     dictionary="DICT_4X4_50", squares_x=5, squares_y=4, square_m=0.03, marker_m=0.022
@@ -44,33 +41,3 @@ def test_opencv_finds_the_board_where_it_is(tmp_path):
         turn = rotation @ np.array(pose["rotation"]).T
         assert np.degrees(np.arccos(min((np.trace(turn) - 1) / 2, 1.0))) < 2
         assert np.linalg.norm(translation - pose["translation"]) < 0.03 * translation[2]
-
-
-def test_the_camera_file_is_the_camera(tmp_path):
-    file = save(tmp_path, [], CAMERA)
-    camera = calibration_of(read_tree(file.read_bytes()))
-    assert (camera.width_px, camera.height_px, camera.fx_px) == (320, 240, 300.0)
-    assert (camera.cx_px, camera.distortion[:2]) == (159.5, (-0.1, 0.02))
-
-
-@pytest.mark.long
-def test_equal_seeds_give_equal_photographs_and_each_effect_changes_them():
-    effects = WEBCAM | {
-        "curvature_per_m": 0.5, "bend": "saddle", "bayer": "RGGB", "jpeg_quality": 80,
-        "tone_knee": 0.2, "tone_toe": 0.2, "noise_table": (0.0, 3.0, 255.0, 1.0),
-    }
-    small = CAMERA | {"width_px": 160, "height_px": 120, "fx_px": 150.0}
-    (image,) = (each.image for each in photographs(BOARD, small, 1, 3, effects))
-    (again,) = (each.image for each in photographs(BOARD, small, 1, 3, effects))
-    assert np.array_equal(image, again)
-    for name in ("sharpening", "bloom", "tone_gamma", "blur_px", "noise_grey", "geometry_px",
-                 "curvature_per_m", "bayer", "jpeg_quality", "tone_knee", "tone_toe",
-                 "noise_table", "illumination_gradient"):
-        less = {key: value for key, value in effects.items() if key != name}
-        (other,) = (each.image for each in photographs(BOARD, small, 1, 3, less))
-        assert not np.array_equal(image, other), name
-
-
-def test_an_effect_that_there_is_not_is_refused():
-    with pytest.raises(ValueError, match="sharpning"):
-        photographs(BOARD, CAMERA, 1, 3, {"sharpning": 1.0})

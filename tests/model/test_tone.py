@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from support.exact_image import clipped_image, values
 from support.small_scenes import image_of
-from sweep.model.tone import apply_tone, bloomed
+from sweep.model.sensor import apply_tone
 
 SLOPES = st.floats(-1, 1)
 GAMMAS = st.floats(0.1, 10)
@@ -42,31 +42,6 @@ def test_response_is_its_closed_form(share, gamma, toe, knee):
     assert level == pytest.approx(expected, rel=1e-13, abs=1e-13)
 
 
-@EXAMPLES
-@given(gamma=GAMMAS, toe=SLOPES, knee=SLOPES)
-def test_response_grows_from_black_to_white_and_ends_on_the_scale(gamma, toe, knee):
-    levels = toned(np.linspace(0, 255, 4097), gamma, toe, knee)
-    # A rounding of a share, at slope 0: neighbours may be equal, never exchanged by more.
-    assert (np.diff(levels) >= -1e-12).all()
-    assert levels[0] == 0.0
-    assert levels[-1] == 255.0
-    assert levels[2048] == pytest.approx(255 * 0.5**gamma)
-    assert toned([-40, 300], gamma, toe, knee).tolist() == [0.0, 255.0]
-
-
-def test_ends_of_the_curve_have_the_stated_slopes():
-    h = 1e-6
-    for toe, knee in ((0.5, 0.0), (-1.0, 0.3), (1.0, 1.0)):
-        low, high, middle = (
-            np.diff(toned([255 * (at - h), 255 * (at + h)], 1.0, toe, knee))[0] / (510 * h)
-            for at in (h, 1 - h, 0.5)
-        )
-        # The curvature at the ends is at most 8, times the step.
-        assert low == pytest.approx(1 - toe, abs=1e-5)
-        assert high == pytest.approx(1 - knee, abs=1e-5)
-        assert middle == pytest.approx(1, abs=1e-5)
-
-
 def test_neutral_response_is_the_identity_to_the_bit():
     levels = np.random.default_rng(3).uniform(0, 255, 1000)
     levels[:6] = 0.0, 255.0, 127.5, 1e-300, 254.99999999999997, 100.0
@@ -88,21 +63,6 @@ def test_image_has_the_response_to_each_level(background):
 
 
 # Bloom.
-
-@EXAMPLES
-@given(
-    bloom=SLOPES, ends=st.tuples(st.floats(0, 255), st.floats(0, 255)),
-    levels=st.lists(st.floats(-50, 400), min_size=2, max_size=20),
-)
-def test_bloom_keeps_order_ends_and_what_lies_outside(bloom, ends, levels):
-    levels = np.sort(levels)[None]
-    grown = bloomed(levels, *ends, bloom)
-    assert (np.diff(grown) >= -1e-9).all()
-    dark, bright = sorted(ends)
-    outside = (levels <= dark) | (levels >= bright)
-    np.testing.assert_array_equal(grown[outside], levels[outside])
-    if bloom >= 0:
-        assert (grown >= levels).all()
 
 
 def test_bloom_is_the_term_in_share_times_the_rest():

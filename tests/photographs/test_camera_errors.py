@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 
 from support.board_photographs import POSES, SIZE, VIEW, board, camera
-from sweep.photographs.board_truth import unshared_variance
-from sweep.photographs.calibrate import calibrate
-from sweep.photographs.cameras import camera_of_file, known_camera
-from sweep.photographs.corners import FoundCorners
+from sweep.photographs.board_check import calibrate
+from sweep.photographs.folder import FoundCorners
 from sweep.photographs.pose_fit import Lens, fit_pose
+from sweep.photographs.truth import camera_of_file, known_camera, unshared_variance
 
 LENS = Lens.of(*VIEW, (0.1, -0.2, 0.001, -0.001, 0.05))
 NONE = np.empty(0, dtype=np.int64)

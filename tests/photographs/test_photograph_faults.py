@@ -1,5 +1,7 @@
 """Photographs, boards and cameras that do not fit: a line each, which says what to change."""
 
+import os
+
 import cv2
 import numpy as np
 import pytest
@@ -79,6 +81,7 @@ def test_what_is_left_out_and_converted_is_said(folder, tmp_path):
         cv2.imwrite(str(shots / f"deep{number}.png"), grey.astype(np.uint16) * 257)
     cv2.imwrite(str(shots / "colour.png"), cv2.merge([grey, grey // 2, grey]))
     (shots / "cut.jpg").write_bytes(b"\xff\xd8\xff")
+    (shots / os.fsdecode(b"\xff.png")).write_bytes((shots / "deep0.png").read_bytes())
     (shots / "notes.txt").write_text("no photograph")
     made = prepare(
         [shots], folder / "camera.json", board=folder / "board.toml", home=tmp_path
@@ -86,5 +89,6 @@ def test_what_is_left_out_and_converted_is_said(folder, tmp_path):
     said = "\n".join(made.lines)
     assert "left out notes.txt: no images" in said
     assert "left out cut.jpg" in said
+    assert "\\udcff.png (its name is not UTF-8" in said
     assert "2 of 3 photographs have 16 bits" in said
     assert "1 of 3 photographs are in colour" in said

@@ -142,14 +142,6 @@ def test_the_other_camera_is_the_truth_in_two_folders_and_side_by_side(stereo, t
             assert np.median(error) < 0.01  # of 0.3 m; poses by four corners of 25 px
 
 
-def test_without_truth_poses_are_the_markers_own(folder, tmp_path):
-    made = prepare([folder / "shots"], folder / "camera.json", settings=SINGLE, home=tmp_path)
-    record = record_of(made)
-    assert made.lines[-1].endswith("truth: none")
-    error = np.linalg.norm(record.translation[0] - marker_poses(POSES[0])[1], axis=1)
-    assert np.nanmedian(error) < 0.01
-
-
 def test_one_photograph_is_measured_without_intervals(folder, tmp_path):
     shots = tmp_path / "one"
     shots.mkdir()

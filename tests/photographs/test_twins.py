@@ -8,14 +8,14 @@ import xarray as xr
 from support.board_photographs import BOARD, POSES, write_set
 from support.here import calls_here
 from sweep.errors import SweepError
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells
 from sweep.execution.runner import execute
 from sweep.measure.flags import DetectionStatus
 from sweep.photographs.prepare import prepare
 from sweep.photographs.twins import read_scene, twin_pipeline
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
 from sweep.plan.photographs import read_record
+from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import open_dataset
 
 SCENE = {
@@ -74,12 +74,6 @@ def test_what_is_drawn_of_a_photograph_is_the_same_for_all_its_markers(prepared)
     assert np.array_equal(scene_values(twins, some)["blur_px"].values, blur.ravel()[3:9])
 
 
-def test_the_ground_has_the_median_level_of_black(prepared):
-    assert twin_pipeline(prepared, {"black": 35}).fixed["background"] == 35
-    assert twin_pipeline(prepared, {"black": {"uniform": [20, 40]}}).fixed["background"] == 30
-    assert twin_pipeline(prepared, {"black": 35, "background": 9}).fixed["background"] == 9
-
-
 def test_the_quiet_zone_is_as_wide_as_the_board_leaves_clear(prepared):
     twins = twin_pipeline(prepared, {})
     clear = (BOARD["square_m"] - BOARD["marker_m"]) / 2 / (BOARD["marker_m"] / 6)
@@ -100,19 +94,6 @@ def test_blocks_of_any_size_give_the_same_store_without_the_photographs(prepared
     small, large = (open_dataset(str(store)).load() for store in stores)
     xr.testing.assert_identical(small.drop_attrs(), large.drop_attrs())
     assert small.photograph.values.tolist() == ["shot0.png", "shot1.png", "shot2.png"]
-
-
-@pytest.mark.parametrize(("scene", "repeats", "expected"), [
-    ({"blur": 1.0}, 1, "scene.blur: unknown key.*blur_px"),
-    ({"distance_m": 1.0}, 1, "it belongs under .pose."),
-    ({"blur_px": -1.0}, 1, "blur_px = -1.0: expected"),
-    ({"black": {"normal": [1]}}, 1, "black"),
-    ({}, 0, "repeats = 0: expected at least 1"),
-])
-def test_a_scene_that_cannot_be_is_one_line(prepared, scene, repeats, expected):
-    with pytest.raises(SweepError, match=expected) as caught:
-        twin_pipeline(prepared, scene, repeats)
-    assert "\n" not in str(caught.value)
 
 
 def test_only_photographs_have_twins(prepared, tmp_path):

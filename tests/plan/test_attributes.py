@@ -7,11 +7,10 @@ from matplotlib.figure import Figure
 
 import sweep.analysis
 from support.example_results import example_results
-from sweep.plan.attributes import short_name, with_descriptions
-from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import PARAMETERS
-from sweep.plan.schema import SCHEMA
-from sweep.store.layout import FORMATS, RECEIPTS, planned_arrays
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.schema import SCHEMA, short_name, with_descriptions
+from sweep.store.layout import RECEIPTS, planned_arrays
 
 MAX_LINE = 30
 """Characters after which xarray breaks a label; three lines fit beside a chart."""
@@ -25,10 +24,9 @@ EVERYTHING = {
 }
 
 
-@pytest.mark.parametrize("store_format", FORMATS)
-def test_every_array_of_a_store_has_a_short_name_and_its_meaning(store_format):
+def test_every_array_of_a_store_has_a_short_name_and_its_meaning():
     pipeline = Pipeline.from_dict(EVERYTHING)
-    for array in planned_arrays(pipeline, (1, 2), store_format):
+    for array in planned_arrays(pipeline, (1, 2)):
         if array.path != RECEIPTS and array.attributes:
             assert len(array.attributes["long_name"]) <= MAX_LINE + 2, array.path
             assert array.attributes["description"], array.path

@@ -3,7 +3,7 @@
 import pytest
 
 from sweep.errors import PipelineError
-from sweep.plan.board_files import read_board
+from sweep.plan.board_rules import read_board
 
 CHARUCO = """kind = "charuco"
 dictionary = "4x4_1000"
@@ -58,10 +58,10 @@ def test_each_kind_is_read(tmp_path):
 
 
 @pytest.mark.parametrize(("text", "line"), [
-    ("", "kind: expected one of charuco, grid, markers"),
-    ('kind = "charucco"', ('kind = "charucco": expected one of charuco, grid, markers; did you '
-     "mean charuco?")),
-    ("kind = 3", "kind = 3: expected one of charuco, grid, markers"),
+    ("", "kind: expected one of charuco, grid, aprilgrid, markers"),
+    ('kind = "charucco"', ('kind = "charucco": expected one of charuco, grid, aprilgrid, markers; '
+     "did you mean charuco?")),
+    ("kind = 3", "kind = 3: expected one of charuco, grid, aprilgrid, markers"),
     ("kind = ", "not TOML"),
     (CHARUCO + "square = 3", "square: unknown; expected a key of a board of kind charuco: "),
     (CHARUCO + "ids = [1, -2]", "ids = [1, -2]: expected a list of whole numbers from 0 on"),

@@ -5,7 +5,7 @@ import pytest
 
 from sweep.cli import main
 from sweep.errors import PipelineError
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 
 # What is wrong, the file, and what its message must hold: file, key, value, what was expected.
 BROKEN = {
@@ -19,23 +19,21 @@ BROKEN = {
         "board, pose, scene, detector, estimator, axes, require, limit, precision, choose; "
         "did you mean camera?"),
     ),
-    "a key without its section": (
-        "tilt_deg = 3\n[pose]\ndistance_m = 1", "tilt_deg = 3: expected it under [pose]",
-    ),
-    "a key under another section": (
-        "[pose]\ndistance_m = 1\n[camera]\nsize_m = 1",
-        "camera.size_m: unknown key; it belongs under [marker]",
-    ),
     "unknown axis, nearest named": (
         "[axes]\ndistance = [1, 2]\n[pose]\ndistance_m = 1",
         "axes.distance: unknown parameter; did you mean distance_m?",
     ),
+    "a key of earlier versions": (
+        '[pose]\ndistance_m = 1\n[detector]\nenvironment = "other"',
+        "`sweep run` in each virtual environment, then `sweep compare A.zarr B.zarr`",
+    ),
+    "an axis of earlier versions": (
+        '[pose]\ndistance_m = 1\n[axes]\nenvironment = ["installed", "other"]',
+        "`sweep run` in each virtual environment, then `sweep compare A.zarr B.zarr`",
+    ),
     "wrong type": (
         '[pose]\ndistance_m = "near"',
         'pose.distance_m = "near": expected a number above 0',
-    ),
-    "a boolean is no number": (
-        "[pose]\ndistance_m = true", "pose.distance_m = true: expected a number above 0",
     ),
     "a fraction where a count belongs": (
         "[pose]\ndistance_m = 1\n[camera]\nwidth_px = 640.5",
@@ -45,24 +43,12 @@ BROKEN = {
         "[pose]\ndistance_m = 1\ntilt_deg = 500",
         "pose.tilt_deg = 500: expected a number from -360 to 360",
     ),
-    "distance at 0": ("[pose]\ndistance_m = 0", "pose.distance_m = 0: expected a number above 0"),
     "distance below 0 on an axis": (
         "[axes]\ndistance_m = [1, -1]",
         "axes.distance_m = [1, -1]: expected a number above 0 and at most 1e+12 (not -1)",
     ),
-    "not finite": ("[pose]\ndistance_m = inf", "pose.distance_m = inf: expected a number above 0"),
-    "not a number": ("[pose]\ndistance_m = nan", "pose.distance_m = nan: expected a number"),
     "neither distance nor side": (
         "[pose]\ntilt_deg = 0", "pose: expected distance_m or side_px, fixed or under [axes]",
-    ),
-    "distance and side": (
-        "[pose]\ndistance_m = 1\nside_px = 30",
-        "side_px = 30: expected distance_m or side_px, not both; delete one of them",
-    ),
-    "camera in millimetres and in pixels": (
-        "[pose]\ndistance_m = 1\n[camera]\nfx_px = 500\nfocal_length_mm = 4",
-        ("fx_px = 500: expected a camera in pixels or in millimetres, not both; delete it or "
-        "focal_length_mm"),
     ),
     "fy without fx": (
         "[pose]\ndistance_m = 1\n[camera]\nfy_px = 500", "fy_px = 500: expected fx_px beside it",
@@ -88,14 +74,6 @@ BROKEN = {
         '[pose]\ndistance_m = 1\n[scene]\nrenderer = "supersample-0"',
         'scene.renderer = "supersample-0": expected exact, warp, supersample-N',
     ),
-    "unknown refinement": (
-        '[pose]\ndistance_m = 1\n[detector]\ncornerRefinementMethod = "best"',
-        'detector.cornerRefinementMethod = "best": expected one of none, subpix, contour, apriltag',
-    ),
-    "unknown solver": (
-        '[pose]\ndistance_m = 1\n[estimator]\nsolver = "dlt"',
-        'estimator.solver = "dlt": expected one of ippe, ippe_square',
-    ),
     "largest threshold window below the smallest": (
         "[pose]\ndistance_m = 1\n[detector]\nadaptiveThreshWinSizeMin = 31",
         "adaptiveThreshWinSizeMax = 23: expected at least adaptiveThreshWinSizeMin",
@@ -107,10 +85,6 @@ BROKEN = {
     "an empty axis": (
         "[pose]\ndistance_m = 1\n[axes]\ntilt_deg = []",
         "axes.tilt_deg = []: expected at least one value",
-    ),
-    "an empty range": (
-        "[pose]\ndistance_m = 1\n[axes]\nmarker_id = { range = [5, 5] }",
-        "axes.marker_id = {range = [5, 5]}: expected at least one value",
     ),
     "a repeated value": (
         "[pose]\ndistance_m = 1\n[axes]\ntilt_deg = [0, 1, 0.0]",
@@ -125,25 +99,9 @@ BROKEN = {
         "[axes]\ndistance_m = { geom = [0, 1, 3] }",
         "expected geom = [first, last, count], both inclusive, above 0",
     ),
-    "an axis of 10^12 values": (
-        "[axes]\ndistance_m = { linspace = [1, 2, 1000000000000] }",
-        "expected at most 1,000,000 values",
-    ),
-    "an endless step": (
-        "[axes]\ndistance_m = { arange = [1, 2, 0] }",
-        "expected arange = [start, stop, step], half-open",
-    ),
-    "a scalar axis": (
-        "[pose]\ndistance_m = 1\n[axes]\ntilt_deg = 4",
-        "axes.tilt_deg = 4: expected a list, or a table",
-    ),
     "trials of nothing random": (
         "[pose]\ndistance_m = 1\n[axes]\ntrial = 5",
         "axes.trial = 5: expected something random to repeat: jitter_px above 0",
-    ),
-    "no trials": (
-        "[pose]\ndistance_m = 1\njitter_px = 1\n[axes]\ntrial = 0",
-        "axes.trial = 0: expected a whole number from 1 to 1,000,000,000",
     ),
     "a distribution of what is not drawn": (
         "[pose]\ndistance_m = 1\n[marker]\nsize_m = { uniform = [1, 2] }",
@@ -160,26 +118,10 @@ BROKEN = {
         "[pose]\ndistance_m = 1\n[axes]\ntilt_deg = { normal = [0, 4] }",
         "expected an axis; a distribution goes under [pose]",
     ),
-    "an axis under its section": (
-        "[pose]\ndistance_m = { geom = [0.1, 1, 4] }",
-        "expected one value here; more than one goes under [axes]",
-    ),
-    "a normal whose draws leave the range": (
-        "[pose]\ndistance_m = { normal = [0.05, 0.05] }",
-        "expected mean - 8.3 sd and mean + 8.3 sd above 0 and at most 1e+12",
-    ),
-    "a number of 400 digits": (
-        "[pose]\ndistance_m = 1\n[marker]\nmarker_id = 1" + "0" * 400,
-        "expected a whole number from 0 to 1e+06",
-    ),
-    "a step too small to count": (
-        "[axes]\ndistance_m = { arange = [0.1, 1e299, 1e-200] }",
-        "expected at most 1,000,000 values",
-    ),
     "a whole frame too large to hold": (
         ('[pose]\ndistance_m = 1\n[scene]\nwindow = "full"\n[camera]\nwidth_px = 100000\n'
         "height_px = 100000"),
-        "expected auto, for a frame of more than 500,000,000 pixels",
+        "expected what needs no whole frame, for one of more than 500,000,000 pixels",
     ),
     "a section that is no table, beside others": (
         "pose = 3\n[axes]\ndistance_m = [1]\nfy_px = [1]\ntrial = 4",
@@ -213,25 +155,13 @@ BROKEN = {
     "conditions of nothing": (
         '[pose]\ndistance_m = 1\n[require]\nper = ["distance_m"]', "what is required, too",
     ),
-    "an unknown key of what is required": (
-        '[pose]\ndistance_m = 1\n[require]\nany = ["detection >= 0.9"]',
-        "require.any: unknown key; expected all or per",
-    ),
     "a negative seed": (
         "seed = -1\n[pose]\ndistance_m = 1", "seed = -1: expected a whole number from 0",
     ),
     "not TOML": ("[pose\ndistance_m = 1", "not TOML: "),
-    "a key given twice": ("[pose]\ndistance_m = 1\ndistance_m = 2", "not TOML: "),
-    "nested too deeply": ("x = " + "[" * 100_000, "not TOML: nested too deeply"),
-    "a section that is no table": ("pose = 3", "pose = 3: expected a table: [pose]"),
     "a background that is not there": (
         '[pose]\ndistance_m = 1\n[scene]\nbackground = "none.png"',
         'scene.background = "none.png": expected a level or an image file (No such file',
-    ),
-    "a grid without end": (
-        ("[pose]\njitter_px = 1\n[axes]\ndistance_m = { linspace = [1, 2, 10000] }\n"
-        "trial = 1000000000"),
-        "axes: 1e+13 poses: expected at most 1e+12",
     ),
 }
 
@@ -250,14 +180,6 @@ def test_broken_file_names_file_key_value_and_expectation(
         line.startswith("broken.toml: ") and message in line for line in told.err.splitlines()
     ), told.err
     assert [path.name for path in tmp_path.iterdir()] == ["broken.toml"]
-
-
-def test_all_faults_are_told_at_once(tmp_path):
-    path = tmp_path / "many.toml"
-    path.write_text("[pose]\ndistance_m = 0\ntilt_deg = 999\nrol = 1\n[axes]\nsolver = ['x']")
-    with pytest.raises(PipelineError) as told:
-        Pipeline.from_toml(path)
-    assert len(told.value.faults) == 4
 
 
 def test_a_missing_file_and_one_that_is_no_text_are_told_in_a_line(tmp_path, capsys):

@@ -1,6 +1,5 @@
 """A camera as users know it: fields of view, pixel sizes, square pixels, and no silent trap."""
 
-import dataclasses
 import itertools
 import math
 import tomllib
@@ -11,15 +10,13 @@ import pytest
 import sweep
 from support.lengths import first_of
 from sweep.cli import main
-from sweep.errors import PipelineError, StoreError
+from sweep.errors import PipelineError
 from sweep.execution.runner import execute
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
-from sweep.plan.camera_facts import camera_facts, notes
-from sweep.plan.camera_values import stored_text
 from sweep.plan.cell_selection import cell
-from sweep.plan.experiment import Pipeline
+from sweep.plan.facts import camera_facts, camera_notes
 from sweep.plan.grid import scene_axes, scene_values
-from sweep.store.lifecycle import create_store, open_store
+from sweep.plan.pipeline import Pipeline
 from tests.support.here import calls_here
 
 
@@ -81,7 +78,7 @@ def test_pixels_are_square_unless_both_sides_are_given(camera, focal):
     fx, fy, _, _ = view(camera)
     assert [fx, fy] == pytest.approx([focal] * 2, rel=1e-15)
     assert camera_facts(pipeline(camera)).square
-    assert not any("square" in line for line in notes(pipeline(camera)))
+    assert not any("square" in line for line in camera_notes(pipeline(camera)))
 
 
 @pytest.mark.parametrize("camera", [
@@ -93,7 +90,9 @@ def test_pixels_that_are_not_square_are_said_to_be(camera):
     facts = camera_facts(pipeline(camera))
     assert not facts.square
     assert f"pixels are not square: fy/fx = {fy / fx:.4g}" in facts.line()
-    assert notes(pipeline(camera))[0].startswith(f"pixels are not square: fy/fx = {fy / fx:.4g};")
+    assert camera_notes(pipeline(camera))[0].startswith(
+        f"pixels are not square: fy/fx = {fy / fx:.4g};"
+    )
 
 
 @pytest.mark.parametrize("focal_length", first_of([3.6, 12.5, 4.0, 6.0], 2))
@@ -140,23 +139,12 @@ def test_a_frame_size_on_an_axis_keeps_pixels_square():
 
 @pytest.mark.parametrize(("camera", "lines"), [
     ({"hfov_deg": 60, "vfov_deg": 40}, ["vfov_deg = 40: expected hfov_deg or vfov_deg, not both"]),
-    ({"hfov_deg": 60, "dfov_deg": 70},
-     ["dfov_deg = 70: expected hfov_deg or dfov_deg, not both: pixels are square"]),
-    ({"hfov_deg": 60, "fx_px": 500},
-     ["hfov_deg = 60: expected a field of view or focal lengths, not both; delete it or fx_px"]),
     ({"vfov_deg": 60, "focal_length_mm": 5, "sensor_width_mm": 6},
-     [("vfov_deg = 60: expected a field of view or focal lengths, not both; delete it or "
-      "sensor_width_mm, focal_length_mm")]),
-    ({"hfov_deg": 60, "fy_px": 500},
-     ["hfov_deg = 60: expected a field of view or focal lengths, not both; delete it or fy_px",
-      "fy_px = 500: expected fx_px beside it"]),
+     ["vfov_deg = 60: expected sensor_width_mm, focal_length_mm or vfov_deg, not both"]),
+    ({"hfov_deg": 60, "fy_px": 500}, ["hfov_deg = 60: expected fy_px or hfov_deg, not both"]),
     ({"pixel_size_um": 3, "sensor_width_mm": 6, "focal_length_mm": 4},
-     [("pixel_size_um = 3: expected the size of a pixel or the sensor's sides, not both; delete it "
-      "or sensor_width_mm")]),
+     ["pixel_size_um = 3: expected sensor_width_mm or pixel_size_um, not both"]),
     ({"pixel_size_um": 3}, ["pixel_size_um = 3: expected focal_length_mm beside it"]),
-    ({"pixel_size_um": 3, "fx_px": 500},
-     [("fx_px = 500: expected a camera in pixels or in millimetres, not both; delete it or "
-      "pixel_size_um")]),
     ({"pixel_size_um": 0.003, "focal_length_mm": 4},
      ["camera.pixel_size_um = 0.003: expected a number from 0.05 to 10000"]),
     *(({"hfov_deg": bad}, [f"camera.hfov_deg = {bad}: expected a number from 1e-05 to 179.9"])
@@ -237,14 +225,6 @@ def test_sides_of_a_board_s_markers_are_their_own():
     assert "the markers have sides of 3 to 24 px" in facts.line()
 
 
-def test_a_marker_at_the_camera_s_depth_has_no_side_and_no_warning():
-    world = Pipeline.from_dict({
-        "pose": {"camera_x_m": 0}, "marker": {"size_m": 0.1}, "camera": {"fx_px": 600},
-        "axes": {"marker_x_m": [0, 2]},
-    })
-    assert camera_facts(world).side_px == pytest.approx((30, 30))
-
-
 def test_sides_of_poses_in_the_world_are_named():
     # The camera looks along x; fx = 600.
     world = Pipeline.from_dict({
@@ -309,7 +289,7 @@ def test_run_report_and_dataset_name_the_camera(tmp_path, capsys):
 ])
 def test_what_may_surprise_of_a_camera_is_told(sections, line):
     camera = sections.pop("camera")
-    told = notes(pipeline(camera, **sections))
+    told = camera_notes(pipeline(camera, **sections))
     assert [each for each in told if line in each], told
 
 
@@ -319,49 +299,3 @@ def test_notes_are_told_by_a_run_from_python(tmp_path, capfd):
     assert "pixels are not square: fy/fx = 1.25" in capfd.readouterr().err
     told = sweep.open(tmp_path / "s.zarr").attrs["camera_notes"]
     assert told.startswith("pixels are not square: fy/fx = 1.25")
-
-
-# 4. Stores of versions whose pixels were not square by default.
-
-WIDE = "[camera]\nwidth_px = 128\nheight_px = 72\n[pose]\nside_px = 30\n"
-
-
-def test_an_old_store_keeps_its_camera_and_is_not_continued_with_another(tmp_path, monkeypatch):
-    url = str(tmp_path / "s.zarr")
-    old = dataclasses.replace(Pipeline.from_text(stored_text(WIDE, 4)), text=WIDE)
-    with monkeypatch.context() as then:
-        then.setattr("sweep.store.lifecycle.FORMAT", 4)
-        create_store(url, old, ())
-    store = open_store(url)
-    fixed = store.pipeline.fixed
-    fx, fy, _, _ = intrinsics(*(fixed[name] for name in VIEW_PARAMETERS))
-    assert (fx, fy) == (4.0 / 4.8 * 128, 4.0 / 3.6 * 72)
-    at = cell(store.pipeline, "")
-    assert [at.fixed[name] for name in VIEW_PARAMETERS] == [fixed[name] for name in VIEW_PARAMETERS]
-    with pytest.raises(StoreError, match=(
-        r"sensor_height_mm: the store has 3\.6, this run None(.|\n)*pixels are square unless both"
-    )):
-        execute(Pipeline.from_text(WIDE), url)
-    stated = WIDE.replace("[pose]", "sensor_width_mm = 4.8\nsensor_height_mm = 3.6\n[pose]")
-    with calls_here():
-        assert execute(Pipeline.from_text(stated), url).poses == 1
-    assert sweep.open(url).attrs["pipeline"] == WIDE
-    assert float(sweep.open(url)["true_tvec_m"][2]) == fx * fixed["size_m"] / 30
-
-
-@pytest.mark.parametrize("text", [
-    "[pose]\ndistance_m = 1\n",
-    "[camera]\nfx_px = 500\nwidth_px = 1280\n[pose]\ndistance_m = 1\n",
-    "[camera]\nwidth_px = 1280\nheight_px = 960\n[pose]\ndistance_m = 1\n",
-    "[camera]\nsensor_width_mm = 4.8\n[pose]\ndistance_m = 1\n",
-    "[camera]\nsensor_width_mm = 5\nsensor_height_mm = 3\nwidth_px = 9\n[pose]\ndistance_m = 1\n",
-])
-def test_old_texts_in_which_nothing_was_left_to_the_default_are_read_as_written(text):
-    assert stored_text(text, 4) == text
-
-
-def test_old_texts_without_a_section_camera_get_their_sensor():
-    text = stored_text("[axes]\ndistance_m = [1]\nwidth_px = [64, 128]\n", 3)
-    grid = Pipeline.from_text(text)
-    assert [grid.fixed[name] for name in ("sensor_width_mm", "sensor_height_mm")] == [4.8, 3.6]
-    assert stored_text(WIDE, 5) == WIDE

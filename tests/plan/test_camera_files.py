@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import math
 import shutil
 import time
 
@@ -10,14 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from sweep.cli import main
 from sweep.errors import PipelineError, StoreError
 from sweep.execution.runner import execute
 from sweep.integrity.reproduction import reproduce
 from sweep.integrity.verification import verify
-from sweep.plan.camera_facts import camera_facts
 from sweep.plan.cell_selection import cell
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import open_store
 from tests.support.here import calls_here
 
@@ -333,80 +330,53 @@ def damaged(text, old, new):
 GOOD = ros_text()
 REFUSED = {
     "cut short": (GOOD[: GOOD.index("distortion_model") - 30], "cut short"),
-    "cut in the lens": (GOOD[: GOOD.index("1.76")] + "]", "1 x 5, but 3 numbers; is it cut short?"),
     "no lens": (GOOD[: GOOD.index("distortion_coeff")], "no distortion coefficients"),
     "a pipeline": ("seed = 1\n[pose]\ndistance_m = 1\n", "not a camera file"),
-    "a list": ("- 1\n- 2\n", "not a camera file: it has no camera matrix"),
     "prose": ("It was a dark and stormy night.\n", "not a camera file: it has no camera matrix"),
     "empty": ("", "empty"),
-    "blank": (" \n\n", "empty"),
     "binary": (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\xff\xfe", "not text"),
-    "zeros and text": ("camera_matrix: \0", "not text"),
     "compressed": (b"\x1f\x8b\x08\0\0", "compressed; unpack it"),
     "zeros": (damaged(GOOD, ", ".join(map(repr, np.ravel(MATRIX).tolist())),
                       "0, 0, 0, 0, 0, 0, 0, 0, 0"), "a matrix of zeros: the camera was not"),
     "NaN": (damaged(GOOD, repr(MATRIX[0][0]), ".nan"), ".nan is not a number"),
-    "nan": (damaged(GOOD, repr(MATRIX[0][0]), "nan"), "nan is not a finite number"),
     "infinite": (damaged(GOOD, repr(MATRIX[0][0]), "1e999"), "1e999 is not a finite number"),
     "words": (damaged(GOOD, repr(MATRIX[0][0]), "wide"), "wide is not a number"),
     "singular": (damaged(GOOD, repr(MATRIX[1][1]), "0"), "focal lengths 612.346 and 0; expected"),
-    "negative": (damaged(GOOD, repr(MATRIX[1][1]), "-600"), "focal lengths 612.346 and -600"),
     "skew": (ros_text(matrix=[[600, 0.1, 320], [0, 600, 240], [0, 0, 1]]),
              "a skew of 0.1 is not supported"),
     "transposed": (ros_text(matrix=np.transpose(MATRIX).tolist()), "0, 0, 1 as the last row"),
     "2 x 3": (damaged(damaged(GOOD, "rows: 3\n  cols: 3\n  data: [61", "rows: 2\n  cols: 3\n"
                               "  data: [61"), ", 0.0, 0.0, 1.0]", "]"), "expected a matrix of 3 x"),
     "three coefficients": (ros_text(lens=[0.1, 0.2, 0.3]), "3 coefficients; expected 0 or 4 or 5"),
-    "rational with too many": (ros_text("rational_polynomial", [0.1] * 9), "9 coefficients"),
-    "plumb bob with eight": (ros_text(lens=[0.1] * 8), "8 coefficients; expected 0 or 4 or 5"),
     "equidistant": (ros_text("equidistant", [0.1] * 4), "lens model equidistant: not supported"),
     "omni": (damaged(KALIBR, "pinhole", "omni"), "camera model omni: not supported"),
-    "ds": (damaged(KALIBR, "pinhole", "ds"), "camera model ds: not supported, only pinhole"),
-    "eucm": (damaged(KALIBR, "pinhole", "eucm"), "camera model eucm: not supported"),
     "Kalibr equidistant": (damaged(KALIBR, "radtan", "equidistant"), "lens model equidistant"),
-    "Kalibr fov": (damaged(KALIBR, "radtan", "fov"), "lens model fov: not supported"),
     "fisheye": (GOOD + "fisheye_model: 1\n", "a fisheye model: not supported"),
-    "omnidirectional": (GOOD + "xi: 1.2\n", "camera model omnidirectional (xi): not supported"),
     "no size": (damaged(damaged(GOOD, "image_width", "a"), "image_height", "b"),
                 "expected width_px and height_px beside it: c.any does not say which frame size"),
-    "size of zero": (damaged(GOOD, "image_width: 640", "image_width: 0"),
-                     "image_width: 0; expected whole pixels"),
     "half a pixel": (damaged(GOOD, "image_width: 640", "image_width: 640.5"),
                      "image_width: 640.5; expected whole pixels"),
     "twice": (GOOD + "image_width: 800\n", "YAML that has the key image_width twice"),
     "a tag": ("!!python/object/apply:os.system ['true']\n", "YAML with the tag"),
-    "another tag": ("camera_matrix: !include other.yml\n", "YAML with the tag !include"),
     "billion laughs": (
         "a: &a [1,1]\n" + "".join(
             f"{y}: &{y} [*{x},*{x}]\n" for x, y in zip("abcdefghi", "bcdefghij", strict=True)
         ), "YAML with references (*)"),
     "XML bomb": (('<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "aa">]><opencv_storage>&a;'
                  "</opencv_storage>"), "XML with a document type"),
-    "XML twice": ("<opencv_storage><K>1</K><K>2</K></opencv_storage>", "twice"),
-    "a long tag": ("!" * 100_000, "YAML with the tag"),
-    "a long key": ("".join(f"{'k' * 1000}: 1\n" for _ in range(2)), "twice"),
     "web page": ("<html><body>404</body></html>", "XML of another kind: <html>"),
     "cut XML": ("<opencv_storage><camera_matrix>", "not XML, or cut short"),
-    "cut JSON": ('{"camera_matrix": [[1, 2', "not JSON, or cut short"),
     "deep JSON": ('{"a":' + "[" * 100_000, "nested too deeply"),
-    "deep YAML": ("[" * 5000, "nested too deeply"),
-    "deep blocks": ("".join(f"{' ' * k}a:\n" for k in range(300)), "nested too deeply"),
     "deep XML": ("<opencv_storage>" + "<a>" * 300 + "</a>" * 300 + "</opencv_storage>",
                  "nested too deeply"),
     "huge": (b"#" * 4_000_001, "more than 4,000,000 bytes"),
     "many values": ("a: [" + "1," * 400_000 + "]", "more than 300,000 values"),
-    "long digits": ('{"a": ' + "1" * 10_000 + "}", "too many digits"),
     "deviations below 0": (GOOD + f"std_deviations_intrinsics: {[-1] * 9}\n", "below 0"),
-    "too few deviations": (GOOD + "std_deviations_intrinsics: [1, 1, 1, 1, 1]\n", "expected 9"),
     "odd covariance": (GOOD + f"covariance_intrinsics: {[1] * 80}\n", "expected 9 x 9"),
     "two matrices": (GOOD + "K: [600, 0, 320, 0, 600, 240, 0, 0, 1]\n",
                      "camera_matrix and K differ: delete one of them"),
-    "two lenses": (GOOD + "D: [0.1, 0, 0, 0]\n", "distortion_coefficients and D differ"),
     "a region of the frame": (GOOD + "roi: {x_offset: 0, width: 320, height: 240}\n",
                               "roi with width = 320: the matrix is that of the whole frame"),
-    "numbers on their own": ("fx: 800\nfy: 801\nk1: 0.1\nwidth: 640\nheight: 480\n",
-                             "it has no camera matrix"),
-    "cut in a tag": ("%YAML:1.0\n---\ncamera_matrix: !!open", "is the file cut short?"),
     "two calibrations of a size": (
         json.dumps({"calibrations": [photonvision(), photonvision(distCoeffs=[0.1] * 5)]}),
         "two calibrations of 1280x720 that differ"),
@@ -581,18 +551,3 @@ def test_a_store_does_not_need_its_camera_file_any_more(tmp_path):
     )
     with pytest.raises(StoreError, match=r"fx_px: the store has 612\.345\d+, this run 700\.0"):
         execute(other, url)
-
-
-@pytest.mark.long
-def test_show_and_plan_take_a_camera_file(tmp_path, capsys):
-    write(tmp_path / "c.yaml", GOOD)
-    file = write(tmp_path / "p.toml", '[camera]\ncamera_file = "c.yaml"\n[pose]\nside_px = 60\n')
-    assert main(["show", str(file), "-o", str(tmp_path / "s.png")]) == 0
-    assert main(["plan", str(file)]) == 0
-    hfov = math.degrees(2 * math.atan(320 / MATRIX[0][0]))
-    line = (
-        "fx = 612.346 px, fy = 611.988 px (pixels are not square: fy/fx = 0.9994), "
-        f"HFOV {hfov:.4g}°"
-    )
-    assert line in capsys.readouterr().out
-    assert camera_facts(Pipeline.from_toml(file)).side_px == (60, 60)

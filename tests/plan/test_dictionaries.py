@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 
 from support.lengths import lengths
 from sweep.errors import PipelineError
-from sweep.plan.alternatives import IN_CAMERA, superseded
 from sweep.plan.axes import TRIAL
-from sweep.plan.experiment import Pipeline
-from sweep.plan.parameters import PARAMETERS
+from sweep.plan.parameters import IN_CAMERA, PARAMETERS, superseded
+from sweep.plan.pipeline import Pipeline
 from sweep.plan.toml_text import document_text, read_document
 
 DRAWABLE = [

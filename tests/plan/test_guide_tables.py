@@ -5,8 +5,9 @@ import sys
 
 import pytest
 
+from support import guide_tables
+from support.guide_tables import TABLES, main, outdated_tables, updated
 from sweep.plan.parameters import PARAMETERS, SECTIONS
-from sweep.plan.reference import TABLES, main, outdated_tables, updated
 from sweep.plan.schema import VARIABLES
 
 GUIDE = """# A guide
@@ -89,6 +90,6 @@ def test_the_command_writes_checks_and_lists(tmp_path, capsys):
     guide.write_text("<!-- table: nothing -->\n<!-- /table -->")
     assert main([str(guide)]) == 2
     listed = subprocess.run(
-        [sys.executable, "-m", "sweep.plan.reference"], capture_output=True, text=True, check=True
+        [sys.executable, guide_tables.__file__], capture_output=True, text=True, check=True
     )
     assert listed.stdout.split() == list(TABLES)

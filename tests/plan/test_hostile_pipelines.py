@@ -1,6 +1,5 @@
 """Pipelines that mean harm: each is refused in lines that are few, short and printable."""
 
-import contextlib
 import os
 import struct
 import subprocess
@@ -16,7 +15,7 @@ from hypothesis import strategies as st
 from sweep.errors import PipelineError
 from sweep.messages import MAX_FAULTS, MAX_LINE_LENGTH, shown
 from sweep.plan.cell_selection import cell
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 
 POSE = "[pose]\ndistance_m = 1\n"
 AXES = POSE + "jitter_px = 1\n[axes]\n"
@@ -37,17 +36,9 @@ def faults_of(read, *arguments, **options):
 HOSTILE = {
     # Axes without end, in every form.
     "range": (AXES + "marker_id = { range = [0, 1000000000000] }", "at most 1,000,000,000 values"),
-    "range, downwards": (
-        AXES + "marker_id = { range = [1000000000000, 0, -1] }", "at most 1,000,000,000 values",
-    ),
-    "range of numbers": (AXES + "tilt_deg = { range = [0, 10000000] }", "at most 1,000,000 values"),
     "linspace": (AXES + "tilt_deg = { linspace = [0, 1, 1000000000000] }", "at most 1,000,000"),
     "geom": (AXES + "size_m = { geom = [1, 2, 10000000] }", "at most 1,000,000 values"),
-    "arange": (AXES + "tilt_deg = { arange = [0, 1, 1e-12] }", "at most 1,000,000 values"),
-    "arange, downwards": (AXES + "tilt_deg = { arange = [1, 0, -1e-12] }", "at most 1,000,000"),
     "arange, least step": (AXES + "tilt_deg = { arange = [0, 1e299, 5e-324] }", "at most 1,000"),
-    "arange, not numbers": (AXES + "tilt_deg = { arange = [0, 1, nan] }", "expected arange ="),
-    "linspace, to infinity": (AXES + "tilt_deg = { linspace = [0, inf, 3] }", "linspace ="),
     "trial": (AXES + "trial = 1000000000000", "from 1 to 1,000,000,000"),
     "axes that are long together": (
         AXES + "tilt_deg = { linspace = [0, 1, 600000] }\nroll_deg = { linspace = [0, 1, 600000] }",
@@ -74,23 +65,15 @@ HOSTILE = {
     ),
     # Nesting, and what takes time that grows with a square.
     "lists": ("x = " + "[" * 100_000, "not TOML: nested too deeply"),
-    "tables": ("x = " + "{a=" * 50_000, "not TOML: nested too deeply"),
-    "lists, closed": (POSE + "tilt_deg = " + "[" * 300 + "]" * 300, "pose.tilt_deg = [[[["),
     "tables, closed": (POSE + "tilt_deg = " + "{a=" * 200 + "1" + "}" * 200, "= {a = {a = "),
     "a dotted key": ("a" + ".a" * 100_000 + " = 1", "expected keys of at most 8 parts"),
-    "a dotted key, quoted": ('"a"' + " . 'a'" * 20_000 + " = 1", "keys of at most 8 parts"),
-    "a dotted table": ("[a" + ".a" * 100_000 + "]", "expected keys of at most 8 parts"),
     "deep keys": ("".join(f"a{DEEP}{i} = 1\n" for i in MANY), "a: unknown; expected a section"),
     "quotes, none a key": (POSE + "x = '" + '"\\' * 50_000 + "'", "pose.x: unknown key"),
     # Size.
     "text": ("# " + "x" * 10_000_000, "expected at most 250,000 bytes"),
     "unknown keys": (POSE + "".join(f"k{i} = 1\n" for i in MANY), "... and 1,980 faults more"),
-    "unknown sections": ("".join(f"[t{i}]\n" for i in MANY) + POSE, "... and 1,980 faults more"),
-    "unknown axes": (AXES + "".join(f"k{i} = 1\n" for i in MANY), "... and 1,980 faults more"),
     "a key": (POSE + "k" * 200_000 + " = 1", "kkk...: unknown key"),
-    "a key twice": (POSE + 2 * ("k" * 100_000 + " = 1\n"), "not TOML: "),
     "a string": (POSE + f'tilt_deg = "{"k" * 200_000}"', "kkk...: expected a number"),
-    "a list": (POSE + f"tilt_deg = [{'1,' * 100_000}]", "tilt_deg = [1, 1, 1, "),
     "values": (AXES + f"tilt_deg = [{'1,' * 100_000}]", "each value once (1.0 is repeated)"),
     "a title": (f'title = "{"k" * 1000}"\n' + POSE, "one line of at most 200 characters"),
     "a path": (POSE + f'[scene]\nbackground = "{"a/" * 100_000}"', "(File name too long)"),
@@ -100,33 +83,24 @@ HOSTILE = {
         f"hexadecimal digits, {name}": (text % ("0x1" + "0" * 20_000), expected)
         for name, text, expected in (
             ("a value", POSE + "tilt_deg = %s", "pose.tilt_deg = 0x1000"),
-            ("the seed", "seed = %s\n" + POSE, "seed = 0x1000"),
             ("a list", AXES + "tilt_deg = [%s]", "(not 0x1000"),
             ("a range", AXES + "marker_id = { range = [0, %s] }", "expected range ="),
-            ("a step", AXES + "marker_id = { range = [0, 5, %s] }", "expected range ="),
             ("a lens", POSE + "[camera]\ndistortion = [%s, 0, 0, 0]", "expected a list of 0, 4"),
             ("a draw", "[pose]\ndistance_m = { uniform = [0, %s] }", "expected uniform ="),
-            ("trials", AXES + "trial = %s", "from 1 to 1,000,000,000"),
         )
     },
     # What a terminal would obey, or take for a line of ours.
     "control characters, a key": (
         POSE + '"\\u001b[2J\\nforged: line" = 1', "pose.\\u001b[2J\\nforged: line: unknown key",
     ),
-    "control characters, a section": ('"\\u001b[2J\\n" = 1\n' + POSE, "\\u001b[2J\\n: unknown;"),
-    "control characters, an axis": (AXES + '"\\u001b\\n" = 1', "axes.\\u001b\\n: unknown"),
-    "control characters, a form": (AXES + 'tilt_deg = { "\\u001b" = [1] }', '{"\\u001b" = [1]}'),
     "control characters, a value": (
         POSE + 'tilt_deg = "\\u009b31m\\u202e\\u2028\\n"',
         'tilt_deg = "\\u009b31m\\u202e\\u2028\\n": expected',
     ),
-    "control characters, a list": (AXES + 'tilt_deg = ["\\u001b"]', '(not "\\u001b")'),
     "control characters, a path": (
         POSE + '[scene]\nbackground = "\\u001b[31mx.png"', "a path without control characters",
     ),
     "control characters, the title": ('title = "\\u001b[2J"\n' + POSE, 'title = "\\u001b[2J"'),
-    "control characters, a table twice": ('["\\u001b\\n"]\n["\\u001b\\n"]', "not TOML: "),
-    "a byte that is none": (POSE + "\0", "not TOML: "),
     "half a character": (POSE + "# \ud800", "expected UTF-8"),
 }
 
@@ -138,18 +112,11 @@ def test_a_hostile_text_is_refused_in_short_lines(text, expected):
 
 SETTINGS = {
     "nested lists": ("tilt_deg=" + "[" * 50_000, "expected a TOML value"),
-    "nested lists, closed": ("tilt_deg=" + "[" * 400 + "]" * 400, "tilt_deg = [[["),
-    "nested tables": ("tilt_deg=" + "{a=" * 40_000, "expected a TOML value"),
-    "nested tables, closed": ("tilt_deg=" + "{a=" * 300 + "1" + "}" * 300, "tilt_deg = {a ="),
     "a dotted key": ("tilt_deg={a" + ".a" * 50_000 + "=1}", "expected a TOML value"),
-    "a list": ("tilt_deg=[" + "1," * 50_000 + "]", "each value once"),
     "digits": ("tilt_deg=1" + "0" * 5000, "expected a TOML value"),
     "hexadecimal digits": ("seed=0x1" + "0" * 5000, "seed = 0x1"),
-    "control characters": ("tilt_deg=\x1b[31m", "--set tilt_deg=\\u001b[31m: expected"),
     "control characters, a key": ("\x1b\nforged: x=3", "--set \\u001b\\nforged: x=3: unknown"),
-    "a long key": ("x" * 100_000 + "=1", "xxx...: unknown parameter"),
     "no UTF-8": ('title="\udcff"', "expected a TOML value"),
-    "another key": ("tilt_deg=1\nx=3", "expected a TOML value"),
 }
 
 
@@ -172,15 +139,9 @@ def test_a_hostile_text_is_refused_as_soon_where_a_setting_changes_it(text):
     ("at", "expected"),
     [
         ("tilt_deg=" + "[" * 50_000, "expected a number"),
-        ("tilt_deg=" + "{a=" * 40_000, "expected a number"),
-        ("[" * 50_000 + "," * 50_000, "expected name=value"),
-        ("tilt_deg=1," * 10_000, "... and 9,979 faults more"),
         ("x=1," * 10_000, "... and 9,980 faults more"),
         ("tilt_deg=0x1" + "0" * 5000, "expected a number"),
-        ("trial=0x1" + "0" * 5000, "expected a whole number"),
         ("\x1b\nforged: x=3", "\\u001b\\nforged: x=3: unknown parameter"),
-        ("tilt_deg=1\nx=3", "expected a number"),
-        ('background="\\u001b"', "a path without control characters"),
         ("background=\udcff", "a path without control characters"),
     ],
 )
@@ -212,8 +173,12 @@ def test_a_file_with_a_byte_order_mark_is_read(tmp_path):
 ))
 def test_any_text_is_a_pipeline_or_is_refused(text):
     for arguments in ((text,), (POSE, [text]), (POSE, ["tilt_deg=" + text])):
-        with contextlib.suppress(PipelineError):
+        try:
             Pipeline.from_text(*arguments)
+        except PipelineError as told:
+            lines = str(told).split("\n")
+            assert len(lines) <= MAX_FAULTS + 1
+            assert all(line.isprintable() and 0 < len(line) <= MAX_LINE_LENGTH for line in lines)
 
 
 @settings(derandomize=True, deadline=None, max_examples=50)

@@ -4,12 +4,10 @@ import json
 
 import pytest
 
-import sweep
 from support.here import calls_here
 from sweep.cli import main
-from sweep.plan.experiment import Pipeline
-from sweep.plan.notes import notes
-from sweep.plan.pose_facts import MAX_SAMPLE, pose_facts
+from sweep.plan.facts import MAX_SAMPLE, notes, pose_facts
+from sweep.plan.pipeline import Pipeline
 
 
 def told(pose, axes=None, **sections):
@@ -105,10 +103,3 @@ def test_plan_says_how_the_marker_is_seen(tmp_path, capsys):
     (line,) = content["notes"]
     assert line in text
     assert content["views"]["viewing_angle_deg"] == pytest.approx([40, 80])
-
-
-def test_a_run_begins_with_it(tmp_path, capfd):
-    with calls_here():
-        sweep.run({"pose": {"distance_m": 0.3}, "axes": {"tilt_deg": [0, 120]}},
-                  store=str(tmp_path / "seen.zarr"))
-    assert "50 % of the poses show the marker's back" in capfd.readouterr().err

@@ -1,5 +1,7 @@
 """Ways of giving a pose: each against SciPy's Rotation and closed forms, and all against draws."""
 
+import itertools
+
 import cv2
 import numpy as np
 import pytest
@@ -9,15 +11,14 @@ import sweep
 from support.here import calls_here
 from support.lengths import lengths
 from sweep.errors import PipelineError
+from sweep.evaluation.block import GEOMETRY
 from sweep.evaluation.search import visibility_flags
-from sweep.evaluation.variables import GEOMETRY
 from sweep.measure.flags import DetectionStatus
 from sweep.model.scene import build_scenes
-from sweep.plan.alternatives import CHOICES, IN_CAMERA, RIVALS, WORLD
 from sweep.plan.cell_selection import cell
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import scene_axes, scene_values
-from sweep.plan.parameters import PARAMETERS
+from sweep.plan.parameters import CHOICES, IN_CAMERA, PARAMETERS, RIVALS, WORLD
+from sweep.plan.pipeline import Pipeline
 
 FLIP = np.diag([1.0, -1.0, -1.0])
 ANGLE_DEG = 1e-12
@@ -183,11 +184,6 @@ def test_a_marker_larger_than_the_frame_is_cut_off_alike_at_both_edges(distortio
         np.testing.assert_allclose(scenes.translation[:, :2], 0, atol=1e-15)
 
 
-def test_a_marker_beside_the_camera_has_a_place_all_the_same():
-    _, scenes = made({"frame_x": 0.5, "frame_y": 0, "distance_m": 0.001, "tilt_deg": 80})
-    assert np.isfinite(scenes.translation).all()
-
-
 def test_a_scenes_place_does_not_depend_on_the_others():
     axes = {"frame_x": [0.1, 0.9], "view_angle_deg": [0, 70], "distortion": [[], LENS],
             "distance_m": [0.02, 0.3, 2]}
@@ -249,7 +245,8 @@ def any_document(rng):
     if rng.random() < 0.25:
         names = [str(name) for name in rng.choice(WORLD, rng.integers(1, 12), replace=False)]
     else:
-        chosen = [ways[rng.integers(len(ways))] for ways in CHOICES]
+        chosen = [ways[rng.integers(len(ways))] for ways in CHOICES
+                  if {*ways[0]} <= {*IN_CAMERA}]
         turned = {"yaw_deg", "pitch_deg"} & {name for way in chosen for name in way}
         without = ("tilt_deg", "view_angle_deg", "azimuth_deg") if turned else ()
         given = dict.fromkeys(name for way in chosen for name in way)
@@ -366,25 +363,10 @@ def test_coordinates_are_what_was_given_and_none_that_has_no_meaning(tmp_path):
 
 @pytest.mark.parametrize(
     ("pose", "line"),
-    [({"distance_m": 1, "tilt_deg": 3, "view_angle_deg": 4},
-      "view_angle_deg = 4: expected tilt_deg or view_angle_deg, not both; delete one of them"),
-     ({"distance_m": 1, "tilt_deg": 3, "yaw_deg": 4},
-      "yaw_deg = 4: expected tilt_deg or yaw_deg, not both; delete one of them"),
-     ({"distance_m": 1, "azimuth_deg": 3, "pitch_deg": 4},
-      "pitch_deg = 4: expected azimuth_deg or pitch_deg, not both; delete one of them"),
-     ({"distance_m": 1, "view_angle_deg": 3, "pitch_deg": 4},
-      "pitch_deg = 4: expected view_angle_deg or pitch_deg, not both; delete one of them"),
-     ({"distance_m": 1, "x_m": 3, "bearing_x_deg": 4},
-      "x_m = 3: expected bearing_x_deg or x_m, not both; delete one of them"),
-     ({"distance_m": 1, "frame_y": 0.3, "y_m": 4},
-      "frame_y = 0.3: expected y_m or frame_y, not both; delete one of them"),
-     ({"distance_m": 1, "camera_x_m": 3, "marker_z_m": 0, "roll_deg": 2},
-      ("camera_x_m = 3: expected a pose in the world or in the camera's frame, not both; delete "
-       "camera_x_m, marker_z_m, or distance_m, roll_deg")),
+    [({"distance_m": 1, "camera_x_m": 3, "marker_z_m": 0, "roll_deg": 2},
+      ("pose.camera_x_m = 3: expected a pose in the world or in the camera's frame, not both; "
+       "delete camera_x_m, marker_z_m, or distance_m, roll_deg")),
      ({"x_m": 3}, "pose: expected distance_m or side_px, fixed or under [axes]"),
-     ({"distance_m": 1, "view_angle_deg": 181},
-      "pose.view_angle_deg = 181: expected a number from -180 to 180"),
-     ({"distance_m": 1, "frame_x": 1.01}, "pose.frame_x = 1.01: expected a number from 0 to 1"),
      ({"distance_m": 1, "frame_x": {"normal": [0.5, 0.2]}},
       "pose.frame_x = {normal = [0.5, 0.2]}: expected mean - 8.3 sd and mean + 8.3 sd from 0 to 1"),
      ({"camera_x_m": "left"},
@@ -394,6 +376,20 @@ def test_contradictions_are_refused_in_a_line_that_says_what_to_delete(pose, lin
     with pytest.raises(PipelineError) as refused:
         Pipeline.from_dict({"pose": pose})
     assert [fault.removeprefix("pipeline: ") for fault in refused.value.faults] == [line]
+
+
+@pytest.mark.parametrize(("first", "other"), [
+    pair for choice in CHOICES for pair in itertools.combinations(choice, 2)
+    if {*pair[0]} <= {*IN_CAMERA}
+])
+def test_two_ways_to_give_a_quantity_are_refused_in_a_line(first, other):
+    pose = {"distance_m": 1} | dict.fromkeys((first[0], other[0]), 0.4)
+    with pytest.raises(PipelineError) as refused:
+        Pipeline.from_dict({"pose": pose})
+    assert any(
+        line.startswith(f"pipeline: pose.{other[0]} = {pose[other[0]]}: expected ")
+        and f"{first[0]} or {other[0]}, not both; delete one" in line
+        for line in refused.value.faults), refused.value.faults
 
 
 def test_every_parameter_of_a_pose_can_be_drawn_and_be_an_axis():

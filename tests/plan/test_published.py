@@ -8,8 +8,8 @@ import pytest
 import sweep
 from support.stores import by_hand
 from sweep.measure.flags import EstimateStatus
-from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import Stage
+from sweep.plan.pipeline import Pipeline
 
 FOLDER = Path(__file__).parents[2] / "pipelines" / "published"
 NEEDS = {

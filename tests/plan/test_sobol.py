@@ -7,12 +7,19 @@ from scipy.stats import qmc
 
 import sweep
 from sweep.errors import PipelineError
-from sweep.model.calibration_error import CalibrationError
+from sweep.model.calibration import CalibrationError
 from sweep.plan.cell_selection import cell
-from sweep.plan.draws import jointly_drawn
+from sweep.plan.draws import (
+    BITS,
+    DIMENSIONS,
+    REPLICATES,
+    jointly_drawn,
+    points,
+    scrambled,
+    sobol_uniform,
+)
 from sweep.plan.grid import scene_values
 from sweep.plan.parameters import PARAMETERS
-from sweep.plan.sobol import BITS, DIMENSIONS, REPLICATES, points, scrambled, sobol_uniform
 from sweep.store.provenance import fingerprint
 
 
@@ -135,9 +142,7 @@ def test_replicates_are_independent():
 
 @pytest.mark.parametrize(("settings", "sections", "line"), [
     (["trial=40"], {}, "axes.trial = 40: expected a multiple of 16, at least 32, for sampling"),
-    (["trial=16"], {}, "axes.trial = 16: expected a multiple of 16, at least 32, for sampling"),
     (["sampling=halton"], {}, 'sampling = "halton": expected one of independent, sobol'),
-    (["sampling=[1]"], {}, "sampling = [1]: expected one of independent, sobol"),
     ([], {"pose": {"distance_m": 1}, "scene": {"noise_grey": 1}},
      'sampling = "sobol": expected a distribution or jitter_px above 0'),
 ])

@@ -3,12 +3,14 @@
 import cv2
 import pytest
 
-from sweep.errors import PipelineError
-from sweep.measure.detector import REFINEMENTS
+from sweep.errors import PipelineError, StoreError
+from sweep.measure.detectors import REFINEMENTS
 from sweep.measure.estimators import SOLVERS
+from sweep.plan.board_rules import read_board
 from sweep.plan.cell_selection import parse_selection
-from sweep.plan.experiment import Pipeline
 from sweep.plan.parameters import PARAMETERS
+from sweep.plan.pipeline import Pipeline
+from sweep.store.lifecycle import open_store
 
 OPENCV = {
     "cornerRefinementMethod": {f"CORNER_REFINE_{name.upper()}": name for name in REFINEMENTS},
@@ -32,6 +34,87 @@ def test_every_name_of_opencv_is_understood_in_any_case_and_with_its_module(name
                         choice.removeprefix("DICT_")):
             assert parameter.check(written) in twins[choice.casefold()], written
         assert parameter.check(spelled if name == "dictionary" else choice) == choice
+
+
+@pytest.mark.parametrize(("written", "value"), [
+    ("36h11", "DICT_APRILTAG_36h11"), ("tag36h11", "DICT_APRILTAG_36h11"),
+    ("25h9", "DICT_APRILTAG_25h9"), ("Tag16H5", "DICT_APRILTAG_16h5"),
+    ("AprilTag-36h10", "DICT_APRILTAG_36h10"), ("DICT_36h11", "DICT_APRILTAG_36h11"),
+    ("mip_36h12", "DICT_ARUCO_MIP_36h12"), ("4x4-50", "DICT_4X4_50"), ("hd11", "STAG_HD11"),
+    ("standard41h12", "tagStandard41h12"), ("circle21h7", "tagCircle21h7"),
+])
+def test_a_dictionary_is_understood_by_its_number_where_that_is_one(written, value):
+    assert PARAMETERS["dictionary"].check(written) == value
+    if value.startswith("DICT"):
+        pipeline = Pipeline.from_text("[pose]\nside_px = 40", [f"dictionary={written}"])
+        assert pipeline.fixed["dictionary"] == value
+
+
+@pytest.mark.parametrize(("written", "meant"), [
+    ("DICT_4X4", "DICT_4X4_50, DICT_4X4_100, DICT_4X4_250 or DICT_4X4_1000"),
+    ("5x5", "DICT_5X5_50, DICT_5X5_100, DICT_5X5_250 or DICT_5X5_1000"),
+    ("apriltag", ", ".join(f"DICT_APRILTAG_{name}" for name in ("16h5", "25h9", "36h10"))
+     + " or DICT_APRILTAG_36h11"),
+    ("tag41h12", "tagStandard41h12"),
+])
+def test_of_several_dictionaries_the_nearest_are_named(written, meant):
+    with pytest.raises(ValueError, match=f"; did you mean {meant}\\?$"):
+        PARAMETERS["dictionary"].check(written)
+    with pytest.raises(PipelineError, match=f"; did you mean {meant}\\?"):
+        Pipeline.from_text("[pose]\nside_px = 40", [f'dictionary=["{written}", "36h11"]'])
+
+
+@pytest.mark.parametrize("name", sorted(PARAMETERS))
+def test_a_parameter_in_a_wrong_section_is_told_with_the_right_one(name):
+    home = PARAMETERS[name].section
+    for section in {"camera", "pose", "detector", "limit", "require", "precision", "elsewhere"} - {
+            home}:
+        with pytest.raises(PipelineError) as raised:
+            Pipeline.from_text(f"[{section}]\n{name} = 1")
+        (line,) = (line for line in raised.value.faults if f"{name}" in line and "belongs" in line)
+        assert f"belongs under [{home}]" in line
+        if section not in ("limit", "require", "precision"):
+            with pytest.raises(PipelineError, match=f"expected {name} or {home}.{name}"):
+                Pipeline.from_text("", [f"{section}.{name}=1"])
+
+
+@pytest.mark.parametrize(("text", "told"), [
+    ("[pose]\ntilt_deg = [0, 30]", "an axis: they go under [axes]"),
+    ("[estimator]\nsolver = ['ippe', 'sqpnp']", "an axis: they go under [axes]"),
+    ("[pose]\ntilt_deg = { linspace = [0, 30, 3] }", "goes under [axes]"),
+    ("[pose]\nboth = { zip = { tilt_deg = [0, 1], roll_deg = [1, 2] } }", "under [axes]"),
+    ("[pose]\ntrial = 3", "belongs under [axes]"), ("trial = 3", "it under [axes]"),
+    ("solver = 'ippe'", "it under [estimator]"), ("[pose]\nseed = 3", "at the top"),
+    ("[axes]\nseed = [3]", "at the top"),
+    ("[pose]\nvelocity_x = 3", "did you mean velocity_x_m_s under [scene]?"),
+    ("[camera]\nvelocty_x_m_s = 3", "did you mean velocity_x_m_s under [scene]?"),
+])
+def test_what_stands_in_a_wrong_place_is_told_with_the_right_one(text, told):
+    with pytest.raises(PipelineError) as raised:
+        Pipeline.from_text(text)
+    assert any(told in line for line in raised.value.faults), raised.value.faults
+
+
+@pytest.mark.parametrize(("wrong", "right"), [
+    ("smok.toml", "smoke.toml"), ("Smoke.TOML", "smoke.toml"), ("smoke", "smoke.toml"),
+    ("folder/smoek.toml", "folder/smoke.toml"),
+])
+def test_of_a_misspelled_file_the_nearest_in_its_folder_is_named(
+    wrong, right, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    for name in ("smoke.toml", "other.toml", "camera.yaml", "board.toml", "folder/smoke.toml"):
+        (tmp_path / name).touch()
+    with pytest.raises(PipelineError, match=f"; did you mean {right}\\?"):
+        Pipeline.from_toml(wrong)
+    with pytest.raises(PipelineError, match=r"did you mean board\.toml"):
+        read_board("bord.toml")
+    with pytest.raises(PipelineError, match=r"did you mean camera\.yaml"):
+        Pipeline.from_text('[camera]\ncamera_file = "camra.yaml"')
+    (tmp_path / "runs/smoke.zarr").mkdir(parents=True)
+    with pytest.raises(StoreError, match=r"did you mean runs/smoke\.zarr"):
+        open_store("smok.zarr")
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,8 @@ import itertools
 
 import pytest
 
-from sweep.plan.experiment import Pipeline
-from sweep.plan.used_settings import distinct, used_settings
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.same_meaning import distinct, used_settings
 
 PLUGINS = """
 from dataclasses import dataclass

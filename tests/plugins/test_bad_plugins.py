@@ -10,16 +10,16 @@ import pytest
 
 import sweep
 from sweep.errors import PipelineError, PluginError
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells
+from sweep.execution.cluster import _worker_identity
 from sweep.execution.runner import execute
-from sweep.execution.worker_versions import _worker_identity
 from sweep.isolation.child_process import Child
-from sweep.isolation.plugin_check import check_plugins, use
+from sweep.isolation.crash_isolation import check_plugins, use
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings
-from sweep.plugins.calls import call
-from sweep.tradeoff.configuration_costs import clock_of
+from sweep.plan.pipeline import Pipeline
+from sweep.plugins.loading import call
+from sweep.tradeoff.costs import clock_of
 from tests.support.here import Here
 
 DETECTORS = '''
@@ -41,15 +41,9 @@ nan = at(lambda image: (ONE * np.nan, [0]))
 shape = at(lambda image: (ONE[0], [0]))
 many = at(lambda image: (np.zeros((10000, 4, 2)), np.zeros(10000, int)))
 words = at(lambda image: ([["a"]], [0]))
-ragged = at(lambda image: ([[1.0], [1.0, 2.0]], [0]))
-texts = at(lambda image: (ONE.astype(str), [0]))
-complexes = at(lambda image: (ONE + 1j, [0]))
 masked = at(lambda image: (np.ma.masked_array(ONE, mask=True), [0]))
-ids_masked = at(lambda image: (ONE, np.ma.masked_array([0], mask=True)))
-ids_huge = at(lambda image: (ONE, np.array([2**64 - 1], np.uint64)))
 ids_float = at(lambda image: (ONE, [0.0]))
 ids_negative = at(lambda image: (ONE, [-1]))
-ids_missing = at(lambda image: (ONE, None))
 ids_many = at(lambda image: (ONE, [0, 1]))
 nothing = at(lambda image: None)
 changes = at(lambda image: (image.fill(0), ([], []))[1])
@@ -100,15 +94,9 @@ def pipeline(tmp_path):
     ("shape", "returned corners of shape (4, 2); expected (n, 4, 2)"),
     ("many", "returned 10,000 corners for one image; expected at most 1,000"),
     ("words", "returned corners of type <U1; expected real numbers"),
-    ("ragged", "returned corners that are no array of numbers"),
-    ("texts", "returned corners of type <U32; expected real numbers"),
-    ("complexes", "returned corners of type complex128; expected real numbers"),
     ("masked", "returned corners of which some are masked; expected NaN or none"),
-    ("ids_masked", "returned ids of which some are masked"),
-    ("ids_huge", "returned the ID 18446744073709551615; expected below 2^63"),
     ("ids_float", "returned ids of type float64; expected whole numbers"),
     ("ids_negative", "returned the ID -1; expected at least 0"),
-    ("ids_missing", "returned ids of shape (); expected (1,), one of each marker"),
     ("ids_many", "returned ids of shape (2,); expected (1,), one of each marker"),
     ("nothing", "returned a NoneType; expected a tuple (corners, ids)"),
     ("changes", "changed the image that it was given; copy it first"),
@@ -175,13 +163,10 @@ def test_a_detector_that_ends_its_process_or_never_returns_refuses_the_run(pipel
 @pytest.mark.parametrize(("source", "told"), [
     ("import missing_library", "cannot be imported" ),
     ("x =", "SyntaxError"),
-    ("raise SystemExit(2)", "SystemExit: 2 (line 1 of mine.py)"),
     ("D = 3", "a record DetectorPlugin, not a value of type int"),
     ("", "a name in mine.py"),
     ("from sweep.plugins import DetectorPlugin\nD = DetectorPlugin(make=1)",
      "TypeError: make: expected a class or function of settings and family (line 2 of mine.py)"),
-    ("from sweep.plugins import *\nD = DetectorPlugin(make=print, corner_order=(0, 1, 2, 2))",
-     "corner_order = (0, 1, 2, 2): expected the numbers 0 to 3, each once"),
     ("from sweep.plugins import *\nD = DetectorPlugin(make=print, distribution='not-there-9')",
      "the distribution not-there-9, which is not installed: `pip install not-there-9`"),
     ("from sweep.plugins import *\nD = EstimatorPlugin(make=print)",
@@ -194,14 +179,6 @@ class Settings:
     tilt_deg: float = parameter(0.0, "ours")
 D = DetectorPlugin(make=print, settings=Settings)
 """, "another name for its setting tilt_deg: the pipeline has this one"),
-    ("""
-from dataclasses import dataclass
-from sweep.plugins import DetectorPlugin
-@dataclass
-class Settings:
-    plain: float = 1.0
-D = DetectorPlugin(make=print, settings=Settings)
-""", "the setting plain as `name: type = parameter(default, meaning)`"),
     ("""
 from dataclasses import dataclass
 from sweep.plugins import DetectorPlugin, parameter
@@ -338,19 +315,6 @@ def test_costs_are_counted_by_a_clock_that_sees_all_that_works(tmp_path):
     settings = detector_settings(Pipeline.from_text(text, folder=tmp_path))
     assert clock_of(settings[:1]) is time.thread_time
     assert clock_of(settings) is time.process_time
-
-
-def test_many_names_of_plug_ins_are_refused_at_once(tmp_path):
-    names = ", ".join(f'"nowhere{k}:D"' for k in range(20_000))
-    words = ", ".join(f'"solver{k}"' for k in range(20_000))
-    started = time.perf_counter()
-    with pytest.raises(PipelineError) as refused:
-        Pipeline.from_text(
-            f"effects = [{names}]\n[pose]\nside_px = 24\n[axes]\ndetector = [{names}]\n"
-            f"solver = [{words}]\n", folder=tmp_path,
-        )
-    assert len(refused.value.faults) <= 21
-    assert time.perf_counter() - started < 20  # 0.5 s by itself
 
 
 def test_a_worker_says_which_plug_ins_it_lacks(pipeline, tmp_path):

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from sweep.errors import PipelineError, PluginError
-from sweep.evaluation.cells import run_cells
-from sweep.isolation.plugin_check import use
+from sweep.evaluation.block import run_cells
+from sweep.isolation.crash_isolation import use
 from sweep.measure.flags import DetectionStatus
 from sweep.plan.cell_selection import cell
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import detector_settings
-from sweep.store.lifecycle import create_store, open_dataset
+from sweep.plan.pipeline import Pipeline
 
 MINE = '''
 from dataclasses import dataclass
@@ -77,15 +76,6 @@ def test_a_detector_of_other_conventions_gives_opencv_s_corners(folder):
     np.testing.assert_allclose(plain, opencv, rtol=0, atol=1e-5)  # OpenCV's corners are float32
     np.testing.assert_allclose(shifted, opencv + 0.25, rtol=0, atol=1e-5)
     assert (np.array(columns["detection"]) == DetectionStatus.detected).all()
-
-
-def test_detectors_go_together_with_their_settings_along_one_axis_of_a_store(folder):
-    grid = GRID.replace('detector = ["opencv", "mine:TURNED"]', """method = { zip = {
-        detector = ["opencv", "mine:TURNED"], shift_px = [0, 0.25] } }""").replace("\n    ", " ")
-    store = create_store(str(folder / "s.zarr"), Pipeline.from_text(grid, folder=folder), (2,))
-    along = open_dataset(store.url)["shift_px"]
-    assert (along.dims, along.values.tolist()) == (("method",), [0, 0.25])
-    assert along.attrs["units"] == "px"
 
 
 def test_settings_are_checked_as_our_own(folder):

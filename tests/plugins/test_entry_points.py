@@ -9,8 +9,8 @@ import pytest
 
 from sweep.cli import main
 from sweep.errors import PipelineError, PluginError
-from sweep.evaluation.cells import run_cells
-from sweep.plan.experiment import Pipeline
+from sweep.evaluation.block import run_cells
+from sweep.plan.pipeline import Pipeline
 from sweep.plan.plugins import lacking_plugins
 from sweep.plugins import loading
 from sweep.store.provenance import fingerprint
@@ -96,9 +96,3 @@ def test_a_name_that_two_packages_offer_is_refused(site):
     install(site, "slow-markers", "1.0", "[sweep.detectors]\nturned = slow:D\n")
     with pytest.raises(PipelineError, match="fast-markers and slow-markers both have it"):
         Pipeline.from_text(TEXT)
-
-
-@pytest.mark.usefixtures("site")
-def test_an_effect_must_be_an_effect():
-    with pytest.raises(PipelineError, match="a record EffectPlugin, not a value of"):
-        Pipeline.from_text('effects = ["turned"]\n[pose]\nside_px = 50\n')

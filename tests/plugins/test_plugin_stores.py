@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import sweep
-from sweep.analysis.stored_parameters import parameter_value
+from sweep.analysis.dataset import parameter_value
 from sweep.cli import main
 from sweep.errors import OtherExperimentError, PipelineError, StoreError
 from sweep.evaluation.inspection import scene_image
 from sweep.execution.reuse import match
 from sweep.execution.runner import execute
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import open_store
 from sweep.store.provenance import differences, fingerprint
 from tests.plugins.test_detector_plugins import MINE

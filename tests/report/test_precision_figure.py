@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from sweep.analysis.half_widths import Reached
-from sweep.report.precision_figure import PRECISION, _poses_of_conditions, _rows
+from sweep.analysis.precision import Reached
+from sweep.report.comparison_figures import _poses_of_conditions, _rows
 
 
 @pytest.fixture
@@ -32,11 +32,3 @@ def test_each_configuration_has_the_number_of_conditions_by_flag(table):
 
 def test_poses_of_conditions_are_in_increasing_order(table):
     assert _poses_of_conditions(table).tolist() == [50, 100, 300]
-
-
-def test_stores_of_fixed_trials_have_no_such_figure():
-    class Data:
-        class pipeline:  # noqa: N801
-            stopping = None
-
-    assert not PRECISION.applies(Data)

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from support.reports import command, made
-from sweep.analysis.required_pipeline import check_required
-from sweep.plan.experiment import Pipeline
+from sweep.analysis.requirements import check_required
+from sweep.plan.pipeline import Pipeline
 
 FOLDER = Path(__file__).parents[2] / "pipelines" / "questions"
 QUESTIONS = sorted(path.stem for path in FOLDER.glob("*.toml"))
@@ -29,15 +29,15 @@ SMALL = {
 
 EXPECTED = {
     "how_far": "up to 0.5 m",
-    "which": "etected in at least 99 %",
-    "which_size": "with markers of 0.4 m and larger",
-    "flips": "tilt",
-    "focal_length": "etected in at least 99 % at all distances",
-    "field_of_view": "up to a hfov of 30\u00b0",
-    "blur": "up to a blur of 0 px",
-    "dictionary": "down to a side of 40 px",
-    "threshold": "etected in ",
-    "room": "etected in ",
+    "which": " against ",
+    "which_size": "0.4 m",
+    "flips": "along tilt_deg",
+    "focal_length": "Detected in 100 %",
+    "field_of_view": "up to 30",
+    "blur": "along blur_px: up to 0 px",
+    "dictionary": "down to 40 px",
+    "threshold": " against ",
+    "room": "Detected in ",
 }
 """A part of the first sentence on the small grid."""
 
@@ -67,8 +67,9 @@ def test_the_first_sentence_answers_the_question(name, tmp_path):
     assert EXPECTED[name] in shown["answer"]
     if name == "focal_length":
         (table,) = (each for each in shown["tables"]
-                    if each["caption"].startswith("What a wrong belief"))
-        bias = [float(row[table["headings"].index("range bias, %")].split()[0].replace(
-            "\u2212", "-")) for row in table["rows"]]
-        assert bias[1] - bias[0] == pytest.approx(-1, abs=0.05)
-        assert bias[2] - bias[0] == pytest.approx(1, abs=0.05)
+                    if each["caption"].startswith("Configurations, with"))
+        assert shown["configuration"] == "believed_focal_scale 1.0"
+        bias = [float(row[table["headings"].index("range bias, %")].split()[0])
+                for row in table["rows"]]
+        assert bias[0] - bias[1] == pytest.approx(-1, abs=0.05)
+        assert bias[2] - bias[1] == pytest.approx(1, abs=0.05)

@@ -1,21 +1,33 @@
-"""The answer of a report: what is required, judged by configuration, is what plain NumPy finds."""
+"""The answer of a report: line, table and JSON agree, and are what plain NumPy finds."""
 
+import io
 import json
+import math
 import re
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
 
 from support.reports import CAMERA, command, made
 from support.small_datasets import perfect
+from sweep.analysis.requirements import Decision
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
+from sweep.report import comparison as comparisons
 from sweep.report.answer import answer
-from sweep.report.figures import figure_kinds
+from sweep.report.formatting import number
 from sweep.report.report_data import ReportData, read_report_data
+from sweep.report.write_report import figure_kinds
+from sweep.store.lifecycle import open_dataset
 
+GUIDE = (Path(__file__).parents[2] / "pipelines" / "README.md").read_text(encoding="utf-8")
+TUTORIAL = re.search(r"<!-- file: mine.toml -->\n```toml\n(.*?)```", GUIDE, re.DOTALL)[1]
 SMALL = f"""title = "How far?"
 {CAMERA}
 [pose]
@@ -27,6 +39,28 @@ side_px = [8, 40]
 cornerRefinementMethod = ["none", "subpix"]
 trial = 4
 """
+TARGETS = f"""{CAMERA}
+[pose]
+jitter_px = 0.5
+[scene]
+noise_grey = 2
+[axes]
+dictionary = ["DICT_4X4_50", "DICT_6X6_250"]
+side_px = [15, 20, 40]
+trial = 20
+"""
+STORES = {
+    "tutorial": (TUTORIAL, ["distance_m=[1, 3, 5]", "tilt_deg=[30, 60]", "trial=12"]),
+    "targets": (TARGETS, []),
+    "one pose": (f"{CAMERA}[pose]\nside_px = 40\n", []),
+}
+
+
+@pytest.fixture(scope="module", params=STORES)
+def store(request, tmp_path_factory):
+    text, settings = STORES[request.param]
+    return request.param, made(
+        tmp_path_factory.mktemp("answer"), text, "answer", settings=settings)
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +68,142 @@ def small(tmp_path_factory):
     return made(tmp_path_factory.mktemp("small"), SMALL, "small")
 
 
-NONE = "cornerRefinementMethod none"
-"""How a configuration is called in a sentence."""
+def told(url, *arguments):
+    """Return a report's answer as JSON, and its page."""
+    page = Path(url).parent / "report.html"
+    code, out, err = command("report", url, "-o", page, "--json", *arguments)
+    assert (code, err) == (0, "")
+    return json.loads(out), page.read_text(encoding="utf-8")
+
+
+def numbers_of(results):
+    """Return n, rates and RMSE of one configuration, and its squared errors, by plain NumPy."""
+    solved = (results["estimate"] == EstimateStatus.solved).values
+    rotation = results["rotation_error_deg"].values.astype(float)
+    errors, truth = xr.broadcast(results["translation_error_m"], results["true_tvec_m"])
+    order = (*results["estimate"].dims, ...)
+    depth = (errors.astype(float) / truth).transpose(*order).values[..., 2]
+    detected = (results["detection"] == DetectionStatus.detected).values
+    return SimpleNamespace(
+        count=detected.size, detected=100 * detected.mean(), solved=solved,
+        rotation=np.where(solved, rotation, np.nan) ** 2,
+        depth=np.where(solved, depth, np.nan) ** 2,
+        median=np.sort(np.where(solved, rotation, np.inf).ravel())[math.ceil(solved.size / 2) - 1],
+        flipped=(results["flipped"] == Flipped.flipped).values)
+
+
+def configurations_of(results, name):
+    """Return the configurations of a store, by label."""
+    axis = {"tutorial": "cornerRefinementMethod", "targets": "dictionary"}.get(name)
+    if axis is None:
+        return {"as set": results}
+    return {str(value): results.sel({axis: value}) for value in results[axis].values}
+
+
+def value_of(cell):
+    """Return the number that a cell begins with."""
+    return cell.split(" ")[0]
+
+
+def test_line_table_and_json_are_what_plain_numpy_finds(store):
+    name, url = store
+    shown, page = told(url)
+    parts = {label: numbers_of(one)
+             for label, one in configurations_of(open_dataset(url).load(), name).items()}
+    table = next(each for each in shown["tables"]
+                 if each["caption"].startswith("Configurations, with"))
+    rows = {row[0]: dict(zip(table["headings"], row, strict=True)) for row in table["rows"]}
+    assert set(rows) == set(parts)
+    for label, one in parts.items():
+        row = rows[label]
+        assert row["n"] == f"{one.count:,}"
+        for heading, value in (
+            ("detected, %", one.detected), ("solved, %", 100 * one.solved.mean()),
+            ("rotation median, deg", one.median),
+            ("rotation RMSE, deg", math.sqrt(np.nanmean(one.rotation))),
+            ("range RMSE, %", 100 * math.sqrt(np.nanmean(one.depth))),
+            ("flips, %", 100 * one.flipped.sum() / one.solved.sum())):
+            assert value_of(row[heading]) == number(value)
+    assert f'<p class="verdict">{shown["answer"]}</p>' in page
+    named = shown["configuration"] or "as set"
+    tiles = {each["name"]: each["text"] for each in shown["numbers"]}
+    assert tiles["detected"] == f"{number(parts[named].detected)} %"
+    assert tiles["rotation error, RMSE"] == f"{value_of(rows[named]['rotation RMSE, deg'])}\u00b0"
+    assert tiles["range error, RMSE"] == f"{value_of(rows[named]['range RMSE, %'])} %"
+    if len(parts) == 1:
+        assert shown["comparison"] == []
+        assert shown["answer"].startswith(f"Detected in {tiles['detected']}")
+        return
+    (other,) = set(parts) - {named}
+    (found,) = shown["comparison"]
+    assert (found["configuration"], found["against"]) == (named, other)
+    assert rows[named]["verdict"] == "best"
+    assert rows[other]["verdict"].split(":")[0] == found["verdict"] != "worse"
+    best, beaten = parts[named], parts[other]
+    both = best.solved & beaten.solved
+    differ = (best.flipped != beaten.flipped) & both
+    few = 0 < differ.sum() < 10
+    unflipped = both & ~best.flipped & ~beaten.flipped if few else both
+    expected = {
+        "detection": best.detected - beaten.detected,
+        "solved": 100 * (best.solved.mean() - beaten.solved.mean()),
+        "rotation": math.sqrt(best.rotation[unflipped].mean() / beaten.rotation[unflipped].mean()),
+        "range": math.sqrt(best.depth[both].mean() / beaten.depth[both].mean())}
+    for each in found["differences"]:
+        kind = each["quantity"].split()[0]
+        assert each["value"] == pytest.approx(expected[kind], rel=1e-6, abs=1e-12)
+        cell = next(text for heading, text in rows[other].items()
+                    if heading.startswith(kind) and ("difference" in heading or "ratio" in heading))
+        assert value_of(cell) == number(each["value"]).replace("\u2212", "-")
+        equal = 0 if "difference" in each["quantity"] else 1
+        assert (each["verdict"] == "not decided") == (each["low"] <= equal <= each["high"])
+        if each["verdict"] != "not decided":
+            assert (f"{each['quantity']} {number(each['value'])} ({number(each['low'])} to "
+                    f"{number(each['high'])})") in shown["answer"]
+            assert (each["value"] > equal) == ((each["verdict"] == "better") == (equal == 0))
+
+
+def test_the_tutorial_names_the_refinement_that_is_better_on_the_same_images(tmp_path):
+    text, settings = STORES["tutorial"]
+    shown, _ = told(made(tmp_path, text, "mine", settings=settings))
+    assert shown["answer"].startswith("subpix against none: ")
+    assert shown["configuration"] == "subpix"
+    assert "range RMSE ratio 0." in shown["answer"]
+
+
+VERDICTS = st.integers(2, 6).flatmap(lambda n: st.lists(
+    st.sampled_from([-1, 0, 1]), min_size=n * (n - 1) // 2, max_size=n * (n - 1) // 2).map(
+        lambda flat: (n, flat)))
+
+
+@given(VERDICTS)
+def test_no_configuration_is_named_that_another_one_is_better_than_if_there_is_one(drawn):
+    count, flat = drawn
+    matrix = np.zeros((count, count), int)
+    matrix[np.triu_indices(count, 1)] = flat
+    matrix -= matrix.T
+
+    def against(_, __, best, ___):
+        return [() if k == best else (comparisons.Difference("d", 0, 0, 0, "", verdict),)
+                for k, verdict in enumerate(matrix[best].tolist())]
+
+    names = [f"c{k}" for k in range(count)]
+    summary = xr.Dataset({name: ("configuration", np.zeros(count)) for name in (
+        "range_rmse_percent", "rotation_rmse_deg", "solved_rate", "detection_rate")})
+    known = SimpleNamespace(
+        settings=SimpleNamespace(combinations=[{}] * count, grouping=None), names=names,
+        wrong=np.zeros(count, bool), summary=summary)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(comparisons, "_against_each", against)
+        patch.setattr(comparisons, "configurations", lambda _: known)
+        patch.setattr(comparisons, "target_axes", lambda _: ())
+        found = comparisons._comparison(None, None)
+    worse = (matrix < 0).sum(axis=1)
+    assert worse[found.best] == worse.min()
+    assert ("worse" in found.line) == bool(worse.min())
+
+
+# What is required.
 
 SIZES = {"distance_m": 4, "tilt_deg": 2, "trial": 400, "cornerRefinementMethod": 2}
 
@@ -64,115 +232,96 @@ def synthetic(rates, require=("detection >= 0.9",), per=("distance_m", "tilt_deg
     return ReportData("made", results, pipeline, {}, require=tuple(require), per=per)
 
 
-def test_the_headline_is_of_the_best_configuration_and_never_of_several_together():
-    # Pooled, 3 of 4 would be detected at 0.4 m; of each configuration all or half are.
-    rates = [[[1, 1], [1, 1]], [[1, 0.5], [1, 0.5]], [[1, 0.5], [0.5, 0.5]], [[0.5, 0], [0, 0]]]
+def all_tilts(rates):
+    """Return these rates (distance, refinement) at both tilts."""
+    return np.repeat(np.asarray(rates, float)[:, None, :], 2, axis=1)
+
+
+@pytest.mark.parametrize(("rates", "named", "decision", "reached"), [
+    (all_tilts([[1, 1], [1, 0.5], [0.5, 0.5], [0, 0]]), "none", "not_met",
+     "at all values of tilt_deg: up to 0.4 m (0.4)"),
+    (np.ones((4, 2, 2)), "", "met", "at all values, up to 1.6 m"),
+    (np.zeros((4, 2, 2)), "", "not_met", "at all values of tilt_deg: at no value"),
+    (np.full((4, 2, 2), 0.91), "", "undecided", "up to 1.6 m"),
+    (all_tilts([[0, 0], [0, 1], [0, 1], [0, 0]]), "subpix", "not_met", "0.4 to 0.8 m (0.8)"),
+    (np.stack([np.ones((4, 2)), np.full((4, 2), 0.2)], axis=1), "", "not_met",
+     "at no value; at tilt_deg=0: at all values, up to 1.6 m"),
+], ids=["found", "always", "never", "too few", "within", "one angle"])
+def test_what_is_required_is_decided_with_how_far_and_the_configuration(
+    rates, named, decision, reached
+):
     shown = answer(synthetic(rates))
-    assert shown.headline == f"Yes up to 0.4 m at tilts up to 30\u00b0, with {NONE}."
-    assert shown.of == NONE
-    assert ("It is limited by detection_rate >= 0.9, which is 0.500 at 0.8 m and a tilt of "
-            "30\u00b0." in shown.paragraph)
-    (table,) = (each for each in shown.tables if each.caption.startswith("How far"))
-    assert table.rows == [
-        ["none", "0.8 m", "0.4 m", "detection_rate 0.500 at 0.8 m, 30\u00b0"],
-        ["subpix", "0.2 m", "0.2 m", "detection_rate 0.500 at 0.4 m, 30\u00b0"]]
-    assert {tile.heading: tile.value for tile in shown.tiles}["detected"] == "75.0 %"
+    assert shown.of == named or (not named and shown.of in {"none", "subpix"})
+    assert shown.headline.endswith(f", with {shown.of}.")
+    assert reached in shown.headline
+    assert shown.numbers["decision"] is Decision[decision]
+    words = {"met": "met", "not_met": "not met", "undecided": "not decided"}[decision]
+    assert shown.headline.startswith(f"detection >= 0.9: {words} at ")
+    together, by_angle = shown.tables[:2]
+    assert together.frame["cornerRefinementMethod"].tolist() == ["none", "subpix"]
+    assert set(together.frame["decided"]) <= {"yes", "no"}
+    assert len(by_angle.frame) == 4
 
 
-@pytest.mark.parametrize(("near", "headline"), [
-    (0.5, "No: at no distance at tilts up to 30\u00b0, with none of the configurations."),
-    (0.9, (f"Perhaps up to 0.2 m (at most 0.2) at tilts up to 30\u00b0, with {NONE}: too few draws "
-           "to tell.")),
-    (0.88, (f"Probably not: at no distance at tilts up to 30\u00b0, with {NONE}, but there are too "
-            "few draws to tell.")),
-    (1, f"Yes up to 0.2 m at tilts up to 30\u00b0, with {NONE}."),
-])
-def test_the_answer_says_yes_perhaps_or_no(near, headline):
-    rates = np.zeros((4, 2, 2))
-    rates[0] = near
-    assert answer(synthetic(rates)).headline == headline
+def test_the_table_of_limits_has_a_dip_and_an_open_interval():
+    shown = answer(synthetic(all_tilts([[1, 0.91], [0.2, 0.91], [1, 0.2], [0.2, 0.2]])))
+    rows = {row[0]: row for row in shown.tables[0].rows}
+    assert rows["none"][1:4] == ["up to 0.2 m", "0.2", "yes"]
+    assert rows["none"][5] == "kept again by estimate, farthest at 0.8 m"
+    assert rows["subpix"][1:4] == ["not decided: up to 0.4 m", "below 0.2 to 0.4", "no"]
 
 
-def test_where_large_angles_fail_the_answer_is_of_the_smaller_ones_and_says_so():
-    rates = np.ones((4, 2, 2))
-    rates[:, 1] = 0.2
-    rates[-1, 0, 1] = 0.2
-    shown = answer(synthetic(rates))
-    assert shown.headline == (
-        f"Yes at all distances, up to 1.6 m (1.6 or more) at tilts up to 0\u00b0, with {NONE}.")
-    assert shown.paragraph.startswith("At tilts up to 30\u00b0: at no distance.")
+def test_without_an_axis_the_worst_value_and_the_draws_that_would_decide_are_told():
+    shown = answer(synthetic(np.full((4, 2, 2), 0.9), per=("cornerRefinementMethod",)))
+    assert re.fullmatch(
+        r"detection >= 0\.9: not decided \(0\.900 \(.*\)\); no number of draws would tell, "
+        r"with \w+\.", shown.headline)
+    assert answer(synthetic(np.ones((4, 2, 2)), per=())).headline.startswith(
+        "detection >= 0.9: met (1.00 (")
 
 
-def test_what_is_met_between_two_values_is_said_so():
-    rates = np.full((4, 2, 2), 0.2)
-    rates[1:3] = 1
-    shown = answer(synthetic(rates))
-    assert shown.headline == "Yes from 0.4 m to 0.8 m at tilts up to 30\u00b0, with subpix."
-    assert "0.200 at 1.6 m and a tilt of 30" in shown.paragraph
-    assert "Not at 0.2 m: there detection_rate >= 0.9 is not met, it is 0.200." in shown.paragraph
+def test_a_wrong_belief_is_never_named():
+    beliefs = {"believed_focal_scale": [0.99, 1.0, 1.01]}
+    for require in ((), ("detection >= 0.9",)):
+        shown = answer(synthetic(np.ones((4, 2, 2)), require, **beliefs))
+        assert shown.of.endswith("believed_focal_scale 1.0")
+        assert "wrong" not in shown.headline
+    (table,) = (each for each in shown.tables if each.caption.startswith("Configurations, with"))
+    assert sum("(wrong)" in row[0] for row in table.rows) == 4
 
 
-def test_small_angles_at_which_nothing_is_met_are_named():
-    rates = np.ones((4, 2, 2))
-    rates[:, 0] = 0.2
-    rates[2:] = 0.2
-    shown = answer(synthetic(rates))
-    assert shown.headline == f"Yes up to 0.4 m at a tilt of 30\u00b0, with {NONE}."
-    assert shown.paragraph.startswith(
-        "At tilts below 30\u00b0: at no distance (detection_rate 0.200 at 0.2 m, 0\u00b0).")
-
-
-def test_angles_of_which_the_large_are_the_easy_ones_are_told_from_small_to_large():
-    rates = np.ones((4, 2, 2))
-    rates[:, 0] = 0.2
-    shown = answer(synthetic(rates, per=("tilt_deg",)))
-    assert shown.headline == "Yes only at a tilt of 30\u00b0, with subpix."
-
-
-def test_without_an_ordered_condition_the_answer_is_of_all_conditions():
-    rates = np.ones((4, 2, 2))
-    rates[..., 1] = 0.2
-    shown = answer(synthetic(rates, per=("cornerRefinementMethod",)))
-    assert shown.headline == f"Yes, with {NONE}."
-
-
-def test_a_wrong_belief_is_in_no_answer():
-    shown = answer(synthetic(np.ones((4, 2, 2)), believed_focal_scale=[0.99, 1.0, 1.01]))
-    assert shown.of == f"{NONE} \u00b7 believed_focal_scale 1.0"
-    assert "wrong" not in shown.headline + shown.of
-    assert "4 configurations with a wrong belief are no choice; the range bias is " in (
-        shown.paragraph)
-    (table,) = (each for each in shown.tables if each.caption.startswith("Which configuration"))
-    assert not any("wrong" in cell for row in table.rows for cell in row)
-    (table,) = (each for each in shown.tables if each.caption.startswith("What a wrong belief"))
-    assert [row[0] for row in table.rows] == [
-        f"none \u00b7 believed_focal_scale {scale}"
-        for scale in ("1.0", "0.99 (wrong)", "1.01 (wrong)")]
+def test_the_report_decides_as_the_command_require(small):
+    for requirement in ("detection >= 0.9", "range_rmse_percent <= 3"):
+        shown, _ = told(small, "--require", requirement, "--per", "side_px")
+        out = command("require", small, requirement, "--per", "side_px", "--json")[1]
+        printed = json.loads(out)["requirements"]
+        for mine, theirs in zip(shown["requirements"], printed, strict=True):
+            assert mine == {name: theirs[name] for name in mine}
 
 
 def blank(_, file, **__):
-    """Write a drawing that is empty, on a page; none where it would be a file."""
+    """Write a drawing that is empty, as text on a page and as bytes of a file."""
     if not isinstance(file, Path):
-        file.write("<svg></svg>")
+        file.write("<svg></svg>" if isinstance(file, io.StringIO) else b"")
 
 
 def test_page_markdown_json_and_terminal_have_the_same_answer(small, tmp_path, monkeypatch):
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", blank)
-    arguments = ["report", small, "--require", "detection >= 0.9", "--per", "side_px"]
-    page, text = tmp_path / "r.html", tmp_path / "r.md"
-    code, out, err = command(*arguments, "-o", page, "--json")
+    arguments = ["--require", "detection >= 0.9", "--per", "side_px"]
+    text = tmp_path / "r.md"
+    found, shown = told(small, *arguments)
+    assert found["required"] == ["detection_rate >= 0.9"]
+    code, out, err = command("report", small, *arguments, "-o", text)
     assert (code, err) == (0, "")
-    told = json.loads(out)
-    assert told["required"] == ["detection_rate >= 0.9"]
-    code, out, err = command(*arguments, "-o", text)
-    assert (code, err) == (0, "")
-    assert told["answer"] == out.splitlines()[1]
-    shown = page.read_text(encoding="utf-8")
-    assert re.search(r'<p class="verdict">(.*?)</p>', shown)[1] == told["answer"]
-    assert f"**{told['answer']}**" in text.read_text(encoding="utf-8")
-    for each in told["numbers"]:
-        assert f'<span class="value">{each["value"]}</span>' in shown
-        assert f"**{each['value']}**" in text.read_text(encoding="utf-8")
+    assert found["answer"] == out.splitlines()[1]
+    line = re.search(r'<p class="verdict">(.*?)</p>', shown)[1]
+    assert line.replace("&gt;", ">") == found["answer"]
+    written = text.read_text(encoding="utf-8").replace("\\", "").replace("&gt;", ">")
+    assert f"**{found['answer']}**" in written
+    assert all(isinstance(each["value"], float | None) for each in found["numbers"])
+    for each in found["numbers"]:
+        assert f'<span class="value">{each["text"]}</span>' in shown
+        assert f"**{each['text']}**" in written
 
 
 @pytest.mark.long

@@ -101,20 +101,6 @@ def test_a_page_that_asked_for_something_would_be_told(tmp_path):
     assert "Content Security Policy" in console[0]
 
 
-SMALLER = {
-    "paper_fig3": ["marker_id=[0, 1]", "distance_m={ linspace = [0.02, 0.3, 9] }", "trial=2"],
-    "paper_fig4": ["marker_id=[0, 1]", "distance_m={ linspace = [0.1, 0.5, 45] }", "trial=2"],
-    "smoke": ["trial=2"],
-    "bound": ["trial=3", "side_px=[20, 50]", "tilt_deg=[0, 30, 60]"],
-    "renderers": ["trial=2", "renderer=['exact', 'warp', 'supersample-2']", "side_px=[20, 50]"],
-    "tradeoff": ["trial=2", "side_px=[20, 50]"],
-    "second_dip": ["marker_id=[0, 1]", "side_px=[13, 15.5, 18, 25]", "trial=2"],
-    "second_dip_settings": ["marker_id=[0, 1]", "side_px=[15.2, 18, 22]", "trial=2",
-                            "perspectiveRemovePixelPerCell=[4, 8]"],
-    "faults": ["trial=2", "exposure_s=[0, 0.002]", "distance_m=[0.8, 1.6]"],
-}
-
-
 KINDS = {
     "one pose": "[pose]\nside_px = 40\n",
     "sobol": """seed = 1
@@ -187,16 +173,3 @@ def test_a_report_of_a_million_poses_is_written_and_opened_in_time(tmp_path):
     print(f"\nwritten in {written:.1f} s, opened in {shown - start:.2f} s")
     assert written < 30
     assert shown - start < 2
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", sorted(path.stem for path in PIPELINES.glob("*.toml")))
-def test_reports_of_every_pipeline_are_right(name, tmp_path):
-    text = (PIPELINES / f"{name}.toml").read_text(encoding="utf-8")
-    url = made(tmp_path, text, name, settings=SMALLER.get(name, ["trial=2"]))
-    if name == "tradeoff":
-        assert command("tradeoff", url, "--per", "side_px", "--seconds", "20")[0] == 0
-    page = tmp_path / "report.html"
-    code, _, err = command("report", url, "-o", page)
-    assert (code, err) == (0, "")
-    check(page, tmp_path)

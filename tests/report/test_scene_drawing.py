@@ -5,9 +5,9 @@ import pytest
 
 from sweep.evaluation.inspection import inspect_scene
 from sweep.plan.cell_selection import cell
-from sweep.plan.experiment import Pipeline
-from sweep.report import scene_drawing
-from sweep.report.scene_drawing import DETECTED, TRUTH, cut_to_marker, draw_outlines, draw_scene
+from sweep.plan.pipeline import Pipeline
+from sweep.report import scenes as scene_drawing
+from sweep.report.scenes import DETECTED, TRUTH, cut_to_marker, draw_outlines, draw_scene
 
 FRAME = {
     "camera": {"width_px": 1600, "height_px": 1200, "fx_px": 1000},

@@ -1,7 +1,6 @@
 """What accuracy costs: the front, the advice, the tables and the figure."""
 
 import itertools
-import json
 import re
 
 import numpy as np
@@ -12,12 +11,9 @@ from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation, Text
 
-from sweep.errors import ArgumentError
-from sweep.report.tradeoff_chart import draw_trade
-from sweep.report.tradeoff_table import MAX_WIDTH, as_json, table_markdown, table_text
-from sweep.tradeoff.advice import advice
-from sweep.tradeoff.labels import digits
-from sweep.tradeoff.pareto import CRITERIA, UNITS, mark_front, pareto_front
+from sweep.report.table import MAX_WIDTH
+from sweep.report.tradeoff_figure import draw_trade, headlines, tradeoff_table
+from sweep.tradeoff.pareto import CRITERIA, UNITS, advice, digits, mark_front, pareto_front
 
 P95 = "rotation_p95_deg"
 SOLVERS = ("ippe_square", "ippe", "iterative", "sqpnp", "ap3p")
@@ -120,15 +116,6 @@ def test_the_front_is_what_no_other_point_beats(points):
     assert pareto_front(*zip(*points, strict=True)).tolist() == expected
 
 
-def test_equal_points_are_both_on_the_front():
-    assert pareto_front([1, 1, 1], [2, 2, 3]).tolist() == [True, True, False]
-
-
-def test_costs_and_errors_must_be_of_one_shape():
-    with pytest.raises(ArgumentError, match="expected the shape"):
-        pareto_front([1, 2], [1])
-
-
 @pytest.mark.parametrize("criterion", CRITERIA)
 def test_each_regime_has_its_own_front(criterion):
     trade = mark_front(synthetic(), criterion)
@@ -208,15 +195,6 @@ def test_an_rmse_is_not_told_without_what_was_solved():
     assert sentence.count("% solved)") == len(sentence.split("; "))
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0.31, "0.310"), (99.96, "100"), (999.6, "1000"), (123456, "123000"), (1e7, "1.00e+07"),
-     (-0.01234, "-0.0123"), (0, "0"), (np.inf, "inf"), (np.nan, "-")],
-)
-def test_numbers_have_three_digits(value, text):
-    assert digits(value) == text
-
-
 # Tables, JSON and figures, for one, three and no regimes, and for one treatment.
 
 def spoilt():
@@ -251,49 +229,24 @@ TRADES = pytest.mark.parametrize(
 
 @TRADES
 def test_tables_have_a_row_for_every_treatment(trade):
-    text, markdown = table_text(trade, P95), table_markdown(trade, P95)
+    table = tradeoff_table(trade, P95)
+    text = table.text()
     assert max(map(len, text.splitlines())) <= MAX_WIDTH
-    regimes = trade.sizes.get("side_px", 1)
-    tables = text.count("  configuration")
-    assert tables % regimes == 0
-    front = mark_front(trade, P95).on_front
-    assert text.count("\n* ") == int(front.sum()) * tables // regimes + 1  # and the legend
-    assert markdown.count("| **") == int(front.sum())
-    rows = [line for line in markdown.splitlines() if line.startswith("|")]
-    assert len(rows) == regimes * (trade.sizes["treatment"] + 2)
-    assert len({line.count("|") for line in rows}) == 1
-    assert "nan" not in text + markdown
+    assert len(table.frame) == trade.sizes.get("side_px", 1) * trade.sizes["treatment"]
+    assert (table.frame["on the front"] == "yes").sum() == mark_front(trade, P95).on_front.sum()
+    assert ("condition" in table.frame) == (trade["cost_ms"].ndim > 1)
+    assert "nan" not in text + table.markdown() + "".join(headlines(trade))
 
 
 def test_tables_are_sorted_by_cost_and_show_intervals():
     trade = synthetic([20])
-    text = table_text(trade, P95)
+    table = tradeoff_table(trade, P95)
     order = trade.isel(side_px=0).sortby("cost_ms").treatment.values
-    found = [line[2:].split("  ")[0] for line in text.splitlines() if " \u00b7 " in line]
-    assert found[1:22] == order.tolist()  # behind the baseline's headline
+    assert table.frame["configuration"].tolist() == order.tolist()
     one = trade.isel(side_px=0, treatment=-1)
     for name in ("cost_ms", "cost_ratio", P95):
         low, value, high = (digits(one[f"{name}{end}"]) for end in ("_low", "", "_high"))
-        assert f"{value} ({low}..{high})" in text
-
-
-@TRADES
-def test_json_holds_everything(trade):
-    content = json.loads(json.dumps(as_json(trade), allow_nan=False))
-    assert content["attrs"] == trade.attrs
-    assert content["data_vars"].keys() | content["coords"].keys() == set(trade.variables)
-
-    def back(value):
-        if isinstance(value, list):
-            return [back(one) for one in value]
-        return {"infinite": np.inf, None: np.nan}.get(value, value)
-
-    for name, variable in trade.variables.items():
-        stored = (content["data_vars"] | content["coords"])[name]
-        assert tuple(stored["dims"]) == variable.dims
-        assert np.array_equal(
-            back(stored["data"]), variable.values, equal_nan=variable.dtype.kind == "f"
-        )
+        assert f"{value} ({low} to {high})" in table.text()
 
 
 @pytest.mark.long
@@ -307,11 +260,6 @@ def test_a_figure_is_written(trade, suffix, start, tmp_path):
     path = tmp_path / f"trade.{suffix}"
     draw_trade(trade, P95, path)
     assert path.read_bytes().startswith(start)
-
-
-def test_a_figure_of_an_unknown_format_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="Format"):
-        draw_trade(synthetic([20], treatments=1), P95, tmp_path / "trade.nonsense")
 
 
 def drawn_figure(monkeypatch, trade, **options):

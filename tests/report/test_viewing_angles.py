@@ -4,9 +4,8 @@ import pytest
 
 import sweep
 from sweep.analysis import detection_limit
-from sweep.report.question import course_of
 from sweep.report.report_data import read_report_data
-from sweep.report.scene_figures import DETECTION, MAPS
+from sweep.report.scene_figures import DETECTION, MAPS, course_of
 from tests.support.here import calls_here
 
 

@@ -1,5 +1,7 @@
 """A search for the smallest choice answers as the truth is, and faults of its file are lines."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -10,11 +12,11 @@ from sweep.analysis.requirements import Decision
 from sweep.errors import PipelineError
 from sweep.execution.runner import execute
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.experiment import Pipeline
-from sweep.sampling.choice import store_cells
-from sweep.sampling.group_dataset import group_dataset
-from sweep.sampling.rules import make_rule
-from sweep.sampling.stopping import GroupResults
+from sweep.plan.pipeline import Pipeline
+from sweep.report import answer_tables as size_lines
+from sweep.sampling.rules import GroupResults, make_rule
+from sweep.sampling.searches import group_dataset, store_cells
+from sweep.tradeoff import choice_search
 
 DOCUMENT = {
     "pose": {"distance_m": 1.0, "jitter_px": 0.5},
@@ -39,21 +41,21 @@ def changed(**sections):
 
 
 FAULTS = [
-    ({"choose": {"smallest": "solver"}}, 'choose.smallest = "solver": expected an axis of the sc'),
-    ({"choose": {"smallest": "dictionary", "among": []}}, "dictionary has no order: put it into"),
+    ({"choose": {"smallest": "solver"}}, "choose.smallest: solver: each configuration has its own"),
+    ({"choose": {"smallest": "dictionary", "among": []}}, "of numbers; dictionary has no order"),
     ({"choose": {"smallest": "distance_m"}}, "list the values of distance_m under [axes]"),
     ({"choose": {"smallest": "trial"}}, "trials are what is counted"),
     ({"choose": {"smallest": "size"}}, "size: no such axis; did you mean size_m?"),
     ({"choose": {"largest": "size_m"}}, "smallest or largest, not both"),
     ({"choose": {"among": ["size_m"]}}, "size_m once: it is sought along already"),
-    ({"choose": {"among": "dictionary"}}, 'a list of names of axes, such as ["dictionary", "solv'),
+    ({"choose": {"among": "dictionary"}}, 'a list of texts, such as ["dictionary", "solver"]'),
     ({"choose": {"confidence": 95}}, "choose.confidence = 95: expected a number from 0.5 to"),
     ({"choose": {"max_trials": 0}}, "choose.max_trials = 0: expected"),
     ({"choose": {"max_trials": 30}}, "choose.max_trials = 30: expected at least "),
     ({"choose": {"smalest": 1}}, "choose.smalest: unknown key; expected smallest, largest"),
-    ({"axes": {"size_m": [0.02]}}, "size_m has one: there is nothing to choose"),
+    ({"axes": {"size_m": [0.02]}}, "axis of several values, from easy to hard; size_m has one"),
     ({"choose": {"smallest": "distance_m"}, "pose": {"distance_m": {"uniform": [1, 2]}}},
-     "distance_m is drawn: give it values under [axes]"),
+     "it is drawn for each trial: give distance_m values under [axes]"),
     ({"require": None}, 'expected what must be met: [require] all = ["detection >= 0.99"]'),
     ({"require": {"per": ["size_m"]}}, "expected conditions; size_m is what [choose] chooses"),
     ({"require": {"all": ["detection >= 0.9", "detection <= 0.8"]}}, "contradicts"),
@@ -121,6 +123,86 @@ def group(pipeline, rates, trials, generator):
         "flipped": np.where(both, Flipped.not_flipped, Flipped.no_estimate).astype(np.uint8)})
 
 
+@pytest.mark.parametrize("section", [
+    {"require": {"all": ["detection >= 0.5"], "per": []},
+     "choose": {"smallest": "size_m", "max_trials": 40}},
+    {"precision": {"detection_rate": 0.1, "per": [], "max_trials": 40}},
+    {"limit": {"require": ["detection >= 0.5"], "along": "size_m", "per": [], "max_trials": 40}},
+])
+def test_a_first_wave_of_many_pooled_cells_can_be_decided(section):
+    pipeline = Pipeline.from_dict({
+        "pose": {"distance_m": 1.0, "jitter_px": 0.5},
+        "axes": {"size_m": [0.02, 0.08], "marker_id": list(range(50))}, **section})
+    rule = make_rule(pipeline)
+    first = rule.ends[0]
+    assert first >= 2
+    flags = np.ones((2, 50, first), np.uint8)
+    values = {"detection": flags, "estimate": flags, "flipped": flags}
+    rule.needed(GroupResults(pipeline, (0, 0), (2, 50), 1, first, values))
+
+
+@pytest.fixture
+def chosen(monkeypatch):
+    """Return what makes the choice of a search that found these rates (size, tilt)."""
+    def choice(rates, trials, wish="smallest", sizes=(0.02, 0.04, 0.08)):
+        pipeline = Pipeline.from_dict({
+            "pose": {"distance_m": 1.0, "jitter_px": 0.5},
+            "axes": {"size_m": list(sizes), "tilt_deg": [0, 60]},
+            "require": {"all": ["detection >= 0.9"]},
+            "choose": {wish: "size_m", "max_trials": trials}})
+        found = np.arange(trials) < np.round(trials * np.asarray(rates))[..., None]
+        detection = np.where(found, DetectionStatus.detected, DetectionStatus.rejected)
+        detection[np.isnan(rates)] = DetectionStatus.not_visible
+        results = group_dataset(GroupResults(
+            pipeline, (0, 0), (3, 2), 1, trials, {
+                "detection": detection.astype(np.uint8),
+                "estimate": np.where(found, EstimateStatus.solved, EstimateStatus.no_detection),
+                "flipped": np.where(found, Flipped.not_flipped, Flipped.no_estimate)}))
+        monkeypatch.setattr(choice_search, "execute", lambda *_, **__: SimpleNamespace(
+            store="runs/a.zarr", warnings=()))
+        monkeypatch.setattr(choice_search, "open_dataset", lambda _: results)
+        return choice_search.search_choice(pipeline)
+
+    return choice
+
+
+@pytest.mark.parametrize(("wish", "rates", "bound"), [
+    ("smallest", [[0.0, 0.0], [0.93, 1.0], [1.0, 1.0]], "at most size_m=0.08"),
+    ("largest", [[1.0, 1.0], [0.93, 1.0], [0.0, 0.0]], "at least size_m=0.02"),
+])
+def test_an_answer_that_a_better_one_may_replace_is_not_decided(wish, rates, bound, chosen):
+    choice = chosen(rates, 200, wish)
+    shown = size_lines.as_json(choice)
+    first, following, *_ = shown["sentences"]
+    assert choice.decision is Decision.undecided
+    assert first.startswith(f"not decided: {bound}")
+    assert following.startswith("detection_rate >= 0.9 is not decided: 0.930 (")
+    assert "200 draws, about " in following
+    assert (shown["decision"], shown["answer"]) == (Decision.undecided, None)
+    assert list(shown["known"]) == ["size_m"]
+
+
+def test_a_decided_answer_is_told_as_one(chosen):
+    choice = chosen([[0.0, 0.0], [1.0, 1.0], [1.0, 1.0]], 200)
+    assert choice.decision is Decision.met
+    assert size_lines.headline(choice).startswith("size_m=0.04 is the smallest choice")
+    assert size_lines.as_json(choice)["answer"] == {"size_m": 0.04}
+
+
+def test_estimates_beyond_an_undecided_value_are_no_findings(chosen):
+    choice = chosen([[0.0, 0.0], [1.0, 1.0], [0.88, 1.0]], 200)
+    text = " ".join(size_lines.as_json(choice)["sentences"])
+    assert choice.decision is Decision.undecided
+    assert "seem" not in text
+    assert "detection_rate >= 0.9 is not decided: 0.880 (" in text
+
+
+def test_sizes_at_which_nothing_can_be_judged_are_left_out(chosen):
+    """The largest does not fit into the image."""
+    choice = chosen([[0.0, 0.0], [1.0, 1.0], [np.nan, np.nan]], 200)
+    assert (choice.decision, choice.answers[0].value) == (Decision.met, 0.04)
+
+
 def test_trials_are_needed_up_to_the_first_size_that_fails():
     """Of sizes 0.02, 0.08, 0.04 the walk is 0.08, 0.04, 0.02; 4X4 fails at 0.04 and tilt 60.
 
@@ -150,7 +232,7 @@ def test_pipelines_are_read_again_from_their_text():
 def test_another_choice_does_not_continue_a_store():
     rule = Pipeline.from_dict(DOCUMENT).stopping
     other = Pipeline.from_dict(changed(choose={"max_trials": 500})).stopping
-    assert other.looser(rule) == "choose: max_trials: the store has 400, this run 500"
+    assert other.looser(rule) == "choose.max_trials: the store has 400, this run 500"
     assert not rule.looser(rule)
 
 

@@ -10,16 +10,22 @@ import pytest
 from scipy import special, stats
 
 from support.searches import flags_of, is_covered, pipeline_of, searched, true_limits
-from sweep.analysis.repeated_looks import looks_factor
-from sweep.analysis.searched_limits import requirement_limits
+from sweep.analysis.intervals import looks_factor
+from sweep.analysis.limits import requirement_limits
+from sweep.analysis.requirements import Decision
 from sweep.errors import PipelineError
 from sweep.measure.flags import DetectionStatus
-from sweep.plan.experiment import Pipeline
-from sweep.plan.wave_ends import wave_ends
-from sweep.sampling.group_dataset import group_dataset
-from sweep.sampling.limit import limit_sampling
-from sweep.sampling.limit_search import BEYOND, wanted_values
-from sweep.sampling.stopping import GroupResults
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.sampling import wave_ends
+from sweep.report.limit_figure import as_json, limit_table
+from sweep.sampling.rules import GroupResults
+from sweep.sampling.searches import (
+    BEYOND,
+    group_dataset,
+    limit_sampling,
+    size_shrinks_upwards,
+    wanted_values,
+)
 
 CHANCE = 1e-6
 SIDES = np.geomspace(60, 8, 20)
@@ -172,17 +178,48 @@ def test_a_store_of_equal_trials_has_limits_too():
     assert limits["poses"].values.tolist() == [1200]
 
 
+def test_a_limit_that_is_not_decided_is_never_told_as_met():
+    rng = np.random.default_rng(4)
+    told = {False: 0, True: 0}
+    for curve in rng.uniform(0.8, 1.0, (6, 1, 1)) * special.expit((SIDES - 12.0) / 2):
+        limits = searched(curve, SIDES, "detection >= 0.9", 80, seed=6)
+        (listed,) = as_json(limits)["limits"]
+        (row,) = limit_table(limits).shown_rows
+        decision = limits["decision"].isel(tilt_deg=0)
+        met = {name: isinstance(listed[name], float) and bool(
+            (decision[listed[name] <= SIDES] == Decision.met).all())
+            for name in ("value", "met_to")}
+        told[met["value"]] += 1
+        assert met["value"] or "not decided" in row[1] or listed["decided"]
+        assert met["met_to"] or not isinstance(listed["met_to"], float)
+    assert told[False]
+
+
+def test_the_hard_end_of_an_axis_is_the_same_for_the_search_and_for_its_results():
+    """Of sizes at distances that are drawn no sides can be computed; the smaller ones are hard."""
+    pipeline = Pipeline.from_dict({
+        "pose": {"jitter_px": 0.5, "distance_m": {"uniform": [1, 2]}},
+        "axes": {"size_m": [0.1, 0.2], "trial": 50}})
+    detection = np.full((2, 50), DetectionStatus.detected, np.uint8)
+    detection[1] = DetectionStatus.rejected
+    results = group_dataset(GroupResults(pipeline, (0,), (2,), 1, 50, flags_of(detection)))
+    results.attrs["pipeline"] = pipeline.text
+    harder = requirement_limits(results, ["detection >= 0.9"], "size_m").attrs["harder"]
+    assert size_shrinks_upwards(pipeline, "size_m") is False
+    assert harder == "downwards"
+
+
 AXES = {"side_px": [10, 20], "dictionary": ["DICT_4X4_50", "DICT_5X5_50"], "roll_deg": [0],
         "solver": ["ippe", "iterative"], "tilt_deg": [0, 30]}
 GOOD = {"require": ["detection >= 0.9"], "along": "side_px", "max_trials": 80}
 
 
 @pytest.mark.parametrize(("changed", "words"), [
-    ({"along": "dictionary"}, "its values have no order"),
-    ({"along": "roll_deg"}, "it has one value"),
+    ({"along": "dictionary"}, "has no order"),
+    ({"along": "roll_deg"}, "roll_deg has one"),
     ({"along": "noise_grey"}, "it has one value"),
     ({"along": "azimuth_deg"}, "it is drawn for each trial"),
-    ({"along": "solver"}, "each configuration has its own limit"),
+    ({"along": "solver"}, "each configuration has its own answer"),
     ({"along": "trial"}, "trials are what is counted"),
     ({"along": "sides"}, "no such axis"),
     ({"along": 3}, "the axis that is searched"),
@@ -191,9 +228,9 @@ GOOD = {"require": ["detection >= 0.9"], "along": "side_px", "max_trials": 80}
     ({"require": ["budget_ms <= 2"]}, "the cost is that of a configuration"),
     ({"per": ["side_px"]}, "other axes than side_px"),
     ({"per": ["tilt_deg"], "at_all": ["tilt_deg"]}, "in per or in at_all"),
-    ({"at_all": ["nothing"]}, "no such axis of the scene"),
+    ({"at_all": ["nothing"]}, "no such axis"),
     ({"max_trials": 1}, "at least 2"),
-    ({"coarse_trials": 1}, "a whole number from 2 on"),
+    ({"coarse_trials": 1}, "a whole number from 2 to"),
     ({"coarse_trials": 81}, "coarse_trials = 81: expected at most max_trials, 80"),
     ({"more": 1}, "unknown key"),
 ])

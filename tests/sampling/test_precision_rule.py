@@ -8,9 +8,8 @@ from scipy import stats
 
 from sweep.errors import PipelineError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.experiment import Pipeline
-from sweep.sampling.rules import make_rule
-from sweep.sampling.stopping import GroupResults
+from sweep.plan.pipeline import Pipeline
+from sweep.sampling.rules import GroupResults, make_rule
 
 TEXT = """
 seed = 3

@@ -9,15 +9,13 @@ from support.here import Here, calls_here
 from support.stores import by_hand, in_waves, same
 from sweep.errors import OtherExperimentError, StoreError
 from sweep.execution.calibration import Calibration
-from sweep.execution.finalize import close
-from sweep.execution.runner import execute
-from sweep.execution.status import status
-from sweep.execution.tightening import tighten
-from sweep.execution.work_left import check_new
+from sweep.execution.forecast import check_new
+from sweep.execution.runner import execute, tighten
+from sweep.execution.status import close, status
 from sweep.integrity.repair import repair
 from sweep.integrity.verification import verify
 from sweep.measure.flags import DetectionStatus
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 from sweep.store.blocks import committed, drop_block, receipts
 from sweep.store.lifecycle import open_dataset
 

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from sweep.analysis.half_widths import evaluate
+from sweep.analysis.draws import as_stopped
 from sweep.analysis.intervals import LEVEL
-from sweep.analysis.pose_view import Poses
+from sweep.analysis.poses import Poses
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.experiment import Pipeline
-from sweep.sampling.rules import make_rule
-from sweep.sampling.stopping import GroupResults
+from sweep.plan.pipeline import Pipeline
+from sweep.sampling.rules import GroupResults, make_rule
 
 REPETITIONS = 2000
 FEWEST = int(stats.binom.ppf(1e-6, REPETITIONS, 0.95))
@@ -53,6 +52,15 @@ def simulated(name, truth, width, most, draw, repetitions=REPETITIONS):
             break
     return held / repetitions, float(np.nanmean(np.concatenate(deviations))), np.concatenate(
         used).mean()
+
+
+def evaluate(statistics, poses):
+    """Return the variables (groups,) of poses, as they are where sampling was stopped."""
+    variables = {}
+    for statistic in map(as_stopped, statistics):
+        known = statistic.prepare_second(statistic.first_pass(poses).fold())
+        variables |= statistic.finish(known, statistic.second_pass(poses, known).fold())
+    return variables
 
 
 def of_stopped(wanted, values, truth, width):

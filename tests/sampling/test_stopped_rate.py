@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sweep.analysis.stopped_sampling import TAIL_SHARE
-from sweep.sampling.stopped_rate import StoppedRate
-from sweep.sampling.stopping import wave_ends
+from support.stopped_rate import StoppedRate
+from sweep.analysis.draws import TAIL_SHARE
+from sweep.plan.sampling import wave_ends
 
 ALPHA = 0.05 * TAIL_SHARE
 RATES = (0.0, 0.001, 0.01, 0.1, 0.5, 0.9, 0.99, 1.0)
@@ -43,44 +43,6 @@ def test_the_enumeration_has_the_properties_of_all_sequences(rate):
     expected = of_all_sequences(0.31, (3, 6, 9), rate)
     assert StoppedRate(0.31, (3, 6, 9)).at(rate) == pytest.approx(expected, abs=1e-12)
     assert expected[2] < 9   # some stop before
-
-
-def test_the_unbiased_estimate_is_the_first_waves_given_where_sampling_stopped():
-    ends, rate = (3, 6, 9), 0.3
-    rule = StoppedRate(0.31, ends)
-    mass, first = {}, {}
-    for sequence in itertools.product((0, 1), repeat=ends[-1]):
-        probability = float(np.prod([rate if hit else 1 - rate for hit in sequence]))
-        n = next((n for n in ends if rule.stops[ends.index(n)][sum(sequence[:n])]), ends[-1])
-        at = (sum(sequence[:n]), n)
-        mass[at] = mass.get(at, 0.0) + probability
-        first[at] = first.get(at, 0.0) + probability * sum(sequence[:3]) / 3
-    assert sum(each * rule.unbiased(*at) for at, each in mass.items()) == pytest.approx(rate)
-    for at, each in mass.items():
-        assert rule.unbiased(*at) == pytest.approx(first[at] / each)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("half_width", "most"), [(0.02, 3000), (0.05, 700), (0.1, 250)])
-def test_the_unbiased_estimate_is_not_nearer_to_the_rate(half_width, most):
-    rule = StoppedRate(half_width, wave_ends(most, 50))
-    ratios, biases = [], []
-    for rate in (0.001, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 0.3, 0.5):
-        bias, squares = np.zeros(2), np.zeros(2)
-        for wave, successes, probability in rule.stopped(rate):
-            n = rule.ends[wave]
-            likely = probability > 1e-9
-            for k, each in zip(successes[likely], probability[likely], strict=True):
-                error = np.array([k / n, rule.unbiased(int(k), n)]) - rate
-                bias += each * error
-                squares += each * error**2
-        assert abs(bias[1]) < 1e-5
-        biases.append(abs(bias[0]) / half_width)
-        ratios.append(np.sqrt(squares[1] / squares[0]))
-    print(f"+-{half_width}: bias of successes over draws at most {max(biases):.3f} half-widths; "
-          f"RMSE without bias {min(ratios):.2f} to {max(ratios):.2f} times")
-    assert max(ratios) > 1.1
-    assert max(biases) < 0.15
 
 
 def test_probabilities_add_up_to_one():

@@ -9,11 +9,10 @@ import pytest
 from support.stores import by_hand, same
 from sweep.errors import PipelineError
 from sweep.measure.flags import DetectionStatus
-from sweep.plan.experiment import Pipeline
 from sweep.plan.grid import Blocks
-from sweep.sampling.rules import make_rule
-from sweep.sampling.stopping import block_unit, wave_ends
-from sweep.sampling.waves import Waves
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.sampling import wave_ends
+from sweep.sampling.rules import Waves, block_unit, make_rule
 from sweep.store.lifecycle import open_dataset
 
 TEXT = """

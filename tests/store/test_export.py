@@ -11,9 +11,9 @@ import sweep
 from support.stores import by_hand
 from sweep.analysis import detection_rate
 from sweep.errors import ArgumentError
-from sweep.execution.finalize import close
+from sweep.execution.status import close
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 from sweep.store.blocks import drop_block
 
 TEXT = """

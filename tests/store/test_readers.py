@@ -1,6 +1,5 @@
 """Readers beside a writer: no flag speaks of a number that is not there, no block is torn."""
 
-import json
 import pickle
 
 import numpy as np
@@ -13,13 +12,12 @@ from support.store_files import editable
 from support.stores import by_hand
 from sweep.errors import StoreError
 from sweep.execution.block_task import compute_block
-from sweep.execution.finalize import close
-from sweep.execution.status import status
+from sweep.execution.status import close, status
 from sweep.integrity.verification import verify
 from sweep.measure.flags import EstimateStatus, present_values
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 from sweep.plan.schema import SCHEMA, VARIABLES
-from sweep.store.blocks import committed, drop_block, receipts
+from sweep.store.blocks import drop_block, receipts
 from sweep.store.lifecycle import create_store, open_store
 
 TEXT = """
@@ -129,19 +127,3 @@ def test_blocks_that_were_swapped_with_their_receipts_are_found(pipeline, tmp_pa
     assert {damage.block for damage in found.damage} == {0, 1}
     with pytest.raises(StoreError, match=r"block 0 has the receipt of block 1.*verify --repair"):
         status(str(url))
-
-
-def test_store_of_format_3_is_continued_in_its_format(pipeline, tmp_path, monkeypatch):
-    url = str(tmp_path / "read.zarr")
-    with monkeypatch.context() as then:
-        then.setattr("sweep.store.lifecycle.FORMAT", 3)
-        store = create_store(url, pipeline, (2,))
-    assert store.format == 3
-    compute_block(url, store.run_id, store.blocks[0])
-    assert "block" not in json.loads(str(editable(url, "commits/receipt")[0]))
-    assert status(url).blocks_done == 1
-    compute_block(url, store.run_id, store.blocks[1])
-    close(store)
-    assert open_store(url).format == 3
-    assert committed(open_store(url)) == {0, 1}
-    assert verify(url, 0).damage == []

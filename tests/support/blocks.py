@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells
 from sweep.evaluation.results import Failure, to_dataset_layout
 from sweep.plan.grid import block_indices
 from sweep.plan.schema import variables_of

@@ -5,7 +5,7 @@ import xarray as xr
 from scipy import special
 
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.variable import POSE_PARAMETERS, XYZ
+from sweep.plan.schema import POSE_PARAMETERS, XYZ
 
 SIDES = [10.0, 20.0, 40.0]
 TRIALS = 8

@@ -11,7 +11,8 @@ import cv2
 from numba.core.errors import LoweringError
 from zarr.storage import LocalStore
 
-from sweep.evaluation import cells, search
+from sweep.evaluation import block as cells
+from sweep.evaluation import search
 
 FAULTS = (
     "cache", "compiler", "disk", "memory", "opencv memory", "import", "descriptors", "passing",

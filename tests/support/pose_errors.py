@@ -1,9 +1,11 @@
 """Datasets of poses whose errors follow a known law of distance, side and viewing angle."""
 
+from pathlib import Path
+
 import numpy as np
 import xarray as xr
 
-from sweep.analysis.sight_frame import viewing_angle_of
+from sweep.analysis.poses import viewing_angle_of
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.model.pose import rotation_of_vector, vector_of_rotation
 
@@ -22,6 +24,17 @@ azimuth_deg = {{ uniform = [0, 360] }}
 """
 FX, SIZE_M = 900.0, 0.165
 
+GUIDE = Path(__file__).parents[2] / "sweep" / "analysis" / "README.md"
+MARK = "<!-- reader of error models -->\n```python\n"
+
+
+def reader_of_the_guide():
+    """Return the function that the guide reads error models by."""
+    code = GUIDE.read_text().partition(MARK)[2].partition("```")[0]
+    namespace = {}
+    exec(code, namespace)  # noqa: S102
+    return namespace["pose_errors"]
+
 
 def minimal_turn(direction):
     """Return rotations of (0, 0, 1) to unit vectors (..., 3) by the shortest way, by Rodrigues."""
@@ -32,16 +45,19 @@ def minimal_turn(direction):
     return rotation_of_vector(axis / np.where(sine > 0, sine, 1.0) * angle)
 
 
-def poses_with_law(seed, axes, law, *, bearing_deg=0.0, normal=None):
+def poses_with_law(seed, axes, law, *, bearing_deg=0.0, normal=None, drawn=None):
     """Return a dataset; ``law(distance, side, angle)`` gives bias and sigma (..., 6) in sight.
 
     ``axes``: distance_m, tilt_deg, optionally size_m and solver, and trial; a law of solvers gets
-    the same values for each. ``normal`` draws the unit errors: ``normal(rng, shape)``.
+    the same values for each. ``normal`` draws the unit errors: ``normal(rng, shape)``; ``drawn``
+    gives parameters that are no axes, by name: ``drawn(rng, shape)``.
     """
     rng = np.random.default_rng(seed)
     scene = [name for name in axes if name != "solver"]
     shape = tuple(len(axes[name]) for name in scene)
     grid = dict(zip(scene, np.meshgrid(*(axes[n] for n in scene), indexing="ij"), strict=True))
+    values = {} if drawn is None else drawn(rng, shape)
+    grid |= values
     z, tilt = grid["distance_m"], np.radians(grid["tilt_deg"])
     bearings = np.tan(np.radians(rng.uniform(-bearing_deg, bearing_deg, (2, *shape))))
     position = np.stack([z * bearings[0], z * bearings[1], z], axis=-1)
@@ -52,8 +68,8 @@ def poses_with_law(seed, axes, law, *, bearing_deg=0.0, normal=None):
     rvec = vector_of_rotation(rotation.reshape(-1, 3, 3)).reshape(*shape, 3)
     side = FX * grid.get("size_m", SIZE_M) / z
     bias, sigma = law(z, side, viewing_angle_of(rvec, position))
-    draw = normal or (lambda rng, size: rng.normal(size=size))
     dims, count = tuple(scene), len(axes.get("solver", [0]))
+    draw = normal or (lambda rng, size: rng.normal(size=size))
     unit = position / np.linalg.norm(position, axis=-1, keepdims=True)
     turn = minimal_turn(unit)
     parts = []
@@ -74,7 +90,8 @@ def poses_with_law(seed, axes, law, *, bearing_deg=0.0, normal=None):
     assert errors.shape[:-1] == size
     listed = {name: list(map(float, axes[name])) for name in scene if name != "trial"}
     text = TEXT.format(
-        fx=FX, size="" if "size_m" in axes else f"size_m = {SIZE_M}", distance="", axes="\n".join(
+        fx=FX, size="" if "size_m" in axes else f"size_m = {SIZE_M}",
+        distance="" if "distance_m" in axes else "distance_m = 1", axes="\n".join(
             f"{name} = {values}" for name, values in listed.items()) + "\ntrial = 9")
     return xr.Dataset(
         {
@@ -86,7 +103,8 @@ def poses_with_law(seed, axes, law, *, bearing_deg=0.0, normal=None):
             "translation_error_m": ((*estimated, "xyz"), errors[..., :3].astype(np.float32)),
             "rotation_error_rad": ((*estimated, "xyz"), errors[..., 3:].astype(np.float32)),
         },
-        {name: list(values) for name, values in axes.items()} | {"xyz": ["x", "y", "z"]},
+        {name: list(values) for name, values in axes.items()} | {"xyz": ["x", "y", "z"]}
+        | {name: (dims, each) for name, each in values.items()},
         {"pipeline": text},
     )
 

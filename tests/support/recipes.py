@@ -10,9 +10,9 @@ import sys
 from pathlib import Path
 
 import sweep
-from sweep.compilation import cache_folder
 
 PACKAGE = Path(sweep.__file__).parent
+TESTS = Path(__file__).parent.parent
 
 
 def added(folder, *changes):
@@ -20,8 +20,7 @@ def added(folder, *changes):
 
     An anchor stands once in its file; without one, the file is new.
     """
-    ignored = shutil.ignore_patterns("__pycache__")
-    shutil.copytree(PACKAGE, folder / "sweep", ignore=ignored)
+    shutil.copytree(PACKAGE, folder / "sweep")  # with its compiled code, for unchanged sources
     for file, anchor, text in changes:
         path = folder / "sweep" / file
         if anchor is None:
@@ -34,16 +33,11 @@ def added(folder, *changes):
 
 
 def printed_by(folder, script):
-    """Run a script with the package in a folder; return what it prints, read as JSON.
-
-    Code that is compiled is that of the package itself, as its sources are the same.
-    """
-    environment = os.environ | {"PYTHONPATH": str(folder)}
-    if (compiled := cache_folder()) is not None:
-        environment["NUMBA_CACHE_DIR"] = str(compiled.parent)
+    """Run a script with the package in a folder; return what it prints, read as JSON."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(TESTS)])}
     done = subprocess.run(
-        [sys.executable, "-c", script], env=environment, cwd=folder, capture_output=True,
-        text=True, check=False,
+        [sys.executable, "-c", script], env=environment, cwd=folder,
+        capture_output=True, text=True, check=False,
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

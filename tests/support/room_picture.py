@@ -60,7 +60,9 @@ def reduced(arrows):
 
 def subject(room):
     """Return the first sentence of a room's docstring."""
-    text = ast.get_docstring(ast.parse((TOP / "sweep" / room / "__init__.py").read_text())) or ""
+    path = TOP / "sweep" / room
+    path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    text = ast.get_docstring(ast.parse(path.read_text())) or ""
     return " ".join(text.split("\n\n")[0].split()).partition(". ")[0].rstrip(".")
 
 

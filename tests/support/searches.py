@@ -2,12 +2,11 @@
 
 import numpy as np
 
-from sweep.analysis.searched_limits import requirement_limits
+from sweep.analysis.limits import requirement_limits
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.experiment import Pipeline
-from sweep.sampling.group_dataset import group_dataset
-from sweep.sampling.limit import limit_sampling
-from sweep.sampling.stopping import GroupResults
+from sweep.plan.pipeline import Pipeline
+from sweep.sampling.rules import GroupResults
+from sweep.sampling.searches import group_dataset, limit_sampling
 
 
 def pipeline_of(curves, values, text, most, coarse=40):

@@ -22,24 +22,25 @@ from scipy import stats
 
 from sweep import cli
 from sweep.execution.block_task import compute_block
-from sweep.execution.finalize import close
 from sweep.execution.runner import execute
-from sweep.execution.status import status
-from sweep.isolation.interrupts import Interrupts
-from sweep.plan.experiment import Pipeline
+from sweep.execution.status import close, status
+from sweep.isolation.child_process import Interrupts
+from sweep.messages import to_json
 from sweep.plan.grid import scene_axes
-from sweep.report.tradeoff_table import as_json
+from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import create_store
-from sweep.tradeoff import configuration_costs, paired_timing, scene_sample
+from sweep.tradeoff import costs as configuration_costs
+from sweep.tradeoff import costs as paired_timing
+from sweep.tradeoff import costs as scene_sample
 from sweep.tradeoff import measurement as tradeoff
-from sweep.tradeoff.advice import budget_advice
-from sweep.tradeoff.paired_timing import (
+from sweep.tradeoff.costs import (
     LEAST_ROUNDS,
     MIN_ROUNDS,
     NARROW,
     median_interval,
     time_in_turns,
 )
+from sweep.tradeoff.pareto import budget_advice
 
 CAMERA = """
 seed = 3
@@ -160,12 +161,13 @@ def trade(store):
 
 def values(content, name):
     """Return a variable of the JSON as an array: null is NaN."""
-    def number(value):
+    def number(value, flag):
         if isinstance(value, list):
-            return [number(one) for one in value]
-        return {None: math.nan, "infinite": math.inf}.get(value, value)
+            return [number(one, flag and flag[k]) for k, one in enumerate(value)]
+        return math.inf if flag == "infinite" else math.nan if value is None else value
 
-    return np.array(number(content["data_vars"][name]["data"]), dtype=float)
+    stored = content["data_vars"][name]
+    return np.array(number(stored["data"], stored.get("data_flag")), dtype=float)
 
 
 # From a store to what is printed.
@@ -257,7 +259,7 @@ def test_the_group_holds_what_was_printed_and_the_store_is_as_before(store, trad
     del printed["advice"]
     with xr.open_zarr(store, group="cost/tradeoff") as written:
         assert written["cost_ms"].dims == ("tilt_deg", "treatment")
-        again = json.loads(json.dumps(as_json(written.load())))
+        again = json.loads(to_json(written.load().to_dict()))
     for part in ("attrs", "dims", "data_vars"):
         assert again[part] == printed[part]
     assert {name: one["data"] for name, one in again["coords"].items()} == {

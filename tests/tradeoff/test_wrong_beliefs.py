@@ -3,10 +3,9 @@
 import numpy as np
 import xarray as xr
 
-from sweep.plan.experiment import Pipeline
+from sweep.plan.pipeline import Pipeline
 from sweep.plan.same_meaning import wrong_beliefs, wrong_configurations
-from sweep.tradeoff.advice import advice, budget_advice
-from sweep.tradeoff.pareto import WRONG_BELIEF, mark_front
+from sweep.tradeoff.pareto import WRONG_BELIEF, advice, budget_advice, mark_front
 
 TEXT = """seed = 1
 [camera]

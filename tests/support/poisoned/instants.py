@@ -17,11 +17,11 @@ from pathlib import Path
 
 import zarr.storage._local as local
 
-from sweep.evaluation.cells import run_cells
+from sweep.evaluation.block import run_cells
 from sweep.execution.block_task import compute_block
-from sweep.execution.finalize import close
-from sweep.plan.experiment import Pipeline
+from sweep.execution.status import close
 from sweep.plan.grid import block_indices
+from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import create_store, open_store
 from sweep.store.lock import locked
 

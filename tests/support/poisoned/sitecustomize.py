@@ -216,7 +216,7 @@ class _Finder(importlib.abc.MetaPathFinder):
         self._given = poisons, log
 
     def find_spec(self, name, path=None, target=None):
-        if name != "sweep.evaluation.cells":
+        if name != "sweep.evaluation.block":
             return None
         spec = importlib.machinery.PathFinder.find_spec(name, path, target)
         load = spec.loader.exec_module

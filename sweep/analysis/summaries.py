@@ -1,0 +1,565 @@
+"""Summaries of errors by condition: bias, RMSE, quantiles; against stated covariance and bound."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from scipy import special
+
+from sweep.analysis.aggregate import aggregate
+from sweep.analysis.binning import Bins
+from sweep.analysis.counts import Count, Rate
+from sweep.analysis.dataset import axes_of, describes, kept_dimensions
+from sweep.analysis.intervals import LEVEL
+from sweep.analysis.means import (
+    FlipMixture,
+    Mean,
+    MeanLength,
+    PositiveMean,
+    RootMeanSquare,
+    StandardDeviation,
+    guarded,
+)
+from sweep.analysis.poses import (
+    DEPTH,
+    DETECTION_INPUTS,
+    ERROR_INPUTS,
+    ESTIMATE_INPUTS,
+    QUANTITIES,
+    Poses,
+    Quantity,
+    chosen_quantities,
+    norm_squared,
+    pose_arrays,
+    relative,
+)
+from sweep.analysis.quantiles import Quantiles
+from sweep.analysis.rates import DETECTION_RATE, FLIP_RATE, LOOKED_FOR, SOLVED, SOLVED_RATE
+from sweep.analysis.statistic import Output, Statistic
+from sweep.errors import ArgumentError
+from sweep.plan.schema import POSE_PARAMETERS, XYZ
+from sweep.typing import Floats, Masks
+
+# --------------------------------------------------------------------------------------------------
+# The statistics of `sweep.analysis.error_statistics`, a record each.
+#
+# A new record here is all that a new statistic needs: the table of `error_statistics`, the
+# attributes of its variables and the report's table of errors follow from it.
+
+AnyPoseStatistic = Statistic[Poses, Any, Any, Any]
+
+
+@dataclass(frozen=True)
+class PoseStatistic:
+    """A statistic of poses.
+
+    Attributes
+    ----------
+    statistic
+        What to compute.
+    inputs
+        Names of the arrays that it reads, as in `sweep.analysis.poses.pose_arrays`.
+    """
+
+    statistic: AnyPoseStatistic
+    inputs: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ErrorStatistic:
+    """A statistic of each kind of error.
+
+    Attributes
+    ----------
+    headings
+        The statistic's part of its variables' names (``rmse`` of ``rotation_rmse_deg``), with
+        what a table calls it; one, or more that are computed together.
+    make
+        Returns the statistic of a kind of error; its variables have the names
+        ``quantity.named("rmse")``.
+    inputs
+        Names of the arrays that it reads, as in `sweep.analysis.poses.pose_arrays`, beside
+        those that the kind of error reads.
+    of_signed
+        Whether it is computed of the errors along axes and about angles, `SIGNED`, too.
+    """
+
+    headings: Mapping[str, str]
+    make: Callable[[Quantity], AnyPoseStatistic]
+    inputs: tuple[str, ...] = field(default=ERROR_INPUTS)
+    of_signed: bool = False
+
+
+def _bias(quantity: Quantity) -> AnyPoseStatistic:
+    """Return the mean error: signed if the error is, else the mean vector's length."""
+    mean, of = (Mean, "mean") if quantity.signed else (MeanLength, "length of the mean")
+    return mean(quantity.named("bias"), f"{of} {quantity.words}, solved and not flipped",
+                quantity.units, quantity.vector, lambda poses: poses.unflipped)
+
+
+def _root_mean_square(quantity: Quantity) -> AnyPoseStatistic:
+    """Return the RMSE of the solved: of a rotation flips make most, and it is bounded."""
+    labels = quantity.named("rmse"), f"RMS {quantity.words}, solved", quantity.units
+    if quantity.bound is not None:
+        return FlipMixture(*labels, quantity.squares, quantity.bound)
+    return RootMeanSquare(*labels, quantity.squares, lambda poses: poses.solved)
+
+
+POSE_STATISTICS: tuple[PoseStatistic, ...] = (
+    PoseStatistic(Count(*LOOKED_FOR, lambda poses: poses.looked_for), DETECTION_INPUTS),
+    PoseStatistic(Count(*SOLVED, lambda poses: poses.solved), ESTIMATE_INPUTS),
+    *(PoseStatistic(record.rate, record.inputs)
+      for record in (DETECTION_RATE, SOLVED_RATE, FLIP_RATE)),
+)
+"""What is known of the poses as such."""
+
+QUANTILES = ErrorStatistic(
+    {"median": "median (not solved: infinite)", "p95": "95 % quantile (p95)",
+     "p99": "99 % quantile (p99)"},
+    lambda quantity: Quantiles(
+        quantity.named("{}"), f"absolute {quantity.words}", quantity.units, quantity.norm,
+        lambda poses: poses.solved, lambda poses: poses.looked_for,
+        # Why an end is missing is the same for all kinds of error.
+        with_reason=quantity is QUANTITIES[0]))
+"""Quantiles of absolute errors, which take a second pass over the poses."""
+
+ERROR_STATISTICS: tuple[ErrorStatistic, ...] = (
+    QUANTILES,
+    ErrorStatistic(
+        {"rmse": "RMSE of the solved"}, _root_mean_square),
+    ErrorStatistic(
+        {"rmse_unflipped": "RMSE without flips"},
+        lambda quantity: RootMeanSquare(
+            quantity.named("rmse_unflipped"), f"RMS {quantity.words}, solved and not flipped",
+            quantity.units, quantity.squares, lambda poses: poses.unflipped)),
+    ErrorStatistic({"bias": "bias without flips"}, _bias, of_signed=True),
+    ErrorStatistic(
+        {"sd": "standard deviation without flips"},
+        lambda quantity: StandardDeviation(
+            quantity.named("sd"),
+            f"standard deviation of the {quantity.words}, solved and not flipped",
+            quantity.units, quantity.vector, lambda poses: poses.unflipped),
+        of_signed=True),
+)
+"""What is computed of each kind of error; of those of `SIGNED` only what says so."""
+
+
+def quantiles_of(quantity: Quantity) -> PoseStatistic:
+    """Return the quantiles of a kind of error, also of one with a sign: of the absolute values."""
+    return PoseStatistic(QUANTILES.make(quantity), (*QUANTILES.inputs, *quantity.inputs))
+
+
+def registered(quantities: Sequence[Quantity] = QUANTITIES) -> list[PoseStatistic]:
+    """Return all statistics, those of some kinds of error among them."""
+    return [*POSE_STATISTICS, *(
+        PoseStatistic(record.make(quantity), (*record.inputs, *quantity.inputs))
+        for quantity in quantities for record in ERROR_STATISTICS
+        if quantity in QUANTITIES or record.of_signed)]
+
+
+def error_headings() -> dict[str, str]:
+    """Return the names of the statistics of errors by what a table calls them.
+
+    Examples
+    --------
+    >>> error_headings()["bias without flips"]
+    'bias'
+    """
+    return {heading: name for record in ERROR_STATISTICS
+            for name, heading in record.headings.items()}
+
+
+# --------------------------------------------------------------------------------------------------
+# How large the errors of estimates are: bias, spread, root mean squares and quantiles.
+
+@describes
+def error_statistics(
+    results: xr.Dataset, per: Sequence[str] = (), bins: Bins | None = None,
+    quantities: Sequence[str] | None = None,
+) -> xr.Dataset:
+    """Return rates, errors and their intervals.
+
+    Parameters
+    ----------
+    results, per, bins
+        As in `sweep.analysis.detection_rate`.
+    quantities
+        Kinds of error; by default ``rotation``, ``range`` and ``position``. Others have a sign,
+        estimated minus true; of these bias and standard deviation are computed. By groups:
+
+        - ``camera_frame``: ``x``, ``y``, ``z`` of the marker's position in the camera's frame
+          (right, down, forward), in metres.
+        - ``marker_frame``: the same error along the axes of the true marker (right, up, out):
+          ``marker_frame_x``, ``marker_frame_y``, ``marker_frame_z``.
+        - ``camera_in_marker``: of the camera's position in the marker's frame, as a robot has it
+          that localises on the marker: ``camera_in_marker_x``, ``_y``, ``_z``. It has the error
+          of the rotation times the distance in it.
+        - ``yaw_pitch_roll``: ``yaw``, ``pitch``, ``roll``, the differences of the angles of
+          R = Ry(yaw) · Rx(pitch) · Rz(roll) · Rx(180°), those of a pipeline's pose, in degrees.
+        - ``angles``: ``tilt`` (to the image plane) and ``viewing_angle`` (to the line of sight),
+          which are never negative, so that errors of frontal markers are above 0 on average; and
+          ``in_plane``, the rotation error about the true normal (counter-clockwise seen from the
+          camera is positive).
+
+    Returns
+    -------
+    xr.Dataset
+        Dimensions (*per, *bins); lazy if ``results`` is. The interval of ``x`` is in ``x_low`` and
+        ``x_high``. The rotation error is in degrees, the range error is that of z in percent of
+        the true z, the position error in metres.
+
+        - ``looked_for``: poses (times pooled settings) whose detection is none of not_run,
+          not_visible and not_modelled; ``solved`` of these. ``detection_rate`` and
+          ``solved_rate`` are of ``looked_for``, ``flip_rate`` is of ``solved``.
+        - ``*_median_*``, ``*_p95_*``, ``*_p99_*``: quantiles of the absolute error over the poses
+          looked for. A pose that is not solved counts as infinite, so an infinite quantile says
+          that more than 50, 5 or 1 % were not solved. ``median_interval``, ``p95_interval`` and
+          ``p99_interval`` say why an end of the interval is missing
+          (`sweep.analysis.quantiles.IntervalOf`).
+        - ``*_rmse_*``: over the solved poses; ``*_rmse_unflipped_*`` without flipped ones.
+        - ``*_bias_*``: of rotation and position the length of the mean vector, of the others the
+          signed mean; solved and not flipped. A length is never negative, so it is above 0 by
+          chance alone; then its low end is 0.
+        - ``*_sd_*``: standard deviation of all components about that mean together (n - 1).
+
+    Raises
+    ------
+    ArgumentError, DatasetError
+        As in `sweep.analysis.detection_rate`; also for a kind of error that does not exist.
+
+    Notes
+    -----
+    95 % intervals over the random draws, conditional on the grid; NaN if no cell has two draws
+    that count. Those of rates are Wilson's, a little wide if the cells' rates differ. That of a
+    mean is Student's, that of an RMSE or a standard deviation Student's of the logarithm of the
+    mean square (`sweep.analysis.means`, `sweep.analysis.means`): they need some 50 draws
+    and tails not much heavier than normal, for no sample tells of what it has not seen; if a few
+    cells have nearly all of the error, only their draws count. That of ``rotation_rmse_deg``
+    counts the flips that the sample may have missed, with 180 degrees each
+    (`sweep.analysis.means`): it holds if flips are rare, and is wide (0.5 of 0.4 to 48
+    without a flip in 50 draws). ``rotation_rmse_unflipped_deg`` with ``flip_rate``, and the
+    quantiles, say more; Wilson's interval of 1 % in 50 covers 0.91.
+
+    Quantiles are order statistics, the smallest value (in single precision) with at least that
+    share at or below; so are their intervals' ends, NaN if n is too small.
+
+    The statistics are the records of `sweep.analysis.summaries`.
+
+    Examples
+    --------
+    >>> table = error_statistics(results, per=["solver"])
+    >>> table["rotation_rmse_unflipped_deg"].round(3).values.tolist()
+    [0.365, 0.735]
+    >>> table["rotation_median_deg"].round(3).values.tolist()
+    [0.376, 0.752]
+    >>> table["rotation_p95_deg"].values.tolist()  # 11 of 24 poses are not solved
+    [inf, inf]
+    >>> table = error_statistics(results, quantities=["camera_in_marker", "yaw"])
+    >>> float(table["camera_in_marker_x_sd_m"].round(4)), float(table["yaw_sd_deg"].round(2))
+    (0.0074, 0.32)
+    """
+    records = registered(chosen_quantities(quantities))
+    return _table(results, per, bins, records, [record.statistic for record in records])
+
+
+def guarded_error_statistics(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
+    """Return `error_statistics` with the intervals by which configurations are preferred.
+
+    Upper ends of root mean squares and standard deviations hold rare errors that no draw showed, as
+    those of requirements do (`sweep.analysis.means.with_unseen_tail`).
+    """
+    records = registered()
+    return _table(results, per, None, records, [guarded(record.statistic) for record in records])
+
+
+def _table(
+    results: xr.Dataset, per: Sequence[str], bins: Bins | None,
+    records: Sequence[PoseStatistic], statistics: Sequence[AnyPoseStatistic],
+) -> xr.Dataset:
+    kept = kept_dimensions(results, per)
+    inputs = pose_arrays(results, [name for record in records for name in record.inputs])
+    return aggregate(results, inputs, kept, statistics, Poses, bins)
+
+
+# --------------------------------------------------------------------------------------------------
+# Whether the covariances that estimates come with describe their errors.
+
+TOLERANCE = 0.02
+"""By how much the coverage of a trusted covariance may differ from the level."""
+
+MIN_DRAWS = 50
+"""Draws from which on a covariance can be trusted."""
+
+
+def _nees(poses: Poses) -> Floats:
+    return poses["nees"].astype(np.float64)
+
+
+def _with_nees(poses: Poses) -> Masks:
+    return poses.solved & ~np.isnan(_nees(poses))
+
+
+NEES_MEAN = PoseStatistic(
+    PositiveMean("nees_mean", "mean normalised estimation error squared, expected 6", "1",
+                 lambda poses: _nees(poses)[..., None], _with_nees),
+    (*ESTIMATE_INPUTS, "nees"))
+"""The mean of ``nees``."""
+
+
+@describes
+def covariance_trust(
+    results: xr.Dataset,
+    per: Sequence[str] = (),
+    levels: Sequence[float] = (0.5, 0.9, 0.99),
+    scale: xr.DataArray | None = None,
+) -> xr.Dataset:
+    """Return whether the estimates' own covariances describe their errors.
+
+    Parameters
+    ----------
+    results
+        The dataset of a run, with its variable ``nees``: the normalised estimation error squared
+        e' C⁻¹ e of the six pose parameters, NaN if the estimate has no covariance.
+    per
+        Dimensions that are kept; all others are pooled.
+    levels
+        Probabilities of the covariance's regions, between 0 and 1.
+    scale
+        Factors of ``nees``, with axes of the dataset (the kept ones, as a rule) and their
+        coordinates: with 1/k² the assumed corner noise becomes k times as large.
+
+    Returns
+    -------
+    xr.Dataset
+        Dimensions (*per[, level]); lazy if ``results`` is. Without ``nees`` all is NaN and nothing
+        trusted.
+
+        - ``nees_count``: estimates with a number. ``nees_mean``, expected to be 6, with Student's
+          interval of its logarithm.
+        - ``covariance_coverage`` (..., level): share of them within the region of that level, with
+          Wilson's interval.
+        - ``covariance_trusted``: at every level the interval of the coverage, at 95 % for all
+          levels together (Bonferroni), holds a share within 0.02 of the level, and there are at
+          least 50 draws. False means wrong, or too few draws to know.
+
+    Raises
+    ------
+    ArgumentError
+        For a dimension that does not exist, a level outside (0, 1), and a ``scale`` whose
+        coordinates differ from the dataset's.
+    DatasetError
+        As in `sweep.analysis.detection_rate`.
+
+    Notes
+    -----
+    With a true covariance ``nees`` is chi-squared with 6 degrees of freedom: Bar-Shalom, Li and
+    Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 5.4.
+    Every pose with a number counts, flipped ones too: who trusts a covariance does not know of
+    flips.
+
+    Examples
+    --------
+    >>> table = covariance_trust(results, levels=[0.5, 0.9])
+    >>> int(table["nees_count"]), round(float(table["nees_mean"]), 3)
+    (26, 5.97)
+    >>> table["covariance_coverage"].round(3).values.tolist()
+    [0.5, 0.885]
+    >>> bool(table["covariance_trusted"])  # fewer than 50 draws
+    False
+    """
+    nominal = np.atleast_1d(np.array(levels, dtype=np.float64))
+    if not (nominal.size and ((nominal > 0.0) & (nominal < 1.0)).all()):
+        raise ArgumentError("levels", levels, "expected numbers between 0 and 1")
+    kept = kept_dimensions(results, per)
+    nees = results.get("nees", xr.DataArray(np.nan))
+    if scale is not None:
+        nees = _scaled(results, nees, scale)
+    limits = special.chdtri(len(POSE_PARAMETERS), 1.0 - nominal).tolist()
+    inputs = pose_arrays(results, ESTIMATE_INPUTS) | {"nees": nees}
+    table = aggregate(results, inputs, kept, _nees_statistics(limits), Poses)
+    level = xr.DataArray(nominal, dims="level", attrs={
+        "long_name": "nominal probability of the covariance's region", "units": "1"})
+
+    def over_levels(name: str) -> xr.DataArray:
+        parts = [table[name.format(at)] for at in range(len(limits))]
+        return xr.concat(
+            parts, dim="level", coords="minimal", compat="override", join="exact",
+        ).transpose(..., "level")
+
+    right = ((over_levels("joint {}_low") - TOLERANCE <= level)
+             & (level <= over_levels("joint {}_high") + TOLERANCE)).all("level")
+    variables = {name: table[name] for name in (
+        "nees_mean", "nees_mean_low", "nees_mean_high", "nees_count")}
+    variables["covariance_trusted"] = (right & (table["draws"] >= MIN_DRAWS)).assign_attrs(
+        long_name="whether the coverage is the level, at every level", units="1")
+    for ending, words in (("", ""), ("_low", "lower end of the 95 % interval: "),
+                          ("_high", "upper end of the 95 % interval: ")):
+        variables[f"covariance_coverage{ending}"] = over_levels(
+            f"coverage {{}}{ending}").assign_attrs(
+                long_name=f"{words}share of estimates within the covariance's region of a level",
+                units="1")
+    return xr.Dataset(variables, dict(table.coords)).assign_coords(level=level)
+
+
+def _scaled(results: xr.Dataset, nees: xr.DataArray, scale: xr.DataArray) -> xr.DataArray:
+    """Return ``nees`` times ``scale``, if their coordinates agree."""
+    described, axes = f"array over {', '.join(map(str, scale.dims))}", axes_of(results)
+    if not set(scale.dims) <= set(axes):
+        raise ArgumentError("scale", described,
+                            f"no such dimension; there are {', '.join(axes) or 'none'}")
+    try:
+        nees, scale = xr.align(nees, scale, join="exact")
+    except ValueError as error:
+        raise ArgumentError(
+            "scale", described, "expected the dataset's coordinates") from error
+    return nees * scale
+
+
+def _nees_statistics(limits: Sequence[float]) -> list[Statistic[Poses, Any, Any, Any]]:
+    """Return the mean of ``nees``, and the shares below each limit with two intervals.
+
+    "coverage 0" has the interval of its level alone, "joint 0" that of all levels together.
+    """
+    joint = 1.0 - (1.0 - LEVEL) / len(limits)
+
+    statistics: list[Statistic[Poses, Any, Any, Any]] = [NEES_MEAN.statistic]
+    for at, limit in enumerate(limits):
+        def within(poses: Poses, most: float = limit) -> Masks:
+            return np.asarray(_nees(poses) <= most)
+
+        statistics += [
+            Rate(f"coverage {at}", "within the region of used", within, _with_nees,
+                 counts=(("nees_count", "estimates with a normalised estimation error squared"),
+                         (f"hits {at}", ""))),
+            Rate(f"joint {at}", "within the region of used", within, _with_nees, joint),
+        ]
+    return statistics
+
+
+# --------------------------------------------------------------------------------------------------
+# How near the errors of estimates come to the accuracy bound.
+
+@describes
+def efficiency(
+    results: xr.Dataset, per: Sequence[str] = (), bins: Bins | None = None
+) -> xr.Dataset:
+    """Return how near the errors come to the accuracy bound, 1 being on it.
+
+    Parameters
+    ----------
+    results
+        The dataset of a run, with its variable ``bound_std``: the least standard deviation of an
+        unbiased estimate (Cramér and Rao), NaN if the scene has none. Dimensions of the scene and
+        ``pose_parameter``: rotation_x, rotation_y, rotation_z (rad), translation_x,
+        translation_y, translation_z (m), camera frame.
+    per, bins
+        As in `sweep.analysis.detection_rate`.
+
+    Returns
+    -------
+    xr.Dataset
+        Dimensions (*per, *bins); lazy if ``results`` is.
+
+        - ``rotation_efficiency``: sqrt(mean of the sum of the three bounds squared) over the RMS
+          norm of the rotation error.
+        - ``range_efficiency``: RMS of bound over true z, over that of error over true z, so that
+          all distances weigh alike.
+
+        Each has its interval in ``*_low`` and ``*_high``. NaN if no pose that counts has a bound,
+        and everywhere without ``bound_std``; infinite if the errors are exactly 0.
+
+    Raises
+    ------
+    ArgumentError, DatasetError
+        As in `sweep.analysis.detection_rate`.
+
+    Notes
+    -----
+    Both are over the poses that have a bound and are solved and not flipped: a flip is another
+    minimum, which the bound does not describe. A biased estimator can be above 1. The intervals
+    are those of the RMSE; the bound is taken as known. Kay, "Fundamentals of Statistical Signal
+    Processing: Estimation Theory", 1993, chapter 3.
+
+    Examples
+    --------
+    >>> table = efficiency(results, per=["solver"])
+    >>> table["rotation_efficiency"].round(3).values.tolist()
+    [0.544, 0.27]
+    """
+    kept = kept_dimensions(results, per)
+    inputs = pose_arrays(results, ERROR_INPUTS) | bound_arrays(results)
+    statistics = [statistic for ratio in RATIOS for statistic in ratio.statistics()]
+    table = aggregate(results, inputs, kept, statistics, Poses, bins)
+    variables: dict[str, xr.DataArray] = {}
+    for ratio in RATIOS:
+        bound, error = (statistic.name for statistic in ratio.statistics())
+        for ending, other, words in (
+            ("", "", ""), ("_low", "_high", "lower end of the 95 % interval: "),
+            ("_high", "_low", "upper end of the 95 % interval: "),
+        ):
+            variables[f"{ratio.output.name}{ending}"] = (
+                table[bound] / table[f"{error}{other}"]).assign_attrs(
+                    long_name=f"{words}{ratio.output.meaning}", units="1")
+    return xr.Dataset(variables, dict(table.coords))
+
+
+def bound_arrays(results: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Return the bounds by the names that `BoundRatio` reads; NaN without ``bound_std``."""
+    labels = [f"rotation_{axis}" for axis in XYZ]
+    bound = results.get("bound_std", xr.DataArray(
+        np.full(4, np.nan), {"pose_parameter": [*labels, "translation_z"]}, "pose_parameter"
+    ))
+    return {
+        "rotation_bound": bound.sel(pose_parameter=labels),
+        "depth_bound": bound.sel(pose_parameter="translation_z", drop=True),
+    }
+
+
+@dataclass(frozen=True)
+class BoundRatio:
+    """The RMS bound over the RMS error of a kind of error.
+
+    Attributes
+    ----------
+    quantity
+        The kind of error.
+    bound_squared
+        The squared bounds (...) of poses.
+    """
+
+    quantity: Quantity
+    bound_squared: Callable[[Poses], Floats]
+
+    @property
+    def output(self) -> Output:
+        """The ratio's name and meaning."""
+        words = f"RMS bound over RMS {self.quantity.words}, solved and not flipped"
+        return Output(f"{self.quantity.name}_efficiency", words, "1")
+
+    def statistics(self) -> tuple[RootMeanSquare[Poses], RootMeanSquare[Poses]]:
+        """Return the RMS bound and the RMS error of the poses that have both."""
+        quantity = self.quantity
+        return (
+            RootMeanSquare(
+                quantity.named("bound"), f"RMS bound of the {quantity.words}", quantity.units,
+                lambda poses: self.bound_squared(poses)[..., None], self.used),
+            RootMeanSquare(
+                quantity.named("rmse"), f"RMS {quantity.words} of poses with a bound",
+                quantity.units, quantity.squares, self.used),
+        )
+
+    def used(self, poses: Poses) -> Masks:
+        """Return the poses that have a bound and are solved and not flipped."""
+        return poses.unflipped & np.isfinite(self.bound_squared(poses))
+
+
+RATIOS = (
+    BoundRatio(QUANTITIES[0], lambda poses: norm_squared(np.degrees(poses["rotation_bound"]))),
+    BoundRatio(QUANTITIES[1],
+               lambda poses: (100.0 * relative(poses["depth_bound"], poses[DEPTH])) ** 2),
+)
+"""Of the rotation and of the depth."""

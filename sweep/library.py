@@ -1,0 +1,126 @@
+"""The modules of the library, each imported when it is first used (PEP 562).
+
+Commands and the public functions reach the library through it, so that ``import sweep`` and
+``sweep --help`` import neither OpenCV, Numba, Dask nor xarray.
+"""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sweep import analysis as analysis
+    from sweep import compilation as compilation
+    from sweep import processor as processor
+    from sweep.analysis import camera_calibration as camera_calibration
+    from sweep.analysis import comparisons as comparisons
+    from sweep.analysis import requirements as requirements
+    from sweep.analysis import simulation_gaps as simulation_gaps
+    from sweep.conformance import check as check
+    from sweep.evaluation import block as block
+    from sweep.evaluation import inspection as inspection
+    from sweep.exchange import answers as answers
+    from sweep.exchange import export as export
+    from sweep.exchange import score as score
+    from sweep.execution import forecast as forecast
+    from sweep.execution import limit_search as limit_search
+    from sweep.execution import progress as progress
+    from sweep.execution import runner as runner
+    from sweep.execution import status as status
+    from sweep.fitting import folders as folders
+    from sweep.integrity import repair as repair
+    from sweep.integrity import reproduction as reproduction
+    from sweep.integrity import sample_check as sample_check
+    from sweep.integrity import verification as verification
+    from sweep.photographs import folder as folder
+    from sweep.photographs import prepare as prepare
+    from sweep.photographs import twins as twins
+    from sweep.plan import cell_selection as cell_selection
+    from sweep.plan import facts as facts
+    from sweep.plan import parameters as parameters
+    from sweep.plan import pipeline as pipeline
+    from sweep.plan import sampling as sampling
+    from sweep.plugins import declared as declared
+    from sweep.report import answer_tables as answer_tables
+    from sweep.report import charts as charts
+    from sweep.report import error_model_file as error_model_file
+    from sweep.report import formatting as formatting
+    from sweep.report import gap_figure as gap_figure
+    from sweep.report import limit_figure as limit_figure
+    from sweep.report import output_file as output_file
+    from sweep.report import report_data as report_data
+    from sweep.report import scenes as scenes
+    from sweep.report import table as table
+    from sweep.report import tradeoff_figure as tradeoff_figure
+    from sweep.report import write_report as write_report
+    from sweep.sampling import rules as rules
+    from sweep.store import lifecycle as lifecycle
+    from sweep.store import locations as locations
+    from sweep.store import lock as lock
+    from sweep.tradeoff import choice_search as choice_search
+    from sweep.tradeoff import measurement as measurement
+    from sweep.tradeoff import pareto as pareto
+
+_MODULES = (
+    "sweep.analysis",
+    "sweep.analysis.camera_calibration",
+    "sweep.analysis.comparisons",
+    "sweep.analysis.requirements",
+    "sweep.analysis.simulation_gaps",
+    "sweep.compilation",
+    "sweep.conformance.check",
+    "sweep.evaluation.block",
+    "sweep.evaluation.inspection",
+    "sweep.exchange.answers",
+    "sweep.exchange.export",
+    "sweep.exchange.score",
+    "sweep.execution.forecast",
+    "sweep.execution.limit_search",
+    "sweep.execution.progress",
+    "sweep.execution.runner",
+    "sweep.execution.status",
+    "sweep.fitting.folders",
+    "sweep.integrity.repair",
+    "sweep.integrity.reproduction",
+    "sweep.integrity.sample_check",
+    "sweep.integrity.verification",
+    "sweep.photographs.folder",
+    "sweep.photographs.prepare",
+    "sweep.photographs.twins",
+    "sweep.plan.cell_selection",
+    "sweep.plan.facts",
+    "sweep.plan.parameters",
+    "sweep.plan.pipeline",
+    "sweep.plan.sampling",
+    "sweep.plugins.declared",
+    "sweep.processor",
+    "sweep.report.answer_tables",
+    "sweep.report.charts",
+    "sweep.report.error_model_file",
+    "sweep.report.formatting",
+    "sweep.report.gap_figure",
+    "sweep.report.limit_figure",
+    "sweep.report.output_file",
+    "sweep.report.report_data",
+    "sweep.report.scenes",
+    "sweep.report.table",
+    "sweep.report.tradeoff_figure",
+    "sweep.report.write_report",
+    "sweep.sampling.rules",
+    "sweep.store.lifecycle",
+    "sweep.store.locations",
+    "sweep.store.lock",
+    "sweep.tradeoff.choice_search",
+    "sweep.tradeoff.measurement",
+    "sweep.tradeoff.pareto",
+)
+
+
+def __getattr__(name: str) -> ModuleType:
+    """Import a module when it is first used."""
+    for module in _MODULES:
+        if module.rpartition(".")[2] == name:
+            return importlib.import_module(module)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

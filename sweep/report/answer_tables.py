@@ -1,0 +1,282 @@
+"""Tables of decisions: what is required, and what is chosen, with their JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from sweep.analysis.dataset import DRAWS, axes_of, configuration_axes
+from sweep.analysis.draws import is_replicated
+from sweep.analysis.requirements import Decision, Verdict, described
+from sweep.errors import ArgumentError
+from sweep.messages import label, nearest, quoted
+from sweep.plan.cell_selection import parse_selection
+from sweep.plan.draws import REPLICATES
+from sweep.report.formatting import coordinate, interval_text, number, plural
+from sweep.report.table import Table
+from sweep.tradeoff.pareto import digits
+
+if TYPE_CHECKING:
+    from sweep.analysis.choices import Answer, Cause
+    from sweep.analysis.comparisons import Regression
+    from sweep.plan.pipeline import Pipeline
+    from sweep.tradeoff.choice_search import Choice
+
+# --------------------------------------------------------------------------------------------------
+# Tables that ``sweep require`` prints: verdicts, comparisons, conditions.
+
+MAX_ROWS = 500
+"""Conditions that JSON lists."""
+
+UNITS = {"1": "", "percent": " %", "degree": "\u00b0"}
+
+WORDS = {Decision.met: "met", Decision.not_met: "not met", Decision.undecided: "not decided",
+         Decision.not_applicable: "nothing to judge"}
+
+
+def selected(results: xr.Dataset, at: Sequence[str], pipeline: Pipeline) -> xr.Dataset:
+    """Return results at some values of axes, or of parameters that go together along one.
+
+    Raises
+    ------
+    ArgumentError
+        For an axis or a value that the store does not have.
+    """
+    for name, value in parse_selection(",".join(at), pipeline).items() if at else ():
+        axis = str(results[name].dims[0]) if name in results.coords and (
+            results[name].ndim == 1) else ""
+        if axis not in axes_of(results):
+            axes = axes_of(results)
+            raise ArgumentError("at", name, f"no such axis{nearest(name, axes)}; "
+                                f"there are {', '.join(axes)}")
+        values = results[name].to_numpy()
+        if values.dtype.kind in "fiu" and isinstance(value, int | float):
+            same = np.isclose(values, value, rtol=1e-9, atol=0.0)
+        else:
+            same = values.astype(str) == label(value)
+        if not same.any():
+            shown = ", ".join(label(each) for each in values[:20].tolist())
+            raise ArgumentError("at", f"{name}={label(value)}", f"no such value; there are {shown}")
+        results = results.isel({axis: np.nonzero(same)[0]})
+    return results
+
+
+def pooled_axes(results: xr.Dataset, per: Sequence[str]) -> list[str]:
+    """Return the axes of the scene that are pooled."""
+    named = {*per, DRAWS, *configuration_axes(results)}
+    return [name for name in axes_of(results) if name not in named and results.sizes[name] > 1]
+
+
+def failing(
+    each: Verdict, table: xr.Dataset | None, *, every: bool = False
+) -> list[dict[str, Any]]:
+    """Return the conditions at which a requirement is not met, or else undecided; worst first.
+
+    ``table`` is that of `sweep.analysis.check_requirements`. Each has its condition, decision,
+    value, interval and draws. ``every``: all conditions.
+    """
+    decided = each.decision not in (Decision.not_met, Decision.undecided)
+    if table is None or (decided and not every):
+        return []
+    one = table.isel(requirement=table["requirement"].values.tolist().index(each.requirement))
+    one = one.sel({name: value for name, value in each.configuration.items() if name in one.dims})
+    dims = [str(dim) for dim in one["decision"].dims]
+    found = []
+    for index in np.argwhere(every | (one["decision"].values == each.decision)).tolist():
+        cell = one.isel(dict(zip(dims, index, strict=True)))
+        found.append({
+            "condition": {name: cell[name].item() for name in dims},
+            "decision": Decision(int(cell["decision"])),
+            **{name: cell[name].item() for name in ("value", "low", "high", "draws")},
+        })
+    sign = -1 if one["relation"].item() in (">=", ">") else 1
+    return sorted(found, key=lambda row: -sign * np.nan_to_num(row["value"], nan=sign * np.inf))
+
+
+def tables(
+    found: Sequence[Verdict], worse: Sequence[Regression], table: xr.Dataset | None, *,
+    every: bool,
+) -> Iterator[Table]:
+    """Yield tables of verdicts, of comparisons, and of conditions.
+
+    These are all with ``every``, else those at which a requirement fails, where there are several.
+    """
+    if found:
+        yield Table.of("Requirements, with the worst condition", (
+            "", "requirement", "configuration", "value", "condition", "met at", "draws"), [
+                [WORDS[each.decision], each.requirement, described(each.configuration),
+                 valued(each.value, each.low, each.high, each.units), described(each.condition),
+                 f"{each.counts.get(Decision.met, 0)} of {each.conditions}", needs(each)]
+                for each in found], words=True)
+    if worse:
+        yield Table.of("Compared with the older store pose by pose, new minus old", (
+            "", "quantity", "configuration", "difference", "condition"), [
+                ["worse" if one.worse else "not worse", one.quantity, described(one.configuration),
+                 valued(one.difference, one.low, one.high, one.units), described(one.condition)]
+                for one in worse], words=True)
+    listed = [(each, failing(each, table, every=every)) for each in found]
+    rows = [[WORDS[row["decision"]], each.requirement, described(each.configuration),
+             described(row["condition"]),
+             valued(row["value"], row["low"], row["high"], each.units), f"{row['draws']:,}"]
+            for each, listing in listed for row in listing if every or len(listing) > 1]
+    if rows:
+        yield Table.of("All conditions" if every else "Conditions that fail, the worst first", (
+            "", "requirement", "configuration", "condition", "value", "draws"), rows, words=True)
+
+
+def valued(value: float, low: float, high: float, units: str) -> str:
+    """Return a number with its interval and unit.
+
+    >>> valued(1.0, 0.5, math.inf, "percent")
+    '1.00 (0.500 to \u221e) %'
+    """
+    if math.isnan(value):
+        return "no number"
+    return f"{number(value)} ({interval_text(low, high)}){UNITS.get(units, f' {units}')}"
+
+
+def needs(each: Verdict | Cause) -> str:
+    """Return the draws of what is undecided, and how many would decide it."""
+    if each.decision is not Decision.undecided or math.isnan(each.draws_needed):
+        return ""
+    if math.isinf(each.draws_needed):
+        return f"{each.draws:,} draws, no number would decide so small a difference"
+    return f"{each.draws:,} draws, about {each.draws_needed:,.0f} would decide"
+
+
+def more_draws(found: Sequence[Verdict], results: xr.Dataset, store: str) -> str:
+    """Return the command that makes about as many draws as are needed."""
+    trials = results.sizes.get(DRAWS, 1)
+    factors = [each.draws_needed / each.draws for each in found
+               if each.draws > 0 and math.isfinite(each.draws_needed)]
+    if not factors or max(factors) <= 1.0:
+        return f"sweep report {quoted(store)}"
+    count = math.ceil(trials * max(factors))
+    if is_replicated(results):
+        count = math.ceil(count / REPLICATES) * REPLICATES
+    return (f"sweep run {quoted(store)} --set trial={count} --store more.zarr "
+            f"--reuse {quoted(store)}")
+
+
+# --------------------------------------------------------------------------------------------------
+# What ``sweep size`` prints: the answer in a line, a table of the alternatives, JSON.
+
+def headline(choice: Choice) -> str:
+    """Return the line that says what is chosen; without a choice, what is nearest to one."""
+    rule = choice.rule
+    wish = ("largest" if rule.largest else "smallest") if rule.along else "cheapest"
+    what = (f"{plural(len(rule.requirements), 'requirement')} at "
+            f"{plural(choice.conditions, 'condition')}, with {100 * rule.confidence:g} % "
+            "confidence")
+    if choice.best is not None:
+        answer, cost = choice.answers[choice.best], choice.costs[choice.best]
+        ms = "" if cost is None else f", {digits(cost.ms)} ms a frame"
+        name = _name(choice, answer, answer.value)
+        if not choice.is_undecided:
+            return f"{name} is the {wish} choice{ms}: it meets {what}"
+        bound = f"{'at least' if rule.largest else 'at most'} " if rule.along else ""
+        return f"not decided: {bound}{name}{ms}: it meets {what}; a better one may, too"
+    start = f"no choice meets {what}" if not choice.is_undecided else (
+        f"not decided: no choice is known to meet {what}")
+    if any(answer.met for answer in choice.answers):
+        return f"{start}, within {choice.budget_ms:g} ms a frame"
+    near = [(answer.nearest, answer) for answer in choice.answers if answer.nearest is not None]
+    if not near:
+        return start
+    nearest, answer = min(near, key=lambda each: each[0].excess)
+    return f"{start}; nearest is {_name(choice, answer, nearest.value)}: {reason(nearest.cause)}"
+
+
+def _why(choice: Choice, k: int) -> str:
+    """Return why no better value of an alternative is chosen, or why the alternative is not."""
+    answer, cost = choice.answers[k], choice.costs[k]
+    out = []
+    if answer.next_cause is not None:
+        out.append(reason(answer.next_cause))
+    if answer.passing:
+        beyond = ", ".join(map(coordinate, answer.passing))
+        failing = ", ".join(coordinate(value) for value, _ in answer.isolated)
+        out.append(f"beyond {failing}, {beyond} keep all limits by estimate")
+    if answer.met and cost is not None and not choice.within_budget(k):
+        at = f" at {described(cost.condition)}" if cost.condition else ""
+        state = "not within" if cost.low > (choice.budget_ms or 0.0) else "not decided: within"
+        out.append(f"takes {digits(cost.ms)} ms ({digits(cost.low)} to {digits(cost.high)}){at}: "
+                   f"{state} {choice.budget_ms:g} ms")
+    return "; ".join(out)
+
+
+def _name(choice: Choice, answer: Answer, value: float | None) -> str:
+    """Return a choice as text."""
+    along = {} if value is None else {choice.rule.along: value}
+    return described({**along, **answer.alternative})
+
+
+def reason(cause: Cause) -> str:
+    """Return why a choice fails: the requirement, its value with interval, the condition."""
+    at = f" at {described(cause.condition)}" if cause.condition else ""
+    draws = f"; {text}: raise choose.max_trials" if (text := needs(cause)) else ""
+    return (f"{cause.requirement} is {WORDS[cause.decision]}: "
+            f"{valued(cause.value, cause.low, cause.high, cause.units)}{at}{draws}")
+
+
+def alternatives(choice: Choice) -> Table:
+    """Return a row for each alternative: those that meet all first, the best of them before."""
+    def rank(k: int) -> tuple[bool, float, float]:
+        answer, cost = choice.answers[k], choice.costs[k]
+        value = 0.0 if answer.value is None else answer.value
+        return (not answer.met, -value if choice.rule.largest else value,
+                math.inf if cost is None else cost.ms)
+
+    along = choice.rule.along
+    rows = []
+    for k in sorted(range(len(choice.answers)), key=rank):
+        answer, cost = choice.answers[k], choice.costs[k]
+        value = ["none" if each is None else coordinate(each)
+                 for each in (answer.value, answer.next)] if along else [
+                     "yes" if answer.met else "no"]
+        ms = "" if cost is None else f"{digits(cost.ms)}{'*' * (k in choice.front)}"
+        rows.append([*map(str, answer.alternative.values()), *value, ms, _why(choice, k)])
+    front = "; * no other is as good and cheaper" if choice.front else ""
+    return Table.of(
+        headline(choice) + front,
+        [*choice.rule.among, *([along, "next"] if along else ["meets all"]), "ms a frame",
+         "why not better" if along else "why not"], rows, stub=len(choice.rule.among), words=True)
+
+
+def poses_line(choice: Choice) -> str:
+    """Return how many poses the search took, and a grid of equally many trials."""
+    factor = choice.grid_poses / max(choice.poses, 1)
+    return (f"{choice.poses:,} poses; {choice.most_trials:,} trials of every cell, which the "
+            f"hardest one took, are {choice.grid_poses:,} poses ({factor:.1f} times as many)")
+
+
+def as_json(choice: Choice) -> dict[str, Any]:
+    """Return the content of ``--json``.
+
+    ``answer`` is the decided choice; ``known`` meets the requirements, though a better choice may,
+    too.
+    """
+    listed = [
+        {**dataclasses.asdict(answer), "cost": None if cost is None else dataclasses.asdict(cost),
+         "on_front": k in choice.front, "within_budget": choice.within_budget(k)}
+        for k, (answer, cost) in enumerate(zip(choice.answers, choice.costs, strict=True))]
+    best = None if choice.best is None else choice.answers[choice.best]
+    known = None if best is None else {**best.alternative, **(
+        {choice.rule.along: best.value} if choice.rule.along else {})}
+    return {
+        "answer": known if choice.decision is Decision.met else None, "known": known,
+        "decision": choice.decision,
+        "sentences": [headline(choice), *filter(None, (
+            _why(choice, k) for k in range(len(choice.answers))))],
+        "best": choice.best, "next": choice.next, "along": choice.rule.along,
+        "confidence": choice.rule.confidence, "conditions": choice.conditions,
+        "budget_ms": choice.budget_ms, "alternatives": listed,
+        "poses": choice.poses, "grid_poses": choice.grid_poses,
+        "most_trials": choice.most_trials, "store": choice.store,
+        "warnings": list(choice.notes),
+    }

@@ -1,0 +1,697 @@
+"""Example scenes: chosen, rendered and searched again, drawn, compared with the stored values."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import shlex
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from sweep.errors import SweepError
+from sweep.evaluation.inspection import SceneInspection, inspect_scene
+from sweep.integrity.sample_check import StoredValues, compare, current_pipeline
+from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, Flipped, uncounted_values
+from sweep.plan.cell_selection import cell, coordinates_text, selection_text
+from sweep.plan.experiment import target_word
+from sweep.plan.grid import Block, scene_axes
+from sweep.plan.pipeline import Pipeline
+from sweep.plan.schema import VARIABLES, Variable, variables_of
+from sweep.processor import processor
+from sweep.report.figure import uncapitalised
+from sweep.report.formatting import coordinate, degrees, number, plural
+from sweep.report.report_data import AREA, ReportData, store_errors
+from sweep.store.blocks import receipts
+from sweep.store.lifecycle import open_store
+from sweep.typing import Floats
+
+# --------------------------------------------------------------------------------------------------
+# One scene as a picture, with the truth and the detections drawn on it.
+
+Colour = tuple[int, int, int]
+
+# Blue, green, red; of the palette of Okabe and Ito, distinguishable by the colour-blind.
+TRUTH: Colour = (115, 158, 0)
+DETECTED: Colour = (0, 94, 213)
+OTHER: Colour = (167, 121, 204)
+REJECTED: Colour = (66, 228, 240)
+CHESSBOARD: Colour = (178, 114, 0)
+AXES: tuple[Colour, Colour, Colour] = ((0, 0, 230), (0, 170, 0), (230, 80, 0))
+PAPER: Colour = (255, 255, 255)
+INK: Colour = (40, 40, 40)
+FAINT: Colour = (110, 110, 110)
+
+LEGEND: tuple[tuple[str, Colour], ...] = (
+    ("true outline", TRUTH), ("detected corners (dot: the first)", DETECTED),
+    ("other detection", OTHER), ("rejected candidate", REJECTED),
+    ("estimated x", AXES[0]), ("y", AXES[1]), ("z", AXES[2]),
+)
+"""The meaning of the colours."""
+
+CHESSBOARD_LEGEND = ("corners of the chessboard", CHESSBOARD)
+
+MAX_SIDE = 900
+MIN_SIDE = 560
+LINE_HEIGHT = 26
+CAPTION_SIDE = 1200
+"""Pixels of a picture's width from which on its caption grows with it."""
+
+SHIFT = 4
+"""Fractional bits of the drawn coordinates."""
+
+MARGIN = 0.35
+"""Of the marker's side, shown around it."""
+
+MIN_CUT_PX = 4
+
+SMALL = 0.08
+"""Share of a picture's larger side below which a marker is shown enlarged in a corner, too."""
+
+INSET = 0.36
+"""Share of a picture's smaller side that this takes."""
+
+
+def draw_scene(scene: SceneInspection, title: str) -> NDArray[np.uint8]:
+    """Return a scene enlarged, (H, W, 3), blue-green-red, with a caption below it.
+
+    A marker that is small in the picture is framed, and shown enlarged in the corner that is
+    farthest from it.
+
+    Parameters
+    ----------
+    scene
+        Image, truth and detections.
+    title
+        First line of the caption: the pose on its grid. Then come what was drawn at random, flags
+        and errors, and the legend.
+    """
+    return _captioned(_with_inset(draw_outlines(scene), scene), scene, title)
+
+
+def cut_to_marker(scene: SceneInspection) -> SceneInspection:
+    """Return a scene whose image is cut to the marker and its surroundings, where it is seen."""
+    corners = scene.true_corners
+    left, top, right, bottom = scene.window
+    if not np.isfinite(corners).all():
+        return scene
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    margin = max(4.0, MARGIN * float((high - low).max()))
+    x0, y0 = np.maximum(np.floor(low - margin), (left, top)).astype(int)
+    x1, y1 = np.minimum(np.ceil(high + margin) + 1, (right, bottom)).astype(int)
+    if x1 - x0 < MIN_CUT_PX or y1 - y0 < MIN_CUT_PX:
+        return scene
+    image = scene.image[y0 - top : y1 - top, x0 - left : x1 - left]
+    return dataclasses.replace(
+        scene, image=np.ascontiguousarray(image), window=(int(x0), int(y0), int(x1), int(y1)))
+
+
+def _scale(scene: SceneInspection, side: float = MAX_SIDE) -> int:
+    """Return by which factor the image is enlarged so that it has at most that side."""
+    return max(1, min(int(side) // int(max(scene.image.shape)), 24))
+
+
+def _with_inset(canvas: NDArray[np.uint8], scene: SceneInspection) -> NDArray[np.uint8]:
+    """Return the picture with a frame around a small marker, and the frame's content enlarged."""
+    height, width = canvas.shape[:2]
+    cut = cut_to_marker(scene)
+    x0, y0, x1, y1 = cut.window
+    scale = _scale(scene)
+    if cut is scene or scale * max(x1 - x0, y1 - y0) > 2 * SMALL * max(height, width):
+        return canvas
+    inset = draw_outlines(cut, INSET * min(height, width))
+    line = max(2, round(max(height, width) / 600))
+    frame = scale * (np.array([x0, y0, x1, y1]) - np.tile(scene.window[:2], 2))
+    centre = (frame[:2] + frame[2:]) / 2
+    room = 3 * line
+    size = np.array(inset.shape[1::-1])
+    corner = np.where(centre < np.array([width, height]) / 2,
+                      np.array([width, height]) - size - room, room)
+    to = np.append(corner, corner + size)
+    for colour, thickness in ((INK, 3 * line), (PAPER, line)):
+        cv2.line(canvas, centre.astype(int).tolist(), (corner + size // 2).tolist(), colour,
+                 thickness, cv2.LINE_AA)
+    x, y = frame[:2].astype(int)
+    u, v = frame[2:].astype(int)
+    canvas[y:v, x:u] = draw_outlines(cut, scale=scale)
+    canvas[to[1] : to[3], to[0] : to[2]] = inset
+    for box in (frame + np.array([-1, -1, 1, 1]) * 2 * line, to):
+        for colour, thickness in ((INK, 3 * line), (PAPER, line)):
+            low, high = box.astype(int)[:2].tolist(), box.astype(int)[2:].tolist()
+            cv2.rectangle(canvas, low, high, colour, thickness)
+    return canvas
+
+
+def draw_outlines(
+    scene: SceneInspection, side: float = MAX_SIDE, *, scale: int | None = None
+) -> NDArray[np.uint8]:
+    """Return a scene enlarged to about a side, (H, W, 3), without a caption.
+
+    Parameters
+    ----------
+    scene
+        Image, truth and detections.
+    side
+        Pixels that the larger side has at most, unless the image has more.
+    scale
+        By which factor the image is enlarged; None follows from ``side``.
+    """
+    scale = scale or _scale(scene, side)
+    enlarged = cv2.resize(
+        scene.image, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST
+    )
+    canvas = np.asarray(cv2.cvtColor(enlarged, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+    origin = np.array(scene.window[:2], dtype=np.float64)
+    weight = max(2, round(max(canvas.shape[:2]) / 700))
+
+    def at(points: NDArray[np.float64]) -> NDArray[np.int32]:
+        """Return points (n, 2) px of the frame as fixed-point coordinates of the picture."""
+        # The centre of pixel 0 lies half an enlarged pixel inside the picture.
+        moved = (points - origin + 0.5) * scale - 0.5
+        clipped = np.clip(moved, -1e6, 1e6)
+        return np.asarray(np.round(clipped * 2**SHIFT), dtype=np.int32)
+
+    def outline(points: NDArray[np.float64], colour: Colour, thickness: int) -> None:
+        if np.isfinite(points).all():
+            cv2.polylines(
+                canvas, [at(points).reshape(-1, 1, 2)], isClosed=True, color=colour,
+                thickness=thickness, lineType=cv2.LINE_AA, shift=SHIFT,
+            )
+
+    for quad in scene.rejected:
+        outline(quad, REJECTED, 1)
+    for quad in other_quadrilaterals(scene):
+        outline(quad, OTHER, weight)
+    several = len(scene.true_markers) > 1
+    for quad in scene.true_markers:
+        outline(quad, TRUTH, weight + (1 if several else 3))
+    radius = 3 if several else 6
+    for quad in scene.markers[np.isfinite(scene.markers).all(axis=(1, 2))]:
+        outline(quad, DETECTED, 1 if several else weight)
+        for k, corner in enumerate(at(quad).tolist()):
+            filled = cv2.FILLED if k == 0 else 1 if several else weight
+            cv2.circle(
+                canvas, corner, radius << SHIFT, DETECTED, filled, cv2.LINE_AA, SHIFT
+            )
+    for corner in at(scene.chessboard[np.isfinite(scene.chessboard).all(axis=1)]).tolist():
+        cv2.circle(canvas, corner, radius << SHIFT, CHESSBOARD, weight, cv2.LINE_AA, SHIFT)
+    if np.isfinite(scene.axes_px).all():
+        ends = at(scene.axes_px).tolist()
+        for colour, end in zip(AXES, ends[1:], strict=True):
+            cv2.line(canvas, ends[0], end, colour, weight + 1, cv2.LINE_AA, SHIFT)
+    return canvas
+
+
+def other_quadrilaterals(scene: SceneInspection) -> list[NDArray[np.float64]]:
+    """Return the decoded quadrilaterals that are not the scene's markers."""
+    return [
+        quad for _, quad in scene.decoded
+        if not np.isclose(quad, scene.markers, atol=0.01).all(axis=(1, 2)).any()
+    ]
+
+
+def _captioned(canvas: NDArray[np.uint8], scene: SceneInspection, title: str) -> NDArray[np.uint8]:
+    """Return the picture with title, draws, result and legend below it."""
+    legend = [LEGEND[0]]
+    if np.isfinite(scene.markers).all(axis=(1, 2)).any():
+        legend.append(LEGEND[1])
+    if np.isfinite(scene.chessboard).any():
+        legend.append(CHESSBOARD_LEGEND)
+    if other_quadrilaterals(scene):
+        legend.append(LEGEND[2])
+    if scene.rejected:
+        legend.append((f"rejected candidates: {len(scene.rejected)}", REJECTED))
+    if np.isfinite(scene.axes_px).all():
+        legend += LEGEND[-3:]
+    width = max(canvas.shape[1], MIN_SIDE)
+    size = max(1.0, width / CAPTION_SIDE)
+    room = width / size - 32
+    texts = [(line, colour) for text, colour in (
+        (title, INK), (_drawn_text(scene), FAINT), (_result_text(scene), INK),
+    ) for line in _wrapped(text, room, size)]
+    rows = [[legend[0]]]
+    for entry in legend[1:]:
+        if sum(_entry_width(text, size) for text, _ in (*rows[-1], entry)) > room:
+            rows.append([])
+        rows[-1].append(entry)
+    caption_height = round(size * (LINE_HEIGHT * (len(texts) + len(rows)) + 20))
+    page = np.full((canvas.shape[0] + caption_height, width, 3), PAPER, dtype=np.uint8)
+    left = (width - canvas.shape[1]) // 2
+    page[: canvas.shape[0], left : left + canvas.shape[1]] = canvas
+    y = canvas.shape[0] + size * LINE_HEIGHT
+    for text, colour in texts:
+        _text(page, text, 16 * size, y, colour, size)
+        y += size * LINE_HEIGHT
+    for row in rows:
+        x = 16.0
+        for text, colour in row:
+            box = [round(size * x), round(y - 12 * size)], [round(size * (x + 14)), round(y + size)]
+            cv2.rectangle(page, *box, colour, cv2.FILLED)
+            cv2.rectangle(page, *box, FAINT, 1)
+            _text(page, text, size * (x + 21), y, FAINT, size)
+            x += _entry_width(text, size)
+        y += size * LINE_HEIGHT
+    return page
+
+
+FONT, FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.52
+
+
+def _text(
+    page: NDArray[np.uint8], text: str, x: float, y: float, colour: Colour, size: float
+) -> None:
+    cv2.putText(page, text, (round(x), round(y)), FONT, size * FONT_SCALE, colour,
+                max(1, round(size)), cv2.LINE_AA)
+
+
+def _text_width(text: str, size: float) -> float:
+    """Return the width of a text, in units of ``size`` pixels."""
+    thickness = max(1, round(size))
+    return float(cv2.getTextSize(text, FONT, size * FONT_SCALE, thickness)[0][0]) / size
+
+
+def _entry_width(text: str, size: float) -> float:
+    """Return the width of an entry of the legend, with its colour and the gap behind it."""
+    return 21 + _text_width(text, size) + 20
+
+
+def _wrapped(text: str, width: float, size: float) -> list[str]:
+    """Return a text of parts behind commas as lines that are not wider, as far as parts are."""
+    lines: list[str] = []
+    for part in text.split(", ") if text else []:
+        longer = f"{lines[-1]}, {part}" if lines else part
+        if lines and _text_width(longer, size) <= width:
+            lines[-1] = longer
+        else:
+            lines.append(part)
+    return lines
+
+
+def _drawn_text(scene: SceneInspection) -> str:
+    """Return what was drawn at random for the scene; empty if nothing was."""
+    drawn = ", ".join(
+        f"{name} {float(value):.5g}" for name, value in scene.values.items()
+        if name not in VARIABLES and value.ndim == 0)
+    return f"drawn: {drawn}" if drawn else ""
+
+
+def _result_text(scene: SceneInspection) -> str:
+    """Return flags and errors in one line of ASCII, which is all that OpenCV's font has."""
+    parts = [scene.detection.name.replace("_", " "), f"area {scene.area_px:.4g} px2"]
+    if not math.isnan(scene.errors["rotation_error_deg"]):
+        parts += [
+            f"rotation error {scene.errors['rotation_error_deg']:.3g} deg",
+            f"position error {1000 * scene.errors['translation_error_m']:.3g} mm",
+            f"reprojection error {scene.errors['reprojection_error_px']:.2g} px",
+        ]
+    if scene.detection.name == "detected" and scene.estimate.name != "solved":
+        parts.append(scene.estimate.name.replace("_", " "))
+    return ", ".join(parts)
+
+
+def css_colour(colour: Colour) -> str:
+    """Return a colour as CSS has it.
+
+    >>> css_colour((255, 128, 0))
+    '#0080ff'
+    """
+    blue, green, red = colour
+    return f"#{red:02x}{green:02x}{blue:02x}"
+
+
+# --------------------------------------------------------------------------------------------------
+# Values of one cell as lines of text, with the stored values beside them.
+
+NAME_WIDTH, VALUE_WIDTH = 34, 44
+
+
+def value_lines(
+    variables: Sequence[Variable], recomputed: Mapping[str, NDArray[Any]],
+    stored: Mapping[str, NDArray[Any]] | None,
+) -> list[str]:
+    """Return a line for each of the variables.
+
+    Each has the recomputed value with its unit, and the stored value if that differs.
+    """
+    lines = []
+    for variable in variables:
+        value = recomputed[variable.name]
+        text = _text_scene_values(variable, value)
+        line = f"  {variable.name:{NAME_WIDTH}} {text:{VALUE_WIDTH}} {variable.units}".rstrip()
+        if stored is not None and variable.name in stored:
+            line += _difference(variable, text, value, stored[variable.name])
+        lines.append(line)
+    return lines
+
+
+def _difference(
+    variable: Variable, text: str, value: NDArray[Any], stored: NDArray[Any]
+) -> str:
+    """Return a remark on the stored value; empty if it is the same."""
+    stored_text = _text_scene_values(variable, stored)
+    if stored_text != text:
+        return f"  (stored: {stored_text})"
+    same = np.array_equal(value, stored, equal_nan=variable.flags is None)
+    return "" if same else "  (stored: other last digits)"
+
+
+MAX_NUMBERS = 12
+"""Numbers of a variable that are written out; of more, as of boards' corners, a summary is."""
+
+
+def _text_scene_values(variable: Variable, value: NDArray[Any]) -> str:
+    if variable.flags is not None:
+        names = Counter(variable.flags(int(flag)).name for flag in np.ravel(value))
+        return next(iter(names)) if np.ndim(value) == 0 else ", ".join(
+            f"{count} {name}" for name, count in names.items())
+    if value.size > MAX_NUMBERS:
+        known = value[np.isfinite(value)]
+        if not known.size:
+            return f"{value.size} x nan"
+        return (f"RMS {coordinate(float(np.sqrt(np.mean(known**2))))}, largest "
+                f"{coordinate(float(np.abs(known).max()))} of {known.size} numbers")
+    return " ".join(coordinate(float(number)) for number in value.ravel())
+
+
+# --------------------------------------------------------------------------------------------------
+# One cell of a report's store, and how a recomputation of it differs.
+
+def stored_cell(data: ReportData, index: Mapping[str, int]) -> StoredValues:
+    """Return the stored values of the cell at an index along each axis, by variable.
+
+    Raises
+    ------
+    StoreError
+        If the store cannot be read.
+    """
+    variables = variables_of(data.pipeline)
+    names = [variable.name for variable in variables if variable.name in data.results.variables]
+    with store_errors(data.store):
+        cell = data.results[names].isel(index).load()
+    return {name: np.asarray(cell[name].values) for name in names}
+
+
+def difference_from_store(
+    data: ReportData, recomputed: StoredValues, stored: StoredValues, index: Mapping[str, int]
+) -> str:
+    """Return how recomputed values differ from the stored ones; empty if they agree.
+
+    As in `sweep verify`, every bit must agree if the stored ones were computed by the same
+    versions on a processor with the same features; otherwise they must lie within the tolerances.
+
+    Raises
+    ------
+    StoreError
+        If the store cannot be read.
+    PipelineError
+        If a file of the pipeline is missing.
+    """
+    exact = _computed_alike(data, index)
+    variables = variables_of(data.pipeline)
+    difference = compare(recomputed, stored, variables, same_processor=exact).difference
+    if not difference or exact:
+        return difference
+    return f"{difference}, outside the tolerance for another processor or version"
+
+
+def _computed_alike(data: ReportData, index: Mapping[str, int]) -> bool:
+    """Return whether a cell was computed by these versions, on a processor with these features."""
+    with store_errors(data.store):
+        store = open_store(data.store)
+        corner = tuple(index[axis.name] for axis in scene_axes(store.pipeline))
+        number = store.blocks.number(Block(corner, corner))
+        _, receipt = next(iter(receipts(store, [number])))
+    return tuple(receipt.processors) == (processor(),) and not current_pipeline(store)[1]
+
+
+# --------------------------------------------------------------------------------------------------
+# Example scenes of a store: the best, the median, the worst, a flip, and one of each failure.
+#
+# The store is read a piece at a time; only the best candidate of each kind is kept.
+
+MAX_PIECE = 2_000_000
+"""Results that are read at once."""
+
+BINS = 1200
+MIN_ERROR, MAX_ERROR = 1e-9, 180.0
+"""Degrees; the median is known to one of :data:`BINS` bins between them, 2 % wide."""
+
+MIN_FLIP_DEG = 5.0
+"""The rotation error of a flip that is shown exceeds this: others are hardly visible."""
+
+Index = dict[str, int]
+
+
+def _failures() -> Iterator[Flag]:
+    """Yield the flags of poses that are counted but not solved; those of both stages last."""
+    for flags, other in ((DetectionStatus, EstimateStatus), (EstimateStatus, DetectionStatus)):
+        ending = [flag for flag in flags if flag.counted and flag.ends]
+        ending.sort(key=lambda flag: flag.name in other.__members__)
+        yield from (flag for flag in ending if flag is not EstimateStatus.solved)
+
+
+FAILURES: tuple[Flag, ...] = tuple(_failures())
+
+
+@dataclass(slots=True)
+class _Candidates:
+    """The best candidate of each kind so far, with its merit and its index."""
+
+    best: dict[str, tuple[float, Index]] = field(default_factory=dict)
+    counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(BINS, dtype=np.int64))
+    members: dict[int, Index] = field(default_factory=dict)
+
+    def offer(self, kind: str, merits: Floats, index: Mapping[str, NDArray[np.intp]]) -> None:
+        """Keep the candidate with the largest of ``merits`` (n,) if it exceeds the kept one's."""
+        if not merits.size:
+            return
+        k = int(np.argmax(merits))
+        if kind not in self.best or merits[k] > self.best[kind][0]:
+            self.best[kind] = float(merits[k]), {d: int(i[k]) for d, i in index.items()}
+
+    def count(self, errors: Floats, index: Mapping[str, NDArray[np.intp]]) -> None:
+        """Add errors (n,), in degrees, to the bins, and keep a member of each bin."""
+        clipped = np.clip(errors, MIN_ERROR, MAX_ERROR)
+        share = np.log(clipped / MIN_ERROR) / math.log(MAX_ERROR / MIN_ERROR)
+        bins, first, counts = np.unique(
+            np.minimum((share * BINS).astype(np.int64), BINS - 1), return_index=True,
+            return_counts=True)
+        self.counts[bins] += counts
+        for bin_number, k in zip(bins.tolist(), first.tolist(), strict=True):
+            self.members.setdefault(bin_number, {d: int(i[k]) for d, i in index.items()})
+
+    def median(self) -> Index | None:
+        """Return the index of an error in the median's bin; None without errors."""
+        total = int(self.counts.sum())
+        if total == 0:
+            return None
+        return self.members[int(np.searchsorted(np.cumsum(self.counts), (total + 1) // 2))]
+
+
+def select_scenes(results: xr.Dataset) -> Iterator[tuple[str, Index]]:
+    """Yield a title and the index along each axis, for each kind of scene that occurs."""
+    candidates = _scan(results)
+    titles = {
+        "best": "best: the smallest rotation error", "worst": "worst: the largest rotation error",
+        "worst_unflipped": "worst without a flip", "flipped": "flipped to the mirrored pose",
+    }
+    if "best" in candidates.best:
+        yield titles.pop("best"), candidates.best["best"][1]
+    median = candidates.median()
+    if median is not None:
+        yield "median rotation error of the solved", median
+    for kind, title in titles.items():
+        if kind in candidates.best:
+            yield title, candidates.best[kind][1]
+    for flag in FAILURES:
+        if _kind(flag) in candidates.best:
+            meaning = uncapitalised(flag.meaning).removesuffix(".")
+            yield f"{flag.name.replace('_', ' ')}: {meaning}", candidates.best[_kind(flag)][1]
+
+
+def _kind(flag: Flag) -> str:
+    return f"{type(flag).__name__}.{flag.name}"
+
+
+def _scan(results: xr.Dataset) -> _Candidates:
+    candidates = _Candidates()
+    names = ("estimate", "rotation_error_deg", "flipped", "detection", AREA)
+    for offsets, piece in _pieces(results[list(names)].reset_coords(drop=True)):
+        dims = tuple(str(dim) for dim in piece["estimate"].dims)
+        estimate, error, flipped = (piece[name].values for name in names[:3])
+        area = piece[AREA].broadcast_like(piece["estimate"]).transpose(*dims).values
+        area = np.nan_to_num(area, nan=-1.0, posinf=-1.0)
+
+        def indices(
+            mask: NDArray[np.bool_], dims: tuple[str, ...] = dims, offsets: Index = offsets
+        ) -> dict[str, NDArray[np.intp]]:
+            return {
+                dim: indices + offsets[dim]
+                for dim, indices in zip(dims, np.nonzero(mask), strict=True)
+            }
+
+        solved = (estimate == EstimateStatus.solved) & np.isfinite(error)
+        index = indices(solved)
+        errors = error[solved].astype(np.float64)
+        candidates.offer("best", -errors, index)
+        candidates.offer("worst", errors, index)
+        mirrored = flipped == Flipped.flipped
+        unflipped = solved & ~mirrored
+        candidates.offer("worst_unflipped", error[unflipped].astype(np.float64), indices(unflipped))
+        mirrored &= solved & (error > MIN_FLIP_DEG)
+        candidates.offer("flipped", area[mirrored], indices(mirrored))
+        candidates.count(errors, index)
+        detection = piece["detection"].broadcast_like(piece["estimate"]).transpose(*dims).values
+        for flag in FAILURES:
+            flagged = (detection if isinstance(flag, DetectionStatus) else estimate) == flag
+            # The larger the marker, the more surprising the failure.
+            candidates.offer(_kind(flag), area[flagged], indices(flagged))
+    for flag in EstimateStatus:
+        # A failure of the detection is flagged in the estimate, too: it is shown once.
+        name = flag.name
+        if name in DetectionStatus.__members__ and _kind(DetectionStatus[name]) in candidates.best:
+            candidates.best.pop(_kind(flag), None)
+    return candidates
+
+
+def _pieces(results: xr.Dataset) -> Iterator[tuple[Index, xr.Dataset]]:
+    """Yield the results in pieces of whole chunks, each with the index of its first cell."""
+    sizes = {str(dim): size for dim, size in results["estimate"].sizes.items()}
+    chunks = {str(dim): edges for dim, edges in results["estimate"].chunksizes.items()}
+    quota = MAX_PIECE
+    cuts: dict[str, list[int]] = {}
+    for dim in reversed(list(sizes)):
+        length = chunks.get(dim, (sizes[dim],))[0]
+        step = min(sizes[dim], max(length, quota // length * length))
+        cuts[dim] = list(range(0, sizes[dim], step))
+        quota = max(1, quota // step)
+        sizes[dim] = step
+    for starts in itertools.product(*(cuts[dim] for dim in sizes)):
+        offsets = dict(zip(sizes, starts, strict=True))
+        box = {dim: slice(start, start + sizes[dim]) for dim, start in offsets.items()}
+        yield offsets, results.isel(box).load()
+
+
+# --------------------------------------------------------------------------------------------------
+# Example scenes of a store, rendered and searched again, and compared with the stored values.
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """One scene of the gallery.
+
+    Attributes
+    ----------
+    titles
+        The kinds of scenes that it is an example of.
+    coordinates
+        Its coordinates, as text.
+    command
+        Command line that draws it.
+    result
+        Flags and errors, as text.
+    alt
+        The picture in words.
+    picture
+        A PNG; None if ``problem`` says why there is none.
+    size
+        Width and height of the picture, px.
+    problem
+        Why there is no picture, or how it differs from the stored values; empty otherwise.
+    chessboard
+        Whether corners of a chessboard are drawn.
+    """
+
+    titles: tuple[str, ...]
+    coordinates: str
+    command: str
+    result: str
+    alt: str
+    picture: bytes | None
+    size: tuple[int, int] = (0, 0)
+    problem: str = ""
+    chessboard: bool = False
+
+
+def scenes_of(data: ReportData) -> Iterator[Scene]:
+    """Yield the scenes of a store's gallery; kinds with the same scene share it."""
+    chosen: dict[tuple[tuple[str, int], ...], list[str]] = {}
+    with store_errors(data.store):
+        selected = list(select_scenes(data.results))
+    for title, index in selected:
+        chosen.setdefault(tuple(sorted(index.items())), []).append(title)
+    for key, titles in chosen.items():
+        yield _scene(data, dict(key), tuple(titles))
+
+
+def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
+    stored = stored_cell(data, index)
+    at = selection_text(data.pipeline.cell_at(index))
+    command = f"sweep show {pipeline_file(data.pipeline)}"
+    command += f" --at {shlex.quote(at)}" if at else ""
+    detection = DetectionStatus(int(stored["detection"]))
+    estimate = EstimateStatus(int(stored["estimate"]))
+    scene = Scene(
+        titles, at.replace(",", ", "), command, _flags_text(detection, estimate), "", None)
+    if DetectionStatus.crashed is detection or EstimateStatus.crashed is estimate:
+        return dataclasses.replace(
+            scene, problem="Not drawn: its process died; `sweep repro` computes it in a process "
+            "of its own.")
+    try:
+        single = cell(data.pipeline, at)
+        inspected = inspect_scene(single)
+        scene = dataclasses.replace(scene, coordinates=coordinates_text(data.pipeline, single))
+        picture = draw_outlines(cut_to_marker(inspected))  # the page has a caption of its own
+        difference = difference_from_store(data, inspected.values, stored, index)
+    except (SweepError, OSError, ValueError, cv2.error, np.linalg.LinAlgError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        return dataclasses.replace(scene, problem=f"Cannot be drawn on this machine: {reason}")
+    _, encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    result = _result_text_gallery(inspected)
+    return dataclasses.replace(
+        scene, result=result, picture=encoded.tobytes(),
+        problem=f"Differs from the store: {difference}." if difference else "",
+        size=(picture.shape[1], picture.shape[0]),
+        alt=f"Rendered {target_word(data.pipeline)} with its true outline and the detections: "
+            f"{result}",
+        chessboard=bool(np.isfinite(inspected.chessboard).any()),
+    )
+
+
+def pipeline_file(pipeline: Pipeline) -> str:
+    """Return the name of the file with a pipeline's text, quoted for a shell."""
+    return shlex.quote(f"{pipeline.name}.toml")
+
+
+def _flags_text(detection: DetectionStatus, estimate: EstimateStatus) -> str:
+    """Return the flags in words, without an estimate that follows from the detection."""
+    names = [detection.name]
+    if estimate.counted and estimate.ends and estimate is not EstimateStatus.solved:
+        names.append(estimate.name)
+    return ", ".join(name.replace("_", " ") for name in dict.fromkeys(names))
+
+
+def _result_text_gallery(scene: SceneInspection) -> str:
+    """Return the flags and the errors of the pose, in words."""
+    parts = [scene.detection.name.replace("_", " "), f"area {number(scene.area_px)} px\u00b2"]
+    if "marker_detection" in scene.values:
+        flags = scene.values["marker_detection"]
+        counted = flags[~np.isin(flags, uncounted_values(DetectionStatus))]
+        found = int((counted == DetectionStatus.detected).sum())
+        parts.insert(1, f"{found} of {plural(len(counted), 'visible marker')}")
+    if scene.detection is DetectionStatus.detected and scene.estimate is not EstimateStatus.solved:
+        parts.append(scene.estimate.name.replace("_", " "))
+    rotation = scene.errors["rotation_error_deg"]
+    if math.isfinite(rotation):
+        parts += [
+            f"rotation error {degrees(rotation)}",
+            f"position error {number(1000 * scene.errors['translation_error_m'])} mm",
+            f"reprojection error {number(scene.errors['reprojection_error_px'])} px",
+        ]
+    return ", ".join(parts)

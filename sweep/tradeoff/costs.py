@@ -1,0 +1,494 @@
+"""Costs of configurations and renderers, timed in pairs on a sample of scenes."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from sweep.evaluation.block import detections_for
+from sweep.evaluation.opencv_threads import single_threaded
+from sweep.evaluation.search import SearchResult, search, visibility_flags, whole_frames
+from sweep.isolation.child_process import Interrupts
+from sweep.measure.detectors import (
+    AnyDetectorSetting,
+    DetectorSetting,
+    FindFunction,
+    full_frame_reason,
+    make_detector,
+)
+from sweep.measure.estimation import Detections, PoseEstimator
+from sweep.measure.estimators import EstimatorSetting, build
+from sweep.measure.flags import DetectionStatus
+from sweep.model.extent import marker_boxes
+from sweep.model.renderers import render_all
+from sweep.model.scene import Scenes, build_scenes
+from sweep.plan.axes import TRIAL
+from sweep.plan.experiment import scene_plugins
+from sweep.plan.grid import detector_settings, estimators, scene_axes, scene_values
+from sweep.plan.pipeline import Pipeline
+from sweep.typing import Floats, Grey
+
+# --------------------------------------------------------------------------------------------------
+# Paired timing: parts are timed in turns, in random order, until their ratios are known.
+#
+# Each round times every part once, in a new order, so that changes of the machine (clock, cache,
+# neighbours) affect all of them. The ratio of two parts is the median over rounds, with the
+# interval of order statistics. Another process, with another layout of its memory, gives ratios
+# that differ by a little more than the rounds of one process show: :data:`PROCESS_SHARE` is added
+# to the intervals on both sides.
+
+PROCESS_SHARE = 0.025
+"""Difference of ratios between processes: standard deviations of 0.3 to 1.5 % were measured."""
+
+MIN_ROUNDS, MAX_ROUNDS = 12, 2000
+
+LEAST_ROUNDS = 6
+"""Rounds where the time limit does not allow more: the fewest with a 95 % interval of a median."""
+
+NARROW = 0.03
+"""Width of a ratio's 95 % interval, as a share of it, that is narrow enough."""
+
+
+def time_in_turns(
+    parts: Sequence[Callable[[], Any]], ratios: Callable[[Floats], Floats], limit_s: float,
+    interrupts: Interrupts, progress: Callable[[float], None] | None = None,
+    clock: Callable[[], float] | None = None,
+) -> Floats:
+    """Time P parts in R rounds, each round in a random order of its own.
+
+    Parameters
+    ----------
+    parts
+        Functions without arguments.
+    ratios
+        (R, P) seconds -> (R, ...) ratios; rounds end once the interval of each ratio's median is
+        narrower than :data:`NARROW`, or the ratio is NaN.
+    limit_s
+        Time limit in seconds; :data:`LEAST_ROUNDS` rounds are measured in any case.
+    interrupts
+        Checked between two parts.
+    progress
+        Called after each round with the share of the time limit that is used.
+    clock
+        Returns the seconds that are counted (default: this thread's own time).
+
+    Returns
+    -------
+    (R, P) seconds of the clock, without the first round, which warms up.
+    """
+    clock = clock or time.thread_time
+    generator = np.random.Generator(np.random.PCG64(0))
+    rounds = np.zeros((MAX_ROUNDS, len(parts)))
+    started = time.perf_counter()
+    for count in range(MAX_ROUNDS):
+        for part in generator.permutation(len(parts)):
+            interrupts.check()
+            begun = clock()
+            parts[part]()
+            rounds[count, part] = clock() - begun
+        used_s = time.perf_counter() - started
+        if progress is not None:
+            progress(min(used_s / limit_s, 1.0))
+        if count >= LEAST_ROUNDS and used_s + used_s / (count + 1) > limit_s:
+            break
+        if count >= MIN_ROUNDS:
+            value, low, high = median_interval(ratios(rounds[1 : count + 1]))
+            if not (high - low > NARROW * value).any():
+                break
+    return rounds[1 : count + 1]
+
+
+def median_interval(values: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the median of (R, ...) values along the first axis, and its 95 % interval.
+
+    The interval ends at the order statistics that cover the median with a probability of at least
+    95 % (David and Nagaraja, "Order Statistics", 3rd edition, section 7.1).
+
+    Returns
+    -------
+    Median, low and high end, each (...).
+    """
+    ordered = np.sort(values, axis=0)
+    count = len(ordered)
+    lowest = int(stats.binom.ppf(0.025, count, 0.5))
+    lowest = min(max(lowest - 1, 0), count - 1)
+    return np.median(ordered, axis=0), ordered[lowest], ordered[count - 1 - lowest]
+
+
+def any_process_interval(ratio: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the median ratio of (R, ...) rounds, and the interval of what any process measures.
+
+    The interval of the baseline, whose ratio is 1 in each round, stays [1, 1].
+    """
+    value, low, high = median_interval(ratio)
+    spare = np.where(high > low, PROCESS_SHARE * value, 0.0)
+    return value, low - spare, high + spare
+
+
+# --------------------------------------------------------------------------------------------------
+# The scenes on which costs are measured: a seeded sample of each condition.
+
+Indices = NDArray[np.intp]
+
+MIN_SCENES, MAX_SCENES = 12, 48
+"""Scenes of each condition: fewer if whole frames are searched."""
+
+MAX_PX = 1 << 27
+"""Pixels of images that are kept, over all conditions: 134 MB."""
+
+
+def whole_frames_of(pipeline: Pipeline) -> list[bool]:
+    """Return whether whole frames are searched, for each detector setting."""
+    whole = pipeline.any_value("window", lambda value: value == "full")
+    whole |= pipeline.any_value("background", lambda value: isinstance(value, str))
+    return [
+        whole or full_frame_reason(setting) is not None for setting in detector_settings(pipeline)
+    ]
+
+
+def sample_scenes(
+    pipeline: Pipeline, fixed: Mapping[str, int], conditions: int
+) -> list[Indices]:
+    """Return a seeded sample of the scenes of a condition: (n,) indices along each scene axis.
+
+    The cells of the axes that are not fixed have equal shares, or are drawn if they are more than
+    the sample has scenes; trials are drawn.
+
+    Parameters
+    ----------
+    pipeline
+        Its grid is sampled; its frames decide how many scenes fit into memory.
+    fixed
+        Scene axis -> the index along it that makes the condition.
+    conditions
+        Number of conditions. The size of the sample follows from it and the pipeline alone, so that
+        the same scenes are measured each time.
+    """
+    generator = np.random.Generator(np.random.PCG64(0))
+    frame = max(pipeline.values_of("width_px")) * max(pipeline.values_of("height_px"))
+    count = MIN_SCENES if any(whole_frames_of(pipeline)) else MAX_SCENES
+    count = int(min(max(MAX_PX // (frame * conditions), 1), count))
+    axes = scene_axes(pipeline)
+    lengths = [
+        1 if axis.name in fixed or axis.name == TRIAL else len(axis) for axis in axes
+    ]
+    cells = math.prod(lengths)
+    numbers = (
+        np.arange(count) * cells // count if cells <= count
+        else generator.integers(0, cells, count)
+    )
+    indices = []
+    for axis, length in zip(reversed(axes), reversed(lengths), strict=True):
+        numbers, index = numbers // length, numbers % length
+        if axis.name in fixed:
+            index = np.full(count, fixed[axis.name])
+        elif axis.name == TRIAL:
+            index = generator.integers(0, len(axis), count)
+        indices.append(index.astype(np.intp))
+    return indices[::-1]
+
+
+# --------------------------------------------------------------------------------------------------
+# The cost of each configuration: of its detection, and of its estimation, a frame.
+#
+# All are measured on the same images, by paired timing in one process. Frames are searched one at
+# a time, as a user does. Estimators solve :data:`BATCH` detections in one call, so that the
+# overhead of a call is that of a run.
+
+BATCH = 16
+"""Detections that an estimator gets in one call."""
+
+TRIAL_SCENES = 2
+"""Scenes of each condition that are timed first, to see how many the time limit allows."""
+
+
+@dataclass(frozen=True, slots=True)
+class Costs:
+    """The costs of C conditions, D detector settings and E estimators in R rounds.
+
+    Attributes
+    ----------
+    detection
+        (R, C, D) seconds a frame.
+    estimation
+        (R, C, D, E) seconds a frame, those without a detection included.
+    frames
+        (C,) images that were measured.
+    """
+
+    detection: Floats
+    estimation: Floats
+    frames: NDArray[np.int64]
+
+    @property
+    def total(self) -> Floats:
+        """(R, C, D, E) seconds a frame of detection and estimation."""
+        return self.detection[..., None] + self.estimation
+
+    @property
+    def ratio(self) -> Floats:
+        """(R, C, D, E) cost over the first configuration's; NaN if no scene is visible."""
+        total = self.total
+        with np.errstate(invalid="ignore"):
+            return np.asarray(total / total[:, :, :1, :1])
+
+
+@dataclass(frozen=True, slots=True)
+class _Condition:
+    """The scenes of a condition, ready to be measured."""
+
+    scenes: Scenes
+    values: dict[str, Any]
+    searches: list[SearchResult]
+    """The result of each detector setting, with the image that it searches of each scene."""
+
+
+@single_threaded()
+def measure(
+    pipeline: Pipeline, conditions: Sequence[Sequence[Indices]], limit_s: float,
+    interrupts: Interrupts, progress: Callable[[float], None] | None = None,
+) -> Costs:
+    """Measure detection and estimation of every configuration on the scenes of each condition.
+
+    Parameters
+    ----------
+    pipeline
+        The pipeline whose configurations are measured.
+    conditions
+        For each condition, the (n,) indices of its scenes along each scene axis.
+    limit_s
+        Time limit in seconds. Where it does not do for
+        `sweep.tradeoff.costs.LEAST_ROUNDS` rounds, fewer scenes of each condition are
+        measured.
+    interrupts
+        Checked between two measurements.
+    progress
+        Called after each round with the share of the time limit that is used.
+    """
+    started = time.perf_counter()
+    settings, estimating = detector_settings(pipeline), estimators(pipeline)
+    configurations = _Configurations(
+        [make_detector(setting) for setting in settings], estimating,
+        [build(estimator) for estimator in estimating],
+    )
+
+    def prepared_with(most: int) -> list[_Condition]:
+        chosen = []
+        for indices in conditions:
+            interrupts.check()
+            chosen.append(_prepare(pipeline, indices, most))
+        return chosen
+
+    prepared = prepared_with(TRIAL_SCENES)
+    search_s, estimation_s = configurations.round_s(prepared, interrupts)
+    left_s = limit_s - (time.perf_counter() - started) - (1 + LEAST_ROUNDS) * estimation_s
+    # Beside the rounds, each scene is rendered and searched once.
+    most = max(int(TRIAL_SCENES * left_s / ((3 + LEAST_ROUNDS) * search_s)), 1)
+    if any(len(condition.scenes) == TRIAL_SCENES for condition in prepared) or most == 1:
+        prepared = prepared_with(most)
+    parts, detected_share = configurations.parts(prepared)
+    shape = (len(prepared), len(settings), len(estimating))
+    frames = np.array([len(condition.scenes) for condition in prepared])
+    visible = np.array([len(condition.searches[0].images) > 0 for condition in prepared])
+
+    def costs(seconds: Floats) -> Costs:
+        each = seconds.reshape(-1, *shape[:2], 1 + shape[2])
+        # A condition without a visible scene has no costs.
+        count = np.where(visible, frames, np.nan)[:, None]
+        estimation = each[..., 1:] / BATCH * detected_share[..., None]
+        return Costs(
+            each[..., 0] / count, np.where(visible[:, None, None], estimation, np.nan),
+            np.where(visible, frames, 0),
+        )
+
+    def ratios(seconds: Floats) -> Floats:
+        return costs(seconds).ratio
+
+    left_s = max(limit_s - (time.perf_counter() - started), 0.1)
+    return costs(time_in_turns(parts, ratios, left_s, interrupts, progress, clock_of(settings)))
+
+
+def clock_of(settings: Sequence[AnyDetectorSetting]) -> Callable[[], float]:
+    """Return the clock that counts all that detectors do.
+
+    OpenCV's own works in this thread, plug-ins may have threads of their own.
+    """
+    if all(isinstance(setting, DetectorSetting) for setting in settings):
+        return time.thread_time
+    return time.process_time
+
+
+@dataclass(frozen=True, slots=True)
+class _Configurations:
+    """The detector settings and the estimators, ready to be timed."""
+
+    finders: Sequence[FindFunction]
+    settings: Sequence[EstimatorSetting]
+    estimators: Sequence[PoseEstimator]
+
+    def parts(
+        self, conditions: Sequence[_Condition]
+    ) -> tuple[list[Callable[[], Any]], Floats]:
+        """Return what is timed, and the (C, D) share of scenes with a detection.
+
+        For each condition and detector setting: the search of all scenes, then each estimator.
+        """
+        parts: list[Callable[[], Any]] = []
+        detected_share = np.zeros((len(conditions), len(self.finders)))
+        for c, condition in enumerate(conditions):
+            sides = condition.scenes.frame.max(axis=1).tolist()
+            for d, find in enumerate(self.finders):
+                images = condition.searches[d].images
+                parts.append(partial(_search_all, find, images, condition.scenes, sides))
+                rows = np.flatnonzero(condition.searches[d].flags == DetectionStatus.detected)
+                detected_share[c, d] = len(rows) / len(condition.scenes)
+                for setting, estimate in zip(self.settings, self.estimators, strict=True):
+                    detections = detections_for(
+                        setting, condition.values, condition.scenes, condition.searches[d],
+                        np.resize(rows, BATCH if len(rows) else 0),
+                    )
+                    parts.append(partial(_estimate_all, estimate, detections))
+        return parts, detected_share
+
+    def round_s(
+        self, conditions: Sequence[_Condition], interrupts: Interrupts
+    ) -> tuple[float, float]:
+        """Return the seconds of all searches, and of all estimates; code is compiled before."""
+        parts, _ = self.parts(conditions)
+        spent = [0.0, 0.0]
+        for number, part in enumerate(parts):
+            interrupts.check()
+            kind = int(number % (1 + len(self.estimators)) > 0)
+            if kind:
+                part()
+            begun = time.perf_counter()
+            part()
+            spent[kind] += time.perf_counter() - begun
+        return max(spent[0], 1e-6), spent[1]
+
+
+def _search_all(
+    find: FindFunction, images: Mapping[int, Grey], scenes: Scenes,
+    sides: Sequence[int],
+) -> None:
+    for row, image in images.items():
+        # If it raises, the run has flagged the pose; the attempt has a cost as well.
+        with suppress(Exception):
+            find(image, scenes.dictionary[row], sides[row])
+
+
+def _estimate_all(estimator: PoseEstimator, detections: Detections) -> None:
+    with suppress(Exception):
+        if len(detections.corners):
+            estimator(detections)
+
+
+def _prepare(pipeline: Pipeline, indices: Sequence[Indices], most: int) -> _Condition:
+    """Render a condition's visible scenes, and search each once with each setting.
+
+    Of more than ``most`` scenes, so many are taken from all over the sample.
+    """
+    count = len(indices[0]) if indices else 1
+    values = scene_values(pipeline, indices)
+    scenes = build_scenes(values, count, scene_plugins(pipeline))
+    rows = np.flatnonzero(visibility_flags(scenes) == DetectionStatus.not_run)
+    if 0 < len(rows) < count:
+        return _prepare(pipeline, [index[rows] for index in indices], most)
+    if count > most:
+        chosen = (2 * np.arange(most) + 1) * count // (2 * most)
+        return _prepare(pipeline, [index[chosen] for index in indices], most)
+    settings = detector_settings(pipeline)
+    wanted = np.full((count, len(settings)), len(rows) > 0)
+    full = whole_frames(values, count)
+    searches, _, _ = search(scenes, wanted, settings, full, [], keep=True)
+    return _Condition(scenes, values, searches)
+
+
+# --------------------------------------------------------------------------------------------------
+# The cost of each renderer, and how far its images differ from a reference's.
+
+@dataclass(frozen=True, slots=True)
+class RendererCosts:
+    """The costs of K renderers in R rounds; NaN if no scene is visible.
+
+    Attributes
+    ----------
+    seconds
+        (R, K) seconds an image.
+    grey_rms, grey_max
+        (K,) RMS and largest difference from the reference's images, in grey levels, over the pixels
+        that the marker covers there.
+    """
+
+    seconds: Floats
+    grey_rms: Floats
+    grey_max: Floats
+
+
+@single_threaded()
+def measure_renderers(
+    pipeline: Pipeline, samples: Sequence[Sequence[Indices]], reference: int, limit_s: float,
+    interrupts: Interrupts,
+) -> RendererCosts:
+    """Measure K renderers on the same scenes.
+
+    Parameters
+    ----------
+    pipeline
+        A pipeline whose renderer is an axis.
+    samples
+        For each renderer, (n,) indices along each scene axis; equal apart from the renderer's.
+    reference
+        Number of the renderer with which the others are compared.
+    limit_s
+        Time limit in seconds.
+    interrupts
+        Checked between two measurements.
+    """
+    count = len(samples[0][0])
+    plugins = scene_plugins(pipeline)
+    scenes = [
+        build_scenes(scene_values(pipeline, indices), count, plugins) for indices in samples
+    ]
+    rows = np.flatnonzero(visibility_flags(scenes[reference]) == DetectionStatus.not_run)
+    boxes = [marker_boxes(each)[rows] for each in scenes]
+    windows = np.concatenate(
+        [np.min([box[:, :2] for box in boxes], axis=0),
+         np.max([box[:, 2:] for box in boxes], axis=0)],
+        axis=1,
+    )
+    if not len(rows):
+        unknown = np.full(len(scenes), np.nan)
+        return RendererCosts(unknown[None], unknown, unknown)
+    images = [
+        render_all(each, rows, box, windows) for each, box in zip(scenes, boxes, strict=True)
+    ]
+    rms, largest = np.zeros(len(scenes)), np.zeros(len(scenes))
+    inner = boxes[reference] - np.tile(windows[:, :2], 2)
+    for k in range(len(scenes)):
+        differences = [
+            (image.astype(np.float64) - true)[top:bottom, left:right].ravel()
+            for image, true, (left, top, right, bottom) in zip(
+                images[k], images[reference], inner.tolist(), strict=True
+            )
+        ]
+        difference = np.concatenate(differences)
+        rms[k], largest[k] = np.sqrt(np.mean(difference**2)), np.abs(difference).max()
+    parts = [
+        partial(render_all, each, rows, box, windows)
+        for each, box in zip(scenes, boxes, strict=True)
+    ]
+    seconds = time_in_turns(
+        parts, lambda spent: np.asarray(spent / spent[:, reference : reference + 1]), limit_s,
+        interrupts,
+    )
+    return RendererCosts(seconds / len(rows), rms, largest)

@@ -1,0 +1,73 @@
+"""What commands tell: detections of what was looked for, and a bound that no pose has."""
+
+import json
+
+import pytest
+
+from support.stores import by_hand
+from sweep import Pipeline, cli
+from sweep.evaluation.block import bound_notes
+from sweep.execution.status import close
+
+TEXT = """
+[scene]
+noise_grey = 2
+bound = "known_blur"
+[pose]
+jitter_px = 0.5
+[axes]
+side_px = [8, 40]
+tilt_deg = [0, 89.9]
+cornerRefinementMethod = ["none", "subpix"]
+solver = ["ippe", "sqpnp", "iterative"]
+trial = 2
+"""
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    url = str(tmp_path_factory.mktemp("told") / "two.zarr")
+    close(by_hand(url, Pipeline.from_text(TEXT, name="two")))
+    return url
+
+
+def told(capsys, *arguments):
+    """Return what a command prints, and with --json the object."""
+    assert cli.main(list(arguments)) == 0
+    text = capsys.readouterr().out
+    assert cli.main([*arguments, "--json"]) == 0
+    return text, json.loads(capsys.readouterr().out)
+
+
+def test_detections_are_told_of_what_was_looked_for(store, capsys):
+    text, summary = told(capsys, "run", store)
+    state = told(capsys, "status", store)
+    flags = state[1]["detection"]
+    looked_for = sum(flags.values()) - flags.get("not_visible", 0) - flags.get("not_modelled", 0)
+    assert summary["looked_for"] == state[1]["looked_for"] == looked_for <= 16
+    line = f"detected {summary['detected']} of {looked_for} looked for"
+    assert f"8 poses, {line}" in text
+    assert "results" not in text
+    assert f"looked for  {looked_for}" in state[0]
+
+
+def test_a_bound_that_no_pose_has_is_a_line_of_every_command(store, capsys, tmp_path):
+    wanted = "no pose has a bound: clipped"
+    for arguments in (["run", store], ["status", store], ["plan", store],
+                      ["report", store, "-o", str(tmp_path / "report.html")]):
+        assert wanted in told(capsys, *arguments)[0]
+    assert wanted in (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.parametrize(("settings", "reasons"), [
+    (["black=30", "white=220", "background=200"], []), (["bound=none"], []),
+    (["black=[0, 30]", "white=220", "background=200"], []),
+    (["black=30", "white={ uniform = [254, 255] }"], ["clipped"]),
+    (["noise_grey=0.1"], ["no_noise"]), (["noise_grey=[0.1, 4]"], ["no_noise", "clipped"]),
+    (["gain=2", "black=30", "white=220"], ["clipped"]), (["vignetting=0.3"], ["not_in_model"]),
+    (["bound=['none', 'known_blur']"], ["clipped"]),
+])
+def test_why_no_pose_has_a_bound_is_told(settings, reasons):
+    line = "".join(bound_notes(Pipeline.from_text(TEXT, settings)))
+    assert [name for name in ("no_noise", "clipped", "not_in_model") if f"{name}: " in line] == (
+        reasons)

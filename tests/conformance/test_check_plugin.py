@@ -1,0 +1,173 @@
+"""`sweep plugins check` on OpenCV's own detector, on our solvers, and on plug-ins with faults."""
+
+import json
+import shutil
+from pathlib import Path
+from unittest import mock
+
+import pytest
+
+from support.here import Here
+from sweep.cli import main
+from sweep.conformance.check import check_plugin
+from sweep.errors import ArgumentError, PipelineError
+
+GUIDE = Path(__file__).parents[2] / "pipelines" / "plugins"
+
+DETECTOR = """
+import os, time
+import cv2
+import numpy as np
+
+SEEN = []
+
+def D(settings, family):
+    aruco = cv2.aruco
+    parameters = aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
+    inner = aruco.ArucoDetector(aruco.getPredefinedDictionary(getattr(aruco, family)), parameters)
+    def search(image):
+        SEEN.append(0)
+        corners, ids, _ = inner.detectMarkers(image)
+        corners = np.reshape(corners, (-1, 4, 2)).astype(float)
+        ids = np.ravel(ids).astype(int) if len(corners) else np.empty(0, int)
+        {body}
+        return corners, ids
+    return search
+"""
+
+SOLVER = """
+import os
+import cv2
+import numpy as np
+from sweep.plugins import EstimatorPlugin
+
+SQUARE = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5, -0.5, 0]])
+SEEN = []
+
+def solve(detections):
+    SEEN.append(0)
+    rotation, translation = [], []
+    for row, corners in enumerate(detections.corners):
+        camera = detections.cameras.matrix(row)
+        _, rvec, tvec = cv2.solvePnP(
+            SQUARE * detections.size_m[row], corners, camera, None, flags=cv2.SOLVEPNP_SQPNP)
+        rotation.append(cv2.Rodrigues(rvec)[0])
+        translation.append(tvec.ravel())
+    rotation, translation = np.array(rotation), np.array(translation)
+    {body}
+    return rotation, translation
+
+D = EstimatorPlugin(make=lambda settings: solve)
+"""
+
+
+@pytest.fixture
+def checked(tmp_path):
+    def run(source, body="pass", **options):
+        (tmp_path / "mine.py").write_text(source.replace("{body}", body))
+        with mock.patch("sweep.conformance.check.Child", options.pop("child", Here)):
+            return check_plugin("mine:D", folder=str(tmp_path), **options)
+    return run
+
+
+def faults(report):
+    return {finding.check: finding.text for finding in report.findings
+            if finding.verdict == "fault"}
+
+
+@pytest.mark.parametrize("source", [DETECTOR, SOLVER], ids=["detector", "solver"])
+def test_what_conforms_passes_six_checks(source, checked):
+    report = checked(source)
+    assert report.conforms, faults(report)
+    assert [finding.verdict for finding in report.findings] == ["ok"] * 6
+    assert report.numbers.get("detected", report.numbers.get("solved")) == 32
+
+
+@pytest.mark.parametrize(("source", "body", "check", "named"), [
+    (DETECTOR, "corners += 0.5", "keeps conventions",
+     "offset by (0.50, 0.50) px: declare pixel_center = 0.5"),
+    (SOLVER, "translation = translation + 1e-9 * len(SEEN)", "repeats itself", "32 of 32"),
+    (SOLVER, "translation = translation + 1e-6 * len(rotation)", "ignores the batch", "32 of 32"),
+    *(pytest.param(*case, marks=pytest.mark.long) for case in (
+        (DETECTOR, "corners = np.roll(corners, 1, axis=1)", "keeps conventions",
+         "corner_order = (1, 2, 3, 0)"),
+        (DETECTOR, "ids = ids + 1", "keeps conventions", "32 of 32 scenes, always +1"),
+        (DETECTOR, "image[:] = 0", "returns markers", "changed the image"),
+        (DETECTOR, "return None", "returns markers", "returned a NoneType"),
+        (DETECTOR, "corners, ids = corners[:0], ids[:0]", "finds markers", "0 of 32"),
+        (DETECTOR, "corners += np.random.default_rng().random() * 1e-3", "repeats itself",
+         "32 of 32"),
+        (DETECTOR, "corners += (len(SEEN) == 80) * 1e-3", "has no memory", "1 of 32"),
+        (SOLVER, "translation = translation * 1000", "solves scenes", "metres"),
+        (SOLVER, "rotation = rotation.transpose(0, 2, 1)", "keeps frames", "20 deg"),
+        (SOLVER, "translation = translation * 1.1", "keeps frames", "10 %"),
+        (SOLVER, "rotation = 2 * rotation", "returns poses", "no rotation matrix"),
+        (SOLVER, "return rotation[:, :2], translation", "returns poses", "shape"),
+        (SOLVER, "return rotation[:1], translation", "returns poses", "shape (1, 3, 3)"),
+        (SOLVER, "raise ValueError('none')", "returns poses", "ValueError: none"),
+        (SOLVER, "detections.corners[:] = 0; translation += np.random.default_rng().random() / 1e6",
+         "repeats itself", "32 of 32"),
+    )),
+])
+def test_a_fault_is_found_by_its_check(source, body, check, named, checked):
+    found = faults(checked(source, body))
+    assert named in found[check]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("source", "body", "check", "named"), [
+    (DETECTOR, "os.abort()", "returns markers", "SIGABRT"),
+    (DETECTOR, "image.shape[0] > 8 or os._exit(3)", "has no memory", "exit status 3"),
+    (DETECTOR, "time.sleep(60)", "returns markers", "did not return"),
+    (SOLVER, "os.abort()", "returns poses", "SIGABRT"),
+])
+def test_a_crash_or_an_endless_call_ends_the_checks(source, body, check, named, checked):
+    from sweep.isolation.child_process import Child  # noqa: PLC0415
+
+    report = checked(source, body, child=Child, time_limit_s=5 if "sleep" in body else 60)
+    assert named in faults(report)[check]
+    assert report.findings[-1].check == check
+
+
+@pytest.mark.long
+def test_plug_ins_of_the_guide_conform(tmp_path):
+    for name in ("homography:SOLVER", "consensus:SOLVER", "enlarged:DETECTOR"):
+        shutil.copy(GUIDE / f"{name.partition(':')[0]}.py", tmp_path)
+        with mock.patch("sweep.conformance.check.Child", Here):
+            report = check_plugin(name, folder=str(tmp_path))
+        assert report.conforms, faults(report)
+
+
+@pytest.mark.parametrize(("name", "options", "error", "named"), [
+    ("nothing", {}, ArgumentError, "no such plug-in"),
+    ("opencv", {"settings": ["cornerRefinementMetod=none"]}, PipelineError,
+     "cornerRefinementMethod"),
+    ("opencv", {"settings": ["cornerRefinementMethod=['none', 'subpix']"]}, PipelineError,
+     "no axes"),
+    ("opencv", {"dictionary": "DICT_NONE"}, PipelineError, "DICT_NONE"),
+    ("ippe", {"time_limit_s": 0}, ArgumentError, "above 0"),
+])
+def test_what_cannot_be_tried_is_refused(name, options, error, named):
+    with pytest.raises(error, match=named):
+        check_plugin(name, **options)
+
+
+def test_the_command_checks_a_solver(capsys):
+    with mock.patch("sweep.conformance.check.Child", Here):
+        assert main(["plugins", "check", "sqpnp", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (said["kind"], said["conforms"], said["solved"]) == ("estimator", True, 32)
+    assert len(said["findings"]) == 6
+
+
+@pytest.mark.parametrize(("arguments", "named"), [
+    (["check", "opencv", "--dictionary", "DICT_5X5"], "DICT_5X5"),
+    (["opencv", "ippe"], "`sweep plugins check ippe`"),
+    (["opencv", "--set", "x=1"], "expected `check` and a name"),
+])
+def test_the_command_refuses_in_a_line(arguments, named, capsys):
+    assert main(["plugins", *arguments]) == 2
+    err = capsys.readouterr().err
+    assert named in err
+    assert err.count("\n") == 1

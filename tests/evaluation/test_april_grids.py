@@ -1,0 +1,93 @@
+"""AprilGrids in scenes: Kalibr's order, IDs of one's own, and what detects them."""
+
+import numpy as np
+import pytest
+
+from support.blocks import run_block
+from sweep.errors import PipelineError
+from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.plan.facts import notes
+from sweep.plan.grid import Block
+from sweep.plan.pipeline import Pipeline
+
+TEXT = """
+[marker]
+dictionary = "DICT_APRILTAG_36h11"
+size_m = 0.04
+[board]
+kind = "aprilgrid"
+tagCols = 4
+tagRows = 3
+tagSpacing = 0.3
+[pose]
+jitter_px = 1
+azimuth_deg = { uniform = [0, 360] }
+roll_deg = { uniform = [0, 360] }
+[estimator]
+solver = "sqpnp"
+[axes]
+distance_m = [0.4, 0.7, 1.2]
+tilt_deg = [0, 25, 50]
+trial = 3
+"""
+
+FOUND = ["adaptiveThreshConstant=60", "adaptiveThreshWinSizeMax=33", "adaptiveThreshWinSizeStep=4"]
+"""The setting that the guide of boards and the plan name."""
+
+
+def run(settings):
+    return run_block(Pipeline.from_text(TEXT, settings), Block((0, 0, 0), (3, 3, 3))).values
+
+
+def test_the_named_setting_finds_what_the_default_loses():
+    default, named = run([]), run(FOUND)
+    lost = default["detection"] != DetectionStatus.detected
+    assert lost.sum() >= 5
+    assert (named["detection"] == DetectionStatus.detected).all()
+    found = [(each["marker_detection"] == DetectionStatus.detected).mean()
+             for each in (default, named)]
+    print(f"\nmarkers found: {found[0]:.2f} by default, {found[1]:.2f} as named; {lost.sum()} of "
+          "27 scenes have none by default")
+    assert found[0] < 0.5
+    assert found[1] > 0.75
+    solved = named["estimate"] == EstimateStatus.solved
+    assert solved.mean() > 0.9
+    # A board whose markers have other IDs or another turn than the picture fits nowhere.
+    assert np.nanmedian(named["reprojection_error_px"][solved]) < 2
+    assert np.nanmedian(np.linalg.norm(named["rotation_error_rad"], axis=-1)[solved]) < 0.05
+
+
+def test_plan_names_the_setting_where_the_default_loses_markers():
+    (line,) = [each for each in notes(Pipeline.from_text(TEXT)) if "squares" in each]
+    for setting in FOUND:
+        assert setting.replace("=", " = ") in line
+    assert not [each for each in notes(Pipeline.from_text(TEXT, FOUND)) if "squares" in each]
+
+
+@pytest.mark.parametrize("kind", ["aprilgrid", "grid"])
+def test_ids_are_those_listed_in_the_order_of_the_kind(kind):
+    ids = [7, 3, 11, 5, 30, 31, 32, 33, 0, 1, 2, 4]
+    text = TEXT if kind == "aprilgrid" else TEXT.replace(
+        'kind = "aprilgrid"\ntagCols = 4\ntagRows = 3\ntagSpacing = 0.3',
+        'kind = "grid"\ncolumns = 4\nrows = 3\ngap_m = 0.012',
+    )
+    values = run_block(
+        Pipeline.from_text(text, [f"ids={ids}", *FOUND]), Block((0, 0, 0), (1, 1, 1))
+    ).values
+    assert values["board_marker_id"].ravel().tolist() == ids
+    assert (values["marker_detection"] == DetectionStatus.detected).mean() > 0.5
+
+
+@pytest.mark.parametrize(("settings", "named"), [
+    (["ids=[1, 2]"], ["board.ids", "12 IDs"]),
+    (["ids=[1, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]"], ["board.ids", "1 is listed"]),
+    (["ids=[1, 0, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]", "marker_id=3"], ["board.ids", "marker_id"]),
+    (["marker_id=580"], ["marker_id = 580"]),
+    (["gap_m=0.01"], ["board.gap_m", "aprilgrid"]),
+    (["tagSpacing=1.5"], ["board.tagSpacing = 1.5"]),
+])
+def test_faults_of_an_april_grid_name_their_key(settings, named):
+    with pytest.raises(PipelineError) as refused:
+        Pipeline.from_text(TEXT, settings)
+    for each in named:
+        assert each in str(refused.value)

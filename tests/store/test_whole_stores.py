@@ -1,0 +1,162 @@
+"""What readers check of a store: its chunks and coordinates are there, and which processor."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+import zarr
+
+import sweep
+from support.store_files import edit_receipt, editable
+from support.stores import by_hand
+from sweep.cli import main
+from sweep.errors import StoreError
+from sweep.execution.block_task import compute_block
+from sweep.execution.reuse import match
+from sweep.execution.status import close, status
+from sweep.integrity.reproduction import reproduce
+from sweep.integrity.verification import verify
+from sweep.plan.pipeline import Pipeline
+from sweep.processor import processor
+from sweep.store.blocks import drop_block, receipts
+from sweep.store.layout import checksum_of
+from sweep.store.lifecycle import create_store, open_store
+
+TEXT = """
+seed = 3
+[pose]
+jitter_px = 0.5
+tilt_deg = { uniform = [0, 60] }
+[axes]
+side_px = [30, 60]
+solver = ["ippe_square", "iterative"]
+trial = 4
+"""
+
+EXTENTS = (1, 2)
+"""Four blocks."""
+
+
+@pytest.fixture(scope="module")
+def pipeline():
+    return Pipeline.from_text(TEXT, name="whole")
+
+
+@pytest.fixture(scope="module")
+def finished(pipeline, tmp_path_factory):
+    url = str(tmp_path_factory.mktemp("finished") / "whole.zarr")
+    close(by_hand(url, pipeline, EXTENTS))
+    return Path(url)
+
+
+@pytest.fixture
+def copied(finished, tmp_path):
+    return Path(shutil.copytree(finished, tmp_path / "whole.zarr"))
+
+
+COMMANDS = (["status"], ["report"], ["require", "detection >= 0.1"])
+
+
+@pytest.mark.parametrize("lost", [
+    ("detection/c/0", "rotation_error_rad/c/1/0/1"), ("true_rvec/c",), ("commits/receipt/c/2",),
+    ("tilt_deg/c/0/1",),
+], ids=["parts", "a variable", "a receipt", "a drawn coordinate"])
+def test_readers_name_what_is_gone_and_what_repairs_it(lost, pipeline, copied, capsys):
+    store = open_store(str(copied))
+    for key in lost:
+        path = copied / key
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    name = lost[0].partition("/c")[0]
+    for reader in (sweep.open, status, lambda url: match(pipeline, open_store(url))):
+        if name == "commits/receipt" and reader is not sweep.open:
+            continue
+        with pytest.raises(StoreError, match=rf"{name}/c/.* of block .*sweep verify --repair"):
+            reader(str(copied))
+    for command, *more in COMMANDS:
+        assert main([command, str(copied), *more]) == 2
+        assert "sweep verify --repair" in capsys.readouterr().err
+    assert {damage.block for damage in verify(str(copied), 0).damage} <= set(range(4))
+    if name == "detection":
+        with pytest.raises(StoreError, match="detection/c/0"):
+            reproduce(str(copied), "side_px=30")
+    assert store.finished
+
+
+def test_store_that_is_being_written_is_read_though_blocks_are_missing(pipeline, tmp_path):
+    url = str(tmp_path / "half.zarr")
+    store = by_hand(url, pipeline, EXTENTS)
+    drop_block(store, store.blocks[1])
+    assert status(url).blocks_done == 3
+    assert int((sweep.open(url).detection == 0).sum()) == 2
+
+
+@pytest.mark.parametrize(("name", "values"), [
+    ("side_px", [60.0, 30.0]), ("side_px", [30.0, 61.0]), ("trial", [0, 1, 2, 4]),
+    ("solver", ["iterative", "ippe_square"]), ("xyz", ["x", "z", "y"]), ("size_m", 0.02),
+])
+def test_readers_name_a_coordinate_that_was_rewritten(name, values, copied, capsys):
+    array = editable(copied, name)
+    array[...] = np.array(values, dtype=object if array.dtype.kind in "OTU" else None)
+    with pytest.raises(StoreError, match=rf"{name}/c.* is not as its pipeline.*--repair"):
+        sweep.open(copied)
+    assert main(["require", str(copied), "detection >= 0.1"]) == 2
+    assert f"{name}/c" in capsys.readouterr().err
+    assert name in {damage.where.partition("/")[0] for damage in verify(str(copied), 0).damage}
+
+
+def test_a_coordinate_that_is_gone_is_named(copied):
+    shutil.rmtree(copied / "side_px/c")
+    with pytest.raises(StoreError, match=r"side_px/c/0 is not as its pipeline"):
+        sweep.open(copied)
+
+
+def computed_elsewhere(url):
+    """Change a store as if another processor had computed it: last digits, and its features."""
+    for key, content in (
+        (path.relative_to(url).as_posix(), path) for path in (url / "corner_error_px/c").rglob("*")
+        if path.is_file()
+    ):
+        number = open_store(str(url)).chunks.number(key)
+        array = editable(url, "corner_error_px")
+        block = open_store(str(url)).blocks[number]
+        part = tuple(slice(*ends) for ends in zip(block.starts, block.stops, strict=True))
+        array[part] = np.asarray(array[part]) + 1e-5
+        edit_receipt(url, number, lambda receipt, content=content: receipt.update(
+            processors=["elsewhere"],
+            checksums=receipt["checksums"] | {
+                "corner_error_px": checksum_of(content.read_bytes())}))
+
+
+def test_reused_cells_keep_the_processor_that_computed_them(copied, tmp_path, capsys):
+    computed_elsewhere(copied)
+    assert verify(str(copied), 40).damage == []
+    grown = Pipeline.from_text(TEXT.replace("trial = 4", "trial = 6"), name="grown")
+    url = str(tmp_path / "grown.zarr")
+    store = create_store(url, grown, (1, 3))
+    for block in store.blocks:
+        compute_block(url, store.run_id, block, (str(copied),))
+    close(store)
+    found = [receipt.processors for _, receipt in receipts(store, range(4))]
+    assert found == [("elsewhere",), tuple(sorted({"elsewhere", processor()}))] * 2
+    report = verify(url, 40)
+    assert (report.damage, report.processors) == ([], {"elsewhere": 4, processor(): 2})
+    for command in ("verify", "status"):
+        assert main([command, url]) == 0
+        assert "processors with 2 different sets of features" in capsys.readouterr().out
+    assert json.loads(sweep.open(url).attrs["sweep"])["counts"]["processors"]["elsewhere"] == 4
+
+
+def test_a_store_is_netcdf_and_zarr_without_sweep(finished, tmp_path):
+    with xr.open_zarr(finished) as results:
+        results.to_netcdf(tmp_path / "results.nc")
+        assert isinstance(results.attrs["sweep"], str)
+        results.load()
+    with xr.open_dataset(tmp_path / "results.nc") as again:
+        np.testing.assert_array_equal(
+            again.detection.transpose(*results.detection.dims), results.detection)
+    for member in zarr.open_group(finished, mode="r").members(max_depth=None):
+        assert all(isinstance(value, (str, int, float, list))
+                   for value in member[1].attrs.values()), member[0]

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import csv
-import itertools
-import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from sweep.errors import ArgumentError, PipelineError, StoreError
 from sweep.messages import nearest, nearest_file, plain
@@ -109,7 +108,7 @@ def _words(text: str) -> list[str]:
 
 
 # --------------------------------------------------------------------------------------------------
-# What is read of a program's answers so far: names of columns, faults, and numbers as arrays.
+# The table of a CSV file, whatever program wrote it, and the faults of its rows.
 
 CORNER_COLUMNS = tuple(f"{axis}{corner}" for corner in range(4) for axis in "xy")
 VECTOR = ("rx", "ry", "rz")
@@ -125,7 +124,10 @@ ALIASES = {
 }
 """Other names of columns."""
 
-NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+SEPARATORS = ",;\t"
+"""The header has most of the one that separates; with semicolons, commas are decimal points."""
+
+NUMBER = r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"
 
 MAX_PX = 1e7
 MAX_M = 1e9
@@ -137,209 +139,138 @@ MAX_TOLD_COLUMNS = 12
 
 
 @dataclass(slots=True)
-class Reading:
-    """A file as far as it could be read, and its faults."""
+class _Table:
+    """The rows of a file that have no fault so far, as texts, and the faults.
+
+    Attributes
+    ----------
+    source
+        What the lines of faults begin with.
+    rows
+        Columns by our names; the index is the line in the file.
+    faults
+        Line of the file and text; of each check no more than are listed.
+    count
+        All faults.
+    """
 
     source: str
-    images: Mapping[str, int]
-    faults: list[str] = field(default_factory=list)
+    rows: pd.DataFrame = field(default_factory=pd.DataFrame)
+    faults: list[tuple[int, str]] = field(default_factory=list)
     count: int = 0
 
     def fault(self, line: int, text: str) -> None:
         """Note a fault of a line."""
         self.count += 1
-        if len(self.faults) < MAX_FAULTS:
-            self.faults.append(f"{self.source}: line {line}: {plain(text, 300)}")
+        self.faults.append((line, text))
+
+    def refuse(self, wrong: pd.Series, say: Callable[[pd.Series], str]) -> None:
+        """Note a fault of each row that is ``wrong``, and leave it out from now on."""
+        chosen = wrong.to_numpy(dtype=bool)
+        for line, row in self.rows.loc[chosen].head(MAX_FAULTS).iterrows():
+            self.faults.append((int(str(line)), say(row)))
+        self.count += int(chosen.sum())
+        self.rows = self.rows.loc[~chosen]
 
     def check(self) -> None:
-        """Raise PipelineError if there are faults."""
-        if self.count > len(self.faults):
-            self.faults.append(f"... and {self.count - len(self.faults):,} faults more")
-        if self.faults:
-            raise PipelineError(self.faults)
+        """Raise PipelineError if there are faults: a line each, in the order of the file."""
+        told = [
+            f"{self.source}: line {line}: {plain(text, 300)}"
+            for line, text in sorted(self.faults, key=lambda fault: fault[0])[:MAX_FAULTS]
+        ]
+        if self.count > len(told):
+            told.append(f"... and {self.count - len(told):,} faults more")
+        if told:
+            raise PipelineError(told)
 
 
-def finish(reading: Reading, line: int, answer: dict[str, Any]) -> bool:
-    """Turn an answer's numbers into arrays; False with a fault if they cannot be."""
-    pose = answer.pop("pose", None)
-    if "corners" in answer:
-        corners = np.array(answer["corners"]).reshape(4, 2)
-        if np.abs(corners).max() > MAX_PX:
-            reading.fault(line, f"corners beyond {MAX_PX:.0e} px; expected pixels of the image")
-            return False
-        answer["corners"] = corners
-    if pose is not None:
-        angles, position = np.array(pose[:-3]), np.array(pose[-3:])
-        if np.abs(position).max() > MAX_M:
-            reading.fault(line, f"a position beyond {MAX_M:.0e}; expected metres")
-            return False
-        if len(angles) == 4:
-            length = float(np.linalg.norm(angles))
-            if abs(length - 1) > 0.01:
-                reading.fault(
-                    line, f"a quaternion of length {length:.3g}; expected w, x, y, z of length 1"
-                )
-                return False
-            w, x, y, z = angles / length
-            half = math.atan2(math.hypot(x, y, z), w)
-            sine = math.sin(half)
-            angles = 2 * half * np.array([x, y, z]) / sine if sine else np.zeros(3)
-        if np.abs(angles).max() > 1e6:
-            reading.fault(line, "a rotation vector beyond 1e6; expected radians")
-            return False
-        answer["rotation"] = rotation_of_vector(angles[None])[0]
-        answer["translation"] = position
-    if "corners" not in answer and pose is None:
-        reading.fault(line, "an ID without corners and without a pose")
-        return False
-    return True
+def _text(path: Path, table: _Table) -> str:
+    """Return a file's text in any encoding that a byte order mark names, else UTF-8."""
+    try:
+        content = path.read_bytes()
+    except (OSError, ValueError) as error:
+        reason = f"{plain(getattr(error, 'strerror', None) or error)}{nearest_file(path)}"
+        raise StoreError(f"{table.source}: cannot be read: {reason}") from None
+    encoding = "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    try:
+        text = content.decode(encoding)
+    except UnicodeDecodeError as error:
+        table.fault(content[: error.start].count(b"\n") + 1, "not UTF-8 text; expected CSV")
+        return ""
+    if "\0" in text:
+        table.fault(text[: text.index("\0")].count("\n") + 1, "not text: a zero byte")
+    elif text.lstrip()[:1] in ("{", "["):
+        table.fault(1, "JSON; expected CSV with a header such as image,id,x0,y0,x1,y1,...")
+    return text
 
 
-# --------------------------------------------------------------------------------------------------
-# Rows of a CSV file, whatever program wrote it: separators, line ends, comments.
+def _read_rows(text: str, table: _Table) -> None:
+    """Put the rows of a CSV text into a table; lines that begin with ``#`` are left out.
 
-SEPARATORS = ",;\t"
-
-
-def csv_rows(
-    text: str,
-) -> tuple[int, list[str], Iterator[tuple[int, list[str]]], bool] | None:
-    r"""Return the header's line and names, the rows with their lines, whether commas are points.
-
-    None if there is no header. Empty lines, and those that begin with ``#``, are left out. The
-    separator is the one that the header has most of.
-
-    Examples
-    --------
-    >>> line, header, rows, commas = csv_rows("# mine\r\nimage;x0\r\na;1,5\r\n")
-    >>> line, header, list(rows), commas
-    (2, ['image', 'x0'], [(3, ['a', '1,5'])], True)
+    The header must have image and id, and all columns of the corners, of the pose, or of both.
     """
-    lines = text_lines(text)
-    start = next(
-        (k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")),
-        None,
-    )
-    if start is None:
-        return None
-    separator = max(SEPARATORS, key=lines[start].count)
-
-    def rows() -> Iterator[tuple[int, list[str]]]:
-        for number, line in zip(itertools.count(start + 1), lines[start:], strict=False):
-            if line.strip() and not line.lstrip().startswith("#"):
-                try:
-                    yield number, next(csv.reader([line], delimiter=separator), [])
-                except csv.Error:
-                    yield number, [line]
-
-    each = rows()
-    header_line, header = next(each)
-    return header_line, header, each, separator == ";"
-
-
-def text_lines(text: str) -> list[str]:
-    r"""Return the lines of a text, ended as Unix, Windows or an old Mac does.
-
-    >>> text_lines("a\r\nb\rc\u2028d\n")
-    ['a', 'b', 'c\u2028d', '']
-    """
-    return re.split(r"\r\n|\n|\r", text)
-
-
-# --------------------------------------------------------------------------------------------------
-# Answers in a CSV file: a row a marker, the columns in any order.
-
-def csv_answers(text: str, reading: Reading) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield the line and content of each row of a CSV file."""
-    table = csv_rows(text)
-    if table is None:
+    numbered = [
+        (number, line) for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not numbered:
+        table.rows = pd.DataFrame(columns=["image", "id", *CORNER_COLUMNS], dtype=object)
         return
-    header_line, written, rows, decimal_comma = table
-    header = [_column(name) for name in written]
-    usable = _check_header(reading, header_line, header, written)
-    if usable is None:
-        return
-    has_corners, angles = usable
-    wanted = [*(CORNER_COLUMNS if has_corners else ()), *angles, *(POSITION if angles else ())]
-    for line, cells in rows:
-        if len(cells) != len(header):
-            reading.fault(
-                line, f"{len(cells)} values; expected {len(header)}, as the header has"
-            )
-            continue
-        row = dict(zip(header, (cell.strip() for cell in cells), strict=True))
-        answer: dict[str, Any] = {"image": row["image"]}
-        if not any(row[name] for name in (*wanted, "id")):
-            yield line, answer
-            continue
-        answer["id"] = row["id"]
-        if decimal_comma:
-            row |= {name: row[name].replace(",", ".") for name in wanted}
-        complete = _numbers(reading, line, row, answer, "corners", CORNER_COLUMNS) \
-            if has_corners else True
-        if complete and angles:
-            complete = _numbers(reading, line, row, answer, "pose", (*angles, *POSITION))
-        if complete and finish(reading, line, answer):
-            yield line, answer
-
-
-def _column(name: str) -> str:
-    bare = name.strip().lower()
-    return ALIASES.get(bare, bare)
+    separator = max(SEPARATORS, key=numbered[0][1].count)
+    (first, written), *rows = [
+        (number, [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])])
+        for number, line in numbered
+    ]
+    header = [ALIASES.get(name.lower(), name.lower()) for name in written]
+    _check_header(table, first, header, written)
+    table.check()
+    for number, row in rows:
+        if len(row) != len(header):
+            table.fault(number, f"{len(row)} values; expected {len(header)}, as the header has")
+    complete = [(number, row) for number, row in rows if len(row) == len(header)]
+    table.rows = pd.DataFrame(
+        [row for _, row in complete], [number for number, _ in complete], header, dtype=object)
+    if separator == ";":
+        numbers = table.rows.columns.intersection(
+            [*CORNER_COLUMNS, *VECTOR, *QUATERNION, *POSITION])
+        table.rows[numbers] = table.rows[numbers].map(lambda cell: cell.replace(",", "."))
 
 
 def _check_header(
-    reading: Reading, line: int, header: list[str], written: list[str]
-) -> tuple[bool, tuple[str, ...]] | None:
-    """Return whether there are corners, and the columns of the rotation; None with a fault."""
+    table: _Table, line: int, header: Sequence[str], written: Sequence[str]
+) -> None:
+    """Note what a header lacks, or has twice; ``written`` are the names as the file has them."""
+    columns = set(header)
     repeated = next((name for name in header if name and header.count(name) > 1), None)
     if repeated is not None:
-        reading.fault(line, f"the column {repeated} is there twice")
-        return None
-    if "x4" in header or "y4" in header:
-        reading.fault(line, "columns of more than four corners; expected x0, y0 to x3, y3")
-        return None
-    columns = set(header)
-    angles = QUATERNION if columns & {*QUATERNION} else VECTOR if columns & {*VECTOR} else ()
-    has_pose = bool(angles or columns & {*POSITION})
-    has_corners = bool(columns & {*CORNER_COLUMNS})
-    expected = ["image", "id"]
-    if has_corners or not has_pose:
-        expected += CORNER_COLUMNS
-    if has_pose:
-        expected += [*(angles or VECTOR), *POSITION]
-    if missing := [name for name in expected if name not in columns]:
-        listed = ", ".join(missing[:MAX_TOLD_COLUMNS])
-        unknown = [name for name in written if _column(name) not in expected]
-        hint = nearest(unknown[0].strip(), missing) if unknown else ""
-        poses = "" if has_pose or has_corners else ", or rx, ry, rz, tx, ty, tz of poses"
-        found = ", ".join(plain(name, 40) for name in written[:MAX_TOLD_COLUMNS])
-        reading.fault(line, f"no column {listed}{poses}; the header has {found}{hint}")
-        return None
-    return has_corners, tuple(angles)
+        table.fault(line, f"the column {repeated} is there twice")
+    elif columns & {"x4", "y4"}:
+        table.fault(line, "columns of more than four corners; expected x0, y0 to x3, y3")
+    else:
+        angles = _angles(columns)
+        has_pose = bool(columns & {*angles, *POSITION})
+        has_corners = bool(columns & {*CORNER_COLUMNS})
+        expected = [
+            "image", "id", *(CORNER_COLUMNS if has_corners or not has_pose else ()),
+            *((*angles, *POSITION) if has_pose else ()),
+        ]
+        if missing := [name for name in expected if name not in columns]:
+            listed = ", ".join(missing[:MAX_TOLD_COLUMNS])
+            unknown = [name for name, ours in zip(written, header, strict=True)
+                       if ours not in expected]
+            hint = nearest(unknown[0], missing) if unknown else ""
+            poses = "" if has_pose or has_corners else ", or rx, ry, rz, tx, ty, tz of poses"
+            found = ", ".join(plain(name, 40) for name in written[:MAX_TOLD_COLUMNS])
+            table.fault(line, f"no column {listed}{poses}; the header has {found}{hint}")
 
 
-def _numbers(
-    reading: Reading, line: int, row: Mapping[str, str], answer: dict[str, Any], what: str,
-    names: tuple[str, ...],
-) -> bool:
-    """Put the numbers of columns into an answer, none where all are empty; False with a fault."""
-    empty = [name for name in names if not row[name]]
-    if len(empty) == len(names):
-        return True
-    if empty:
-        reading.fault(line, f"no {', '.join(empty)}; expected all numbers of the {what}, or none")
-        return False
-    for name in names:
-        if not NUMBER.fullmatch(row[name]):
-            reading.fault(line, f"{name} = {plain(row[name])}: expected a finite number")
-            return False
-    answer[what] = [float(row[name]) for name in names]
-    return True
+def _angles(columns: set[str]) -> tuple[str, ...]:
+    """Return the names of the columns of the rotation, as a quaternion if there is part of one."""
+    return QUATERNION if columns & {*QUATERNION} else VECTOR
 
 
 # --------------------------------------------------------------------------------------------------
-# Answers of other programs: files of detections and poses, read with all their faults told.
+# Answers of other programs: detections and poses, read with all their faults told.
 
 _NAME = re.compile(r"(\d{6,})-[0-9a-f]{8}")
 
@@ -358,10 +289,6 @@ class Answers:
         (M, 4, 2) px of the image; NaN where none were given.
     rotation, translation
         (M, 3, 3) and (M, 3); NaN where no pose was given.
-    line
-        (M,) lines of the file.
-    named
-        Images that the file names, found in or not.
     """
 
     image: Integers
@@ -369,8 +296,6 @@ class Answers:
     corners: Floats
     rotation: Floats
     translation: Floats
-    line: Integers
-    named: set[int]
 
 
 def read_answers(
@@ -396,100 +321,133 @@ def read_answers(
     StoreError
         If the file cannot be read.
     """
-    reading = Reading(plain(path, 300), images)
-    text = _text(path, reading)
-    reading.check()
-    image: list[int] = []
-    ids: list[int] = []
-    corners: list[Any] = []
-    rotation: list[Any] = []
-    translation: list[Any] = []
-    lines: list[int] = []
-    named: set[int] = set()
-    first: dict[tuple[int, int], int] = {}
-    no_corners, no_rotation = np.full((4, 2), np.nan), np.full((3, 3), np.nan)
-    for line, row in csv_answers(text, reading):
-        where = _image(reading, line, row.get("image"))
-        if where is None:
-            continue
-        named.add(where)
-        if row.keys() <= {"image"}:
-            continue  # it was searched, and nothing was found
-        marker = _marker_id(reading, line, row.get("id"))
-        if marker is None:
-            continue
-        if marker != REJECTED and doubled == "refuse":
-            before = first.setdefault((where, marker), line)
-            if before != line:
-                reading.fault(
-                    line, f"image {row['image']} has ID {marker} twice, here and in line {before}; "
-                    "delete one, or pass --doubled nearest: the one nearest to the truth counts, "
-                    "as of detectors that run here",
-                )
-                continue
-        image.append(where)
-        ids.append(marker)
-        corners.append(row.get("corners", no_corners))
-        rotation.append(row.get("rotation", no_rotation))
-        translation.append(row.get("translation", (np.nan,) * 3))
-        lines.append(line)
-    reading.check()
-    count = len(image)
+    table = _Table(plain(path, 300))
+    text = _text(path, table)
+    table.check()
+    _read_rows(text, table)
+    _check_images(table, images)
+    angles = _angles({*table.rows})
+    numbers = [*table.rows.columns.intersection([*CORNER_COLUMNS, *angles, *POSITION])]
+    # A row with nothing but the image: it was searched, and nothing was found.
+    table.rows = table.rows.loc[(table.rows[["id", *numbers]] != "").any(axis=1)]
+    table.refuse(
+        table.rows["id"].map(lambda text: not _is_marker_id(text)),
+        lambda row: f"id {plain(row['id'])}: expected a whole number, or -1 for a candidate that "
+        "was not decoded",
+    )
+    corners = _numbers(table, "corners", CORNER_COLUMNS)
+    table.refuse(
+        (corners.abs() > MAX_PX).any(axis=1),
+        lambda _: f"corners beyond {MAX_PX:.0e} px; expected pixels of the image",
+    )
+    position = _numbers(table, "pose", (*angles, *POSITION))[[*POSITION]]
+    table.refuse(
+        (position.abs() > MAX_M).any(axis=1),
+        lambda _: f"a position beyond {MAX_M:.0e}; expected metres",
+    )
+    rotation = _rotations(table, angles)
+    corners, position = corners.loc[table.rows.index], position.loc[table.rows.index]
+    table.refuse(
+        corners.isna().any(axis=1) & position.isna().any(axis=1),
+        lambda _: "an ID without corners and without a pose",
+    )
+    ids = table.rows["id"].astype(np.float64).astype(np.int64)
+    if doubled == "refuse":
+        _refuse_doubled(table, ids)
+    table.check()
+    count = len(table.rows)
     return Answers(
-        np.array(image, dtype=np.int64), np.array(ids, dtype=np.int64),
-        conventions.corners(np.array(corners, dtype=np.float64).reshape(count, 4, 2)),
-        conventions.rotations(np.array(rotation, dtype=np.float64).reshape(count, 3, 3)),
-        np.array(translation, dtype=np.float64).reshape(count, 3),
-        np.array(lines, dtype=np.int64), named,
+        table.rows["index"].to_numpy(np.int64), ids.to_numpy(),
+        conventions.corners(corners.to_numpy(np.float64).reshape(count, 4, 2)),
+        conventions.rotations(rotation), position.to_numpy(np.float64),
     )
 
 
-def _text(path: Path, reading: Reading) -> str:
-    """Return a file's text in any encoding that a byte order mark names, else UTF-8."""
-    try:
-        content = path.read_bytes()
-    except (OSError, ValueError) as error:
-        reason = f"{plain(getattr(error, 'strerror', None) or error)}{nearest_file(path)}"
-        raise StoreError(f"{reading.source}: cannot be read: {reason}") from None
-    encoding = "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
-    try:
-        text = content.decode(encoding)
-    except UnicodeDecodeError as error:
-        reading.fault(
-            content[: error.start].count(b"\n") + 1, "not UTF-8 text; expected CSV"
+def _check_images(table: _Table, images: Mapping[str, int]) -> None:
+    """Put the index of each row's image into the column ``index``, and refuse unknown ones."""
+    table.refuse(table.rows["image"] == "", lambda _: "no image; expected the name of one")
+    stems = table.rows["image"].str.replace(
+        r"^.*[/\\]|\.[A-Za-z0-9]{1,5}$", "", regex=True)
+    table.rows = table.rows.assign(stem=stems, index=stems.map(images.get))
+    table.refuse(
+        table.rows["index"].isna(),
+        lambda row: f"image {plain(row['image'])} is not among those that were exported"
+        + ("; it is of another export" if _NAME.fullmatch(row["stem"]) else
+           f"; expected a name such as {next(iter(images), '')}.png"),
+    )
+
+
+def _is_marker_id(text: str) -> bool:
+    if not re.fullmatch(NUMBER, text):
+        return False
+    number = float(text)
+    return number.is_integer() and REJECTED <= number < 2**31
+
+
+def _numbers(table: _Table, what: str, names: Sequence[str]) -> pd.DataFrame:
+    """Return the numbers of columns, NaN where a row has none of them, or the file no column.
+
+    Rows with some of them, or with what is no finite number, are refused.
+    """
+    if not {*names} <= {*table.rows}:
+        return pd.DataFrame(np.nan, table.rows.index, [*names])
+    names = [*names]
+    empty = table.rows[names] == ""
+    table.refuse(
+        empty.any(axis=1) & ~empty.all(axis=1),
+        lambda row: f"no {', '.join(name for name in names if not row[name])}; expected all "
+        f"numbers of the {what}, or none",
+    )
+
+    def wrong(row: pd.Series) -> str:
+        return next((name for name in names
+                     if row[name] and not re.fullmatch(NUMBER, row[name])), "")
+
+    texts = table.rows[names]
+    is_number = texts.map(lambda cell: not cell or bool(re.fullmatch(NUMBER, cell)))
+    table.refuse(
+        ~is_number.all(axis=1),
+        lambda row: f"{wrong(row)} = {plain(row[wrong(row)])}: expected a finite number",
+    )
+    return table.rows[names].replace("", "nan").astype(np.float64)
+
+
+def _rotations(table: _Table, angles: tuple[str, ...]) -> Floats:
+    """Return the rotations (n, 3, 3) of rotation vectors or quaternions; NaN where there are none.
+
+    Rows with what is none of them are refused.
+    """
+    if angles == QUATERNION:
+        length = np.sqrt((_numbers(table, "pose", angles) ** 2).sum(axis=1, skipna=False))
+        table.refuse(
+            (length - 1).abs() > 0.01,
+            lambda row: f"a quaternion of length {length[row.name]:.3g}; expected w, x, y, z of "
+            "length 1",
         )
-        return ""
-    if "\0" in text:
-        reading.fault(text[: text.index("\0")].count("\n") + 1, "not text: a zero byte")
-    elif text.lstrip()[:1] in ("{", "["):
-        reading.fault(1, "JSON; expected CSV with a header such as image,id,x0,y0,x1,y1,...")
-    return text
+    given = _numbers(table, "pose", angles)
+    table.refuse(
+        (given.abs() > 1e6).any(axis=1), lambda _: "a rotation vector beyond 1e6; expected radians")
+    numbers = given.loc[table.rows.index].to_numpy(np.float64)
+    rotations = np.full((len(numbers), 3, 3), np.nan)
+    known = np.isfinite(numbers).all(axis=1)
+    if angles == QUATERNION:
+        w, xyz = numbers[known, :1], numbers[known, 1:]
+        rotations[known] = Rotation.from_quat(np.hstack([xyz, w])).as_matrix()
+    else:
+        rotations[known] = rotation_of_vector(numbers[known])
+    return rotations
 
 
-def _image(reading: Reading, line: int, name: object) -> int | None:
-    """Return the index of a named image; None with a fault if there is none."""
-    if not isinstance(name, str) or not name.strip():
-        reading.fault(line, "no image; expected the name of one")
-        return None
-    stem = re.sub(r"\.[A-Za-z0-9]{1,5}$", "", name.strip().replace("\\", "/").rpartition("/")[2])
-    found = reading.images.get(stem)
-    if found is None:
-        hint = "; it is of another export" if _NAME.fullmatch(stem) else (
-            f"; expected a name such as {next(iter(reading.images), '')}.png"
-        )
-        reading.fault(line, f"image {plain(name)} is not among those that were exported{hint}")
-    return found
-
-
-def _marker_id(reading: Reading, line: int, value: object) -> int | None:
-    """Return an ID; None with a fault if it is none."""
-    written = isinstance(value, str) and NUMBER.fullmatch(value.strip())
-    counts = isinstance(value, (int, float)) and not isinstance(value, bool)
-    number = float(str(value)) if written or counts else math.nan
-    if not (math.isfinite(number) and number.is_integer() and REJECTED <= number < 2**31):
-        reading.fault(
-            line, f"id {plain(value)}: expected a whole number, or -1 for a candidate that was not "
-            "decoded",
-        )
-        return None
-    return int(number)
+def _refuse_doubled(table: _Table, ids: pd.Series) -> None:
+    """Refuse rows whose image has the same ID in an earlier row."""
+    decoded = table.rows.assign(number=ids)[ids != REJECTED]
+    first = decoded.index.to_series().groupby([decoded["index"], decoded["number"]]).transform(
+        "first")
+    again = pd.Series(False, table.rows.index)
+    again[first.index[first != first.index]] = True
+    table.refuse(
+        again,
+        lambda row: f"image {row['image']} has ID {ids[row.name]} twice, here and in line "
+        f"{first[row.name]}; delete one, or pass --doubled nearest: the one nearest to the truth "
+        "counts, as of detectors that run here",
+    )

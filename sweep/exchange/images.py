@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import csv
-import itertools
 import json
 import math
-import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
+import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.errors import StoreError
@@ -30,13 +28,9 @@ from sweep.plan.experiment import scene_plugins
 from sweep.plan.grid import detector_settings, image_keys, scene_axes, scene_values
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.schema import LABELS, VARIABLES, drawn_quantities
-from sweep.store.files import whole_text, write_whole
+from sweep.store.files import write_whole
 from sweep.store.locations import reason_of
 from sweep.typing import Integers, Masks
-
-if TYPE_CHECKING:
-    import xarray as xr
-
 
 # --------------------------------------------------------------------------------------------------
 # An experiment's scenes as a set of images: their numbers, names, windows, and visibility.
@@ -225,17 +219,13 @@ def _ros_matrix(name: str, rows: int, values: Sequence[float]) -> list[str]:
 CORNERS = tuple(f"{axis}{corner}" for corner in range(4) for axis in "xy")
 """Columns of the corners: x0, y0 of the top left one, then clockwise on the marker."""
 
-COLUMNS = (
-    "image", "id", "dictionary", *CORNERS, "rx", "ry", "rz", "tx", "ty", "tz", "size_m",
-    "width_px", "height_px", "origin_x_px", "origin_y_px", "fx_px", "fy_px", "cx_px", "cy_px",
-    "camera", "marker_area_px",
-)
-"""Columns of truth.csv, before those of the experiment's axes and draws."""
+POSE = ("rx", "ry", "rz", "tx", "ty", "tz")
+"""Columns of the rotation vector in rad and of the position in m."""
 
 
 @dataclass(slots=True)
 class TruthTables:
-    """Tables of the truth that grow by batches of scenes.
+    """Tables of the truth of an export's images.
 
     Attributes
     ----------
@@ -259,93 +249,59 @@ class TruthTables:
         drawn = drawn_quantities(self.pipeline)
         columns |= {each.name: [] for each in drawn}
         names: list[str] = []
-        extra = self._extra_columns()
-        categories: dict[tuple[str, int], int] = {}
-        with (
-            whole_text(folder / "truth.csv") as table,
-            whole_text(folder / "truth_coco.json") as coco,
-            tempfile.TemporaryFile("w+", encoding="utf-8", dir=folder) as annotations,
-        ):
-            rows = csv.writer(table, lineterminator="\n")
-            rows.writerow([*COLUMNS, *extra])
-            coco.write(f'{{"info": {json.dumps(COCO_INFO)},\n"images": [')
-            for batch in image_batches(self.pipeline, windowed=self.windowed):
-                for name, function in GEOMETRY.items():
-                    columns[name].append(function(batch.scenes))
-                columns["true_corners_px"].append(batch.scenes.corners_px)
-                for each in drawn:
-                    columns[each.name].append(each.of(batch.values, len(batch)))
-                names += [
-                    f"{name}.png" if visible else ""
-                    for name, visible in zip(batch.names, batch.visible.tolist(), strict=True)
-                ]
-                for record in self._records(batch, columns, extra):
-                    rows.writerow(record)
-                    number = self.images
-                    key = str(record[2]), int(record[1])
-                    category = categories.setdefault(key, len(categories) + 1)
-                    separator = ",\n" if number else "\n"
-                    coco.write(separator + json.dumps(_coco_image(record, number)))
-                    annotations.write(
-                        separator + json.dumps(_coco_annotation(record, number, category))
-                    )
-                    self.images += 1
-                self.invisible += int((~batch.visible).sum())
-            coco.write('\n],\n"annotations": [')
-            annotations.seek(0)
-            shutil.copyfileobj(annotations, coco)
-            listed = [
-                {"id": number, "name": f"{dictionary} {marker}", "supercategory": dictionary,
-                 "marker_id": marker, "keypoints": list(LABELS["corner"])}
-                for (dictionary, marker), number in categories.items()
-            ]
-            coco.write(f'\n],\n"categories": {json.dumps(listed)}}}\n')
+        tables: list[pd.DataFrame] = []
+        for batch in image_batches(self.pipeline, windowed=self.windowed):
+            for name, function in GEOMETRY.items():
+                columns[name].append(function(batch.scenes))
+            columns["true_corners_px"].append(batch.scenes.corners_px)
+            for each in drawn:
+                columns[each.name].append(each.of(batch.values, len(batch)))
+            names += np.where(batch.visible, [f"{name}.png" for name in batch.names], "").tolist()
+            tables.append(self._rows(batch, {name: parts[-1] for name, parts in columns.items()}))
+        table = pd.concat(tables, ignore_index=True)
+        self.images, self.invisible = len(table), len(names) - len(table)
+        write_whole(folder / "truth.csv", table.to_csv(index=False, lineterminator="\n").encode())
+        write_whole(folder / "truth_coco.json", _coco(table).encode())
         dataset = self._dataset(columns, names)
         write_whole(folder / "truth.nc", bytes(dataset.to_netcdf(engine="scipy")))
 
-    def _extra_columns(self) -> list[str]:
-        """Return the columns of what varies: axes, and draws."""
-        varying = [name for axis in scene_axes(self.pipeline) for name in axis.columns]
-        varying += [each.name for each in drawn_quantities(self.pipeline)]
-        return [name for name in dict.fromkeys(varying) if name not in (*COLUMNS, "marker_id")]
-
-    def _records(
-        self, batch: ImageBatch, columns: dict[str, list[Any]], extra: list[str]
-    ) -> Iterator[list[Any]]:
-        """Yield the rows of truth.csv of a batch whose variables are the last of ``columns``."""
+    def _rows(self, batch: ImageBatch, variables: dict[str, Any]) -> pd.DataFrame:
+        """Return the rows of truth.csv of a batch with these variables, and note its cameras."""
         scenes, axes = batch.scenes, scene_axes(self.pipeline)
-        vectors = vector_of_rotation(scenes.rotation)
-        origins = batch.windows[:, :2]
-        corners = scenes.corners_px - origins[:, None]
+        first, last = batch.windows[:, :2], batch.windows[:, 2:]
+        view = scenes.cameras.view
+        cameras = [
+            self.cameras.setdefault(FileCamera.of(scenes, row), f"camera-{len(self.cameras)}")
+            if visible else "" for row, visible in enumerate(batch.visible.tolist())
+        ]
+        numbers = np.column_stack([
+            (scenes.corners_px - first[:, None]).reshape(-1, 8),
+            vector_of_rotation(scenes.rotation), scenes.translation, scenes.size_m,
+        ])
+        table = pd.DataFrame({
+            "image": [f"{name}.png" for name in batch.names],
+            "id": scenes.marker_id, "dictionary": scenes.dictionary,
+            **dict(zip((*CORNERS, *POSE, "size_m"), numbers.T, strict=True)),
+            **dict(zip(("width_px", "height_px"), (last - first).T, strict=True)),
+            **dict(zip(("origin_x_px", "origin_y_px"), first.T, strict=True)),
+            **dict(zip(("fx_px", "fy_px"), view[:, :2].T, strict=True)),
+            **dict(zip(("cx_px", "cy_px"), (view[:, 2:] - first).T, strict=True)),
+            "camera": cameras, "marker_area_px": variables["marker_area_px"],
+        })
         lengths = tuple(len(axis) for axis in axes)
-        names = batch.names
-        for row in np.flatnonzero(batch.visible).tolist():
-            index = np.unravel_index(batch.numbers[row], lengths) if lengths else ()
-            varying = {
-                name: label(value) if isinstance(value, tuple) else value
-                for axis, k in zip(axes, index, strict=True)
-                for name, value in axis.at(int(k)).items()
-            }
-            varying |= {
-                each.name: float(columns[each.name][-1][row])
-                for each in drawn_quantities(self.pipeline)
-            }
-            camera = FileCamera.of(scenes, row)
-            x0, y0, x1, y1 = batch.windows[row].tolist()
-            fx, fy, cx, cy = scenes.cameras.view[row].tolist()
-            yield [
-                f"{names[row]}.png", scenes.marker_id[row], scenes.dictionary[row],
-                *corners[row].ravel().tolist(), *vectors[row].tolist(),
-                *scenes.translation[row].tolist(), float(scenes.size_m[row]), x1 - x0, y1 - y0,
-                x0, y0, fx, fy, cx - x0, cy - y0,
-                self.cameras.setdefault(camera, f"camera-{len(self.cameras)}"),
-                float(columns["marker_area_px"][-1][row]), *(varying[name] for name in extra),
-            ]
+        indices = np.unravel_index(batch.numbers, lengths) if lengths else ()
+        for axis, along in zip(axes, indices, strict=True):
+            for name, values in axis.columns.items():
+                if name not in (*table, "marker_id"):
+                    labels = [label(v) if isinstance(v, tuple) else v for v in values]
+                    table[name] = [labels[k] for k in along.tolist()]
+        for each in drawn_quantities(self.pipeline):
+            if each.name not in table:
+                table[each.name] = variables[each.name]
+        return table.loc[batch.visible]
 
     def _dataset(self, columns: dict[str, list[Any]], names: list[str]) -> xr.Dataset:
         """Return the truth over the experiment's scene axes."""
-        import xarray as xr  # noqa: PLC0415  (slow to import)
-
         axes = scene_axes(self.pipeline)
         dims, shape = tuple(axis.name for axis in axes), tuple(len(axis) for axis in axes)
 
@@ -408,33 +364,44 @@ COCO_INFO = {
 """What the COCO-like file says of itself."""
 
 
-def _coco_image(record: list[Any], number: int) -> dict[str, Any]:
-    named = dict(zip(COLUMNS, record, strict=False))
-    return {
-        "id": number, "file_name": f"images/{named['image']}", "width": named["width_px"],
-        "height": named["height_px"],
+def _coco(table: pd.DataFrame) -> str:
+    """Return rows of truth.csv as COCO keypoints; a category is a dictionary's marker."""
+    records = table.to_dict("records")
+    markers = [(row["dictionary"], row["id"]) for row in records]
+    categories = {marker: number for number, marker in enumerate(dict.fromkeys(markers), 1)}
+    content = {
+        "info": COCO_INFO,
+        "images": [
+            {"id": number, "file_name": f"images/{row['image']}", "width": row["width_px"],
+             "height": row["height_px"]}
+            for number, row in enumerate(records)
+        ],
+        "annotations": [
+            _coco_annotation(row, number, categories[marker])
+            for number, (row, marker) in enumerate(zip(records, markers, strict=True))
+        ],
+        "categories": [
+            {"id": number, "name": f"{dictionary} {marker}", "supercategory": dictionary,
+             "marker_id": marker, "keypoints": list(LABELS["corner"])}
+            for (dictionary, marker), number in categories.items()
+        ],
     }
+    return json.dumps(content)
 
 
-def _coco_annotation(record: list[Any], number: int, category: int) -> dict[str, Any]:
-    named = dict(zip(COLUMNS, record, strict=False))
-    points = [(named[f"x{k}"], named[f"y{k}"]) for k in range(4)]
-    flat = list(itertools.chain(*points))
-    xs, ys = flat[::2], flat[1::2]
-    seen = [
-        2 if -0.5 <= x <= named["width_px"] - 0.5 and -0.5 <= y <= named["height_px"] - 0.5 else 0
-        for x, y in points
-    ]
+def _coco_annotation(row: dict[Any, Any], number: int, category: int) -> dict[str, Any]:
+    points = np.array([row[name] for name in CORNERS]).reshape(4, 2)
+    size = np.array([row["width_px"], row["height_px"]])
+    least, extent = points.min(axis=0), np.ptp(points, axis=0)
+    seen = ((points >= -0.5) & (points <= size - 0.5)).all(axis=1)  # COCO's 2: visible
+    flat = points.ravel().tolist()
     return {
         "id": number, "image_id": number, "category_id": category, "iscrowd": 0,
-        "bbox": [min(xs), min(ys), max(xs) - min(xs), max(ys) - min(ys)],
-        "area": named["marker_area_px"], "segmentation": [flat],
-        "keypoints": list(itertools.chain(*(
-            (*point, flag) for point, flag in zip(points, seen, strict=True)
-        ))),
-        "num_keypoints": sum(flag > 0 for flag in seen),
-        "rvec": [named["rx"], named["ry"], named["rz"]],
-        "tvec_m": [named["tx"], named["ty"], named["tz"]],
+        "bbox": [*least.tolist(), *extent.tolist()],
+        "area": row["marker_area_px"], "segmentation": [flat],
+        "keypoints": np.column_stack([points, 2 * seen]).ravel().tolist(),
+        "num_keypoints": int(seen.sum()),
+        "rvec": [row[name] for name in POSE[:3]], "tvec_m": [row[name] for name in POSE[3:]],
     }
 
 

@@ -10,9 +10,8 @@ import stat
 import tempfile
 import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from io import TextIOWrapper
 from pathlib import Path
-from typing import Any, BinaryIO, TextIO
+from typing import Any, BinaryIO
 
 from zarr.abc.store import Store
 from zarr.buffer import cpu, default_buffer_prototype
@@ -140,13 +139,6 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def whole_text(path: Path) -> Iterator[TextIO]:
-    """Open a text file as :func:`whole_file` does."""
-    with whole_file(path) as file, TextIOWrapper(file, encoding="utf-8", newline="") as text:
-        yield text
 
 
 def check_folder_writable(folder: Path) -> None:

@@ -27,7 +27,7 @@ from sweep.plan.pipeline import Pipeline
 
 TOP = Path(__file__).parent.parent
 FOLDERS = ("pipelines", "sweep", "tests", "notebooks")
-GUIDES = [TOP / "README.md", *sorted(
+GUIDES = [TOP / "README.md", TOP / "CONTRIBUTING.md", *sorted(
     path for folder in FOLDERS for path in (TOP / folder).rglob("README.md"))]
 NAMES = [str(path.relative_to(TOP)) for path in GUIDES]
 ROOMS_WITH_A_GUIDE = ("analysis", "execution", "integrity", "measure", "tradeoff")

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sweep.measure.detectors import (
     NOISE_MARGIN_PX,
@@ -21,17 +20,17 @@ from sweep.measure.estimators import SOLVERS
 from sweep.messages import label
 from sweep.model.camera import (
     VIEW_PARAMETERS,
+    Column,
     are_square,
     canonical_distortion,
     field_of_view_deg,
-    intrinsics,
 )
 from sweep.model.effects import Effect, is_coded
 from sweep.model.extent import hidden, outside_frame
 from sweep.model.lens import fold_radius
 from sweep.model.marker import module_count
 from sweep.model.pose import viewing_angle
-from sweep.model.scene import Scenes, build_scenes
+from sweep.model.scene import Scenes, build_cameras, build_scenes
 from sweep.plan.beliefs import belief_notes
 from sweep.plan.experiment import effects_of, relative_sizes, shows_boards, target_word
 from sweep.plan.grid import detector_settings, scene_axes, scene_values
@@ -46,13 +45,12 @@ from sweep.typing import Floats, Masks
 Range = tuple[float, float]
 """The least and the largest value on the grid."""
 
-NORMAL_SDS = 3.0
-"""Standard deviations from the mean at which the ends of a normal distribution are stated."""
-
 
 @dataclass(frozen=True, slots=True)
 class CameraFacts:
     """The camera of a grid; each quantity has its least and its largest value.
+
+    Of large grids, and of what is drawn, by the scenes that are looked at.
 
     Attributes
     ----------
@@ -68,8 +66,8 @@ class CameraFacts:
         Whether the pixels are square everywhere on the grid.
     side_px
         Side of the black square parallel to the image plane, at the farthest and the nearest
-        pose; None if the distance is not one of the pipeline's numbers. Of boards the sides of the
-        smallest and the largest marker.
+        pose; None if all are behind the camera. Of boards the sides of the smallest and the
+        largest marker.
     boards
         Whether scenes show boards.
     """
@@ -131,102 +129,75 @@ def _text(ends: Range, digits: int = 6) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-MAX_ROWS = 10**6
-"""The most rows of axes of parameters that go together whose cameras are computed."""
+MAX_SAMPLE = 600
+"""Scenes that are looked at, of a larger grid: its corners first, then scenes anywhere."""
+
+MAX_CORNERS = 200
+"""The most corners of a grid that are looked at."""
+
+
+def sampled_scenes(pipeline: Pipeline) -> tuple[int, dict[str, Column]]:
+    """Return the number of the scenes that are looked at, and the values of their parameters.
+
+    Every quantity of a camera is monotonic in each of its parameters, so that the corners of the
+    grid have its ends; axes of the camera, the size and the distance are varied first.
+    """
+    axes = scene_axes(pipeline)
+    lengths = [len(axis) for axis in axes]
+    cells = math.prod(lengths)
+    if cells <= MAX_SAMPLE:
+        indices = [index.ravel() for index in np.indices(lengths, dtype=np.intp)]
+        return max(cells, 1), scene_values(pipeline, indices)
+    first = {*VIEW_PARAMETERS, "size_m", "distance_m", "side_px"}
+    # The last axis of a product varies fastest.
+    order = sorted(range(len(axes)), key=lambda k: not first.isdisjoint(axes[k].columns))
+    ends = itertools.product(*((0, lengths[k] - 1) if lengths[k] > 1 else (0,) for k in order))
+    corners = np.array(list(itertools.islice(ends, MAX_CORNERS)), dtype=np.intp)
+    chosen = np.random.default_rng(0)
+    anywhere = [chosen.integers(0, length, MAX_SAMPLE - len(corners)) for length in lengths]
+    return MAX_SAMPLE, scene_values(pipeline, [
+        np.concatenate([corners[:, order.index(k)], other]).astype(np.intp)
+        for k, other in enumerate(anywhere)
+    ])
 
 
 def camera_facts(pipeline: Pipeline) -> CameraFacts:
-    """Return what a pipeline's camera is.
+    """Return what a pipeline's camera is, by the scenes that are looked at."""
+    count, values = sampled_scenes(pipeline)
+    fx, fy, cx, cy = build_cameras(values, count).view.T
+    width, height = (values[name].broadcast(count) for name in ("width_px", "height_px"))
 
-    Every quantity is monotonic in each parameter, so that the ends of the axes have its ends; of
-    parameters that go together every row is looked at.
-    """
-    together = [axis for axis in pipeline.axes
-                if axis.zipped and axis.columns.keys() & set(VIEW_PARAMETERS)]
-    lengths = [len(axis) for axis in together]
-    if math.prod(lengths) > MAX_ROWS:
-        together, lengths = [], []  # the ends of each column are bounds
-    rows = [index.ravel() for index in np.indices(lengths)]
-    zipped = {
-        name: np.asarray(column)[index]
-        for axis, index in zip(together, rows, strict=True)
-        for name, column in axis.columns.items() if name in VIEW_PARAMETERS
-    }
-    chosen = [
-        [zipped[name]] if name in zipped else dict.fromkeys(_ends(pipeline, name) or (None,))
-        for name in VIEW_PARAMETERS
-    ]
-    found: dict[str, list[Floats]] = {}
-    for values in itertools.product(*chosen):
-        fx, fy, cx, cy = intrinsics(*values)
-        width, height = values[:2]
-        for name, numbers in {
-            "width_px": width, "height_px": height, "fx_px": fx, "fy_px": fy, "cx_px": cx,
-            "cy_px": cy, "hfov_deg": field_of_view_deg(width, fx),
-            "vfov_deg": field_of_view_deg(height, fy), "aspect": fy / fx,
-            "off_centre_x": (cx - (width - 1) / 2) / width,
-            "off_centre_y": (cy - (height - 1) / 2) / height,
-        }.items():
-            found.setdefault(name, []).append(np.asarray(numbers, dtype=np.float64))
-    ranges = {
-        name: (float(min(map(np.min, parts))), float(max(map(np.max, parts))))
-        for name, parts in found.items()
-    }
-    square = all(
-        np.all(are_square(fx, fy)) for fx, fy in zip(found["fx_px"], found["fy_px"], strict=True)
+    def ends(numbers: Floats) -> Range:
+        return float(np.min(numbers)), float(np.max(numbers))
+
+    given = values["side_px"]
+    with np.errstate(divide="ignore"):
+        sides = given.broadcast(count) if not given.missing else (
+            fx * values["size_m"].broadcast(count) / values["distance_m"].broadcast(count))
+    sides = sides[sides > 0]  # before the camera
+    least, largest = relative_sizes(pipeline)
+    return CameraFacts(
+        width_px=ends(width), height_px=ends(height), fx_px=ends(fx), fy_px=ends(fy),
+        cx_px=ends(cx), cy_px=ends(cy), hfov_deg=ends(field_of_view_deg(width, fx)),
+        vfov_deg=ends(field_of_view_deg(height, fy)), aspect=ends(fy / fx),
+        off_centre_x=ends((cx - (width - 1) / 2) / width),
+        off_centre_y=ends((cy - (height - 1) / 2) / height),
+        square=bool(np.all(are_square(fx, fy))), boards=shows_boards(pipeline),
+        side_px=(float(sides.min()) * least, float(sides.max()) * largest) if len(sides) else None,
     )
-    return CameraFacts(square=square, side_px=_side(pipeline, ranges["fx_px"]),
-                       boards=shows_boards(pipeline), **ranges)
 
 
-def _ends(pipeline: Pipeline, name: str) -> tuple[Any, Any] | None:
-    """Return the least and the largest value of a parameter; None if it is not given."""
-    if name in pipeline.distributions:
-        drawn = pipeline.distributions[name]
-        if drawn.kind == "uniform":
-            return drawn.a, drawn.b
-        return drawn.a - NORMAL_SDS * drawn.b, drawn.a + NORMAL_SDS * drawn.b
-    values = pipeline.values_of(name)
-    if not len(values) or values[0] is None:
-        return None
-    return min(values), max(values)
+def _ends(pipeline: Pipeline, name: str) -> Range | None:
+    """Return the least and the largest number that the document has for a parameter, if any."""
+    values = _numbers(pipeline, name)
+    return (min(values), max(values)) if values else None
 
 
-def _side(pipeline: Pipeline, fx: Range) -> Range | None:
-    """Return the least and the largest side of a marker in pixels."""
-    sides, (least, largest) = _side_of_size_m(pipeline, fx), relative_sizes(pipeline)
-    return sides and (sides[0] * least, sides[1] * largest)
-
-
-def _side_of_size_m(pipeline: Pipeline, fx: Range) -> Range | None:
-    """Return the least and the largest side in pixels, fx · size / distance."""
-    if (sides := _ends(pipeline, "side_px")) is not None:
-        return sides
-    size, distance = _ends(pipeline, "size_m"), _ends(pipeline, "distance_m")
-    if size is None or distance is None:
-        return _side_of_cells(pipeline)
-    if not distance[0] > 0:
-        return None
-    return fx[0] * size[0] / distance[1], fx[1] * size[1] / distance[0]
-
-
-MAX_CELLS = 10_000
-"""Poses whose distances are computed where they are not numbers of the pipeline."""
-
-
-def _side_of_cells(pipeline: Pipeline) -> Range | None:
-    """Return the least and the largest side in pixels of a small grid's poses before the camera."""
-    lengths = [len(axis) for axis in scene_axes(pipeline)]
-    count = math.prod(lengths)
-    if count > MAX_CELLS:
-        return None
-    values = scene_values(pipeline, [index.ravel() for index in np.indices(lengths, dtype=np.intp)])
-    fx = intrinsics(*(values[name].values for name in VIEW_PARAMETERS))[0]
-    distance = values["distance_m"].broadcast(count)
-    before = distance > 0
-    sides = np.broadcast_to(fx, count)[before] * values["size_m"].broadcast(count)[before]
-    sides = sides / distance[before]
-    return (float(sides.min()), float(sides.max())) if len(sides) else None
+def _numbers(pipeline: Pipeline, name: str) -> list[float]:
+    """Return the numbers that the document has for a parameter: the ends or the mean of draws."""
+    if (drawn := pipeline.distributions.get(name)) is not None:
+        return [drawn.a, drawn.b] if drawn.kind == "uniform" else [drawn.a]
+    return [float(value) for value in pipeline.values_of(name) if value is not None]
 
 
 OFF_CENTRE = 0.15
@@ -341,12 +312,6 @@ def _varies(pipeline: Pipeline, name: str) -> bool:
 # --------------------------------------------------------------------------------------------------
 # What a pipeline's poses are: how they are seen, how far away, and what may surprise of them.
 
-MAX_SAMPLE = 600
-"""Poses that are looked at, of a larger grid: its corners first, then poses anywhere."""
-
-MAX_CORNERS = 200
-"""The most corners of a grid that are looked at."""
-
 APART_DEG = 5.0
 """Difference of tilt and viewing angle that is told."""
 
@@ -416,9 +381,7 @@ class PoseFacts:
 
 def pose_facts(pipeline: Pipeline) -> PoseFacts:
     """Return what a pipeline's poses are."""
-    indices = _sample([len(axis) for axis in scene_axes(pipeline)])
-    count = len(indices[0]) if indices else 1
-    values = scene_values(pipeline, indices)
+    count, values = sampled_scenes(pipeline)
     scenes = build_scenes(values, count)
     normal, depth = scenes.rotation[:, 2, 2], scenes.translation[:, 2]
     behind = np.asarray(~np.isfinite(scenes.outline_px).all(axis=(1, 2)))
@@ -436,21 +399,6 @@ def pose_facts(pipeline: Pipeline) -> PoseFacts:
         behind=behind, averted=averted, outside=outside,
         cut=_cut(scenes) & ~behind & ~averted & ~outside,
     )
-
-
-def _sample(lengths: Sequence[int]) -> list[NDArray[np.intp]]:
-    """Return the indices (n,) along each axis of the cells that are looked at."""
-    cells = math.prod(lengths)
-    if cells <= MAX_SAMPLE:
-        return [index.ravel() for index in np.indices(lengths, dtype=np.intp)]
-    ends = itertools.product(*((0, length - 1) if length > 1 else (0,) for length in lengths))
-    corners = np.array(list(itertools.islice(ends, MAX_CORNERS)), dtype=np.intp)
-    chosen = np.random.default_rng(0)
-    anywhere = [chosen.integers(0, length, MAX_SAMPLE - len(corners)) for length in lengths]
-    return [
-        np.concatenate([corner, other]).astype(np.intp)
-        for corner, other in zip(corners.T, anywhere, strict=True)
-    ]
 
 
 def _cut(scenes: Scenes) -> Masks:
@@ -527,10 +475,7 @@ def _unit_notes(pipeline: Pipeline) -> list[str]:
     for parameter in PARAMETERS.values():
         if parameter.section != "pose" or parameter.unit != "degree":
             continue
-        drawn = pipeline.distributions.get(parameter.name)
-        values = [drawn.a, drawn.b] if drawn else [
-            float(value) for value in pipeline.values_of(parameter.name) if value is not None
-        ]
+        values = _numbers(pipeline, parameter.name)
         steps = np.array([value for value in values if value]) / (math.pi / 12)
         close = np.abs(steps - np.round(steps)) * (math.pi / 12) < ROUNDED_RAD
         if len(steps) > 0 and (close & (np.abs(steps) > 0.5) & (np.abs(steps) < 24.5)).all():

@@ -1,4 +1,4 @@
-"""Detections in windows are those of whole frames under the camera's processing."""
+"""Detections in windows are those of whole frames under noise and the camera's processing."""
 
 import numpy as np
 import pytest
@@ -26,11 +26,12 @@ SETTINGS
 [axes]
 background = [0, 128, 255]
 side_px = { geom = [10, 250, 12] }
-noise_grey = [2, 8, 32]
-trial = 40
+noise_grey = [1, 2, 4, 8, 16, 32]
+trial = 20
 """
 
 PROCESSING = {
+    "noise alone": "",
     "correlated": "noise_correlation = 0.5",
     "far correlated": "noise_correlation = 0.99",
     "JPEG": "jpeg_quality = 30",

@@ -416,6 +416,8 @@ BOXED = {
         "aperture_mm": 100.0, "focus_distance_m": 0.3, "tilt_deg": 75.0, "side_px": 24.0,
     },
     "occluded": {"occlusion": 0.4, "occlusion_deg": 30.0, "blur_px": 1.0},
+    "bent": {"curvature_per_m": 6.0, "blur_px": 0.7},
+    "shifted": {"geometry_px": 1.0, "geometry_length_px": 15.0, "noise_key": 5},
     "coming out of focus": {
         "aperture_mm": 30.0, "focus_distance_m": 0.33, "velocity_z_m_s": 1.0, "exposure_s": 0.3,
     },

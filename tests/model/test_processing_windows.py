@@ -79,6 +79,6 @@ def test_window_finds_what_the_frame_holds(name, refinement):
     assert len(exceptions) <= 2
     for i in exceptions:
         assert len(outcomes_elsewhere(scenes, i, setting)) > 1
-    # The bounds of tests/model/test_sensor.py and tests/evaluation/test_window.py.
+    # The bounds of tests/evaluation/test_window.py.
     limit = {"none": 0.0, "subpix": 10.0, "contour": 1.0, "apriltag": np.spacing(np.float32(640))}
     assert difference.max() <= limit[refinement]

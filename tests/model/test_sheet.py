@@ -240,32 +240,6 @@ def test_shifts_are_normal_and_correlated_as_said():
     assert abs(np.mean(np.abs(drawn) < 2) - 0.6827) < 0.02
 
 
-@pytest.mark.long
-def test_image_with_shifts_and_bends_does_not_depend_on_the_window():
-    rng = np.random.default_rng(2)
-    for given in (
-        {"geometry_px": 1.0, "geometry_length_px": 15.0, "noise_key": 5},
-        {"curvature_per_m": 6.0, "blur_px": 0.7},
-        {"curvature_per_m": 3.0, "geometry_px": 0.5, "exposure_s": 0.01, "velocity_x_m_s": 1.0,
-         "noise_key": 6},
-        {"curvature_per_m": 3.0, "row_time_s": 1e-4, "velocity_x_m_s": 1.0},
-    ):
-        value, scenes = scenes_of(tilt_deg=20.0, bearing_x_deg=10.0, **given)
-        box = marker_boxes(scenes)[0]
-        frame = render(scenes, 0, box, (0, 0, 48, 44))
-        # Nothing of the marker lies beyond its box.
-        wide = np.full((44, 48), 0.0)
-        wide[:] = marker_exposure(
-            scenes, 0, (0, 0, 48, 44), np.array([100.0, 10.0, 240.0, 0.0])
-        )
-        assert np.abs(wide - exact_frame(scenes, value)).max() < 1e-3
-        for _ in range(3):
-            left, top = rng.integers(0, box[:2] + 1).tolist()
-            right, bottom = rng.integers(box[2:], np.array([48, 44]) + 1).tolist()
-            image = render(scenes, 0, box, (left, top, right, bottom))
-            assert np.array_equal(image, frame[top:bottom, left:right])
-
-
 def test_shifts_that_fold_the_image_are_not_modelled():
     _, scenes = scenes_of(geometry_px=40.0, geometry_length_px=5.0)
     assert not_modelled(scenes)[0]

@@ -60,19 +60,6 @@ def test_results_of_analyses_have_them_too(name):
     assert "description" not in results["marker_area_px"].attrs
 
 
-def test_an_older_store_s_words_become_descriptions_and_nothing_else_changes():
-    old = xr.Dataset({"tilt_deg": ("x", [1.0], {"long_name": "to the image", "units": "degree"}),
-                      "other": ("x", [2.0]),
-                      "own": ("x", [3.0], {"long_name": "kept", "description": "as it is"})})
-    new = with_descriptions(old)
-    assert new["tilt_deg"].attrs == {
-        "long_name": "tilt", "description": "to the image", "units": "degree"}
-    assert new["other"].attrs == {}
-    assert new["own"].attrs == old["own"].attrs
-    assert old["tilt_deg"].attrs["long_name"] == "to the image"
-    xr.testing.assert_equal(old, new)
-
-
 def test_xarray_s_own_plots_have_labels_that_fit():
     results = with_descriptions(xr.Dataset(
         {name: (("tilt_deg", "distance_m"), [[1.0, 2.0], [3.0, 4.0]], variable.attributes())

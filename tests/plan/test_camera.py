@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import sweep
+from support.here import calls_here
 from support.lengths import first_of
 from sweep.cli import main
 from sweep.errors import PipelineError
@@ -17,7 +18,6 @@ from sweep.plan.cell_selection import cell
 from sweep.plan.facts import camera_facts, camera_notes
 from sweep.plan.grid import scene_axes, scene_values
 from sweep.plan.pipeline import Pipeline
-from tests.support.here import calls_here
 
 
 def pipeline(camera=None, settings=(), **sections):
@@ -195,21 +195,6 @@ def test_an_axis_of_fields_of_view_is_set_on_the_command_line():
 
 
 # 3. What is told.
-
-@pytest.mark.long
-def test_plan_names_focal_lengths_fields_of_view_and_sides(tmp_path, capsys):
-    file = tmp_path / "p.toml"
-    file.write_text(
-        "[marker]\nsize_m = 0.1\n[camera]\nwidth_px = 1280\nheight_px = 720\nhfov_deg = 90\n"
-        "[axes]\ndistance_m = [0.5, 2]\n"
-    )
-    assert main(["plan", str(file)]) == 0
-    # fx = 640; VFOV = 2 atan(360 / 640); sides 640 · 0.1 / 0.5 and 640 · 0.1 / 2.
-    assert (
-        "  1280 x 720 px, fx = fy = 640 px, HFOV 90°, VFOV 58.72°, the marker's side is 128 px at "
-        "the nearest pose, 32 px at the farthest\n"
-    ) in capsys.readouterr().out
-
 
 def test_sides_of_a_board_s_markers_are_their_own():
     # 600 · 0.01 / 2 and 600 · 0.04 / 1 px; the size of [marker] is that of no marker.

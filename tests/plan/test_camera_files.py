@@ -2,21 +2,15 @@
 
 import hashlib
 import json
-import shutil
 import time
 
 import cv2
 import numpy as np
 import pytest
 
-from sweep.errors import PipelineError, StoreError
-from sweep.execution.runner import execute
-from sweep.integrity.reproduction import reproduce
-from sweep.integrity.verification import verify
+from sweep.errors import PipelineError
 from sweep.plan.cell_selection import cell
 from sweep.plan.pipeline import Pipeline
-from sweep.store.lifecycle import open_store
-from tests.support.here import calls_here
 
 MATRIX = [[612.34567890123456, 0, 321.123456789], [0, 611.98765432109876, 1 / 3 + 238],
           [0, 0, 1]]
@@ -511,43 +505,3 @@ def test_set_of_a_camera_file_replaces_the_camera_and_keeps_comments(tmp_path):
     assert_camera(chosen)
     assert "[camera]  # mine" in chosen.to_toml()
     assert "focal_length_mm" not in chosen.to_toml()
-
-
-@pytest.mark.long
-def test_a_store_does_not_need_its_camera_file_any_more(tmp_path):
-    write(tmp_path / "c.yaml", GOOD)
-    url = str(tmp_path / "s.zarr")
-    grid = Pipeline.from_dict(
-        {"camera": {"camera_file": "c.yaml"}, "marker": {"size_m": 0.05},
-         "axes": {"distance_m": [0.5, 0.8]}}, folder=tmp_path,
-    )
-    with calls_here():
-        execute(grid, url)
-        (tmp_path / "away").mkdir()
-        shutil.move(tmp_path / "c.yaml", tmp_path / "away")
-        assert_camera(open_store(url).pipeline)
-        assert verify(url, 2).damage == []
-        again = reproduce(url, "distance_m=0.8")
-        assert again.difference == ""
-        assert again.changes == []
-        # The file elsewhere has the same content: the run is finished.
-        moved = Pipeline.from_dict(
-            {"camera": {"camera_file": "away/c.yaml"}, "marker": {"size_m": 0.05},
-             "axes": {"distance_m": [0.5, 0.8]}}, folder=tmp_path,
-        )
-        assert execute(moved, url).computed_blocks == 0
-        # The same camera in numbers: its cells are reused.
-        numbers = {name: grid.fixed[name] for name in (
-            "fx_px", "fy_px", "cx_px", "cy_px", "distortion")}
-        grown = Pipeline.from_dict({
-            "camera": numbers, "marker": {"size_m": 0.05},
-            "axes": {"distance_m": [0.5, 0.8, 1.0]},
-        })
-        assert execute(grown, str(tmp_path / "grown.zarr"), reuse=[url]).poses == 3
-    changed = write(tmp_path / "c.yaml", GOOD.replace(repr(MATRIX[0][0]), "700.0"))
-    other = Pipeline.from_dict(
-        {"camera": {"camera_file": changed.name}, "marker": {"size_m": 0.05},
-         "axes": {"distance_m": [0.5, 0.8]}}, folder=tmp_path,
-    )
-    with pytest.raises(StoreError, match=r"fx_px: the store has 612\.345\d+, this run 700\.0"):
-        execute(other, url)

@@ -196,23 +196,6 @@ def test_jitter_scales_with_its_half_width_and_is_absent_at_zero():
         assert np.abs(table[..., k]).max() > 0.5 * half_width
 
 
-@pytest.mark.parametrize("extents", [(1, 1, 1, 1), (2, 3, 1, 3), (3, 2, 2, 1)])
-def test_values_of_a_block_are_those_of_the_whole_grid_cut(extents):
-    pipeline = Pipeline.from_text(DRAWN)
-    expected = drawn()
-    blocks = Blocks(whole(pipeline).shape, extents)
-    covered = 0
-    for block in blocks:
-        part = tuple(slice(a, b) for a, b in zip(block.starts, block.stops, strict=True))
-        values = scene_values(pipeline, block_indices(block))
-        for name in QUANTITIES:
-            np.testing.assert_array_equal(
-                values[name].values.reshape(block.shape), expected[name][part], err_msg=name
-            )
-        covered += len(block)
-    assert covered == len(whole(pipeline))
-
-
 def test_results_of_a_block_are_those_of_the_whole_grid_cut():
     pipeline = Pipeline.from_text(DRAWN, ["cornerRefinementMethod=['none', 'subpix']"])
     expected = run_block(pipeline, whole(pipeline)).values

@@ -1,11 +1,8 @@
 """What may surprise of poses is told in a line, by `plan` and at the start of a run."""
 
-import json
 
 import pytest
 
-from support.here import calls_here
-from sweep.cli import main
 from sweep.plan.facts import MAX_SAMPLE, notes, pose_facts
 from sweep.plan.pipeline import Pipeline
 
@@ -76,30 +73,3 @@ def test_poses_of_a_large_grid_are_a_sample_with_its_corners():
     # tan 30.96° = 320 / 533.3 is the frame's edge: 9/40 of the bearings are outside: a share
     # of 600 poses is off by 0.11, six standard deviations, with a probability of 1e-9.
     assert abs(facts.outside.mean() - (1 - 30.96 / 40)) < 0.11
-
-
-def test_a_grid_of_any_size_is_looked_at():
-    for lengths in ({}, {"trial": 1}, {f"{name}_deg": [1, 2] for name in
-                                      ("tilt", "azimuth", "roll", "bearing_x", "bearing_y")}):
-        axes = {**lengths, "marker_id": {"range": [0, 50]}, "size_m": [0.01, 0.02, 0.03],
-                "fx_px": [500, 600], "quiet_zone_modules": [1, 2]}
-        facts = pose_facts(Pipeline.from_dict(
-            {"pose": {"distance_m": 1, "jitter_px": 0.5}, "axes": axes}
-        ))
-        assert 1 <= facts.sampled <= MAX_SAMPLE
-
-
-@pytest.mark.long
-def test_plan_says_how_the_marker_is_seen(tmp_path, capsys):
-    path = tmp_path / "seen.toml"
-    path.write_text("[pose]\ntilt_deg = 60\nazimuth_deg = 90\n[axes]\n"
-                    "bearing_x_deg = [-20, 20]\ndistance_m = [0.2, 0.4]\n")
-    with calls_here():
-        assert main(["plan", str(path)]) == 0
-        text = capsys.readouterr().out
-        assert main(["plan", str(path), "--json"]) == 0
-    content = json.loads(capsys.readouterr().out)
-    assert "Poses\n  tilt 60°, viewing angle 40 to 80°, 0.2128 to 0.4257 m away" in text
-    (line,) = content["notes"]
-    assert line in text
-    assert content["views"]["viewing_angle_deg"] == pytest.approx([40, 80])

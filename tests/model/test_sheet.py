@@ -1,4 +1,4 @@
-"""Bent sheets, printed sizes and shifted images, against rays and sums written in these tests."""
+"""Lenses, bent sheets, printed sizes, shifted images: against rays and sums written here."""
 
 import itertools
 
@@ -7,10 +7,12 @@ import pytest
 
 from support.bent_sheets import flat_points
 from support.exact_image import LENSES, modules_of, plane_of, values
+from support.lengths import lengths
+from sweep.model import lens
 from sweep.model.effects import NEUTRAL
 from sweep.model.exposure import marker_exposure
 from sweep.model.extent import areas_px, hidden, marker_boxes, not_modelled
-from sweep.model.renderers import render
+from sweep.model.renderers import marker_levels, render
 from sweep.model.scene import build_scenes
 from sweep.model.scene_sheet import shift_waves
 
@@ -30,7 +32,11 @@ def exact_frame(scenes, value):
     frame = np.full((value["height_px"], value["width_px"]), value["background"])
     areas = np.array([value["background"], value["black"], value["white"], 0.0])
     if box[2] > box[0]:
-        inner = marker_exposure(scenes, 0, tuple(box.tolist()), areas)
+        if scenes.effects is None:
+            mean, share = marker_levels(scenes, 0, tuple(box.tolist()))
+            inner = mean + (1 - share) * value["background"]
+        else:
+            inner = marker_exposure(scenes, 0, tuple(box.tolist()), areas)
         frame[box[1] : box[3], box[0] : box[2]] = inner
     return frame
 
@@ -66,6 +72,10 @@ def sampled_frame(value, per_side, shifted=None):
     centre = (np.array([value["width_px"], value["height_px"]]) - 1) / 2
     rays = np.stack([(u - centre[0]) / value["fx_px"], (v - centre[1]) / value["fx_px"],
                      np.ones_like(u)], axis=-1).reshape(-1, 3)
+    if value["distortion"]:
+        # The lens by itself is held against OpenCV and fifty digits in test_arithmetic.py.
+        packed = lens.pack(value["distortion"])
+        rays[:, :2] = lens.undistort_points(rays[None, :, :2], packed[None])[0]
     if value["curvature_per_m"] == 0:
         flat = rays @ np.linalg.inv(plane_of(value).astype(np.float64)).T
         column, row = (flat[:, :2] / flat[:, 2:]).T
@@ -87,6 +97,16 @@ def assert_sampled(found, expected, per_side):
     assert np.abs(found - expected).max() < 5 * deviation
     assert np.sqrt(np.mean((found - expected) ** 2)) < 0.7 * deviation
     assert abs(np.mean(found - expected)) < 0.03 * deviation + 0.01
+
+
+@pytest.mark.parametrize("distortion", LENSES)
+@lengths(16, 32)
+def test_an_image_under_a_lens_is_that_of_samples_traced_back(count, distortion):
+    value, scenes = scenes_of(
+        distortion=distortion, tilt_deg=35.0, azimuth_deg=70.0, roll_deg=25.0, bearing_x_deg=8.0,
+        quiet_zone_modules=1.5,
+    )
+    assert_sampled(exact_frame(scenes, value), sampled_frame(value, count), count)
 
 
 CURVES = [

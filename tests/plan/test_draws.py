@@ -81,29 +81,20 @@ def test_draws_do_not_depend_on_fixed_or_axis_nor_on_the_rest_of_the_grid():
     assert_same(wider, expected)
 
 
-def test_draws_do_not_depend_on_defaults_written_out():
-    assert_same(
-        drawn("bearing_y_deg=0", "roll_deg=0.0", "quiet_zone_modules=1", "dictionary=DICT_5X5_50",
-              "cx_px=319.5", "cy_px=239.5", "distortion=[0, 0, 0, 0]"),
-        drawn(),
-    )
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        ["renderer=warp"],
-        ["window=full"],
-        ["black=40", "white=220", "background=128"],
-        ["background=[0, 128]"],
-        ["black={uniform=[0, 40]}"],
-        ["cornerRefinementMethod=subpix", "adaptiveThreshWinSizeMax=[23, 61]"],
-        ["solver=['p3p', 'ippe']", "guarded=false", "believed_fx_px=500"],
-        ["believed_cx_px={normal=[319.5, 2]}"],
-    ],
-    ids=",".join,
-)
-def test_draws_do_not_depend_on_renderer_levels_detector_or_estimator(settings):
+@pytest.mark.parametrize("settings", [
+    ["bearing_y_deg=0", "roll_deg=0.0", "quiet_zone_modules=1", "dictionary=DICT_5X5_50",
+     "cx_px=319.5", "cy_px=239.5", "distortion=[0, 0, 0, 0]"],  # the defaults
+    ["fx_px=533.3333333333334"],  # the default in pixels
+    ["renderer=warp"],
+    ["window=full"],
+    ["black=40", "white=220", "background=128"],
+    ["background=[0, 128]"],
+    ["black={uniform=[0, 40]}"],
+    ["cornerRefinementMethod=subpix", "adaptiveThreshWinSizeMax=[23, 61]"],
+    ["solver=['p3p', 'ippe']", "guarded=false", "believed_fx_px=500"],
+    ["believed_cx_px={normal=[319.5, 2]}"],
+], ids=",".join)
+def test_draws_do_not_depend_on_defaults_renderer_levels_detector_or_estimator(settings):
     assert_same(drawn(*settings), drawn())
 
 
@@ -114,13 +105,6 @@ def test_draws_are_the_same_for_a_side_in_pixels_as_for_the_distance_it_stands_f
     )
     order = ("marker_id", "side_px", "bearing_x_deg", "trial")
     assert_same(drawn(text=text, order=order), drawn())
-
-
-def test_draws_are_the_same_for_a_camera_in_millimetres_as_in_pixels():
-    millimetres = drawn("focal_length_mm=6")
-    for given in (["fx_px=800"], ["fx_px=800", "fy_px=800"]):
-        assert_same(drawn(*given), millimetres)
-    assert_same(drawn("fx_px=533.3333333333334"), drawn())
 
 
 @pytest.mark.parametrize(

@@ -96,23 +96,6 @@ def test_numbers_of_single_precision_are_those_that_were_written(tmp_path):
     assert_camera(camera(tmp_path / "c.yml"), matrix.tolist(), lens[0].tolist())
 
 
-def test_the_old_header_and_an_image_size_of_opencv_are_read(tmp_path):
-    path = write(tmp_path / "c.yml", f"""%YAML:1.0
-image_Size: [ 640, 480 ]
-Camera_Matrix: !!opencv-matrix
-   rows: 3
-   cols: 3
-   dt: d
-   data: {np.ravel(MATRIX).tolist()}
-Distortion_Coefficients: !!opencv-matrix
-   rows: 5
-   cols: 1
-   dt: d
-   data: {LENS}
-""")
-    assert_camera(camera(path))
-
-
 def test_a_stereo_pair_has_two_cameras_that_are_named_and_no_frame_size(tmp_path):
     storage = cv2.FileStorage(str(tmp_path / "intrinsics.yml"), cv2.FILE_STORAGE_WRITE)
     second = np.array(MATRIX) + np.diag([5, 5, 0])
@@ -249,26 +232,6 @@ def test_names_of_folders_and_files_may_have_the_mark_of_a_camera(tmp_path):
         camera(tmp_path / ("a" * 5000))
 
 
-def test_a_sensor_file_of_euroc_is_read(tmp_path):
-    path = write(tmp_path / "sensor.yaml", """sensor_type: camera
-comment: VI-Sensor cam0 (MT9M034)
-T_BS:
-  cols: 4
-  rows: 4
-  data: [0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
-rate_hz: 20
-resolution: [752, 480]
-camera_model: pinhole
-intrinsics: [458.654, 457.296, 367.215, 248.375] #fu, fv, cu, cv
-distortion_model: radial-tangential
-distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
-""")
-    assert_camera(
-        camera(path), pinhole(458.654, 457.296, 367.215, 248.375),
-        (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05), (752, 480),
-    )
-
-
 def photonvision(width=1280, height=720, **more):
     return {
         "resolution": {"width": float(width), "height": float(height)},
@@ -293,14 +256,6 @@ def test_a_calibration_of_photonvision_is_read_alone_and_among_its_settings(tmp_
     assert "lens model LENSMODEL_STEREOGRAPHIC: not supported" in line
 
 
-def test_a_calibration_of_limelight_is_read(tmp_path):
-    path = write(tmp_path / "c.json", json.dumps({
-        "camera_matrix": MATRIX, "distortion_coefficients": [LENS], "img_size": [640, 480],
-        "avg_reprojection_error": 0.4,
-    }))
-    assert_camera(camera(path))
-
-
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16"])
 def test_dates_and_shells_of_other_countries_are_read(tmp_path, encoding):
     path = tmp_path / "c.yml"
@@ -309,9 +264,42 @@ def test_dates_and_shells_of_other_countries_are_read(tmp_path, encoding):
     assert_camera(camera(path))
 
 
-def test_a_camera_info_of_a_whole_region_or_with_equal_names_is_read(tmp_path):
-    text = ros_text() + "roi: {x_offset: 0, y_offset: 0, width: 640, height: 480}\n"
-    assert_camera(camera(write(tmp_path / "c.yml", text + f"D: {LENS}\n")))
+OTHERS = {
+    "OpenCV 2": f"""%YAML:1.0
+image_Size: [ 640, 480 ]
+Camera_Matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: {np.ravel(MATRIX).tolist()}
+Distortion_Coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: {LENS}
+""",
+    "EuRoC": f"""sensor_type: camera
+comment: VI-Sensor cam0 (MT9M034)
+rate_hz: 20
+resolution: [640, 480]
+camera_model: pinhole
+intrinsics: {[MATRIX[0][0], MATRIX[1][1], MATRIX[0][2], MATRIX[1][2]]} #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: {LENS[:4]}
+""",
+    "Limelight": json.dumps({
+        "camera_matrix": MATRIX, "distortion_coefficients": [LENS], "img_size": [640, 480],
+        "avg_reprojection_error": 0.4,
+    }),
+    "ROS, the whole region": (
+        ros_text() + "roi: {x_offset: 0, y_offset: 0, width: 640, height: 480}\n" + f"D: {LENS}\n"),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_files_of_other_programs_are_read(tmp_path, name):
+    lens = LENS[:4] if name == "EuRoC" else LENS
+    assert_camera(camera(write(tmp_path / "c.any", OTHERS[name])), lens=lens)
 
 
 # 2. What is refused, in one line each.

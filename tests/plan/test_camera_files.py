@@ -8,9 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from sweep.errors import PipelineError
+from support.stores import by_hand
+from sweep.errors import PipelineError, StoreError
+from sweep.execution.runner import execute
 from sweep.plan.cell_selection import cell
 from sweep.plan.pipeline import Pipeline
+from sweep.store.lifecycle import open_store
 
 MATRIX = [[612.34567890123456, 0, 321.123456789], [0, 611.98765432109876, 1 / 3 + 238],
           [0, 0, 1]]
@@ -493,3 +496,20 @@ def test_set_of_a_camera_file_replaces_the_camera_and_keeps_comments(tmp_path):
     assert_camera(chosen)
     assert "[camera]  # mine" in chosen.to_toml()
     assert "focal_length_mm" not in chosen.to_toml()
+
+
+def test_a_store_does_not_need_its_camera_file_any_more(tmp_path):
+    url, rest = str(tmp_path / "s.zarr"), {"marker": {"size_m": 0.05}, "axes": {
+        "distance_m": [0.5, 0.8]}}
+
+    def pipeline(name):
+        return Pipeline.from_dict({"camera": {"camera_file": name}, **rest}, folder=tmp_path)
+
+    by_hand(url, pipeline(write(tmp_path / "c.yaml", GOOD).name))
+    (tmp_path / "c.yaml").rename(tmp_path / "moved.yaml")
+    assert_camera(open_store(url).pipeline)
+    # The file elsewhere has the same content: the run is finished.
+    assert execute(pipeline("moved.yaml"), url).computed_blocks == 0
+    write(tmp_path / "c.yaml", GOOD.replace(repr(MATRIX[0][0]), "700.0"))
+    with pytest.raises(StoreError, match=r"fx_px: the store has 612\.345\d+, this run 700\.0"):
+        execute(pipeline("c.yaml"), url)

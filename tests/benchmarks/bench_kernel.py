@@ -272,9 +272,8 @@ def images_table():
     header("frame", "distance", "image / images of its markers one by one",
            "34 markers outside the frame / one")
     for (width, height), (near, far) in itertools.product(BOARD_SIZES, DISTANCES):
-        def made(board, frame=(width, height), limits=(near, far)):
-            return Block(BOARD, *frame, BOARD_POSES[frame[0]], board=board, near=limits[0],
-                         far=limits[1])
+        def made(board, width=width, height=height, near=near, far=far):
+            return Block(BOARD, width, height, BOARD_POSES[width], board=board, near=near, far=far)
 
         def of_markers(places):
             tables = (f"[[board.markers]]\nmarker_id = {k}\nx_m = {x}\ny_m = {y}\n"

@@ -241,7 +241,7 @@ def test_shifted_image_is_that_of_shifted_samples(geometry_px, length_px):
     )
     assert not not_modelled(scenes)[0]
     shifted = shift_of(shift_waves(geometry_px, length_px, np.uint64(77)))
-    assert_sampled(exact_frame(scenes, value), sampled_frame(value, 8, shifted), 8)
+    assert_sampled(exact_frame(scenes, value), sampled_frame(value, 6, shifted), 6)
 
 
 @pytest.mark.long

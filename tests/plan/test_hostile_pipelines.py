@@ -158,7 +158,7 @@ def test_a_file_with_a_byte_order_mark_is_read(tmp_path):
     assert Pipeline.from_toml(tmp_path / "p.toml").fixed["distance_m"] == 1
 
 
-@settings(derandomize=True, deadline=None, max_examples=200)
+@settings(derandomize=True, deadline=None, max_examples=100)
 @given(st.one_of(
     st.text(),
     st.binary().map(lambda data: data.decode("latin-1")),

@@ -377,9 +377,9 @@ def test_a_file_that_is_no_camera_s_is_refused_in_one_line(tmp_path, case, capfd
     path.write_bytes(content.encode() if isinstance(content, str) else content)
     if "cam1" in str(content):
         path = path.with_name("c.any#cam0")
-    start = time.perf_counter()
+    start = time.process_time()
     line, = refusals(path)
-    assert time.perf_counter() - start < 10
+    assert time.process_time() - start < 10
     assert line.startswith(f'pipeline: camera.camera_file = "{path.name}": expected ')
     assert expected in line
     assert len(line) < 500

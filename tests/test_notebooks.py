@@ -1,23 +1,17 @@
 """The notebooks run, show their figures, and are stored with the outputs of their sources."""
 
-import ast
 import asyncio
 import os
 import re
 import runpy
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import nbformat
-import pandas as pd
 import pytest
 from nbclient import NotebookClient
 
-import sweep
-
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 FIGURES = {"choosing_a_marker": 6, "paper_reproduced": 4, "first_analysis": 5}
-FEW_TRIALS = 2  # in place of what a reader gets
 TIMEOUT_S = 300  # a cell, on a busy machine
 MAX_BYTES = 1_000_000
 COSTS = {"choosing_a_marker": "## The recommendation"}
@@ -55,45 +49,6 @@ def outcomes(tmp_path_factory):
     folders = {name: tmp_path_factory.mktemp(name) for name in FIGURES}
     ended = asyncio.run(all_executed(folders))
     return dict(zip(folders, zip(ended, folders.values(), strict=True), strict=True))
-
-
-@pytest.fixture
-def kernel(no_child, tmp_path, monkeypatch):  # noqa: ARG001  (used by being there)
-    """Run a cell in this process; return how many figures it shows.
-
-    A kernel and workers of each notebook's own take longer to start than the cells to run.
-    """
-    run = sweep.run
-    figures = []
-
-    def run_here(*arguments, workers, **options):
-        assert workers > 0
-        return run(*arguments, **options)
-
-    def show():
-        figures.extend(plt.get_fignums())
-        for number in plt.get_fignums():
-            plt.figure(number).canvas.draw()
-        plt.close("all")
-
-    def display(*values):
-        assert all(value is None or repr(value) for value in values)
-
-    def run_cell(source):
-        figures.clear()
-        *statements, last = ast.parse(source).body
-        if isinstance(last, ast.Expr):
-            last = ast.parse(f"display({ast.unparse(last.value)})").body[0]
-        exec(compile(ast.Module([*statements, last], []), "cell", "exec"), names)  # noqa: S102
-        return len(figures)
-
-    names = {"__name__": "__main__", "display": display}
-    monkeypatch.setattr(sweep, "run", run_here)
-    monkeypatch.setattr(plt, "show", show)
-    monkeypatch.setenv("SWEEP_RUNS", str(tmp_path))
-    monkeypatch.chdir(NOTEBOOKS)
-    with plt.rc_context(), pd.option_context("display.float_format", None):
-        yield run_cell
 
 
 def test_all_notebooks_are_known():
@@ -150,26 +105,6 @@ def printed(notebook, until):
                       if output.output_type == "execute_result"
                       and "xarray.Dataset" not in output.data["text/plain"]]
     return texts
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", [
-    name if name == "first_analysis" else pytest.param(name, marks=pytest.mark.long)
-    for name in FIGURES
-])
-def test_notebook_runs_with_few_trials(name, kernel, tmp_path, capsys):
-    sources = [cell.source for cell in code_cells(read(name))]
-    few = [re.sub(r"^trials = \d+", f"trials = {FEW_TRIALS}", source, flags=re.MULTILINE)
-           for source in sources]
-    assert sum(source != other for source, other in zip(sources, few, strict=True)) == 1
-    shown = 0
-    for source in few:
-        figures = kernel(source)
-        assert figures == source.count("plt.show()"), source
-        shown += figures
-    assert shown == FIGURES[name]
-    assert capsys.readouterr().err == ""
-    assert list(tmp_path.glob("*.zarr")), "stores go where SWEEP_RUNS says"
 
 
 @pytest.mark.long

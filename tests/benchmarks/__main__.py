@@ -17,19 +17,18 @@ TOP = HERE.parents[1]
 
 QUICK = {
     "analysis": (["1e4", "60"], ["CALLS = dict(list(CALLS.items())[:2])"]),
-    "board": ([], ["SIZES = SIZES[:1]", "POSES = {640: 2}", "REPEATS = 1",
-                   "DISTANCES = DISTANCES[:1]", "BOARDS = dict(list(BOARDS.items())[:1])"]),
     "detectors": (["--scenes", "8", "--noise", "0", "--only", "none"], []),
     "engine": (["1"], ["MARKERS, DISTANCES, START_S, REPEATS, COUNT = 1, 3, 5.0, 1, 24",
                        "OTHERS = {}"]),
     "fit": (["1", "3"], []),
-    "kernel": ([], ["SIZES = SIZES[:1]", "POSES = {640: 20}", "REPEATS = 1", "BLOCK = 20"]),
+    "kernel": ([], ["SIZES = BOARD_SIZES = SIZES[:1]", "POSES = {640: 20}", "REPEATS = 1",
+                    "BOARD_POSES = {640: 2}", "DISTANCES = DISTANCES[:1]",
+                    "BOARDS = dict(list(BOARDS.items())[:1])"]),
     "limit": (["20", "1", "40"], [
         "EXPERIMENT['axes'] = {'dictionary': ['DICT_4X4_50'], 'tilt_deg': [0]}",
         "EXPERIMENT['axes'] |= {'noise_grey': [2], 'side_px': [12, 30]}", "RATES = (0.9,)"]),
-    "photograph": ([], ["PHOTOGRAPHS = 1", "SIDES = (20,)"]),
-    "photometric": ([], ["SCENES, SIDES, TILTS = 3, (20,), (0,)"]),
-    "precision": (["--sides", "2", "--max-trials", "500", "--width", "0.2"], []),
+    "photometric": ([], ["SCENES, SIDES, TILTS = 3, (20,), (0,)",
+                         "PHOTOGRAPHS, REAL_SIDES = 1, (20,)"]),
     "renderers": ([], ["SIDES, LENSES, SCENES = (8,), ((),), 2"]),
     "scale": (["--workers", "2", "--waves", "2", "--block-s", "0.1"], []),
     "size": (["{folder}", "smallest_marker"], [

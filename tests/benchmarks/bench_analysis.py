@@ -140,21 +140,23 @@ def measured(store, call, seconds=600):
 
 
 def main():
+    from tables import header, row  # noqa: PLC0415  (tests import this file from elsewhere)
+
     poses = int(float(sys.argv[1])) if len(sys.argv) > 1 else 10**7
     seconds = float(sys.argv[2]) if len(sys.argv) > 2 else 600
     with tempfile.TemporaryDirectory(prefix="sweep-bench-") as folder:
         begun = time.perf_counter()
         store, written = write_store(folder, poses)
         print(f"{written:,} poses written in {time.perf_counter() - begun:.0f} s")
-        print(f"{'':24}{'call s':>8}{'compute s':>11}{'peak MB':>9}{'values':>9}")
+        header("call", "call s", "compute s", "peak MB", "values")
         for name, call in CALLS.items():
             try:
                 found = measured(store, call, seconds)
             except (subprocess.TimeoutExpired, RuntimeError) as error:
-                print(f"{name:24} {str(error).splitlines()[-1][-100:]}")
+                row(name, str(error).splitlines()[-1][-100:])
                 continue
-            print(f"{name:24}{found['call_s']:8.2f}{found['compute_s']:11.1f}"
-                  f"{found['peak'] / 1e6:9.0f}{found['values']:9,}", flush=True)
+            row(name, f"{found['call_s']:.2f}", f"{found['compute_s']:.1f}",
+                f"{found['peak'] / 1e6:.0f}", f"{found['values']:,}")
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ import time
 import bench_detectors  # functions that a child process calls are of a module
 import cv2
 import numpy as np
+from tables import header, row
 
 from sweep.analysis.intervals import wilson
 from sweep.conformance.check import trial_pipeline, trial_scenes
@@ -44,22 +45,22 @@ def searched(name, scenes, noise):
     find = make_detector(shown.setting)
     find(shown.images[0], dictionary, 640)  # what is made once is made
     errors, seconds = np.full((scenes, 4, 2), np.nan), np.full(scenes, np.nan)
-    for row, image in enumerate(shown.images):
+    for k, image in enumerate(shown.images):
         begun = time.perf_counter()
         corners, ids, _ = find(image, dictionary, 640)
-        seconds[row] = time.perf_counter() - begun
+        seconds[k] = time.perf_counter() - begun
         right = [] if ids is None else [
-            np.reshape(quad, (4, 2)) - shown.corners_px[row]
+            np.reshape(quad, (4, 2)) - shown.corners_px[k]
             for quad, number in zip(corners, np.ravel(ids), strict=True)
-            if number == shown.marker_id[row]
+            if number == shown.marker_id[k]
         ]
         if right:
-            errors[row] = min(right, key=lambda error: (error**2).sum())
+            errors[k] = min(right, key=lambda error: (error**2).sum())
     return errors, seconds
 
 
-def line(name, errors, seconds, rng):
-    """Return a row of the table."""
+def line(errors, seconds, rng):
+    """Return the cells of a detector."""
     half = len(errors) // 2
     found = ~np.isnan(errors).any(axis=(1, 2))
     pairs = errors.reshape(2, half, 4, 2)[:, found.reshape(2, half).all(axis=0)]
@@ -70,10 +71,10 @@ def line(name, errors, seconds, rng):
     low, high = np.sqrt(np.quantile(squares[draws].mean(axis=1), [0.025, 0.975]))
     rate_low, rate_high = wilson(int(found.sum()), len(found))
     return (
-        f"| {name} | {np.sqrt(squares.mean()):.3f} ({low:.3f}-{high:.3f}) "
-        f"| {offset[0]:+.3f} ± {spread[0]:.3f}, {offset[1]:+.3f} ± {spread[1]:.3f} "
-        f"| {found.mean():.3f} ({float(rate_low):.3f}-{float(rate_high):.3f}) "
-        f"| {1e3 * np.median(seconds):.1f} |"
+        f"{np.sqrt(squares.mean()):.3f} ({low:.3f}-{high:.3f})",
+        f"{offset[0]:+.3f} ± {spread[0]:.3f}, {offset[1]:+.3f} ± {spread[1]:.3f}",
+        f"{found.mean():.3f} ({float(rate_low):.3f}-{float(rate_high):.3f})",
+        f"{1e3 * np.median(seconds):.1f}",
     )
 
 
@@ -85,8 +86,7 @@ def main():
     options = parser.parse_args()
     for noise in options.noise:
         print(f"\n{options.scenes} scenes, noise of {noise:g} grey levels\n")
-        print("| detector | RMS, px | mean offset x, y, px | found | ms |")
-        print("| --- | --- | --- | --- | --- |")
+        header("detector", "RMS, px", "mean offset x, y, px", "found", "ms")
         for name in METHODS:
             if options.only in name:
                 with Child("bench_detectors") as child:
@@ -95,10 +95,10 @@ def main():
                             bench_detectors.searched, name, options.scenes, noise, limit_s=3600
                         )
                     except ChildDiedError as death:
-                        print(f"| {name} | ended its process: {death} |")
+                        row(name, f"ended its process: {death}")
                     else:
                         rng = np.random.default_rng(4)
-                        print(line(name, errors, seconds, rng), flush=True)
+                        row(name, *line(errors, seconds, rng))
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from tables import header, row
 
 from sweep.evaluation.block import run_cells
 from sweep.execution.calibration import calibrate
@@ -133,10 +134,10 @@ def engine_against_processes(seconds):
             )
         )
     steady, whole, extra, predicted = (statistics.median(x) for x in zip(*rates, strict=True))
-    print(f"| {workers} workers / {workers} bare processes, while at work | {steady:.2f} |")
-    print(f"| whole run of {total:.0f} s / bare kernel time | {whole:.2f} |")
-    print(f"| start, measuring, shutdown beside that | {extra:.1f} s |")
-    print(f"| predicted / measured time | {predicted:.2f} |", flush=True)
+    row(f"{workers} workers / {workers} bare processes, while at work", f"{steady:.2f}")
+    row(f"whole run of {total:.0f} s / bare kernel time", f"{whole:.2f}")
+    row("start, measuring, shutdown beside that", f"{extra:.1f} s")
+    row("predicted / measured time", f"{predicted:.2f}")
 
 
 def shared_work():
@@ -165,7 +166,7 @@ def shared_work():
                     )
         ratios.append(apart / joint)
     ratio = statistics.median(ratios)
-    print(f"| 20 sweeps / one sweep of 4 refinements x 5 solvers | {ratio:.1f} |", flush=True)
+    row("20 sweeps / one sweep of 4 refinements x 5 solvers", f"{ratio:.1f}")
 
 
 # What a user would pick instead, on the same images and work: one call a pose.
@@ -239,7 +240,7 @@ def what_one_would_pick():
         execute(pipeline, f"{folder}/s.zarr", workers=workers)
         rate = math.prod(len(axis) for axis in pipeline.axes) / (time.perf_counter() - begun)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        rows.append(("sweep", rate, peak, "Zarr, labelled, resumable"))
+        rows.append(("sweep", rate, peak))
         for name, body in OTHERS.items():
             package = name.split(",")[0].split(".")[0]
             if importlib.util.find_spec(package) is None:
@@ -260,16 +261,16 @@ def what_one_would_pick():
                 print(f"{name}: {ran.stderr.strip().splitlines()[-1]}", file=sys.stderr)
                 continue
             other, memory = json.loads(ran.stdout.strip().splitlines()[-1])
-            rows.append((name, other, memory, "xyz" if package == "xyzpy" else "in memory"))
-    print("\n| tool | poses/s, start included | sweep / it | client's peak memory |")
-    print("| --- | --- | --- | --- |")
-    for name, rate, memory, _ in rows:
-        print(f"| {name} | {rate:.0f} | {rows[0][1] / rate:.1f} | {memory:.0f} MB |", flush=True)
+            rows.append((name, other, memory))
+    print()
+    header("tool", "poses/s, start included", "sweep / it", "client's peak memory")
+    for name, rate, memory in rows:
+        row(name, f"{rate:.0f}", f"{rows[0][1] / rate:.1f}", f"{memory:.0f} MB")
 
 
 def main():
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0
-    print("| engine | ratio |\n| --- | --- |")
+    header("engine", "ratio")
     shared_work()
     engine_against_processes(seconds)
     what_one_would_pick()

@@ -1,23 +1,25 @@
 """The kernel against a user's good loop, and against the bare calls that it makes.
 
-    python tests/benchmarks/bench_kernel.py
+    python tests/benchmarks/bench_kernel.py [markers] [boards] [images]
 
-One core, medians of paired runs: ratios within one run, for machines are noisy.
+Single markers, boards, and images of boards alone; all three if none is named. One core, medians of
+paired runs, seconds of the processor: ratios count.
 """
 
+import itertools
 import statistics
+import sys
 import time
-from unittest import mock
 
 import cv2
 import numpy as np
+from tables import header, row
 
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search_windows, visibility_flags, whole_frames
-from sweep.measure.detectors import Detector
+from sweep.measure.detectors import Detector, charuco_board
 from sweep.measure.flags import DetectionStatus
-from sweep.model import coverage as drawing
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render_all
 from sweep.model.scene import build_scenes
@@ -27,10 +29,9 @@ from sweep.plan.pipeline import Pipeline
 SIZES = ((640, 480), (1920, 1080), (4000, 3000))
 POSES = {640: 1000, 1920: 400, 4000: 150}
 REPEATS = 5
-BLOCK = 3000
-"""Poses of a block: about a second's work."""
+DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50)
 
-GRID = """
+MARKER = """
 seed = 1
 [camera]
 width_px = {width}
@@ -40,162 +41,273 @@ fx_px = {focal}
 dictionary = "DICT_5X5_50"
 size_m = 0.04
 [pose]
-distance_m = {{{{ uniform = [0.2, 2.0] }}}}
-tilt_deg = {{{{ uniform = [0, 70] }}}}
-azimuth_deg = {{{{ uniform = [0, 360] }}}}
-roll_deg = {{{{ uniform = [0, 360] }}}}
-bearing_x_deg = {{{{ uniform = [-15, 15] }}}}
-bearing_y_deg = {{{{ uniform = [-15, 15] }}}}
+distance_m = {{ uniform = [0.2, 2.0] }}
+tilt_deg = {{ uniform = [0, 70] }}
+azimuth_deg = {{ uniform = [0, 360] }}
+roll_deg = {{ uniform = [0, 360] }}
+bearing_x_deg = {{ uniform = [-15, 15] }}
+bearing_y_deg = {{ uniform = [-15, 15] }}
 [scene]
 background = 255
 [axes]
-trial = {{poses}}
+trial = {poses}
+"""
+
+BOARD_SIZES = ((640, 480), (4000, 3000))
+BOARD_POSES = {640: 60, 4000: 15}
+DISTANCES = ((0.4, 0.8), (0.8, 1.6), (1.6, 3.2))
+MARKER_M, SQUARE_M = 0.03, 0.0375
+PX_PER_M = 10 * 7 / MARKER_M
+"""Pixels of the naive loop's bitmap: ten a module."""
+
+BOARDS = {
+    "grid of 7 x 5": 'kind = "grid"\nrows = 5\ncolumns = 7\ngap_m = 0.0075',
+    "ChArUco of 10 x 7": 'kind = "charuco"\nsquares_x = 10\nsquares_y = 7\nsquare_m = 0.0375',
+}
+"""Boards of 35 markers of 30 mm."""
+
+BOARD = """
+seed = 1
+[camera]
+width_px = {width}
+height_px = {height}
+fx_px = {focal}
+[marker]
+dictionary = "DICT_5X5_50"
+size_m = 0.03
+[board]
+{board}
+[pose]
+distance_m = {{ uniform = [{near}, {far}] }}
+tilt_deg = {{ uniform = [0, 60] }}
+azimuth_deg = {{ uniform = [0, 360] }}
+roll_deg = {{ uniform = [0, 360] }}
+jitter_px = 20
+[scene]
+background = 255
+[estimator]
+solver = "iterative"
+[axes]
+trial = {poses}
 """
 
 
-def naive_loop(scenes, bitmaps, camera, frame):
-    """A user's good loop: bitmaps cached, one detector, whole frames, plain calls."""
-    detector = cv2.aruco.ArucoDetector(
-        cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50), cv2.aruco.DetectorParameters()
-    )
-    side = 0.04 / 2
-    objects = np.array(
-        [[-side, side, 0], [side, side, 0], [side, -side, 0], [-side, -side, 0]], np.float32
-    )
-    bitmap, source = bitmaps
-    found = 0
-    for rvec, tvec in scenes:
-        corners = cv2.projectPoints(objects, rvec, tvec, camera, None)[0].reshape(4, 2)
-        transform = cv2.getPerspectiveTransform(source, corners.astype(np.float32))
-        image = cv2.warpPerspective(
-            bitmap, transform, frame, flags=cv2.INTER_LINEAR, borderValue=(255,)
-        )
-        quads, ids, _ = detector.detectMarkers(image)
-        if ids is not None:
-            found += 1
-            cv2.solvePnP(objects, quads[0], camera, None, flags=cv2.SOLVEPNP_IPPE_SQUARE)
-    return found
+class Block:
+    """A pipeline's trials: their values and scenes, and where visible ones are searched."""
 
+    def __init__(self, text, width, height, poses, **given):
+        self.pipeline = Pipeline.from_text(text.format(
+            width=width, height=height, focal=4 / 4.8 * width, poses=poses, **given))
+        self.poses, self.indices = poses, [np.arange(poses)]
+        self.values = scene_values(self.pipeline, self.indices)
+        self.scenes = build_scenes(self.values, poses)
+        self.boxes = marker_boxes(self.scenes)
+        self.rows = np.flatnonzero(visibility_flags(self.scenes) == DetectionStatus.not_run)
+        self.setting = detector_settings(self.pipeline)[0]
+        self.cut = search_windows(
+            self.scenes, self.boxes, self.setting, whole_frames(self.values, poses))
+        self.camera = self.scenes.cameras.matrix(0)
+        self.posed = [
+            (cv2.Rodrigues(self.scenes.rotation[k])[0], self.scenes.translation[k])
+            for k in self.rows
+        ]
 
-def bare_calls(scenes, boxes, cut, rows, setting):
-    """The coverage and detection calls that the kernel makes, and nothing else but their loop."""
-    find = Detector(setting).find
-    side = int(scenes.frame.max())
-    for some in np.array_split(rows, max(len(rows) // 100, 1)):
-        for image in render_all(scenes, some, boxes[some], cut[some]):
-            find(image, "DICT_5X5_50", side)
+    def run(self):
+        return run_cells(self.pipeline, self.indices)
 
+    def images(self, windows, a_time=100):
+        """Yield the images of the visible scenes."""
+        for some in np.array_split(self.rows, max(len(self.rows) // a_time, 1)):
+            yield from render_all(self.scenes, some, self.boxes[some], windows[some])
 
-def beside(text):
-    """Seconds that a block of the kernel takes beside its calls, answered from a record.
-
-    Drawing does nothing, searches and solutions are those of a run before; what giving the
-    answers takes is measured too, and taken off.
-    """
-    pipeline, indices = Pipeline.from_text(text), [np.arange(BLOCK)]
-    real, answers, solutions = cv2.aruco.ArucoDetector, [], []
-    told = {"search": 0, "solve": 0}
-
-    class Recorder:
-        def __init__(self, *arguments):
-            self.detector = real(*arguments)
-
-        def detectMarkers(self, image):  # noqa: N802  (OpenCV's name)
-            answers.append(self.detector.detectMarkers(image))
-            return answers[-1]
-
-    class Player:
-        def __init__(self, *arguments):
-            pass
-
-        def detectMarkers(self, image):  # noqa: N802, ARG002  (OpenCV's name and argument)
-            told["search"] += 1
-            return answers[told["search"] - 1]
-
-    solve = cv2.solvePnPGeneric
-
-    def recorded(*arguments, **named):
-        solutions.append(solve(*arguments, **named))
-        return solutions[-1]
-
-    def played(*arguments, **named):  # noqa: ARG001  (in place of OpenCV's)
-        told["solve"] += 1
-        return solutions[told["solve"] - 1]
-
-    def answered():
-        for name in told:
-            told[name] = 0
-        player = Player()
-        for _ in answers:
-            player.detectMarkers(None)
-        for _ in solutions:
-            played(None, None, None, None, flags=0)
-        for name in told:
-            told[name] = 0
-
-    with mock.patch.object(cv2, "solvePnPGeneric", recorded), \
-            mock.patch.object(cv2.aruco, "ArucoDetector", Recorder):
-        run_cells(pipeline, indices)
-    spent = []
-    with mock.patch.object(cv2, "solvePnPGeneric", played), \
-            mock.patch.object(cv2.aruco, "ArucoDetector", Player), \
-            mock.patch.object(drawing, "draw_greys"):
-        for _ in range(REPEATS):
-            answering = clock(answered)
-            spent.append(clock(run_cells, pipeline, indices) - answering)
-    return statistics.median(spent)
+    def bare_calls(self, charuco=None):
+        """The coverage and detection calls of the kernel, and their loop; markers decoded."""
+        find, side = Detector(self.setting).find, int(self.scenes.frame.max())
+        decoded = 0
+        for image in self.images(self.cut):
+            corners, ids, _ = find(image, "DICT_5X5_50", side)
+            decoded += len(corners)
+            if charuco is not None and ids is not None:
+                charuco.detectBoard(image, markerCorners=list(corners), markerIds=ids)
+        return decoded
 
 
 def clock(function, *arguments):
-    start = time.perf_counter()
+    start = time.process_time()
     function(*arguments)
-    return time.perf_counter() - start
+    return time.process_time() - start
+
+
+def compared(block, naive, bare):
+    """Return cells: ms a pose of a naive loop and of the kernel, their ratio, kernel over bare."""
+    rows = []
+    for _ in range(REPEATS + 1):  # the first wakes the processor
+        a, b, c = clock(naive), clock(block.run), clock(bare)
+        rows.append((1e3 * a / block.poses, 1e3 * b / block.poses, a / b, b / c))
+    naive_ms, ours_ms, gain, over = map(statistics.median, zip(*rows[1:], strict=True))
+    return f"{naive_ms:.2f}", f"{ours_ms:.3f}", f"{gain:.1f}", f"{over:.2f}"
+
+
+def square_points(side):
+    half = side / 2
+    return np.array(
+        [[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]], np.float32)
+
+
+def marker_loop(block):
+    """Return a user's good loop: bitmap cached, one detector, whole frames, plain calls."""
+    detector = cv2.aruco.ArucoDetector(DICTIONARY, cv2.aruco.DetectorParameters())
+    objects, frame = square_points(0.04), tuple(block.scenes.frame[0].tolist())
+    marker = cv2.aruco.generateImageMarker(DICTIONARY, 0, 70)
+    bitmap = cv2.copyMakeBorder(marker, 10, 10, 10, 10, cv2.BORDER_CONSTANT, value=255)
+    source = np.array([[9.5, 9.5], [79.5, 9.5], [79.5, 79.5], [9.5, 79.5]], np.float32)
+
+    def loop():
+        for rvec, tvec in block.posed:
+            corners = cv2.projectPoints(objects, rvec, tvec, block.camera, None)[0].reshape(4, 2)
+            transform = cv2.getPerspectiveTransform(source, corners.astype(np.float32))
+            image = cv2.warpPerspective(
+                bitmap, transform, frame, flags=cv2.INTER_LINEAR, borderValue=(255,))
+            quads, ids, _ = detector.detectMarkers(image)
+            if ids is not None:
+                cv2.solvePnP(
+                    objects, quads[0], block.camera, None, flags=cv2.SOLVEPNP_IPPE_SQUARE)
+
+    return loop
+
+
+def markers_table():
+    header("frame", "naive ms a pose", "sweep ms a pose", "naive / sweep", "sweep / bare calls")
+    for width, height in SIZES:
+        block = Block(MARKER, width, height, POSES[width])
+
+        def bare(block=block):
+            for rvec, tvec in block.posed[:block.bare_calls()]:
+                pixels = cv2.projectPoints(square_points(0.04), rvec, tvec, block.camera, None)[0]
+                cv2.solvePnPGeneric(square_points(0.04), pixels, block.camera, None,
+                                    flags=cv2.SOLVEPNP_IPPE_SQUARE)
+
+        row(f"{width} x {height}", *compared(block, marker_loop(block), bare))
+
+
+def naive_board(ours):
+    """Return the board as OpenCV has it, its ChArUco detector or None, its bitmap and the map."""
+    board = cv2.aruco.Board(
+        ours.corners_m.astype(np.float32), DICTIONARY, np.array(ours.marker_ids))
+    low = ours.corners_m.reshape(-1, 3).min(axis=0)[:2] - SQUARE_M
+    high = ours.corners_m.reshape(-1, 3).max(axis=0)[:2] + SQUARE_M
+    size = np.round((high - low) * PX_PER_M).astype(int)
+    # Pixel (0, 0) is the middle of the bitmap's top left pixel; y is up on the board.
+    to_board = np.array([
+        [1 / PX_PER_M, 0, low[0] + 0.5 / PX_PER_M], [0, -1 / PX_PER_M, high[1] - 0.5 / PX_PER_M],
+        [0, 0, 1],
+    ])
+    bitmap = np.full(size[::-1], 255, np.uint8)
+    if ours.chessboard is not None:
+        charuco, squares = charuco_board(ours), ours.chessboard
+        drawn = charuco.generateImage((
+            round(squares.squares_x * SQUARE_M * PX_PER_M),
+            round(squares.squares_y * SQUARE_M * PX_PER_M),
+        ))
+        top, left = (size[1] - drawn.shape[0]) // 2, (size[0] - drawn.shape[1]) // 2
+        bitmap[top:top + drawn.shape[0], left:left + drawn.shape[1]] = drawn
+        return board, cv2.aruco.CharucoDetector(charuco), bitmap, to_board
+    side = round(MARKER_M * PX_PER_M)
+    for number, corners in zip(ours.marker_ids, ours.corners_m, strict=True):
+        left = round((corners[0, 0] - low[0]) * PX_PER_M)
+        top = round((high[1] - corners[0, 1]) * PX_PER_M)
+        bitmap[top:top + side, left:left + side] = cv2.aruco.generateImageMarker(
+            DICTIONARY, number, side)
+    return board, None, bitmap, to_board
+
+
+def board_loop(block, board, charuco, bitmap, to_board):
+    """As :func:`marker_loop`, of a board."""
+    detector = cv2.aruco.ArucoDetector(DICTIONARY)
+    frame = tuple(block.scenes.frame[0].tolist())
+
+    def loop():
+        for k, (rvec, tvec) in zip(block.rows, block.posed, strict=True):
+            rotation = block.scenes.rotation[k]
+            to_frame = block.camera @ np.column_stack([rotation[:, :2], tvec]) @ to_board
+            image = cv2.warpPerspective(
+                bitmap, to_frame, frame, flags=cv2.INTER_LINEAR, borderValue=(255,))
+            corners, ids, _ = detector.detectMarkers(image)
+            if ids is None:
+                continue
+            if charuco is not None:
+                charuco.detectBoard(image, markerCorners=corners, markerIds=ids)
+            objects, pixels = board.matchImagePoints(corners, ids)
+            cv2.solvePnP(objects, pixels, block.camera, None, rvec.copy(), tvec.copy())
+
+    return loop
+
+
+def boards_table():
+    header("board", "frame", "window, share of the frame", "markers found", "naive ms a pose",
+           "sweep ms a pose", "naive / sweep", "sweep / bare calls")
+    for name, declared in BOARDS.items():
+        for (width, height), (near, far) in itertools.product(BOARD_SIZES, DISTANCES):
+            block = Block(BOARD, width, height, BOARD_POSES[width], board=declared, near=near,
+                          far=far)
+            windows = block.cut[block.rows]
+            share = np.mean(np.prod(windows[:, 2:] - windows[:, :2], axis=1)) / (width * height)
+            printed = block.values["board"].listed(1)[0]
+            naive = naive_board(printed)
+            decoded = block.bare_calls(naive[1]) / (35 * len(block.rows))
+            points = printed.corners_m.reshape(-1, 3)
+
+            def bare(block=block, charuco=naive[1], points=points):
+                block.bare_calls(charuco)
+                for rvec, tvec in block.posed:
+                    pixels = cv2.projectPoints(points, rvec, tvec, block.camera, None)[0]
+                    cv2.solvePnP(points, pixels, block.camera, None)
+
+            row(f"{name}, {near}-{far} m", f"{width} x {height}", f"{share:.2f}", f"{decoded:.2f}",
+                *compared(block, board_loop(block, *naive), bare))
+
+
+def images_table():
+    """One image of 35 markers against 35 images of a marker each, at the same poses."""
+    header("frame", "distance", "image / images of its markers one by one",
+           "34 markers outside the frame / one")
+    for (width, height), (near, far) in itertools.product(BOARD_SIZES, DISTANCES):
+        def made(board, width=width, height=height, near=near, far=far):
+            return Block(BOARD, width, height, BOARD_POSES[width], board=board, near=near, far=far)
+
+        def of_markers(places):
+            tables = (f"[[board.markers]]\nmarker_id = {k}\nx_m = {x}\ny_m = {y}\n"
+                      for k, x, y in places)
+            return made('kind = "markers"\n' + "".join(tables))
+
+        def drawn(block):
+            box = block.boxes
+            for _ in block.images(np.column_stack(
+                    [np.maximum(box[:, :2], 0), np.minimum(box[:, 2:], block.scenes.frame)]), 20):
+                pass
+
+        whole = made(BOARDS["grid of 7 x 5"])
+        corners = whole.values["board"].listed(1)[0].corners_m
+        parts = [of_markers([(k, *each.mean(axis=0)[:2])]) for k, each in enumerate(corners)]
+        two, many = (of_markers([(k, 100 * k, 0) for k in range(n)]) for n in (2, 35))
+        ratios, outside = [], []
+        for _ in range(REPEATS + 1):
+            whole_s, *part_s = (clock(drawn, block) for block in (whole, *parts))
+            ratios.append(whole_s / sum(part_s))
+            two_s, many_s = clock(two.run), clock(many.run)
+            outside.append(many_s / two_s)
+        row(f"{width} x {height}", f"{near}-{far} m", f"{statistics.median(ratios[1:]):.2f}",
+            f"{statistics.median(outside[1:]):.2f}")
+
+
+TABLES = {"markers": markers_table, "boards": boards_table, "images": images_table}
 
 
 @single_threaded()
 def main():
-    print("| frame | naive ms a pose | sweep ms a pose | naive / sweep | sweep / bare calls "
-          "| µs a pose beside them |")
-    print("| --- | --- | --- | --- | --- | --- |")
-    for width, height in SIZES:
-        poses = POSES[width]
-        focal = 4 / 4.8 * width
-        text = GRID.format(width=width, height=height, focal=focal)
-        pipeline = Pipeline.from_text(text.format(poses=poses))
-        indices = [np.arange(poses)]
-        values = scene_values(pipeline, indices)
-        scenes = build_scenes(values, poses)
-        setting = detector_settings(pipeline)[0]
-        boxes = marker_boxes(scenes)
-        cut = search_windows(scenes, boxes, setting, whole_frames(values, poses))
-        rows = np.flatnonzero(visibility_flags(scenes) == DetectionStatus.not_run)
-        camera = scenes.cameras.matrix(0)
-        marker = cv2.aruco.generateImageMarker(
-            cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_50), 0, 70
-        )
-        bitmap = cv2.copyMakeBorder(marker, 10, 10, 10, 10, cv2.BORDER_CONSTANT, value=255)
-        source = np.array([[9.5, 9.5], [79.5, 9.5], [79.5, 79.5], [9.5, 79.5]], np.float32)
-        posed = [
-            (cv2.Rodrigues(scenes.rotation[row])[0], scenes.translation[row]) for row in rows
-        ]
-        naive, ours, ratios, bare = [], [], [], []
-        for repeat in range(REPEATS + 1):
-            a = clock(naive_loop, posed, (bitmap, source), camera, (width, height))
-            b = clock(run_cells, pipeline, indices)
-            result_s = clock(bare_calls, scenes, boxes, cut, rows, setting)
-            solve_s = sum(run_cells(pipeline, indices).seconds["estimation"])
-            if repeat == 0:
-                continue
-            naive.append(1e3 * a / poses)
-            ours.append(1e3 * b / poses)
-            ratios.append(a / b)
-            bare.append(b / (result_s + solve_s))
-        median = statistics.median
-        print(
-            f"| {width} x {height} | {median(naive):.2f} | {median(ours):.3f} "
-            f"| {median(ratios):.1f} | {median(bare):.2f} "
-            f"| {1e6 * beside(text.format(poses=BLOCK)) / BLOCK:.1f} |", flush=True,
-        )
+    for name in sys.argv[1:] or TABLES:
+        TABLES[name]()
+        print()
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import time
 
 import cv2
 import numpy as np
+from tables import header, row
 
 from sweep.model.camera import Camera
 from sweep.model.extent import marker_boxes
@@ -61,15 +62,15 @@ def medians(side_px, distortion):
     boxes = {name: marker_boxes(built[name]) for name in names}
     seconds = {name: [] for name in names}
     for turn in range(60):
-        for row in range(SCENES):
+        for k in range(SCENES):
             for name in names:
                 turns, rows = repetitions(name, side_px, distortion)
-                if turn >= turns or row >= rows:
+                if turn >= turns or k >= rows:
                     continue
-                box = boxes[name][row]
+                box = boxes[name][k]
                 window = tuple(box.tolist())
                 start = time.perf_counter()
-                render(built[name], row, box, window)
+                render(built[name], k, box, window)
                 seconds[name].append(time.perf_counter() - start)
     return {name: float(np.median(taken)) for name, taken in seconds.items()}
 
@@ -80,15 +81,15 @@ def main():
     for distortion in LENSES:
         medians(8, distortion)  # compile, and wake the processor
     print(f"OpenCV {cv2.__version__}, one thread; medians in ms an image")
-    print(f"{'side_px':>7} {'lens':>5} {'exact':>9} {'warp':>9} {'super-8':>9} "
-          f"{'exact/warp':>11} {'super-8/exact':>14}")
+    header("side, px", "lens", "exact", "warp", "supersample-8", "exact / warp",
+           "supersample-8 / exact")
     for distortion in LENSES:
         for side_px in SIDES:
             taken = medians(side_px, distortion)
             exact, warp = 1e3 * taken["exact"], 1e3 * taken["warp"]
             sampled = 1e3 * taken.get("supersample-8", np.nan)
-            print(f"{side_px:7d} {'yes' if distortion else 'no':>5} {exact:9.4f} {warp:9.4f} "
-                  f"{sampled:9.3f} {exact / warp:11.2f} {sampled / exact:14.1f}", flush=True)
+            row(side_px, "yes" if distortion else "no", f"{exact:.4f}", f"{warp:.4f}",
+                f"{sampled:.3f}", f"{exact / warp:.2f}", f"{sampled / exact:.1f}")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """JPEG, demosaicing, and all effects of the camera's processing together: windows, extremes."""
 
 import itertools
+from functools import cache
 
 import cv2
 import numpy as np
@@ -26,6 +27,7 @@ EVERYTHING = [
 ]
 
 
+@cache
 def exact_levels():
     """The levels of SMALL by polygon clipping."""
     levels, share = clipped_image(values(

@@ -4,7 +4,6 @@ A correct sensor passes each statistical test with a probability of at least 1 -
 """
 
 import math
-import re
 
 import mpmath
 import numpy as np
@@ -13,7 +12,6 @@ import pytest
 from support.lengths import lengths
 from support.small_scenes import image_of
 from sweep.model.sensor import noise_kernel, normal_field
-from sweep.plan.parameters import PARAMETERS
 
 FAR = 5.5
 """Standard deviations that a normal number exceeds with a probability of 4e-8."""
@@ -42,17 +40,6 @@ def test_weights_have_the_correlation_of_the_closed_form(correlation):
     for lag in (2, 3, 4):
         # Cut off at 5 standard deviations: exp(-12.5) = 4e-6 of the largest weight.
         assert at[lag] == pytest.approx(float(theta_ratio(sigma, lag)), abs=1e-5)
-
-
-def test_correlation_two_pixels_apart_is_what_the_parameter_states():
-    stated, values = re.search(
-        r"two pixels apart ([0-9., ]+) for ([0-9., ]+);",
-        PARAMETERS["noise_correlation"].declaration.meaning,
-    ).groups()
-    for number, correlation in zip(stated.split(", "), values.split(", "), strict=True):
-        kernel = noise_kernel(float(correlation))
-        digits = len(number) - 2
-        assert round(math.fsum(kernel[:-2] * kernel[2:]), digits) == float(number), correlation
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 0.5, 0.9])

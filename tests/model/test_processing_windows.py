@@ -1,4 +1,4 @@
-"""Detections in windows are those of whole frames under the camera's processing."""
+"""Detections in windows are those of whole frames under noise and the camera's processing."""
 
 import numpy as np
 import pytest
@@ -26,11 +26,12 @@ SETTINGS
 [axes]
 background = [0, 128, 255]
 side_px = { geom = [10, 250, 12] }
-noise_grey = [2, 8, 32]
-trial = 40
+noise_grey = [1, 2, 4, 8, 16, 32]
+trial = 20
 """
 
 PROCESSING = {
+    "noise alone": "",
     "correlated": "noise_correlation = 0.5",
     "far correlated": "noise_correlation = 0.99",
     "JPEG": "jpeg_quality = 30",
@@ -78,6 +79,6 @@ def test_window_finds_what_the_frame_holds(name, refinement):
     assert len(exceptions) <= 2
     for i in exceptions:
         assert len(outcomes_elsewhere(scenes, i, setting)) > 1
-    # The bounds of tests/model/test_sensor.py and tests/evaluation/test_window.py.
+    # The bounds of tests/evaluation/test_window.py.
     limit = {"none": 0.0, "subpix": 10.0, "contour": 1.0, "apriltag": np.spacing(np.float32(640))}
     assert difference.max() <= limit[refinement]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.support.recipes import added, printed_by
+from support.recipes import added, printed_by
 
 RECORDS = """
     Effect(

@@ -1,4 +1,4 @@
-"""Noise, its statistics and what it depends on; quantisation; windows under noise.
+"""Noise, its statistics and what it depends on; quantisation.
 
 Every draw is seeded. Statistical tests pass a correct sensor with a probability of 1 - 1e-6 or
 more each. With ``-s`` a row: effect | reference | cases | worst error | tolerance.
@@ -10,11 +10,6 @@ import pytest
 from scipy import stats
 
 from support.lengths import lengths
-from support.windows import outcomes_elsewhere
-from sweep.evaluation.opencv_threads import single_threaded
-from sweep.evaluation.search import search, search_windows, visibility_flags
-from sweep.measure.detectors import REFINEMENTS, DetectorSetting
-from sweep.measure.flags import DetectionStatus
 from sweep.model import sensor
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import marker_levels, render_all
@@ -83,28 +78,23 @@ def chi_square(counts, probabilities, total):
     return stats.chisquare(joined, expected * (total / expected.sum())).pvalue
 
 
-@pytest.mark.parametrize(
-    ("mean", "noise"), [(128, 1), (100.25, 5), (127.5, 40), (3, 20), (200, 90)]
-)
-def test_grey_noise_is_normal_rounded_and_clipped(mean, noise):
-    image = flat(mean, f"noise_grey={noise}")
-    upper = stats.norm.cdf((np.arange(256) + 0.5 - mean) / noise)
+# What a pixel of a level is: the distribution, and the settings that make it.
+LEVELS = [
+    *((mean, f"noise_grey={noise}", stats.norm(mean, noise)) for mean, noise in (
+        (128, 1), (100.25, 5), (127.5, 40), (3, 20), (200, 90))),
+    *((mean, "full_well_e=255", stats.poisson(mean)) for mean in (
+        0.1, 1.0, 5.0, 9.99, 10.0, 30.0, 100.0, 200.0)),  # an electron is a level
+]
+
+
+@pytest.mark.parametrize(("mean", "noise", "distribution"), LEVELS)
+def test_noise_is_normal_or_poisson_rounded_and_clipped(mean, noise, distribution):
+    image = flat(mean, noise)
+    upper = distribution.cdf(np.arange(256) + 0.5)
     upper[255] = 1.0
     counts = np.bincount(image.ravel(), minlength=256)
     p = chi_square(counts, np.diff(upper, prepend=0.0), image.size)
-    print(f"\n| grey noise {noise} at {mean} | binned normal | {image.size} | p = {p:.2g} |")
-    assert p > UNLIKELY
-
-
-@pytest.mark.parametrize("mean", [0.1, 1.0, 5.0, 9.99, 10.0, 30.0, 100.0, 200.0])
-def test_shot_noise_is_poisson_where_an_electron_is_a_level(mean):
-    image = flat(mean, "full_well_e=255")
-    upper = stats.poisson.cdf(np.arange(256), mean)
-    upper[255] = 1.0
-    p = chi_square(
-        np.bincount(image.ravel(), minlength=256), np.diff(upper, prepend=0.0), image.size
-    )
-    print(f"\n| shot noise, {mean} e- | binned Poisson | {image.size} | p = {p:.2g} |")
+    print(f"\n| {noise} at {mean} | binned distribution | {image.size} | p = {p:.2g} |")
     assert p > UNLIKELY
 
 
@@ -181,21 +171,6 @@ def test_noise_is_that_of_the_scene_whatever_renderer_window_and_levels(noise):
     assert np.array_equal(flat(128, *noise, seed=1, trial=0), image)
 
 
-@pytest.mark.parametrize("noise", ["noise_grey=20", "full_well_e=300"])
-def test_noise_of_a_pixel_does_not_depend_on_the_window(noise):
-    rng = np.random.default_rng(8)
-    pipeline = Pipeline.from_text(
-        FLAT.format(level=90, seed=5, tilt_deg=30, height=300), [noise, "side_px=60"]
-    )
-    frame = image_of(pipeline)
-    box = marker_boxes(scenes_of(pipeline))[0]
-    for _ in range(20):
-        left, top = rng.integers(0, box[:2] + 1).tolist()
-        right, bottom = rng.integers(box[2:], [1001, 301]).tolist()
-        image = image_of(pipeline, window=(left, top, right, bottom))
-        assert np.array_equal(image, frame[top:bottom, left:right])
-
-
 # Photon transfer.
 
 def test_photon_transfer_is_within_one_percent_of_theory():
@@ -268,78 +243,3 @@ background = 90.4
             worst = max(worst, np.abs(found - expected)[decided].max())
             cases += 1
     row("gain, 8-16 bits, clipping", "integers of NumPy", cases, worst, 0)
-
-
-# Extremes.
-
-
-# Windows.
-
-NOISY = """
-seed = 21
-[pose]
-tilt_deg = { uniform = [0, 75] }
-azimuth_deg = { uniform = [0, 360] }
-roll_deg = { uniform = [0, 360] }
-bearing_x_deg = { uniform = [-30, 30] }
-bearing_y_deg = { uniform = [-23, 23] }
-[axes]
-background = [0, 128, 255]
-side_px = { geom = [10, 250, 12] }
-noise_grey = [1, 2, 4, 8, 16, 32]
-trial = 20
-"""
-
-
-@single_threaded()
-def both_searches(count, setting):
-    """Return the scenes, and what a setting finds in the windows and in the whole frames."""
-    pipeline = Pipeline.from_text(NOISY)
-    shape = tuple(len(axis) for axis in scene_axes(pipeline))
-    order = np.random.default_rng(6).permutation(int(np.prod(shape)))[: count * 5 // 4 + 20]
-
-    def built(cells):
-        indices = list(np.unravel_index(cells, shape))
-        return build_scenes(scene_values(pipeline, indices), len(cells))
-
-    seen = np.flatnonzero(visibility_flags(built(order)) == DetectionStatus.not_run)[:count]
-    assert len(seen) == count
-    scenes = built(order[seen])
-    failures = []
-    windowed, framed = (
-        search(scenes, np.ones((count, 1), dtype=bool), [setting], np.full(count, full), failures)
-        [0][0] for full in (False, True)
-    )
-    assert not failures
-    return scenes, windowed, framed
-
-
-@pytest.mark.long
-@lengths(25, 400)
-@pytest.mark.parametrize("refinement", REFINEMENTS)
-def test_window_finds_what_the_frame_holds_under_noise(count, refinement):
-    setting = DetectorSetting(cornerRefinementMethod=refinement)
-    scenes, windowed, framed = both_searches(count, setting)
-    windows = search_windows(scenes, marker_boxes(scenes), setting, np.zeros(count, dtype=bool))
-    assert (windows[:, 2:] - windows[:, :2] < scenes.frame).any()
-    exceptions = np.flatnonzero(windowed.flags != framed.flags)
-    both = (windowed.flags == DetectionStatus.detected) & (framed.flags == DetectionStatus.detected)
-    difference = np.abs(windowed.corners - framed.corners)[both].max(axis=(1, 2))
-    print(
-        f"\n{refinement}: {count} poses, {both.sum()} detected, {len(exceptions)} exceptions "
-        f"{[(int(windowed.flags[i]), int(framed.flags[i])) for i in exceptions]}; corners differ "
-        f"by 99th percentile {np.quantile(difference, 0.99):.2g}, worst {difference.max():.2g} px"
-    )
-    assert both.sum() > count // 4
-    # As in test_window.py, whose bounds have their reasons there: OpenCV itself may make something
-    # else of the very same pixels elsewhere in the frame.
-    assert len(exceptions) <= max(1, 0.001 * count)
-    for i in exceptions:
-        assert len(outcomes_elsewhere(scenes, i, setting)) > 1
-    limit = {"none": 0.0, "subpix": 10.0, "contour": 1.0, "apriltag": np.spacing(np.float32(640))}
-    assert difference.max() <= limit[refinement]
-    if refinement == "subpix":
-        assert np.quantile(difference, 0.99) < DetectorSetting().cornerRefinementMinAccuracy
-
-
-# Files that cannot be run.

@@ -2,14 +2,15 @@
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
-from scipy.special import ndtr
 
 from support.exact_image import clipped_image, values
 from support.lengths import lengths
 from support.small_scenes import SMALL, image_of
+from sweep.model.renderers import background_image
 
 FINE = 8
 """Pixels of the reference's finer image along a side of a pixel."""
@@ -60,30 +61,6 @@ def test_sharpening_is_the_image_plus_its_difference_from_a_blurred_one(
         assert np.abs(image - plain).max() > 4
 
 
-@pytest.mark.parametrize("radius", [0.3, 2.0, 20.0])
-@pytest.mark.parametrize("amount", [0.2, 1.0])
-def test_sharpening_of_a_long_edge_is_its_closed_form(amount, radius):
-    """The box of a pixel, convolved with two Gaussians: integrals of the normal distribution."""
-    def edge(t, sigma):
-        def integral(t):
-            density = np.exp(-0.5 * (t / sigma) ** 2) / math.sqrt(2 * math.pi)
-            return t * ndtr(t / sigma) + sigma * density
-        return integral(t + 0.5) - integral(t - 0.5)
-
-    # A square of one level, 4000 px wide, whose right side is 0.3 px from the frame's middle.
-    shift_deg = math.degrees(math.atan((0.3 - 2000) / 80))
-    image = image_of([
-        "tilt_deg=0", "roll_deg=0", "distance_m=0.002", f"bearing_x_deg={shift_deg}",
-        "quiet_zone_modules=0", "black=140", "white=140", "background=90", "blur_px=0.5",
-        f"sharpening={amount}", f"sharpening_px={radius}",
-    ])
-    t = 28.3 - np.arange(57)
-    plain, wide = edge(t, 0.5), edge(t, math.hypot(0.5, radius))
-    expected = 90 + 50 * (plain + amount * (plain - wide))
-    assert np.abs(image[22] - expected).max() <= ROUNDING + 0.02
-    assert (image == image[22]).all()
-
-
 def test_sharpening_leaves_the_noise_as_it_is_and_follows_gain_and_light():
     plain = "black=100", "white=140", "background=90", "blur_px=0.6"
     sharp = *plain, "sharpening=1", "sharpening_px=1.5"
@@ -107,8 +84,6 @@ def test_sharpening_leaves_the_noise_as_it_is_and_follows_gain_and_light():
 
 
 def test_sharpening_over_a_background_image_acts_on_the_marker_alone(tmp_path):
-    import cv2  # noqa: PLC0415
-
     rng = np.random.default_rng(4)
     behind = rng.integers(60, 160, (45, 57)).astype(np.uint8)
     cv2.imwrite(str(tmp_path / "wall.png"), behind)
@@ -119,7 +94,6 @@ def test_sharpening_over_a_background_image_acts_on_the_marker_alone(tmp_path):
     assert (image[-6:] == behind[-6:]).all()
     even = behind * 0 + 100
     cv2.imwrite(str(tmp_path / "wall.png"), even.astype(np.uint8))
-    from sweep.model.renderers import background_image  # noqa: PLC0415
     background_image.cache_clear()
     flat = image_of([*settings, "background=100"])
     np.testing.assert_array_equal(image_of(settings, text=text), flat)

@@ -1,15 +1,12 @@
 """Short names for the axes of charts, and whole meanings beside them."""
 
-import matplotlib as mpl
 import pytest
-import xarray as xr
-from matplotlib.figure import Figure
 
 import sweep.analysis
 from support.example_results import example_results
 from sweep.plan.parameters import PARAMETERS
 from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import SCHEMA, short_name, with_descriptions
+from sweep.plan.schema import SCHEMA, short_name
 from sweep.store.layout import RECEIPTS, planned_arrays
 
 MAX_LINE = 30
@@ -58,41 +55,3 @@ def test_results_of_analyses_have_them_too(name):
         assert len(variable.attrs["long_name"]) <= 42, each
         assert variable.attrs["description"], each
     assert "description" not in results["marker_area_px"].attrs
-
-
-def test_an_older_store_s_words_become_descriptions_and_nothing_else_changes():
-    old = xr.Dataset({"tilt_deg": ("x", [1.0], {"long_name": "to the image", "units": "degree"}),
-                      "other": ("x", [2.0]),
-                      "own": ("x", [3.0], {"long_name": "kept", "description": "as it is"})})
-    new = with_descriptions(old)
-    assert new["tilt_deg"].attrs == {
-        "long_name": "tilt", "description": "to the image", "units": "degree"}
-    assert new["other"].attrs == {}
-    assert new["own"].attrs == old["own"].attrs
-    assert old["tilt_deg"].attrs["long_name"] == "to the image"
-    xr.testing.assert_equal(old, new)
-
-
-def test_xarray_s_own_plots_have_labels_that_fit():
-    results = with_descriptions(xr.Dataset(
-        {name: (("tilt_deg", "distance_m"), [[1.0, 2.0], [3.0, 4.0]], variable.attributes())
-         for name, variable in ((each.name, each) for each in SCHEMA) if not variable.inner},
-        {"tilt_deg": ("tilt_deg", [0, 30], {"long_name": PARAMETERS[
-            "tilt_deg"].declaration.meaning, "units": "degree"}),
-         "distance_m": ("distance_m", [1, 2], {"long_name": PARAMETERS[
-             "distance_m"].declaration.meaning, "units": "m"})}))
-    with mpl.rc_context({"font.size": 10}):
-        longest = sorted(results.data_vars, key=lambda name: -len(results[name].attrs["long_name"]))
-        for name in longest[:4]:
-            figure = Figure((6.4, 4.8))
-            axes = figure.add_subplot()
-            results[name].isel(distance_m=0, drop=True).plot.line(ax=axes)
-            figure.draw_without_rendering()
-            renderer = figure._get_renderer()
-            for label in (axes.xaxis.label, axes.yaxis.label, axes.title):
-                box = label.get_window_extent(renderer)
-                assert figure.bbox.x0 <= box.x0, name
-                assert box.x1 <= figure.bbox.x1, name
-                assert figure.bbox.y0 <= box.y0, name
-                assert box.y1 <= figure.bbox.y1, name
-            assert axes.get_xlabel() == "tilt [degree]"

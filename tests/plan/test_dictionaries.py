@@ -100,31 +100,6 @@ def test_text_of_a_pipeline_reads_back_to_an_equal_one(count):
     check()
 
 
-@pytest.mark.long
-@settings(max_examples=150, deadline=None)
-@given(documents(), st.data())
-def test_faults_are_those_of_a_file(document, data):
-    anything = st.recursive(
-        st.one_of(st.booleans(), st.integers(), st.floats(), st.text(max_size=5)),
-        # tomlkit puts tables after values: one key a table.
-        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text("ab", min_size=1),
-                                                                    inner, max_size=1),
-        max_leaves=4,
-    )
-    section = data.draw(st.sampled_from(["pose", "axes", "camera", "detector", "elsewhere"]))
-    name = data.draw(st.sampled_from([*PARAMETERS, TRIAL, "tilt"]))
-    document.setdefault(section, {})[name] = data.draw(anything)
-    outcomes = []
-    for read, form in (
-        (Pipeline.from_dict, document), (Pipeline.from_text, file_text(document))
-    ):
-        try:
-            outcomes.append(dataclasses.replace(read(form), text=""))
-        except PipelineError as error:
-            outcomes.append(sorted(error.faults))
-    assert outcomes[0] == outcomes[1]
-
-
 @lengths(50, 500)
 def test_any_document_is_written_as_toml_that_means_the_same(count):
     values = st.recursive(
@@ -188,7 +163,7 @@ LOOP["pose"] = {"distance_m": LOOP}
      ({"pose": {3: 1}}, "cell: pose.3: expected a string as key"),
      ({"pose": {"distance_m": 1j}, "seed": None}, "pose.distance_m = 1j: .*\n.*seed = None"),
      ({"pose": {"distance": 1}}, "pose.distance: unknown key; did you mean distance_m"),
-     ({"axes": {"distance_m": np.arange(1.0, 90_000)}}, "expected at most 250,000 bytes"),
+     ({"axes": {"distance_m": np.arange(1.0, 40_000)}}, "expected at most 250,000 bytes"),
      (LOOP, "cell: pose.distance_m: nested too deeply")],
 )
 def test_values_that_toml_does_not_have_are_told_by_key(document, message):

@@ -81,29 +81,20 @@ def test_draws_do_not_depend_on_fixed_or_axis_nor_on_the_rest_of_the_grid():
     assert_same(wider, expected)
 
 
-def test_draws_do_not_depend_on_defaults_written_out():
-    assert_same(
-        drawn("bearing_y_deg=0", "roll_deg=0.0", "quiet_zone_modules=1", "dictionary=DICT_5X5_50",
-              "cx_px=319.5", "cy_px=239.5", "distortion=[0, 0, 0, 0]"),
-        drawn(),
-    )
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        ["renderer=warp"],
-        ["window=full"],
-        ["black=40", "white=220", "background=128"],
-        ["background=[0, 128]"],
-        ["black={uniform=[0, 40]}"],
-        ["cornerRefinementMethod=subpix", "adaptiveThreshWinSizeMax=[23, 61]"],
-        ["solver=['p3p', 'ippe']", "guarded=false", "believed_fx_px=500"],
-        ["believed_cx_px={normal=[319.5, 2]}"],
-    ],
-    ids=",".join,
-)
-def test_draws_do_not_depend_on_renderer_levels_detector_or_estimator(settings):
+@pytest.mark.parametrize("settings", [
+    ["bearing_y_deg=0", "roll_deg=0.0", "quiet_zone_modules=1", "dictionary=DICT_5X5_50",
+     "cx_px=319.5", "cy_px=239.5", "distortion=[0, 0, 0, 0]"],  # the defaults
+    ["fx_px=533.3333333333334"],  # the default in pixels
+    ["renderer=warp"],
+    ["window=full"],
+    ["black=40", "white=220", "background=128"],
+    ["background=[0, 128]"],
+    ["black={uniform=[0, 40]}"],
+    ["cornerRefinementMethod=subpix", "adaptiveThreshWinSizeMax=[23, 61]"],
+    ["solver=['p3p', 'ippe']", "guarded=false", "believed_fx_px=500"],
+    ["believed_cx_px={normal=[319.5, 2]}"],
+], ids=",".join)
+def test_draws_do_not_depend_on_defaults_renderer_levels_detector_or_estimator(settings):
     assert_same(drawn(*settings), drawn())
 
 
@@ -114,13 +105,6 @@ def test_draws_are_the_same_for_a_side_in_pixels_as_for_the_distance_it_stands_f
     )
     order = ("marker_id", "side_px", "bearing_x_deg", "trial")
     assert_same(drawn(text=text, order=order), drawn())
-
-
-def test_draws_are_the_same_for_a_camera_in_millimetres_as_in_pixels():
-    millimetres = drawn("focal_length_mm=6")
-    for given in (["fx_px=800"], ["fx_px=800", "fy_px=800"]):
-        assert_same(drawn(*given), millimetres)
-    assert_same(drawn("fx_px=533.3333333333334"), drawn())
 
 
 @pytest.mark.parametrize(
@@ -194,23 +178,6 @@ def test_jitter_scales_with_its_half_width_and_is_absent_at_zero():
     for k, half_width in ((1, 0.001), (2, 30)):
         assert np.abs(table[..., k]).max() <= half_width
         assert np.abs(table[..., k]).max() > 0.5 * half_width
-
-
-@pytest.mark.parametrize("extents", [(1, 1, 1, 1), (2, 3, 1, 3), (3, 2, 2, 1)])
-def test_values_of_a_block_are_those_of_the_whole_grid_cut(extents):
-    pipeline = Pipeline.from_text(DRAWN)
-    expected = drawn()
-    blocks = Blocks(whole(pipeline).shape, extents)
-    covered = 0
-    for block in blocks:
-        part = tuple(slice(a, b) for a, b in zip(block.starts, block.stops, strict=True))
-        values = scene_values(pipeline, block_indices(block))
-        for name in QUANTITIES:
-            np.testing.assert_array_equal(
-                values[name].values.reshape(block.shape), expected[name][part], err_msg=name
-            )
-        covered += len(block)
-    assert covered == len(whole(pipeline))
 
 
 def test_results_of_a_block_are_those_of_the_whole_grid_cut():

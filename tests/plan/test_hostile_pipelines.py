@@ -2,8 +2,6 @@
 
 import os
 import struct
-import subprocess
-import sys
 import zlib
 
 import cv2
@@ -160,7 +158,7 @@ def test_a_file_with_a_byte_order_mark_is_read(tmp_path):
     assert Pipeline.from_toml(tmp_path / "p.toml").fixed["distance_m"] == 1
 
 
-@settings(derandomize=True, deadline=None, max_examples=200)
+@settings(derandomize=True, deadline=None, max_examples=100)
 @given(st.one_of(
     st.text(),
     st.binary().map(lambda data: data.decode("latin-1")),
@@ -250,38 +248,35 @@ def test_an_image_that_is_none_or_a_bomb_is_refused(content, expected, tmp_path,
     assert capfd.readouterr().err == ""
 
 
-@pytest.mark.parametrize("ending", [".png", ".jpg", ".bmp", ".pgm", ".ppm", ".pbm"])
-def test_an_image_of_the_frames_size_is_taken(ending, tmp_path):
-    image = NOISE if ending in (".pgm", ".pbm") else np.dstack([NOISE] * 3)
-    (tmp_path / "image").write_bytes(encoded(ending, image))
+IMAGES = {
+    **{ending: encoded(ending, np.dstack([NOISE] * 3)) for ending in (".png", ".jpg", ".bmp")},
+    **{ending: encoded(ending, NOISE) for ending in (".pgm", ".pbm")},
+    "16 bits": encoded(".png", NOISE.astype(np.uint16) * 256),
+    "alpha": encoded(".png", np.dstack([NOISE] * 4)),
+}
+
+
+@pytest.mark.parametrize("content", IMAGES.values(), ids=IMAGES)
+def test_an_image_of_the_frames_size_is_taken(content, tmp_path):
+    (tmp_path / "image").write_bytes(content)
     assert list(Pipeline.from_text(FRAME % "image", folder=tmp_path).files) == ["image"]
 
 
-def test_images_of_16_bits_and_with_alpha_are_taken(tmp_path):
-    for image in (NOISE.astype(np.uint16) * 256, np.dstack([NOISE] * 4)):
-        (tmp_path / "image").write_bytes(encoded(".png", image))
-        assert Pipeline.from_text(FRAME % "image", folder=tmp_path).files
-
-
-def special_files(folder):
-    """Return paths that are no regular files, or too large to be read."""
-    os.mkfifo(folder / "pipe")
-    (folder / "folder").mkdir()
-    (folder / "loop").symlink_to("loop")
-    (folder / "zero").symlink_to("/dev/zero")
-    with (folder / "large").open("wb") as file:
+def test_special_files_are_refused_unread(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    with (tmp_path / "large").open("wb") as file:
         file.write(encoded(".png", NOISE))
         file.truncate(10**10)
-    return {"pipe": "Not a regular file", "folder": "Is a directory", "zero": "Not a regular file",
-            "loop": "symbolic links", "large": "bytes"}
-
-
-def test_special_files_are_refused_unread(tmp_path):
-    for name, expected in special_files(tmp_path).items():
-        line, = faults_of(Pipeline.from_toml, tmp_path / name)
-        assert expected in line
-        line, = faults_of(Pipeline.from_text, FRAME % name, folder=tmp_path)
-        assert expected in line
+    for name, expected in (
+        ("pipe", "Not a regular file"), ("folder", "Is a directory"), ("loop", "symbolic links"),
+        ("zero", "Not a regular file"), ("large", "bytes"),
+    ):
+        for line, in (faults_of(Pipeline.from_toml, tmp_path / name),
+                      faults_of(Pipeline.from_text, FRAME % name, folder=tmp_path)):
+            assert expected in line
 
 
 def test_a_file_whose_name_forges_a_line_is_told_in_one(tmp_path):
@@ -289,23 +284,3 @@ def test_a_file_whose_name_forges_a_line_is_told_in_one(tmp_path):
     assert "a\\nforged: \\u001b[31m.toml: cannot be read: No such file" in line
     faults_of(Pipeline.from_toml, "x" * 5000)
     faults_of(Pipeline.from_toml, "a\0b")
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("command", "name"), [("plan", "deep.toml"), ("run", "bomb.toml"), ("run", "pipe.toml")]
-)
-def test_a_command_refuses_in_one_line_and_writes_nothing_else(command, name, tmp_path):
-    os.mkfifo(tmp_path / "pipe.toml")
-    (tmp_path / "bomb").write_bytes(png(60_000, 60_000, b"\0" * 10**6))
-    (tmp_path / "bomb.toml").write_text(FRAME % "bomb")
-    (tmp_path / "deep.toml").write_text("a" + ".a" * 100_000 + " = 1")
-    before = sorted(tmp_path.iterdir())
-    done = subprocess.run(
-        [sys.executable, "-m", "sweep", command, name], cwd=tmp_path, timeout=60,
-        capture_output=True, text=True, check=False,
-    )
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith(f"{name}: ")
-    assert done.stderr.count("\n") == 1
-    assert sorted(tmp_path.iterdir()) == before

@@ -1,11 +1,8 @@
 """What may surprise of poses is told in a line, by `plan` and at the start of a run."""
 
-import json
 
 import pytest
 
-from support.here import calls_here
-from sweep.cli import main
 from sweep.plan.facts import MAX_SAMPLE, notes, pose_facts
 from sweep.plan.pipeline import Pipeline
 
@@ -14,51 +11,39 @@ def told(pose, axes=None, **sections):
     return notes(Pipeline.from_dict({"pose": pose, "axes": axes or {}, **sections}))
 
 
-@pytest.mark.parametrize(
-    ("pose", "axes", "lines"),
-    [
-        ({"distance_m": 0.3}, {"tilt_deg": [0, 45, 80], "bearing_x_deg": [0, 4.9]}, []),
-        ({"distance_m": 0.3, "azimuth_deg": 90}, {"tilt_deg": [60], "bearing_x_deg": [-22, 22]},
-         [("off the optical axis the viewing angle differs from the tilt by up to 22° (tilt 60°, "
-          "viewing angle 38 to 82°): tilt_deg is to the image plane, view_angle_deg is to the line "
-          "of sight")]),
-        ({"distance_m": 0.3, "bearing_x_deg": 20}, {"yaw_deg": [0, 20]},
-         [("off the optical axis the viewing angle differs from the tilt by up to 20° (tilt 0 to "
-          "20°, viewing angle 0 to 20°): yaw_deg and pitch_deg are to the image plane, "
-          "view_angle_deg is to the line of sight")]),
-        ({"distance_m": 0.3, "bearing_x_deg": 20}, {"view_angle_deg": [0, 80]}, []),
-        ({"distance_m": 0.3}, {"tilt_deg": [0, 120]},
-         [("50 % of the poses show the marker's back or its edge (a viewing angle of 90° or more): "
-          "not_visible")]),
-        ({"distance_m": 0.3, "view_angle_deg": 0}, {"bearing_x_deg": [0, 35]},
-         [("50 % of the poses are outside the frame: not_visible; frame_x and frame_y place a "
-          "marker within it"),
-          ("distance_m counts along the optical axis: off it, the marker's centre is up to 1.22 "
-          "times as far away")]),
-        ({"distance_m": 0.3, "view_angle_deg": 0, "y_m": 0.134}, {"trial": 1},
-         ["all poses are cut off by the frame's edge"]),
-        ({"distance_m": 0.01, "frame_x": 0.5}, {},
-         [("all poses are cut off by the frame's edge; where the marker is too large for the "
-           "frame, frame_x and frame_y put it in the middle")]),
-        ({"distance_m": 0.3, "azimuth_deg": {"uniform": [0, 360]}}, {"trial": 4},
-         ["azimuth_deg has no effect: it is the direction of a tilt, and tilt_deg is 0"]),
-        ({"distance_m": 0.3}, {"azimuth_deg": [0, 90], "tilt_deg": [0, 30]}, []),
-        ({"distance_m": 0.3}, {"tilt_deg": [0, 0.785, 1.571]},
-         ["tilt_deg = 1.571: in degrees; 1.571 radians would be 90.01"]),
-        ({"distance_m": 0.3}, {"tilt_deg": [0, 0.001, 1, 2, 3, 4, 5]}, []),
-        ({"camera_z_m": 1, "marker_yaw_deg": 180}, {"marker_x_m": [-2, -1]},
-         ["all poses have a corner behind the camera: not_visible"]),
-        ({"marker_yaw_deg": 180}, {"marker_x_m": [-2, 0.3]},
-         ["50 % of the poses have a corner behind the camera: not_visible"]),
-        ({"camera_z_m": 1}, {"marker_x_m": [0.5], "marker_yaw_deg": [0, 180]},
-         ["all poses are not_visible:",
-          ("50 % of the poses show the marker's back or its edge (a viewing angle of 90° or more): "
-          "not_visible"),
-          "50 % of the poses are outside the frame of the camera: not_visible"]),
-    ],
-)
-def test_what_may_surprise_of_poses_is_a_line_each(pose, axes, lines):
-    assert told(pose, axes) == lines
+@pytest.mark.parametrize(("pose", "axes", "named"), [
+    ({"distance_m": 0.3}, {"tilt_deg": [0, 45, 80], "bearing_x_deg": [0, 4.9]}, []),
+    ({"distance_m": 0.3, "azimuth_deg": 90}, {"tilt_deg": [60], "bearing_x_deg": [-22, 22]},
+     ["by up to 22° (tilt 60°, viewing angle 38 to 82°): tilt_deg is to the image plane"]),
+    ({"distance_m": 0.3, "bearing_x_deg": 20}, {"yaw_deg": [0, 20]},
+     ["by up to 20° (tilt 0 to 20°, viewing angle 0 to 20°): yaw_deg and pitch_deg are to"]),
+    ({"distance_m": 0.3, "bearing_x_deg": 20}, {"view_angle_deg": [0, 80]}, []),
+    ({"distance_m": 0.3}, {"tilt_deg": [0, 120]}, ["50 % of the poses show the marker's back"]),
+    ({"distance_m": 0.3, "view_angle_deg": 0}, {"bearing_x_deg": [0, 35]},
+     ["50 % of the poses are outside the frame: not_visible; frame_x and frame_y",
+      "distance_m counts along the optical axis: off it, the marker's centre is up to 1.22 times"]),
+    ({"distance_m": 0.3, "view_angle_deg": 0, "y_m": 0.134}, {"trial": 1},
+     ["all poses are cut off by the frame's edge"]),
+    ({"distance_m": 0.01, "frame_x": 0.5}, {}, ["frame's edge; where the marker is too large"]),
+    ({"distance_m": 0.3, "azimuth_deg": {"uniform": [0, 360]}}, {"trial": 4},
+     ["azimuth_deg has no effect"]),
+    ({"distance_m": 0.3}, {"azimuth_deg": [0, 90], "tilt_deg": [0, 30]}, []),
+    ({"distance_m": 0.3}, {"tilt_deg": [0, 0.785, 1.571]},
+     ["tilt_deg = 1.571: in degrees; 1.571 radians would be 90.01"]),
+    ({"distance_m": 0.3}, {"tilt_deg": [0, 0.001, 1, 2, 3, 4, 5]}, []),
+    ({"camera_z_m": 1, "marker_yaw_deg": 180}, {"marker_x_m": [-2, -1]},
+     ["all poses have a corner behind the camera: not_visible"]),
+    ({"marker_yaw_deg": 180}, {"marker_x_m": [-2, 0.3]},
+     ["50 % of the poses have a corner behind the camera: not_visible"]),
+    ({"camera_z_m": 1}, {"marker_x_m": [0.5], "marker_yaw_deg": [0, 180]},
+     ["all poses are not_visible:", "50 % of the poses show the marker's back",
+      "50 % of the poses are outside the frame of the camera: not_visible"]),
+])
+def test_what_may_surprise_of_poses_is_a_line_each(pose, axes, named):
+    lines = told(pose, axes)
+    assert len(lines) == len(named), lines
+    for line, part in zip(lines, named, strict=True):
+        assert part in line
 
 
 def test_poses_of_a_large_grid_are_a_sample_with_its_corners():
@@ -76,30 +61,3 @@ def test_poses_of_a_large_grid_are_a_sample_with_its_corners():
     # tan 30.96° = 320 / 533.3 is the frame's edge: 9/40 of the bearings are outside: a share
     # of 600 poses is off by 0.11, six standard deviations, with a probability of 1e-9.
     assert abs(facts.outside.mean() - (1 - 30.96 / 40)) < 0.11
-
-
-def test_a_grid_of_any_size_is_looked_at():
-    for lengths in ({}, {"trial": 1}, {f"{name}_deg": [1, 2] for name in
-                                      ("tilt", "azimuth", "roll", "bearing_x", "bearing_y")}):
-        axes = {**lengths, "marker_id": {"range": [0, 50]}, "size_m": [0.01, 0.02, 0.03],
-                "fx_px": [500, 600], "quiet_zone_modules": [1, 2]}
-        facts = pose_facts(Pipeline.from_dict(
-            {"pose": {"distance_m": 1, "jitter_px": 0.5}, "axes": axes}
-        ))
-        assert 1 <= facts.sampled <= MAX_SAMPLE
-
-
-@pytest.mark.long
-def test_plan_says_how_the_marker_is_seen(tmp_path, capsys):
-    path = tmp_path / "seen.toml"
-    path.write_text("[pose]\ntilt_deg = 60\nazimuth_deg = 90\n[axes]\n"
-                    "bearing_x_deg = [-20, 20]\ndistance_m = [0.2, 0.4]\n")
-    with calls_here():
-        assert main(["plan", str(path)]) == 0
-        text = capsys.readouterr().out
-        assert main(["plan", str(path), "--json"]) == 0
-    content = json.loads(capsys.readouterr().out)
-    assert "Poses\n  tilt 60°, viewing angle 40 to 80°, 0.2128 to 0.4257 m away" in text
-    (line,) = content["notes"]
-    assert line in text
-    assert content["views"]["viewing_angle_deg"] == pytest.approx([40, 80])

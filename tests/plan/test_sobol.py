@@ -105,17 +105,6 @@ def test_a_draw_depends_on_its_own_cell_and_trial_alone():
     assert len(set(ours["tilt_deg"].tolist())) == 128
 
 
-def test_the_jitter_changes_no_other_quantity_of_the_same_cell():
-    # But for the cell's own value of jitter_px, which is part of its geometry.
-    even = drawn(pipeline("jitter_px=1"), np.zeros(64, dtype=int), np.arange(64))
-    for name in ("tilt_deg", "shift_u_px", "shift_v_px"):
-        per = 16 * np.array([0, 1, 2, 3])
-        for replicate in range(REPLICATES):
-            low, high = (0, 60) if name == "tilt_deg" else (-1, 1)
-            quarter = np.floor((even[name][per + replicate] - low) / (high - low) * 4)
-            assert sorted(quarter.tolist()) == [0, 1, 2, 3], name
-
-
 def test_what_a_calibration_gives_is_drawn_evenly_with_all_else():
     grid = pipeline(camera={"fx_px": 600, "calibration_sd": [5, 5, 2, 2]},
                     estimator={"believed": "calibration"})

@@ -99,25 +99,25 @@ def test_an_axis_that_is_almost_of_parameters_that_go_together_is_told_how_to_wr
                          "beside zip")
 
 
-@pytest.mark.parametrize("name", ["detection", "xyz", "jitter_u_px", "solved", "outcome", "cost"])
-def test_names_of_the_dataset_are_taken(name):
-    line = refused({name: {"zip": {"fx_px": [600, 800], "fy_px": [600, 800]}}})
-    assert line == f"axes.{name}: expected another name: the dataset or its analyses have this one"
+TOGETHER = {"zip": {"fx_px": [600, 800], "fy_px": [600, 800]}}
 
 
-def test_names_are_identifiers_and_no_parameters():
-    together = {"zip": {"fx_px": [600, 800], "fy_px": [600, 800]}}
-    assert "letters, digits and underscores" in refused({"my lens": together})
-    assert "an axis of tilt_deg alone" in refused({"tilt_deg": together})
-    assert "a whole number from 1" in refused({"trial": together})
+@pytest.mark.parametrize(("axes", "named"), [
+    *(({name: TOGETHER}, f"axes.{name}: expected another name: the dataset")
+      for name in ("detection", "xyz", "jitter_u_px", "solved", "outcome", "cost")),
+    ({"my lens": TOGETHER}, "letters, digits and underscores"),
+    ({"tilt_deg": TOGETHER}, "an axis of tilt_deg alone"),
+    ({"trial": TOGETHER}, "a whole number from 1"),
+    ({"fx_px": [1], "lens": TOGETHER}, "axes.fx_px is given too"),
+    ({"lens": TOGETHER, "fx_px": [1]}, "axes.lens.fx_px is given too"),
+    ({"a": TOGETHER, "b": TOGETHER}, "axes.a.fx_px is given too"),
+])
+def test_names_are_identifiers_of_their_own_and_a_member_is_given_once(axes, named):
+    assert named in refused(axes)
 
 
-def test_a_member_is_given_once():
-    two = {"fx_px": [600, 800], "fy_px": [600, 800]}
-    assert "axes.fx_px is given too" in refused({"fx_px": [1], "lens": {"zip": two}})
-    assert "axes.lens.fx_px is given too" in refused({"lens": {"zip": two}, "fx_px": [1]})
-    assert "axes.a.fx_px is given too" in refused({"a": {"zip": two}, "b": {"zip": two}})
-    assert "camera.fx_px is given too" in refused({"lens": {"zip": two}}, camera={"fx_px": 5})
+def test_a_member_that_is_fixed_is_given_twice():
+    assert "camera.fx_px is given too" in refused({"lens": TOGETHER}, camera={"fx_px": 5})
 
 
 def test_pairs_are_checked_and_not_their_product():

@@ -159,6 +159,13 @@ def values(**given):
     return value
 
 
+def through_lens(points, distortion):
+    """Distort normalised points (N, 2) with OpenCV."""
+    space = np.column_stack([points, np.ones(len(points))])
+    none = np.zeros(3)
+    return cv2.projectPoints(space, none, none, np.eye(3), np.array(distortion))[0][:, 0]
+
+
 def visible(value):
     """Tell whether a marker is seen from the front, well before the camera."""
     corners = vertices_of(value)[[0, 0, -1, -1], [0, -1, 0, -1]]

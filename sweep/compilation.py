@@ -64,10 +64,10 @@ def choose_when_compiled(
 ) -> None:
     """Let compiled callers of ``function`` call a choice by the first argument, a NamedTuple."""
 
-    def choose(*args):  # type: ignore[no-untyped-def]  # Numba compares annotations
+    def choose(*args: Any) -> Any:
         chosen = choices[args[0].instance_class]
 
-        def call(*args):  # type: ignore[no-untyped-def]
+        def call(*args: Any) -> Any:
             return chosen(*args)
 
         return call

@@ -88,14 +88,15 @@ def pose_covariance(information: Floats, variance: float, distance: float) -> tu
 # for at every step (Golub and Pereyra, "The differentiation of pseudo-inverses and nonlinear
 # least squares problems whose variables separate", SIAM J. Numer. Anal. 10, 1973).
 
-STATE_LENGTH = 17
+STATE_LENGTH = 18
 ROTATION, POSITION = slice(0, 9), slice(9, 12)
 DEPTH, SPREAD = 11, 12
 GREY_LEVELS = slice(13, 16)
-OUTSIDE, BLACK, WHITE, TONE = 13, 14, 15, 16
+OUTSIDE, BLACK, WHITE, OUTSIDE_SHARE, TONE = 13, 14, 15, 16, 17
 """A state vector: rotation matrix (row by row), position in metres, of which the last is the depth,
-standard deviation of the point spread in pixels, the levels of outside, black and white, and of
-photographs the tone curve (:mod:`sweep.measure.photograph_model`)."""
+standard deviation of the point spread in pixels, the levels of outside, black and white; and of
+photographs, as shares of the contrast, the level outside and the tone curve, for which slopes are
+computed (:mod:`sweep.measure.photograph_model`)."""
 
 MIN_SPREAD_PX = 0.1
 """Smallest point spread that is estimated; a smaller one becomes 0 and stays so."""
@@ -192,8 +193,8 @@ def noise_variance(noise_grey: float) -> float:
 
 
 def state_of(rotation: Floats, translation: Floats, spread_px: float, levels: Floats) -> Floats:
-    """Return the state (17,) of a pose (3, 3), (3,), a point spread, and levels (3,)."""
-    return np.concatenate([rotation.ravel(), translation, [spread_px], levels, [0.0]])
+    """Return the state (18,) of a pose (3, 3), (3,), a point spread, and levels (3,)."""
+    return np.concatenate([rotation.ravel(), translation, [spread_px], levels, np.zeros(2)])
 
 
 @compiled
@@ -466,7 +467,9 @@ def descend(
                 continue
             trial = moved_state(state, step[:, 0], view.least_spread_px)
             if is_before_camera(trial, view):
-                trial_squares = squared_residuals(seen, trial, work, trial_information, trial_gradient)
+                trial_squares = squared_residuals(
+                    seen, trial, work, trial_information, trial_gradient
+                )
                 if trial_squares < squares:
                     accepted = True
                     break

@@ -13,6 +13,7 @@ from sweep.measure.likelihood import (
     DEPTH,
     MODELS,
     OUTSIDE,
+    OUTSIDE_SHARE,
     SPREAD,
     TONE,
     WHITE,
@@ -369,7 +370,7 @@ def draw(view: PhotographView, state: Floats, work: System) -> None:
     (rates, outsides), images = work.slopes, work.images
     height, width = view.levels.shape
     add_plane(
-        work.slopes, view.marker.edges, np.array([outside_value(state), 0.0, 1.0]),
+        work.slopes, view.marker.edges, np.array([state[OUTSIDE_SHARE], 0.0, 1.0]),
         Projection(plane_of(state, view.marker), view.marker.optics), state[SPREAD],
         view.panel_px,
     )
@@ -391,15 +392,6 @@ def draw(view: PhotographView, state: Floats, work: System) -> None:
             by_spread[j] = gain * row[4 * j + 3]
         row[:] = 0.0
         steps[:] = 0.0
-
-
-@compiled
-def outside_value(state: Floats) -> float:
-    """Return the level outside, from black, as a share of the contrast."""
-    contrast = state[WHITE] - state[BLACK]
-    if contrast == 0.0:
-        return 0.0
-    return float(min(max((state[OUTSIDE] - state[BLACK]) / contrast, -1.0), MAX_OUTSIDE))
 
 
 @compiled
@@ -536,9 +528,12 @@ def _squares_of_photograph(
     )
     black, contrast, change, toned = linear[0], linear[1], linear[2], linear[3]
     # The level outside was in the image, as a share of the contrast.
-    state[OUTSIDE] = black + contrast * outside_value(state) + change
+    state[OUTSIDE] = black + contrast * state[OUTSIDE_SHARE] + change
     state[BLACK], state[WHITE] = black, black + contrast
-    state[TONE] = toned / contrast if contrast != 0.0 else 0.0
+    divisor = contrast if contrast != 0.0 else 1.0
+    share = state[OUTSIDE_SHARE] + min(max(change / divisor, -1.0), 1.0)
+    state[OUTSIDE_SHARE] = min(max(share, -1.0), MAX_OUTSIDE)
+    state[TONE] = toned / divisor
     for k in range(MOVED):
         gradient[k] *= contrast
         for m in range(MOVED):

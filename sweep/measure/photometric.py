@@ -151,7 +151,7 @@ def locate(
     coarse, coarse_work
         What is seen in the means of 2 x 2 pixels.
     starts
-        (K, 17) states; those behind the camera are skipped.
+        (K, 18) states; those behind the camera are skipped.
     search
         How far fits go.
     information
@@ -160,7 +160,7 @@ def locate(
     Returns
     -------
     tuple
-        The state (17,), its sum of squares, infinite without a pose, whether the minimum was
+        The state (18,), its sum of squares, infinite without a pose, whether the minimum was
         reached, and the state of the next best minimum; NaN if there is none.
     """
     count, free = len(starts), len(information)
@@ -414,7 +414,7 @@ def refined_quad(image: Grey, corners: Floats, modules: float) -> Floats | None:
 def start_states(
     poses: list[Pose], middle_m: Floats, spread_px: float
 ) -> Floats:
-    """Return the states (K, 17) of a target's middle at the finite ones of some poses."""
+    """Return the states (K, 18) of a target's middle at the finite ones of some poses."""
     states = [
         state_of(rotation, translation + rotation @ middle_m, spread_px, np.zeros(LEVELS))
         for rotation, translation in poses

@@ -462,23 +462,6 @@ def test_scenes_do_not_depend_on_which_others_are_needed(whole, kept_px, monkeyp
         assert (columns["detection"][k][~asked] == DetectionStatus.not_run).all()
 
 
-def test_a_mixture_of_scenes_is_as_each_of_them():
-    sides = (18, 60)
-    mixed = pipeline("side_px=[18, 60]", "noise_grey=[0, 3]", "trial=10", seed=19)
-    # In the order of the axes: whatever it is, each scene is found by its own indices.
-    names = [axis.name for axis in mixed.axes]
-    grid = np.indices([len(axis) for axis in mixed.axes]).reshape(3, -1)
-    order = np.random.default_rng(20).permutation(grid.shape[1])
-    index = dict(zip(names, grid[:, order], strict=True))
-    columns = run_cells(mixed, list(grid[:, order])).columns
-    for (k, side), (m, noise) in itertools.product(enumerate(sides), enumerate((0, 3))):
-        rows = np.flatnonzero((index["side_px"] == k) & (index["noise_grey"] == m))
-        rows = rows[np.argsort(index["trial"][rows])]
-        alone = run(10, f"side_px={side}", f"noise_grey={noise}", seed=19)
-        for name in ("estimate", "translation_error_m", "bound_std", "nees"):
-            assert same(alone.columns[name][0], columns[name][0][rows]), (name, side, noise)
-
-
 # Estimators of one's own.
 
 class Nothing:

@@ -26,8 +26,7 @@ from sweep.measure.bound import bound_of_scene
 from sweep.measure.estimation import Detections
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.measure.likelihood import BACKGROUND_MARGIN_PX, marker_view, noise_variance, state_of
-from sweep.measure.photograph import PhotometricReal
-from sweep.measure.photometric import Photometric
+from sweep.measure.photometric import Photometric, PhotometricReal
 from sweep.measure.surroundings import BoardMarker
 from sweep.model.board_kinds import Charuco
 from sweep.model.extent import marker_boxes
@@ -138,7 +137,7 @@ def of_photographs(side):
     spent, solved = [], []
     for every, effects in ((False, EFFECTS), (True, WEBCAM)):
         found = detections(side, effects)
-        solver = PhotometricReal(False, every, every, every, 1.0)
+        solver = PhotometricReal(refined=False, spread_free=True, tone=every)
         solved.append(np.mean(solver(found).status == EstimateStatus.solved))
         spent.append(best_ms(lambda s=solver, f=found: s(f), len(found.corners)))
     return side, *(f"{value:.3g}" for value in spent), f"{100 * min(solved):.0f}"
@@ -152,7 +151,7 @@ def main():
         each = np.median([measured(side, tilt) for tilt in TILTS], axis=0)
         row(side, *(f"{value:.3g}" for value in each))
     print()
-    header("side, px", "levels and blur, ms", "light, tone and sharpening too, ms", "solved, %")
+    header("side, px", "levels and blur, ms", "tone and other effects too, ms", "solved, %")
     for side in REAL_SIDES:
         row(*of_photographs(side))
 

@@ -54,7 +54,7 @@ def test_a_search_says_what_it_knows_once_and_names_the_command_that_goes_on(cap
     assert words[-4:] == ["--store", "runs/marker-limit-side_px-2.zarr",
                           "--reuse", "runs/marker-limit-side_px.zarr"]
     status, out, _ = told(capsys, *words[1:], "--json")
-    assert status == 0
+    assert status == 3
     assert json.loads(out)["store"].endswith("-2.zarr")
 
 

@@ -170,7 +170,7 @@ REQUIRE = Command(
 # ``sweep size``.
 
 UNDECIDED = 3
-"""Exit status where the most trials do not decide which choice is the best, or if any will do."""
+"""Exit status where the most trials do not decide the best choice, if any will do, or a limit."""
 
 
 def _add_arguments_size(parser: argparse.ArgumentParser) -> None:
@@ -300,14 +300,15 @@ def _execute_limit(options: argparse.Namespace, child: Child) -> int:
                 library.limit_figure.limit_panels(limits), output.suffix.lower()
             ),
         )
+    status = 0 if library.limit_figure.are_decided(limits).all() else UNDECIDED
     if options.json:
         print_json({**library.limit_figure.as_json(limits), "store": store})
-        return 0
+        return status
     print_table(library.limit_figure.limit_table(limits), options)
     for line in library.limit_figure.summary_lines(limits):
         say(f"- {line}" if options.markdown else line)
     say_next(f"sweep report {quoted(store)}")
-    return 0
+    return status
 
 
 LIMIT = Command(

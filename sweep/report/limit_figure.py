@@ -35,7 +35,7 @@ from sweep.report.charts import (
 from sweep.report.formatting import coordinate, coordinates, number, plural, short_coordinate
 from sweep.report.report_data import axis_label
 from sweep.report.table import Table
-from sweep.typing import Floats
+from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
 # Limits that requirements have along an axis, as a table for a terminal, a page, or JSON.
@@ -143,24 +143,35 @@ def beyond_text(one: xr.Dataset) -> str:
     return f"kept again by estimate, farthest at {with_unit(one, float(one['farthest_beyond']))}"
 
 
+def are_decided(limits: xr.Dataset) -> Masks:
+    """Return which limits are decided: to one value of the grid, or to the grid's hard end.
+
+    Where nothing could be judged there is nothing to decide, unless that is so everywhere.
+    """
+    reach = limits["reach"].values
+    met = limits["value"].values == limits[
+        "low" if limits.attrs["harder"] == "upwards" else "high"].values
+    judged = reach != Reach.not_run
+    decided = limits["settled"].values | ((reach == Reach.always) & met)
+    return np.asarray(decided & judged | ~judged & judged.any())
+
+
 def summary_lines(limits: xr.Dataset) -> list[str]:
     """Return sentences on all limits together."""
-    reach, settled = limits["reach"].values, limits["settled"].values
+    reach, decided = limits["reach"].values, are_decided(limits)
     count = reach.size
     along, upwards = limits.attrs["along"], limits.attrs["harder"] == "upwards"
-    met = limits["value"].values == limits["low" if upwards else "high"].values
-    decided = settled | (reach == Reach.not_run) | ((reach == Reach.always) & met)
     lines = []
     for flag, words in ((Reach.always, f"met at every value of {along}: the limit may lie beyond"),
                         (Reach.never, f"met at no value of {along}"),
                         (Reach.not_run, "nothing to judge")):
-        if number_of := int(((reach == flag) & decided).sum()):
+        if number_of := int(((reach == flag) & (decided | (reach == Reach.not_run))).sum()):
             lines.append(f"{plural(number_of, 'limit') if number_of < count else 'all'}: {words}")
     dips = int((limits["met_beyond"].values > 0).sum())
     if dips:
         lines.append(f"{plural(dips, 'condition')} with a dip: beyond it the estimates keep all "
                      "limits again, which the limit does not count")
-    if wide := int((~settled).sum()):
+    if wide := int((~decided & (reach != Reach.not_run)).sum()):
         lines.append(f"{plural(wide, 'limit')} of {count:,} {'is' if wide == 1 else 'are'} not "
                      "decided to one value of the grid: see the intervals; more --max-trials "
                      "decide more, unless a rate is all but the limit")

@@ -64,6 +64,7 @@ from sweep.report.scenes import (
 )
 from sweep.report.table import Table, markdown_text
 from sweep.report.tradeoff_figure import TRADE
+from sweep.store.files import write_whole
 from sweep.store.locations import enclosing_store, is_remote
 
 # --------------------------------------------------------------------------------------------------
@@ -475,7 +476,8 @@ def write_report(
         if figures is not None:
             figures.mkdir(exist_ok=True)
             for path in drawn:
-                write_output_file(figures / path.name, path.read_bytes())
+                with write_errors_explained(figures / path.name):  # through no link there
+                    write_whole(figures / path.name, path.read_bytes())
         if folder is not None and temporary is not None:
             _replace_folder(
                 Path(os.path.realpath(folder)), temporary / "figures", temporary / "old"

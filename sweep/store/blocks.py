@@ -407,6 +407,29 @@ def check_whole(store: RunStore, *, finished: bool | None = None) -> set[int]:
     )
 
 
+CHECKED_BLOCKS = 100
+"""Blocks, evenly over a store, of which its readers compare drawn coordinates with receipts."""
+
+
+def changed_draw(store: RunStore) -> str:
+    """Return the key of a drawn coordinate's chunk that is not as its receipt says; empty if none.
+
+    So chunks are found that were swapped, or written by another program. `sweep verify` looks at
+    all blocks; the store must be finished.
+    """
+    names = sorted(variable.name for variable in store.variables if variable.drawn_as)
+    if not names:
+        return ""
+    count = len(store.blocks)
+    numbers = sorted({k * count // CHECKED_BLOCKS for k in range(CHECKED_BLOCKS)})
+    wanted = {store.chunks.key(name, number): receipt.checksums[name]
+              for number, receipt in receipts(store, numbers)
+              for name in names if name in receipt.checksums}
+    contents = read_files(store.storage, list(wanted))
+    return next((key for (key, checksum), content in zip(wanted.items(), contents, strict=True)
+                 if content is None or checksum_of(content) != checksum), "")
+
+
 # --------------------------------------------------------------------------------------------------
 # Blocks of which nothing was needed, written together: flags alone, of few different contents.
 

@@ -34,7 +34,14 @@ from sweep.plan.sampling import texts_in
 from sweep.plan.schema import PHOTOGRAPH_SCHEMA, VARIABLES, with_descriptions
 from sweep.plan.toml_text import MAX_BYTES, read_document
 from sweep.plugins.declared import RECORDED, recorded_plugins
-from sweep.store.blocks import BEGUN, RunStore, check_whole, committed, run_metadata_in
+from sweep.store.blocks import (
+    BEGUN,
+    RunStore,
+    changed_draw,
+    check_whole,
+    committed,
+    run_metadata_in,
+)
 from sweep.store.chunks import Chunks
 from sweep.store.files import (
     absent_files,
@@ -454,9 +461,12 @@ def open_dataset(url: str | os.PathLike[str]) -> xr.Dataset:
     finished = store.finished
     done = check_whole(store, finished=finished)
     try:
-        if key := changed_coordinate(store):
+        key, origin = changed_coordinate(store), "its pipeline has it"
+        if finished and not key:
+            key, origin = changed_draw(store), "its block's receipt has it"
+        if key:
             raise StoreError(
-                f"{store.url}: damaged: {key} is not as its pipeline has it; "
+                f"{store.url}: damaged: {key} is not as {origin}; "
                 "`sweep verify --repair` repairs it"
             )
         with warnings.catch_warnings():

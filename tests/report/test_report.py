@@ -372,10 +372,14 @@ def test_a_trade_is_shown_where_the_store_has_one(odd, tmp_path):
 
 @pytest.mark.long
 def test_markdown_has_its_figures_beside_it_and_figures_go_where_they_are_asked(full, tmp_path):
-    output, folder = tmp_path / "answer.md", tmp_path / "pictures"
+    output, folder, mine = (tmp_path / name for name in ("answer.md", "pictures", "mine"))
+    folder.mkdir()
+    mine.write_text("mine")
+    for name in kinds(full):  # nothing is written through a link that waits
+        (folder / f"{name}.svg").symlink_to(mine)
     code, out, err = command("report", full, "-o", output, "--figures", folder)
-    assert (code, err) == (0, "")
-    assert out.startswith(f"{output}: 10 figures")
+    assert (code, err, mine.read_text()) == (0, "", "mine")
+    assert out.startswith(f"{output}: {len(kinds(full))} figures")
     text = output.read_text(encoding="utf-8")
     assert text.startswith('# All &lt;axes&gt; &amp; "kinds" of \\$figures\\$\n')
     linked = re.findall(r"!\[[^\]]*\]\(([^)]*)\)", text)

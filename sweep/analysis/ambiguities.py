@@ -128,7 +128,7 @@ def ambiguity(
     Returns
     -------
     xr.Dataset
-        Dimensions (*per, *configuration, *bins); lazy if ``results`` is. Intervals are in
+        Dimensions (*per, *configuration, *bins). Intervals are in
         ``x_low`` and ``x_high``.
 
         - ``solved``, ``flipped``, ``without_alternative``: solved poses, those of them that are
@@ -176,7 +176,7 @@ def ambiguity(
     if not (_is_number(min_kept) and 0.0 <= min_kept <= 1.0):
         raise ArgumentError("min_kept", min_kept, "expected a number from 0 to 1, such as 0.05")
     kept = kept_dimensions(results, (*as_names(per), *configuration_axes(results)))
-    statistics: list[Statistic[AmbiguousPoses, Any, Any, Any]] = [
+    statistics: list[Statistic[AmbiguousPoses]] = [
         Count(*SOLVED, lambda poses: poses.solved),
         Count(*FLIPPED, lambda poses: poses.flipped),
         Count("without_alternative", "solved poses without another solution",
@@ -249,10 +249,9 @@ def _along_thresholds(table: xr.Dataset, tried: Sequence[float]) -> xr.Dataset:
     """Return a table of variables at single thresholds as one of variables along them."""
     def along(name: str, end: str = "") -> xr.DataArray:
         parts = [table[_at(name, threshold, end)] for threshold in tried]
-        joined = xr.concat(
+        return xr.concat(
             parts, dim="threshold", coords="minimal", compat="override", join="exact",
         ).transpose(..., "threshold")
-        return joined.chunk({"threshold": -1}) if joined.chunks is not None else joined
 
     variables = {name: table[name] for name in ("solved", "flipped", "without_alternative")}
     for name, source, meaning in (
@@ -289,10 +288,8 @@ def _with_choice(
         "kept_flip_rate_low", "right_rejected_rate")]
     choice, *values = xr.apply_ufunc(
         functools.partial(_choose, flip_rate=flip_rate, min_kept=min_kept, tail=tail), *inputs,
-        input_core_dims=[["threshold"]] * len(inputs), dask="parallelized",
-        output_core_dims=[[]] * (1 + len(CHOSEN)),
-        output_dtypes=[np.uint8, *[np.float64] * len(CHOSEN)],
-    )
+        input_core_dims=[["threshold"]] * len(inputs),
+        output_core_dims=[[]] * (1 + len(CHOSEN)))
     chosen = {name: value.assign_attrs(cf_attributes(meaning, "1"))
               for (name, meaning), value in zip(CHOSEN.items(), values, strict=True)}
     chosen["choice"] = choice.assign_attrs(

@@ -14,7 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.analysis.aggregate import aggregate
-from sweep.analysis.binning import Arrays, Bins
+from sweep.analysis.binning import Bins
 from sweep.analysis.counts import Count, CountOfDraws, Rate, newcombe_and_mcnemar
 from sweep.analysis.dataset import (
     DRAWS,
@@ -45,7 +45,7 @@ from sweep.analysis.poses import (
     norm_squared,
     pose_arrays,
 )
-from sweep.analysis.statistic import Statistic
+from sweep.analysis.statistic import Arrays, Statistic
 from sweep.errors import ArgumentError, DatasetError, SweepError
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.messages import plain
@@ -200,7 +200,7 @@ def _rotation_shift(pair: Pair) -> Floats:
 # --------------------------------------------------------------------------------------------------
 # Two configurations on the same scenes, pose by pose: what differs, and whether it is chance.
 
-PairStatistic = Statistic[Pair, Any, Any, Any]
+PairStatistic = Statistic[Pair]
 
 ROTATION = QUANTITIES[0]
 
@@ -223,7 +223,7 @@ def compare(
     Returns
     -------
     xr.Dataset
-        Dimensions (*per, *bins); lazy if the datasets are.
+        Dimensions (*per, *bins).
 
         - ``compared``: poses that were looked for in both, and the ``draws`` they are worth.
           ``both_detected``, ``only_first_detected``, ``only_second_detected`` and
@@ -383,9 +383,7 @@ def _tested(table: xr.Dataset, level: float) -> dict[str, xr.DataArray]:
             "both", "only_first", "only_second", "neither")]
         arrays = xr.apply_ufunc(
             newcombe_and_mcnemar, *counts, table["draws"], table["drawn"],
-            kwargs={"level": level}, output_core_dims=[[]] * 4, dask="parallelized",
-            output_dtypes=[np.float64] * 4,
-        )
+            kwargs={"level": level}, output_core_dims=[[]] * 4)
         difference = f"{rate} rate, second minus first"
         meanings = {
             f"{rate}_difference": difference,
@@ -419,7 +417,7 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
     -------
     xr.Dataset
         Dimensions: renderer and those of the detector's settings; for the pose variables also
-        those of the estimator's. All others are pooled. Lazy if ``results`` is. The interval of
+        those of the estimator's. All others are pooled. The interval of
         ``x`` is in ``x_low`` and ``x_high``.
 
         - ``detection_disagreement``: share of the poses looked for with both (``compared``) that
@@ -554,7 +552,7 @@ def regressions(
     kept = kept_dimensions(new, tuple(dict.fromkeys((*configuration, *as_names(per)))))
     count = math.prod(new.sizes[name] for name in kept) * (1 + len(quantities))
     level = 1.0 - (1.0 - LEVEL) / count
-    table = paired_table(old, new, kept, None, quantities, level).compute()
+    table = paired_table(old, new, kept, None, quantities, level)
     if int(table["different_scenes"].sum()):
         raise DatasetError("the scenes of the two stores differ, so that nothing can be paired; "
                            "compare stores of one pipeline")

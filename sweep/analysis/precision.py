@@ -40,7 +40,7 @@ from sweep.typing import Floats, Masks
 # relative to the value. The intervals are those that the analysis shows of a store whose sampling
 # was stopped (`sweep.analysis.draws`).
 
-PoseStatistic = Statistic[Poses, Any, Any, Any]
+PoseStatistic = Statistic[Poses]
 
 MIN_DRAWS = 450
 """Draws below which no interval of a mean or a root mean square is narrow enough.
@@ -337,7 +337,7 @@ def precision_table(
           for each in precision.statistics(f"{number} ")),
     ]
     inputs = requirable_arrays(results, [each.requirable for each in precisions])
-    table = aggregate(results, inputs, kept, statistics, Poses, stopped=True).compute()
+    table = aggregate(results, inputs, kept, statistics, Poses, stopped=True)
     run, poses = (table[name].transpose(*kept) for name in ("run", "poses"))
     judged: dict[str, list[Any]] = {
         name: [] for name in ("value", "half_width", "reached", "used", "draws")}

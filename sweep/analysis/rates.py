@@ -98,7 +98,7 @@ def detection_rate(
     Returns
     -------
     xr.Dataset
-        Dimensions (*per, *bins); lazy if ``results`` is.
+        Dimensions (*per, *bins).
 
         - ``looked_for``: poses whose detection is none of not_run, not_visible, not_modelled, and
           ``detected`` of these.
@@ -145,7 +145,7 @@ def flip_rate(
     Returns
     -------
     xr.Dataset
-        Dimensions (*per, *bins); lazy if ``results`` is. ``flipped`` of ``solved`` poses, the
+        Dimensions (*per, *bins). ``flipped`` of ``solved`` poses, the
         ``draws`` that these are worth, and ``flip_rate`` with intervals as in `detection_rate`.
 
     Raises
@@ -211,7 +211,7 @@ def failure_composition(
     Returns
     -------
     xr.Dataset
-        Dimensions (*per, *bins, outcome); lazy if ``results`` is.
+        Dimensions (*per, *bins, outcome).
 
         - ``outcome``: solved, then the flags of detection and estimation with which a pose ends
           (`sweep.measure.flags.outcomes`).
@@ -285,7 +285,7 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     Returns
     -------
     xr.Dataset
-        Dimensions (*per, marker_id); lazy if ``results`` is.
+        Dimensions (*per, marker_id).
 
         - ``looked_for`` and ``detection_rate`` with its interval, as in
           `sweep.analysis.detection_rate`.
@@ -335,9 +335,7 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     hits = (counts["detected"] * n / counts["looked_for"]).where(n > 0, 0.0)
     strata = [n, n.sum("marker_id"), hits.sum("marker_id")]
     expected, variance, third = xr.apply_ufunc(
-        hypergeometric_moments, *strata, dask="parallelized", output_core_dims=[[]] * 3,
-        output_dtypes=[np.float64] * 3,
-    )
+        hypergeometric_moments, *strata, output_core_dims=[[]] * 3)
     sums = {name: array.sum(cells).transpose(*kept) for name, array in (
         ("n", n), ("hits", hits), ("expected", expected), ("variance", variance),
         ("third", third))}
@@ -345,20 +343,12 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     drawn = table["detection_rate_low"].notnull() & (not is_replicated(results))
     p_value = xr.apply_ufunc(
         two_sided, sums["hits"] - sums["expected"], sums["variance"], sums["third"],
-        dask="parallelized", output_dtypes=[np.float64],
     ).where(drawn)
-    whole = dict.fromkeys(p_value.dims, -1)
-    adjusted = xr.apply_ufunc(
-        holm, p_value.chunk(whole) if p_value.chunks else p_value, dask="parallelized",
-        output_dtypes=[np.float64],
-    )
+    adjusted = xr.apply_ufunc(holm, p_value)
     expected_rate = sums["expected"] / sums["n"]
     share = table["detection_rate"] / expected_rate
     rank = xr.apply_ufunc(
-        _rank, share.chunk(marker_id=-1) if share.chunks else share, dask="parallelized",
-        input_core_dims=[["marker_id"]], output_core_dims=[["marker_id"]],
-        output_dtypes=[np.float64],
-    )
+        _rank, share, input_core_dims=[["marker_id"]], output_core_dims=[["marker_id"]])
     below = table["detection_rate"] < expected_rate
     meanings = {
         "expected_rate": (expected_rate, "detection rate if all IDs were alike in each cell"),

@@ -109,7 +109,7 @@ class Requirable:
     """
 
     output: Output
-    statistics: Callable[[str, float], Sequence[Statistic[Poses, Any, Any, Any]]]
+    statistics: Callable[[str, float], Sequence[Statistic[Poses]]]
     inputs: tuple[str, ...]
     used: Callable[[Poses], Masks]
     exact: bool
@@ -156,7 +156,7 @@ class Requirable:
         """Level of the interval by which one condition is decided."""
         return EXACT_LEVEL if self.exact else MEAN_LEVEL
 
-    def computed(self, prefix: str, level: float) -> list[Statistic[Poses, Any, Any, Any]]:
+    def computed(self, prefix: str, level: float) -> list[Statistic[Poses]]:
         """Return the statistics, their variables' names beginning with a prefix."""
         return [*self.statistics(prefix, level), CountOfDraws(
             f"{prefix}used", "poses that count", self.used, f"{prefix}draws", f"{prefix}drawn")]
@@ -241,8 +241,8 @@ def _of_record(record: PoseStatistic, quantities: Sequence[Quantity]) -> list[Re
 
 
 def _renamed(
-    statistic: Statistic[Poses, Any, Any, Any], prefix: str, level: float
-) -> list[Statistic[Poses, Any, Any, Any]]:
+    statistic: Statistic[Poses], prefix: str, level: float
+) -> list[Statistic[Poses]]:
     """Return a statistic with another name and level; rates have Clopper and Pearson's interval."""
     if isinstance(statistic, Rate):
         return [dataclasses.replace(
@@ -258,7 +258,7 @@ def _renamed(
 def _of_ratio(ratio: BoundRatio) -> Requirable:
     bound, error = ratio.statistics()
 
-    def statistics(prefix: str, level: float) -> list[Statistic[Poses, Any, Any, Any]]:
+    def statistics(prefix: str, level: float) -> list[Statistic[Poses]]:
         return [*_renamed(bound, prefix, level), *_renamed(error, prefix, level)]
 
     return Requirable(
@@ -693,7 +693,7 @@ def decide(
               prefix, 1.0 - (1.0 - each.requirable.level) * share))),
     ]
     stopped = None if shares is None else False
-    table = aggregate(results, inputs, kept, statistics, Poses, bins, stopped=stopped).compute()
+    table = aggregate(results, inputs, kept, statistics, Poses, bins, stopped=stopped)
     if shares is None:
         _require_numbers(table, required)
     replicated = is_replicated(results)

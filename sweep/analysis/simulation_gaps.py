@@ -12,6 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.analysis.binning import PREFIX, Binning, Bins, image_sides, read_bins
+from sweep.analysis.counts import Rate
 from sweep.analysis.dataset import (
     DRAWS,
     axes_of,
@@ -22,7 +23,7 @@ from sweep.analysis.dataset import (
     parameter_value,
     require_poses,
 )
-from sweep.analysis.draws import PhotographRate, quantile_ends, quantile_of
+from sweep.analysis.draws import Design, Unit
 from sweep.analysis.intervals import (
     MIN_UNITS,
     percentile_interval,
@@ -30,6 +31,8 @@ from sweep.analysis.intervals import (
     unit_counts,
 )
 from sweep.analysis.poses import ERROR_INPUTS, Poses, norm_squared, pose_arrays
+from sweep.analysis.quantiles import quantile_intervals
+from sweep.analysis.statistic import Blocks
 from sweep.errors import DatasetError
 from sweep.messages import label, shown
 from sweep.plan.parameters import PARAMETERS, SIMULATED, Stage
@@ -349,6 +352,9 @@ SOURCES = ("photographs", "simulated")
 
 PERCENTS = {"median": 50, "p90": 90}
 
+BY_PHOTOGRAPH = Design(Unit.photograph)
+"""A photograph, or a scene of a simulation, is the draw."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Compared:
@@ -527,16 +533,14 @@ def _gap(pair: PairedUnits, inside: tuple[Masks, Masks]) -> dict[str, Any]:
 
 def _rates(rate: GapRate, sides: list[Units]) -> dict[str, Any]:
     """Return a rate of both, its difference, and their intervals."""
-    statistic: PhotographRate[Mapping[str, Masks]] = PhotographRate(
-        "rate", rate.meaning, lambda view: view["hit"], lambda view: view["used"]
-    )
     found = []
     for side in sides:
-        view = {
-            name: getattr(side, source)[:, None] for name, source in
-            (("hit", rate.successes), ("used", rate.used))
-        }
-        found.append(statistic.result(statistic.first_pass(view).fold()))
+        used = getattr(side, rate.used)
+        hit = getattr(side, rate.successes) & used
+        by_unit = {"hit": hit[:, None], "used": used[:, None]}
+        statistic: Rate[Mapping[str, Masks]] = Rate(
+            "rate", rate.meaning, lambda view: view["hit"], lambda view: view["used"])
+        found.append(statistic.variables(Blocks(by_unit, dict), BY_PHOTOGRAPH))
     value, low, high = (
         np.stack([each[name] for each in found]) for name in ("rate", "rate_low", "rate_high")
     )
@@ -558,13 +562,13 @@ def _quantiles(
         errors = np.abs(errors) if each.absolute else errors
         used = side.solved[configuration] & np.isfinite(errors)
         share = each.percent / 100.0
-        values.append(quantile_of(np.sort(errors[used]), share))
+        interval = quantile_intervals(
+            np.where(used, errors, np.nan)[None, None], used.sum(axis=1)[None, None],
+            [each.percent], BY_PHOTOGRAPH)[0, 0].tolist()
+        values.append(interval[0])
         replicates.append(resampled_quantiles(errors, used, drawn, share))
         units.append(int(used.any(axis=1).sum()))
-        ends.append(
-            quantile_ends(errors[used], np.nonzero(used)[0], share) if units[-1] >= MIN_UNITS
-            else (np.nan, np.nan)
-        )
+        ends.append(interval[1:] if units[-1] >= MIN_UNITS else (np.nan, np.nan))
     with np.errstate(divide="ignore", invalid="ignore"):
         gaps = replicates[1] / replicates[0] if each.ratio else replicates[1] - replicates[0]
         gap = np.divide(values[1], values[0]) if each.ratio else values[1] - values[0]

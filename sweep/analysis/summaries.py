@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -50,7 +49,7 @@ from sweep.typing import Floats, Masks
 # A new record here is all that a new statistic needs: the table of `error_statistics`, the
 # attributes of its variables and the report's table of errors follow from it.
 
-AnyPoseStatistic = Statistic[Poses, Any, Any, Any]
+AnyPoseStatistic = Statistic[Poses]
 
 
 @dataclass(frozen=True)
@@ -208,7 +207,7 @@ def error_statistics(
     Returns
     -------
     xr.Dataset
-        Dimensions (*per, *bins); lazy if ``results`` is. The interval of ``x`` is in ``x_low`` and
+        Dimensions (*per, *bins). The interval of ``x`` is in ``x_low`` and
         ``x_high``. The rotation error is in degrees, the range error is that of z in percent of
         the true z, the position error in metres.
 
@@ -335,7 +334,7 @@ def covariance_trust(
     Returns
     -------
     xr.Dataset
-        Dimensions (*per[, level]); lazy if ``results`` is. Without ``nees`` all is NaN and nothing
+        Dimensions (*per[, level]). Without ``nees`` all is NaN and nothing
         trusted.
 
         - ``nees_count``: estimates with a number. ``nees_mean``, expected to be 6, with Student's
@@ -419,14 +418,14 @@ def _scaled(results: xr.Dataset, nees: xr.DataArray, scale: xr.DataArray) -> xr.
     return nees * scale
 
 
-def _nees_statistics(limits: Sequence[float]) -> list[Statistic[Poses, Any, Any, Any]]:
+def _nees_statistics(limits: Sequence[float]) -> list[Statistic[Poses]]:
     """Return the mean of ``nees``, and the shares below each limit with two intervals.
 
     "coverage 0" has the interval of its level alone, "joint 0" that of all levels together.
     """
     joint = 1.0 - (1.0 - LEVEL) / len(limits)
 
-    statistics: list[Statistic[Poses, Any, Any, Any]] = [NEES_MEAN.statistic]
+    statistics: list[Statistic[Poses]] = [NEES_MEAN.statistic]
     for at, limit in enumerate(limits):
         def within(poses: Poses, most: float = limit) -> Masks:
             return np.asarray(_nees(poses) <= most)
@@ -462,7 +461,7 @@ def efficiency(
     Returns
     -------
     xr.Dataset
-        Dimensions (*per, *bins); lazy if ``results`` is.
+        Dimensions (*per, *bins).
 
         - ``rotation_efficiency``: sqrt(mean of the sum of the three bounds squared) over the RMS
           norm of the rotation error.

@@ -218,13 +218,6 @@ def test_every_value_lies_in_its_interval_and_is_described(mixed):
     assert low.attrs["description"].startswith("lower end of the 95 %")
 
 
-def test_lazy_arrays_give_the_same(mixed):
-    for function in (error_statistics, efficiency, covariance_trust):
-        lazy = function(mixed.chunk(trial=2), ["solver"])
-        assert all(array.chunks is not None for array in lazy.values())
-        xr.testing.assert_allclose(lazy.compute(), function(mixed, ["solver"]), rtol=1e-12)
-
-
 def test_a_share_that_was_not_solved_makes_quantiles_infinite():
     rng = np.random.default_rng(2)
     results = measured(rng, {"trial": 100}, {}, {})

@@ -27,6 +27,8 @@ from sweep.analysis.requirements import (
     Requirement,
     combined_decision,
     decide,
+    excess_of,
+    kept_by,
     parse_requirements,
 )
 from sweep.errors import ArgumentError, DatasetError, SweepError
@@ -80,8 +82,6 @@ def farthest_met(
           requirements keep their limits; NaN for never. ``start``: the value from which they do,
           which is the easiest, or the first of the longest run of values if they do not there:
           near 0 tilt poses flip, near the camera a marker is cut off.
-        - ``start_limited_by``, ``start_fails_at``, ``start_fails_where``, ``start_failing_value``:
-          as the following, of the value before ``start``.
         - ``low``, ``high``: ends of its interval, in the axis' unit. Up to the end nearer to the
           easy values they are decided to be met, beyond the other end a requirement is decided not
           to be met. -inf or inf: the limit may lie beyond the grid's end.
@@ -126,9 +126,7 @@ def farthest_met(
     if overlap:
         raise ArgumentError("at_all", ", ".join(overlap), "is in per, too; name it in one of them")
     table = decide(results, required, [*names, *together, along], shares=shares)
-    keeps = xr.zeros_like(table["value"], dtype=bool)
-    for k, each in enumerate(required):
-        keeps[{"requirement": k}] = each.holds(table["value"].isel(requirement=k))
+    keeps = kept_by(table, required)
     upwards = is_harder_upwards(results, along, keeps)
     order = np.argsort(values if upwards else -values, kind="stable")
     table, keeps = table.isel({along: order}), keeps.isel({along: order})
@@ -145,24 +143,22 @@ def farthest_met(
     shape = decision.transpose(*kept, along)
     out: dict[str, Any] = {name: np.full(shape.shape[:-1], np.nan) for name in (
         "value", "low", "high", "fails_at", "failing_value", "met_beyond", "farthest_beyond",
-        "start", "start_fails_at", "start_failing_value")}
+        "start")}
     out["reach"] = np.zeros(shape.shape[:-1], np.uint8)
     texts = {name: np.full(shape.shape[:-1], "", dtype=object) for name in (
-        "limited_by", "fails_where", "start_limited_by", "start_fails_where")}
+        "limited_by", "fails_where")}
     for index in np.ndindex(*shape.shape[:-1]):
         at = dict(zip(kept, index, strict=True))
         one = {"keeps": all_keep.isel(at).values, "judged": judged.isel(at).values,
                "decision": decision.isel(at).values}
-        numbers, before, beyond = _limit(values, upwards, **one)
+        numbers, failing = _limit(values, upwards, **one)
         for name, number in numbers.items():
             out[name][index] = number
-        for which, failing in (("start_", before), ("", beyond)):
-            if failing is None:
-                continue
+        if failing is not None:
             cell = {**at, along: failing}
             words = _cause(table.isel(cell), keeps.isel(cell), together)
-            texts[f"{which}limited_by"][index], texts[f"{which}fails_where"][index] = words[:2]
-            out[f"{which}failing_value"][index] = words[2]
+            texts["limited_by"][index], texts["fails_where"][index] = words[:2]
+            out["failing_value"][index] = words[2]
     units = str(results[along].attrs.get("units", ""))
     meanings = {
         "value": f"{along} up to which all requirements are met",
@@ -170,15 +166,13 @@ def farthest_met(
         "high": f"upper end of the interval: {along} up to which all are met",
         "start": f"{along} from which all requirements are met",
         "fails_at": f"first {along} at which one is not",
-        "start_fails_at": f"last {along} before the start at which one is not",
-        "start_failing_value": "value of the requirement that fails there",
         "farthest_beyond": f"farthest {along} beyond it at which all are met again",
         "failing_value": "value of the requirement that fails there",
         "met_beyond": "values beyond it at which all are met again",
     }
     variables: dict[str, Any] = {
         name: (kept, out[name], {"long_name": meaning, "units": {
-            "failing_value": "", "start_failing_value": "", "met_beyond": "1"}.get(name, units)})
+            "failing_value": "", "met_beyond": "1"}.get(name, units)})
         for name, meaning in meanings.items()}
     variables["reach"] = (kept, out["reach"], cf_attributes(
         "how far the requirements are met", flags=Reach))
@@ -257,13 +251,10 @@ def easier_first(keeps: NDArray[Any], values: NDArray[Any]) -> bool:
 def _limit(
     values: np.ndarray[Any, Any], upwards: bool, *, keeps: np.ndarray[Any, Any],
     judged: np.ndarray[Any, Any], decision: np.ndarray[Any, Any],
-) -> tuple[dict[str, float], int | None, int | None]:
-    """Return the limit along the axis, from easy to hard, and the indices of failures around it.
-
-    The first is that before the values at which all are met, the second that beyond.
-    """
+) -> tuple[dict[str, float], int | None]:
+    """Return the limit along the axis, from easy to hard, and the index of the failure beyond."""
     if not judged.any():
-        return {"reach": Reach.not_run}, None, None
+        return {"reach": Reach.not_run}, None
     none, beyond = (-np.inf, np.inf) if upwards else (np.inf, -np.inf)
     run = met_run(keeps, judged)
     before_run = np.nonzero(~keeps & judged)[0]
@@ -288,19 +279,16 @@ def _limit(
                "met_beyond": 0.0}
     if run:
         numbers["start"] = float(values[run[0]])
-    easier = int(before_run[-1]) if before_run.size else None
-    if easier is not None:
-        numbers["start_fails_at"] = float(values[easier])
     if not len(failing):
-        return {**numbers, "reach": Reach.always if easier is None else Reach.within}, easier, None
+        return {**numbers, "reach": Reach.within if before_run.size else Reach.always}, None
     first = int(failing[0])
     again = np.nonzero(keeps & judged)[0]
     again = again[again > first]
     numbers |= {"fails_at": float(values[first]), "met_beyond": float(len(again)),
                 "farthest_beyond": float(values[again[-1]]) if len(again) else np.nan,
                 "reach": Reach.never if run is None else
-                Reach.found if easier is None else Reach.within}
-    return numbers, easier, first
+                Reach.within if before_run.size else Reach.found}
+    return numbers, first
 
 
 def met_run(
@@ -332,9 +320,7 @@ def _cause(
 ) -> tuple[str, str, float]:
     """Return which requirement fails worst, where among ``together``, and its value there."""
     failing = ~keeps & (cell["decision"] != Decision.not_applicable)
-    ratio = cell["value"] / cell["limit"]
-    at_least = cell["relation"].isin([">=", ">"])
-    excess = (1.0 - ratio).where(at_least, 1.0 - 1.0 / ratio).fillna(np.inf).where(failing)
+    excess = excess_of(cell).where(failing)
     flat = excess.stack(all_dims=excess.dims)
     worst = flat.isel(all_dims=int(flat.argmax("all_dims")))
     at = {name: worst[name].item() for name in excess.dims}

@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import math
 import re
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -973,11 +974,13 @@ def _verdict(
     one: xr.Dataset, configuration: Sequence[str], conditions: Sequence[str]
 ) -> Verdict:
     """Return the verdict of a table (*conditions) of one configuration and requirement."""
-    decisions = one["decision"].transpose(*conditions).values
+    one = one.transpose(*conditions)
+    decisions = one["decision"].values
     counts = {each: count for each in Decision if (count := int((decisions == each).sum()))}
     order = (Decision.not_met, Decision.undecided, Decision.met, Decision.not_applicable)
     decision = next(each for each in order if each in counts)
-    index = worst_condition(one.transpose(*conditions), decisions == decision)
+    among = np.where(decisions == decision, excess_of(one).values, -np.inf)
+    index = np.unravel_index(int(np.argmax(among)), among.shape)
     cell = one.isel(dict(zip(conditions, index, strict=True)))
     needed = one["draws_needed"].values[decisions == Decision.undecided]
     return Verdict(
@@ -989,12 +992,24 @@ def _verdict(
             np.isfinite(needed) | np.isinf(needed)).any() else math.nan, counts)
 
 
-def worst_condition(one: xr.Dataset, among: np.ndarray[Any, Any]) -> tuple[int, ...]:
-    """Return the index of the value that is farthest on the wrong side of the limit."""
-    value, limit = one["value"].values, float(one["limit"])
-    excess = limit - value if one["relation"].item() in (">=", ">") else value - limit
-    excess = np.where(among, np.nan_to_num(excess, nan=np.inf, posinf=np.inf), -np.inf)
-    return tuple(map(int, np.unravel_index(int(np.argmax(excess)), excess.shape)))
+def excess_of(table: xr.Dataset) -> xr.DataArray:
+    """Return how far the values of a table are beyond the limits, relative to these.
+
+    It is infinite for no number, finite and negative on the right side of the limit.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = table["value"] / table["limit"]
+        at_least = table["relation"].isin([">=", ">"])
+        excess = (1.0 - ratio).where(at_least, 1.0 - 1.0 / ratio)
+    return excess.clip(min=-sys.float_info.max).fillna(np.inf)
+
+
+def kept_by(table: xr.Dataset, required: Sequence[Requirement]) -> xr.DataArray:
+    """Return where the values of a table (..., requirement) keep their limits."""
+    return xr.concat([
+        each.holds(table["value"].isel(requirement=k)) for k, each in enumerate(required)],
+        "requirement", coords="minimal", compat="override", join="exact",
+    ).transpose(*table["value"].dims)
 
 
 def described(values: Mapping[str, Any]) -> str:

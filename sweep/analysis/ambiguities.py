@@ -24,12 +24,13 @@ from sweep.analysis.dataset import (
     describes,
     is_sampling_stopped,
     kept_dimensions,
+    stacked,
 )
 from sweep.analysis.draws import TAIL_SHARE
 from sweep.analysis.intervals import TAIL, clopper_pearson
 from sweep.analysis.poses import ESTIMATE_INPUTS, Poses, pose_arrays
 from sweep.analysis.rates import FLIPPED, SOLVED
-from sweep.analysis.statistic import Statistic
+from sweep.analysis.statistic import INTERVAL, Statistic
 from sweep.errors import ArgumentError
 from sweep.measure.flags import Flag, flag
 from sweep.plan.schema import cf_attributes
@@ -248,10 +249,7 @@ def _at(name: str, threshold: float, end: str = "") -> str:
 def _along_thresholds(table: xr.Dataset, tried: Sequence[float]) -> xr.Dataset:
     """Return a table of variables at single thresholds as one of variables along them."""
     def along(name: str, end: str = "") -> xr.DataArray:
-        parts = [table[_at(name, threshold, end)] for threshold in tried]
-        return xr.concat(
-            parts, dim="threshold", coords="minimal", compat="override", join="exact",
-        ).transpose(..., "threshold")
+        return stacked([table[_at(name, threshold, end)] for threshold in tried], "threshold")
 
     variables = {name: table[name] for name in ("solved", "flipped", "without_alternative")}
     for name, source, meaning in (
@@ -261,8 +259,7 @@ def _along_thresholds(table: xr.Dataset, tried: Sequence[float]) -> xr.Dataset:
     ):
         variables[name] = along(source).assign_attrs(cf_attributes(meaning, "1"))
     for name, meaning in RATES.items():
-        for end, words in (("", ""), ("_low", "lower end of the 95 % interval: "),
-                           ("_high", "upper end of the 95 % interval: ")):
+        for end, words in INTERVAL.items():
             variables[f"{name}{end}"] = along(name, end).assign_attrs(
                 cf_attributes(words + meaning, "1"))
     coordinates = {"threshold": ("threshold", list(tried), cf_attributes(

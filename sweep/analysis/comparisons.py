@@ -43,7 +43,7 @@ from sweep.analysis.poses import (
     norm_squared,
     pose_arrays,
 )
-from sweep.analysis.statistic import Arrays, Statistic
+from sweep.analysis.statistic import INTERVAL, Arrays, Statistic
 from sweep.errors import ArgumentError, DatasetError, SweepError
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.messages import plain
@@ -384,9 +384,7 @@ def _tested(table: xr.Dataset, level: float) -> dict[str, xr.DataArray]:
             kwargs={"level": level}, output_core_dims=[[]] * 4)
         difference = f"{rate} rate, second minus first"
         meanings = {
-            f"{rate}_difference": difference,
-            f"{rate}_difference_low": f"lower end of the 95 % interval: {difference}",
-            f"{rate}_difference_high": f"upper end of the 95 % interval: {difference}",
+            **{f"{rate}_difference{end}": words + difference for end, words in INTERVAL.items()},
             f"{rate}_p_value": f"chance that the discordant counts differ so much if the {rate} "
                                "rates are equal (McNemar, exact)",
         }
@@ -771,8 +769,10 @@ class _Total(NamedTuple):
 def _total(shifts: Sequence[_Shift], configurations: int) -> _Total:
     """Return the sums over shifts of several kinds of items."""
     none = np.zeros(configurations, dtype=np.int64)
-    counts = [sum((mask.sum(axis=(0, 2)) for mask in masks), none)
-              for masks in zip(*(each[:3] for each in shifts), strict=True)] or [none] * 3
+    compared, once, differing = (
+        none + sum(mask.sum(axis=(0, 2)) for mask in masks) for masks in (
+            [each.both for each in shifts], [each.once for each in shifts],
+            [each.differ for each in shifts]))
     numbers = [np.nonzero(each.differ)[1] for each in shifts]
     units = zip(*(each.distances for each in shifts), strict=True) if shifts else [()]
     statistics = []
@@ -784,7 +784,7 @@ def _total(shifts: Sequence[_Shift], configurations: int) -> _Total:
         statistics.append(np.array([
             [*np.quantile(each, (0.5, 0.99)), each.max()] if each.size
             else [np.nan] * len(STATISTICS) for each in values]))
-    return _Total(*counts, statistics)
+    return _Total(compared, once, differing, statistics)
 
 
 def _column(

@@ -201,6 +201,13 @@ def require_dimension(results: xr.Dataset, *names: str) -> str:
                        f"there are {', '.join(axes) or 'none'}")
 
 
+def stacked(arrays: Sequence[xr.DataArray], dim: str) -> xr.DataArray:
+    """Return arrays of the same coordinates as one, whose last dimension is a new one."""
+    return xr.concat(
+        arrays, dim=dim, coords="minimal", compat="override", join="exact",
+    ).transpose(..., dim)
+
+
 # --------------------------------------------------------------------------------------------------
 # Values of a parameter, from a dataset's coordinates or the pipeline in its attributes.
 

@@ -106,7 +106,7 @@ class WantedPrecision:
         """
         parts = list(self.requirable.computed(prefix, LEVEL))
         if self._spread:
-            parts += requirables()[self._spread].statistics(f"{prefix}of ", LEVEL)
+            parts.append(requirables()[self._spread].renamed(f"{prefix}of ", LEVEL))
         return parts
 
     @property

@@ -21,9 +21,11 @@ from sweep.analysis.dataset import (
     is_grid_axis,
     kept_dimensions,
     require_dimension,
+    stacked,
 )
 from sweep.analysis.draws import is_replicated, with_common_trials
 from sweep.analysis.poses import DETECTION_INPUTS, ESTIMATE_INPUTS, Poses, pose_arrays
+from sweep.analysis.statistic import INTERVAL
 from sweep.errors import ArgumentError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, outcomes
 from sweep.typing import Floats, Masks
@@ -246,13 +248,10 @@ def failure_composition(
     for name, begin, end, meaning in (
         ("count", "count ", "", "poses that ended so"),
         ("share", "share ", "", "share of the poses looked for"),
-        ("share_low", "share ", "_low", "lower end of the 95 % interval: share"),
-        ("share_high", "share ", "_high", "upper end of the 95 % interval: share"),
+        ("share_low", "share ", "_low", f"{INTERVAL['_low']}share"),
+        ("share_high", "share ", "_high", f"{INTERVAL['_high']}share"),
     ):
-        parts = [table[f"{begin}{outcome}{end}"] for outcome in OUTCOMES]
-        values = xr.concat(
-            parts, dim="outcome", coords="minimal", compat="override", join="exact",
-        ).transpose(..., "outcome")
+        values = stacked([table[f"{begin}{outcome}{end}"] for outcome in OUTCOMES], "outcome")
         if name != "count":
             values = values.where(is_counted)
         variables[name] = values.assign_attrs(long_name=meaning, units="1")

@@ -10,7 +10,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import xarray as xr
@@ -27,6 +27,7 @@ from sweep.analysis.dataset import (
     configuration_axes,
     describes,
     kept_dimensions,
+    stacked,
 )
 from sweep.analysis.detection_limits import SIZE_AXES
 from sweep.analysis.draws import is_replicated
@@ -47,7 +48,6 @@ from sweep.analysis.statistic import Output, Statistic
 from sweep.analysis.summaries import (
     NEES_MEAN,
     RATIOS,
-    BoundRatio,
     PoseStatistic,
     bound_arrays,
     quantiles_of,
@@ -93,10 +93,10 @@ class Requirable:
     ----------
     output
         Its name, meaning and units.
-    statistics
-        The statistics that it is computed of, their variables' names beginning with a prefix.
+    statistic
+        What computes it.
     inputs
-        Names of the arrays that they read, as in `sweep.analysis.poses.pose_arrays`.
+        Names of the arrays that it reads, as in `sweep.analysis.poses.pose_arrays`.
     used
         The poses that count.
     exact
@@ -105,19 +105,15 @@ class Requirable:
         The largest value that exists.
     signed
         Whether the value has a sign: its absolute value is required.
-    numerator
-        Of a ratio of a bound to an error, the name of the bound; else empty.
     """
 
     output: Output
-    statistics: Callable[[str, float], Sequence[Statistic[Poses]]]
+    statistic: Statistic[Poses]
     inputs: tuple[str, ...]
     used: Callable[[Poses], Masks]
     exact: bool
     largest: float
     signed: bool = False
-    numerator: str = ""
-    denominator: str = ""
 
     @property
     def name(self) -> str:
@@ -157,19 +153,27 @@ class Requirable:
         """Level of the interval by which one condition is decided."""
         return EXACT_LEVEL if self.exact else MEAN_LEVEL
 
+    def renamed(self, prefix: str, level: float) -> Statistic[Poses]:
+        """Return what computes it, with another level; its variables' names begin with a prefix.
+
+        Rates have Clopper and Pearson's interval.
+        """
+        statistic: Any = self.statistic
+        changes: dict[str, Any] = {"exact": True} if isinstance(statistic, Rate) else {}
+        if isinstance(statistic, Quantiles):
+            changes["with_reason"] = False
+        return cast("Statistic[Poses]", dataclasses.replace(
+            statistic, name=f"{prefix}{statistic.name}", level=level, **changes))
+
     def computed(self, prefix: str, level: float) -> list[Statistic[Poses]]:
         """Return the statistics, their variables' names beginning with a prefix."""
-        return [*self.statistics(prefix, level), CountOfDraws(
+        return [self.renamed(prefix, level), CountOfDraws(
             f"{prefix}used", "poses that count", self.used, f"{prefix}draws", f"{prefix}drawn")]
 
     def interval(
         self, table: xr.Dataset, prefix: str
     ) -> tuple[xr.DataArray, xr.DataArray, xr.DataArray]:
         """Return value, low and high from the table of `computed`."""
-        if self.numerator:
-            least, error = table[prefix + self.numerator], prefix + self.denominator
-            return (least / table[error], least / table[f"{error}_high"],
-                    least / table[f"{error}_low"])
         value, low, high = (table[f"{prefix}{self.name}{end}"] for end in ("", "_low", "_high"))
         if not self.signed:
             return value, low, high
@@ -213,10 +217,9 @@ def requirables() -> dict[str, Requirable]:
     """
     signed = [each for group in SIGNED.values() for each in group]
     quantities = [*QUANTITIES, *signed]
-    records = [*registered(quantities), *map(quantiles_of, signed), NEES_MEAN]
-    found = [each for record in records for each in _of_record(record, quantities)]
-    found += [_of_ratio(ratio) for ratio in RATIOS]
-    return {each.name: each for each in found}
+    records = [*registered(quantities), *map(quantiles_of, signed), NEES_MEAN,
+               *(PoseStatistic(ratio, (*ERROR_INPUTS, BOUND)) for ratio in RATIOS)]
+    return {each.name: each for record in records for each in _of_record(record, quantities)}
 
 
 def _of_record(record: PoseStatistic, quantities: Sequence[Quantity]) -> list[Requirable]:
@@ -237,34 +240,8 @@ def _of_record(record: PoseStatistic, quantities: Sequence[Quantity]) -> list[Re
         largest = quantity.bound
     signed = type(statistic) is Mean
     return [Requirable(
-        output, functools.partial(_renamed, statistic), record.inputs, used, exact, largest, signed)
+        output, statistic, record.inputs, used, exact, largest, signed)
         for name, output in outputs.items() if f"{name}_low" in outputs]
-
-
-def _renamed(
-    statistic: Statistic[Poses], prefix: str, level: float
-) -> list[Statistic[Poses]]:
-    """Return a statistic with another name and level; rates have Clopper and Pearson's interval."""
-    if isinstance(statistic, Rate):
-        return [dataclasses.replace(
-            statistic, name=f"{prefix}{statistic.name}", level=level, exact=True)]
-    if isinstance(statistic, Quantiles):
-        return [dataclasses.replace(
-            statistic, name=f"{prefix}{statistic.name}", level=level, with_reason=False)]
-    if isinstance(statistic, FlipMixture | Mean):
-        return [dataclasses.replace(statistic, name=f"{prefix}{statistic.name}", level=level)]
-    raise TypeError(statistic)
-
-
-def _of_ratio(ratio: BoundRatio) -> Requirable:
-    bound, error = ratio.statistics()
-
-    def statistics(prefix: str, level: float) -> list[Statistic[Poses]]:
-        return [*_renamed(bound, prefix, level), *_renamed(error, prefix, level)]
-
-    return Requirable(
-        ratio.output, statistics, (*ERROR_INPUTS, BOUND), error.used, exact=False, largest=math.inf,
-        numerator=bound.name, denominator=error.name)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -651,9 +628,7 @@ def check_requirements(
         draws_needed(each, one["value"], one["low"], one["high"], one["draws"], share,
                      one["decision"] == Decision.undecided)
         for number, each in enumerate(required) for one in [table.isel(requirement=number)]]
-    return table.assign(draws_needed=xr.concat(
-        needed, "requirement", coords="minimal", compat="override", join="exact").transpose(
-        *table["value"].dims).assign_attrs(
+    return table.assign(draws_needed=stacked(needed, "requirement").assign_attrs(
         long_name="draws that would decide it, if the value stays", units="1"))
 
 
@@ -1006,10 +981,8 @@ def excess_of(table: xr.Dataset) -> xr.DataArray:
 
 def kept_by(table: xr.Dataset, required: Sequence[Requirement]) -> xr.DataArray:
     """Return where the values of a table (..., requirement) keep their limits."""
-    return xr.concat([
-        each.holds(table["value"].isel(requirement=k)) for k, each in enumerate(required)],
-        "requirement", coords="minimal", compat="override", join="exact",
-    ).transpose(*table["value"].dims)
+    keeps = [each.holds(table["value"].isel(requirement=k)) for k, each in enumerate(required)]
+    return stacked(keeps, "requirement").transpose(*table["value"].dims)
 
 
 def described(values: Mapping[str, Any]) -> str:

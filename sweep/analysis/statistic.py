@@ -293,18 +293,19 @@ class Output:
         return cf_attributes(self.meaning, self.units, self.flags)
 
 
+INTERVAL = {"": "", "_low": "lower end of the 95 % interval: ",
+            "_high": "upper end of the 95 % interval: "}
+"""Endings of names, of a value and of its interval's ends, with what meanings begin with."""
+
+
 def with_interval(name: str, meaning: str, units: str) -> list[Output]:
     """Return a variable and the ends of its interval."""
-    return [
-        Output(name, meaning, units),
-        Output(f"{name}_low", f"lower end of the 95 % interval: {meaning}", units),
-        Output(f"{name}_high", f"upper end of the 95 % interval: {meaning}", units),
-    ]
+    return [Output(f"{name}{end}", words + meaning, units) for end, words in INTERVAL.items()]
 
 
 def interval_variables(name: str, interval: Sequence[NDArray[Any]]) -> Variables:
     """Return a value and the ends of its interval, (value, low, high), by name."""
-    return dict(zip((name, f"{name}_low", f"{name}_high"), interval, strict=True))
+    return {f"{name}{end}": each for end, each in zip(INTERVAL, interval, strict=True)}
 
 
 class Statistic(ABC, Generic[ViewT]):

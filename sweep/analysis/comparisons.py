@@ -59,6 +59,9 @@ from sweep.typing import Floats, Integers, Masks
 TRUTH = ("true_tvec_m", "true_rvec")
 """Variables that are the same for both poses of a pair."""
 
+DIFFERING = "differing"
+"""Name of the mask of the pairs whose truth differs."""
+
 
 class Pair:
     """The poses of two datasets, pose by pose.
@@ -71,6 +74,7 @@ class Pair:
 
     def __init__(self, arrays: Arrays) -> None:
         self.first, self.second = Poses(arrays, "first "), Poses(arrays, "second ")
+        self._arrays = arrays
 
     @property
     def draws(self) -> Masks:
@@ -85,9 +89,7 @@ class Pair:
     @property
     def differing(self) -> Masks:
         """Poses whose truth differs."""
-        names = [name for name in TRUTH if name in self.first and name in self.second]
-        differ = [(self.first[name] != self.second[name]).any(axis=-1) for name in names]
-        return np.asarray(np.any(differ, axis=0))
+        return self._arrays[DIFFERING]
 
     @property
     def both_solved(self) -> Masks:
@@ -291,7 +293,11 @@ def paired_table(
            and not (name in second.coords and value.equals(second.coords[name]))]
     first = first.drop_vars(own)  # such as the name of its solver
     names = dict.fromkeys(name for quantity in quantities for name in quantity.inputs)
-    inputs = paired_arrays(*(_errors_and_truth(side, names) for side in (first, second)))
+    inputs = paired_arrays(*(
+        pose_arrays(side, (*ERROR_INPUTS, *names)) for side in (first, second)))
+    inputs[DIFFERING] = sum(
+        ((first[name] != second[name]).any("xyz").reset_coords(drop=True)
+         for name in TRUTH if name in first and name in second), xr.DataArray(False))
     statistics: list[PairStatistic] = [
         *_agreement("detected", lambda poses: poses.detected),
         *_agreement("solved", lambda poses: poses.solved),
@@ -316,11 +322,6 @@ def _of_common_trials(
         return first, second
     common = np.intersect1d(first[DRAWS].values, second[DRAWS].values)
     return first.sel({DRAWS: common}), second.sel({DRAWS: common})
-
-
-def _errors_and_truth(results: xr.Dataset, names: Iterable[str]) -> dict[str, xr.DataArray]:
-    truth = (name for name in TRUTH if name in results)
-    return pose_arrays(results, (*ERROR_INPUTS, *names, *truth))
 
 
 def _agreement(ending: str, reached: Callable[[Poses], Masks]) -> list[PairStatistic]:

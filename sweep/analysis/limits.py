@@ -17,7 +17,7 @@ from sweep.analysis.dataset import (
     axes_of,
     configuration_axes,
     describes,
-    stored_pipeline,
+    stopping_rule,
 )
 from sweep.analysis.draws import computed_scenes
 from sweep.analysis.intervals import looks_factor
@@ -31,7 +31,7 @@ from sweep.analysis.requirements import (
     kept_by,
     parse_requirements,
 )
-from sweep.errors import ArgumentError, DatasetError, SweepError
+from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import Flag, flag
 from sweep.plan.sampling import LimitRule
 from sweep.plan.schema import cf_attributes
@@ -388,7 +388,8 @@ def requirement_limits(
     >>> limit["value"].item(), limit["low"].item(), limit["high"].item()
     (20.0, 20.0, 40.0)
     """
-    rule = _searched(results)
+    rule = stopping_rule(results)
+    rule = rule if isinstance(rule, LimitRule) else None
     require = [require] if isinstance(require, str) and require else require
     if not require or not along:
         if rule is None:
@@ -416,12 +417,3 @@ def requirement_limits(
     found["poses"] = computed.sum([*cells, along]).compute().assign_attrs(
         long_name="scenes that were computed, of all values", units="1")
     return found.assign_attrs(per=[*per], at_all=at_all, require=[*require])
-
-
-def _searched(results: xr.Dataset) -> LimitRule | None:
-    """Return the search that a dataset is of; None if it is of none."""
-    try:
-        rule = stored_pipeline(results).stopping
-    except (KeyError, SweepError):
-        return None
-    return rule if isinstance(rule, LimitRule) else None

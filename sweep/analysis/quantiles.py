@@ -207,3 +207,18 @@ def interval_ranks(n: int, percent: int, level: float = LEVEL) -> tuple[int, int
     first = below[np.searchsorted(chance, tail)]
     last = below[np.searchsorted(chance, 1.0 - tail)] + 1
     return int(first), int(last)
+
+
+@functools.cache
+def draws_of_quantile(percent: int, level: float = LEVEL) -> int:
+    """Return the least number of draws at which the interval of a quantile has an upper end.
+
+    From the median on it has a lower one, too.
+
+    >>> draws_of_quantile(95)
+    72
+    """
+    n = 1
+    while interval_ranks(n, percent, level)[1] > n:
+        n += 1
+    return n

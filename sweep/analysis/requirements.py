@@ -43,7 +43,7 @@ from sweep.analysis.poses import (
     Quantity,
     pose_arrays,
 )
-from sweep.analysis.quantiles import PERCENTS, Quantiles, interval_ranks
+from sweep.analysis.quantiles import PERCENTS, Quantiles, draws_of_quantile
 from sweep.analysis.statistic import Output, Statistic
 from sweep.analysis.summaries import (
     NEES_MEAN,
@@ -787,7 +787,7 @@ def _needed(
         return _of_rate(value, requirement.limit, what.level)
     least = float(MIN_DRAWS)
     if what.percent is not None:
-        least = float(_of_quantile(what.percent, what.level))
+        least = float(draws_of_quantile(what.percent, what.level))
     good = value >= requirement.limit if requirement.at_least else value <= requirement.limit
     # The end that has to pass the limit.
     end = low if good == requirement.at_least else high
@@ -822,19 +822,6 @@ def _of_rate(rate: float, limit: float, level: float) -> float:
 
     first = bisect.bisect_left(counts, True, key=is_decided)
     return _rounded(float(counts[first])) if first < len(counts) else math.inf
-
-
-@functools.cache
-def _of_quantile(percent: int, level: float) -> int:
-    """Return the least number of draws at which a quantile's interval has an upper end.
-
-    >>> _of_quantile(95, 0.95)
-    72
-    """
-    n = 1
-    while interval_ranks(n, percent, level)[1] > n:
-        n += 1
-    return n
 
 
 def _rounded(count: float) -> float:

@@ -141,24 +141,20 @@ def farthest_met(
         cf_attributes("whether all requirements are met", flags=Decision))
     kept = [dim for dim in decision.dims if dim != along]
     shape = decision.transpose(*kept, along)
-    out: dict[str, Any] = {name: np.full(shape.shape[:-1], np.nan) for name in (
-        "value", "low", "high", "fails_at", "failing_value", "met_beyond", "farthest_beyond",
-        "start")}
-    out["reach"] = np.zeros(shape.shape[:-1], np.uint8)
-    texts = {name: np.full(shape.shape[:-1], "", dtype=object) for name in (
-        "limited_by", "fails_where")}
+    rows = []
     for index in np.ndindex(*shape.shape[:-1]):
         at = dict(zip(kept, index, strict=True))
-        one = {"keeps": all_keep.isel(at).values, "judged": judged.isel(at).values,
-               "decision": decision.isel(at).values}
-        numbers, failing = _limit(values, upwards, **one)
-        for name, number in numbers.items():
-            out[name][index] = number
+        numbers, failing = _limit(
+            values, upwards, keeps=all_keep.isel(at).values, judged=judged.isel(at).values,
+            decision=decision.isel(at).values)
         if failing is not None:
             cell = {**at, along: failing}
-            words = _cause(table.isel(cell), keeps.isel(cell), together)
-            texts["limited_by"][index], texts["fails_where"][index] = words[:2]
-            out["failing_value"][index] = words[2]
+            numbers |= _cause(table.isel(cell), keeps.isel(cell), together)
+        rows.append(numbers)
+
+    def column(name: str, missing: Any) -> NDArray[Any]:
+        return np.array([row.get(name, missing) for row in rows]).reshape(shape.shape[:-1])
+
     units = str(results[along].attrs.get("units", ""))
     meanings = {
         "value": f"{along} up to which all requirements are met",
@@ -171,14 +167,14 @@ def farthest_met(
         "met_beyond": "values beyond it at which all are met again",
     }
     variables: dict[str, Any] = {
-        name: (kept, out[name], {"long_name": meaning, "units": {
+        name: (kept, column(name, np.nan), {"long_name": meaning, "units": {
             "failing_value": "", "met_beyond": "1"}.get(name, units)})
         for name, meaning in meanings.items()}
-    variables["reach"] = (kept, out["reach"], cf_attributes(
+    variables["reach"] = (kept, column("reach", Reach.not_run).astype(np.uint8), cf_attributes(
         "how far the requirements are met", flags=Reach))
-    variables |= {name: (kept, words.astype(str), {
-        "long_name": "requirement that fails" if "by" in name else "where it fails"})
-        for name, words in texts.items()}
+    for name, meaning in (("limited_by", "requirement that fails"),
+                          ("fails_where", "where it fails")):
+        variables[name] = kept, column(name, ""), {"long_name": meaning}
     variables["decision"] = decision.transpose(*kept, along)
     variables["keeps"] = all_keep.transpose(*kept, along).assign_attrs(
         long_name="whether all values keep their limits", units="1")
@@ -251,7 +247,7 @@ def easier_first(keeps: NDArray[Any], values: NDArray[Any]) -> bool:
 def _limit(
     values: np.ndarray[Any, Any], upwards: bool, *, keeps: np.ndarray[Any, Any],
     judged: np.ndarray[Any, Any], decision: np.ndarray[Any, Any],
-) -> tuple[dict[str, float], int | None]:
+) -> tuple[dict[str, Any], int | None]:
     """Return the limit along the axis, from easy to hard, and the index of the failure beyond."""
     if not judged.any():
         return {"reach": Reach.not_run}, None
@@ -317,7 +313,7 @@ def met_run(
 
 def _cause(
     cell: xr.Dataset, keeps: xr.DataArray, together: Sequence[str]
-) -> tuple[str, str, float]:
+) -> dict[str, Any]:
     """Return which requirement fails worst, where among ``together``, and its value there."""
     failing = ~keeps & (cell["decision"] != Decision.not_applicable)
     excess = excess_of(cell).where(failing)
@@ -326,7 +322,8 @@ def _cause(
     at = {name: worst[name].item() for name in excess.dims}
     where = ", ".join(f"{name} = {at[name]:g}" if isinstance(at[name], float) else
                       f"{name} = {at[name]}" for name in together)
-    return str(at["requirement"]), where, float(cell["value"].sel(at))
+    return {"limited_by": str(at["requirement"]), "fails_where": where,
+            "failing_value": float(cell["value"].sel(at))}
 
 
 # --------------------------------------------------------------------------------------------------

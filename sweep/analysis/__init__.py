@@ -1,8 +1,8 @@
 """Answers from a dataset: rates, errors, comparisons and limits, each with its uncertainty.
 
-Every function takes a dataset as `sweep.open` returns it and returns a dataset, lazy if the first
-one is. In their examples ``results`` is a small dataset of two solvers at three sides, eight draws
-each.
+Every function takes a dataset as `sweep.open` returns it and returns one that is computed: the
+columns that it needs are read into memory. In their examples ``results`` is a small dataset of two
+solvers at three sides, eight draws each.
 """
 
 from __future__ import annotations

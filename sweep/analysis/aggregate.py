@@ -1,58 +1,45 @@
-"""Statistics of all poses of a dataset that may be larger than memory: block by block, merged.
+"""Statistics of all poses of a dataset, by group: the one way to a table.
 
-The blocks are the chunks of a lazy dataset, and the result is then lazy, too.
+Columns are held in memory, those of a lazy dataset from the call on.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import functools
+import itertools
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Generic
+from typing import Any
 
-import dask.array as da
+import numpy as np
 import xarray as xr
-from dask.typing import Key
 from numpy.typing import NDArray
 
-from sweep.analysis.binning import (
-    Arrays,
-    Binning,
-    Bins,
-    ChunkReader,
-    Layout,
-    Lengths,
-    ReadBlock,
-    TaskLayer,
-    add_pass,
-    array_of_blocks,
-    read_bins,
+from sweep.analysis.binning import Bins, read_bins
+from sweep.analysis.dataset import (
+    DRAWS,
+    is_fixed,
+    is_grid_axis,
+    is_sampling_stopped,
+    of_photographs,
 )
-from sweep.analysis.dataset import is_fixed, is_sampling_stopped, of_photographs
-from sweep.analysis.draws import (
-    as_stopped,
-    by_photograph,
-    common_trials,
-    replicate_order,
-    replicated,
-)
+from sweep.analysis.draws import Design, Unit, common_trials, replicate_order
 from sweep.analysis.poses import COMMON
-from sweep.analysis.statistic import Nothing, Output, SinglePass, State, Statistic, Variables, ViewT
+from sweep.analysis.statistic import MAX_BLOCK, Arrays, Blocks, Statistic, Variables, ViewT
+from sweep.plan.draws import REPLICATES
+from sweep.plan.schema import LABELS
 
-MAX_AT_ONCE = 1 << 21
-"""Poses, times the lengths of inner dimensions, up to which what is in memory is one block.
-
-Dask's graph takes longer than the statistics of so few.
-"""
+MAX_THREADS = 4
+"""Blocks that are computed side by side; with more, reading memory is what takes time."""
 
 
 def aggregate(
     results: xr.Dataset,
     inputs: Mapping[str, xr.DataArray],
     kept: Sequence[str],
-    statistics: Sequence[Statistic[ViewT, Any, Any, Any]],
+    statistics: Sequence[Statistic[ViewT]],
     view: Callable[[Arrays], ViewT],
     bins: Bins | None = None,
     *,
@@ -81,7 +68,7 @@ def aggregate(
     Returns
     -------
     xr.Dataset
-        A variable (*kept, *bins) for each output; lazy if any of the inputs is.
+        A variable (*kept, *bins) for each output, computed.
 
     Raises
     ------
@@ -89,143 +76,112 @@ def aggregate(
         For bins that cannot be.
     """
     binning, binned = read_bins(results, kept, bins or {})
-    lazy = any(array.chunks is not None for array in inputs.values())
-    if is_sampling_stopped(results) if stopped is None else stopped:
-        statistics = [as_stopped(statistic) for statistic in statistics]
-        if (common := common_trials(results, inputs, kept)) is not None:
-            inputs = {**inputs, COMMON: common}
-    dataset = xr.Dataset(
-        {name: array.reset_coords(drop=True) for name, array in inputs.items()} | binned)
-    photographs = of_photographs(results)
-    layout = Layout.of(dataset, kept, has_cells=not photographs)
-    if photographs:
-        statistics = [by_photograph(statistic) for statistic in statistics]
-    if (order := replicate_order(results, layout.draws)) is not None:
-        settings = math.prod(results.sizes[name] for name in layout.settings)
-        layout = dataclasses.replace(layout, order=order)
-        statistics = [replicated(statistic, settings) for statistic in statistics]
-    passes = Passes(layout, binning, tuple(statistics), view)
+    stopped = is_sampling_stopped(results) if stopped is None else stopped
+    if stopped and (common := common_trials(results, inputs, kept)) is not None:
+        inputs = {**inputs, COMMON: common}
+    inputs = {**inputs, **binned}
+    layout = Layout.of(results, inputs, kept)
+    columns = {name: layout.arranged(array) for name, array in inputs.items()}
+    unit = Unit.replicate if layout.order is not None else (
+        Unit.photograph if of_photographs(results) else Unit.trial)
+    design = Design(unit, math.prod(layout.sizes[name] for name in layout.settings), stopped)
+    with ThreadPoolExecutor(min(MAX_THREADS, len(os.sched_getaffinity(0)))) as threads:
+        tables = [_table(part, statistics, view, design, threads)
+                  for part in binning.split(columns)]
+    shape = (*(layout.sizes[name] for name in layout.kept), *binning.shape)
+    dims = (*layout.kept, *binning.edges)
+    variables = {
+        output.name: (
+            dims, np.stack([table[output.name] for table in tables], axis=-1).reshape(shape).astype(
+                output.dtype), output.attributes())
+        for statistic in statistics for output in statistic.outputs()}
     coordinates = {name: value.variable for name, value in results.coords.items()
                    if set(value.dims) <= set(kept) and not is_fixed(value)}
-    dims = (*layout.kept, *binning.edges)
-    if not lazy and math.prod(dataset.sizes.values()) <= MAX_AT_ONCE:
-        sizes = {name: dataset.sizes.get(name, results.sizes[name]) for name in layout.dimensions}
-        values = passes.of_block(sizes, [each.values for each in dataset.values()])
-        shape = (*(sizes[name] for name in layout.kept), *binning.shape)
-        found = {output.name: (dims, _pick(output, shape, values), output.attributes())
-                 for statistic in statistics for output in statistic.outputs()}
-        return xr.Dataset(found, coordinates).assign_coords(binning.coordinates(results))
-    chunked = layout.rechunk(dataset, lazy=lazy)
-    lengths = {name: tuple(chunked.chunks[name]) if name in chunked.sizes
-               else (results.sizes[name],) for name in layout.dimensions}
-    layer, tables = _add_tasks(chunked, lengths, passes)
-    chunks = (*(lengths[name] for name in layout.kept), *((count,) for count in binning.shape))
-    variables = {
-        output.name: (dims, array_of_blocks(
-            layer, tables, functools.partial(_pick, output), output.name, chunks, output.dtype,
-        ), output.attributes())
-        for statistic in statistics for output in statistic.outputs()
-    }
-    table = xr.Dataset(variables, coordinates).assign_coords(binning.coordinates(results))
-    return table if lazy else table.compute(scheduler="synchronous")
+    return xr.Dataset(variables, coordinates).assign_coords(binning.coordinates(results))
 
+
+def _table(
+    columns: Arrays, statistics: Sequence[Statistic[ViewT]], view: Callable[[Arrays], ViewT],
+    design: Design, threads: Executor,
+) -> Variables:
+    """Return the variables (groups,) of columns, some groups at a time if they are small."""
+    groups, *rest = next(iter(columns.values())).shape[:4]
+    step = max(MAX_BLOCK // max(math.prod(rest), 1), 1)
+
+    def of_groups(start: int, threads: Executor | None = None) -> Variables:
+        blocks = Blocks(
+            {name: array[start : start + step] for name, array in columns.items()}, view, threads)
+        return {name: values for statistic in statistics
+                for name, values in statistic.variables(blocks, design).items()}
+
+    if groups <= step:
+        return of_groups(0, threads)
+    parts = list(threads.map(of_groups, range(0, groups, step)))
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+# --------------------------------------------------------------------------------------------------
+# How a dataset's dimensions become the four axes of a block: groups, cells, draws, settings.
+#
+# Named dimensions are kept, all others are pooled. Of these, ``trial`` counts random draws; the
+# other dimensions of camera, marker and pose make cells, a fixed grid; all others that are pooled
+# (effects, levels, renderers, settings of detector and estimator, and names that are no
+# parameter's) see the same draws (`sweep.plan.draws`), so that their values together count as one
+# draw.
 
 @dataclass(frozen=True)
-class Passes(Generic[ViewT]):
-    """The passes of several statistics over a block, as functions of tasks.
+class Layout:
+    """What each dimension is: kept, of cells, of draws, or of settings.
 
-    States are in lists, one for each statistic. Groups are those of the kept dimensions times the
-    combinations of bins, the bins fastest.
+    ``order`` are the indices of the trials by replicate, if they have such: then replicates stand
+    in the place of draws.
     """
 
-    layout: Layout
-    binning: Binning
-    statistics: tuple[Statistic[ViewT, Any, Any, Any], ...]
-    view: Callable[[Arrays], ViewT]
+    sizes: Mapping[str, int]
+    kept: tuple[str, ...]
+    cells: tuple[str, ...]
+    draws: tuple[str, ...]
+    settings: tuple[str, ...]
+    order: NDArray[np.intp] | None = None
 
-    @property
-    def single(self) -> bool:
-        """Whether no statistic needs the second pass."""
-        return all(isinstance(statistic, SinglePass) for statistic in self.statistics)
+    @classmethod
+    def of(
+        cls, results: xr.Dataset, inputs: Mapping[str, xr.DataArray], kept: Sequence[str]
+    ) -> Layout:
+        """Return the layout of the dimensions of some arrays of a dataset."""
+        sizes = {name: results.sizes[name] for name in kept}
+        for array in inputs.values():
+            sizes |= {str(dim): size for dim, size in array.sizes.items() if dim not in LABELS}
+        pooled = [name for name in sizes if name not in kept]
+        draws = tuple(name for name in pooled if name == DRAWS)
+        cells = tuple(
+            name for name in pooled if name != DRAWS and is_grid_axis(name, results))
+        return cls(
+            sizes, tuple(kept), cells, draws,
+            tuple(name for name in pooled if name not in (*cells, *draws)),
+            replicate_order(results, draws))
 
-    def first_pass(self, sizes: Mapping[str, int], read: ReadBlock) -> list[State]:
-        """Return the states of a block."""
-        return self._by_bin(sizes, read, lambda poses, _: [
-            statistic.first_pass(poses) for statistic in self.statistics])
-
-    def prepare_second(self, first: Sequence[State]) -> list[State]:
-        """Return what the second pass needs, from the states of all blocks."""
-        return [statistic.prepare_second(state)
-                for statistic, state in zip(self.statistics, first, strict=True)]
-
-    def second_pass(
-        self, sizes: Mapping[str, int], read: ReadBlock, known: Sequence[State]
-    ) -> list[State]:
-        """Return the states of a block."""
-        return self._by_bin(sizes, read, lambda poses, number: [
-            statistic.second_pass(poses, state.every_nth(self.binning.count, number))
-            for statistic, state in zip(self.statistics, known, strict=True)])
-
-    def finish(self, known: Sequence[State], second: Sequence[State] | None = None) -> Variables:
-        """Return the variables of all statistics, each (groups,)."""
-        variables: Variables = {}
-        second = second or [Nothing()] * len(known)
-        for statistic, *states in zip(self.statistics, known, second, strict=True):
-            variables |= statistic.finish(*states)
-        return variables
-
-    def of_block(
-        self, sizes: Mapping[str, int], arrays: Sequence[NDArray[Any]]
-    ) -> Variables:
-        """Return the variables of all statistics of a dataset that is one block."""
-        def read() -> list[NDArray[Any]]:
-            return list(arrays)
-
-        known = self.prepare_second(fold(self.first_pass(sizes, read)))
-        if self.single:
-            return self.finish(known)
-        return self.finish(known, fold(self.second_pass(sizes, read, known)))
-
-    def _by_bin(
-        self, sizes: Mapping[str, int], read: ReadBlock,
-        pass_over: Callable[[ViewT, int], list[State]],
-    ) -> list[State]:
-        """Return the states of all combinations of bins, those of a group together."""
-        arrays = self.layout.arrange(read(), sizes)
-        by_bin = []
-        for number, (part, cells) in enumerate(self.binning.split(arrays)):
-            states = pass_over(self.view(part), number)
-            by_bin.append(states if cells is None else [each.scatter(cells) for each in states])
-        return [type(states[0]).interleave(states) for states in zip(*by_bin, strict=True)]
+    def arranged(self, array: xr.DataArray) -> NDArray[Any]:
+        """Return the values of an array as (groups, cells, draws, settings, ...)."""
+        parts = (self.kept, self.cells, self.draws, self.settings)
+        dims = [dim for dim in itertools.chain(*parts) if dim in array.dims]
+        inner = [dim for dim in array.dims if dim not in dims]
+        values = array.variable.transpose(*dims, *inner).to_numpy()
+        rest = values.shape[len(dims):]
+        # Of dimensions that make an axis together an array has all, or is repeated along some.
+        present = [any(name in dims for name in part) for part in parts]
+        own = [name for part, some in zip(parts, present, strict=True) if some for name in part]
+        values = values.reshape((*(self.sizes[name] if name in dims else 1 for name in own), *rest))
+        values = np.broadcast_to(values, (*(self.sizes[name] for name in own), *rest))
+        shape = [math.prod(self.sizes[name] for name in part) for part in parts]
+        values = values.reshape((
+            *(size if some else 1 for size, some in zip(shape, present, strict=True)), *rest))
+        values = np.broadcast_to(values, (*shape, *rest))
+        return values if self.order is None else _by_replicate(values, self.order)
 
 
-def fold(*parts: Sequence[State]) -> list[State]:
-    """Return the folded states of some cells, of all their draws."""
-    return [functools.reduce(type(states[0]).merge, states).fold()
-            for states in zip(*parts, strict=True)]
-
-
-def merge(*parts: Sequence[State]) -> list[State]:
-    """Return the states of all blocks together."""
-    return [functools.reduce(type(states[0]).merge, states)
-            for states in zip(*parts, strict=True)]
-
-
-def _add_tasks(
-    dataset: xr.Dataset, lengths: Lengths, passes: Passes[ViewT]
-) -> tuple[TaskLayer, list[Key]]:
-    """Return the tasks, and the keys of the variables of each block of the kept dimensions."""
-    layer = TaskLayer("statistics")
-    reader = ChunkReader([da.asarray(array.data) for array in dataset.data_vars.values()])
-    add = functools.partial(add_pass, layer, reader, passes.layout, lengths)
-    known = [layer.add(passes.prepare_second, layer.merge(merge, states))
-             for states in add(passes.first_pass, fold)]
-    if passes.single:
-        return layer, [layer.add(passes.finish, state) for state in known]
-    second = [layer.merge(merge, states) for states in add(passes.second_pass, fold, known)]
-    return layer, [layer.add(passes.finish, *states)
-                   for states in zip(known, second, strict=True)]
-
-
-def _pick(output: Output, shape: tuple[int, ...], table: Variables) -> NDArray[Any]:
-    return table[output.name].reshape(shape).astype(output.dtype)
+def _by_replicate(array: NDArray[Any], order: NDArray[np.intp]) -> NDArray[Any]:
+    """Return (groups, cells, trials, settings, ...) as (groups, cells, replicates, rest, ...)."""
+    groups, cells, trials, settings = array.shape[:4]
+    rest = trials // REPLICATES * settings
+    return array[:, :, order].reshape((groups, cells, REPLICATES, rest, *array.shape[4:]))

@@ -24,12 +24,13 @@ from sweep.analysis.dataset import (
     describes,
     is_sampling_stopped,
     kept_dimensions,
+    stacked,
 )
 from sweep.analysis.draws import TAIL_SHARE
 from sweep.analysis.intervals import TAIL, clopper_pearson
 from sweep.analysis.poses import ESTIMATE_INPUTS, Poses, pose_arrays
 from sweep.analysis.rates import FLIPPED, SOLVED
-from sweep.analysis.statistic import Statistic
+from sweep.analysis.statistic import INTERVAL, Statistic
 from sweep.errors import ArgumentError
 from sweep.measure.flags import Flag, flag
 from sweep.plan.schema import cf_attributes
@@ -128,7 +129,7 @@ def ambiguity(
     Returns
     -------
     xr.Dataset
-        Dimensions (*per, *configuration, *bins); lazy if ``results`` is. Intervals are in
+        Dimensions (*per, *configuration, *bins). Intervals are in
         ``x_low`` and ``x_high``.
 
         - ``solved``, ``flipped``, ``without_alternative``: solved poses, those of them that are
@@ -176,7 +177,7 @@ def ambiguity(
     if not (_is_number(min_kept) and 0.0 <= min_kept <= 1.0):
         raise ArgumentError("min_kept", min_kept, "expected a number from 0 to 1, such as 0.05")
     kept = kept_dimensions(results, (*as_names(per), *configuration_axes(results)))
-    statistics: list[Statistic[AmbiguousPoses, Any, Any, Any]] = [
+    statistics: list[Statistic[AmbiguousPoses]] = [
         Count(*SOLVED, lambda poses: poses.solved),
         Count(*FLIPPED, lambda poses: poses.flipped),
         Count("without_alternative", "solved poses without another solution",
@@ -248,11 +249,7 @@ def _at(name: str, threshold: float, end: str = "") -> str:
 def _along_thresholds(table: xr.Dataset, tried: Sequence[float]) -> xr.Dataset:
     """Return a table of variables at single thresholds as one of variables along them."""
     def along(name: str, end: str = "") -> xr.DataArray:
-        parts = [table[_at(name, threshold, end)] for threshold in tried]
-        joined = xr.concat(
-            parts, dim="threshold", coords="minimal", compat="override", join="exact",
-        ).transpose(..., "threshold")
-        return joined.chunk({"threshold": -1}) if joined.chunks is not None else joined
+        return stacked([table[_at(name, threshold, end)] for threshold in tried], "threshold")
 
     variables = {name: table[name] for name in ("solved", "flipped", "without_alternative")}
     for name, source, meaning in (
@@ -262,8 +259,7 @@ def _along_thresholds(table: xr.Dataset, tried: Sequence[float]) -> xr.Dataset:
     ):
         variables[name] = along(source).assign_attrs(cf_attributes(meaning, "1"))
     for name, meaning in RATES.items():
-        for end, words in (("", ""), ("_low", "lower end of the 95 % interval: "),
-                           ("_high", "upper end of the 95 % interval: ")):
+        for end, words in INTERVAL.items():
             variables[f"{name}{end}"] = along(name, end).assign_attrs(
                 cf_attributes(words + meaning, "1"))
     coordinates = {"threshold": ("threshold", list(tried), cf_attributes(
@@ -289,10 +285,8 @@ def _with_choice(
         "kept_flip_rate_low", "right_rejected_rate")]
     choice, *values = xr.apply_ufunc(
         functools.partial(_choose, flip_rate=flip_rate, min_kept=min_kept, tail=tail), *inputs,
-        input_core_dims=[["threshold"]] * len(inputs), dask="parallelized",
-        output_core_dims=[[]] * (1 + len(CHOSEN)),
-        output_dtypes=[np.uint8, *[np.float64] * len(CHOSEN)],
-    )
+        input_core_dims=[["threshold"]] * len(inputs),
+        output_core_dims=[[]] * (1 + len(CHOSEN)))
     chosen = {name: value.assign_attrs(cf_attributes(meaning, "1"))
               for (name, meaning), value in zip(CHOSEN.items(), values, strict=True)}
     chosen["choice"] = choice.assign_attrs(

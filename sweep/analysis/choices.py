@@ -19,6 +19,8 @@ from sweep.analysis.requirements import (
     Requirement,
     combined_decision,
     decide,
+    excess_of,
+    kept_by,
     parse_requirements,
     read_requirements,
 )
@@ -370,22 +372,12 @@ def choice_cells(results: xr.Dataset, rule: ChoiceRule, shares: ErrorShares) -> 
     each = cells("decision").astype(np.uint8)
     hopeless = (poses >= MIN_DRAWS) & (coming < MIN_DRAWS) & (each == Decision.undecided)
     decision = combined_decision(each, -1)
-    excess = np.stack([_excess(one, cells("value")[..., k]) for k, one in enumerate(required)], -1)
-    excess = np.where(each == Decision.not_applicable, -np.inf, excess)
+    table = table.assign(excess=excess_of(table), keeps=kept_by(table, required))
+    excess = np.where(each == Decision.not_applicable, -np.inf, cells("excess"))
+    keeps = cells("keeps") | (each == Decision.not_applicable)
     return ChoiceCells(
-        table, decision, np.asarray((excess <= 0.0).all(-1)), each, excess,
+        table, decision, np.asarray(keeps.all(-1)), each, excess,
         hopeless.any(-1) & (decision == Decision.undecided), rule.among, rule.per)
-
-
-def _excess(requirement: Requirement, value: Floats) -> Floats:
-    """Return how far values are beyond the limit, relative to it; a limit is never 0."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = value / requirement.limit
-        excess = 1.0 - ratio if requirement.at_least else 1.0 - 1.0 / ratio
-    excess = np.where(np.isnan(value), np.inf, excess)
-    if requirement.relation in (">", "<"):  # at the limit it is not kept
-        return np.where(excess == 0.0, np.finfo(float).tiny, excess)
-    return np.asarray(excess)
 
 
 def answers(cells: ChoiceCells, along: str) -> list[Answer]:

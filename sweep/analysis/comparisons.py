@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.analysis.aggregate import aggregate
-from sweep.analysis.binning import Arrays, Bins
+from sweep.analysis.binning import Bins
 from sweep.analysis.counts import Count, CountOfDraws, Rate, newcombe_and_mcnemar
 from sweep.analysis.dataset import (
     DRAWS,
@@ -38,14 +37,13 @@ from sweep.analysis.poses import (
     ERROR_INPUTS,
     OF_MARKERS,
     QUANTITIES,
-    REQUIRED_VARIABLES,
     SIGNED,
     Poses,
     Quantity,
     norm_squared,
     pose_arrays,
 )
-from sweep.analysis.statistic import Statistic
+from sweep.analysis.statistic import INTERVAL, Arrays, Statistic
 from sweep.errors import ArgumentError, DatasetError, SweepError
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.messages import plain
@@ -61,6 +59,9 @@ from sweep.typing import Floats, Integers, Masks
 TRUTH = ("true_tvec_m", "true_rvec")
 """Variables that are the same for both poses of a pair."""
 
+DIFFERING = "differing"
+"""Name of the mask of the pairs whose truth differs."""
+
 
 class Pair:
     """The poses of two datasets, pose by pose.
@@ -73,6 +74,7 @@ class Pair:
 
     def __init__(self, arrays: Arrays) -> None:
         self.first, self.second = Poses(arrays, "first "), Poses(arrays, "second ")
+        self._arrays = arrays
 
     @property
     def draws(self) -> Masks:
@@ -87,9 +89,7 @@ class Pair:
     @property
     def differing(self) -> Masks:
         """Poses whose truth differs."""
-        names = [name for name in TRUTH if name in self.first and name in self.second]
-        differ = [(self.first[name] != self.second[name]).any(axis=-1) for name in names]
-        return np.asarray(np.any(differ, axis=0))
+        return self._arrays[DIFFERING]
 
     @property
     def both_solved(self) -> Masks:
@@ -200,7 +200,7 @@ def _rotation_shift(pair: Pair) -> Floats:
 # --------------------------------------------------------------------------------------------------
 # Two configurations on the same scenes, pose by pose: what differs, and whether it is chance.
 
-PairStatistic = Statistic[Pair, Any, Any, Any]
+PairStatistic = Statistic[Pair]
 
 ROTATION = QUANTITIES[0]
 
@@ -223,7 +223,7 @@ def compare(
     Returns
     -------
     xr.Dataset
-        Dimensions (*per, *bins); lazy if the datasets are.
+        Dimensions (*per, *bins).
 
         - ``compared``: poses that were looked for in both, and the ``draws`` they are worth.
           ``both_detected``, ``only_first_detected``, ``only_second_detected`` and
@@ -293,7 +293,11 @@ def paired_table(
            and not (name in second.coords and value.equals(second.coords[name]))]
     first = first.drop_vars(own)  # such as the name of its solver
     names = dict.fromkeys(name for quantity in quantities for name in quantity.inputs)
-    inputs = paired_arrays(*(_errors_and_truth(side, names) for side in (first, second)))
+    inputs = paired_arrays(*(
+        pose_arrays(side, (*ERROR_INPUTS, *names)) for side in (first, second)))
+    inputs[DIFFERING] = sum(
+        ((first[name] != second[name]).any("xyz").reset_coords(drop=True)
+         for name in TRUTH if name in first and name in second), xr.DataArray(False))
     statistics: list[PairStatistic] = [
         *_agreement("detected", lambda poses: poses.detected),
         *_agreement("solved", lambda poses: poses.solved),
@@ -318,11 +322,6 @@ def _of_common_trials(
         return first, second
     common = np.intersect1d(first[DRAWS].values, second[DRAWS].values)
     return first.sel({DRAWS: common}), second.sel({DRAWS: common})
-
-
-def _errors_and_truth(results: xr.Dataset, names: Iterable[str]) -> dict[str, xr.DataArray]:
-    truth = (name for name in TRUTH if name in results)
-    return pose_arrays(results, (*ERROR_INPUTS, *names, *truth))
 
 
 def _agreement(ending: str, reached: Callable[[Poses], Masks]) -> list[PairStatistic]:
@@ -383,14 +382,10 @@ def _tested(table: xr.Dataset, level: float) -> dict[str, xr.DataArray]:
             "both", "only_first", "only_second", "neither")]
         arrays = xr.apply_ufunc(
             newcombe_and_mcnemar, *counts, table["draws"], table["drawn"],
-            kwargs={"level": level}, output_core_dims=[[]] * 4, dask="parallelized",
-            output_dtypes=[np.float64] * 4,
-        )
+            kwargs={"level": level}, output_core_dims=[[]] * 4)
         difference = f"{rate} rate, second minus first"
         meanings = {
-            f"{rate}_difference": difference,
-            f"{rate}_difference_low": f"lower end of the 95 % interval: {difference}",
-            f"{rate}_difference_high": f"upper end of the 95 % interval: {difference}",
+            **{f"{rate}_difference{end}": words + difference for end, words in INTERVAL.items()},
             f"{rate}_p_value": f"chance that the discordant counts differ so much if the {rate} "
                                "rates are equal (McNemar, exact)",
         }
@@ -419,7 +414,7 @@ def renderer_bias(results: xr.Dataset, reference: str = "exact") -> xr.Dataset:
     -------
     xr.Dataset
         Dimensions: renderer and those of the detector's settings; for the pose variables also
-        those of the estimator's. All others are pooled. Lazy if ``results`` is. The interval of
+        those of the estimator's. All others are pooled. The interval of
         ``x`` is in ``x_low`` and ``x_high``.
 
         - ``detection_disagreement``: share of the poses looked for with both (``compared``) that
@@ -554,7 +549,7 @@ def regressions(
     kept = kept_dimensions(new, tuple(dict.fromkeys((*configuration, *as_names(per)))))
     count = math.prod(new.sizes[name] for name in kept) * (1 + len(quantities))
     level = 1.0 - (1.0 - LEVEL) / count
-    table = paired_table(old, new, kept, None, quantities, level).compute()
+    table = paired_table(old, new, kept, None, quantities, level)
     if int(table["different_scenes"].sum()):
         raise DatasetError("the scenes of the two stores differ, so that nothing can be paired; "
                            "compare stores of one pipeline")
@@ -628,8 +623,7 @@ def store_differences(first: xr.Dataset, second: xr.Dataset) -> xr.Dataset:
     -------
     xr.Dataset
         Dimensions: those of the detector's settings, for estimates and poses also those of the
-        estimator's; ``statistic``: median, p99 and worst. Scenes are pooled. It is computed at
-        once, a chunk of ``first`` at a time.
+        estimator's; ``statistic``: median, p99 and worst. Scenes are pooled.
 
         - ``detections`` and ``estimates`` (..., first_flag, second_flag): poses by their flag in
           the first store and in the second; ``detections_compared``: those computed in both;
@@ -667,51 +661,42 @@ def store_differences(first: xr.Dataset, second: xr.Dataset) -> xr.Dataset:
     found = [dim for dim in axes_of(first, Stage.scene, Stage.detection) if dim not in scene]
     solved = [dim for dim in axes_of(first) if dim not in scene]
     corners = [name for name in CORNER_VARIABLES if name in first and name in second]
-    names = [*REQUIRED_VARIABLES, *TRUTH, *corners]
-    names = [name for name in dict.fromkeys(names) if name in first and name in second]
-    detections, estimates = _Flags(DetectionStatus), _Flags(EstimateStatus)
-    shifts = _Shifts(("corner_shift_px",))
-    motions = _Shifts(("position_shift_m", "rotation_shift_deg"))
-    once: Any = 0
-    for part in _chunks(first["detection"], scene):
-        pair = [side[names].isel(part).load() for side in (first, second)]
-        _require_equal_truths(pair[0], pair[1], scene)
-        flags = [_column(side, "detection", scene, found) for side in pair]
-        computed = [~np.isin(each, _NOT_COMPUTED) for each in flags]
-        both = computed[0] & computed[1]
-        once = once + (computed[0] ^ computed[1]).sum(axis=0)
-        detections.add(flags[0], flags[1], both)
-        for name in corners:
-            shifts.add(*_corner_shifts(pair, name, scene, found, both))
-        flags = [_column(side, "estimate", scene, solved) for side in pair]
-        estimates.add(flags[0], flags[1], np.logical_and(*(
-            ~np.isin(each, (EstimateStatus.not_run, EstimateStatus.not_needed)) for each in flags
-        )))
-        motions.add(*_motions(pair, scene, solved, np.logical_and(*(
-            each == EstimateStatus.solved for each in flags
-        ))))
+    sides = (first, second)
+    _require_equal_truths(first, second, scene)
+    flags = [_column(side, "detection", scene, found) for side in sides]
+    computed = [~np.isin(each, _NOT_COMPUTED) for each in flags]
+    both = computed[0] & computed[1]
+    once = (computed[0] ^ computed[1]).sum(axis=0)
+    detections = _flag_counts(DetectionStatus, flags, both)
+    shifts = _total([_corner_shifts(sides, name, scene, found, both) for name in corners],
+                    both.shape[1])
+    flags = [_column(side, "estimate", scene, solved) for side in sides]
+    estimates = _flag_counts(EstimateStatus, flags, np.logical_and(*(
+        ~np.isin(each, (EstimateStatus.not_run, EstimateStatus.not_needed)) for each in flags)))
+    motions = _total([_motions(sides, scene, solved, np.logical_and(*(
+        each == EstimateStatus.solved for each in flags)))], flags[0].shape[1])
     table = xr.Dataset(coords={
         **{dim: first[dim] for dim in solved if dim in first.coords},
         "statistic": list(STATISTICS),
     })
     sizes = {dim: first.sizes[dim] for dim in solved}
     for name, dims, values, meaning, units in (
-        ("detections_compared", found, detections.compared, "poses computed in both", "1"),
-        ("detections_differing", found, detections.differing,
+        ("detections_compared", found, detections.sum(axis=(1, 2)), "poses computed in both", "1"),
+        ("detections_differing", found, _differing(detections),
          "of them, poses with another flag of detection", "1"),
         ("computed_once", found, once, "poses that one store computed and the other did not", "1"),
         ("corners_compared", found, shifts.compared, "corners that both found", "1"),
         ("corners_found_once", found, shifts.once, "corners that one of both found", "1"),
         ("corners_differing", found, shifts.differing, "corners with another coordinate", "1"),
-        ("corner_shift_px", found, shifts.statistics(0), "distance of corners that differ", "px"),
-        ("estimates_differing", solved, estimates.differing,
+        ("corner_shift_px", found, shifts.statistics[0], "distance of corners that differ", "px"),
+        ("estimates_differing", solved, _differing(estimates),
          "poses with another flag of the estimate", "1"),
         ("poses_compared", solved, motions.compared, "poses that both solved", "1"),
         ("poses_differing", solved, motions.differing,
          "poses with another position or rotation", "1"),
-        ("position_shift_m", solved, motions.statistics(0), "distance of positions that differ",
+        ("position_shift_m", solved, motions.statistics[0], "distance of positions that differ",
          "m"),
-        ("rotation_shift_deg", solved, motions.statistics(1), "angle of rotations that differ",
+        ("rotation_shift_deg", solved, motions.statistics[1], "angle of rotations that differ",
          "degree"),
     ):
         shape = [sizes[dim] for dim in dims]
@@ -720,14 +705,15 @@ def store_differences(first: xr.Dataset, second: xr.Dataset) -> xr.Dataset:
             (*dims, *inner), np.reshape(values, (*shape, *(len(STATISTICS) for _ in inner))),
             cf_attributes(meaning, units),
         )
-    for name, dims, tally in (
-        ("detections", found, detections), ("estimates", solved, estimates),
+    for name, dims, counts, flag in (
+        ("detections", found, detections, DetectionStatus),
+        ("estimates", solved, estimates, EstimateStatus),
     ):
-        kinds = [each.name for each in tally.flags]
-        sides = [f"{side}_{name.removesuffix('s')}" for side in ("first", "second")]
-        table = table.assign_coords(dict.fromkeys(sides, kinds))
+        kinds = [each.name for each in flag]
+        labels = [f"{side}_{name.removesuffix('s')}" for side in ("first", "second")]
+        table = table.assign_coords(dict.fromkeys(labels, kinds))
         table[name] = (
-            (*dims, *sides), tally.counts.reshape(*(sizes[dim] for dim in dims), *[len(kinds)] * 2),
+            (*dims, *labels), counts.reshape(*(sizes[dim] for dim in dims), *[len(kinds)] * 2),
             cf_attributes("poses by their flags in the first and in the second store", "1"),
         )
     differences = list(_fingerprint_differences(fingerprint_of(first), fingerprint_of(second)))
@@ -743,72 +729,63 @@ def store_differences(first: xr.Dataset, second: xr.Dataset) -> xr.Dataset:
     return table
 
 
-class _Flags:
-    """Pairs of flags, counted: ``counts`` (configurations, flags, flags)."""
-
-    def __init__(self, kind: type[IntEnum]) -> None:
-        self.flags = list(kind)
-        self.counts: Integers = np.zeros((1, len(self.flags), len(self.flags)), dtype=np.int64)
-
-    def add(self, first: NDArray[Any], second: NDArray[Any], both: Masks) -> None:
-        """Add flags (scenes, configurations) of the poses that both stores computed."""
-        values = np.array(self.flags)
-        size, count = len(values), first.shape[1]
-        codes = np.searchsorted(values, first) * size + np.searchsorted(values, second)
-        codes = codes + np.arange(count) * size**2
-        added = np.bincount(codes[both].ravel(), minlength=count * size**2)
-        self.counts = self.counts + added.reshape(count, size, size)
-
-    @property
-    def compared(self) -> Integers:
-        """(configurations,) poses."""
-        return np.asarray(self.counts.sum(axis=(1, 2)))
-
-    @property
-    def differing(self) -> Integers:
-        """(configurations,) poses with two different flags."""
-        return np.asarray(self.compared - np.trace(self.counts, axis1=1, axis2=2))
+def _flag_counts(
+    kind: type[IntEnum], flags: Sequence[NDArray[Any]], both: Masks
+) -> Integers:
+    """Return the poses that both computed by their two flags: (configurations, flags, flags)."""
+    values = np.array(list(kind))
+    size, count = len(values), both.shape[1]
+    codes = np.searchsorted(values, flags[0]) * size + np.searchsorted(values, flags[1])
+    codes = codes + np.arange(count) * size**2
+    counts = np.bincount(codes[both].ravel(), minlength=count * size**2)
+    return counts.reshape(count, size, size)
 
 
-class _Shifts:
-    """Distances of what differs, by configuration, with the numbers of what was compared."""
-
-    def __init__(self, names: Sequence[str]) -> None:
-        self.compared: Any = 0
-        self.differing: Any = 0
-        self.once: Any = 0
-        self._distances: list[list[list[Floats]]] = [[] for _ in names]
-
-    def add(self, both: Masks, once: Masks, differ: Masks, *distances: Floats) -> None:
-        """Add masks and distances (scenes, configurations, items)."""
-        self.compared = self.compared + both.sum(axis=(0, 2))
-        self.once = self.once + once.sum(axis=(0, 2))
-        self.differing = self.differing + differ.sum(axis=(0, 2))
-        for collected, each in zip(self._distances, distances, strict=True):
-            collected.append([
-                each[:, k][differ[:, k]].astype(np.float32) for k in range(each.shape[1])
-            ])
-
-    def statistics(self, k: int) -> Floats:
-        """Return (configurations, 3) median, 99th percentile and maximum of a distance."""
-        rows = []
-        for parts in zip(*self._distances[k], strict=True):
-            values = np.concatenate(parts).astype(np.float64)
-            rows.append(
-                [*np.quantile(values, (0.5, 0.99)), values.max()] if values.size
-                else [np.nan] * len(STATISTICS)
-            )
-        return np.array(rows)
+def _differing(counts: Integers) -> Integers:
+    """Return the poses (configurations,) with two different flags."""
+    return np.asarray(counts.sum(axis=(1, 2)) - np.trace(counts, axis1=1, axis2=2))
 
 
-def _chunks(flags: xr.DataArray, scene: Sequence[str]) -> Iterator[dict[str, slice]]:
-    """Yield the parts of the scene axes that lie in one chunk of a variable."""
-    cuts = []
-    for dim in scene:
-        ends = np.cumsum([0, *flags.chunksizes.get(dim, (flags.sizes[dim],))]).tolist()
-        cuts.append([slice(*pair) for pair in itertools.pairwise(ends)])
-    for part in itertools.product(*cuts):
-        yield dict(zip(scene, part, strict=True))
+class _Shift(NamedTuple):
+    """Which items (scenes, configurations, items) both have, one has, and which differ.
+
+    ``distances`` (differing items,) are how far these are apart, in one unit or more.
+    """
+
+    both: Masks
+    once: Masks
+    differ: Masks
+    distances: tuple[Floats, ...]
+
+
+class _Total(NamedTuple):
+    """Numbers of items (configurations,), and `STATISTICS` (configurations, 3) of distances."""
+
+    compared: Integers
+    once: Integers
+    differing: Integers
+    statistics: list[Floats]
+
+
+def _total(shifts: Sequence[_Shift], configurations: int) -> _Total:
+    """Return the sums over shifts of several kinds of items."""
+    none = np.zeros(configurations, dtype=np.int64)
+    compared, once, differing = (
+        none + sum(mask.sum(axis=(0, 2)) for mask in masks) for masks in (
+            [each.both for each in shifts], [each.once for each in shifts],
+            [each.differ for each in shifts]))
+    numbers = [np.nonzero(each.differ)[1] for each in shifts]
+    units = zip(*(each.distances for each in shifts), strict=True) if shifts else [()]
+    statistics = []
+    for distances in units:
+        values = [
+            np.concatenate([np.empty(0), *(
+                each[number == k] for each, number in zip(distances, numbers, strict=True))])
+            for k in range(configurations)]
+        statistics.append(np.array([
+            [*np.quantile(each, (0.5, 0.99)), each.max()] if each.size
+            else [np.nan] * len(STATISTICS) for each in values]))
+    return _Total(compared, once, differing, statistics)
 
 
 def _column(
@@ -826,22 +803,22 @@ def _column(
 def _corner_shifts(
     pair: Sequence[xr.Dataset], name: str, scene: Sequence[str], settings: Sequence[str],
     computed: Masks,
-) -> tuple[Masks, Masks, Masks, Floats]:
-    """Return which corners both found, one found, which differ, and how far they are apart, px."""
+) -> _Shift:
+    """Return how corners differ; the distance is in pixels."""
     first, second = (_column(side, name, scene, settings) for side in pair)
     first, second = (each.reshape(*each.shape[:2], -1, 2) for each in (first, second))
     has_first, has_second = (np.isfinite(each).all(axis=-1) for each in (first, second))
     both = has_first & has_second & computed[..., None]
     once = (has_first ^ has_second) & computed[..., None]
     differ = both & (first != second).any(axis=-1)
-    distance = np.linalg.norm(np.subtract(second, first, dtype=np.float64), axis=-1)
-    return both, once, differ, distance
+    moved = np.subtract(second[differ], first[differ], dtype=np.float64)
+    return _Shift(both, once, differ, (np.linalg.norm(moved, axis=-1),))
 
 
 def _motions(
     pair: Sequence[xr.Dataset], scene: Sequence[str], settings: Sequence[str], both: Masks
-) -> tuple[Masks, Masks, Masks, Floats, Floats]:
-    """Return which poses both solved, which differ, and distances in metres and degrees."""
+) -> _Shift:
+    """Return how poses that both solved differ; distances are in metres and in degrees."""
     positions, rotations = (
         [_column(side, name, scene, settings) for side in pair]
         for name in ("translation_error_m", "rotation_error_rad")
@@ -849,14 +826,14 @@ def _motions(
     differ = both & np.logical_or(*(
         (first != second).any(axis=-1) for first, second in (positions, rotations)
     ))
-    distance = np.linalg.norm(np.subtract(*positions[::-1], dtype=np.float64), axis=-1)
-    turned = np.full(distance.shape, np.nan)
+    first, second = (each[differ].astype(np.float64) for each in positions)
+    distance = np.linalg.norm(second - first, axis=-1)
     # Errors are rotations from the true one: R2 R1ᵀ = (R2 Rᵀ)(R1 Rᵀ)ᵀ.
     first, second = (rotation_of_vector(each[differ].astype(np.float64)) for each in rotations)
     relative = vector_of_rotation(second @ np.swapaxes(first, -1, -2))
-    turned[differ] = np.degrees(np.linalg.norm(relative, axis=-1))
-    none = np.zeros_like(both)[..., None]
-    return both[..., None], none, differ[..., None], distance[..., None], turned[..., None]
+    turned = np.degrees(np.linalg.norm(relative, axis=-1))
+    return _Shift(
+        both[..., None], np.zeros_like(both)[..., None], differ[..., None], (distance, turned))
 
 
 def _require_one_pipeline(first: xr.Dataset, second: xr.Dataset) -> None:

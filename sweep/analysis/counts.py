@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Generic
 
 import numpy as np
 from scipy import special
 
+from sweep.analysis.draws import Design, Sample
 from sweep.analysis.intervals import LEVEL, clopper_pearson, jeffreys, wilson
 from sweep.analysis.statistic import (
     OVER_ALL,
+    Blocks,
     Output,
-    Sample,
-    SinglePass,
-    State,
+    Statistic,
     Variables,
     ViewT,
+    settings_of,
     with_interval,
 )
 from sweep.typing import Floats, Integers, Masks
@@ -38,14 +38,7 @@ def scaled_to_draws(hits: Integers, n: Integers, draws: Integers) -> tuple[Integ
 
 
 @dataclass(frozen=True)
-class CountState(State):
-    """How many poses there are, (groups,)."""
-
-    n: Integers
-
-
-@dataclass(frozen=True)
-class Count(SinglePass[ViewT, CountState], Generic[ViewT]):
+class Count(Statistic[ViewT]):
     """How many poses there are of a kind."""
 
     name: str
@@ -56,17 +49,14 @@ class Count(SinglePass[ViewT, CountState], Generic[ViewT]):
         """Return the variable."""
         return [Output(self.name, self.meaning, "1", "i8")]
 
-    def first_pass(self, poses: ViewT) -> CountState:
-        """Count."""
-        return CountState(np.asarray(self.of(poses).sum(axis=OVER_ALL)))
-
-    def result(self, state: CountState) -> Variables:
+    def variables(self, blocks: Blocks[ViewT], design: Design) -> Variables:  # noqa: ARG002
         """Return the count."""
-        return {self.name: state.n}
+        counts = blocks.map(lambda poses: self.of(poses).sum(axis=OVER_ALL))
+        return {self.name: np.sum(counts, axis=0)}
 
 
 @dataclass(frozen=True)
-class CountOfDraws(SinglePass[ViewT, Sample], Generic[ViewT]):
+class CountOfDraws(Statistic[ViewT]):
     """How many poses there are of a kind, the draws they are worth, and if intervals exist."""
 
     name: str
@@ -81,32 +71,20 @@ class CountOfDraws(SinglePass[ViewT, Sample], Generic[ViewT]):
                 Output(self.draws, "random draws that the intervals are of", "1", "i8"),
                 Output(self.drawn, "whether any cell has two draws", "1", "?")]
 
-    def first_pass(self, poses: ViewT) -> Sample:
-        """Count."""
-        return Sample.of(self.of(poses))
-
-    def result(self, state: Sample) -> Variables:
+    def variables(self, blocks: Blocks[ViewT], design: Design) -> Variables:  # noqa: ARG002
         """Return the counts."""
-        return {self.name: state.n, self.draws: state.draws, self.drawn: state.drawn}
+        sample = Sample(*blocks.gather(lambda poses: (settings_of(self.of(poses)),)))
+        return {self.name: sample.n, self.draws: sample.draws, self.drawn: sample.drawn}
 
 
 @dataclass(frozen=True)
-class RateState(State):
-    """The poses that count, and how many of them are successes, (groups,)."""
-
-    sample: Sample
-    hits: Integers
-
-
-@dataclass(frozen=True)
-class Rate(SinglePass[ViewT, RateState], Generic[ViewT]):
+class Rate(Statistic[ViewT]):
     """The share of ``used`` that are ``successes``, with an interval of a level.
 
-    It is Wilson's, or Clopper and Pearson's if it is to be ``exact``.
+    It is Wilson's, or Clopper and Pearson's if it is to be ``exact``, or sampling was stopped.
 
-    Pooled settings see the same draws: n of the interval is the number of draws, `Sample.draws`,
-    and the successes are rounded outwards to whole draws. It is a little wide if the cells' rates
-    differ.
+    n of the interval is the number of draws that the rate is worth (`Design.worth`), and the
+    successes are rounded outwards to whole draws. It is a little wide if the cells' rates differ.
     """
 
     name: str
@@ -131,32 +109,34 @@ class Rate(SinglePass[ViewT, RateState], Generic[ViewT]):
               if self.with_jeffreys else []),
         ]
 
-    def first_pass(self, poses: ViewT) -> RateState:
-        """Count."""
-        used = self.used(poses)
-        hits = (self.successes(poses) & used).sum(axis=OVER_ALL)
-        return RateState(Sample.of(used), np.asarray(hits))
+    def by_draw(self, blocks: Blocks[ViewT]) -> tuple[Integers, Integers]:
+        """Return the numbers of successes and of poses that count, (groups, cells, draws) each."""
+        def count(poses: ViewT) -> tuple[Integers, Integers]:
+            used = self.used(poses)
+            return settings_of(self.successes(poses) & used), settings_of(used)
 
-    def draws_of(self, state: RateState) -> Integers:
-        """Return the number of draws that the interval is of."""
-        return state.sample.draws
+        hits, used = blocks.gather(count)
+        return hits, used
 
-    def result(self, state: RateState) -> Variables:
+    def variables(self, blocks: Blocks[ViewT], design: Design) -> Variables:
         """Return the rate and its intervals."""
-        n, draws, hits = state.sample.n, self.draws_of(state), state.hits
+        hits_by_draw, used_by_draw = self.by_draw(blocks)
+        level, sample = design.level(self.level), Sample(used_by_draw)
+        hits = hits_by_draw.sum(axis=(1, 2), dtype=np.int64)
+        n, draws = sample.n, design.draws_of_rate(hits_by_draw, used_by_draw, level)
         fewest, most = scaled_to_draws(hits, n, draws)
         with np.errstate(invalid="ignore"):
             values: Variables = {self.name: hits / n}
         if self.counts:
             names = (name for name, _ in self.counts)
             values |= dict(zip(names, (n, hits), strict=False)) | {self.draws_name: draws}
-        kinds = {"": clopper_pearson if self.exact else wilson}
+        kinds = {"": clopper_pearson if self.exact or design.stopped else wilson}
         if self.with_jeffreys:
             kinds["_jeffreys"] = jeffreys
         for ending, interval in kinds.items():
-            low, high = interval(fewest, draws, self.level)[0], interval(most, draws, self.level)[1]
-            values[f"{self.name}{ending}_low"] = np.where(state.sample.drawn, low, np.nan)
-            values[f"{self.name}{ending}_high"] = np.where(state.sample.drawn, high, np.nan)
+            low, high = interval(fewest, draws, level)[0], interval(most, draws, level)[1]
+            values[f"{self.name}{ending}_low"] = np.where(sample.drawn, low, np.nan)
+            values[f"{self.name}{ending}_high"] = np.where(sample.drawn, high, np.nan)
         return values
 
 

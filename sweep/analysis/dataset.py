@@ -17,6 +17,7 @@ from sweep.errors import ArgumentError, DatasetError, SweepError
 from sweep.messages import shown
 from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS, PHOTOGRAPHS, Stage
 from sweep.plan.pipeline import Pipeline
+from sweep.plan.reader import StoppingRule
 from sweep.plan.sampling import STOPPING_SECTIONS
 from sweep.plan.schema import FIXED, LABELS, SCHEMA, with_descriptions
 from sweep.plan.toml_text import read_document
@@ -99,17 +100,20 @@ def stored_pipeline(results: xr.Dataset) -> Pipeline:
     )
 
 
+def stopping_rule(results: xr.Dataset) -> StoppingRule | None:
+    """Return the rule by which a dataset's sampling was stopped; None if it was not."""
+    try:
+        # To read a pipeline takes milliseconds.
+        if not any(name in pipeline_text(results) for name in STOPPING_SECTIONS):
+            return None
+        return stored_pipeline(results).stopping
+    except (KeyError, SweepError):
+        return None
+
+
 def is_sampling_stopped(results: xr.Dataset) -> bool:
     """Return whether a dataset is of a pipeline whose sampling stops when results suffice."""
-    try:
-        text = pipeline_text(results)
-        return any(
-            name in text for name in STOPPING_SECTIONS
-        ) and (  # to read it takes milliseconds
-            stored_pipeline(results).stopping is not None
-        )
-    except (KeyError, SweepError):
-        return False
+    return stopping_rule(results) is not None
 
 
 def _run_metadata(results: xr.Dataset) -> Mapping[str, Any]:
@@ -199,6 +203,13 @@ def require_dimension(results: xr.Dataset, *names: str) -> str:
             return name
     raise DatasetError(f"{' or '.join(names)}: no such dimension; "
                        f"there are {', '.join(axes) or 'none'}")
+
+
+def stacked(arrays: Sequence[xr.DataArray], dim: str) -> xr.DataArray:
+    """Return arrays of the same coordinates as one, whose last dimension is a new one."""
+    return xr.concat(
+        arrays, dim=dim, coords="minimal", compat="override", join="exact",
+    ).transpose(..., dim)
 
 
 # --------------------------------------------------------------------------------------------------

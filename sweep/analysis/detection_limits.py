@@ -74,7 +74,7 @@ def detection_limit(
     Returns
     -------
     xr.Dataset
-        Dimensions (*per); lazy if ``results`` is.
+        Dimensions (*per).
 
         - ``side_px``: side in pixels, if the square were parallel to the image, from which on, at
           all larger sides of the grid, the detection rate is at least ``rate``: so a dip at a
@@ -133,12 +133,10 @@ def detection_limit(
     table = detection_rate(results, (*kept, *(name for name in along if name not in bins)), bins)
     n, draws, hits = (table[name] for name in ("looked_for", "draws", "detected"))
     drawn = table["detection_rate_low"].notnull()
-    counts = [array.chunk(dict.fromkeys(along, -1)) if array.chunks else array
-              for array in (hits, n, draws, drawn)]
     *values, limit = xr.apply_ufunc(
-        _limit, sides, *counts, dask="parallelized",
+        _limit, sides, hits, n, draws, drawn,
         kwargs={"rate": rate, "dims": len(along), "count": distinct, "stopped": stopped},
-        input_core_dims=[along] * 5, output_core_dims=[[]] * 5, output_dtypes=[np.float64] * 5,
+        input_core_dims=[along] * 5, output_core_dims=[[]] * 5,
     )
     limits = dict(zip(("side_px", "side_px_low", "side_px_high", "side_px_below"), values,
                       strict=True))
@@ -256,7 +254,7 @@ def _in_units_of_the_axis(
             out[f"{name}{ending}"] = xr.apply_ufunc(
                 _value_of_side, limits[source], sides.drop_vars(axis, errors="ignore"),
                 kwargs={"values": values.astype(np.float64), "smaller": smaller},
-                input_core_dims=[[], [axis]], dask="parallelized", output_dtypes=[np.float64],
+                input_core_dims=[[], [axis]],
             ).assign_attrs(long_name=f"{name}: {words}",
                            units=str(results[name].attrs.get("units", "1")))
     return out

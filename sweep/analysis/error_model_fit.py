@@ -5,18 +5,19 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-import dask.array as da
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.analysis.aggregate import aggregate
 from sweep.analysis.dataset import DRAWS, parameter_value
+from sweep.analysis.draws import Design
 from sweep.analysis.poses import (
     DEPTH,
     SIGNED_INPUTS,
@@ -27,7 +28,7 @@ from sweep.analysis.poses import (
     sight_rotation,
     viewing_angle_of,
 )
-from sweep.analysis.statistic import Largest, Output, SinglePass, State, Variables
+from sweep.analysis.statistic import Blocks, Output, Statistic, Variables
 from sweep.errors import DatasetError
 from sweep.measure.flags import DetectionStatus, uncounted_values
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
@@ -154,7 +155,8 @@ def hat_basis(at: Floats, knots: Sequence[Floats]) -> Floats:
         for k, each in enumerate(knots)
     ]
     return functools.reduce(
-        lambda a, b: (a[:, :, None] * b[:, None, :]).reshape(len(at), -1), parts)
+        lambda a, b: (a[:, :, None] * b[:, None, :]).reshape(len(at), a.shape[1] * b.shape[1]),
+        parts)
 
 
 def differences(knots: Sequence[Floats]) -> Floats:
@@ -336,7 +338,7 @@ def grid_points(knots: Sequence[Floats]) -> Floats:
 
 
 # --------------------------------------------------------------------------------------------------
-# Streamed sums for error models: moments of errors in bins, and how many lie within two sigma.
+# Sums for error models: moments of errors in bins, and how many lie within two sigma.
 
 QUANTITIES = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
 """Errors in the sight frame: of the position (m), and the rotation vector (rad)."""
@@ -428,25 +430,7 @@ class SightErrors(Poses):
 
 
 @dataclass(frozen=True)
-class Sums(State):
-    """Sums (groups, halves, bins, columns)."""
-
-    values: Floats
-
-
-@dataclass(frozen=True)
-class Region(State):
-    """Poses looked for in cells (groups, halves, cells, 1), and how far they reach.
-
-    Columns of ``reach``: the largest projection on each direction, then on its opposite.
-    """
-
-    counts: Floats
-    reach: Largest
-
-
-@dataclass(frozen=True)
-class _OfBins(SinglePass[SightErrors, Sums]):
+class _OfBins(Statistic[SightErrors]):
     """A statistic of a single variable, whose value is the array (halves, bins, columns)."""
 
     bins: Bins
@@ -455,13 +439,17 @@ class _OfBins(SinglePass[SightErrors, Sums]):
         """Return the variable."""
         return [Output("sums", "sums over bins", "1", "O")]
 
-    def result(self, state: Sums) -> Variables:
+    def variables(self, blocks: Blocks[SightErrors], design: Design) -> Variables:  # noqa: ARG002
         """Return an array a group."""
-        return {"sums": _objects(state.values)}
+        return {"sums": _objects(np.sum(blocks.map(self.of_block), axis=0))}
+
+    @abstractmethod
+    def of_block(self, poses: SightErrors) -> Floats:
+        """Return the sums (groups, halves, bins, columns) of a block."""
 
 
 @dataclass(frozen=True)
-class SeenRegion(SinglePass[SightErrors, Region]):
+class SeenRegion(Statistic[SightErrors]):
     """Cells of distance, side, viewing angle and bearing with poses, and how far poses reach.
 
     ``directions`` (directions, 4) are in ln(distance), ln(side), viewing angle and bearing.
@@ -475,13 +463,18 @@ class SeenRegion(SinglePass[SightErrors, Region]):
         return [Output("counts", "poses looked for in cells", "1", "O"),
                 Output("reach", "largest projections on directions and their opposites", "1", "O")]
 
-    def result(self, state: Region) -> Variables:
+    def variables(self, blocks: Blocks[SightErrors], design: Design) -> Variables:  # noqa: ARG002
         """Return two arrays a group."""
-        return {"counts": _objects(state.counts.sum(axis=1)[..., 0]),
-                "reach": _objects(state.reach.values)}
+        counts, reach = zip(*blocks.map(self.of_block), strict=True)
+        return {"counts": _objects(np.sum(counts, axis=0).sum(axis=1)[..., 0]),
+                "reach": _objects(np.max(reach, axis=0))}
 
-    def first_pass(self, poses: SightErrors) -> Region:
-        """Count in a block, and project."""
+    def of_block(self, poses: SightErrors) -> tuple[Floats, Floats]:
+        """Return the poses in cells (groups, halves, cells, 1), and how far they reach.
+
+        The columns of the second (groups, 2 x directions) are the largest projection on each
+        direction, then on its opposite.
+        """
         numbers, inside = _numbers(self.bins, poses)
         groups = len(poses.detection)
         shape = numbers.shape
@@ -491,7 +484,7 @@ class SeenRegion(SinglePass[SightErrors, Region]):
         reach = np.full((groups, 2 * len(self.directions)), -np.inf)
         np.maximum.at(reach, of_group, np.concatenate([projected, -projected], axis=-1))
         used = numbers[inside]
-        return Region(_add(self.bins, used, groups, [np.ones(len(used))]), Largest(reach))
+        return _add(self.bins, used, groups, [np.ones(len(used))]), reach
 
 
 def _objects(values: Sequence[Any] | Floats) -> NDArray[Any]:
@@ -522,8 +515,8 @@ def _numbers(bins: Bins, poses: SightErrors) -> tuple[Integers, NDArray[np.bool_
 class BinMoments(_OfBins):
     """Number of poses, sums of their coordinates and of the powers of each error."""
 
-    def first_pass(self, poses: SightErrors) -> Sums:
-        """Sum over a block."""
+    def of_block(self, poses: SightErrors) -> Floats:
+        """Return the sums of a block."""
         numbers, inside = _numbers(self.bins, poses)
         groups, used = len(poses.detection), inside & poses.unflipped
         errors = np.broadcast_to(poses.in_sight, (*numbers.shape, len(QUANTITIES)))[used]
@@ -533,7 +526,7 @@ class BinMoments(_OfBins):
             for _ in range(POWERS):
                 power = power * errors[:, k]
                 columns.append(power)
-        return Sums(_add(self.bins, numbers[used], groups, columns))
+        return _add(self.bins, numbers[used], groups, columns)
 
 
 @dataclass(frozen=True)
@@ -582,8 +575,8 @@ class Coverage(_OfBins):
 
     fitted: Fitted = field(repr=False)
 
-    def first_pass(self, poses: SightErrors) -> Sums:
-        """Count in a block."""
+    def of_block(self, poses: SightErrors) -> Floats:
+        """Return the counts of a block."""
         numbers, inside = _numbers(self.bins, poses)
         shape = numbers.shape
         used = inside & poses.unflipped
@@ -609,7 +602,7 @@ class Coverage(_OfBins):
             np.ravel(np.broadcast_to(each, shape) & inside).astype(float)
             for each in (poses.looked_for, poses.solved, poses.flipped, poses.unflipped)])
         within = _add(self.bins, numbers[used], groups, columns)
-        return Sums(np.concatenate([counts, within], axis=-1))
+        return np.concatenate([counts, within], axis=-1)
 
 
 def sums_of(
@@ -627,7 +620,7 @@ def sums_of(
         HALF: xr.DataArray(half.astype(np.int64), dims=DRAWS),
         FOCAL_SIZE: focal_size,
     }
-    table = aggregate(results, inputs, kept, statistics, SightErrors).compute()
+    table = aggregate(results, inputs, kept, statistics, SightErrors)
     return {str(name): list(values.transpose(*kept).values.ravel())
             for name, values in table.data_vars.items()}
 
@@ -849,16 +842,12 @@ def distinct_values(results: xr.Dataset, focal_size: xr.DataArray) -> dict[str, 
     DatasetError
         If no pose was looked for.
     """
-    position = results["true_tvec_m"]
-    distance = position.isel(xyz=2, drop=True).reset_coords(drop=True)
+    position = results["true_tvec_m"].reset_coords(drop=True).compute()
+    distance = position.isel(xyz=2, drop=True)
     angle = xr.apply_ufunc(
-        viewing_angle_of, results["true_rvec"].reset_coords(drop=True),
-        position.reset_coords(drop=True), input_core_dims=[["xyz"], ["xyz"]], dask="parallelized",
-        output_dtypes=[np.float64], dask_gufunc_kwargs={"allow_rechunk": True})
-    bearing = xr.apply_ufunc(
-        bearing_of, position.reset_coords(drop=True), input_core_dims=[["xyz"]],
-        dask="parallelized", output_dtypes=[np.float64],
-        dask_gufunc_kwargs={"allow_rechunk": True})
+        viewing_angle_of, results["true_rvec"].reset_coords(drop=True).compute(), position,
+        input_core_dims=[["xyz"], ["xyz"]])
+    bearing = xr.apply_ufunc(bearing_of, position, input_core_dims=[["xyz"]])
     seen = results["detection"].reset_coords(drop=True)
     counted = ~seen.isin(uncounted_values(DetectionStatus)) & (distance > 0)
     counted = counted.any([dim for dim in counted.dims if dim not in position.dims])
@@ -877,7 +866,7 @@ def distinct_values(results: xr.Dataset, focal_size: xr.DataArray) -> dict[str, 
 
 def _distinct(values: xr.DataArray, *, absolute: bool = False) -> Floats:
     """Return the sorted values, those that are the same once."""
-    flat = da.unique(da.asarray(values.data).ravel()).compute()
+    flat = np.unique(values.to_numpy())
     flat = flat[np.isfinite(flat)]
     if not len(flat):
         return np.asarray(flat)

@@ -42,6 +42,7 @@ from sweep.analysis.error_model_fit import (
 )
 from sweep.analysis.intervals import DEVIATIONS
 from sweep.analysis.poses import SIGNED_INPUTS, bearing_of, pose_arrays, sight_rotation
+from sweep.analysis.statistic import INTERVAL
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import Flag, flag
 from sweep.plan.schema import cf_attributes
@@ -301,9 +302,7 @@ def _knot_variables(
             for each in fits]).reshape(*shape, len(QUANTITIES), *grid)
 
     variables = {}
-    for ending, side in (("", 0.0), ("_low", -z), ("_high", z)):
-        words = {"": "", "_low": "lower end of the 95 % interval: ",
-                 "_high": "upper end of the 95 % interval: "}[ending]
+    for (ending, words), side in zip(INTERVAL.items(), (0.0, -z, z), strict=True):
         variables[f"sigma{ending}"] = (dims, stacked(
             lambda fit, side=side: np.exp(
                 0.5 * (fit.log_variance + side * fit.log_variance_error))),
@@ -388,9 +387,7 @@ def _exponents(
     return {
         f"exponent{ending}": ((*kept, "quantity"), each.reshape(*shape, -1),
                               cf_attributes(text + words, "1"))
-        for (ending, text), each in zip(
-            (("", ""), ("_low", "lower end of the 95 % interval: "),
-             ("_high", "upper end of the 95 % interval: ")), values, strict=True)
+        for (ending, text), each in zip(INTERVAL.items(), values, strict=True)
     }
 
 

@@ -17,7 +17,7 @@ from sweep.analysis.dataset import (
     axes_of,
     configuration_axes,
     describes,
-    stored_pipeline,
+    stopping_rule,
 )
 from sweep.analysis.draws import computed_scenes
 from sweep.analysis.intervals import looks_factor
@@ -27,9 +27,11 @@ from sweep.analysis.requirements import (
     Requirement,
     combined_decision,
     decide,
+    excess_of,
+    kept_by,
     parse_requirements,
 )
-from sweep.errors import ArgumentError, DatasetError, SweepError
+from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import Flag, flag
 from sweep.plan.sampling import LimitRule
 from sweep.plan.schema import cf_attributes
@@ -80,8 +82,6 @@ def farthest_met(
           requirements keep their limits; NaN for never. ``start``: the value from which they do,
           which is the easiest, or the first of the longest run of values if they do not there:
           near 0 tilt poses flip, near the camera a marker is cut off.
-        - ``start_limited_by``, ``start_fails_at``, ``start_fails_where``, ``start_failing_value``:
-          as the following, of the value before ``start``.
         - ``low``, ``high``: ends of its interval, in the axis' unit. Up to the end nearer to the
           easy values they are decided to be met, beyond the other end a requirement is decided not
           to be met. -inf or inf: the limit may lie beyond the grid's end.
@@ -126,9 +126,7 @@ def farthest_met(
     if overlap:
         raise ArgumentError("at_all", ", ".join(overlap), "is in per, too; name it in one of them")
     table = decide(results, required, [*names, *together, along], shares=shares)
-    keeps = xr.zeros_like(table["value"], dtype=bool)
-    for k, each in enumerate(required):
-        keeps[{"requirement": k}] = each.holds(table["value"].isel(requirement=k))
+    keeps = kept_by(table, required)
     upwards = is_harder_upwards(results, along, keeps)
     order = np.argsort(values if upwards else -values, kind="stable")
     table, keeps = table.isel({along: order}), keeps.isel({along: order})
@@ -143,26 +141,20 @@ def farthest_met(
         cf_attributes("whether all requirements are met", flags=Decision))
     kept = [dim for dim in decision.dims if dim != along]
     shape = decision.transpose(*kept, along)
-    out: dict[str, Any] = {name: np.full(shape.shape[:-1], np.nan) for name in (
-        "value", "low", "high", "fails_at", "failing_value", "met_beyond", "farthest_beyond",
-        "start", "start_fails_at", "start_failing_value")}
-    out["reach"] = np.zeros(shape.shape[:-1], np.uint8)
-    texts = {name: np.full(shape.shape[:-1], "", dtype=object) for name in (
-        "limited_by", "fails_where", "start_limited_by", "start_fails_where")}
+    rows = []
     for index in np.ndindex(*shape.shape[:-1]):
         at = dict(zip(kept, index, strict=True))
-        one = {"keeps": all_keep.isel(at).values, "judged": judged.isel(at).values,
-               "decision": decision.isel(at).values}
-        numbers, before, beyond = _limit(values, upwards, **one)
-        for name, number in numbers.items():
-            out[name][index] = number
-        for which, failing in (("start_", before), ("", beyond)):
-            if failing is None:
-                continue
+        numbers, failing = _limit(
+            values, upwards, keeps=all_keep.isel(at).values, judged=judged.isel(at).values,
+            decision=decision.isel(at).values)
+        if failing is not None:
             cell = {**at, along: failing}
-            words = _cause(table.isel(cell), keeps.isel(cell), together)
-            texts[f"{which}limited_by"][index], texts[f"{which}fails_where"][index] = words[:2]
-            out[f"{which}failing_value"][index] = words[2]
+            numbers |= _cause(table.isel(cell), keeps.isel(cell), together)
+        rows.append(numbers)
+
+    def column(name: str, missing: Any) -> NDArray[Any]:
+        return np.array([row.get(name, missing) for row in rows]).reshape(shape.shape[:-1])
+
     units = str(results[along].attrs.get("units", ""))
     meanings = {
         "value": f"{along} up to which all requirements are met",
@@ -170,21 +162,19 @@ def farthest_met(
         "high": f"upper end of the interval: {along} up to which all are met",
         "start": f"{along} from which all requirements are met",
         "fails_at": f"first {along} at which one is not",
-        "start_fails_at": f"last {along} before the start at which one is not",
-        "start_failing_value": "value of the requirement that fails there",
         "farthest_beyond": f"farthest {along} beyond it at which all are met again",
         "failing_value": "value of the requirement that fails there",
         "met_beyond": "values beyond it at which all are met again",
     }
     variables: dict[str, Any] = {
-        name: (kept, out[name], {"long_name": meaning, "units": {
-            "failing_value": "", "start_failing_value": "", "met_beyond": "1"}.get(name, units)})
+        name: (kept, column(name, np.nan), {"long_name": meaning, "units": {
+            "failing_value": "", "met_beyond": "1"}.get(name, units)})
         for name, meaning in meanings.items()}
-    variables["reach"] = (kept, out["reach"], cf_attributes(
+    variables["reach"] = (kept, column("reach", Reach.not_run).astype(np.uint8), cf_attributes(
         "how far the requirements are met", flags=Reach))
-    variables |= {name: (kept, words.astype(str), {
-        "long_name": "requirement that fails" if "by" in name else "where it fails"})
-        for name, words in texts.items()}
+    for name, meaning in (("limited_by", "requirement that fails"),
+                          ("fails_where", "where it fails")):
+        variables[name] = kept, column(name, ""), {"long_name": meaning}
     variables["decision"] = decision.transpose(*kept, along)
     variables["keeps"] = all_keep.transpose(*kept, along).assign_attrs(
         long_name="whether all values keep their limits", units="1")
@@ -257,13 +247,10 @@ def easier_first(keeps: NDArray[Any], values: NDArray[Any]) -> bool:
 def _limit(
     values: np.ndarray[Any, Any], upwards: bool, *, keeps: np.ndarray[Any, Any],
     judged: np.ndarray[Any, Any], decision: np.ndarray[Any, Any],
-) -> tuple[dict[str, float], int | None, int | None]:
-    """Return the limit along the axis, from easy to hard, and the indices of failures around it.
-
-    The first is that before the values at which all are met, the second that beyond.
-    """
+) -> tuple[dict[str, Any], int | None]:
+    """Return the limit along the axis, from easy to hard, and the index of the failure beyond."""
     if not judged.any():
-        return {"reach": Reach.not_run}, None, None
+        return {"reach": Reach.not_run}, None
     none, beyond = (-np.inf, np.inf) if upwards else (np.inf, -np.inf)
     run = met_run(keeps, judged)
     before_run = np.nonzero(~keeps & judged)[0]
@@ -288,19 +275,16 @@ def _limit(
                "met_beyond": 0.0}
     if run:
         numbers["start"] = float(values[run[0]])
-    easier = int(before_run[-1]) if before_run.size else None
-    if easier is not None:
-        numbers["start_fails_at"] = float(values[easier])
     if not len(failing):
-        return {**numbers, "reach": Reach.always if easier is None else Reach.within}, easier, None
+        return {**numbers, "reach": Reach.within if before_run.size else Reach.always}, None
     first = int(failing[0])
     again = np.nonzero(keeps & judged)[0]
     again = again[again > first]
     numbers |= {"fails_at": float(values[first]), "met_beyond": float(len(again)),
                 "farthest_beyond": float(values[again[-1]]) if len(again) else np.nan,
                 "reach": Reach.never if run is None else
-                Reach.found if easier is None else Reach.within}
-    return numbers, easier, first
+                Reach.within if before_run.size else Reach.found}
+    return numbers, first
 
 
 def met_run(
@@ -329,18 +313,17 @@ def met_run(
 
 def _cause(
     cell: xr.Dataset, keeps: xr.DataArray, together: Sequence[str]
-) -> tuple[str, str, float]:
+) -> dict[str, Any]:
     """Return which requirement fails worst, where among ``together``, and its value there."""
     failing = ~keeps & (cell["decision"] != Decision.not_applicable)
-    ratio = cell["value"] / cell["limit"]
-    at_least = cell["relation"].isin([">=", ">"])
-    excess = (1.0 - ratio).where(at_least, 1.0 - 1.0 / ratio).fillna(np.inf).where(failing)
+    excess = excess_of(cell).where(failing)
     flat = excess.stack(all_dims=excess.dims)
     worst = flat.isel(all_dims=int(flat.argmax("all_dims")))
     at = {name: worst[name].item() for name in excess.dims}
     where = ", ".join(f"{name} = {at[name]:g}" if isinstance(at[name], float) else
                       f"{name} = {at[name]}" for name in together)
-    return str(at["requirement"]), where, float(cell["value"].sel(at))
+    return {"limited_by": str(at["requirement"]), "fails_where": where,
+            "failing_value": float(cell["value"].sel(at))}
 
 
 # --------------------------------------------------------------------------------------------------
@@ -402,7 +385,8 @@ def requirement_limits(
     >>> limit["value"].item(), limit["low"].item(), limit["high"].item()
     (20.0, 20.0, 40.0)
     """
-    rule = _searched(results)
+    rule = stopping_rule(results)
+    rule = rule if isinstance(rule, LimitRule) else None
     require = [require] if isinstance(require, str) and require else require
     if not require or not along:
         if rule is None:
@@ -430,12 +414,3 @@ def requirement_limits(
     found["poses"] = computed.sum([*cells, along]).compute().assign_attrs(
         long_name="scenes that were computed, of all values", units="1")
     return found.assign_attrs(per=[*per], at_all=at_all, require=[*require])
-
-
-def _searched(results: xr.Dataset) -> LimitRule | None:
-    """Return the search that a dataset is of; None if it is of none."""
-    try:
-        rule = stored_pipeline(results).stopping
-    except (KeyError, SweepError):
-        return None
-    return rule if isinstance(rule, LimitRule) else None

@@ -6,28 +6,25 @@ import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar, cast
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar, cast
 
 import numpy as np
 from scipy import special
 
-from sweep.analysis.counts import Rate, RateState, scaled_to_draws
+from sweep.analysis.counts import Rate, scaled_to_draws
+from sweep.analysis.draws import SPREAD_TAIL_SHARE, TAIL_SHARE, Design, Sample, Unit
 from sweep.analysis.intervals import LEVEL, clopper_pearson
 from sweep.analysis.poses import Poses, component_sum
 from sweep.analysis.statistic import (
     OVER_ALL,
-    CellDeviations,
-    CellDraws,
-    Freedom,
-    Largest,
+    Blocks,
     Moments,
     Output,
-    Spread,
-    State,
     Statistic,
     Variables,
     ViewT,
     interval_variables,
+    settings_of,
     sum_of_settings,
     with_interval,
 )
@@ -54,8 +51,13 @@ class MeanEstimate(NamedTuple):
     freedom: Floats
 
 
-def estimate_mean(mean: Floats, n: Integers, freedom: Integers, spread: Spread) -> MeanEstimate:
+def estimate_mean(
+    mean: Floats, n: Integers, freedom: Integers, within: Moments
+) -> MeanEstimate:
     """Return the means of ``n`` values in cells, with their standard errors.
+
+    ``within`` are the moments (groups, cells) of what the draws of a cell add to the sum of
+    ``used * (value - mean)``.
 
     A mean is a ratio of two sums over a stratified sample, the cells being the strata and the
     draws the sample: of the values, and of what counts. So its variance is that of the sum of
@@ -68,10 +70,16 @@ def estimate_mean(mean: Floats, n: Integers, freedom: Integers, spread: Spread) 
     with the largest errors can make most of the variance. They are at most ``freedom``, the
     draws with a used value beyond the first of each cell; 0 of these: standard error NaN.
     """
+    repeated = within.count > 1
+    rest = np.where(repeated, within.count - 1.0, 0.0)
+    m2 = np.where(repeated, within.m2, 0.0)
     with np.errstate(all="ignore"):
-        pooled = spread.single * spread.m2 / spread.freedom
-        variance = spread.variance + np.where(spread.single > 0, pooled, 0.0)
-        welch = spread.variance ** 2 / spread.squares - 2.0
+        terms = (rest + 1.0) * m2 / np.maximum(rest, 1.0)  # n_c s_c²
+        variance = terms.sum(axis=1)
+        welch = variance**2 / (terms**2 / (rest + 2.0)).sum(axis=1) - 2.0
+        single = (within.count == 1).sum(axis=1)
+        pooled = single * m2.sum(axis=1) / rest.sum(axis=1)
+        variance = variance + np.where(single > 0, pooled, 0.0)
         degrees = np.where(freedom > 0, np.fmin(freedom, welch), np.nan)
         error = np.where(freedom > 0, np.sqrt(variance) / n, np.nan)
     return MeanEstimate(np.where(n > 0, mean, np.nan), error, degrees)
@@ -169,25 +177,29 @@ class DrawnPoses(Protocol):
 DrawnT = TypeVar("DrawnT", bound=DrawnPoses)
 
 
-@dataclass(frozen=True)
-class MeanState(State):
-    """Moments (groups, components) of the values, and the draws' degrees of freedom (groups,)."""
+class Summary(NamedTuple):
+    """What an interval of a mean is made of.
 
+    Attributes
+    ----------
+    estimate
+        The mean of the scores.
+    moments
+        Of the values (groups, components).
+    largest
+        The largest score (groups,) of a pose; -inf of none.
+    draws
+        Independent draws (groups,) of the scores.
+    """
+
+    estimate: MeanEstimate
     moments: Moments
-    freedom: Freedom
+    largest: Floats
+    draws: Integers | Floats
 
 
 @dataclass(frozen=True)
-class CentredState(State):
-    """What the second pass knows: the first's state, and the mean of the scores, (groups,)."""
-
-    moments: Moments
-    freedom: Freedom
-    centre: Floats
-
-
-@dataclass(frozen=True)
-class Mean(Statistic[DrawnT, MeanState, CentredState, Spread], Generic[DrawnT]):
+class Mean(Statistic[DrawnT]):
     """A mean of values, (groups, cells, draws, settings, components), with Student's interval.
 
     Values that are NaN do not count. What varies is the mean of scores, one number a pose: for
@@ -200,54 +212,57 @@ class Mean(Statistic[DrawnT, MeanState, CentredState, Spread], Generic[DrawnT]):
     values: Callable[[DrawnT], Floats]
     used: Callable[[DrawnT], Masks]
     level: float = LEVEL
+    tail_share: ClassVar[float] = TAIL_SHARE
+    """Where sampling was stopped."""
 
     def outputs(self) -> Sequence[Output]:
         """Return the mean and its interval."""
         return with_interval(self.name, self.meaning, self.units)
 
-    def first_pass(self, poses: DrawnT) -> MeanState:
-        """Take the moments of the values, all together."""
-        values = self.values(poses)
-        used = self._used(poses, values)
-        moments = Moments.of(np.where(used[..., None], values, np.nan), axis=OVER_ALL)
-        return MeanState(moments, CellDraws.of(sum_of_settings(used)))
-
-    def prepare_second(self, first: MeanState) -> CentredState:
-        """Return the moments with the mean of the scores."""
-        return CentredState(first.moments, first.freedom, self._centre(first.moments))
-
-    def second_pass(self, poses: DrawnT, known: CentredState) -> Any:
-        """Take the moments of the draws' deviations within the cells."""
-        values = self.values(poses)
-        used = self._used(poses, values)
-        with np.errstate(all="ignore"):
-            scores = self._scores(values, known.moments)
-            centre = known.centre[:, None, None, None]
-            deviations = sum_of_settings(np.where(used, scores - centre, 0.0))
-        largest = np.where(used, scores, -np.inf).max(axis=OVER_ALL, initial=-np.inf)
-        return CellDeviations(
-            Moments.of(np.where(poses.draws, deviations, np.nan), axis=2), Largest(largest))
-
-    def finish(self, known: CentredState, second: Spread) -> Variables:
+    def variables(self, blocks: Blocks[DrawnT], design: Design) -> Variables:
         """Return the mean and its interval."""
-        n = known.moments.count[:, 0]
-        estimate = estimate_mean(known.centre, n, known.freedom, second)
-        return interval_variables(self.name, self._interval(estimate, known, second))
+        interval = self.interval(
+            self.summary(blocks, design), design.level(self.level, self.tail_share))
+        return interval_variables(self.name, interval)
 
-    def _used(self, poses: DrawnT, values: Floats) -> Masks:
-        return np.asarray(self.used(poses) & ~missing(values))
+    def summary(self, blocks: Blocks[DrawnT], design: Design) -> Summary:
+        """Return the mean of the scores with its standard error."""
+        def of_block(poses: DrawnT) -> Moments:
+            values, used = self._values_and_used(poses)
+            return Moments.of(np.where(used[..., None], values, np.nan), axis=OVER_ALL)
+
+        moments = functools.reduce(Moments.merge, blocks.map(of_block))
+        centre = self._centre(moments)
+
+        def deviations(poses: DrawnT) -> tuple[Floats, Integers, Floats]:
+            values, used = self._values_and_used(poses)
+            with np.errstate(all="ignore"):
+                scores = self._scores(values, moments)
+                sums = sum_of_settings(np.where(used, scores - centre[:, None, None, None], 0.0))
+            largest = np.where(used, scores, -np.inf).max(axis=OVER_ALL, initial=-np.inf)
+            return (np.where(poses.draws, sums, np.nan), settings_of(used),
+                    largest[:, None, None])
+
+        sums, settings, largest = blocks.gather(deviations)
+        n, freedom = moments.count[:, 0], Sample(settings).freedom
+        draws = n / design.points if design.unit is Unit.replicate else freedom + 1
+        estimate = estimate_mean(centre, n, freedom, Moments.of(sums, axis=2))
+        return Summary(estimate, moments, largest.max(axis=(1, 2)), draws)
+
+    def _values_and_used(self, poses: DrawnT) -> tuple[Floats, Masks]:
+        values = self.values(poses)
+        return values, np.asarray(self.used(poses) & ~missing(values))
 
     def _centre(self, moments: Moments) -> Floats:
+        """Return the mean of the scores."""
         return np.asarray(moments.mean[:, 0])
 
     def _scores(self, values: Floats, moments: Moments) -> Floats:  # noqa: ARG002
         return values[..., 0]
 
-    def _interval(
-        self, estimate: MeanEstimate, known: CentredState, second: Spread,  # noqa: ARG002
-    ) -> tuple[Floats, Floats, Floats]:
-        """Return value, low and high, from the mean of the scores."""
-        return symmetric(estimate, self.level)
+    def interval(self, summary: Summary, level: float) -> tuple[Floats, Floats, Floats]:
+        """Return value, low and high."""
+        return symmetric(summary.estimate, level)
 
 
 def missing(values: Floats) -> Masks:
@@ -266,17 +281,12 @@ class PositiveMean(Mean[DrawnT]):
     """
 
     guarded: bool = False
-    points_per_draw: int | None = None
-    """Of draws that are Sobol' points, the pooled settings of one; None if draws are random."""
 
-    def _interval(
-        self, estimate: MeanEstimate, known: CentredState, second: Spread
-    ) -> tuple[Floats, Floats, Floats]:
-        mean, low, high = exponential(estimate, self.level)
+    def interval(self, summary: Summary, level: float) -> tuple[Floats, Floats, Floats]:
+        """Return value, low and high."""
+        mean, low, high = exponential(summary.estimate, level)
         if self.guarded:
-            draws = known.freedom + 1 if self.points_per_draw is None else (
-                known.moments.count[:, 0] / self.points_per_draw)
-            high = with_unseen_tail(high, second.largest.values, draws, self.level)
+            high = with_unseen_tail(high, summary.largest, summary.draws, level)
         return mean, low, high
 
 
@@ -288,10 +298,11 @@ class RootMeanSquare(PositiveMean[DrawnT]):
     without the logarithm 0.92 to 0.95; with Laplace's tails 0.90 to 0.94.
     """
 
-    def _interval(
-        self, estimate: MeanEstimate, known: CentredState, second: Spread
-    ) -> tuple[Floats, Floats, Floats]:
-        mean, low, high = map(np.sqrt, super()._interval(estimate, known, second))
+    tail_share: ClassVar[float] = SPREAD_TAIL_SHARE
+
+    def interval(self, summary: Summary, level: float) -> tuple[Floats, Floats, Floats]:
+        """Return value, low and high."""
+        mean, low, high = map(np.sqrt, super().interval(summary, level))
         return mean, low, high
 
 
@@ -320,10 +331,9 @@ class MeanLength(Mean[DrawnT]):
         direction = np.where(length > 0.0, moments.mean / length, unit)
         return np.asarray(component_sum(values * direction[:, None, None, None]))
 
-    def _interval(
-        self, estimate: MeanEstimate, known: CentredState, second: Spread,  # noqa: ARG002
-    ) -> tuple[Floats, Floats, Floats]:
-        return length_interval(estimate, known.moments.mean.shape[1], self.level)
+    def interval(self, summary: Summary, level: float) -> tuple[Floats, Floats, Floats]:
+        """Return value, low and high."""
+        return length_interval(summary.estimate, summary.moments.mean.shape[1], level)
 
 
 class RootMeanSquareRatio(Mean[DrawnT]):
@@ -339,11 +349,10 @@ class RootMeanSquareRatio(Mean[DrawnT]):
         share = values / moments.mean[:, None, None, None]
         return np.asarray(share[..., 1] - share[..., 0])
 
-    def _interval(
-        self, estimate: MeanEstimate, known: CentredState, second: Spread,  # noqa: ARG002
-    ) -> tuple[Floats, Floats, Floats]:
-        half = half_width(estimate, self.level) / 2.0
-        mean = known.moments.mean
+    def interval(self, summary: Summary, level: float) -> tuple[Floats, Floats, Floats]:
+        """Return value, low and high."""
+        half = half_width(summary.estimate, level) / 2.0
+        mean = summary.moments.mean
         with np.errstate(all="ignore"):
             ratio = np.sqrt(mean[:, 1] / mean[:, 0])
             return ratio, ratio * np.exp(-half), ratio * np.exp(half)
@@ -357,38 +366,12 @@ class RootMeanSquareRatio(Mean[DrawnT]):
 # sample alone says nothing of the mean square. What bounds it is how many flips the sample may
 # have missed, and that no rotation error is larger than half a turn.
 
-@dataclass(frozen=True)
-class MixtureState(State):
-    """The squares of the poses that are not flipped, of those that are, and how many are."""
-
-    unflipped: MeanState
-    flipped: MeanState
-    flips: RateState
-
-
-@dataclass(frozen=True)
-class CentredMixture(State):
-    """What the second pass knows."""
-
-    unflipped: CentredState
-    flipped: CentredState
-    flips: RateState
-
-
-@dataclass(frozen=True)
-class MixtureSpread(State):
-    """Sums over cells, of both parts."""
-
-    unflipped: Spread
-    flipped: Spread
-
-
 FLIPS: Rate[Poses] = Rate("", "", lambda poses: poses.flipped, lambda poses: poses.solved)
 """The share of flips among the solved."""
 
 
 @dataclass(frozen=True)
-class FlipMixture(Statistic[Poses, MixtureState, CentredMixture, MixtureSpread]):
+class FlipMixture(Statistic[Poses]):
     """The root mean square over solved poses, with an interval that holds if flips are rare.
 
     The mean square is (1 - p) u + p v: p the share of flips, u the mean square of the other poses,
@@ -412,63 +395,39 @@ class FlipMixture(Statistic[Poses, MixtureState, CentredMixture, MixtureSpread])
     level: float = LEVEL
     guarded: bool = False
     """Whether the ends of u and v also hold errors that no draw showed, as `PositiveMean` says."""
-    points_per_draw: int | None = None
 
     def outputs(self) -> Sequence[Output]:
         """Return the root mean square and its interval."""
         return with_interval(self.name, self.meaning, self.units)
 
-    def _of(self, used: Callable[[Poses], Masks]) -> RootMeanSquare[Poses]:
-        return RootMeanSquare("rms", "", self.units, self.squares, used, self.level, self.guarded,
-                              self.points_per_draw)
-
-    @property
-    def _unflipped(self) -> RootMeanSquare[Poses]:
-        return self._of(lambda poses: poses.unflipped)
-
-    @property
-    def _flipped(self) -> RootMeanSquare[Poses]:
-        return self._of(lambda poses: poses.flipped)
-
-    def first_pass(self, poses: Poses) -> MixtureState:
-        """Take the moments of both parts, and count."""
-        return MixtureState(
-            self._unflipped.first_pass(poses), self._flipped.first_pass(poses),
-            self.flips.first_pass(poses))
-
-    def prepare_second(self, first: MixtureState) -> CentredMixture:
-        """Return the moments with their means."""
-        return CentredMixture(
-            self._unflipped.prepare_second(first.unflipped),
-            self._flipped.prepare_second(first.flipped), first.flips)
-
-    def second_pass(self, poses: Poses, known: CentredMixture) -> MixtureSpread:
-        """Take the moments of the draws' deviations within the cells, of both parts."""
-        return MixtureSpread(
-            self._unflipped.second_pass(poses, known.unflipped),
-            self._flipped.second_pass(poses, known.flipped))
-
-    def finish(self, known: CentredMixture, second: MixtureSpread) -> Variables:
+    def variables(self, blocks: Blocks[Poses], design: Design) -> Variables:
         """Return the root mean square and its interval."""
-        unflipped = self._unflipped.finish(known.unflipped, second.unflipped)
-        flipped = self._flipped.finish(known.flipped, second.flipped)
-        (u, u_low, u_high), (v, v_low, v_high) = (
-            [part[f"rms{end}"] ** 2 for end in ("", "_low", "_high")]
-            for part in (unflipped, flipped))
-        others, flips = known.unflipped.moments.count[:, 0], known.flipped.moments.count[:, 0]
+        level = design.level(self.level, SPREAD_TAIL_SHARE)
+        parts: list[tuple[Integers, Sequence[Floats]]] = []
+        for used in (lambda poses: poses.unflipped, lambda poses: poses.flipped):
+            part: RootMeanSquare[Poses] = RootMeanSquare(
+                "", "", self.units, self.squares, used, guarded=self.guarded)
+            summary = part.summary(blocks, design)
+            parts.append((summary.moments.count[:, 0],
+                          [end**2 for end in part.interval(summary, level)]))
+        (others, (u, u_low, u_high)), (flips, (v, v_low, v_high)) = parts
         with np.errstate(invalid="ignore"):
             square = np.where(others > 0, u * others, 0.0) + np.where(flips > 0, v * flips, 0.0)
             square = square / (others + flips)
         largest = self.bound**2
         lows = _first_known(u_low, v_low), _first_known(v_low, u_low)
         highs = [np.fmin(high, largest) for high in (u_high, v_high)]
-        shares = _shares(self.flips.draws_of(known.flips), known.flips, self.level)
+        hits, used_by_draw = self.flips.by_draw(blocks)
+        sample = Sample(used_by_draw)
+        draws = design.draws_of_rate(hits, used_by_draw, self.flips.level)
+        fewest, most = scaled_to_draws(
+            hits.sum(axis=(1, 2), dtype=np.int64), sample.n, draws)
+        shares = (clopper_pearson(fewest, draws, level)[0], clopper_pearson(most, draws, level)[1])
         low = np.minimum(*((1 - share) * lows[0] + share * lows[1] for share in shares))
         high = np.maximum(*((1 - share) * highs[0] + share * highs[1] for share in shares))
         # What is computed is rounded: the value lies in its interval.
         interval = (square, np.fmin(low, square), np.fmax(high, square))
-        drawn = known.flips.sample.drawn
-        ends = [np.where(drawn | (k == 0), each, np.nan) for k, each in enumerate(interval)]
+        ends = [np.where(sample.drawn | (k == 0), each, np.nan) for k, each in enumerate(interval)]
         return interval_variables(self.name, [np.sqrt(each) for each in ends])
 
 
@@ -478,18 +437,11 @@ def _first_known(*values: Floats) -> Floats:
     return np.nan_to_num(np.where(np.isnan(first), second, first), nan=0.0)
 
 
-def _shares(draws: Integers, flips: RateState, level: float) -> tuple[Floats, Floats]:
-    """Return the ends of the share of flips, counted in draws."""
-    fewest, most = scaled_to_draws(flips.hits, flips.sample.n, draws)
-    return clopper_pearson(fewest, draws, level)[0], clopper_pearson(most, draws, level)[1]
-
-
-def guarded(statistic: Statistic[ViewT, Any, Any, Any]) -> Statistic[ViewT, Any, Any, Any]:
+def guarded(statistic: Statistic[ViewT]) -> Statistic[ViewT]:
     """Return a statistic with the interval by which something is decided.
 
     Upper ends of means of squares then hold rare errors that no draw showed.
     """
-    if not isinstance(statistic, FlipMixture | PositiveMean):
+    if not hasattr(statistic, "guarded"):
         return statistic
-    changed = dataclasses.replace(statistic, guarded=True)
-    return cast("Statistic[ViewT, Any, Any, Any]", changed)
+    return cast("Statistic[ViewT]", dataclasses.replace(cast("Any", statistic), guarded=True))

@@ -321,8 +321,7 @@ class Poses:
     """Poses of a block: arrays (groups, cells, draws, settings, ...), by name.
 
     Those outside the mask `INSIDE` count as not run, those outside `COMMON` as not needed. The
-    masks and errors have the shape (groups, cells, draws, settings), but for axes of length 1 that
-    broadcast.
+    masks and errors have the shape (groups, cells, draws, settings).
 
     Parameters
     ----------
@@ -342,8 +341,11 @@ class Poses:
         """Return an array, of flags 0 (not run) for the poses that do not count."""
         array = self._arrays[self._prefix + name]
         if name in VARIABLES and VARIABLES[name].flags is not None:
-            # A dataset that was cut or joined has NaN where nothing was run.
-            array = np.where(self.inside, np.nan_to_num(array, nan=0.0), 0)
+            if array.dtype.kind == "f":
+                # A dataset that was cut or joined has NaN where nothing was run.
+                array = np.nan_to_num(array, nan=0.0)
+            if INSIDE in self._arrays:
+                array = np.where(self.inside, array, 0)
             if COMMON in self._arrays:
                 array = np.where(
                     self._arrays[COMMON] | (array == 0), array, VARIABLES[name].not_needed)
@@ -376,12 +378,15 @@ class Poses:
     @cached_property
     def run(self) -> Masks:
         """Poses that were run."""
-        return ~np.isin(self.detection, (DetectionStatus.not_run, DetectionStatus.not_needed))
+        flags = self.detection
+        return np.asarray(
+            (flags != DetectionStatus.not_run) & (flags != DetectionStatus.not_needed))
 
     @cached_property
     def looked_for(self) -> Masks:
         """Poses whose detection is counted: run, visible and modelled."""
-        return ~np.isin(self.detection, NOT_LOOKED_FOR)
+        return np.asarray(functools.reduce(
+            np.logical_and, [self.detection != value for value in NOT_LOOKED_FOR]))
 
     @cached_property
     def detected(self) -> Masks:

@@ -2,36 +2,35 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
 
 import numpy as np
 import xarray as xr
 
 from sweep.analysis.aggregate import aggregate
-from sweep.analysis.counts import Count, CountOfDraws
+from sweep.analysis.counts import Count
 from sweep.analysis.dataset import (
     DRAWS,
     as_names,
     configuration_axes,
     describes,
     kept_dimensions,
-    stored_pipeline,
+    stacked,
+    stopping_rule,
 )
 from sweep.analysis.draws import stopped_level
 from sweep.analysis.intervals import LEVEL, clopper_pearson
 from sweep.analysis.poses import Poses
-from sweep.analysis.quantiles import interval_ranks
+from sweep.analysis.quantiles import draws_of_quantile
+from sweep.analysis.rates import LOOKED_FOR
 from sweep.analysis.requirements import Requirable, named, requirable_arrays, requirables
-from sweep.analysis.statistic import Statistic
-from sweep.errors import ArgumentError, SweepError
+from sweep.analysis.statistic import INTERVAL, Statistic
+from sweep.errors import ArgumentError
 from sweep.measure.flags import Flag, flag
 from sweep.plan.sampling import PrecisionRule
 from sweep.plan.schema import cf_attributes
-from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
 # Half-widths of intervals, by which sampling stops, and whether they are as small as is wanted.
@@ -40,7 +39,7 @@ from sweep.typing import Floats, Masks
 # relative to the value. The intervals are those that the analysis shows of a store whose sampling
 # was stopped (`sweep.analysis.draws`).
 
-PoseStatistic = Statistic[Poses, Any, Any, Any]
+PoseStatistic = Statistic[Poses]
 
 MIN_DRAWS = 450
 """Draws below which no interval of a mean or a root mean square is narrow enough.
@@ -106,7 +105,7 @@ class WantedPrecision:
         """
         parts = list(self.requirable.computed(prefix, LEVEL))
         if self._spread:
-            parts += requirables()[self._spread].statistics(f"{prefix}of ", LEVEL)
+            parts.append(requirables()[self._spread].renamed(f"{prefix}of ", LEVEL))
         return parts
 
     @property
@@ -114,7 +113,7 @@ class WantedPrecision:
         """The dataset's variables that it is computed of."""
         return tuple(dict.fromkeys(self.requirable.variables))
 
-    @functools.cached_property
+    @property
     def least_draws(self) -> int:
         """Draws with a number below which it is useless to go on.
 
@@ -124,10 +123,7 @@ class WantedPrecision:
             return MIN_OF_RATE
         if (percent := self.requirable.percent) is None:
             return MIN_DRAWS
-        n = 1
-        while not _has_ends(n, percent, stopped_level(LEVEL)):
-            n += 1
-        return n
+        return draws_of_quantile(percent, stopped_level(LEVEL))
 
     @property
     def fewest_draws(self) -> int:
@@ -140,61 +136,54 @@ class WantedPrecision:
         tail = (1.0 - stopped_level(LEVEL)) / 2.0
         return math.ceil(math.log(tail) / math.log(1.0 - 2.0 * self.half_width))
 
-    def judge(
-        self, table: Mapping[str, Any], prefix: str, looked_for: Any, run: Any, total: Any
-    ) -> tuple[Any, Any, Any]:
-        """Return the value, its half-width and a flag of `Reached`, each (...).
+    def judged(self, table: xr.Dataset, prefix: str, total: xr.DataArray) -> xr.Dataset:
+        """Return value, half-width, a flag of `Reached`, and the poses and draws that it is of.
 
         Parameters
         ----------
         table
-            The variables of `statistics`, each (...).
+            The variables of `statistics`; ``looked_for`` and ``run``: poses that were.
         prefix
             As there.
-        looked_for, run, total
-            Poses that were looked for, that were run, and that all trials would be, each (...).
+        total
+            Poses that all trials would be.
         """
-        value, low, high = (np.asarray(each, dtype=np.float64)
-                            for each in self._interval(table, prefix))
+        what = self.requirable
+        ends = [table[f"{prefix}{self.name}{end}"] for end in INTERVAL]
+        # Of a bias with its sign.
+        value, low, high = ends if what.signed else what.interval(table, prefix)
+        used, draws = table[f"{prefix}used"], table[f"{prefix}draws"]
         with np.errstate(all="ignore"):
             half = (high - low) / 2.0
-            if self._spread:
-                spread = np.asarray(table[f"{prefix}of {self._spread}"], dtype=np.float64)
-                half = np.where(half == 0.0, 0.0, half / np.hypot(value, spread))
-            elif not self.requirable.is_rate:
-                half = np.where(half == 0.0, 0.0, half / np.abs(value))
+            if not what.is_rate:
+                scale = abs(value)
+                if self._spread:
+                    scale = xr.apply_ufunc(
+                        np.hypot, value, table[f"{prefix}of {self._spread}"])
+                half = (half / scale).where(half != 0.0, 0.0)
         # Too many poses are lost for a quantile: it is infinite, which is all there is to know.
-        half = np.where(np.isposinf(low), 0.0, half)
-        draws, used = (np.asarray(table[f"{prefix}{name}"]) for name in ("draws", "used"))
-        enough = draws >= (1 if self.requirable.exact else MIN_DRAWS)
-        narrow = (half <= self.half_width) & enough
-        rare = ~narrow & self._too_rare(draws, used, np.asarray(run), np.asarray(total))
-        flags = np.select(
-            [np.asarray(run) == 0, np.asarray(looked_for) == 0, narrow, rare],
-            [Reached.not_run, Reached.not_applicable, Reached.reached, Reached.too_rare],
-            Reached.not_reached)
-        return value, half, flags.astype(np.uint8)
+        half = half.where(low != np.inf, 0.0)
+        narrow = (half <= self.half_width) & (draws >= (1 if what.exact else MIN_DRAWS))
+        reached = xr.full_like(used, Reached.not_reached)
+        for where, flag_ in (
+            (self._too_rare(used, draws, table["run"], total), Reached.too_rare),
+            (narrow, Reached.reached), (table["looked_for"] == 0, Reached.not_applicable),
+            (table["run"] == 0, Reached.not_run),
+        ):
+            reached = reached.where(~where, flag_)
+        return xr.Dataset({"value": value, "half_width": half, "reached": reached.astype(np.uint8),
+                           "used": used, "draws": draws})
 
-    def _interval(self, table: Mapping[str, Any], prefix: str) -> Sequence[Any]:
-        """Return value, low and high; of a bias with its sign."""
-        if self.requirable.signed:
-            return [table[f"{prefix}{self.name}{end}"] for end in ("", "_low", "_high")]
-        return self.requirable.interval(cast("Any", table), prefix)
-
-    def _too_rare(self, draws: Any, used: Any, run: Any, total: Any) -> Masks:
+    def _too_rare(
+        self, used: xr.DataArray, draws: xr.DataArray, run: xr.DataArray, total: xr.DataArray
+    ) -> xr.DataArray:
         """Return where even all trials give fewer draws with a number than `least_draws`.
 
         By the upper end of the share of poses that have one; ``used`` poses are worth ``draws``.
         """
-        run = np.maximum(run, used)
-        share: Floats = clopper_pearson(used, run, NEVER_LEVEL)[1]
-        worth = np.where(used > 0, draws / np.maximum(used, 1), 1.0)
-        return np.asarray((share * total * worth < self.least_draws) & (total >= self.least_draws))
-
-
-def _has_ends(n: int, percent: int, level: float) -> bool:
-    low, high = interval_ranks(n, percent, level)
-    return low >= 1 and high <= n
+        share = used.copy(data=clopper_pearson(used, np.maximum(run, used), NEVER_LEVEL)[1])
+        worth = (draws / np.maximum(used, 1)).where(used > 0, 1.0)
+        return (share * total * worth < self.least_draws) & (total >= self.least_draws)
 
 
 def wanted_precisions(wanted: Mapping[str, float]) -> tuple[WantedPrecision, ...]:
@@ -231,16 +220,6 @@ def wanted_precisions(wanted: Mapping[str, float]) -> tuple[WantedPrecision, ...
     if faults:
         raise ValueError("\n".join(faults))
     return tuple(precisions.values())
-
-
-def looked_for_and_run() -> list[PoseStatistic]:
-    """Return what counts the poses that were looked for, and those that were run."""
-    return [
-        CountOfDraws("looked_for", "poses that were run, visible and modelled",
-                     lambda poses: poses.looked_for, "draws", "drawn"),
-        CountOfDraws("run", "poses that were run", lambda poses: poses.run, "run draws",
-                     "run drawn"),
-    ]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -296,7 +275,8 @@ def precision_reached(
     >>> [Reached(flag).name for flag in table["reached"].isel(solver=0, quantity=0).values]
     ['reached', 'not_reached', 'reached']
     """
-    rule = _rule_of(results)
+    rule = stopping_rule(results)
+    rule = rule if isinstance(rule, PrecisionRule) else None
     if wanted is None:
         if rule is None:
             raise ArgumentError("wanted", None, "this store's pipeline has no [precision]; give "
@@ -311,14 +291,6 @@ def precision_reached(
     return precision_table(results, precisions, as_names(per))
 
 
-def _rule_of(results: xr.Dataset) -> PrecisionRule | None:
-    try:
-        rule = stored_pipeline(results).stopping
-    except (KeyError, SweepError):
-        return None
-    return rule if isinstance(rule, PrecisionRule) else None
-
-
 def precision_table(
     results: xr.Dataset, precisions: Sequence[WantedPrecision], per: Sequence[str],
     trials: int | None = None,
@@ -331,40 +303,32 @@ def precision_table(
     kept = kept_dimensions(results, tuple(dict.fromkeys((*configuration, *per))))
     configuration = [name for name in configuration if name in kept]
     statistics = [
-        *looked_for_and_run(),
+        Count(*LOOKED_FOR, lambda poses: poses.looked_for),
+        Count("run", "poses that were run", lambda poses: poses.run),
         Count("poses", "poses that all trials are", lambda poses: np.ones_like(poses.run)),
         *(each for number, precision in enumerate(precisions)
           for each in precision.statistics(f"{number} ")),
     ]
     inputs = requirable_arrays(results, [each.requirable for each in precisions])
-    table = aggregate(results, inputs, kept, statistics, Poses, stopped=True).compute()
-    run, poses = (table[name].transpose(*kept) for name in ("run", "poses"))
-    judged: dict[str, list[Any]] = {
-        name: [] for name in ("value", "half_width", "reached", "used", "draws")}
-    variables = {str(name): each.transpose(*kept).values for name, each in table.items()}
-    total = variables["poses"]
+    table = aggregate(results, inputs, kept, statistics, Poses, stopped=True)
+    total = table["poses"]
     if trials is not None:
         total = total // results.sizes[DRAWS] * trials
-    for number, precision in enumerate(precisions):
-        found = precision.judge(
-            variables, f"{number} ", variables["looked_for"], variables["run"], total)
-        counts = (variables[f"{number} used"], variables[f"{number} draws"])
-        for name, each in zip(judged, (*found, *counts), strict=True):
-            judged[name].append(each)
-    dims = (*kept, "quantity")
-    words = {
-        "value": "value", "half_width": "half-width of the interval, as was wanted",
-        "used": "poses that the value is of", "draws": "random draws that these are worth",
-    }
-    out = {name: xr.DataArray(np.stack(judged[name], axis=-1), dims=dims).assign_attrs(
-        cf_attributes(meaning, "1" if name in ("used", "draws") else ""))
-        for name, meaning in words.items()}
-    out["reached"] = xr.DataArray(np.stack(judged["reached"], axis=-1), dims=dims).assign_attrs(
-        cf_attributes("whether the interval is as narrow as was wanted", flags=Reached))
+    judged = [each.judged(table, f"{number} ", total) for number, each in enumerate(precisions)]
+    out = {str(name): stacked([each[name] for each in judged], "quantity").reset_coords(drop=True)
+           for name in judged[0]}
+    for name, meaning, units in (
+        ("value", "value", ""), ("half_width", "half-width of the interval, as was wanted", ""),
+        ("used", "poses that the value is of", "1"),
+        ("draws", "random draws that these are worth", "1"),
+    ):
+        out[name].attrs = cf_attributes(meaning, units)
+    out["reached"].attrs = cf_attributes(
+        "whether the interval is as narrow as was wanted", flags=Reached)
     needs = out["reached"].isin((Reached.not_run, Reached.not_reached))
     out["settled"] = (~needs.any([*configuration, "quantity"])).assign_attrs(
         cf_attributes("whether no configuration and quantity needs more trials", "1"))
-    out |= {"run": run, "poses": poses}
+    out |= {"run": table["run"], "poses": table["poses"]}
     coordinates = {name: each for name, each in table.coords.items() if set(each.dims) <= {*kept}}
     return xr.Dataset(out, coordinates).assign_coords(
         quantity=("quantity", [each.name for each in precisions]),

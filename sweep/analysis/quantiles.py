@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Generic, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from sweep.analysis.draws import Design, Sample, Unit
 from sweep.analysis.intervals import LEVEL
 from sweep.analysis.statistic import (
+    Blocks,
     Output,
-    Sample,
-    SinglePass,
-    State,
+    Statistic,
     Variables,
     ViewT,
     interval_variables,
+    settings_of,
     with_interval,
 )
 from sweep.errors import DatasetError
@@ -41,72 +42,8 @@ class IntervalOf(Flag):
 MAX_VALUES = 2 * 10**8
 """Values of a column that are sorted at once: 1.6 GB."""
 
-OF_VALUE = 1 << 32
-"""How many keys the values of a group can have."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Keys:
-    """Non-negative values of all groups as whole numbers (m,), in any order.
-
-    A key is the number of the value's group, and below it the bits of the value as a float32 (the
-    precision in which errors are stored), which are ordered as the values are. So the sorted keys
-    have the sorted values of each group, one group after the other.
-    """
-
-    keys: NDArray[np.uint64] | NDArray[np.uint32]
-    """Of 32 bits where all values are of the first group, which takes half the memory."""
-
-    @classmethod
-    def of(cls, groups: Integers, values: Floats) -> Self:
-        """Return the keys of values (m,) of groups (m,); DatasetError as `merge`."""
-        require_values(len(values))
-        with np.errstate(over="ignore"):  # above 3.4e38: infinite
-            bits = np.abs(values).astype(np.float32).view(np.uint32)
-        return cls(groups.astype(np.uint64) * OF_VALUE + bits if groups.any() else bits)
-
-    def merge(self, other: Self) -> Self:
-        """Return the keys of the values of both.
-
-        Raises
-        ------
-        DatasetError
-            If they are too many to be sorted at once.
-        """
-        require_values(len(self.keys) + len(other.keys))
-        return type(self)(np.concatenate([self.keys, other.keys]))
-
-    @staticmethod
-    def interleave(parts: Sequence[Keys]) -> Keys:
-        """Return n parts as one of n times as many groups: g of the k-th becomes g * n + k."""
-        moved = [(*np.divmod(part.keys.astype(np.uint64), OF_VALUE), k)
-                 for k, part in enumerate(parts)]
-        return Keys(np.concatenate([
-            (group * len(parts) + k) * OF_VALUE + bits for group, bits, k in moved]))
-
-    def every_nth(self, n: int, first: int) -> Self:
-        """Return the keys of the groups ``first``, ``first + n`` and so on."""
-        group, bits = np.divmod(self.keys.astype(np.uint64), OF_VALUE)
-        chosen = group % n == first
-        return type(self)(group[chosen] // n * OF_VALUE + bits[chosen])
-
-    def values_at(self, ranks: Integers) -> Floats:
-        """Return the values at ranks (groups, ...), from 1; NaN for those that do not exist."""
-        self.keys.sort()  # in place: their order means nothing
-        ascending = self.keys
-        if ascending.dtype == np.uint32:
-            starts = np.array([0, *[len(ascending)] * len(ranks)])
-        else:
-            starts = np.searchsorted(
-                ascending, np.arange(len(ranks) + 1, dtype=np.uint64) * np.uint64(OF_VALUE))
-        shape = (len(ranks), *[1] * (ranks.ndim - 1))
-        first, size = starts[:-1].reshape(shape), np.diff(starts).reshape(shape)
-        exists = (ranks >= 1) & (ranks <= size)
-        if not len(ascending):
-            return np.full(ranks.shape, np.nan)
-        keys = ascending[np.where(exists, first + ranks - 1, 0)]
-        bits = (keys.astype(np.uint64) % OF_VALUE).astype(np.uint32)
-        return np.where(exists, bits.view(np.float32).astype(np.float64), np.nan)
+ROUNDING = 1e-9
+"""Share of a pose by which a rank may be above a whole number."""
 
 
 def require_values(count: int) -> None:
@@ -117,25 +54,83 @@ def require_values(count: int) -> None:
             "keep an axis apart (per=), or take a part of the dataset (isel) for each condition")
 
 
+def sorted_by_group(errors: Floats) -> Floats:
+    """Return errors (groups, ...) in ascending order (groups, n); NaN stands last."""
+    return np.sort(errors.reshape(len(errors), math.prod(errors.shape[1:])), axis=1)
+
+
+def values_at(ascending: Floats, ranks: Integers) -> Floats:
+    """Return the values (groups, ...) at ranks from 1; NaN for those that do not exist."""
+    flat = ranks.reshape(len(ranks), -1)
+    exists = (flat >= 1) & (flat <= ascending.shape[1])
+    if not ascending.size:
+        return np.full(ranks.shape, np.nan)
+    values = np.take_along_axis(ascending, np.where(exists, flat - 1, 0), axis=1)
+    return np.where(exists, values, np.nan).astype(np.float64).reshape(ranks.shape)
+
+
+def quantile_intervals(
+    errors: Floats, used: Integers, percents: Sequence[int], design: Design, level: float = LEVEL
+) -> Floats:
+    """Return quantiles and the ends of their intervals, (groups, percents, 3).
+
+    A quantile is the smallest value with at least that share at or below. An end is NaN where it
+    lies beyond all values, and where no cell has two draws.
+
+    The ends are order statistics of the pooled sample: David and Nagaraja, "Order Statistics", 3rd
+    ed. 2003, section 7.1. If cells differ, the count below the quantile varies less than binomially
+    (Hoeffding, Annals of Mathematical Statistics 27, 1956): they then cover more. Ranks are counted
+    in draws. Of photographs, whose markers are correlated, they are Woodruff's: the quantiles at
+    the ends of the interval of the share below the quantile (Journal of the American Statistical
+    Association 47, 1952), Clopper and Pearson's of the number of draws that the share is worth
+    (Korn and Graubard, Survey Methodology 24, 1998).
+
+    Parameters
+    ----------
+    errors
+        (groups, cells, draws, settings); NaN for those that do not count.
+    used
+        How many count of each draw, (groups, cells, draws).
+    percents
+        Of the values, at or below the quantile.
+    design
+        What the draws are.
+    level
+        Probability with which the interval is to hold it.
+    """
+    sample, ascending = Sample(used), sorted_by_group(errors)
+    n, draws, drawn = sample.n, sample.draws, sample.drawn
+    values = np.full((len(n), len(percents), 3), np.nan)
+    for at, percent in enumerate(percents):
+        ranks = np.zeros((len(n), 3), dtype=np.int64)
+        ranks[:, 0] = -(-n * percent // 100)
+        if design.unit is Unit.photograph:
+            value = values_at(ascending, ranks[:, :1])
+            below = settings_of(errors <= value.reshape(-1, 1, 1, 1))
+            worth, share = design.worth(below, used, level), percent / 100.0
+            tail = (1.0 - level) / 2.0
+            low = special.betaincinv(share * worth, (1.0 - share) * worth + 1.0, tail)
+            high = special.betaincinv(share * worth + 1.0, (1.0 - share) * worth, 1.0 - tail)
+            ranks[:, 1] = np.ceil(np.nan_to_num(low) * n - ROUNDING)
+            ranks[:, 2] = np.floor(np.nan_to_num(high) * n + ROUNDING) + 1
+        else:
+            for count in np.unique(draws[drawn]).tolist():
+                same = (draws == count) & drawn
+                first, last = interval_ranks(count, percent, level)
+                ranks[same, 1] = first * n[same] // count
+                # One beyond the last if there is no such draw.
+                ranks[same, 2] = -(-last * n[same] // count) if last <= count else n[same] + 1
+        ranks[:, 1:] = np.where(drawn[:, None], ranks[:, 1:], 0)
+        values[:, at] = values_at(ascending, ranks)
+    return values
+
+
 @dataclass(frozen=True)
-class QuantileState(State):
-    """The poses that count, and their values."""
-
-    sample: Sample
-    values: Keys
-
-
-@dataclass(frozen=True)
-class Quantiles(SinglePass[ViewT, QuantileState], Generic[ViewT]):
+class Quantiles(Statistic[ViewT]):
     """The quantiles of `PERCENTS` of the errors of ``used`` poses; not ``solved`` is infinite.
 
-    The values of a column are in memory at once, up to `MAX_VALUES` of a block of the table.
-
-    A quantile is the smallest value with at least that share at or below. The interval's ends are
-    order statistics of the pooled sample: David and Nagaraja, "Order Statistics", 3rd ed. 2003,
-    section 7.1. If cells differ, the count below the quantile varies less than binomially
-    (Hoeffding, Annals of Mathematical Statistics 27, 1956): it then covers more. Pooled settings
-    see the same draws: ranks are counted in draws.
+    The values of a column are in memory at once, up to `MAX_VALUES` of a group, in single precision
+    as errors are stored. Intervals: `quantile_intervals`.
     """
 
     name: str
@@ -160,48 +155,36 @@ class Quantiles(SinglePass[ViewT, QuantileState], Generic[ViewT]):
                     "both ends, or not", "", "u1", IntervalOf))
         return variables
 
-    def first_pass(self, poses: ViewT) -> QuantileState:
-        """Take the values."""
-        used = self.used(poses)
-        return QuantileState(
-            Sample.of(used), Keys.of(*self._grouped_errors(poses, used)))
+    def column(self, blocks: Blocks[ViewT]) -> tuple[Floats, Integers]:
+        """Return the errors (groups, cells, draws, settings), and how many count of each draw."""
+        def values(poses: ViewT) -> tuple[NDArray[np.float32], Integers]:
+            errors, used = self.errors(poses), self.used(poses)
+            known = self.solved(poses) & ~np.isnan(errors)
+            with np.errstate(over="ignore"):  # above 3.4e38: infinite
+                single = np.where(used, np.where(known, errors, np.inf), np.nan).astype(np.float32)
+            return single, settings_of(used)
 
-    def result(self, state: QuantileState) -> Variables:
+        require_values(blocks.poses)
+        errors, used = blocks.gather(values)
+        return errors, used
+
+    def variables(self, blocks: Blocks[ViewT], design: Design) -> Variables:
         """Return the quantiles, their intervals, and why these may have no ends."""
-        ranks, sample = self._ranks(state.sample), state.sample
-        values = state.values.values_at(ranks)
-        variables: Variables = {}
+        errors, used = self.column(blocks)
+        sample = Sample(used)
+        values = quantile_intervals(
+            errors, used, [*PERCENTS.values()], design, design.level(self.level))
+        found: Variables = {}
         for at, statistic in enumerate(PERCENTS):
-            variables |= interval_variables(self.name.format(statistic), list(values[:, at].T))
+            found |= interval_variables(self.name.format(statistic), list(values[:, at].T))
             if self.with_reason:
                 missing = np.isnan(values[:, at, 1:]).any(axis=1)
-                variables[f"{statistic}_interval"] = np.select(
+                found[f"{statistic}_interval"] = np.select(
                     [sample.n == 0, ~sample.drawn, missing],
                     [IntervalOf.not_run, IntervalOf.nothing_drawn, IntervalOf.too_few_draws],
                     IntervalOf.given,
                 ).astype(np.uint8)
-        return variables
-
-    def _ranks(self, sample: Sample) -> Integers:
-        """Return the ranks (groups, percents, 3) of quantiles and their interval's ends."""
-        n, draws, drawn = sample.n, sample.draws, sample.drawn
-        ranks = np.zeros((len(n), len(PERCENTS), 3), dtype=np.int64)
-        for at, percent in enumerate(PERCENTS.values()):
-            ranks[:, at, 0] = -(-n * percent // 100)
-            for count in np.unique(draws[drawn]).tolist():
-                same = (draws == count) & drawn
-                low, high = interval_ranks(count, percent, self.level)
-                ranks[same, at, 1] = low * n[same] // count
-                # One beyond the last if there is no such draw.
-                ranks[same, at, 2] = -(-high * n[same] // count) if high <= count else n[same] + 1
-        return ranks
-
-    def _grouped_errors(self, poses: ViewT, used: Masks) -> tuple[Integers, Floats]:
-        """Return the group and the error of each used pose, both (m,)."""
-        groups = np.nonzero(used)[0]
-        errors = self.errors(poses)
-        known = self.solved(poses) & ~np.isnan(errors)
-        return groups, np.where(known, errors, np.inf)[used]
+        return found
 
 
 @functools.lru_cache(maxsize=4096)
@@ -224,3 +207,18 @@ def interval_ranks(n: int, percent: int, level: float = LEVEL) -> tuple[int, int
     first = below[np.searchsorted(chance, tail)]
     last = below[np.searchsorted(chance, 1.0 - tail)] + 1
     return int(first), int(last)
+
+
+@functools.cache
+def draws_of_quantile(percent: int, level: float = LEVEL) -> int:
+    """Return the least number of draws at which the interval of a quantile has an upper end.
+
+    From the median on it has a lower one, too.
+
+    >>> draws_of_quantile(95)
+    72
+    """
+    n = 1
+    while interval_ranks(n, percent, level)[1] > n:
+        n += 1
+    return n

@@ -21,9 +21,11 @@ from sweep.analysis.dataset import (
     is_grid_axis,
     kept_dimensions,
     require_dimension,
+    stacked,
 )
 from sweep.analysis.draws import is_replicated, with_common_trials
 from sweep.analysis.poses import DETECTION_INPUTS, ESTIMATE_INPUTS, Poses, pose_arrays
+from sweep.analysis.statistic import INTERVAL
 from sweep.errors import ArgumentError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, outcomes
 from sweep.typing import Floats, Masks
@@ -98,7 +100,7 @@ def detection_rate(
     Returns
     -------
     xr.Dataset
-        Dimensions (*per, *bins); lazy if ``results`` is.
+        Dimensions (*per, *bins).
 
         - ``looked_for``: poses whose detection is none of not_run, not_visible, not_modelled, and
           ``detected`` of these.
@@ -145,7 +147,7 @@ def flip_rate(
     Returns
     -------
     xr.Dataset
-        Dimensions (*per, *bins); lazy if ``results`` is. ``flipped`` of ``solved`` poses, the
+        Dimensions (*per, *bins). ``flipped`` of ``solved`` poses, the
         ``draws`` that these are worth, and ``flip_rate`` with intervals as in `detection_rate`.
 
     Raises
@@ -211,7 +213,7 @@ def failure_composition(
     Returns
     -------
     xr.Dataset
-        Dimensions (*per, *bins, outcome); lazy if ``results`` is.
+        Dimensions (*per, *bins, outcome).
 
         - ``outcome``: solved, then the flags of detection and estimation with which a pose ends
           (`sweep.measure.flags.outcomes`).
@@ -246,13 +248,10 @@ def failure_composition(
     for name, begin, end, meaning in (
         ("count", "count ", "", "poses that ended so"),
         ("share", "share ", "", "share of the poses looked for"),
-        ("share_low", "share ", "_low", "lower end of the 95 % interval: share"),
-        ("share_high", "share ", "_high", "upper end of the 95 % interval: share"),
+        ("share_low", "share ", "_low", f"{INTERVAL['_low']}share"),
+        ("share_high", "share ", "_high", f"{INTERVAL['_high']}share"),
     ):
-        parts = [table[f"{begin}{outcome}{end}"] for outcome in OUTCOMES]
-        values = xr.concat(
-            parts, dim="outcome", coords="minimal", compat="override", join="exact",
-        ).transpose(..., "outcome")
+        values = stacked([table[f"{begin}{outcome}{end}"] for outcome in OUTCOMES], "outcome")
         if name != "count":
             values = values.where(is_counted)
         variables[name] = values.assign_attrs(long_name=meaning, units="1")
@@ -285,7 +284,7 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     Returns
     -------
     xr.Dataset
-        Dimensions (*per, marker_id); lazy if ``results`` is.
+        Dimensions (*per, marker_id).
 
         - ``looked_for`` and ``detection_rate`` with its interval, as in
           `sweep.analysis.detection_rate`.
@@ -335,9 +334,7 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     hits = (counts["detected"] * n / counts["looked_for"]).where(n > 0, 0.0)
     strata = [n, n.sum("marker_id"), hits.sum("marker_id")]
     expected, variance, third = xr.apply_ufunc(
-        hypergeometric_moments, *strata, dask="parallelized", output_core_dims=[[]] * 3,
-        output_dtypes=[np.float64] * 3,
-    )
+        hypergeometric_moments, *strata, output_core_dims=[[]] * 3)
     sums = {name: array.sum(cells).transpose(*kept) for name, array in (
         ("n", n), ("hits", hits), ("expected", expected), ("variance", variance),
         ("third", third))}
@@ -345,20 +342,12 @@ def marker_ranking(results: xr.Dataset, per: Sequence[str] = ()) -> xr.Dataset:
     drawn = table["detection_rate_low"].notnull() & (not is_replicated(results))
     p_value = xr.apply_ufunc(
         two_sided, sums["hits"] - sums["expected"], sums["variance"], sums["third"],
-        dask="parallelized", output_dtypes=[np.float64],
     ).where(drawn)
-    whole = dict.fromkeys(p_value.dims, -1)
-    adjusted = xr.apply_ufunc(
-        holm, p_value.chunk(whole) if p_value.chunks else p_value, dask="parallelized",
-        output_dtypes=[np.float64],
-    )
+    adjusted = xr.apply_ufunc(holm, p_value)
     expected_rate = sums["expected"] / sums["n"]
     share = table["detection_rate"] / expected_rate
     rank = xr.apply_ufunc(
-        _rank, share.chunk(marker_id=-1) if share.chunks else share, dask="parallelized",
-        input_core_dims=[["marker_id"]], output_core_dims=[["marker_id"]],
-        output_dtypes=[np.float64],
-    )
+        _rank, share, input_core_dims=[["marker_id"]], output_core_dims=[["marker_id"]])
     below = table["detection_rate"] < expected_rate
     meanings = {
         "expected_rate": (expected_rate, "detection rate if all IDs were alike in each cell"),

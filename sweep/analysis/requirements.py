@@ -7,9 +7,10 @@ import dataclasses
 import functools
 import math
 import re
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import xarray as xr
@@ -26,6 +27,7 @@ from sweep.analysis.dataset import (
     configuration_axes,
     describes,
     kept_dimensions,
+    stacked,
 )
 from sweep.analysis.detection_limits import SIZE_AXES
 from sweep.analysis.draws import is_replicated
@@ -41,12 +43,11 @@ from sweep.analysis.poses import (
     Quantity,
     pose_arrays,
 )
-from sweep.analysis.quantiles import PERCENTS, Quantiles, interval_ranks
+from sweep.analysis.quantiles import PERCENTS, Quantiles, draws_of_quantile
 from sweep.analysis.statistic import Output, Statistic
 from sweep.analysis.summaries import (
     NEES_MEAN,
     RATIOS,
-    BoundRatio,
     PoseStatistic,
     bound_arrays,
     quantiles_of,
@@ -92,10 +93,10 @@ class Requirable:
     ----------
     output
         Its name, meaning and units.
-    statistics
-        The statistics that it is computed of, their variables' names beginning with a prefix.
+    statistic
+        What computes it.
     inputs
-        Names of the arrays that they read, as in `sweep.analysis.poses.pose_arrays`.
+        Names of the arrays that it reads, as in `sweep.analysis.poses.pose_arrays`.
     used
         The poses that count.
     exact
@@ -104,19 +105,15 @@ class Requirable:
         The largest value that exists.
     signed
         Whether the value has a sign: its absolute value is required.
-    numerator
-        Of a ratio of a bound to an error, the name of the bound; else empty.
     """
 
     output: Output
-    statistics: Callable[[str, float], Sequence[Statistic[Poses, Any, Any, Any]]]
+    statistic: Statistic[Poses]
     inputs: tuple[str, ...]
     used: Callable[[Poses], Masks]
     exact: bool
     largest: float
     signed: bool = False
-    numerator: str = ""
-    denominator: str = ""
 
     @property
     def name(self) -> str:
@@ -156,19 +153,27 @@ class Requirable:
         """Level of the interval by which one condition is decided."""
         return EXACT_LEVEL if self.exact else MEAN_LEVEL
 
-    def computed(self, prefix: str, level: float) -> list[Statistic[Poses, Any, Any, Any]]:
+    def renamed(self, prefix: str, level: float) -> Statistic[Poses]:
+        """Return what computes it, with another level; its variables' names begin with a prefix.
+
+        Rates have Clopper and Pearson's interval.
+        """
+        statistic: Any = self.statistic
+        changes: dict[str, Any] = {"exact": True} if isinstance(statistic, Rate) else {}
+        if isinstance(statistic, Quantiles):
+            changes["with_reason"] = False
+        return cast("Statistic[Poses]", dataclasses.replace(
+            statistic, name=f"{prefix}{statistic.name}", level=level, **changes))
+
+    def computed(self, prefix: str, level: float) -> list[Statistic[Poses]]:
         """Return the statistics, their variables' names beginning with a prefix."""
-        return [*self.statistics(prefix, level), CountOfDraws(
+        return [self.renamed(prefix, level), CountOfDraws(
             f"{prefix}used", "poses that count", self.used, f"{prefix}draws", f"{prefix}drawn")]
 
     def interval(
         self, table: xr.Dataset, prefix: str
     ) -> tuple[xr.DataArray, xr.DataArray, xr.DataArray]:
         """Return value, low and high from the table of `computed`."""
-        if self.numerator:
-            least, error = table[prefix + self.numerator], prefix + self.denominator
-            return (least / table[error], least / table[f"{error}_high"],
-                    least / table[f"{error}_low"])
         value, low, high = (table[f"{prefix}{self.name}{end}"] for end in ("", "_low", "_high"))
         if not self.signed:
             return value, low, high
@@ -212,10 +217,9 @@ def requirables() -> dict[str, Requirable]:
     """
     signed = [each for group in SIGNED.values() for each in group]
     quantities = [*QUANTITIES, *signed]
-    records = [*registered(quantities), *map(quantiles_of, signed), NEES_MEAN]
-    found = [each for record in records for each in _of_record(record, quantities)]
-    found += [_of_ratio(ratio) for ratio in RATIOS]
-    return {each.name: each for each in found}
+    records = [*registered(quantities), *map(quantiles_of, signed), NEES_MEAN,
+               *(PoseStatistic(ratio, (*ERROR_INPUTS, BOUND)) for ratio in RATIOS)]
+    return {each.name: each for record in records for each in _of_record(record, quantities)}
 
 
 def _of_record(record: PoseStatistic, quantities: Sequence[Quantity]) -> list[Requirable]:
@@ -236,34 +240,8 @@ def _of_record(record: PoseStatistic, quantities: Sequence[Quantity]) -> list[Re
         largest = quantity.bound
     signed = type(statistic) is Mean
     return [Requirable(
-        output, functools.partial(_renamed, statistic), record.inputs, used, exact, largest, signed)
+        output, statistic, record.inputs, used, exact, largest, signed)
         for name, output in outputs.items() if f"{name}_low" in outputs]
-
-
-def _renamed(
-    statistic: Statistic[Poses, Any, Any, Any], prefix: str, level: float
-) -> list[Statistic[Poses, Any, Any, Any]]:
-    """Return a statistic with another name and level; rates have Clopper and Pearson's interval."""
-    if isinstance(statistic, Rate):
-        return [dataclasses.replace(
-            statistic, name=f"{prefix}{statistic.name}", level=level, exact=True)]
-    if isinstance(statistic, Quantiles):
-        return [dataclasses.replace(
-            statistic, name=f"{prefix}{statistic.name}", level=level, with_reason=False)]
-    if isinstance(statistic, FlipMixture | Mean):
-        return [dataclasses.replace(statistic, name=f"{prefix}{statistic.name}", level=level)]
-    raise TypeError(statistic)
-
-
-def _of_ratio(ratio: BoundRatio) -> Requirable:
-    bound, error = ratio.statistics()
-
-    def statistics(prefix: str, level: float) -> list[Statistic[Poses, Any, Any, Any]]:
-        return [*_renamed(bound, prefix, level), *_renamed(error, prefix, level)]
-
-    return Requirable(
-        ratio.output, statistics, (*ERROR_INPUTS, BOUND), error.used, exact=False, largest=math.inf,
-        numerator=bound.name, denominator=error.name)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -650,9 +628,7 @@ def check_requirements(
         draws_needed(each, one["value"], one["low"], one["high"], one["draws"], share,
                      one["decision"] == Decision.undecided)
         for number, each in enumerate(required) for one in [table.isel(requirement=number)]]
-    return table.assign(draws_needed=xr.concat(
-        needed, "requirement", coords="minimal", compat="override", join="exact").transpose(
-        *table["value"].dims).assign_attrs(
+    return table.assign(draws_needed=stacked(needed, "requirement").assign_attrs(
         long_name="draws that would decide it, if the value stays", units="1"))
 
 
@@ -693,7 +669,7 @@ def decide(
               prefix, 1.0 - (1.0 - each.requirable.level) * share))),
     ]
     stopped = None if shares is None else False
-    table = aggregate(results, inputs, kept, statistics, Poses, bins, stopped=stopped).compute()
+    table = aggregate(results, inputs, kept, statistics, Poses, bins, stopped=stopped)
     if shares is None:
         _require_numbers(table, required)
     replicated = is_replicated(results)
@@ -811,7 +787,7 @@ def _needed(
         return _of_rate(value, requirement.limit, what.level)
     least = float(MIN_DRAWS)
     if what.percent is not None:
-        least = float(_of_quantile(what.percent, what.level))
+        least = float(draws_of_quantile(what.percent, what.level))
     good = value >= requirement.limit if requirement.at_least else value <= requirement.limit
     # The end that has to pass the limit.
     end = low if good == requirement.at_least else high
@@ -846,19 +822,6 @@ def _of_rate(rate: float, limit: float, level: float) -> float:
 
     first = bisect.bisect_left(counts, True, key=is_decided)
     return _rounded(float(counts[first])) if first < len(counts) else math.inf
-
-
-@functools.cache
-def _of_quantile(percent: int, level: float) -> int:
-    """Return the least number of draws at which a quantile's interval has an upper end.
-
-    >>> _of_quantile(95, 0.95)
-    72
-    """
-    n = 1
-    while interval_ranks(n, percent, level)[1] > n:
-        n += 1
-    return n
 
 
 def _rounded(count: float) -> float:
@@ -973,11 +936,13 @@ def _verdict(
     one: xr.Dataset, configuration: Sequence[str], conditions: Sequence[str]
 ) -> Verdict:
     """Return the verdict of a table (*conditions) of one configuration and requirement."""
-    decisions = one["decision"].transpose(*conditions).values
+    one = one.transpose(*conditions)
+    decisions = one["decision"].values
     counts = {each: count for each in Decision if (count := int((decisions == each).sum()))}
     order = (Decision.not_met, Decision.undecided, Decision.met, Decision.not_applicable)
     decision = next(each for each in order if each in counts)
-    index = worst_condition(one.transpose(*conditions), decisions == decision)
+    among = np.where(decisions == decision, excess_of(one).values, -np.inf)
+    index = np.unravel_index(int(np.argmax(among)), among.shape)
     cell = one.isel(dict(zip(conditions, index, strict=True)))
     needed = one["draws_needed"].values[decisions == Decision.undecided]
     return Verdict(
@@ -989,12 +954,22 @@ def _verdict(
             np.isfinite(needed) | np.isinf(needed)).any() else math.nan, counts)
 
 
-def worst_condition(one: xr.Dataset, among: np.ndarray[Any, Any]) -> tuple[int, ...]:
-    """Return the index of the value that is farthest on the wrong side of the limit."""
-    value, limit = one["value"].values, float(one["limit"])
-    excess = limit - value if one["relation"].item() in (">=", ">") else value - limit
-    excess = np.where(among, np.nan_to_num(excess, nan=np.inf, posinf=np.inf), -np.inf)
-    return tuple(map(int, np.unravel_index(int(np.argmax(excess)), excess.shape)))
+def excess_of(table: xr.Dataset) -> xr.DataArray:
+    """Return how far the values of a table are beyond the limits, relative to these.
+
+    It is infinite for no number, finite and negative on the right side of the limit.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = table["value"] / table["limit"]
+        at_least = table["relation"].isin([">=", ">"])
+        excess = (1.0 - ratio).where(at_least, 1.0 - 1.0 / ratio)
+    return excess.clip(min=-sys.float_info.max).fillna(np.inf)
+
+
+def kept_by(table: xr.Dataset, required: Sequence[Requirement]) -> xr.DataArray:
+    """Return where the values of a table (..., requirement) keep their limits."""
+    keeps = [each.holds(table["value"].isel(requirement=k)) for k, each in enumerate(required)]
+    return stacked(keeps, "requirement").transpose(*table["value"].dims)
 
 
 def described(values: Mapping[str, Any]) -> str:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.analysis.binning import PREFIX, Binning, Bins, image_sides, read_bins
+from sweep.analysis.counts import Rate
 from sweep.analysis.dataset import (
     DRAWS,
     axes_of,
@@ -22,14 +22,17 @@ from sweep.analysis.dataset import (
     parameter_value,
     require_poses,
 )
-from sweep.analysis.draws import PhotographRate, quantile_ends, quantile_of
+from sweep.analysis.draws import Design, Unit
 from sweep.analysis.intervals import (
     MIN_UNITS,
     percentile_interval,
     resampled_quantiles,
     unit_counts,
 )
-from sweep.analysis.poses import ERROR_INPUTS, Poses, norm_squared, pose_arrays
+from sweep.analysis.poses import ERROR_INPUTS, INSIDE, QUANTITIES, Poses, pose_arrays
+from sweep.analysis.quantiles import quantile_intervals
+from sweep.analysis.rates import DETECTION_RATE, FLIP_RATE
+from sweep.analysis.statistic import OVER_ALL, Arrays, Blocks
 from sweep.errors import DatasetError
 from sweep.messages import label, shown
 from sweep.plan.parameters import PARAMETERS, SIMULATED, Stage
@@ -38,6 +41,9 @@ from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
 # Two datasets as units of markers: photographs with theirs, and a simulation's scenes.
+#
+# Arrays are (configurations, 1, units, rows, ...), by the names of `Poses`: a unit is drawn with
+# all its markers.
 
 QUARTERS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Shares of the photographs' markers between which the default bins lie."""
@@ -50,53 +56,15 @@ SEED = 21
 
 
 @dataclass(frozen=True)
-class Units:
-    """Markers of units, which are drawn together: arrays (configurations, units, rows).
-
-    Attributes
-    ----------
-    looked_for, detected, solved, flipped
-        As in `sweep.analysis.poses.Poses`.
-    rotation_deg, range_percent
-        Absolute rotation error, and depth error with its sign of the true depth.
-    single
-        Whether each unit has one marker.
-    """
-
-    looked_for: Masks
-    detected: Masks
-    solved: Masks
-    flipped: Masks
-    rotation_deg: Floats
-    range_percent: Floats
-    single: bool
-
-    @classmethod
-    def of(cls, arrays: dict[str, NDArray[Any]], *, single: bool) -> Units:
-        """Return the units of arrays (configurations, units, rows, ...) by the names of `Poses`."""
-        poses = Poses(arrays)
-        return cls(
-            poses.looked_for, poses.detected & poses.looked_for, poses.solved, poses.flipped,
-            np.sqrt(norm_squared(poses.rotation_deg)), poses.range_percent[..., 0], single,
-        )
-
-    def within(self, inside: Masks) -> Units:
-        """Return those of the markers (units, rows) that are inside."""
-        masks = {
-            name: getattr(self, name) & inside
-            for name in ("looked_for", "detected", "solved", "flipped")
-        }
-        return dataclasses.replace(self, **masks)
-
-
-@dataclass(frozen=True)
 class PairedUnits:
     """Photographs and a simulation with the same configurations.
 
     Attributes
     ----------
     first, second
-        Their units; those of the same index belong together if they are ``paired``.
+        Their arrays; units of the same index belong together if they are ``paired``.
+    single
+        Whether each unit of theirs has one marker.
     paired
         Whether the simulation is the photographs' twin.
     configurations, sizes, coordinates
@@ -109,8 +77,9 @@ class PairedUnits:
         What is binned of both: name -> (units, rows).
     """
 
-    first: Units
-    second: Units
+    first: Arrays
+    second: Arrays
+    single: tuple[bool, bool]
     paired: bool
     configurations: tuple[str, ...]
     sizes: Mapping[str, int]
@@ -119,12 +88,17 @@ class PairedUnits:
     binned: xr.Dataset
     values: tuple[Mapping[str, Floats], Mapping[str, Floats]]
 
+    def within(self, inside: Sequence[Masks]) -> list[Arrays]:
+        """Return the arrays of both with the masks (units, rows) of the markers that count."""
+        return [{**side, INSIDE: mask[None, None]}
+                for side, mask in zip((self.first, self.second), inside, strict=True)]
+
     def bins(self) -> Iterator[tuple[Masks, Masks]]:
         """Yield which markers (units, rows) of both lie in each combination of bins."""
         for index in np.ndindex(*self.binning.shape):
             first, second = (
                 np.logical_and.reduce(
-                    [np.ones(side.looked_for.shape[1:], dtype=bool)] + [
+                    [np.ones(side["detection"].shape[2:], dtype=bool)] + [
                         np.searchsorted(edges, values[name], side="right") - 1 == k
                         for (name, edges), k in zip(self.binning.edges.items(), index, strict=True)
                     ]
@@ -158,28 +132,27 @@ def paired_units(
     if bins is None:
         bins = {} if paired else {SIDE: _quarters(first)}
     binning, _ = read_bins(first, names, bins)
-    sides: list[tuple[dict[str, NDArray[Any]], bool]] = []
-    for side in (first, second):
-        arrays = pose_arrays(side, ERROR_INPUTS) | {
+    single = (not of_photographs(first), not of_photographs(second))
+    arrays = []
+    for side, one in zip((first, second), single, strict=True):
+        columns = pose_arrays(side, ERROR_INPUTS) | {
             f"{PREFIX}{name}": _binned(side, name) for name in binning.edges
         }
         if paired and side is second and TRUTH_STD in side:
-            arrays[TRUTH_STD] = side[TRUTH_STD]
-        single = not of_photographs(side)
-        sides.append((_in_units(side, arrays, names, single=single), single))
+            columns[TRUTH_STD] = side[TRUTH_STD]
+        arrays.append(_in_units(side, columns, names, single=one))
     if paired:
         trials = _trials_of(first, second)
         kept = np.flatnonzero((trials >= 0).any(axis=1))
-        sides[0] = ({name: array[:, kept] for name, array in sides[0][0].items()}, False)
-        sides[1] = ({name: _gathered(array, trials[kept]) for name, array in sides[1][0].items()},
-                    False)
-        _blur_truth(sides[1][0])
+        arrays = [{name: array[:, :, kept] for name, array in arrays[0].items()},
+                  {name: _gathered(array, trials[kept]) for name, array in arrays[1].items()}]
+        _blur_truth(arrays[1])
+        single = (False, False)
     values = [
-        {name: arrays.pop(f"{PREFIX}{name}")[0] for name in binning.edges} for arrays, _ in sides
+        {name: side.pop(f"{PREFIX}{name}")[0, 0] for name in binning.edges} for side in arrays
     ]
-    units = [Units.of(arrays, single=single) for arrays, single in sides]
     return PairedUnits(
-        units[0], units[1], paired, names,
+        arrays[0], arrays[1], single, paired, names,
         {name: first.sizes[name] for name in names},
         {name: first[name].variable for name in names}, binning, first, (values[0], values[1]),
     )
@@ -276,7 +249,7 @@ def _in_units(
     results: xr.Dataset, arrays: Mapping[str, xr.DataArray], configurations: tuple[str, ...], *,
     single: bool,
 ) -> dict[str, NDArray[Any]]:
-    """Return arrays as (configurations, units, rows, ...)."""
+    """Return arrays as (configurations, 1, units, rows, ...)."""
     scene = [name for name in axes_of(results, Stage.scene) if name not in configurations]
     if DRAWS in scene:
         scene = [DRAWS, *(name for name in scene if name != DRAWS)]
@@ -290,7 +263,7 @@ def _in_units(
         values = array.reset_coords(drop=True).drop_vars(array.indexes, errors="ignore")
         values = values.expand_dims(missing).transpose(*dims, *inner)
         shape = tuple(values.sizes[dim] for dim in inner)
-        laid_out[name] = np.asarray(values).reshape(count, units, -1, *shape)
+        laid_out[name] = np.asarray(values).reshape(count, 1, units, -1, *shape)
     return laid_out
 
 
@@ -310,15 +283,15 @@ def _blur_truth(arrays: dict[str, NDArray[Any]]) -> None:
 
 
 def _gathered(array: NDArray[Any], trials: Integers) -> NDArray[Any]:
-    """Return an array (c, t, rows, ...) of trials as that of photographs (c, p, rows, ...).
+    """Return an array (c, 1, t, rows, ...) of trials as that of photographs (c, 1, p, rows, ...).
 
     ``trials`` is (p, repeats); of -1 nothing counts, and flags are 0.
     """
-    taken = array[:, np.maximum(trials, 0)]
-    absent = (trials < 0).reshape(1, *trials.shape, *(1,) * (array.ndim - 2))
+    taken = array[:, :, np.maximum(trials, 0)]
+    absent = (trials < 0).reshape(1, 1, *trials.shape, *(1,) * (array.ndim - 3))
     filler = np.nan if array.dtype.kind == "f" else 0
     taken = np.where(absent, np.asarray(filler, dtype=array.dtype), taken)
-    return taken.reshape(*taken.shape[:2], -1, *array.shape[3:])
+    return taken.reshape(*taken.shape[:3], -1, *array.shape[4:])
 
 
 def _binned(results: xr.Dataset, name: str) -> xr.DataArray:
@@ -349,6 +322,9 @@ SOURCES = ("photographs", "simulated")
 
 PERCENTS = {"median": 50, "p90": 90}
 
+BY_PHOTOGRAPH = Design(Unit.photograph)
+"""A photograph, or a scene of a simulation, is the draw."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Compared:
@@ -362,41 +338,31 @@ class Compared:
 
 @dataclass(frozen=True, kw_only=True)
 class GapRate(Compared):
-    """A rate of markers: fields of `Units`."""
+    """A rate of markers."""
 
-    successes: str
-    used: str
+    rate: Rate[Poses]
 
 
 @dataclass(frozen=True, kw_only=True)
 class GapQuantile(Compared):
-    """A quantile of the errors of solved poses: a field of `Units`."""
+    """A quantile of the errors (...) of solved poses."""
 
-    error: str
+    error: Callable[[Poses], Floats]
     percent: int = 50
-    absolute: bool = True
 
 
-RATES = (
-    GapRate(name="detection_rate", meaning="detected of looked_for", successes="detected",
-            used="looked_for"),
-    GapRate(name="flip_rate", meaning="nearer to the mirror of the truth, of solved",
-            successes="flipped", used="solved"),
-)
+RATES = tuple(GapRate(name=each.rate.name, meaning=each.rate.meaning, rate=each.rate)
+              for each in (DETECTION_RATE, FLIP_RATE))
 
 QUANTILES = (
     GapQuantile(name="range_bias_percent", meaning="median depth error of the true depth, solved",
-                units="percent", error="range_percent", absolute=False),
+                units="percent", error=lambda poses: poses.range_percent[..., 0]),
     *(
         GapQuantile(
-            name=f"{name}_{statistic}_{unit}", units=units, error=f"{name}_{unit}", ratio=True,
-            meaning=f"{percent} % quantile of the absolute {words}, solved", percent=percent,
-        )
-        for name, unit, units, words in (
-            ("rotation", "deg", "degree", "rotation error"),
-            ("range", "percent", "percent", "depth error of the true depth"),
-        )
-        for statistic, percent in PERCENTS.items()
+            name=quantity.named(statistic), units=quantity.units, ratio=True, error=quantity.norm,
+            meaning=f"{percent} % quantile of the absolute {quantity.words}, solved",
+            percent=percent)
+        for quantity in QUANTITIES[:2] for statistic, percent in PERCENTS.items()
     ),
 )
 """What is compared, in the order of the table."""
@@ -503,44 +469,35 @@ def _attributes() -> dict[str, dict[str, Any]]:
 
 def _gap(pair: PairedUnits, inside: tuple[Masks, Masks]) -> dict[str, Any]:
     """Return the variables of one bin: (sources, configurations) or (configurations,)."""
-    sides = [
-        side.within(mask) for side, mask in zip((pair.first, pair.second), inside, strict=True)
-    ]
+    arrays = pair.within(inside)
+    sides = [Poses(each) for each in arrays]
     table: dict[str, Any] = {
-        name: np.stack([getattr(side, name).sum(axis=(1, 2)) for side in sides])
+        name: np.stack([getattr(side, name).sum(axis=OVER_ALL) for side in sides])
         for name in ("looked_for", "solved")
     }
-    table["units"] = np.stack([side.looked_for.any(axis=2).sum(axis=1) for side in sides])
-    for rate in RATES:
-        table |= _rates(rate, sides)
-    counts = [
-        None if side.single else unit_counts(side.looked_for.shape[1]) for side in sides
-    ]
+    table["units"] = np.stack([side.looked_for.any(axis=(1, 3)).sum(axis=1) for side in sides])
+    for each in RATES:
+        table |= _rates(each.rate, arrays)
+    counts = [None if single else unit_counts(side.looked_for.shape[2])
+              for side, single in zip(sides, pair.single, strict=True)]
     if pair.paired:
         counts = [counts[0], counts[0]]
-    for each in QUANTILES:
-        rows = [_quantiles(each, sides, counts, k) for k in range(len(table["units"][0]))]
+    for what in QUANTILES:
+        errors = [what.error(side) for side in sides]
+        rows = [_quantiles(what, [error[k, 0] for error in errors],
+                           [side.solved[k, 0] for side in sides], counts)
+                for k in range(len(errors[0]))]
         for name in rows[0]:
             table[name] = np.stack([row[name] for row in rows], axis=-1)
     return table
 
 
-def _rates(rate: GapRate, sides: list[Units]) -> dict[str, Any]:
+def _rates(rate: Rate[Poses], arrays: Sequence[Arrays]) -> dict[str, Any]:
     """Return a rate of both, its difference, and their intervals."""
-    statistic: PhotographRate[Mapping[str, Masks]] = PhotographRate(
-        "rate", rate.meaning, lambda view: view["hit"], lambda view: view["used"]
-    )
-    found = []
-    for side in sides:
-        view = {
-            name: getattr(side, source)[:, None] for name, source in
-            (("hit", rate.successes), ("used", rate.used))
-        }
-        found.append(statistic.result(statistic.first_pass(view).fold()))
-    value, low, high = (
-        np.stack([each[name] for each in found]) for name in ("rate", "rate_low", "rate_high")
-    )
-    table = {rate.name: value, f"{rate.name}_low": low, f"{rate.name}_high": high}
+    found = [rate.variables(Blocks(each, Poses), BY_PHOTOGRAPH) for each in arrays]
+    names = rate.name, f"{rate.name}_low", f"{rate.name}_high"
+    value, low, high = (np.stack([each[name] for each in found]) for name in names)
+    table = dict(zip(names, (value, low, high), strict=True))
     gap = value[1] - value[0]
     table[f"{rate.name}_gap"] = gap
     table[f"{rate.name}_gap_low"] = gap - np.hypot(value[1] - low[1], high[0] - value[0])
@@ -549,22 +506,22 @@ def _rates(rate: GapRate, sides: list[Units]) -> dict[str, Any]:
 
 
 def _quantiles(
-    each: GapQuantile, sides: list[Units], counts: list[Any], configuration: int
+    each: GapQuantile, errors: Sequence[Floats], solved: Sequence[Masks], counts: Sequence[Any],
 ) -> dict[str, Any]:
-    """Return a quantile of both of one configuration, its gap, and their intervals."""
+    """Return a quantile of both of one configuration, its gap, and their intervals.
+
+    ``errors`` and ``solved`` are (units, rows) of each.
+    """
     values, ends, replicates, units = [], [], [], []
-    for side, drawn in zip(sides, counts, strict=True):
-        errors: Floats = getattr(side, each.error)[configuration]
-        errors = np.abs(errors) if each.absolute else errors
-        used = side.solved[configuration] & np.isfinite(errors)
-        share = each.percent / 100.0
-        values.append(quantile_of(np.sort(errors[used]), share))
-        replicates.append(resampled_quantiles(errors, used, drawn, share))
+    for error, some, drawn in zip(errors, solved, counts, strict=True):
+        used, share = some & np.isfinite(error), each.percent / 100.0
+        interval = quantile_intervals(
+            np.where(used, error, np.nan)[None, None], used.sum(axis=1)[None, None],
+            [each.percent], BY_PHOTOGRAPH)[0, 0].tolist()
+        values.append(interval[0])
+        replicates.append(resampled_quantiles(error, used, drawn, share))
         units.append(int(used.any(axis=1).sum()))
-        ends.append(
-            quantile_ends(errors[used], np.nonzero(used)[0], share) if units[-1] >= MIN_UNITS
-            else (np.nan, np.nan)
-        )
+        ends.append(interval[1:] if units[-1] >= MIN_UNITS else (np.nan, np.nan))
     with np.errstate(divide="ignore", invalid="ignore"):
         gaps = replicates[1] / replicates[0] if each.ratio else replicates[1] - replicates[0]
         gap = np.divide(values[1], values[0]) if each.ratio else values[1] - values[0]

@@ -1,47 +1,107 @@
-"""Statistics whose states merge: sums over chunks, and what is made of them."""
+"""What a statistic of poses is: a record that a block of poses is given to, and its outputs."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 from numpy.lib.array_utils import normalize_axis_tuple
 from numpy.typing import ArrayLike, NDArray
 
+from sweep.analysis.draws import Design
 from sweep.plan.schema import cf_attributes
 from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
-# Arrays whose first axis runs over groups of poses: several put together, some cells among all.
+# Poses of some groups, laid out as (groups, cells, draws, settings, ...), and read in blocks.
+#
+# A group is one row of the table. Its cells are a fixed grid, the draws of a cell are random, and
+# the settings of a draw see the same images, so that together they count as one draw.
 
-def interleaved(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return n arrays (groups, ...) as one (groups * n, ...), the n values of a group together.
+ViewT = TypeVar("ViewT")
+ResultT = TypeVar("ResultT")
 
-    Examples
-    --------
-    >>> interleaved([np.array([1, 2]), np.array([10, 20])]).tolist()
-    [1, 10, 2, 20]
+Arrays = dict[str, NDArray[Any]]
+"""Arrays of poses, by name."""
+
+Variables = dict[str, NDArray[Any]]
+"""Values of variables (groups,), by name."""
+
+OVER_ALL = (1, 2, 3)
+"""Axes of cells, draws and settings."""
+
+MAX_BLOCK = 1 << 17
+"""Poses in a block: a thread needs 25 MB for so many."""
+
+
+class Blocks(Generic[ViewT]):
+    """The poses of some groups, in blocks along the cells and the draws.
+
+    The columns are in memory; what is computed of them pose by pose is so for a block at a time.
+
+    Parameters
+    ----------
+    arrays
+        The columns, (groups, cells, draws, settings, ...).
+    view
+        Makes of a block's arrays the view that statistics read.
+    threads
+        Where blocks are computed side by side; None for one after the other.
     """
-    stacked = np.stack(arrays, axis=1)
-    return stacked.reshape(-1, *stacked.shape[2:])
+
+    def __init__(
+        self, arrays: Arrays, view: Callable[[Arrays], ViewT], threads: Executor | None = None
+    ) -> None:
+        self._arrays, self._view, self._threads = arrays, view, threads
+        groups, cells, draws, settings = next(iter(arrays.values())).shape[:4]
+        self.poses = groups * cells * draws * settings
+        most = max(MAX_BLOCK // max(groups * settings, 1), 1)
+        steps = max(most // max(draws, 1), 1), most
+        self._cuts = [
+            [slice(start, start + step) for start in range(0, max(length, 1), step)]
+            for length, step in zip((cells, draws), steps, strict=True)]
+        self._single: ViewT | None = None
+
+    def map(self, function: Callable[[ViewT], ResultT]) -> list[ResultT]:
+        """Return what a function gives of the view of each block."""
+        blocks = list(itertools.product(*self._cuts))
+        if len(blocks) == 1:
+            # All statistics share the view, which keeps what it has computed.
+            self._single = self._single or self._view(self._arrays)
+            return [function(self._single)]
+
+        def of_block(cut: tuple[slice, ...]) -> ResultT:
+            return function(self._view(
+                {name: array[:, *cut] for name, array in self._arrays.items()}))
+
+        return list(map(of_block, blocks) if self._threads is None
+                    else self._threads.map(of_block, blocks))
+
+    def gather(
+        self, function: Callable[[ViewT], tuple[NDArray[Any], ...]]
+    ) -> tuple[NDArray[Any], ...]:
+        """Return the arrays (groups, cells, draws, ...) that a function gives of the blocks."""
+        found = self.map(function)
+        if len(found) == 1:
+            return found[0]
+        width = len(self._cuts[1])
+        rows = [found[start : start + width] for start in range(0, len(found), width)]
+        return tuple(
+            np.concatenate([np.concatenate([each[k] for each in row], axis=2) for row in rows],
+                           axis=1)
+            for k in range(len(found[0])))
 
 
-def scattered(array: NDArray[Any], where: Masks, fill: float = 0.0) -> NDArray[Any]:
-    """Return an array (groups, some cells) as one of all cells, ``fill`` for the others.
-
-    Examples
-    --------
-    >>> scattered(np.array([[1, 2]]), np.array([True, False, True])).tolist()
-    [[1, 0, 2]]
-    """
-    whole = np.full((len(array), len(where)), fill, dtype=array.dtype)
-    whole[:, where] = array
-    return whole
+def settings_of(used: Masks) -> Integers:
+    """Return how many settings of each draw count: (groups, cells, draws)."""
+    return sum_of_settings(used).astype(np.int32)
 
 
 MAX_SLICES = 8
@@ -203,19 +263,6 @@ class Moments:
             m2 = a.m2 + b.m2 + gap * (gap * share) * larger
         return Moments(larger + smaller, total, rest, m2)
 
-    @staticmethod
-    def interleave(parts: Sequence[Moments]) -> Moments:
-        """Return n moments (groups, ...) as one, (groups * n, ...); the n of a group together."""
-        return Moments(
-            interleaved([part.count for part in parts]), interleaved([part.mean for part in parts]),
-            interleaved([part.mean_tail for part in parts]),
-            interleaved([part.m2 for part in parts]))
-
-    def every_nth(self, n: int, first: int) -> Moments:
-        """Return the moments at ``first``, ``first + n`` and so on along the first axis."""
-        return Moments(self.count[first::n], self.mean[first::n], self.mean_tail[first::n],
-                       self.m2[first::n])
-
 
 def _two_sum(a: Any, b: Any) -> tuple[Any, Any]:
     """Return a + b rounded and the rounding's error, exactly (Knuth 1969); 0 if not finite."""
@@ -226,223 +273,10 @@ def _two_sum(a: Any, b: Any) -> tuple[Any, Any]:
 
 
 # --------------------------------------------------------------------------------------------------
-# States: what a statistic keeps of a block of poses, and how those of several blocks merge.
-#
-# A state is a frozen dataclass whose first axis runs over the groups. That of a block may also
-# hold values of each cell, (groups, cells): it is merged over the blocks that share the cells
-# (other draws), then folded to a state of the groups alone, and that is merged over the other
-# blocks.
-
-class Part(Protocol):
-    """A value of a state that is not an array of sums: `Moments`, a `Tally`, another state."""
-
-    def merge(self, other: Self) -> Self:
-        """Return the value of the poses of both."""
-        ...
-
-    @staticmethod
-    def interleave(parts: Sequence[Any]) -> Any:
-        """Return the value of the groups of all, those of the last index fastest."""
-        ...
-
-
-@dataclass(frozen=True)
-class State:
-    """Base of all states: fields are arrays (groups, ...) that add up, or a `Part`."""
-
-    def merge(self, other: Self) -> Self:
-        """Return the state of the poses of both, of the same groups."""
-        return type(self)(*map(_merge, self._values(), other._values()))
-
-    @classmethod
-    def interleave(cls, states: Sequence[Self]) -> Self:
-        """Return n states of as many groups each as one; the n of a group stand together."""
-        if len(states) == 1:
-            return states[0]
-        return cls(*map(_interleave, zip(*map(cls._values, states), strict=True)))
-
-    def every_nth(self, n: int, first: int) -> Self:
-        """Return the state of the groups ``first``, ``first + n`` and so on."""
-        if n == 1:
-            return self
-        return type(self)(*(
-            value[first::n] if isinstance(value, np.ndarray) else value.every_nth(n, first)
-            for value in self._values()))
-
-    def scatter(self, where: Masks) -> Self:
-        """Return the state of some cells as that of all; ``where`` (cells,) marks those."""
-        return type(self)(*(
-            value.scatter(where) if isinstance(value, State) else value
-            for value in self._values()))
-
-    def fold(self) -> Any:
-        """Return the state of the groups, the values of their cells put together."""
-        return type(self)(*(
-            value.fold() if isinstance(value, State) else value for value in self._values()))
-
-    def _values(self) -> list[Any]:
-        # The names of the fields; `dataclasses.fields` takes longer than to merge a small state.
-        names: tuple[str, ...] = self.__match_args__
-        return [getattr(self, name) for name in names]
-
-
-def _merge(a: Any, b: Any) -> Any:
-    return a + b if isinstance(a, np.ndarray) else a.merge(b)
-
-
-def _interleave(values: Sequence[Any]) -> Any:
-    first = values[0]
-    return interleaved(values) if isinstance(first, np.ndarray) else type(first).interleave(values)
-
-
-@dataclass(frozen=True)
-class Nothing(State):
-    """State of a pass that is not needed."""
-
-
-# Draws.
-
-@dataclass(frozen=True)
-class CellDraws(State):
-    """How many draws of each cell have a pose that counts."""
-
-    draws: Integers  # (groups, cells)
-
-    @classmethod
-    def of(cls, settings: Integers) -> Self:
-        """Return that of the number of settings that count, (groups, cells, draws)."""
-        return cls((settings > 0).sum(axis=2))
-
-    def scatter(self, where: Masks) -> Self:
-        """Return the state of some cells as that of all."""
-        return type(self)(scattered(self.draws, where))
-
-    def fold(self) -> Integers:
-        """Return the degrees of freedom (groups,): the draws beyond the first of each cell."""
-        return np.asarray(np.maximum(self.draws - 1, 0).sum(axis=1))
-
-
-Freedom = Any
-"""Degrees of freedom (groups,): Integers; before a block is folded its `CellDraws`."""
-
-
-@dataclass(frozen=True)
-class Sample(State):
-    """The poses that count, and the draws that they are of; each (groups,)."""
-
-    n: Integers  # poses, times pooled settings
-    squares: Floats  # sum over the draws of the squared number of settings that count
-    freedom: Freedom  # draws beyond the first of each cell
-
-    @classmethod
-    def of(cls, used: Masks) -> Self:
-        """Return the sample of the poses that count, (groups, cells, draws, settings)."""
-        settings = sum_of_settings(used)
-        squares = np.square(settings, dtype=np.float64).sum(axis=(1, 2))
-        return cls(settings.sum(axis=(1, 2)), squares, CellDraws.of(settings))
-
-    @property
-    def draws(self) -> Integers:
-        """Number of draws that the poses are worth.
-
-        That is the number of draws with a pose that counts if each has equally many of them; else
-        it is less, for those with more of them count more: the effective sample size,
-        (Σ m)² / Σ m² of m poses a draw, rounded down (Kish, "Survey Sampling", 1965, section 11.7).
-        """
-        worth = self.n.astype(np.float64)**2 / np.maximum(self.squares, 1.0)
-        return np.asarray(np.floor(worth * (1.0 + 1e-12)), dtype=np.int64)
-
-    @property
-    def drawn(self) -> Masks:
-        """Whether any cell has two draws, so that intervals exist."""
-        return np.asarray(self.freedom > 0)
-
-
-# Spread of draws within cells.
-
-@dataclass(frozen=True)
-class Largest:
-    """The largest values (groups, ...) of poses; -inf of none."""
-
-    values: Floats
-
-    def merge(self, other: Self) -> Self:
-        """Return the largest values of the poses of both."""
-        return type(self)(np.maximum(self.values, other.values))
-
-    @staticmethod
-    def interleave(parts: Sequence[Largest]) -> Largest:
-        """Return n of as many groups each as one; the n of a group stand together."""
-        return Largest(interleaved([part.values for part in parts]))
-
-    def every_nth(self, n: int, first: int) -> Self:
-        """Return the values of the groups ``first``, ``first + n`` and so on."""
-        return type(self)(self.values[first::n])
-
-
-@dataclass(frozen=True)
-class Spread(State):
-    """Sums over cells from which the error of a mean follows; each (groups,).
-
-    `sweep.analysis.means.estimate_mean` uses them.
-    """
-
-    variance: Floats  # sum over the cells of n_c s_c², s_c² being the variance within the cell
-    squares: Floats  # sum of its terms' squares over their degrees of freedom + 2
-    single: Integers  # cells with a single draw
-    m2: Floats  # sum of squared deviations from the cells' means
-    freedom: Floats  # its degrees of freedom
-    largest: Largest  # the largest score of a pose
-
-
-@dataclass(frozen=True)
-class CellDeviations(State):
-    """Moments (groups, cells) of the draws' deviations from the mean, and the largest scores."""
-
-    within: Moments
-    largest: Largest
-
-    def scatter(self, where: Masks) -> Self:
-        """Return the state of some cells as that of all."""
-        w = self.within
-        return type(self)(Moments(
-            scattered(w.count, where), scattered(w.mean, where, np.nan),
-            scattered(w.mean_tail, where), scattered(w.m2, where)), self.largest)
-
-    def fold(self) -> Spread:
-        """Return the sums over the cells."""
-        repeated = self.within.count > 1
-        freedom = np.where(repeated, self.within.count - 1.0, 0.0)
-        m2 = np.where(repeated, self.within.m2, 0.0)
-        with np.errstate(all="ignore"):
-            terms = (freedom + 1.0) * m2 / np.maximum(freedom, 1.0)
-            return Spread(
-                terms.sum(axis=1), (terms**2 / (freedom + 2.0)).sum(axis=1),
-                (self.within.count == 1).sum(axis=1), m2.sum(axis=1), freedom.sum(axis=1),
-                self.largest)
-
-
-# --------------------------------------------------------------------------------------------------
-# A statistic of poses as a record: two passes over every block, and the variables they give.
-#
-# Poses come in blocks, arrays (groups, cells, draws, settings): the settings of a draw see the
-# same images, so that together they count as one draw. A statistic passes over every block twice;
-# it keeps states of a block, which merge (`sweep.analysis.statistic`).
+# A statistic of poses: a record that says what of the blocks it needs, and the variables it gives.
 #
 # All intervals are at 95 %, over the random draws, conditional on the grid; NaN if no cell has
 # two draws that count.
-
-ViewT = TypeVar("ViewT")
-FirstT = TypeVar("FirstT", bound=State)
-KnownT = TypeVar("KnownT", bound=State)
-SecondT = TypeVar("SecondT", bound=State)
-
-Variables = dict[str, NDArray[Any]]
-"""Values of variables (groups,), by name."""
-
-OVER_ALL = (1, 2, 3)
-"""Axes of cells, draws and settings."""
-
 
 @dataclass(frozen=True)
 class Output:
@@ -459,63 +293,28 @@ class Output:
         return cf_attributes(self.meaning, self.units, self.flags)
 
 
+INTERVAL = {"": "", "_low": "lower end of the 95 % interval: ",
+            "_high": "upper end of the 95 % interval: "}
+"""Endings of names, of a value and of its interval's ends, with what meanings begin with."""
+
+
 def with_interval(name: str, meaning: str, units: str) -> list[Output]:
     """Return a variable and the ends of its interval."""
-    return [
-        Output(name, meaning, units),
-        Output(f"{name}_low", f"lower end of the 95 % interval: {meaning}", units),
-        Output(f"{name}_high", f"upper end of the 95 % interval: {meaning}", units),
-    ]
+    return [Output(f"{name}{end}", words + meaning, units) for end, words in INTERVAL.items()]
 
 
 def interval_variables(name: str, interval: Sequence[NDArray[Any]]) -> Variables:
     """Return a value and the ends of its interval, (value, low, high), by name."""
-    return dict(zip((name, f"{name}_low", f"{name}_high"), interval, strict=True))
+    return {f"{name}{end}": each for end, each in zip(INTERVAL, interval, strict=True)}
 
 
-class Statistic(ABC, Generic[ViewT, FirstT, KnownT, SecondT]):
-    """What is computed of poses, in two passes over every block.
-
-    Generic over the view of a block's poses, over the merged states of the first and second pass,
-    and over what the second pass must know of the first.
-    """
+class Statistic(ABC, Generic[ViewT]):
+    """What is computed of poses; generic over the view of them."""
 
     @abstractmethod
     def outputs(self) -> Sequence[Output]:
         """Return the variables that it gives."""
 
     @abstractmethod
-    def first_pass(self, poses: ViewT) -> State:
-        """Return the state of a block."""
-
-    @abstractmethod
-    def prepare_second(self, first: FirstT) -> KnownT:
-        """Return what the second pass needs, from the state of all blocks."""
-
-    @abstractmethod
-    def second_pass(self, poses: ViewT, known: KnownT) -> State:
-        """Return the state of a block, whose groups ``known`` has."""
-
-    @abstractmethod
-    def finish(self, known: KnownT, second: SecondT) -> Variables:
-        """Return the variables, each (groups,)."""
-
-
-class SinglePass(Statistic[ViewT, FirstT, FirstT, Nothing]):
-    """A statistic of a single pass; if all are so the second pass is left out."""
-
-    @abstractmethod
-    def result(self, state: FirstT) -> Variables:
-        """Return the variables, each (groups,)."""
-
-    def prepare_second(self, first: FirstT) -> FirstT:
-        """Return the state of all blocks."""
-        return first
-
-    def second_pass(self, poses: ViewT, known: FirstT) -> Nothing:  # noqa: ARG002
-        """Return nothing."""
-        return Nothing()
-
-    def finish(self, known: FirstT, second: Nothing) -> Variables:  # noqa: ARG002
-        """Return the variables, each (groups,)."""
-        return self.result(known)
+    def variables(self, blocks: Blocks[ViewT], design: Design) -> Variables:
+        """Return the variables, each (groups,), of poses whose draws are of a design."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -13,7 +12,8 @@ from scipy import special
 from sweep.analysis.aggregate import aggregate
 from sweep.analysis.binning import Bins
 from sweep.analysis.counts import Count, Rate
-from sweep.analysis.dataset import axes_of, describes, kept_dimensions
+from sweep.analysis.dataset import axes_of, describes, kept_dimensions, stacked
+from sweep.analysis.draws import Design
 from sweep.analysis.intervals import LEVEL
 from sweep.analysis.means import (
     FlipMixture,
@@ -39,7 +39,15 @@ from sweep.analysis.poses import (
 )
 from sweep.analysis.quantiles import Quantiles
 from sweep.analysis.rates import DETECTION_RATE, FLIP_RATE, LOOKED_FOR, SOLVED, SOLVED_RATE
-from sweep.analysis.statistic import Output, Statistic
+from sweep.analysis.statistic import (
+    INTERVAL,
+    Blocks,
+    Output,
+    Statistic,
+    Variables,
+    interval_variables,
+    with_interval,
+)
 from sweep.errors import ArgumentError
 from sweep.plan.schema import POSE_PARAMETERS, XYZ
 from sweep.typing import Floats, Masks
@@ -50,7 +58,7 @@ from sweep.typing import Floats, Masks
 # A new record here is all that a new statistic needs: the table of `error_statistics`, the
 # attributes of its variables and the report's table of errors follow from it.
 
-AnyPoseStatistic = Statistic[Poses, Any, Any, Any]
+AnyPoseStatistic = Statistic[Poses]
 
 
 @dataclass(frozen=True)
@@ -208,7 +216,7 @@ def error_statistics(
     Returns
     -------
     xr.Dataset
-        Dimensions (*per, *bins); lazy if ``results`` is. The interval of ``x`` is in ``x_low`` and
+        Dimensions (*per, *bins). The interval of ``x`` is in ``x_low`` and
         ``x_high``. The rotation error is in degrees, the range error is that of z in percent of
         the true z, the position error in metres.
 
@@ -335,7 +343,7 @@ def covariance_trust(
     Returns
     -------
     xr.Dataset
-        Dimensions (*per[, level]); lazy if ``results`` is. Without ``nees`` all is NaN and nothing
+        Dimensions (*per[, level]). Without ``nees`` all is NaN and nothing
         trusted.
 
         - ``nees_count``: estimates with a number. ``nees_mean``, expected to be 6, with Student's
@@ -385,10 +393,7 @@ def covariance_trust(
         "long_name": "nominal probability of the covariance's region", "units": "1"})
 
     def over_levels(name: str) -> xr.DataArray:
-        parts = [table[name.format(at)] for at in range(len(limits))]
-        return xr.concat(
-            parts, dim="level", coords="minimal", compat="override", join="exact",
-        ).transpose(..., "level")
+        return stacked([table[name.format(at)] for at in range(len(limits))], "level")
 
     right = ((over_levels("joint {}_low") - TOLERANCE <= level)
              & (level <= over_levels("joint {}_high") + TOLERANCE)).all("level")
@@ -396,8 +401,7 @@ def covariance_trust(
         "nees_mean", "nees_mean_low", "nees_mean_high", "nees_count")}
     variables["covariance_trusted"] = (right & (table["draws"] >= MIN_DRAWS)).assign_attrs(
         long_name="whether the coverage is the level, at every level", units="1")
-    for ending, words in (("", ""), ("_low", "lower end of the 95 % interval: "),
-                          ("_high", "upper end of the 95 % interval: ")):
+    for ending, words in INTERVAL.items():
         variables[f"covariance_coverage{ending}"] = over_levels(
             f"coverage {{}}{ending}").assign_attrs(
                 long_name=f"{words}share of estimates within the covariance's region of a level",
@@ -419,14 +423,14 @@ def _scaled(results: xr.Dataset, nees: xr.DataArray, scale: xr.DataArray) -> xr.
     return nees * scale
 
 
-def _nees_statistics(limits: Sequence[float]) -> list[Statistic[Poses, Any, Any, Any]]:
+def _nees_statistics(limits: Sequence[float]) -> list[Statistic[Poses]]:
     """Return the mean of ``nees``, and the shares below each limit with two intervals.
 
     "coverage 0" has the interval of its level alone, "joint 0" that of all levels together.
     """
     joint = 1.0 - (1.0 - LEVEL) / len(limits)
 
-    statistics: list[Statistic[Poses, Any, Any, Any]] = [NEES_MEAN.statistic]
+    statistics: list[Statistic[Poses]] = [NEES_MEAN.statistic]
     for at, limit in enumerate(limits):
         def within(poses: Poses, most: float = limit) -> Masks:
             return np.asarray(_nees(poses) <= most)
@@ -462,7 +466,7 @@ def efficiency(
     Returns
     -------
     xr.Dataset
-        Dimensions (*per, *bins); lazy if ``results`` is.
+        Dimensions (*per, *bins).
 
         - ``rotation_efficiency``: sqrt(mean of the sum of the three bounds squared) over the RMS
           norm of the rotation error.
@@ -492,19 +496,7 @@ def efficiency(
     """
     kept = kept_dimensions(results, per)
     inputs = pose_arrays(results, ERROR_INPUTS) | bound_arrays(results)
-    statistics = [statistic for ratio in RATIOS for statistic in ratio.statistics()]
-    table = aggregate(results, inputs, kept, statistics, Poses, bins)
-    variables: dict[str, xr.DataArray] = {}
-    for ratio in RATIOS:
-        bound, error = (statistic.name for statistic in ratio.statistics())
-        for ending, other, words in (
-            ("", "", ""), ("_low", "_high", "lower end of the 95 % interval: "),
-            ("_high", "_low", "upper end of the 95 % interval: "),
-        ):
-            variables[f"{ratio.output.name}{ending}"] = (
-                table[bound] / table[f"{error}{other}"]).assign_attrs(
-                    long_name=f"{words}{ratio.output.meaning}", units="1")
-    return xr.Dataset(variables, dict(table.coords))
+    return aggregate(results, inputs, kept, RATIOS, Poses, bins)
 
 
 def bound_arrays(results: xr.Dataset) -> dict[str, xr.DataArray]:
@@ -520,37 +512,43 @@ def bound_arrays(results: xr.Dataset) -> dict[str, xr.DataArray]:
 
 
 @dataclass(frozen=True)
-class BoundRatio:
-    """The RMS bound over the RMS error of a kind of error.
+class BoundRatio(Statistic[Poses]):
+    """The RMS bound over the RMS error of a kind of error, of the poses that have both.
 
     Attributes
     ----------
+    name
+        Of the ratio.
     quantity
         The kind of error.
     bound_squared
         The squared bounds (...) of poses.
+    level, guarded
+        As of `RootMeanSquare`.
     """
 
+    name: str
     quantity: Quantity
     bound_squared: Callable[[Poses], Floats]
+    level: float = LEVEL
+    guarded: bool = False
 
-    @property
-    def output(self) -> Output:
-        """The ratio's name and meaning."""
+    def outputs(self) -> Sequence[Output]:
+        """Return the ratio and its interval."""
         words = f"RMS bound over RMS {self.quantity.words}, solved and not flipped"
-        return Output(f"{self.quantity.name}_efficiency", words, "1")
+        return with_interval(self.name, words, "1")
 
-    def statistics(self) -> tuple[RootMeanSquare[Poses], RootMeanSquare[Poses]]:
-        """Return the RMS bound and the RMS error of the poses that have both."""
-        quantity = self.quantity
-        return (
+    def variables(self, blocks: Blocks[Poses], design: Design) -> Variables:
+        """Return the ratio; its interval is that of the error."""
+        bound, error = (
             RootMeanSquare(
-                quantity.named("bound"), f"RMS bound of the {quantity.words}", quantity.units,
-                lambda poses: self.bound_squared(poses)[..., None], self.used),
-            RootMeanSquare(
-                quantity.named("rmse"), f"RMS {quantity.words} of poses with a bound",
-                quantity.units, quantity.squares, self.used),
-        )
+                "", "", self.quantity.units, squares, self.used, self.level, self.guarded,
+            ).variables(blocks, design)
+            for squares in (lambda poses: self.bound_squared(poses)[..., None],
+                            self.quantity.squares))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = [bound[""] / error[end] for end in ("", "_high", "_low")]
+        return interval_variables(self.name, ends)
 
     def used(self, poses: Poses) -> Masks:
         """Return the poses that have a bound and are solved and not flipped."""
@@ -558,8 +556,9 @@ class BoundRatio:
 
 
 RATIOS = (
-    BoundRatio(QUANTITIES[0], lambda poses: norm_squared(np.degrees(poses["rotation_bound"]))),
-    BoundRatio(QUANTITIES[1],
+    BoundRatio("rotation_efficiency", QUANTITIES[0],
+               lambda poses: norm_squared(np.degrees(poses["rotation_bound"]))),
+    BoundRatio("range_efficiency", QUANTITIES[1],
                lambda poses: (100.0 * relative(poses["depth_bound"], poses[DEPTH])) ** 2),
 )
 """Of the rotation and of the depth."""

@@ -13,13 +13,13 @@ import xarray as xr
 from matplotlib.axes import Axes
 
 from sweep.analysis.binning import Bins
+from sweep.analysis.poses import QUANTITIES, Poses
 from sweep.analysis.simulation_gaps import (
     QUANTILES,
     RATES,
     SOURCES,
     Compared,
     PairedUnits,
-    Units,
     paired_units,
 )
 from sweep.report.charts import COLOURS, DASHES, Panel, legend_above, plain_ticks
@@ -141,15 +141,14 @@ def gap_panels(
     """
     pair = paired_units(photographs, simulated, bins)
     inside = [np.logical_or.reduce(masks) for masks in zip(*pair.bins(), strict=True)]
-    sides = [side.within(mask) for side, mask in zip((pair.first, pair.second), inside,
-                                                      strict=True)]
+    sides = [Poses(arrays) for arrays in pair.within(inside)]
     panels = []
     for k, name in enumerate(_names(pair)[:MAX_CONFIGURATIONS]):
-        for error, words, absolute in (
-            ("rotation_deg", "rotation error [degree]", True),
-            ("range_percent", "depth error [% of the true depth]", False),
+        for errors, words, absolute in (
+            (QUANTITIES[0].norm, "rotation error [degree]", True),
+            (lambda poses: poses.range_percent[..., 0], "depth error [% of the true depth]", False),
         ):
-            values = [_solved(side, error, k) for side in sides]
+            values = [_ascending(errors(side)[k][side.solved[k]]) for side in sides]
             panels.append(Panel(
                 name or "All markers",
                 f"Share of the solved poses with at most this {words}: photographs and simulation.",
@@ -165,9 +164,7 @@ def _names(pair: PairedUnits) -> list[str]:
     return [", ".join(each) for each in itertools.product(*values)]
 
 
-def _solved(side: Units, error: str, configuration: int) -> Floats:
-    """Return the errors of the solved poses of a configuration, ascending."""
-    values = getattr(side, error)[configuration][side.solved[configuration]]
+def _ascending(values: Floats) -> Floats:
     return np.asarray(np.sort(values[np.isfinite(values)]))
 
 

@@ -389,9 +389,8 @@ class ReportData:
     def once(self, key: Any, compute: Callable[[], xr.Dataset]) -> xr.Dataset:
         """Return what ``compute`` returns, loaded; it is called once for each key."""
         if key not in self._analyses:
-            lazy = compute()
             with store_errors(self.store):
-                self._analyses[key] = lazy.compute()
+                self._analyses[key] = compute()
         return self._analyses[key]
 
     def known(self, key: Any) -> xr.Dataset | None:

@@ -24,6 +24,7 @@ from sweep.analysis.requirements import (
     check_required,
     combined_decision,
     decide,
+    kept_by,
     parse_requirements,
 )
 from sweep.errors import DatasetError
@@ -194,10 +195,7 @@ class LimitSampling:
         rule = self.rule
         configurations = [str(name) for name in table.attrs["configuration_dims"]]
         inner = [*rule.at_all, "requirement"]
-        keeps = xr.concat([
-            each.holds(table["value"].isel(requirement=k))
-            for k, each in enumerate(self.required)], "requirement",
-            coords="minimal", compat="override", join="exact")
+        keeps = kept_by(table, self.required)
         order = [*configurations, *rule.per, rule.along, *inner]
         arrays = [array.transpose(*order).values
                   for array in (table["decision"], keeps, self._may_be_decided(

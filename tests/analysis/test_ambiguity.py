@@ -117,13 +117,6 @@ def test_every_rate_is_that_of_a_plain_loop_with_exact_intervals(mixed):
         table["solved"].isel(tilt_deg=1, solver=2))
 
 
-def test_a_lazy_dataset_in_chunks_gives_the_same(mixed):
-    whole = ambiguity(mixed, ["tilt_deg"], thresholds=[0.25])
-    lazy = ambiguity(mixed.chunk({"trial": 40, "tilt_deg": 1}), ["tilt_deg"], thresholds=[0.25])
-    assert lazy["choice"].chunks is not None
-    xr.testing.assert_identical(lazy.compute(), whole)
-
-
 def test_configurations_are_never_pooled_and_bins_are_dimensions(mixed):
     binned = ambiguity(mixed, bins={"tilt_deg": [-0.5, 0.5, 1.5]}, thresholds=[0.2])
     assert binned["kept"].dims == ("solver", "tilt_deg", "threshold")

@@ -40,20 +40,19 @@ def _boards() -> xr.Dataset:
     )
 
 
-@pytest.mark.parametrize("chunked", [False, True])
-def test_rates_of_markers_count_those_that_are_on_the_board_and_visible(chunked: bool) -> None:
+def test_rates_of_markers_count_those_that_are_on_the_board_and_visible() -> None:
     boards = _boards()
     flags = boards["marker_detection"].to_numpy()
-    markers = per_marker(boards.chunk(trial=7) if chunked else boards)
+    markers = per_marker(boards)
     counted = ~np.isin(flags, uncounted_values(DetectionStatus))
-    table = detection_rate(markers, per=["size_m", "board_marker"]).compute()
+    table = detection_rate(markers, per=["size_m", "board_marker"])
     np.testing.assert_array_equal(table["looked_for"], counted.sum(axis=1))
     np.testing.assert_array_equal(table["detected"], (flags == 1).sum(axis=1))
     assert np.isnan(table["detection_rate"].sel(size_m=0.02, board_marker=2))
-    pooled = detection_rate(markers).compute()
+    pooled = detection_rate(markers)
     assert pooled["looked_for"] == counted.sum()
     assert pooled["draws"] <= 60, "markers of one image are one draw at most"
-    by_id = detection_rate(markers, bins={"board_marker_id": [4, 5, 7]}).compute()
+    by_id = detection_rate(markers, bins={"board_marker_id": [4, 5, 7]})
     assert by_id["looked_for"].values.tolist() == [counted[..., 0].sum(), counted[..., 1:].sum()]
     squares = np.nanmean(boards["marker_corner_error_px"].to_numpy() ** 2, axis=(0, 1, 3, 4))
     found = (markers["corner_error_px"] ** 2).mean(["size_m", "trial", "corner", "xy"])
@@ -82,7 +81,7 @@ def test_corners_of_boards_are_paired_where_both_found_them() -> None:
         estimate=(dims, solved.astype(np.uint8)), flipped=(dims, solved.astype(np.uint8)),
         rotation_error_rad=((*dims, "xyz"), zeros), translation_error_m=((*dims, "xyz"), zeros),
     )
-    table = renderer_bias(made).compute()
+    table = renderer_bias(made)
     shift = np.square(errors[1].astype(float) - errors[0])
     found = np.isfinite(shift).any(axis=(2, 3, 4)) & solved[0]
     each = np.nanmean(shift[found], axis=(1, 2, 3))

@@ -134,48 +134,6 @@ def rms(values):
     return math.sqrt(math.fsum(value**2 for value in values) / len(values))
 
 
-def quantile(values, share):
-    """Return the smallest value with at least ``share`` per cent at or below."""
-    return next(value for value in sorted(values)
-                if sum(other <= value for other in values) * 100 >= share * len(values))
-
-
-def approximately(name, value):
-    """Return what to compare a variable with; quantiles are in single precision."""
-    quantile = any(part in name for part in ("median", "p95", "p99"))
-    return pytest.approx(value, rel=2e-7 if quantile else 1e-12)
-
-
-def expected_summary(chosen):
-    """Return the variables without intervals of a list of poses."""
-    aimed = [pose for pose in chosen if looked_for(pose)]
-    solved = [pose for pose in aimed if is_solved(pose)]
-    unflipped = [pose for pose in solved if is_unflipped(pose)]
-    out = {
-        "looked_for": len(aimed),
-        "detection_rate": sum(p["detection"] == DetectionStatus.detected for p in aimed)
-        / len(aimed),
-        "solved_rate": len(solved) / len(aimed),
-        "flip_rate": (len(solved) - len(unflipped)) / len(solved),
-        "rotation_bias_deg": math.degrees(
-            math.hypot(
-                *(
-                    math.fsum(p["rotation_error_rad"][k] for p in unflipped) / len(unflipped)
-                    for k in range(3)
-                )
-            )
-        ),
-        "range_bias_percent": math.fsum(map(percent, unflipped)) / len(unflipped),
-    }
-    for error, name, unit in ((degrees, "rotation", "deg"), (percent, "range", "percent")):
-        out[f"{name}_rmse_{unit}"] = rms([error(pose) for pose in solved])
-        out[f"{name}_rmse_unflipped_{unit}"] = rms([error(pose) for pose in unflipped])
-        errors = [abs(error(pose)) if is_solved(pose) else math.inf for pose in aimed]
-        for label, share in (("median", 50), ("p95", 95), ("p99", 99)):
-            out[f"{name}_{label}_{unit}"] = quantile(errors, share)
-    return out
-
-
 @pytest.fixture(scope="module")
 def mixed():
     rng = np.random.default_rng(1)
@@ -183,19 +141,6 @@ def mixed():
 
 
 # Values.
-
-@pytest.mark.parametrize(("per", "configurations"), [
-    (("distance_m",), ("refinement", "solver")), ((), ()), (("marker_id", "distance_m"), ()),
-    ((), ("solver", "refinement")),
-])
-def test_every_summary_is_that_of_plain_loops_over_the_poses(mixed, per, configurations):
-    kept = (*per, *configurations)
-    summary = error_statistics(mixed, kept)
-    assert tuple(summary["looked_for"].dims) == kept
-    for index in np.ndindex(*(mixed.sizes[name] for name in kept)):
-        at = dict(zip(kept, index, strict=True))
-        for name, value in expected_summary(list(poses(mixed, **at))).items():
-            assert summary[name].isel(at).item() == approximately(name, value), name
 
 
 def test_every_value_lies_in_its_interval_and_is_described(mixed):
@@ -218,114 +163,6 @@ def test_every_value_lies_in_its_interval_and_is_described(mixed):
     assert low.attrs["description"].startswith("lower end of the 95 %")
 
 
-def test_lazy_arrays_give_the_same(mixed):
-    for function in (error_statistics, efficiency, covariance_trust):
-        lazy = function(mixed.chunk(trial=2), ["solver"])
-        assert all(array.chunks is not None for array in lazy.values())
-        xr.testing.assert_allclose(lazy.compute(), function(mixed, ["solver"]), rtol=1e-12)
-
-
-def test_a_share_that_was_not_solved_makes_quantiles_infinite():
-    rng = np.random.default_rng(2)
-    results = measured(rng, {"trial": 100}, {}, {})
-    results["estimate"].values[:3] = EstimateStatus.no_detection
-    results["detection"].values[:3] = DetectionStatus.rejected
-    summary = error_statistics(results, [])
-    assert np.isfinite(summary["rotation_p95_deg"])
-    assert summary["rotation_p95_deg_high"] == np.inf
-    assert summary["rotation_p99_deg"] == np.inf
-    assert summary["range_p99_percent"] == np.inf
-
-
-def test_nothing_seen_says_nothing():
-    results = measured(np.random.default_rng(3))
-    results["detection"].values[...] = DetectionStatus.not_visible
-    results["estimate"].values[...] = EstimateStatus.no_detection
-    summary = error_statistics(results, ["solver"])
-    assert (summary["looked_for"] == 0).all()
-    assert (summary["solved"] == 0).all()
-    assert all(array.isnull().all() for array in summary.values() if array.dtype == float)
-    assert all(array.isnull().all() for array in efficiency(results, []).values())
-    assert not covariance_trust(results, [])["covariance_trusted"]
-
-
-@pytest.mark.parametrize("function", [error_statistics, efficiency, covariance_trust])
-def test_a_dimension_that_is_not_there_is_refused_in_one_line(mixed, function):
-    there = "there are distance_m, marker_id, trial, refinement, solver"
-    for configurations, per in ((["solverr"], []), ([], ["solverr"]), (["xyz"], [])):
-        with pytest.raises(ArgumentError, match=there) as refused:
-            function(mixed, (*per, *configurations))
-        assert "\n" not in str(refused.value)
-
-
-# Intervals of means, against the formulas in plain loops.
-
-def stratified(cells):
-    """Return mean, standard error and Welch's degrees of freedom of a list of cells' values."""
-    n = sum(map(len, cells))
-    terms = [len(cell) * np.var(cell, ddof=1) for cell in cells]
-    freedom = sum(terms) ** 2 / sum(
-        term**2 / (len(cell) + 1) for term, cell in zip(terms, cells, strict=True)
-    ) - 2
-    return (sum(map(sum, cells)) / n, math.sqrt(sum(terms)) / n,
-            min(freedom, n - len(cells)))
-
-
-def in_cells(results, value, trials, **kept):
-    """Return the values of all poses, a list for each marker and distance."""
-    cells = {}
-    for pose in poses(results, **kept):
-        if pose["trial"] in trials:
-            cells.setdefault((pose["distance_m"], pose["marker_id"]), []).append(value(pose))
-    return list(cells.values())
-
-
-def test_intervals_of_means_have_the_variance_within_cells():
-    results = measured(np.random.default_rng(4))
-    summary = error_statistics(results, ["refinement", "solver"])
-    for i, j in itertools.product(range(2), range(2)):
-        answer = summary.isel(refinement=i, solver=j)
-        cells = in_cells(results, percent, range(5), refinement=i, solver=j)
-        mean, error, freedom = stratified(cells)
-        ends = mean + error * stats.t.ppf([0.025, 0.975], freedom)
-        assert answer["range_bias_percent_low"].item() == pytest.approx(ends[0], rel=1e-9)
-        assert answer["range_bias_percent_high"].item() == pytest.approx(ends[1], rel=1e-9)
-        squares = [[value**2 for value in cell] for cell in cells]
-        mean, error, freedom = stratified(squares)
-        ends = np.sqrt(mean * np.exp(error / mean * stats.t.ppf([0.025, 0.975], freedom)))
-        assert answer["range_rmse_percent_low"].item() == pytest.approx(ends[0], rel=1e-9)
-        assert answer["range_rmse_percent_high"].item() == pytest.approx(ends[1], rel=1e-9)
-
-
-def test_the_rotation_bias_ends_at_students_and_scheffes_distance():
-    results = measured(np.random.default_rng(18))
-    answer = error_statistics(results, ["refinement", "solver"]).isel(refinement=1, solver=0)
-    cells = in_cells(results, lambda pose: np.degrees(pose["rotation_error_rad"]), range(5),
-                     refinement=1, solver=0)
-    centre = np.concatenate(cells).mean(axis=0)
-    along = [[vector @ centre / np.linalg.norm(centre) for vector in cell] for cell in cells]
-    mean, error, freedom = stratified(along)
-    low = mean - error * math.sqrt(3 * freedom / (freedom - 2) * stats.f.ppf(0.95, 3, freedom - 2))
-    high = mean + error * stats.t.ppf(0.975, freedom)
-    assert answer["rotation_bias_deg_low"].item() == pytest.approx(max(low, 0), rel=1e-9)
-    assert answer["rotation_bias_deg_high"].item() == pytest.approx(high, rel=1e-9)
-
-
-def test_a_cell_with_a_single_draw_gets_the_pooled_variance():
-    results = measured(np.random.default_rng(5), {"marker_id": 3, "trial": 4}, {}, {})
-    results["detection"].values[0, 1:] = DetectionStatus.not_run
-    results["estimate"].values[0, 1:] = EstimateStatus.not_run
-    cells = [[percent(pose) for pose in poses(results, marker_id=k)] for k in range(3)]
-    alone = cells[0][:1]
-    mean, error, freedom = stratified(cells[1:])
-    pooled = np.mean([np.var(cell, ddof=1) for cell in cells[1:]])
-    mean = (8 * mean + alone[0]) / 9
-    half = math.sqrt((8 * error) ** 2 + pooled) / 9 * stats.t.ppf(0.975, freedom)
-    summary = error_statistics(results, [])
-    assert summary["range_bias_percent"].item() == pytest.approx(mean, rel=1e-12)
-    assert summary["range_bias_percent_high"].item() == pytest.approx(mean + half, rel=1e-9)
-
-
 @pytest.mark.parametrize("how", ["no trial", "one trial", "one pose a cell", "trial kept"])
 def test_where_nothing_was_drawn_there_is_no_interval(mixed, how):
     kept = ["trial"] if how == "trial kept" else []
@@ -344,24 +181,6 @@ def test_where_nothing_was_drawn_there_is_no_interval(mixed, how):
         ends = [name for name in table if name.endswith(("_low", "_high"))]
         assert ends
         assert all(table[name].isnull().all() for name in ends)
-    if how == "one trial":
-        expected = expected_summary(list(poses(results, solver=1)))
-        for name, value in expected.items():
-            assert tables[0][name][1].item() == approximately(name, value), name
-
-
-def test_rates_have_wilsons_interval(mixed):
-    answer = error_statistics(mixed, ["refinement", "solver"]).isel(refinement=1, solver=1)
-    chosen = [pose for pose in poses(mixed, refinement=1, solver=1) if looked_for(pose)]
-    solved = [pose for pose in chosen if is_solved(pose)]
-    for name, of, hits in (
-        ("detection_rate", chosen, sum(p["detection"] == DetectionStatus.detected for p in chosen)),
-        ("solved_rate", chosen, len(solved)),
-        ("flip_rate", solved, len(solved) - sum(map(is_unflipped, solved))),
-    ):
-        ends = stats.binomtest(hits, len(of)).proportion_ci(method="wilson")
-        assert answer[f"{name}_low"].item() == pytest.approx(ends.low, rel=1e-9)
-        assert answer[f"{name}_high"].item() == pytest.approx(ends.high, rel=1e-9)
 
 
 @pytest.mark.parametrize("n", [2, 5, 6, 50, 72, 73, 367, 368, 1000])
@@ -404,36 +223,6 @@ def assert_coverage(count, n, least=0.93, most=0.97):
     assert stats.binom.sf(count - 1, n, most) > 5e-7
 
 
-TAILS = {
-    "normal": (lambda rng, shape: rng.normal(size=shape), 1.0),
-    "uniform": (lambda rng, shape: rng.uniform(-1, 1, shape), 1 / 3),
-}
-
-
-@lengths(60, 10_000)
-@pytest.mark.parametrize(("cells", "trials"), [(1, 50), (5, 10), (25, 2), (4, 50)])
-@pytest.mark.parametrize("tails", TAILS)
-def test_means_and_rmse_of_light_tails_are_covered(tails, cells, trials, count):
-    # Chance of a false alarm: below 1e-6 for each of the four, for a coverage of 0.93 to 0.97.
-    rng = np.random.default_rng([8, cells])
-    draw, variance = TAILS[tails]
-    offsets = np.linspace(-1, 1, cells)[:, None]  # the cells differ, as on a grid
-    shape = (count, cells, trials)
-    rotation = 0.01 * (draw(rng, (*shape, 3)) + np.array([30.0, 0.0, 0.0]))
-    results = measured(
-        rng, {"regime": count, "marker_id": cells, "trial": trials}, {}, {},
-        relative=0.01 * (draw(rng, shape) + offsets), rotation=rotation,
-    )
-    summary = error_statistics(results, ["regime"])
-    assert_coverage(covered(summary, "range_bias_percent", offsets.mean()), count)
-    mean_square = variance + (offsets**2).mean()
-    assert_coverage(covered(summary, "range_rmse_percent", math.sqrt(mean_square)), count)
-    square = math.degrees(0.01) ** 2 * (900 + 3 * variance)
-    assert_coverage(covered(summary, "rotation_rmse_deg", math.sqrt(square)), count)
-    bias = covered(summary, "rotation_bias_deg", math.degrees(0.3))
-    assert_coverage(bias, count, 0.95, 0.995)
-
-
 @lengths(60, 10_000)
 @pytest.mark.parametrize("bias", [0.0, 0.1, 0.4])
 def test_a_rotation_bias_is_covered_be_it_nothing_or_small(bias, count):
@@ -468,23 +257,6 @@ def test_misses_at_random_widen_what_cells_of_other_means_leave_unsure(count):
     assert_coverage(covered(summary, "range_bias_percent", mean), count)
     assert_coverage(covered(summary, "range_rmse_percent", math.sqrt(mean_square)), count)
     assert_coverage(covered(summary, "solved_rate", chances.mean()), count, 0.95, 0.99)
-
-
-@lengths(60, 10_000)
-def test_intervals_of_quantiles_cover_at_least_what_they_say(count):
-    # Chance of a false alarm below 1e-6, for a coverage of 0.95 to 1.
-    rng = np.random.default_rng(11)
-    n, half = 400, 0.5  # p99 needs 368
-    shape = (count, 2, n // 2)
-    results = measured(
-        rng, {"regime": count, "marker_id": 2, "trial": n // 2}, {}, {},
-        relative=rng.random(shape) * np.array([half, 1.0])[:, None] / 100,
-    )
-    summary = error_statistics(results, ["regime"])
-    for name, share in (("median", 0.5), ("p95", 0.95), ("p99", 0.99)):
-        # Half of the values are uniform on [0, 1/2], half on [0, 1].
-        truth = share / 1.5 if share <= 0.75 else 2 * share - 1
-        assert_coverage(covered(summary, f"range_{name}_percent", truth), count, 0.95, 1.0)
 
 
 # Efficiency.

@@ -559,10 +559,3 @@ def test_all_that_is_looked_for_may_be_found_with_pooled_settings(settings):
     assert (alike["detection_difference"] == 0).all()
     assert (alike["detection_difference_high"] > 0).all()
     assert (detection_limit(results, per=["regime"])["limit"] == 3).all()
-
-
-def test_a_limit_needs_sizes():
-    results = perfect(np.random.default_rng(15), {"tilt_deg": 2, "trial": 10})
-    with pytest.raises(DatasetError, match=r"side_px|distance_m") as refused:
-        detection_limit(results)
-    assert "\n" not in str(refused.value)

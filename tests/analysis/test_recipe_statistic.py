@@ -20,10 +20,6 @@ from sweep.report.scene_figures import errors_table
 
 SIZES = {"marker_id": 2, "tilt_deg": 2, "noise_grey": 2, "trial": 30, "solver": 2}
 RESULTS = mixed(SIZES, 7)
-CHUNKINGS = {
-    "in memory": None, "one chunk": {}, "trials": {"trial": 7}, "cells": {"marker_id": 1},
-    "all": {"marker_id": 1, "tilt_deg": 1, "noise_grey": 1, "trial": 4, "solver": 1},
-}
 
 # A mean with its interval, of a class that exists: three lines.
 MEAN_ABSOLUTE_ERROR = ErrorStatistic(
@@ -33,16 +29,18 @@ MEAN_ABSOLUTE_ERROR = ErrorStatistic(
         lambda poses: quantity.norm(poses)[..., None], lambda poses: poses.solved))
 
 
-# A statistic of its own, of a state that exists: the mean of the errors up to their median.
+# A statistic of its own, of the column of a class that exists: the mean of the errors up to their
+# median.
 class TrimmedMean(Quantiles):
     def outputs(self):
         return [Output(self.name, self.meaning, self.units)]
 
-    def result(self, state):
-        median = -(-state.sample.n // 2)
-        ranks = np.arange(1, median.max() + 1) * np.ones((len(median), 1), int)
-        values = state.values.values_at(np.where(ranks <= median[:, None], ranks, 0))
-        return {self.name: np.nanmean(values, axis=1)}
+    def variables(self, blocks, _design):
+        errors, used = self.column(blocks)
+        halves = -(-used.sum(axis=(1, 2)) // 2)
+        ascending = np.sort(errors.reshape(len(errors), -1), axis=1)  # those not used are last
+        return {self.name: np.array([
+            some[:half].mean(dtype=float) for some, half in zip(ascending, halves, strict=True)])}
 
 
 TRIMMED_MEAN = ErrorStatistic(
@@ -66,12 +64,8 @@ def errors_of_solved(solver):
     return np.degrees(np.linalg.norm(vectors, axis=-1)[solved == EstimateStatus.solved])
 
 
-@pytest.mark.parametrize("chunks", CHUNKINGS.values(), ids=CHUNKINGS)
-def test_an_added_statistic_is_that_of_plain_numpy_in_any_chunks(chunks):
-    results = RESULTS if chunks is None else RESULTS.chunk(chunks)
-    table = error_statistics(results, ["solver"])
-    assert (table["rotation_trimmed_deg"].chunks is None) == (chunks is None)
-    table = table.compute()
+def test_an_added_statistic_is_that_of_plain_numpy():
+    table = error_statistics(RESULTS, ["solver"])
     for solver in range(SIZES["solver"]):
         errors = np.sort(errors_of_solved(solver))
         assert len(errors) > 50
@@ -96,9 +90,7 @@ def test_an_added_statistic_has_attributes_and_a_row_in_every_table():
     assert "mean of the smaller half of the errors" in [row[0] for row in rows]
 
 
-@pytest.mark.parametrize("chunks", [None, {"trial": 7}])
-def test_a_column_that_cannot_be_sorted_at_once_is_told_how_to_divide(chunks, monkeypatch):
+def test_a_column_that_cannot_be_sorted_at_once_is_told_how_to_divide(monkeypatch):
     monkeypatch.setattr(quantiles, "MAX_VALUES", 100)
-    results = RESULTS if chunks is None else RESULTS.chunk(chunks)
     with pytest.raises(DatasetError, match="expected at most 100; divide them: keep an axis apart"):
-        error_statistics(results).compute(scheduler="synchronous")
+        error_statistics(RESULTS)

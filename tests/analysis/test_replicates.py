@@ -153,13 +153,6 @@ def test_settings_of_a_trial_count_as_one_draw():
             )
 
 
-def test_chunks_of_trials_do_not_matter():
-    results = dataset(3, 64)
-    expected = error_statistics(results, per=["sim"])
-    lazy = error_statistics(results.chunk(trial=10, sim=2), per=["sim"]).compute()
-    xr.testing.assert_allclose(lazy, expected, rtol=1e-12)
-
-
 def test_parts_of_replicates_are_refused_and_whole_ones_are_not():
     results = dataset(2, 64)
     with pytest.raises(DatasetError, match="not equally many of each of the 16 replicates"):

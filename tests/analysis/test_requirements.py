@@ -216,8 +216,7 @@ def test_values_at_which_all_is_met_need_not_begin_at_the_easiest():
                        "distance_m").isel(solver=0)
     assert Reach(int(one["reach"])) is Reach.within
     assert [float(one[name]) for name in ("start", "low", "value", "high")] == [4.0, 5.0, 5.0, 5.0]
-    assert (float(one["start_fails_at"]), float(one["fails_at"])) == (3.0, 6.0)
-    assert (float(one["start_failing_value"]), float(one["failing_value"])) == (0.5, 0.2)
+    assert (float(one["fails_at"]), float(one["failing_value"])) == (6.0, 0.2)
 
 
 def test_requirements_hold_at_all_tilts_together():

@@ -185,16 +185,14 @@ def signed_of(results):
             for name, values in columns.items()}
 
 
-@pytest.mark.parametrize("chunks", [None, {"trial": 2, "marker_id": 1}])
 @pytest.mark.parametrize("per", [(), ("tilt_deg", "solver")])
-def test_bias_and_spread_are_those_of_plain_arithmetic(per, chunks):
+def test_bias_and_spread_are_those_of_plain_arithmetic(per):
     results = mixed(ALL, seed=4)
     used = (results["estimate"] == EstimateStatus.solved) & (
         results["flipped"] != Flipped.flipped)
     expected = signed_of(results)
     over = [dim for dim in used.dims if dim not in per]
-    answer = error_statistics(results if chunks is None else results.chunk(chunks), per,
-                              quantities=list(SIGNED)).compute()
+    answer = error_statistics(results, per, quantities=list(SIGNED))
     assert not [name for name in answer if name.startswith(("rotation", "range", "position"))]
     for name in NAMES:
         unit = "m" if ("_" in name and "angle" not in name and "plane" not in name) or len(

@@ -7,10 +7,19 @@ from scipy import stats
 
 from support.photograph_results import PHOTOGRAPHS, REFINEMENTS, results_of, twins
 from sweep.analysis import detection_rate, error_statistics, flip_rate, simulation_gap
-from sweep.analysis.draws import quantile_ends, quantile_of
+from sweep.analysis.draws import Design, Unit
 from sweep.analysis.intervals import percentile_interval, resampled_quantiles, unit_counts
+from sweep.analysis.quantiles import quantile_intervals
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus
+
+
+def interval(values, used, percent):
+    """Return a quantile of (photographs, markers) and the ends of its interval."""
+    found = quantile_intervals(
+        np.where(used, values, np.nan)[None, None], used.sum(axis=1)[None, None], [percent],
+        Design(Unit.photograph))
+    return found[0, 0].tolist()
 
 
 def errors(results, name, refinement):
@@ -176,13 +185,14 @@ def test_resampled_quantiles_are_scipys():
         ours = resampled_quantiles(values[:, None], used, counts, 0.9)
         # Of 1,000 and 20,000 replicates: the critical value at an error probability of 1e-4.
         assert stats.ks_2samp(ours, scipys).pvalue > 1e-4
-    assert quantile_of(np.sort(values), 0.9) == np.quantile(values, 0.9, method="inverted_cdf")
+    assert interval(values[:, None], np.ones((len(values), 1), bool), 90)[0] == np.quantile(
+        values, 0.9, method="inverted_cdf")
 
 
 def test_intervals_of_independent_values_are_clopper_and_pearsons_order_statistics():
     rng = np.random.default_rng(10)
     values = rng.normal(size=400)
-    low, high = quantile_ends(values, np.arange(400), 0.9)
+    low, high = interval(values[:, None], np.ones((400, 1), bool), 90)[1:]
     # 400 photographs of one marker each: Student's quantile in the place of the normal one.
     draws = 400 * (stats.norm.ppf(0.975) / stats.t.ppf(0.975, 399)) ** 2 * 399 / 400
     shares = (stats.beta.ppf(0.025, 0.9 * draws, 0.1 * draws + 1),
@@ -192,27 +202,19 @@ def test_intervals_of_independent_values_are_clopper_and_pearsons_order_statisti
     assert high == ascending[int(np.floor(shares[1] * 400))]
 
 
-@pytest.mark.parametrize("chunks", [None, 1, 5])
-def test_quantiles_by_photograph_do_not_depend_on_chunks(chunks):
-    rng = np.random.default_rng(11)
-    results = results_of(rng, 20)
-    lazy = results if chunks is None else results.chunk(trial=chunks)
-    table = error_statistics(lazy, per="cornerRefinementMethod", quantities=["rotation"]).compute()
+def test_tables_of_photographs_have_woodruffs_intervals():
+    results = results_of(np.random.default_rng(11), 20)
+    table = error_statistics(results, per="cornerRefinementMethod", quantities=["rotation"])
     for k, refinement in enumerate(REFINEMENTS):
-        flags = results.detection.sel(cornerRefinementMethod=refinement).values
-        each = results.rotation_error_rad.sel(cornerRefinementMethod=refinement).values
-        error = np.nan_to_num(np.degrees(np.linalg.norm(each, axis=-1)), nan=np.inf)
-        counted = flags != DetectionStatus.not_in_photograph
-        numbers = np.nonzero(counted)[0]
-        for name, share in (("median", 0.5), ("p95", 0.95)):
-            value = table[f"rotation_{name}_deg"][k].item()
-            assert value == np.quantile(error[counted], share, method="inverted_cdf")
-            ends = quantile_ends(error[counted], numbers, share)
-            assert table[f"rotation_{name}_deg_low"][k].item() == ends[0]
-            assert table[f"rotation_{name}_deg_high"][k].item() == pytest.approx(ends[1])
-    binned = error_statistics(lazy, bins={"side_px": [20, 40, 70]}, quantities=["rotation"])
-    whole = error_statistics(results, bins={"side_px": [20, 40, 70]}, quantities=["rotation"])
-    assert np.array_equal(binned.rotation_p95_deg_low, whole.rotation_p95_deg_low, equal_nan=True)
+        each = results.sel(cornerRefinementMethod=refinement)
+        error = np.degrees(np.linalg.norm(each.rotation_error_rad.values, axis=-1))
+        error = np.nan_to_num(error, nan=np.inf)
+        counted = each.detection.values != DetectionStatus.not_in_photograph
+        for name, percent in (("median", 50), ("p95", 95)):
+            ends = [table[f"rotation_{name}_deg{end}"][k].item() for end in ("", "_low", "_high")]
+            assert ends[0] == pytest.approx(np.quantile(
+                error[counted], percent / 100, method="inverted_cdf"), rel=1e-7)
+            assert ends == pytest.approx(interval(error, counted, percent), rel=1e-7, nan_ok=True)
 
 
 @pytest.mark.long
@@ -225,12 +227,11 @@ def test_intervals_hold_what_is_true(photographs, share, correlation):
     own, other = np.sqrt(correlation), np.sqrt(1 - correlation)
     true = stats.norm.ppf(share)
     counts, used = unit_counts(photographs), np.ones((photographs, rows), dtype=bool)
-    numbers = np.nonzero(used)[0]
     covered = np.zeros(2)
     for _ in range(draws):
         common = own * rng.normal(size=(photographs, 1))
         real, twin = (common + other * rng.normal(size=(photographs, rows)) for _ in range(2))
-        low, high = quantile_ends(real.ravel(), numbers, share)
+        low, high = interval(real, used, round(100 * share))[1:]
         covered[0] += low <= true <= high
         gaps = [resampled_quantiles(values, used, counts, share) for values in (real, twin)]
         low, high = percentile_interval(gaps[1] - gaps[0], photographs)

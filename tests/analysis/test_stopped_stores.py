@@ -129,13 +129,6 @@ def test_cells_in_which_nothing_was_looked_for_do_not_lessen_the_trials(stopped)
     assert detection_rate(stopped.assign(detection=flags)).looked_for == 2 * 100
 
 
-def test_chunks_do_not_matter(stopped):
-    lazy = stopped.chunk(side_px=2, trial=60)
-    for per in ([], ["solver"], ["side_px"]):
-        expected = error_statistics(stopped, per)
-        xr.testing.assert_allclose(error_statistics(lazy, per).compute(), expected)
-
-
 def test_intervals_of_errors_are_wider_than_those_of_fixed_trials(stopped, full):
     ours = error_statistics(stopped, ["side_px", "solver"]).isel(side_px=1)
     fixed = error_statistics(full, ["side_px", "solver"]).isel(side_px=1)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from sweep.analysis.draws import as_stopped
+from sweep.analysis.draws import Design
 from sweep.analysis.intervals import LEVEL
 from sweep.analysis.poses import Poses
+from sweep.analysis.statistic import Blocks
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.pipeline import Pipeline
 from sweep.sampling.rules import GroupResults, make_rule
@@ -54,13 +55,11 @@ def simulated(name, truth, width, most, draw, repetitions=REPETITIONS):
         used).mean()
 
 
-def evaluate(statistics, poses):
+def evaluate(statistics, arrays):
     """Return the variables (groups,) of poses, as they are where sampling was stopped."""
-    variables = {}
-    for statistic in map(as_stopped, statistics):
-        known = statistic.prepare_second(statistic.first_pass(poses).fold())
-        variables |= statistic.finish(known, statistic.second_pass(poses, known).fold())
-    return variables
+    blocks = Blocks(arrays, Poses)
+    return {name: values for statistic in statistics
+            for name, values in statistic.variables(blocks, Design(stopped=True)).items()}
 
 
 def of_stopped(wanted, values, truth, width):
@@ -69,7 +68,7 @@ def of_stopped(wanted, values, truth, width):
         return 0, np.zeros(0)
     arrays = {key: array[:, None, :, None] for key, array in values.items()}
     arrays["true_depth_m"] = arrays["true_tvec_m"][..., 2]
-    table = evaluate(wanted.requirable.computed("", LEVEL), Poses(arrays))
+    table = evaluate(wanted.requirable.computed("", LEVEL), arrays)
     value, low, high = (table[f"{wanted.name}{end}"] for end in ("", "_low", "_high"))
     scale = 1.0 if wanted.requirable.is_rate else abs(truth) or 1.0
     return int(((low <= truth) & (truth <= high)).sum()), (value - truth) / scale / width

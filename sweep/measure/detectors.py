@@ -310,23 +310,22 @@ class BoardDetectorSetting:
     )
 
 
-class BoardOutput(NamedTuple):
-    """What is found on a board in one image: markers, and a chessboard's corners.
+class SearchOutput(NamedTuple):
+    """What is found in one image: markers, and a chessboard's corners.
 
     Attributes
     ----------
-    markers
+    corners, ids, rejected
         The detector's output, with the markers that were found by means of the board.
     chessboard_ids, chessboard_px
         (C,) and (C, 2) indices and pixels of the chessboard's corners that were found.
     """
 
-    markers: DetectorOutput
-    chessboard_ids: Integers
-    chessboard_px: Floats
-
-
-_NO_IDS, _NO_CORNERS = np.zeros(0, dtype=np.int64), np.zeros((0, 2))
+    corners: Sequence[NDArray[np.floating[Any]]]
+    ids: NDArray[np.integer[Any]] | None
+    rejected: Sequence[NDArray[np.floating[Any]]]
+    chessboard_ids: Integers = np.zeros(0, dtype=np.int64)
+    chessboard_px: Floats = np.zeros((0, 2))
 
 
 class BoardDetector:
@@ -350,7 +349,7 @@ class BoardDetector:
 
     def complete(
         self, image: NDArray[np.uint8], board: Board, markers: DetectorOutput
-    ) -> BoardOutput:
+    ) -> SearchOutput:
         """Return what is found on a board in an image (h, w) in which ``markers`` were detected.
 
         ``cv2.aruco.ArucoDetector.refineDetectedMarkers`` and
@@ -359,22 +358,22 @@ class BoardDetector:
         """
         corners, ids, rejected = markers
         if ids is None or not len(ids):
-            return BoardOutput(markers, _NO_IDS, _NO_CORNERS)
+            return SearchOutput(*markers)
         if self._setting.refineDetectedMarkers and rejected:
             refine: Any = self._refining_detector(board.dictionary).refineDetectedMarkers
             corners, ids, rejected, _ = refine(
                 image, _opencv_board(board), list(corners), ids, list(rejected)
             )
-            markers = list(corners), ids, list(rejected)
+            corners, rejected = list(corners), list(rejected)
         if board.chessboard is None:
-            return BoardOutput(markers, _NO_IDS, _NO_CORNERS)
+            return SearchOutput(corners, ids, rejected)
         pixels, found, _, _ = self._charuco_detector(board).detectBoard(
             image, markerCorners=list(corners), markerIds=ids
         )
         if found is None or not len(found):
-            return BoardOutput(markers, _NO_IDS, _NO_CORNERS)
-        return BoardOutput(
-            markers, np.asarray(found, dtype=np.int64).ravel(),
+            return SearchOutput(corners, ids, rejected)
+        return SearchOutput(
+            corners, ids, rejected, np.asarray(found, dtype=np.int64).ravel(),
             np.asarray(pixels, dtype=np.float64).reshape(-1, 2),
         )
 

@@ -11,6 +11,7 @@ from sweep.compilation import compiled, compiled_inline
 from sweep.measure.estimation import Detections
 from sweep.measure.likelihood import DEPTH, SPREAD, MarkerView, plane_of
 from sweep.measure.surroundings import clear_modules, edges_alone, surroundings
+from sweep.model.board import Board
 from sweep.model.coverage import NODES, WEIGHTS, MarkerEdges
 from sweep.model.derivatives import POSE
 from sweep.model.lens import jacobian, undistort
@@ -586,7 +587,10 @@ def photograph_view(
     px.
     """
     padding = PADDING_PX + reach
-    dictionary, _, margin = detections.markers[i]
+    target = detections.targets[i]
+    if isinstance(target, Board):
+        raise TypeError("expected a marker")
+    dictionary, _, margin = target
     modules = module_count(dictionary)
     corners = detections.corners[i].tolist()
     side = 0.25 * sum(math.dist(corners[k - 1], corners[k]) for k in range(4))
@@ -628,7 +632,7 @@ def photograph_view(
     optics = Optics(local, optics.lens, optics.distorted)
     extent = math.ceil(4.0 * (ring + MODELLED_PX * modules / side)) / 4.0
     around = (
-        edges_alone(detections.markers[i], extent) if on_board is None
+        edges_alone(target, extent) if on_board is None
         else surroundings(on_board, extent)
     )
     marker = MarkerView(

@@ -9,15 +9,6 @@ import cv2
 import numpy as np
 
 from sweep.compilation import compiled
-from sweep.measure.board_solver import (
-    MIN_POINTS,
-    BoardDetections,
-    Pose,
-    guarded_poses,
-    one_by_one,
-    poses_of_each_marker,
-    reprojection_px,
-)
 from sweep.measure.estimation import Detections, Estimates, covariance_elsewhere
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.likelihood import (
@@ -45,11 +36,20 @@ from sweep.measure.likelihood import (
     state_of,
     turn_between,
 )
-from sweep.measure.solver import both_planar_solutions, reprojection_errors_px
+from sweep.measure.solver import (
+    MIN_POINTS,
+    Pose,
+    both_planar_solutions,
+    guarded_poses,
+    one_by_one,
+    poses_of_each_marker,
+    reprojection_errors_px,
+    reprojection_px,
+)
 from sweep.model.derivatives import LEVELS, POSE, known_pixels, work_space
 from sweep.model.marker import module_count
 from sweep.model.pose import transform_points
-from sweep.model.printed import box_corners, extent_of, unit_m
+from sweep.model.printed import as_board, box_corners, extent_of, unit_m
 from sweep.typing import Floats, Grey
 
 # --------------------------------------------------------------------------------------------------
@@ -278,6 +278,8 @@ class Photometric:
 
     def __call__(self, detections: Detections) -> Estimates:
         """Return the poses, with covariances from the curvature of the likelihood."""
+        if not detections.are_markers:
+            return one_by_one(detections, self._estimate)
         count = len(detections.corners)
         out = Estimates.none(count, EstimateStatus.solver_failed)
         sets = [detections.corners]
@@ -299,7 +301,7 @@ class Photometric:
                 continue
             noise = float(detections.noise_grey[i])
             view = marker_view(
-                detections.markers[i], detections.size_m[i], detections.cameras.optics(i),
+                detections.targets[i], detections.size_m[i], detections.cameras.optics(i),
                 detections.origins[i] + (left, top), noise_variance(noise),
             )
             image = detections.images[i][top:bottom, left:right].astype(np.float64)
@@ -310,97 +312,18 @@ class Photometric:
                 out.reprojection_px[i] = self._reprojection_px(state, detections, i)
         return out
 
-    @staticmethod
-    def _reprojection_px(state: Floats, detections: Detections, i: int) -> float:
-        """Return the RMS reprojection error of a state over the corners of one detection."""
-        row = np.array([i])
-        return float(
-            reprojection_errors_px(
-                rotation_of(state)[None], state[None, POSITION], detections.size_m[row],
-                detections.corners[row], detections.cameras.take(row),
-            )[0]
-        )
+    def _estimate(self, one: Detections, i: int, out: Estimates) -> None:
+        """Write the estimate of a single board as number ``i``.
 
-
-def _windows(detections: Detections) -> list[list[int]]:
-    """Return the part of each image that is fitted: left, top, right, bottom of the quiet zone.
-
-    A share of the corners' extent as wide as the quiet zone, and half of that for perspective.
-    """
-    low, high = detections.corners.min(axis=1), detections.corners.max(axis=1)
-    share = np.array(
-        [1.5 * quiet / module_count(dictionary) for dictionary, _, quiet in detections.markers]
-    )
-    margin = BACKGROUND_MARGIN_PX + share[:, None] * (high - low)
-    sizes = np.array([image.shape[::-1] for image in detections.images]).reshape(-1, 2)
-    low = np.clip(np.floor(low - margin) - detections.origins, 0, sizes)
-    high = np.clip(np.ceil(high + margin) + 1 - detections.origins, 0, sizes)
-    windows: list[list[int]] = np.concatenate([low, high], axis=1).astype(np.int64).tolist()
-    return windows
-
-
-def refined_corners(detections: Detections) -> Floats:
-    """Return the corners (N, 4, 2) after ``cv2.cornerSubPix``, its window OpenCV's for markers."""
-    refined = detections.corners.copy()
-    for i, image in enumerate(detections.images):
-        moved = refined_quad(
-            image, detections.corners[i] - detections.origins[i],
-            module_count(detections.markers[i][0]),
-        )
-        if moved is not None:
-            refined[i] = moved + detections.origins[i]
-    return refined
-
-
-def refined_quad(image: Grey, corners: Floats, modules: float) -> Floats | None:
-    """As :func:`refined_corners`, of corners (4, 2) in pixels of the image; None if one is not."""
-    if not ((corners >= 0) & (corners <= np.array(image.shape[::-1]) - 1)).all():
-        return None
-    side = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
-    half = min(5, max(1, round(0.3 * (side / modules))))
-    moved = cv2.cornerSubPix(
-        image, np.ascontiguousarray(corners[:, None], dtype=np.float32), (half, half),
-        (-1, -1), (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 30, 0.1),
-    )
-    return np.asarray(moved[:, 0], dtype=np.float64)
-
-
-# --------------------------------------------------------------------------------------------------
-# Pose of a board from pixels: maximum likelihood with the exact image of all that is printed.
-#
-# As :mod:`sweep.measure.photometric` has it for a marker. Pixels that show something beside the
-# board are left out. The starts are poses from the corners of all detected markers, and that of
-# the marker on which most of the others agree: one marker that is wrong spoils the former.
-
-@dataclass(frozen=True, slots=True)
-class BoardPhotometric:
-    """Maximum likelihood on a board's pixels as an estimator of its pose.
-
-    Attributes
-    ----------
-    refined, spread_free
-        As :class:`sweep.measure.photometric.Photometric` has them.
-    """
-
-    refined: bool
-    spread_free: bool
-
-    @property
-    def needs_images(self) -> bool:
-        """Whether detections must carry their images: yes."""
-        return True
-
-    def __call__(self, detections: BoardDetections) -> Estimates:
-        """Return the poses, with covariances from the curvature of the likelihood."""
-        return one_by_one(detections, self._estimate)
-
-    def _estimate(self, one: BoardDetections, i: int, out: Estimates) -> None:
-        """Write the estimate of a single board as number ``i``."""
-        board, found, scale = one.boards[0], one.points[0], float(one.scale[0])
-        if found.corners_px.size < 2 * MIN_POINTS:
+        Pixels that show something beside the board are left out. The starts are poses from the
+        corners of all detected markers, and that of the marker on which most of the others agree:
+        one marker that is wrong spoils the former.
+        """
+        board, scale = as_board(one.targets[0]), float(one.scale[0])
+        if one.corners.size < 2 * MIN_POINTS:
             out.status[i] = EstimateStatus.too_few_points
             return
-        sets = [found.corners_px]
+        sets = [one.corners]
         if self.refined:
             sets.append(_refined(one))
         poses = [pose for corners in sets for pose in _starts(one, corners)]
@@ -426,8 +349,7 @@ class BoardPhotometric:
         fitted = write_most_likely(image, starts, view, self.spread_free, noise, out, i)
         if fitted is None:
             return
-        points = scale * board.corners_m[found.marker].reshape(-1, 3)
-        pixels = found.corners_px.reshape(-1, 2)
+        points, pixels = one.objects_m.reshape(-1, 3), one.corners.reshape(-1, 2)
         out.point_count[i] = len(pixels)
         errors = []
         for state in fitted:
@@ -441,10 +363,63 @@ class BoardPhotometric:
             out.translation[i] += arm
             out.covariance[i] = covariance_elsewhere(out.covariance[i], arm)
 
+    @staticmethod
+    def _reprojection_px(state: Floats, detections: Detections, i: int) -> float:
+        """Return the RMS reprojection error of a state over the corners of one detection."""
+        row = np.array([i])
+        return float(
+            reprojection_errors_px(
+                rotation_of(state)[None], state[None, POSITION], detections.size_m[row],
+                detections.corners[row], detections.cameras.take(row),
+            )[0]
+        )
 
-def _starts(one: BoardDetections, corners_px: Floats) -> list[Pose]:
+
+def _windows(detections: Detections) -> list[list[int]]:
+    """Return the part of each image that is fitted: left, top, right, bottom of the quiet zone.
+
+    A share of the corners' extent as wide as the quiet zone, and half of that for perspective.
+    """
+    low, high = detections.corners.min(axis=1), detections.corners.max(axis=1)
+    extents = [extent_of(target) for target in detections.targets]
+    share = np.array([-1.5 * each.sheet[0] / each.modules for each in extents])
+    margin = BACKGROUND_MARGIN_PX + share[:, None] * (high - low)
+    sizes = np.array([image.shape[::-1] for image in detections.images]).reshape(-1, 2)
+    low = np.clip(np.floor(low - margin) - detections.origins, 0, sizes)
+    high = np.clip(np.ceil(high + margin) + 1 - detections.origins, 0, sizes)
+    windows: list[list[int]] = np.concatenate([low, high], axis=1).astype(np.int64).tolist()
+    return windows
+
+
+def refined_corners(detections: Detections) -> Floats:
+    """Return the corners (N, 4, 2) after ``cv2.cornerSubPix``, its window OpenCV's for markers."""
+    refined = detections.corners.copy()
+    for i, image in enumerate(detections.images):
+        moved = refined_quad(
+            image, detections.corners[i] - detections.origins[i],
+            extent_of(detections.targets[i]).modules,
+        )
+        if moved is not None:
+            refined[i] = moved + detections.origins[i]
+    return refined
+
+
+def refined_quad(image: Grey, corners: Floats, modules: float) -> Floats | None:
+    """As :func:`refined_corners`, of corners (4, 2) in pixels of the image; None if one is not."""
+    if not ((corners >= 0) & (corners <= np.array(image.shape[::-1]) - 1)).all():
+        return None
+    side = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
+    half = min(5, max(1, round(0.3 * (side / modules))))
+    moved = cv2.cornerSubPix(
+        image, np.ascontiguousarray(corners[:, None], dtype=np.float32), (half, half),
+        (-1, -1), (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 30, 0.1),
+    )
+    return np.asarray(moved[:, 0], dtype=np.float64)
+
+
+def _starts(one: Detections, corners_px: Floats) -> list[Pose]:
     """Return poses from corners (K, 4, 2): of all together, and the one that fits most markers."""
-    objects = float(one.scale[0]) * one.boards[0].corners_m[one.points[0].marker]
+    objects = one.objects_m
     points, pixels = objects.reshape(-1, 3), corners_px.reshape(-1, 2)
     poses = [
         pose for method in (cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_ITERATIVE)
@@ -458,7 +433,7 @@ def _starts(one: BoardDetections, corners_px: Floats) -> list[Pose]:
 
 
 def _typical_error_px(
-    pose: Pose, one: BoardDetections, objects: Floats, corners_px: Floats
+    pose: Pose, one: Detections, objects: Floats, corners_px: Floats
 ) -> float:
     """Return the median of K markers' reprojection errors; NaN becomes infinite."""
     errors = [
@@ -468,9 +443,9 @@ def _typical_error_px(
     return float(np.median(np.nan_to_num(errors, nan=math.inf)))
 
 
-def _refined(one: BoardDetections) -> Floats:
+def _refined(one: Detections) -> Floats:
     """Return the markers' corners (K, 4, 2) after ``cv2.cornerSubPix``."""
-    modules, corners_px = module_count(one.boards[0].dictionary), one.points[0].corners_px
+    modules, corners_px = module_count(as_board(one.targets[0]).dictionary), one.corners
     refined = [
         refined_quad(one.images[0], corners - one.origins[0], modules) for corners in corners_px
     ]
@@ -480,9 +455,9 @@ def _refined(one: BoardDetections) -> Floats:
     )
 
 
-def _window(one: BoardDetections, poses: list[Pose]) -> list[int]:
+def _window(one: Detections, poses: list[Pose]) -> list[int]:
     """Return what is fitted of the image: left, top, right, bottom around the sheet in any pose."""
-    board = one.boards[0]
+    board = as_board(one.targets[0])
     sheet = box_corners(extent_of(board).target[None]) * unit_m(board) * float(one.scale[0])
     size = np.array(one.images[0].shape[::-1])
     pixels = np.concatenate([

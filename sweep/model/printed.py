@@ -37,6 +37,13 @@ PrintKey: TypeAlias = MarkerKey | Board
 """A marker or a board: it determines what is printed."""
 
 
+def as_board(key: PrintKey) -> Board:
+    """Return a print that is a board; TypeError for a marker."""
+    if not isinstance(key, Board):
+        raise TypeError("expected a board, not a marker alone")
+    return key
+
+
 class Extent(NamedTuple):
     """Where a print's parts end, in units.
 
@@ -484,14 +491,12 @@ def _squares(board: Board) -> list[list[tuple[int, Floats]]]:
 
 
 def boxes_px(
-    board: Board | object, camera: Cameras, rotation: Floats, translation: Floats, scale: float
+    board: Board, camera: Cameras, rotation: Floats, translation: Floats, scale: float
 ) -> Floats:
     """Return rectangles (2, 4, 2) in px about the images of a solid board's sheets, and of all.
 
     Of those that face the camera, if any does; NaN if a part of one is not before it.
     """
-    if not isinstance(board, Board):
-        raise TypeError("a single marker is flat")
     planes = sheet_planes(board, rotation, translation, scale)
     boxes = []
     for count in (own_sheets(board), len(planes)):

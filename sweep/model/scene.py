@@ -19,7 +19,15 @@ from sweep.model.effects import CODED, NEUTRAL, NO_PLUGINS, PLAIN, VELOCITIES, E
 from sweep.model.marker import marker_corners, overhang
 from sweep.model.polygon import Projection
 from sweep.model.pose import rotation_of_angles, transform_points
-from sweep.model.printed import PrintKey, box_corners, boxes_px, extent_of, side_m, sides_m
+from sweep.model.printed import (
+    PrintKey,
+    as_board,
+    box_corners,
+    boxes_px,
+    extent_of,
+    side_m,
+    sides_m,
+)
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
@@ -336,7 +344,7 @@ def build_scenes(
     for row in np.flatnonzero(solid).tolist():
         camera, scale = cameras.take(np.array([row])), float(printed[row] / side[row])
         corners_px[row], outline_px[row] = boxes_px(
-            markers[marker[row]], camera, rotation[row], translation[row], scale
+            as_board(markers[marker[row]]), camera, rotation[row], translation[row], scale
         )
 
     levels = np.stack(

@@ -12,6 +12,7 @@ from sweep.model import coverage
 from sweep.model.board import Board
 from sweep.model.polygon import Projection
 from sweep.model.printed import (
+    as_board,
     facing,
     outlines,
     own_sheets,
@@ -129,10 +130,7 @@ def sheet_folds(scenes: Scenes, row: int) -> bool:
 
 def solid_board(scenes: Scenes, row: int) -> Board:
     """Return the board of one scene; TypeError if it shows a single marker."""
-    board = scenes.markers[scenes.marker[row]]
-    if not isinstance(board, Board):
-        raise TypeError("a single marker is flat")
-    return board
+    return as_board(scenes.markers[scenes.marker[row]])
 
 
 def solid_planes(scenes: Scenes, row: int) -> Floats:

@@ -3,6 +3,7 @@
 python -m tests.benchmarks photograph
 """
 
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -50,12 +51,13 @@ def detections(side, effects):
             images.append(taken.image)
     count, markers = len(corners), len(BOARD)
     cameras = board_scene(BOARD, camera, pose).cameras.take(np.zeros(count, dtype=int))
-    return Detections(
+    found = Detections.of_markers(
         np.array(corners), cameras, np.full(count, 0.03), np.full(count, 2.0), np.zeros(count),
         [(BOARD.dictionary, BOARD.marker_ids[k % markers], 1.0) for k in range(count)], images,
         np.zeros((count, 2), dtype=np.int64),
-        on_board=[BoardMarker(BOARD, k % markers) for k in range(count)],
     )
+    on_board = [BoardMarker(BOARD, k % markers) for k in range(count)]
+    return dataclasses.replace(found, on_board=on_board)
 
 
 @single_threaded()

@@ -9,7 +9,7 @@ import pytest
 from sweep.errors import PipelineError
 from sweep.evaluation.block import run_cells
 from sweep.measure.flags import BoundStatus, EstimateStatus
-from sweep.measure.photometric import BoardPhotometric
+from sweep.measure.photometric import Photometric
 from sweep.plan.pipeline import Pipeline
 
 CHARUCO = 'kind = "charuco"\nsquares_x = 5\nsquares_y = 4\nsquare_m = 0.03'
@@ -102,14 +102,14 @@ def test_board_s_pose_from_pixels_attains_the_bound(board, blur):
 @pytest.mark.long
 def test_board_with_a_wrong_marker_is_solved_from_the_others(monkeypatch):
     """Corners of one of nine markers are moved by a third of its side, before the starts."""
-    estimate = BoardPhotometric.__call__
+    estimate = Photometric.__call__
 
     def spoiled(self, detections):
-        for found in detections.points:
-            found.corners_px[0] += [15.0, -10.0]
+        first = np.searchsorted(detections.owner, np.arange(len(detections)))
+        detections.corners[first] += [15.0, -10.0]
         return estimate(self, detections)
 
-    monkeypatch.setattr(BoardPhotometric, "__call__", spoiled)
+    monkeypatch.setattr(Photometric, "__call__", spoiled)
     columns, relative = computed(GRID, 2)
     assert (columns["estimate"] == EstimateStatus.solved).all()
     assert np.abs(relative).max() < 6

@@ -1,5 +1,7 @@
 """Solver ``photometric_real`` against OpenCV's boards, dense sampling, and images of known pose."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -94,7 +96,7 @@ def detections(board, numbers, image, pose, rng, *, lens=(), error_px=0.3, alone
         )[0].reshape(4, 2)
         for k in numbers
     ])
-    return Detections(
+    found = Detections.of_markers(
         corners + rng.normal(0, error_px, corners.shape),
         Cameras(
             np.repeat(VIEW[None], count, axis=0), np.repeat(pack(lens)[None], count, axis=0),
@@ -103,8 +105,9 @@ def detections(board, numbers, image, pose, rng, *, lens=(), error_px=0.3, alone
         np.full(count, size), np.full(count, 2.0), np.zeros(count),
         [(board.dictionary, board.marker_ids[k], 1.0) for k in numbers], [image] * count,
         np.zeros((count, 2), dtype=np.int64),
-        on_board=None if alone else [BoardMarker(board, k) for k in numbers],
     )
+    on_board = None if alone else [BoardMarker(board, k) for k in numbers]
+    return dataclasses.replace(found, on_board=on_board)
 
 
 def errors_of(board, numbers, estimates, pose):

@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from support.lengths import lengths
-from support.windows import outcomes_elsewhere
+from support.windows import corners_of, outcomes_elsewhere
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search, search_windows, visibility_flags
 from sweep.measure.detectors import REFINEMENTS, DetectorSetting
@@ -324,7 +324,7 @@ def test_window_finds_what_the_frame_holds_under_noise(count, refinement):
     assert (windows[:, 2:] - windows[:, :2] < scenes.frame).any()
     exceptions = np.flatnonzero(windowed.flags != framed.flags)
     both = (windowed.flags == DetectionStatus.detected) & (framed.flags == DetectionStatus.detected)
-    difference = np.abs(windowed.corners - framed.corners)[both].max(axis=(1, 2))
+    difference = np.abs(corners_of(windowed) - corners_of(framed))[both].max(axis=(1, 2))
     print(
         f"\n{refinement}: {count} poses, {both.sum()} detected, {len(exceptions)} exceptions "
         f"{[(int(windowed.flags[i]), int(framed.flags[i])) for i in exceptions]}; corners differ "

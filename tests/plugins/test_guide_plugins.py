@@ -113,7 +113,7 @@ def test_the_solver_finds_the_pose_of_perfect_corners():
     text = SCENE + '[estimator]\nsolver = "homography:SOLVER"\n[axes]\nroll_deg = [0, 40, 200]\n'
     pipeline = pipeline_of(text.replace("roll_deg = 12\n", ""))
     scenes = build_scenes(scene_values(pipeline, [np.arange(3)]), 3)
-    found = build(estimators(pipeline)[0])(Detections(
+    found = build(estimators(pipeline)[0])(Detections.of_markers(
         scenes.corners_px, scenes.cameras, scenes.size_m, np.zeros(3), np.zeros(3),
         [scenes.markers[0]] * 3, [], np.zeros((3, 2), dtype=np.int64),
     ))
@@ -145,9 +145,8 @@ from sweep.plugins import EstimatorPlugin
 
 def near(of):
     def solve(detections):
-        for each in detections.points:
-            each.corners_px[:] = 0
-        count = len(detections.boards)
+        detections.corners[:] = 0
+        count = len(detections)
         return np.tile(np.eye(3), (count, 1, 1)), np.full((count, 3), of)
     return EstimatorPlugin(make=lambda _: solve, of_boards=True)
 

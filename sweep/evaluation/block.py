@@ -41,7 +41,6 @@ from sweep.measure.estimation import (
 )
 from sweep.measure.estimators import EstimatorSetting, build
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
-from sweep.model.board import Board
 from sweep.model.calibration import COEFFICIENTS, VIEW
 from sweep.model.camera import Cameras, Column
 from sweep.model.derivatives import POSE
@@ -134,7 +133,7 @@ def detections_for(
     on_board = values["on_board"].values if "on_board" in values else None
     images = [result.images[row] for row in rows.tolist()] if result.images else []
     beside: list[Masks] = []
-    if images and any(isinstance(each, Board) and each.distractors for each in targets):
+    if images and any(each.distractors for each in targets):
         for row, image in zip(rows.tolist(), images, strict=True):
             left, top = result.origins[row].tolist()
             box = left, top, left + image.shape[1], top + image.shape[0]

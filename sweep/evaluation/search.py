@@ -29,7 +29,6 @@ from sweep.measure.detectors import (
     windows,
 )
 from sweep.measure.flags import DetectionStatus
-from sweep.model.board import Board
 from sweep.model.camera import Column, map_columns
 from sweep.model.extent import hidden, marker_boxes, not_modelled, outside_frame
 from sweep.model.marker import marker_corners
@@ -72,8 +71,8 @@ class ImageSearch:
             return self._last[2]  # another marker of a photograph
         found = self.find(image, dictionary, self.sides[row])
         output = (
-            self.boards.complete(image, target, found) if isinstance(target, Board)
-            else SearchOutput(*found)
+            SearchOutput(*found) if target.is_marker
+            else self.boards.complete(image, target, found)
         )
         self._last = image, dictionary, output
         return output

@@ -14,7 +14,7 @@ from sweep.measure.flags import DetectionStatus
 from sweep.model.board import Board
 from sweep.model.extent import outside_of_frame
 from sweep.model.pose import transform_points
-from sweep.model.printed import PrintKey, unseen_markers
+from sweep.model.printed import unseen_markers
 from sweep.model.scene import Scenes
 from sweep.model.scene_sheet import solid_planes
 from sweep.typing import Floats, Integers, Masks
@@ -38,7 +38,7 @@ class TargetScenes:
         (N, M) why a square is not searched; ``not_run`` for those that are.
     """
 
-    targets: Sequence[PrintKey]
+    targets: Sequence[Board]
     marker_id: Integers
     corners_px: Floats
     chessboard_px: Floats
@@ -57,7 +57,7 @@ def target_scenes(
     count, (most, corners) = len(scenes), shape
     if boards is None:
         return TargetScenes(
-            [scenes.markers[k] for k in scenes.marker.tolist()],
+            [scenes.target(row) for row in range(count)],
             np.array(scenes.marker_id, dtype=np.int64)[:, None], scenes.corners_px[:, None],
             np.empty((count, 0, 2)), visibility[:, None],
         )
@@ -207,7 +207,7 @@ def classify(
 
 
 def _found_squares(
-    targets: Sequence[PrintKey], decoded: Quads, flags: NDArray[np.uint8], corners: Floats
+    targets: Sequence[Board], decoded: Quads, flags: NDArray[np.uint8], corners: Floats
 ) -> tuple[Integers, Integers, Floats]:
     """Return the squares that estimators get: target, number and corners of each, by target.
 
@@ -215,15 +215,14 @@ def _found_squares(
     """
     numbers = {
         board: {each: k for k, each in enumerate(board.marker_ids)}
-        for board in dict.fromkeys(each for each in targets if isinstance(each, Board))
+        for board in dict.fromkeys(each for each in targets if not each.is_marker)
     }
     if not numbers:
         rows = np.flatnonzero(flags == DetectionStatus.detected)
         return rows, np.zeros(len(rows), dtype=np.int64), corners[rows, 0]
     square = np.array([
-        numbers[board].get(each, -1)
+        numbers[targets[row]].get(each, -1)
         for row, each in zip(decoded.owner.tolist(), decoded.ids.tolist(), strict=True)
-        if isinstance(board := targets[row], Board)
     ], dtype=np.int64)
     known = np.flatnonzero(square >= 0)
     known = known[np.argsort(decoded.owner[known], kind="stable")]

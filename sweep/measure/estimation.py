@@ -18,10 +18,9 @@ from sweep.measure.surroundings import BoardMarker
 from sweep.model.board import Board
 from sweep.model.camera import Cameras
 from sweep.model.derivatives import POSE, velocity
-from sweep.model.marker import MarkerKey, marker_corners
+from sweep.model.marker import marker_corners
 from sweep.model.polygon import Optics, side_lengths
 from sweep.model.pose import angle_between, mirrored, transform_points, vector_of_rotation
-from sweep.model.printed import PrintKey
 from sweep.typing import Floats, Grey, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -44,7 +43,7 @@ class Detections:
         of their own), noise of a pixel in grey levels, and point spread, as the estimator assumes
         them.
     targets
-        What is printed: dictionary, ID and quiet zone of a marker, or a board.
+        What is printed.
     images, origins
         The windows that were searched, and (N, 2) their first pixels in the frame; no images for
         estimators that do not need them.
@@ -68,7 +67,7 @@ class Detections:
     size_m: Floats
     noise_grey: Floats
     blur_px: Floats
-    targets: Sequence[PrintKey]
+    targets: Sequence[Board]
     images: Sequence[Grey]
     origins: Integers
     owner: Integers
@@ -83,7 +82,7 @@ class Detections:
     @staticmethod
     def of_markers(
         corners: Floats, cameras: Cameras, size_m: Floats, noise_grey: Floats, blur_px: Floats,
-        markers: Sequence[MarkerKey], images: Sequence[Grey], origins: Integers,
+        markers: Sequence[Board], images: Sequence[Grey], origins: Integers,
     ) -> Detections:
         """Return the detections of N markers whose corners (N, 4, 2) were all found."""
         count = len(corners)
@@ -99,7 +98,7 @@ class Detections:
     @property
     def are_markers(self) -> bool:
         """Whether each target is a marker, upright at the origin of its frame."""
-        return not any(isinstance(target, Board) for target in self.targets)
+        return all(target.is_marker for target in self.targets)
 
     @property
     def objects_m(self) -> Floats:
@@ -108,7 +107,7 @@ class Detections:
             return marker_corners(self.size_m)
         corners = [
             target.corners_m[self.square[self.owner == row]] * self.scale[row]
-            for row, target in enumerate(self.targets) if isinstance(target, Board)
+            for row, target in enumerate(self.targets)
         ]
         return np.concatenate([np.empty((0, 4, 3)), *corners])
 

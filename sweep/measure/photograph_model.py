@@ -11,7 +11,6 @@ from sweep.compilation import compiled, compiled_inline
 from sweep.measure.estimation import Detections
 from sweep.measure.likelihood import DEPTH, SPREAD, MarkerView, plane_of
 from sweep.measure.surroundings import clear_modules, edges_alone, surroundings
-from sweep.model.board import Board
 from sweep.model.coverage import NODES, WEIGHTS, MarkerEdges
 from sweep.model.derivatives import POSE
 from sweep.model.lens import jacobian, undistort
@@ -588,9 +587,7 @@ def photograph_view(
     """
     padding = PADDING_PX + reach
     target = detections.targets[i]
-    if isinstance(target, Board):
-        raise TypeError("expected a marker")
-    dictionary, _, margin = target
+    dictionary, margin = target.dictionary, target.margin or 0.0
     modules = module_count(dictionary)
     corners = detections.corners[i].tolist()
     side = 0.25 * sum(math.dist(corners[k - 1], corners[k]) for k in range(4))

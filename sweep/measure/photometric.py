@@ -49,7 +49,7 @@ from sweep.measure.solver import (
 from sweep.model.derivatives import LEVELS, POSE, known_pixels, work_space
 from sweep.model.marker import module_count
 from sweep.model.pose import transform_points
-from sweep.model.printed import as_board, box_corners, extent_of, unit_m
+from sweep.model.printed import box_corners, extent_of, unit_m
 from sweep.typing import Floats, Grey
 
 # --------------------------------------------------------------------------------------------------
@@ -319,7 +319,7 @@ class Photometric:
         corners of all detected markers, and that of the marker on which most of the others agree:
         one marker that is wrong spoils the former.
         """
-        board, scale = as_board(one.targets[0]), float(one.scale[0])
+        board, scale = one.targets[0], float(one.scale[0])
         if one.corners.size < 2 * MIN_POINTS:
             out.status[i] = EstimateStatus.too_few_points
             return
@@ -445,7 +445,7 @@ def _typical_error_px(
 
 def _refined(one: Detections) -> Floats:
     """Return the markers' corners (K, 4, 2) after ``cv2.cornerSubPix``."""
-    modules, corners_px = module_count(as_board(one.targets[0]).dictionary), one.corners
+    modules, corners_px = module_count(one.targets[0].dictionary), one.corners
     refined = [
         refined_quad(one.images[0], corners - one.origins[0], modules) for corners in corners_px
     ]
@@ -457,7 +457,7 @@ def _refined(one: Detections) -> Floats:
 
 def _window(one: Detections, poses: list[Pose]) -> list[int]:
     """Return what is fitted of the image: left, top, right, bottom around the sheet in any pose."""
-    board = as_board(one.targets[0])
+    board = one.targets[0]
     sheet = box_corners(extent_of(board).target[None]) * unit_m(board) * float(one.scale[0])
     size = np.array(one.images[0].shape[::-1])
     pixels = np.concatenate([

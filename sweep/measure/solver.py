@@ -23,7 +23,6 @@ from sweep.model.camera import Cameras
 from sweep.model.marker import marker_corners
 from sweep.model.polygon import side_lengths, signed_areas
 from sweep.model.pose import rotation_of_vector, transform_points, vector_of_rotation
-from sweep.model.printed import as_board
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
@@ -538,7 +537,7 @@ class PointSolver:
         """Return the points (k, 3) in the board's frame and their pixels (k, 2)."""
         if self.points == "chessboard":
             found = np.isfinite(one.chessboard_px[0, :, 0])
-            board = as_board(one.targets[0])
+            board = one.targets[0]
             return board.chessboard_m[found] * one.scale[0], one.chessboard_px[0, found]
         objects, corners = one.objects_m, one.corners
         if self.points == "largest_marker" and len(corners):

@@ -20,6 +20,7 @@ from sweep.measure.estimation import Detections
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.photograph import PhotometricReal
 from sweep.measure.surroundings import BoardMarker
+from sweep.model.board import single_marker
 from sweep.model.board_kinds import Charuco
 
 BOARD = Charuco(
@@ -53,7 +54,8 @@ def detections(side, effects):
     cameras = board_scene(BOARD, camera, pose).cameras.take(np.zeros(count, dtype=int))
     found = Detections.of_markers(
         np.array(corners), cameras, np.full(count, 0.03), np.full(count, 2.0), np.zeros(count),
-        [(BOARD.dictionary, BOARD.marker_ids[k % markers], 1.0) for k in range(count)], images,
+        [single_marker(BOARD.dictionary, BOARD.marker_ids[k % markers], 1.0)
+         for k in range(count)], images,
         np.zeros((count, 2), dtype=np.int64),
     )
     on_board = [BoardMarker(BOARD, k % markers) for k in range(count)]

@@ -11,6 +11,7 @@ from support.blocks import run_block
 from sweep.measure.classify import TargetScenes, classify
 from sweep.measure.detectors import SearchOutput
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.model.board import single_marker
 from sweep.plan.grid import Block, scene_axes
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.schema import SCHEMA
@@ -229,7 +230,8 @@ def search_result(row, *found):
 def markers(truth, marker_id):
     """N visible markers with corners (N, 4, 2) and IDs (N,)."""
     return TargetScenes(
-        [("DICT_4X4_50", each, 1.0) for each in marker_id], np.array(marker_id)[:, None],
+        [single_marker("DICT_4X4_50", each, 1.0) for each in marker_id],
+        np.array(marker_id)[:, None],
         truth[:, None], np.empty((len(truth), 0, 2)), np.zeros((len(truth), 1), dtype=np.uint8),
     )
 

@@ -33,6 +33,7 @@ from sweep.measure.likelihood import (
     state_of,
 )
 from sweep.measure.photometric import Photometric, _windows, explains
+from sweep.model.board import single_marker
 from sweep.model.derivatives import LEVELS, POSE, work_space
 from sweep.plan.pipeline import Pipeline
 
@@ -522,7 +523,7 @@ def test_an_estimator_of_one_s_own_gets_what_is_believed_and_seen(monkeypatch):
     assert (seen.cameras.view == [500.0, 4 / 3.6 * 480, 319.5, 239.5]).all()
     assert seen.cameras.lenses[:, :2] == pytest.approx(np.tile([-0.1, 0.01], (n, 1)))
     assert seen.cameras.distorted.all()
-    assert list(seen.targets) == [("DICT_5X5_50", 7, 1.0)] * n
+    assert list(seen.targets) == [single_marker("DICT_5X5_50", 7, 1.0)] * n
     assert len(seen.images) == len(seen.origins) == n
 
     keeper.seen.clear()
@@ -608,7 +609,7 @@ def test_nonsense_is_not_solved(monkeypatch):
     plain = dataclasses.replace(seen, images=[np.full_like(one, 120) for one in seen.images])
     turned = dataclasses.replace(seen, corners=np.roll(seen.corners, 1, axis=1))
     mirrored = dataclasses.replace(seen, corners=seen.corners[:, ::-1])
-    other = dataclasses.replace(seen, targets=[("DICT_5X5_50", 1, 1.0)] * 5)
+    other = dataclasses.replace(seen, targets=[single_marker("DICT_5X5_50", 1, 1.0)] * 5)
     for nonsense in (point, beside, plain, turned, mirrored, other):
         estimates = estimator(nonsense)
         assert (estimates.status != EstimateStatus.solved).all()

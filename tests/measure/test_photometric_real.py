@@ -21,6 +21,7 @@ from sweep.measure.photograph_model import (
     system,
 )
 from sweep.measure.surroundings import BoardMarker, clear_modules, surroundings
+from sweep.model.board import single_marker
 from sweep.model.board_kinds import Charuco, Grid
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
@@ -103,7 +104,8 @@ def detections(board, numbers, image, pose, rng, *, lens=(), error_px=0.3, alone
             np.full(count, bool(lens)),
         ),
         np.full(count, size), np.full(count, 2.0), np.zeros(count),
-        [(board.dictionary, board.marker_ids[k], 1.0) for k in numbers], [image] * count,
+        [single_marker(board.dictionary, board.marker_ids[k], 1.0) for k in numbers],
+        [image] * count,
         np.zeros((count, 2), dtype=np.int64),
     )
     on_board = None if alone else [BoardMarker(board, k) for k in numbers]

@@ -6,6 +6,7 @@ import numpy as np
 
 from sweep.measure.estimation import Detections
 from sweep.measure.solver import OPENCV_SOLVERS, PointSolver
+from sweep.model.board import single_marker
 
 BOARD_METHODS = tuple(name for name, each in OPENCV_SOLVERS.items() if each.any_points)
 
@@ -15,7 +16,7 @@ def estimate(corners, cameras, size_m, solver, guarded, limit):
     count = len(corners)
     return PointSolver(solver, guarded, limit)(Detections.of_markers(
         corners, cameras, size_m, np.zeros(count), np.zeros(count),
-        [("DICT_4X4_50", 0, 1.0)] * count, [], np.zeros((count, 2), dtype=np.int64),
+        [single_marker("DICT_4X4_50", 0, 1.0)] * count, [], np.zeros((count, 2), dtype=np.int64),
     ))
 
 

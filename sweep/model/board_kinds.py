@@ -736,13 +736,15 @@ PIPELINE_NAMES = {
 }
 """Key of a board's file -> the parameter of a pipeline that says the same."""
 
+_DECLARED = {kind: declared_fields(declaring) for kind, declaring in KINDS.items()}
+
 DIAMOND = {"squares_x": 3, "squares_y": 3, "legacy_pattern": False}
 """What makes a ChArUco diamond of a charuco."""
 
 
 def _own_keys(kind: str, needed: bool) -> tuple[str, ...]:
     """Return the keys of a kind of board that [board] has, those that it needs or the others."""
-    declared = declared_fields(KINDS["charuco" if kind == "diamond" else kind]).items()
+    declared = _DECLARED["charuco" if kind == "diamond" else kind].items()
     return tuple(
         name for name, each in declared if (each.default is dataclasses.MISSING) == needed
         and PIPELINE_NAMES.get(name, name) not in FROM_MARKER
@@ -779,8 +781,8 @@ def arranged(values: Sequence[Any]) -> Kind:
         )
     if kind == "diamond":
         kind, given = "charuco", given | DIAMOND
-    made = {}
-    for name, declared in declared_fields(KINDS[kind]).items():
+    made: dict[str, Any] = {}
+    for name, declared in _DECLARED[kind].items():
         value = given[PIPELINE_NAMES.get(name, name)]
         # Along an axis, numbers are floating-point.
         made[name] = int(value) if int in declared.types and value is not None else value

@@ -10,7 +10,7 @@ from support.windows import corners_of, outcomes_elsewhere
 from sweep.errors import PipelineError
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search, search_windows, visibility_flags
-from sweep.measure.detectors import REFINEMENTS, DetectorSetting, opencv_full_frame_reason, windows
+from sweep.measure.detectors import REFINEMENTS, DetectorSetting, full_frame_reason, windows
 from sweep.measure.flags import DetectionStatus
 from sweep.model.extent import marker_boxes
 from sweep.model.marker import opencv_dictionary
@@ -188,7 +188,7 @@ def test_window_finds_what_the_frame_holds_under_other_settings(count, given):
     both = (windowed.flags == DetectionStatus.detected) & (framed.flags == DetectionStatus.detected)
     difference = np.abs(corners_of(windowed) - corners_of(framed))[both]
     exact = (
-        opencv_full_frame_reason(setting) is not None or setting.cornerRefinementMethod == "none"
+        full_frame_reason(setting) is not None or setting.cornerRefinementMethod == "none"
     )
     # As above: one float32 ulp of the frame's width for apriltag's corners.
     assert difference.max(initial=0.0) <= (0.0 if exact else np.spacing(np.float32(640)))

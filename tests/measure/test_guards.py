@@ -29,7 +29,7 @@ from support.windows import corners_of
 from sweep.evaluation import search as search_module
 from sweep.evaluation.search import search, visibility_flags
 from sweep.measure import estimation as accuracy
-from sweep.measure.detectors import DetectorSetting, opencv_margin_px
+from sweep.measure.detectors import DetectorSetting, margin_px
 from sweep.measure.estimation import pose_error
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.measure.solver import OPENCV_SOLVERS
@@ -506,6 +506,6 @@ def test_window_leaves_room_for_the_refinement(count, monkeypatch):
     """cornerSubPix refuses images narrower than its window: with the usual 16 px, for 40 %."""
     scenes = scenes_of(Pipeline.from_text(MARGINS.format(count=count)))
     framed = searched(scenes, full=True, **WIDE_REFINEMENT)
-    check_margin(scenes, framed, opencv_margin_px, monkeypatch)
+    check_margin(scenes, framed, margin_px, monkeypatch)
     with pytest.raises(AssertionError):
         check_margin(scenes, framed, lambda _: 16, monkeypatch)

@@ -10,7 +10,7 @@ import contextlib
 import gc
 import importlib
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
@@ -20,6 +20,7 @@ from sweep.errors import MachineFaultError, RunError
 
 try:
     import numba
+    import numba.extending
 except (ValueError, TypeError) as error:
     # Numba interprets its configuration while it is imported.
     raise RunError(
@@ -56,6 +57,22 @@ def compiled_inline(function: Function) -> Function:
     The arithmetic stays the same.
     """
     return compiled(function, forceinline=True)
+
+
+def choose_when_compiled(
+    function: Callable[..., Any], choices: Mapping[type, Callable[..., Any]]
+) -> None:
+    """Let compiled callers of ``function`` call a choice by the first argument, a NamedTuple."""
+
+    def choose(*args: Any) -> Any:
+        chosen = choices[args[0].instance_class]
+
+        def call(*args: Any) -> Any:
+            return chosen(*args)
+
+        return call
+
+    numba.extending.overload(function)(choose)
 
 
 def is_cached(module: str, name: str) -> bool:

@@ -119,15 +119,13 @@ def _execute_fit(options: argparse.Namespace) -> int:
             each.name, each.parameter, library.formatting.number(each.estimate.value),
             library.formatting.interval_text(each.estimate.low, each.estimate.high)
             if math.isfinite(each.estimate.low) else "",
-            library.formatting.number(each.estimate.spread) if each.estimate.spread > 0 else "",
             f"{'kept' if each.kept else 'left out'}{': ' if each.reason else ''}{each.reason}",
         )
         for each in found.terms
     ]
     say(library.table.Table.of(
-        f"{found.markers} markers in {found.photographs} photographs; 95 % intervals and spread "
-        "by photograph",
-        ("term", "parameter", "value", "interval", "spread", ""), rows, stub=2,
+        f"{found.markers} markers in {found.photographs} photographs; 95 % intervals by photograph",
+        ("term", "parameter", "value", "interval", ""), rows, stub=2,
     ).text())
     say()
     for line in found.lines:
@@ -164,7 +162,7 @@ FIT = Command(
     (
         Example(
             "sweep fit shots --camera camera.yaml --board BOARD.toml",
-            "writes scene.toml: blur, sharpening, tone, light, noise, geometry",
+            "writes scene.toml: blur, sharpening, tone, noise, geometry",
         ),
         Example(
             "sweep fit shots --camera calibrate --board BOARD.toml -o webcam.toml",

@@ -42,7 +42,7 @@ def announce_compilation(pipeline: Pipeline) -> None:
     if fits and not library.compilation.is_cached("sweep.measure.likelihood", "fit"):
         seconds += LIKELIHOOD_S
     real = "photometric_real" in pipeline.values_of("solver")
-    if real and not library.compilation.is_cached("sweep.measure.photograph", "locate_photograph"):
+    if real and not library.compilation.is_cached("sweep.measure.photometric", "locate_photograph"):
         seconds += PHOTOGRAPH_S
     if seconds:
         notice(f"compiling, once for this version: about {seconds} s")

@@ -10,26 +10,20 @@ from typing import Any
 import numpy as np
 from scipy import interpolate, special
 
-from sweep.analysis.intervals import LEVEL
+from sweep.analysis.intervals import LEVEL, TAIL
 from sweep.errors import ArgumentError
-from sweep.fitting.estimates import MIN_PHOTOGRAPHS, Estimate, estimate, jackknife
 from sweep.fitting.photograph_fit import (
     AMOUNT,
     BLOOM,
     CORNERS,
-    HIGH,
-    LOW,
-    RADIUS,
     START,
     VARIANCE,
     MarkerState,
     PhotographFit,
     PhotographNoise,
     fit_photograph,
-    kernel,
     photograph_noise,
     products,
-    smoothed,
 )
 from sweep.fitting.views import FittedPhotograph, PhotographScenes, is_saturated, photograph_views
 from sweep.measure.flags import TruthSource
@@ -38,18 +32,59 @@ from sweep.model.board import Board
 from sweep.model.derivatives import POSE
 from sweep.photographs.pose_fit import fit_pose
 from sweep.photographs.truth import marker_frames
-from sweep.plan.parameters import PARAMETERS
 from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
-# The fits of all photographs: which effects there are, and one radius of sharpening for all.
+# Means over photographs, each of which is one draw, and their intervals.
 
-RADIUS_ROUNDS, MAX_RADIUS_FACTOR = 8, 1.5
-"""Most rounds in which the common radius is moved, and the most by which one does so."""
+MIN_PHOTOGRAPHS = 4
+"""Photographs from which intervals are given: with three, Student's are 2.5 standard deviations of
+a photograph wide on each side, and their spread is known to a factor of 6."""
 
-SAME_RADIUS = 0.02
-"""Change of the radius, as a share, at which it is the same."""
 
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A parameter of the camera.
+
+    Attributes
+    ----------
+    value, low, high
+        The mean over the photographs, and the ends of its 95 % interval; NaN with too few.
+    """
+
+    value: float
+    low: float = math.nan
+    high: float = math.nan
+
+    @property
+    def judged(self) -> bool:
+        """Whether there is an interval."""
+        return math.isfinite(self.low)
+
+    def excludes(self, absent: float) -> bool:
+        """Return whether the interval excludes a value."""
+        return self.high < absent or self.low > absent
+
+    def mapped(self, function: Callable[[float], float]) -> Estimate:
+        """Return the estimate of an increasing function of the parameter."""
+        return Estimate(function(self.value), function(self.low), function(self.high))
+
+
+def estimate(values: Floats) -> Estimate:
+    """Return the mean of a parameter's values (n,) in n photographs; the interval is Student's."""
+    known = values[np.isfinite(values)]
+    count = len(known)
+    if not count:
+        return Estimate(math.nan)
+    mean = float(known.mean())
+    if count < MIN_PHOTOGRAPHS:
+        return Estimate(mean)
+    half = float(special.stdtrit(count - 1, 1 - TAIL) * known.std(ddof=1) / math.sqrt(count))
+    return Estimate(mean, mean - half, mean + half)
+
+
+# --------------------------------------------------------------------------------------------------
+# The fits of all photographs: which effects there are.
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraFit:
@@ -60,18 +95,26 @@ class CameraFit:
     fits
         One of each photograph in which a marker could be fitted.
     tested
-        Estimates of (variance, amount, bloom) while all of them were fitted, with a radius that
-        was not: what is absent is judged by these.
-    estimates
-        Of the parameters that are kept: their number -> estimate.
+        Estimates of (variance, amount, bloom) while all of them were fitted: what is absent is
+        judged by these.
+    kept
+        (3,) which of these are kept.
     tested_fits
         The fits of which ``tested`` is.
     """
 
     fits: tuple[PhotographFit, ...]
     tested: tuple[Estimate, ...]
-    estimates: dict[int, Estimate]
-    tested_fits: tuple[PhotographFit, ...] = ()
+    kept: Masks
+    tested_fits: tuple[PhotographFit, ...]
+
+    @property
+    def estimates(self) -> list[Estimate]:
+        """Estimates of (variance, amount, bloom); of what is not kept those tested."""
+        return [
+            estimate(np.array([fit.parameters[k] for fit in self.fits])) if self.kept[k] else one
+            for k, one in enumerate(self.tested)
+        ]
 
 
 def fit_camera(
@@ -89,115 +132,25 @@ def fit_camera(
     known
         Fits of all effects of these photographs, which are then not made again.
     """
-    moved = np.array([True, True, True, False])
-    fits = list(known) or _fitted(photographs, moved, START)
-    if not fits:
-        return CameraFit((), (), {})
-    tested = tuple(_estimates(fits, moved)[k] for k in (VARIANCE, AMOUNT, BLOOM))
-    kept = np.array([*(each.excludes(0.0) or not each.judged for each in tested), False])
+    every = np.ones(len(START), dtype=bool)
+    fits = tuple(known) or _fitted(photographs, every, START)
+    tested = tuple(
+        estimate(np.array([fit.parameters[k] for fit in fits])) for k in range(len(START))
+    )
+    kept = np.array([each.excludes(0.0) or not each.judged for each in tested])
     kept[list(without)] = False
     start = START.copy()
     if not (kept[VARIANCE] and tested[VARIANCE].value > 0):
         kept[VARIANCE], start[VARIANCE] = False, 0.0
-    if kept[AMOUNT]:
-        chosen, estimates = _with_radius(photographs, fits, kept)
-    else:
-        chosen = fits if np.array_equal(kept, moved) else _fitted(photographs, kept, start)
-        estimates = _estimates(chosen, kept)
-    return CameraFit(tuple(chosen), tested, estimates, tuple(fits))
+    chosen = fits if kept.all() else _fitted(photographs, kept, start)
+    return CameraFit(chosen, tested, kept, fits)
 
 
 def _fitted(
-    photographs: Sequence[FittedPhotograph], moved: Masks, start: Floats,
-    known: Sequence[PhotographFit] = (),
-) -> list[PhotographFit]:
-    """Return the fits of photographs; from earlier ones, if they are ``known``."""
-    if not known:
-        fits = [fit_photograph(each, moved, start) for each in photographs]
-        return [each for each in fits if each is not None]
-    by_number = {each.number: each for each in photographs}
-    again = []
-    for fit in known:
-        begin = np.where(moved, np.clip(fit.parameters, LOW, HIGH), start)
-        refitted = fit_photograph(by_number[fit.number], moved, begin, fit.states)
-        if refitted is not None:
-            again.append(refitted)
-    return again
-
-
-def _with_radius(
-    photographs: Sequence[FittedPhotograph], fits: list[PhotographFit], kept: Masks,
-) -> tuple[list[PhotographFit], dict[int, Estimate]]:
-    """Return fits with sharpening, of the one radius that fits all photographs best."""
-    start = np.where(kept, START, 0.0)
-    radius, change = float(START[RADIUS]), 0.0
-    for _ in range(RADIUS_ROUNDS):
-        start[RADIUS] = radius
-        fits = _fitted(photographs, kept, start, fits)
-        pulls, weights = _radius_pulls(fits, kept)
-        moved = radius + float(pulls.sum() / max(weights.sum(), 1e-12))
-        moved = min(max(moved, radius / MAX_RADIUS_FACTOR), radius * MAX_RADIUS_FACTOR)
-        moved = min(max(moved, LOW[RADIUS]), HIGH[RADIUS])
-        change = moved - radius
-        if abs(change) < SAME_RADIUS * radius:
-            break
-        radius = moved
-    if len(fits) < MIN_PHOTOGRAPHS or start[RADIUS] in (LOW[RADIUS], HIGH[RADIUS]):
-        return fits, _estimates(fits, kept) | {RADIUS: Estimate(float(start[RADIUS]))}
-    return fits, _estimates(fits, kept, change)
-
-
-def _radius_pulls(fits: Sequence[PhotographFit], kept: Masks) -> tuple[Floats, Floats]:
-    """Return each photograph's gradient by the radius, and its information, others eliminated."""
-    pulls, weights = [], []
-    for fit in fits:
-        gain = np.linalg.solve(
-            fit.information[np.ix_(kept, kept)], fit.information[kept, RADIUS]
-        )
-        pulls.append(fit.gradient[RADIUS] - gain @ fit.gradient[kept])
-        weights.append(fit.information[RADIUS, RADIUS] - gain @ fit.information[kept, RADIUS])
-    return np.array(pulls), np.array(weights)
-
-
-def _estimates(
-    fits: Sequence[PhotographFit], kept: Masks, change: float | None = None
-) -> dict[int, Estimate]:
-    """Return the estimates of what is kept.
-
-    ``change`` is the last step of the common radius; None if that was not fitted. It is common to
-    all photographs. Without one of them it is another, and so is all that was fitted with it:
-    intervals follow from the jackknife, whose estimates without a photograph are those of the
-    quadratic approximations.
-    """
-    values = np.array([fit.parameters[kept] for fit in fits])
-    variances = np.array([np.diag(fit.covariance)[kept] for fit in fits])
-    numbers = np.flatnonzero(kept).tolist()
-    if change is None:
-        return {
-            number: estimate(values[:, k], variances[:, k]) for k, number in enumerate(numbers)
-        }
-    by_radius = np.array([
-        -np.linalg.solve(fit.information[np.ix_(kept, kept)], fit.information[kept, RADIUS])
-        for fit in fits
-    ])
-    values = values + change * by_radius
-    pulls, weights = _radius_pulls(fits, kept)
-    pulls = pulls - weights * change
-    moves = -pulls / (weights.sum() - weights)
-    out = {}
-    for k, number in enumerate(numbers):
-        full = values[:, k].mean()
-        without = np.array([
-            np.delete(values[:, k] + by_radius[:, k] * move, p).mean()
-            for p, move in enumerate(moves)
-        ])
-        spread = estimate(values[:, k], variances[:, k]).spread
-        interval = estimate(jackknife(full, without))
-        out[number] = Estimate(interval.value, interval.low, interval.high, spread)
-    radius = float(fits[0].parameters[RADIUS]) + change
-    without = np.log(np.clip(radius + moves, LOW[RADIUS], HIGH[RADIUS]))
-    out[RADIUS] = estimate(jackknife(math.log(radius), without)).mapped(math.exp)
-    return out
+    photographs: Sequence[FittedPhotograph], moved: Masks, start: Floats
+) -> tuple[PhotographFit, ...]:
+    fits = [fit_photograph(each, moved, start) for each in photographs]
+    return tuple(each for each in fits if each is not None)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -283,7 +236,6 @@ def _corners(state: MarkerState, noise: PhotographNoise) -> _Corners:
     variance = np.maximum((1 - share) * black + share * white, 0.0) + QUANTISATION_VARIANCE
     fields = np.zeros((CORNERS, *used.shape))
     fields[:, used] = influence.T * np.sqrt(variance) * max(noise.edge_ratio, 1.0)
-    correlated = smoothed(fields, kernel(np.nan_to_num(noise.correlation)))
     cells = np.clip(marker.modules_at[:, used] * CELLS, 0, CELLS - 1).astype(np.int64)
     number = cells[1] * CELLS + cells[0]
     moved = (state.scale * state.slope)[:, used]
@@ -299,7 +251,7 @@ def _corners(state: MarkerState, noise: PhotographNoise) -> _Corners:
         np.bincount(number, edge * each, minlength=CELLS**2) for each in (columns, rows)
     ]) / np.maximum(mass, 1e-12)
     return _Corners(
-        np.tensordot(fields, correlated, axes=([1, 2], [1, 2])),
+        np.tensordot(fields, fields, axes=([1, 2], [1, 2])),
         points.T + marker.frame_px, weights,
     )
 
@@ -468,103 +420,6 @@ def _matched(squares: Floats, fields: Floats) -> tuple[float, float]:
 
 
 # --------------------------------------------------------------------------------------------------
-# Levels of photographs, and how the light varies over the frame, from the levels of markers.
-
-MIN_LIT_MARKERS = 4
-"""Markers of a photograph from which the light's gradient follows, and how well."""
-
-ONE_DIRECTION_DEG = 40.0
-"""Standard deviation of the light's directions below which there is one."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PhotographLight:
-    """The levels of one photograph.
-
-    Attributes
-    ----------
-    black, white
-        At the middle of the frame.
-    variances
-        (2,) of these, from the spread of the markers.
-    gradient
-        (2,) relative change of the light across the frame's width, right and down; NaN with too
-        few markers.
-    gradient_variance
-        Sum of the variances of both.
-    """
-
-    black: float
-    white: float
-    variances: Floats
-    gradient: Floats
-    gradient_variance: float
-
-
-def photograph_light(states: Sequence[MarkerState], frame: Floats) -> PhotographLight:
-    """Return the levels of a photograph; ``frame`` (2,) is the frame's width and height in px."""
-    at = np.array([each.marker.centre_px for each in states])
-    at = (at - (frame - 1) / 2) / frame[0]
-    levels = np.array([each.levels[0] + np.array([0.0, each.levels[1]]) for each in states])
-    count = len(states)
-    none = np.full(2, np.nan)
-    if count < MIN_LIT_MARKERS or np.linalg.matrix_rank(at - at.mean(axis=0), tol=1e-3) < 2:
-        black, white = levels.mean(axis=0).tolist()
-        return PhotographLight(black, white, none, none, math.nan)
-    design = np.column_stack([np.ones(count), at])
-    inverse = np.linalg.inv(design.T @ design)
-    solution = inverse @ design.T @ levels[:, 1]
-    residuals = levels[:, 1] - design @ solution
-    variance = float(residuals @ residuals) / (count - 3)
-    white, gradient = float(solution[0]), solution[1:] / solution[0]
-    dark = levels[:, 0] / (1 + at @ gradient)
-    own = np.array([dark.var(ddof=1) / count, variance * inverse[0, 0]])
-    return PhotographLight(
-        float(dark.mean()), white, own, gradient,
-        variance * float(np.trace(inverse[1:, 1:])) / white**2,
-    )
-
-
-def gradient_square(lights: Sequence[PhotographLight]) -> Estimate:
-    """Return the mean square of the light's gradient, without what errors of levels add."""
-    return estimate(np.array([
-        each.gradient @ each.gradient - each.gradient_variance for each in lights
-    ]))
-
-
-def gradient_size(lights: Sequence[PhotographLight]) -> Estimate:
-    """Return the light's gradient: the root of the mean square, and its spread."""
-    square = gradient_square(lights)
-    lengths = np.array([np.linalg.norm(each.gradient) for each in lights])
-    variances = np.array([each.gradient_variance / 2 for each in lights])
-    spread = estimate(lengths, variances).spread
-    value, low, high = (
-        math.sqrt(max(end, 0.0)) if math.isfinite(end) else math.nan
-        for end in (square.value, square.low, square.high)
-    )
-    return Estimate(value, low, high, spread)
-
-
-def gradient_direction(lights: Sequence[PhotographLight]) -> Estimate | None:
-    """Return the direction in which the light grows, in degrees; None if there is not one."""
-    gradients = np.array([each.gradient for each in lights if np.isfinite(each.gradient).all()])
-    if not len(gradients):
-        return None
-    units = gradients / np.linalg.norm(gradients, axis=1, keepdims=True)
-    mean = math.degrees(math.atan2(*units.sum(axis=0)[::-1]))
-    angles = np.degrees(np.arctan2(gradients[:, 1], gradients[:, 0]))
-    deviations = (angles - mean + 180.0) % 360.0 - 180.0
-    if not math.sqrt(float(np.mean(deviations**2))) < ONE_DIRECTION_DEG:
-        return None
-    errors = np.array([
-        each.gradient_variance / 2 / max(float(each.gradient @ each.gradient), 1e-12)
-        for each in lights if np.isfinite(each.gradient).all()
-    ])
-    around = estimate(deviations, np.degrees(np.sqrt(errors)) ** 2)
-    return Estimate(mean + around.value, mean + around.low, mean + around.high, around.spread)
-
-
-# --------------------------------------------------------------------------------------------------
 # The terms of a scene: what each was estimated to be, and whether it is kept.
 
 DIGITS = 4
@@ -592,8 +447,7 @@ class Term:
     of
         Parameter that switches the effect on, if that is another one: they are kept together.
     setting
-        What a pipeline has in the place of a value or a distribution that follow from the
-        estimate; None for these.
+        What a pipeline has in the place of the estimate's value; None for that.
     """
 
     name: str
@@ -607,38 +461,18 @@ class Term:
 
     @property
     def value(self) -> Any:
-        """What a pipeline has: the mean, or a distribution of the spread between photographs."""
-        return drawn(self.parameter, self.estimate) if self.setting is None else self.setting
+        """What a pipeline has."""
+        return shortened(self.estimate.value) if self.setting is None else self.setting
 
     def as_json(self) -> dict[str, Any]:
         """Return its names, numbers and decision, for JSON."""
         one = self.estimate
         return {"name": self.name, "parameter": self.parameter, "value": one.value,
-                "low": one.low, "high": one.high, "spread": one.spread, "kept": self.kept,
-                "reason": self.reason}
+                "low": one.low, "high": one.high, "kept": self.kept, "reason": self.reason}
 
     def left_out(self, reason: str) -> Term:
         """Return it as not kept."""
         return replace(self, kept=False, reason=reason)
-
-
-def drawn(parameter: str, estimate: Estimate) -> Any:
-    """Return the mean, or the uniform distribution of the same mean and standard deviation.
-
-    Uniform, since a normal one has values that no scene can have, such as a blur below 0.
-    """
-    value = shortened(estimate.value)
-    declared = PARAMETERS[parameter].declaration
-    half = math.sqrt(3.0) * estimate.spread
-    if not half > 0 or not declared.drawable:
-        return value
-    low, high = estimate.value - half, estimate.value + half
-    if declared.low is not None:
-        low = max(low, declared.low)
-    if declared.high is not None:
-        high = min(high, declared.high)
-    low, high = shortened(low), shortened(high)
-    return {"uniform": [low, high]} if low < high else value
 
 
 def shortened(value: float) -> float:
@@ -780,7 +614,7 @@ def fit_scene(
         )
     noises = [photograph_noise(fit.states) for fit in camera.fits]
     terms = [
-        *_levels(camera, taken), *_optics(camera), *_light(camera, taken), *_noise(camera, noises),
+        *_levels(camera), *_optics(camera), *_noise(camera, noises),
         *_geometry(camera, noises, taken, board),
     ]
     terms = [
@@ -794,33 +628,28 @@ def fit_scene(
     )
 
 
-def _levels(camera: CameraFit, taken: PhotographScenes) -> list[Term]:
-    lights = [photograph_light(fit.states, taken.frame) for fit in camera.fits]
-    own = np.array([each.variances for each in lights])
+def _levels(camera: CameraFit) -> list[Term]:
+    black, contrast = (
+        np.array([np.mean([state.levels[k] for state in fit.states]) for fit in camera.fits])
+        for k in range(2)
+    )
     grounds = np.array([
         np.median([state.marker.ground for state in fit.states]) for fit in camera.fits
     ])
     return [
-        Term("black", "black", estimate(np.array([each.black for each in lights]), own[:, 0])),
-        Term("white", "white", estimate(np.array([each.white for each in lights]), own[:, 1])),
+        Term("black", "black", estimate(black)),
+        Term("white", "white", estimate(black + contrast)),
         Term("around the marker", "background", estimate(grounds)),
     ]
 
 
 def _optics(camera: CameraFit) -> list[Term]:
-    none = Estimate(math.nan)
-    variance, amount, bloom = (
-        camera.estimates.get(k, test)
-        for k, test in zip((VARIANCE, AMOUNT, BLOOM), camera.tested, strict=True)
-    )
-    blur = judged("blur", "blur_px", variance, 0.0, camera.tested[0], lambda v: v.mapped(_root))
-    sharpening = judged("sharpening", "sharpening", amount, 0.0, camera.tested[1])
-    radius = camera.estimates.get(RADIUS, none)
+    variance, amount, bloom = camera.estimates
+    of_variance, of_amount, of_bloom = camera.tested
     return [
-        blur, sharpening,
-        Term("radius of sharpening", "sharpening_px", radius, sharpening.kept,
-             "one for all photographs" if sharpening.kept else "no sharpening", of="sharpening"),
-        judged("bloom (tone)", "bloom", bloom, 0.0, camera.tested[2]),
+        judged("blur", "blur_px", variance, 0.0, of_variance, lambda v: v.mapped(_root)),
+        judged("sharpening", "sharpening", amount, 0.0, of_amount),
+        judged("bloom (tone)", "bloom", bloom, 0.0, of_bloom),
     ]
 
 
@@ -828,25 +657,8 @@ def _root(square: float) -> float:
     return math.sqrt(square) if square > 0 else (math.nan if math.isnan(square) else 0.0)
 
 
-def _light(camera: CameraFit, taken: PhotographScenes) -> list[Term]:
-    lights = [photograph_light(fit.states, taken.frame) for fit in camera.fits]
-    gradient = judged(
-        "light gradient", "illumination_gradient", gradient_size(lights), 0.0,
-        gradient_square(lights),
-    )
-    direction = gradient_direction(lights)
-    name, parameter = "direction of light", "illumination_deg"
-    if direction is None:
-        return [gradient, Term(
-            name, parameter, Estimate(math.nan), gradient.kept, "any", of="illumination_gradient",
-            setting={"uniform": [0.0, 360.0]},
-        )]
-    return [gradient, Term(name, parameter, direction, gradient.kept,
-                           "" if gradient.kept else "no gradient", of="illumination_gradient")]
-
-
 def _noise(camera: CameraFit, noises: Sequence[PhotographNoise]) -> list[Term]:
-    """Return the noise as a table of two levels, and its correlation."""
+    """Return the noise as a table of two levels."""
     level = [
         estimate(np.array([
             np.mean([state.levels[0] + share * state.levels[1] for state in fit.states])
@@ -867,19 +679,10 @@ def _noise(camera: CameraFit, noises: Sequence[PhotographNoise]) -> list[Term]:
         for colour, each in zip(("black", "white"), variances, strict=True)
     ]
     kept = any(each.kept and each.estimate.value > 0 for each in terms)
-    terms = [
+    return [
         Term(each.name, "noise_table", deviation, kept, each.reason, 0.0, setting=table)
         for each, deviation in zip(terms, deviations, strict=True)
     ]
-    correlation = judged(
-        "correlation of noise", "noise_correlation",
-        estimate(np.array([each.correlation for each in noises])), 0.0,
-    )
-    if correlation.kept and not kept:
-        correlation = correlation.left_out("no noise")
-    elif correlation.kept and correlation.estimate.value < 0:
-        correlation = correlation.left_out("negative, which no scene has")
-    return [*terms, correlation]
 
 
 def _geometry(

@@ -263,8 +263,7 @@ def scene_text(
     digest = hashlib.sha256("".join(record.digests).encode()).hexdigest()
     head = [
         f"Fitted to {found.markers} markers in {found.photographs} photographs ({plain(name)}),",
-        f"SHA-256 of their digests {digest[:16]}. A distribution is the spread from photograph to",
-        "photograph. Value, 95 % interval by photograph, spread:",
+        f"SHA-256 of their digests {digest[:16]}. Value, 95 % interval by photograph:",
         *(f"  {each.parameter}: {numbers_text(each)}" for each in found.terms if each.kept),
         *(f"  left out: {each.name}: {each.reason}" for each in found.terms if not each.kept),
         *lines, *found.lines,
@@ -276,11 +275,11 @@ def numbers_text(term: Term) -> str:
     """Return a term's estimate in words."""
     one = term.estimate
     if not math.isfinite(one.value):
-        return "any" if term.kept else "not known"
+        return "not known"
     text = f"{one.value:.4g}"
     if math.isfinite(one.low):
         text += f" [{one.low:.4g}, {one.high:.4g}]"
-    return text + (f", spread {one.spread:.2g}" if one.spread > 0 else "")
+    return text
 
 
 # --------------------------------------------------------------------------------------------------
@@ -294,9 +293,7 @@ OF_MARKERS = ("dictionary", "size_m")
 COMPARED = 'cornerRefinementMethod=["none", "subpix"]'
 """What the check compares unless it is set."""
 
-SWITCHES = (
-    "sharpening", "bloom", "illumination_gradient", "noise_correlation", "geometry_px",
-)
+SWITCHES = ("sharpening", "bloom", "geometry_px")
 """Effects that are kept where the errors of photographs that were not fitted say so."""
 
 NOT_NEEDED = "brings the errors no nearer to those of photographs that were not fitted"

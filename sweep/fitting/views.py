@@ -212,9 +212,8 @@ class FittedMarker:
         Along the side of the black square.
     corners_px
         (4, 2) the true corners of the black square in the box: TL, TR, BR, BL.
-    shape, across
-        (4, h, w) the share of each corner in the shift of a pixel, and (2, h, w) px right and down
-        from the marker's centre, over half its side.
+    shape
+        (4, h, w) the share of each corner in the shift of a pixel.
     frame_px
         (2,) first pixel of the box in the frame.
     row
@@ -230,7 +229,6 @@ class FittedMarker:
     modules: int
     corners_px: Floats
     shape: Floats
-    across: Floats
     frame_px: Integers
     row: int
     ground: float
@@ -239,11 +237,6 @@ class FittedMarker:
     def modules_at(self) -> Floats:
         """Column and row of the pixels as shares of the black square's side, (2, h, w)."""
         return np.stack([self.shape[1] + self.shape[2], self.shape[2] + self.shape[3]])
-
-    @property
-    def centre_px(self) -> Floats:
-        """The image of the square's centre in the frame, (2,)."""
-        return marker_centre(self.corners_px) + self.frame_px
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -339,20 +332,11 @@ def marker_view(
     if used.sum() < MIN_SIDE_PX**2:
         return None
     x, y = points / modules
-    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)))
-    across = (pixels - marker_centre(corners - low)[:, None, None]) / (side / 2)
     shape = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y])
     return FittedMarker(
         image[low[1] : high[1], low[0] : high[0]].astype(np.float64), used, optics, edges, modules,
-        corners - low, shape, across, low, row, _along(image, beyond),
+        corners - low, shape, low, row, _along(image, beyond),
     )
-
-
-def marker_centre(corners_px: Floats) -> Floats:
-    """Return the image (2,) of a square's centre: where its diagonals meet, of corners (4, 2)."""
-    first, second, third, fourth = corners_px
-    sides = np.stack([third - first, second - fourth], axis=1)
-    return np.asarray(first + np.linalg.solve(sides, second - first)[0] * (third - first))
 
 
 def _along(image: Grey, outline: Floats) -> float:

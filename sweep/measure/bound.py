@@ -204,7 +204,7 @@ def bound_of_scene(
         for j in range(width):
             image[i, j] += exact[i, j]
     chi_square, reached = fit(
-        image, squares(image), mirrored_state(state), view, work, spread_free,
+        image, squares(image), mirrored_state(state), view, work,
         MIRROR_STEPS, SETTLED, MAX_MIRROR_DISTANCE**2, information,
     )
     if not reached or chi_square < 1e-2:

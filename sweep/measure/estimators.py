@@ -19,8 +19,7 @@ from sweep.measure.estimation import (
     credible_estimates,
 )
 from sweep.measure.flags import EstimateStatus
-from sweep.measure.photograph import PhotometricReal
-from sweep.measure.photometric import Photometric
+from sweep.measure.photometric import Photometric, PhotometricReal
 from sweep.measure.solver import OPENCV_SOLVERS, OpenCVSolver, PointSolver
 from sweep.model.lens import COUNTS
 from sweep.plugins import EstimatorPlugin, Poses
@@ -219,11 +218,10 @@ SOLVERS: dict[str, Solver] = {
         needs_images=True, planar_only=True, of_boards=True,
     ),
     "photometric_real": Solver(
-        "least squares on the pixels of photographs: what else is on the board, point spread, "
-        "light, tone and sharpening are in the model, noise is estimated",
+        "least squares on the pixels of photographs: what else is on the board, point spread "
+        "and tone are in the model, noise is estimated",
         lambda setting: PhotometricReal(
-            setting.refined_starts, setting.estimate_light, setting.estimate_tone,
-            setting.estimate_sharpening, setting.assumed_sharpening_px,
+            setting.refined_starts, spread_free=True, tone=setting.estimate_tone
         ),
         needs_images=True, planar_only=True,
     ),
@@ -287,19 +285,8 @@ class EstimatorSetting:
         False, "photometric also estimates the point spread, starting from believed_blur_px; "
         "photometric_real always does",
     )
-    estimate_light: bool = parameter(
-        True, "photometric_real estimates light that varies linearly over the marker, on black and "
-        "on white",
-    )
     estimate_tone: bool = parameter(
         True, "photometric_real estimates a tone curve, a term in s (1 - s) of white's share s"
-    )
-    estimate_sharpening: bool = parameter(
-        True, "photometric_real estimates the amount of sharpening"
-    )
-    assumed_sharpening_px: float = parameter(
-        1.0, "radius of the sharpening that photometric_real estimates", unit="px", low=0.3,
-        high=20,
     )
     believed: str = parameter(
         "truth", "the camera that is assumed where no other belief says otherwise. truth: the true "

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.compilation import compiled
+from sweep.compilation import choose_when_compiled, compiled
 from sweep.model.board import Board
 from sweep.model.coverage import MarkerEdges
 from sweep.model.derivatives import (
@@ -87,12 +88,15 @@ def pose_covariance(information: Floats, variance: float, distance: float) -> tu
 # for at every step (Golub and Pereyra, "The differentiation of pseudo-inverses and nonlinear
 # least squares problems whose variables separate", SIAM J. Numer. Anal. 10, 1973).
 
-STATE_LENGTH = 16
+STATE_LENGTH = 18
 ROTATION, POSITION = slice(0, 9), slice(9, 12)
 DEPTH, SPREAD = 11, 12
 GREY_LEVELS = slice(13, 16)
+OUTSIDE, BLACK, WHITE, OUTSIDE_SHARE, TONE = 13, 14, 15, 16, 17
 """A state vector: rotation matrix (row by row), position in metres, of which the last is the depth,
-standard deviation of the point spread in pixels, and the levels of outside, black and white."""
+standard deviation of the point spread in pixels, the levels of outside, black and white; and of
+photographs, as shares of the contrast, the level outside and the tone curve, for which slopes are
+computed (:mod:`sweep.measure.photograph_model`)."""
 
 MIN_SPREAD_PX = 0.1
 """Smallest point spread that is estimated; a smaller one becomes 0 and stays so."""
@@ -134,7 +138,9 @@ class MarkerView(NamedTuple):
     optics
         The camera; its principal point is relative to the image's first pixel.
     variance
-        Variance of a pixel's noise in squared grey levels.
+        Variance of a pixel's noise in squared grey levels; 0 if it is not known.
+    least_spread_px
+        Smallest point spread of a state.
     """
 
     edges: MarkerEdges
@@ -143,6 +149,7 @@ class MarkerView(NamedTuple):
     size_m: float
     optics: Optics
     variance: float
+    least_spread_px: float
 
 
 def marker_view(
@@ -158,7 +165,7 @@ def marker_view(
     local[2:] -= corner
     return MarkerView(
         outline, box, extent_of(target).modules, float(size_m),
-        Optics(local, optics.lens, optics.distorted), float(variance),
+        Optics(local, optics.lens, optics.distorted), float(variance), 0.0,
     )
 
 
@@ -183,8 +190,8 @@ def noise_variance(noise_grey: float) -> float:
 
 
 def state_of(rotation: Floats, translation: Floats, spread_px: float, levels: Floats) -> Floats:
-    """Return the state (16,) of a pose (3, 3), (3,), a point spread, and levels (3,)."""
-    return np.concatenate([rotation.ravel(), translation, [spread_px], levels])
+    """Return the state (18,) of a pose (3, 3), (3,), a point spread, and levels (3,)."""
+    return np.concatenate([rotation.ravel(), translation, [spread_px], levels, np.zeros(2)])
 
 
 @compiled
@@ -249,33 +256,7 @@ def curvature(
         if spread_free and state[SPREAD] > 0.0:
             work.slopes[slot, POSE] /= 2.0 * state[SPREAD]
     normal_equations(image, work, free, matrix, vector)
-    levels = np.empty((LEVELS, LEVELS))
-    right = np.empty((LEVELS, free + 1))
-    for k in range(LEVELS):
-        right[k, free] = vector[free + k]
-        for m in range(LEVELS):
-            levels[k, m] = matrix[free + k, free + m]
-        if not levels[k, k] > 0.0:
-            # An area that covers no pixel gets the level 0.
-            levels[k, k] = 1.0
-        for m in range(free):
-            right[k, m] = matrix[free + k, m]
-    if not solve_positive(levels, right):
-        information[:] = 0.0
-        gradient[:] = 0.0
-        return 0.0
-    explained = 0.0
-    for k in range(LEVELS):
-        grey_levels[k] = right[k, free]
-        explained += right[k, free] * vector[free + k]
-    for i in range(free):
-        gradient[i] = vector[i]
-        for k in range(LEVELS):
-            gradient[i] -= matrix[i, free + k] * right[k, free]
-        for j in range(free):
-            information[i, j] = matrix[i, j]
-            for k in range(LEVELS):
-                information[i, j] -= matrix[i, free + k] * right[k, j]
+    explained = eliminate(matrix, vector, grey_levels, information, gradient)
     if spread_free and not state[SPREAD] > 0.0:
         # A point spread of 0 stays as it is.
         information[POSE, POSE] = 1.0
@@ -283,12 +264,53 @@ def curvature(
 
 
 @compiled
-def moved_state(state: Floats, step: Floats, most: float) -> Floats:
-    """Return the state after a step, shortened to ``most`` times the largest turn and shift."""
+def eliminate(
+    matrix: Floats, vector: Floats, linear: Floats, information: Floats, gradient: Floats
+) -> float:
+    """Solve for the linear parameters, the last ones, of normal equations.
+
+    ``matrix`` (n, n) and ``vector`` (n,) are JᵀJ and Jᵀ · image. ``linear`` gets the solution,
+    ``information`` (free, free) and ``gradient`` (free,) those of the others with the linear ones
+    eliminated. Returns the explained part of the image's sum of squares; 0 if they cannot be
+    solved for.
+    """
+    free, count = len(gradient), len(linear)
+    inner, right = np.empty((count, count)), np.empty((count, free + 1))
+    for k in range(count):
+        right[k, free] = vector[free + k]
+        for m in range(count):
+            inner[k, m] = matrix[free + k, free + m]
+        if not inner[k, k] > 0.0:
+            # What covers no pixel gets the level 0.
+            inner[k, k] = 1.0
+        for m in range(free):
+            right[k, m] = matrix[free + k, m]
+    if not solve_positive(inner, right):
+        information[:] = 0.0
+        gradient[:] = 0.0
+        return 0.0
+    explained = 0.0
+    for k in range(count):
+        linear[k] = right[k, free]
+        explained += right[k, free] * vector[free + k]
+    for i in range(free):
+        gradient[i] = vector[i]
+        for k in range(count):
+            gradient[i] -= matrix[i, free + k] * right[k, free]
+        for j in range(free):
+            information[i, j] = matrix[i, j]
+            for k in range(count):
+                information[i, j] -= matrix[i, free + k] * right[k, j]
+    return explained
+
+
+@compiled
+def moved_state(state: Floats, step: Floats, least_spread_px: float) -> Floats:
+    """Return the state after a step, shortened to the largest turn and shift."""
     turn = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
     shift = math.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
-    shrink = min(1.0, most * MAX_TURN / max(turn, 1e-300))
-    shrink = min(shrink, most * MAX_SHIFT / max(shift, 1e-300))
+    shrink = min(1.0, MAX_TURN / max(turn, 1e-300))
+    shrink = min(shrink, MAX_SHIFT / max(shift, 1e-300))
     moved = state.copy()
     before, position = rotation_of(state), state[POSITION]
     after, moved_position = rotation_of(moved), moved[POSITION]
@@ -308,6 +330,7 @@ def moved_state(state: Floats, step: Floats, most: float) -> Floats:
         wanted = min(squared + shrink * step[POSE], 4.0 * squared + 0.1)
         wanted = max(wanted, 0.25 * squared)
         moved[SPREAD] = math.sqrt(wanted) if wanted >= MIN_SPREAD_PX**2 else 0.0
+        moved[SPREAD] = max(moved[SPREAD], least_spread_px)
     return moved
 
 
@@ -321,30 +344,100 @@ def overwrite(values: Floats, others: Floats) -> None:
         values[k] = others[k]
 
 
-@compiled
-def fit(
-    image: Floats, square_sum: float, state: Floats, view: MarkerView, work: Work,
-    spread_free: bool, most_steps: int, settled: float, worth: float, information: Floats,
-) -> tuple[float, bool]:
-    """Move ``state`` to the nearest maximum of the likelihood.
+class Pixels(NamedTuple):
+    """An image (height, width), NaN where a pixel is left out, its sum of squares, and its view."""
 
-    Returns chi-square and whether the maximum was reached: the undamped Newton step is shorter
-    than ``settled`` squared standard deviations, and is taken; or shorter than
-    ``NEARLY_SETTLED`` after ``most_steps``, or when no step decreases chi-square. The fit is
-    abandoned if that step predicts a chi-square above ``worth``. ``information`` (free, free) is
-    that of :func:`curvature` at the last state; its inverse times the variance is the covariance.
+    levels: Floats
+    square_sum: float
+    marker: MarkerView
+
+
+MODELS: dict[type, Callable[..., float]] = {}
+"""What is seen -> the function that does what :func:`squared_residuals` does by its model."""
+
+
+def squared_residuals(
+    seen: Any, state: Floats, work: Any, information: Floats, gradient: Floats
+) -> float:
+    """Return the sum of squared residuals at a state, with the linear parameters solved for.
+
+    ``information`` (free, free) and ``gradient`` (free,) get JᵀJ and Jᵀ · residuals of the other
+    parameters; ``state`` its levels, from which the next slopes are.
     """
-    free = POSE + 1 if spread_free else POSE
+    return MODELS[type(seen)](seen, state, work, information, gradient)
+
+
+choose_when_compiled(squared_residuals, MODELS)
+
+
+@compiled
+def _squares_of_pixels(
+    pixels: Pixels, state: Floats, work: Work, information: Floats, gradient: Floats
+) -> float:
+    """As :func:`squared_residuals`, by the exact image."""
+    spread_free = len(gradient) > POSE
+    if not state[GREY_LEVELS].any():
+        # Slopes need levels.
+        curvature(
+            pixels.levels, state, pixels.marker, work, spread_free, information, gradient
+        )
+    return pixels.square_sum - curvature(
+        pixels.levels, state, pixels.marker, work, spread_free, information, gradient
+    )
+
+
+MODELS[Pixels] = _squares_of_pixels
+
+
+@compiled
+def unit_of(view: MarkerView, squares: float, freedom: int) -> float:
+    """Return the noise's variance; of residuals as noise, where it is not known."""
+    return view.variance if view.variance > 0.0 else squares / freedom
+
+
+@compiled
+def descend(
+    seen: Any, state: Floats, work: Any, freedom: int, most_steps: int, settled: float,
+    worth: float, information: Floats,
+) -> tuple[float, bool]:
+    """Move ``state`` to the nearest minimum of the sum of squared residuals.
+
+    Levenberg-Marquardt with :func:`squared_residuals`.
+
+    Parameters
+    ----------
+    seen, work
+        What is seen, whose ``marker`` is a :class:`MarkerView`, and scratch space.
+    state
+        Where it starts; gets where it ends.
+    freedom
+        Pixels less parameters.
+    most_steps
+        Steps after which it ends.
+    settled
+        Squared standard deviations of the last undamped step.
+    worth
+        It is abandoned if undamped steps predict a sum above this.
+    information
+        (free, free) at the last state; its inverse times the variance is the covariance.
+
+    Returns
+    -------
+    tuple
+        The sum, and whether the minimum was reached: the undamped step is shorter than
+        ``settled``, and is taken; or shorter than ``NEARLY_SETTLED`` after ``most_steps``, or when
+        no step decreases the sum.
+    """
+    view = seen.marker
+    free = len(information)
     gradient = np.empty(free)
     trial_information, trial_gradient = np.empty((free, free)), np.empty(free)
-    state[GREY_LEVELS] = 0.0
-    curvature(image, state, view, work, spread_free, information, gradient)
-    explained = curvature(image, state, view, work, spread_free, information, gradient)
-    chi_square = (square_sum - explained) / view.variance
+    squares = squared_residuals(seen, state, work, information, gradient)
     damping = 1e-3
     above = 0
     decrement = math.inf
     for _ in range(most_steps):
+        unit = unit_of(view, squares, freedom)
         newton = gradient.copy().reshape(free, 1)
         regular = solve_positive(information, newton)
         decrement = math.inf
@@ -352,12 +445,14 @@ def fit(
             decrement = 0.0
             for k in range(free):
                 decrement += gradient[k] * newton[k, 0]
-            above = above + 1 if chi_square - decrement / view.variance > worth else 0
+            above = above + 1 if squares - decrement > worth else 0
             if above > PATIENCE:
-                return chi_square, False
-            if decrement < settled * view.variance:
-                overwrite(state, moved_state(state, newton[:, 0], 1.0))
-                return chi_square, True
+                return squares, False
+            if decrement < settled * unit:
+                moved = moved_state(state, newton[:, 0], view.least_spread_px)
+                if is_before_camera(moved, view):
+                    overwrite(state, moved)
+                return squares, True
         accepted = False
         for _attempt in range(10):
             damped = information.copy()
@@ -367,25 +462,41 @@ def fit(
             if not solve_positive(damped, step):
                 damping = max(10.0 * damping, 1e-3)
                 continue
-            trial = moved_state(state, step[:, 0], 1.0)
+            trial = moved_state(state, step[:, 0], view.least_spread_px)
             if is_before_camera(trial, view):
-                explained = curvature(
-                    image, trial, view, work, spread_free, trial_information, trial_gradient
+                trial_squares = squared_residuals(
+                    seen, trial, work, trial_information, trial_gradient
                 )
-                trial_chi_square = (square_sum - explained) / view.variance
-                if trial_chi_square < chi_square:
+                if trial_squares < squares:
                     accepted = True
                     break
             damping = max(8.0 * damping, 1e-3)
         if not accepted:
             break
-        chi_square = trial_chi_square
+        squares = trial_squares
         overwrite(state, trial)
         overwrite(gradient, trial_gradient)
         for k in range(free):
             overwrite(information[k], trial_information[k])
         damping *= 0.1
-    return chi_square, decrement < NEARLY_SETTLED * view.variance
+    return squares, decrement < NEARLY_SETTLED * unit_of(view, squares, freedom)
+
+
+@compiled
+def fit(
+    image: Floats, square_sum: float, state: Floats, view: MarkerView, work: Work, most_steps: int,
+    settled: float, worth: float, information: Floats,
+) -> tuple[float, bool]:
+    """Move ``state`` to the nearest maximum of the likelihood by the exact image.
+
+    As :func:`descend`, with chi-square in the place of squares.
+    """
+    state[GREY_LEVELS] = 0.0
+    squares, reached = descend(
+        Pixels(image, square_sum, view), state, work, 1, most_steps, settled,
+        worth * view.variance, information,
+    )
+    return squares / view.variance, reached
 
 
 @compiled
@@ -411,6 +522,7 @@ def binned_view(view: MarkerView) -> MarkerView:
     return MarkerView(
         view.edges, view.extent, view.modules, view.size_m,
         Optics(intrinsics, view.optics.lens, view.optics.distorted), 0.25 * view.variance,
+        view.least_spread_px,
     )
 
 

@@ -8,9 +8,21 @@ from typing import NamedTuple
 import numpy as np
 
 from sweep.compilation import compiled, compiled_inline
-from sweep.measure.estimation import Detections
-from sweep.measure.likelihood import DEPTH, SPREAD, MarkerView, plane_of
-from sweep.measure.surroundings import clear_modules, edges_alone, surroundings
+from sweep.measure.likelihood import (
+    BLACK,
+    DEPTH,
+    MODELS,
+    OUTSIDE,
+    OUTSIDE_SHARE,
+    SPREAD,
+    TONE,
+    WHITE,
+    MarkerView,
+    eliminate,
+    plane_of,
+)
+from sweep.measure.surroundings import BoardMarker, clear_modules, edges_alone, surroundings
+from sweep.model.board import Board
 from sweep.model.coverage import NODES, WEIGHTS, MarkerEdges
 from sweep.model.derivatives import POSE
 from sweep.model.lens import jacobian, undistort
@@ -23,7 +35,7 @@ from sweep.model.polygon import (
     distorted_point,
     homogeneous_pixel,
 )
-from sweep.typing import Floats, Integers
+from sweep.typing import Floats, Grey, Integers
 
 # --------------------------------------------------------------------------------------------------
 # A printed plane's blurred image and its slopes, as a photograph is fitted by them.
@@ -227,50 +239,30 @@ def add_plane(
 #
 # The level of a pixel is modelled as
 #
-#     y = F(b + c m + d p + e m (1 - m)) + gx x + gy y + (hx x + hy y) F(m),
-#     F(z) = z + a (z - G(z)),
+#     y = b + c (m + e m (1 - m)) + d p,
 #
-# m is the share of white through a Gaussian point spread, p that of the area outside the modelled
-# paper; b, c, d are levels, e is the tone curve, g and h are the light's gradients on black and
-# on white, and F is sharpening of an amount a, G being the mean over a Gaussian of ``radius_px``.
-# With a c as a parameter in the place of a, all but the pose and the point spread is linear.
+# m is the share of white through a Gaussian point spread, of which the area outside the modelled
+# paper is a part, p the share of that area; b, c, d are levels, e is the tone curve. With c e as a
+# parameter in the place of e, all but the pose and the point spread is linear. The state of a fit
+# is that of :mod:`sweep.measure.likelihood`.
 
-AMOUNT, OUTSIDE_VALUE, TONE = 13, 14, 15
-CONTRAST = 16
-STATE_LENGTH = 19
-"""A state vector begins as that of :mod:`sweep.measure.likelihood`, up to the point spread; then
-from the last solution of the linear parameters the amount of sharpening, the value of outside and
-the tone, both as shares of the contrast, and the contrast with its slopes along x and y."""
-
-MOVED = POSE + 1
-"""Parameters that are moved: the pose's, and the point spread's variance."""
+MOVED, LINEAR = POSE + 1, 4
+"""Parameters that are moved, the pose's and the point spread's variance, and the linear ones."""
 
 MAX_TONE = 5.0
 """Largest tone, as a share of the contrast, for which slopes are computed."""
 
-MIN_AMOUNT, MAX_AMOUNT = -0.9, 5.0
-"""Range of the amount of sharpening for which slopes are computed."""
+MAX_OUTSIDE = 2.0
+"""Largest level outside, from black, as a share of the contrast."""
+
+MIN_OUTSIDE_PX = 1.0
+"""Pixels of the area outside, by squares of its shares, below which its level stays as it is."""
+
+MIN_SPREAD_PX = 0.2
+"""Smallest point spread that is estimated."""
 
 LENS_STEP_PX = 8
 """Pixels between those at which the lens is inverted; between them it is interpolated."""
-
-
-class Nuisances(NamedTuple):
-    """Which nuisances are estimated beside the pose, the point spread and the levels.
-
-    Attributes
-    ----------
-    outside, light, tone, sharpening
-        The level outside the paper, light that varies linearly, the tone curve, and sharpening.
-    radius_px
-        Radius of the sharpening in px.
-    """
-
-    outside: bool
-    light: bool
-    tone: bool
-    sharpening: bool
-    radius_px: float
 
 
 class PhotographView(NamedTuple):
@@ -292,6 +284,8 @@ class PhotographView(NamedTuple):
         (2, height, width) x and y relative to the marker's centre, in halves of its extent.
     panel_px
         Least length of the pieces in which edges are integrated.
+    toned
+        Whether the tone curve is estimated.
     """
 
     marker: MarkerView
@@ -300,6 +294,7 @@ class PhotographView(NamedTuple):
     rays: Floats
     at: Floats
     panel_px: float
+    toned: bool
 
 
 class System(NamedTuple):
@@ -310,24 +305,18 @@ class System(NamedTuple):
     slopes
         As :func:`sweep.measure.photograph_model.slope_space` returns it.
     images
-        (8, height, width): the level's slopes by contrast, tone, x, y, the point spread's variance,
-        the area outside and the amount of sharpening, all as shares of the contrast; and the share
-        of white, sharpened.
-    scratch
-        (2, height, width).
+        (6, height, width): the level's slopes by contrast, tone, x, y, the point spread's variance
+        and the area outside, all as shares of the contrast.
     """
 
     slopes: Slopes
     images: Floats
-    scratch: Floats
 
 
 @compiled
 def system(height: int, width: int) -> System:
     """Return the scratch space for a box."""
-    return System(
-        slope_space(height, width), np.empty((8, height, width)), np.empty((2, height, width))
-    )
+    return System(slope_space(height, width), np.empty((6, height, width)))
 
 
 @compiled
@@ -377,55 +366,12 @@ def rays_of(optics: Optics, height: int, width: int) -> Floats:
 
 
 @compiled
-def smooth(image: Floats, radius: float, smoothed: Floats, scratch: Floats) -> None:
-    """Write an image's (height, width) mean over a Gaussian; zeros lie beyond the box."""
-    height, width = image.shape
-    half = math.ceil(3.0 * radius)
-    kernel = np.empty(half + 1)
-    total = 0.0
-    for k in range(half + 1):
-        kernel[k] = math.exp(-0.5 * (k / radius) ** 2)
-        total += kernel[k] if k == 0 else 2.0 * kernel[k]
-    for k in range(half + 1):
-        kernel[k] /= total
-    for i in range(height):
-        row, out = image[i], scratch[i]
-        for j in range(width):
-            out[j] = kernel[0] * row[j]
-        for k in range(1, min(half, width // 2) + 1):
-            share = kernel[k]
-            for j in range(k):
-                out[j] += share * row[j + k]
-                out[width - 1 - j] += share * row[width - 1 - j - k]
-            middle, before, after = out[k : width - k], row[: width - 2 * k], row[2 * k :]
-            for j in range(width - 2 * k):
-                middle[j] += share * (before[j] + after[j])
-    for i in range(height):
-        out, row = smoothed[i], scratch[i]
-        for j in range(width):
-            out[j] = kernel[0] * row[j]
-        for k in range(1, half + 1):
-            share = kernel[k]
-            above, below = scratch[max(i - k, 0)], scratch[min(i + k, height - 1)]
-            if i >= k and i + k < height:
-                for j in range(width):
-                    out[j] += share * (above[j] + below[j])
-            elif i >= k or i + k < height:
-                one = above if i >= k else below
-                for j in range(width):
-                    out[j] += share * one[j]
-
-
-@compiled
-def draw(view: PhotographView, state: Floats, nuisances: Nuisances, work: System) -> None:
+def draw(view: PhotographView, state: Floats, work: System) -> None:
     """Write the images of a state to ``work.images``."""
     (rates, outsides), images = work.slopes, work.images
     height, width = view.levels.shape
-    values = np.zeros(3)
-    # The level of what is outside is no slope's if it is not estimated.
-    values[0], values[2] = state[OUTSIDE_VALUE] if nuisances.outside else 1.0, 1.0
     add_plane(
-        work.slopes, view.marker.edges, values,
+        work.slopes, view.marker.edges, np.array([state[OUTSIDE_SHARE], 0.0, 1.0]),
         Projection(plane_of(state, view.marker), view.marker.optics), state[SPREAD],
         view.panel_px,
     )
@@ -439,7 +385,7 @@ def draw(view: PhotographView, state: Floats, nuisances: Nuisances, work: System
             level += row[4 * j]
             outside += steps[j]
             shares[j] = level
-            squares[j] = level * (1.0 - level)
+            squares[j] = level * (1.0 - level) if view.toned else 0.0
             outer[j] = outside
             gain = 1.0 + tone * (1.0 - 2.0 * level)
             by_x[j] = gain * row[4 * j + 1]
@@ -447,54 +393,29 @@ def draw(view: PhotographView, state: Floats, nuisances: Nuisances, work: System
             by_spread[j] = gain * row[4 * j + 3]
         row[:] = 0.0
         steps[:] = 0.0
-    if not nuisances.sharpening:
-        return
-    amount = min(max(state[AMOUNT], MIN_AMOUNT), MAX_AMOUNT)
-    smoothed, scratch = work.scratch[0], work.scratch[1]
-    for k in range(5):
-        if k == 1 and not nuisances.tone:
-            continue
-        smooth(images[k], nuisances.radius_px, smoothed, scratch)
-        for i in range(height):
-            image, mean, added, sharp = images[k, i], smoothed[i], images[6, i], images[7, i]
-            if k == 0:
-                for j in range(width):
-                    added[j] = image[j] - mean[j]
-                for j in range(width):
-                    sharp[j] = image[j] + amount * added[j]
-            elif k == 1:
-                # Newton's step of contrast, tone and sharpening: amount · tone is a product.
-                shares = images[0, i]
-                for j in range(width):
-                    difference = image[j] - mean[j]
-                    image[j] += amount * difference
-                    added[j] += tone * difference
-                    shares[j] -= amount * tone * difference
-            else:
-                for j in range(width):
-                    image[j] += amount * (image[j] - mean[j])
 
 
 @compiled
 def write_columns(
-    view: PhotographView, state: Floats, nuisances: Nuisances, images: Floats,
-    i: int, first: int, columns: Floats,
+    view: PhotographView, state: Floats, contrast: float, images: Floats, i: int, first: int,
+    columns: Floats,
 ) -> None:
     """Write the model's derivatives at pixels of a row to ``columns`` (n, ...), from one on.
 
-    The order: six of the pose, the point spread's variance; black, contrast, outside, tone,
-    sharpening and the light's gradients, of those which are estimated; the level itself.
+    The order: six of the pose and the point spread's variance, which are for a ``contrast``; black,
+    contrast, outside, tone; the level itself.
     """
     last = first + len(columns)
     ray_x, ray_y = view.rays[0, i, first:last], view.rays[1, i, first:last]
     ux, uy = view.rays[2, i, first:last], view.rays[3, i, first:last]
     vx, vy = view.rays[4, i, first:last], view.rays[5, i, first:last]
-    at_x, at_y = view.at[0, i, first:last], view.at[1, i, first:last]
-    shares, by_u, by_v = (
-        images[0, i, first:last], images[2, i, first:last], images[3, i, first:last]
+    shares, squares, outside = (
+        images[0, i, first:last], images[1, i, first:last], images[5, i, first:last]
     )
-    by_spread = images[4, i, first:last]
-    contrast, along_x, along_y = state[CONTRAST], state[CONTRAST + 1], state[CONTRAST + 2]
+    by_u, by_v, by_spread = (
+        images[2, i, first:last], images[3, i, first:last], images[4, i, first:last]
+    )
+    levels = view.levels[i, first:last]
     position_x, position_y, position_z = state[9], state[10], state[11]
     # The plane's normal is the third column of the rotation matrix, position follows it.
     height = state[2] * position_x + state[5] * position_y + state[8] * position_z
@@ -503,9 +424,8 @@ def write_columns(
     for j in range(len(columns)):
         column = columns[j]
         x, y = ray_x[j], ray_y[j]
-        scale = contrast + along_x * at_x[j] + along_y * at_y[j]
         # The slope by the direction, from that by the pixel.
-        du, dv = scale * by_u[j], scale * by_v[j]
+        du, dv = contrast * by_u[j], contrast * by_v[j]
         by_x = du * ux[j] + dv * vx[j]
         by_y = du * uy[j] + dv * vy[j]
         inverse = normal_x * x + normal_y * y + normal_z
@@ -520,43 +440,115 @@ def write_columns(
         column[3] = -by_x * nearness
         column[4] = -by_y * nearness
         column[5] = by_z * nearness
-        column[6] = scale * by_spread[j]
+        column[6] = contrast * by_spread[j]
         column[7] = 1.0
         column[8] = shares[j]
-    k = MOVED + 2
-    if nuisances.outside:
-        _copy(images[5, i, first:last], columns, k)
-        k += 1
-    if nuisances.tone:
-        _copy(images[1, i, first:last], columns, k)
-        k += 1
-    if nuisances.sharpening:
-        _copy(images[6, i, first:last], columns, k)
-        k += 1
-    if nuisances.light:
-        sharp = images[7 if nuisances.sharpening else 0, i, first:last]
-        for j in range(len(columns)):
-            column = columns[j]
-            column[k], column[k + 1] = at_x[j], at_y[j]
-            column[k + 2], column[k + 3] = at_x[j] * sharp[j], at_y[j] * sharp[j]
-        k += 4
-    _copy(view.levels[i, first:last], columns, k)
+        column[9] = outside[j]
+        column[10] = squares[j]
+        column[11] = levels[j]
 
 
-@compiled_inline
-def _copy(row: Floats, columns: Floats, k: int) -> None:
-    """Write a row (n,) as the k-th of ``columns`` (n, ...)."""
-    for j in range(len(row)):
-        columns[j, k] = row[j]
+GROUP, TILE = 128, 4
+"""Pixels whose columns are multiplied at once, and the side of the tiles of their products."""
 
 
 @compiled
-def linear_count(nuisances: Nuisances) -> int:
-    """Return how many parameters are linear."""
-    return (
-        2 + int(nuisances.outside) + int(nuisances.tone) + int(nuisances.sharpening)
-        + 4 * int(nuisances.light)
+def normal_equations(view: PhotographView, state: Floats, work: System, matrix: Floats) -> None:
+    """Sum up JᵀJ, Jᵀy and yᵀy over the used pixels, for a contrast of 1, into a matrix (12, 12)."""
+    size = matrix.shape[0]
+    tiles = (size + TILE - 1) // TILE
+    columns, sums = np.zeros((GROUP, TILE * tiles)), np.zeros((TILE * tiles, TILE * tiles))
+    filled = 0
+    for i in range(len(view.spans)):
+        first, last = view.spans[i]
+        while first < last:
+            count = min(last - first, GROUP - filled)
+            write_columns(view, state, 1.0, work.images, i, first, columns[filled : filled + count])
+            filled += count
+            first += count
+            if filled == GROUP:
+                add_products(columns, filled, sums)
+                filled = 0
+    add_products(columns, filled, sums)
+    for k in range(size):
+        for m in range(k + 1):
+            matrix[k, m] = matrix[m, k] = sums[k, m]
+
+
+@compiled
+def add_products(columns: Floats, count: int, sums: Floats) -> None:
+    """Add the products of the columns of ``count`` pixels to the tiles of the lower triangle."""
+    for k in range(0, sums.shape[0], TILE):
+        for m in range(0, k + 1, TILE):
+            add_tile(columns, k, columns, m, count, sums)
+
+
+@compiled_inline
+def add_tile(left: Floats, k: int, right: Floats, m: int, count: int, sums: Floats) -> None:
+    """Add products of four columns of ``left`` from the k-th on with four of ``right``."""
+    s00 = s01 = s02 = s03 = s10 = s11 = s12 = s13 = 0.0
+    s20 = s21 = s22 = s23 = s30 = s31 = s32 = s33 = 0.0
+    for p in range(count):
+        row, other = left[p], right[p]
+        a0, a1, a2, a3 = row[k], row[k + 1], row[k + 2], row[k + 3]
+        b0, b1, b2, b3 = other[m], other[m + 1], other[m + 2], other[m + 3]
+        s00, s01, s02, s03 = s00 + a0 * b0, s01 + a0 * b1, s02 + a0 * b2, s03 + a0 * b3
+        s10, s11, s12, s13 = s10 + a1 * b0, s11 + a1 * b1, s12 + a1 * b2, s13 + a1 * b3
+        s20, s21, s22, s23 = s20 + a2 * b0, s21 + a2 * b1, s22 + a2 * b2, s23 + a2 * b3
+        s30, s31, s32, s33 = s30 + a3 * b0, s31 + a3 * b1, s32 + a3 * b2, s33 + a3 * b3
+    _add_to_row(sums[k], m, s00, s01, s02, s03)
+    _add_to_row(sums[k + 1], m, s10, s11, s12, s13)
+    _add_to_row(sums[k + 2], m, s20, s21, s22, s23)
+    _add_to_row(sums[k + 3], m, s30, s31, s32, s33)
+
+
+@compiled_inline
+def _add_to_row(row: Floats, m: int, a: float, b: float, c: float, d: float) -> None:
+    """Add four numbers to a row from column m on."""
+    row[m] += a
+    row[m + 1] += b
+    row[m + 2] += c
+    row[m + 3] += d
+
+
+@compiled
+def _squares_of_photograph(
+    view: PhotographView, state: Floats, work: System, information: Floats, gradient: Floats
+) -> float:
+    """As :func:`sweep.measure.likelihood.squared_residuals`, by the model of photographs."""
+    draw(view, state, work)
+    end = MOVED + LINEAR
+    matrix, linear = np.empty((end + 1, end + 1)), np.zeros(LINEAR)
+    normal_equations(view, state, work, matrix)
+    outside = MOVED + 2
+    if matrix[outside, outside] < MIN_OUTSIDE_PX:
+        matrix[outside, :] = 0.0
+        matrix[:, outside] = 0.0
+    squares = matrix[end, end] - eliminate(
+        matrix[:end, :end], matrix[end, :end], linear, information, gradient
     )
+    black, contrast, change, toned = linear[0], linear[1], linear[2], linear[3]
+    # The level outside was in the image, as a share of the contrast.
+    state[OUTSIDE] = black + contrast * state[OUTSIDE_SHARE] + change
+    state[BLACK], state[WHITE] = black, black + contrast
+    divisor = contrast if contrast != 0.0 else 1.0
+    share = state[OUTSIDE_SHARE] + min(max(change / divisor, -1.0), 1.0)
+    state[OUTSIDE_SHARE] = min(max(share, -1.0), MAX_OUTSIDE)
+    state[TONE] = toned / divisor
+    for k in range(MOVED):
+        gradient[k] *= contrast
+        for m in range(MOVED):
+            information[k, m] *= contrast**2
+    if state[SPREAD] <= MIN_SPREAD_PX and gradient[POSE] < 0.0:
+        # The squares fall beyond the limit.
+        for k in range(MOVED):
+            information[POSE, k] = information[k, POSE] = 0.0
+        information[POSE, POSE] = 1.0
+        gradient[POSE] = 0.0
+    return max(float(squares), 0.0)
+
+
+MODELS[PhotographView] = _squares_of_photograph
 
 
 # --------------------------------------------------------------------------------------------------
@@ -565,8 +557,8 @@ def linear_count(nuisances: Nuisances) -> int:
 RING_MODULES = 1.5
 """Widest part of the quiet zone that is fitted, in modules: farther out nothing tells the pose."""
 
-PADDING_PX = 2.0
-"""Pixels around the fitted ones in the box, beside the reach of the sharpening."""
+PADDING_PX = 2
+"""Pixels around the fitted ones in the box."""
 
 PANEL_PX, COARSE_PANEL_PX = 0.4, 0.8
 """Least length of the pieces in which edges are integrated, in px: of the photograph, and of means
@@ -577,21 +569,31 @@ MODELLED_PX = 5.0
 
 
 def photograph_view(
-    detections: Detections, i: int, square: Floats, reach: float
+    marker: Board, on_board: BoardMarker | None, size_m: float, corners: Floats, optics: Optics,
+    image: Grey, origin: Integers, toned: bool,
 ) -> PhotographView | None:
-    """Return what is fitted of one detection, and what is known of it; None if that is nothing.
+    """Return what is fitted of one marker, and what is known of it; None if that is nothing.
 
-    The pixels of the marker and of its quiet zone, as far as the detected corners tell: ``square``
-    (3, 3) is the homography of the unit square to them. ``reach`` is how far sharpening carries in
-    px.
+    The pixels of the marker and of its quiet zone, as far as its corners tell.
+
+    Parameters
+    ----------
+    marker, on_board, size_m
+        What is printed, and the black square's side.
+    corners
+        (4, 2) px of the frame.
+    optics
+        The camera.
+    image, origin
+        Grey levels, and the image's first pixel in the frame.
+    toned
+        Whether the tone curve is estimated.
     """
-    padding = PADDING_PX + reach
-    target = detections.targets[i]
-    dictionary, margin = target.dictionary, target.margin or 0.0
+    dictionary, margin = marker.dictionary, marker.margin or 0.0
     modules = module_count(dictionary)
-    corners = detections.corners[i].tolist()
+    with np.errstate(invalid="ignore", divide="ignore"):  # three corners on a line
+        square = from_unit_square(corners[None])[0]
     side = 0.25 * sum(math.dist(corners[k - 1], corners[k]) for k in range(4))
-    on_board = None if detections.on_board is None else detections.on_board[i]
     ring = margin if on_board is None else clear_modules(on_board)
     ring = min(max(ring, overhang(dictionary) + 0.5), overhang(dictionary) + RING_MODULES)
     if not np.isfinite(square).all() or np.linalg.det(square) == 0.0:
@@ -605,12 +607,11 @@ def photograph_view(
     if not (outline[2] > 0.0).all():
         return None  # part of it is behind the horizon
     pixels = (outline[:2] / outline[2]).T
-    image, origin = detections.images[i], detections.origins[i]
-    low = np.floor(pixels.min(axis=0) - padding).astype(np.int64)
-    high = np.ceil(pixels.max(axis=0) + padding).astype(np.int64) + 1
+    low = np.floor(pixels.min(axis=0) - PADDING_PX).astype(np.int64)
+    high = np.ceil(pixels.max(axis=0) + PADDING_PX).astype(np.int64) + 1
     # A detection may be much wider in the plane than the image that was searched.
-    low = np.maximum(low, origin - math.ceil(padding))
-    high = np.minimum(high, origin + image.shape[::-1] + math.ceil(padding))
+    low = np.maximum(low, origin - PADDING_PX)
+    high = np.minimum(high, origin + image.shape[::-1] + PADDING_PX)
     width, height = (high - low).tolist()
     if min(width, height) < 4:
         return None
@@ -623,24 +624,44 @@ def photograph_view(
     levels[top:bottom, left:right] = image[
         first_row : first_row + bottom - top, first_column : first_column + right - left
     ]
-    optics = detections.cameras.optics(i)
     local = optics.intrinsics.copy()
     local[2:] -= low
     optics = Optics(local, optics.lens, optics.distorted)
     extent = math.ceil(4.0 * (ring + MODELLED_PX * modules / side)) / 4.0
     around = (
-        edges_alone(target, extent) if on_board is None
-        else surroundings(on_board, extent)
+        edges_alone(marker, extent) if on_board is None else surroundings(on_board, extent)
     )
-    marker = MarkerView(
-        around, np.repeat([-extent, modules + extent], 2), float(modules),
-        float(detections.size_m[i]), optics, 1.0,
+    known = MarkerView(
+        around, np.repeat([-extent, modules + extent], 2), float(modules), float(size_m), optics,
+        0.0, MIN_SPREAD_PX,
     )
     to_modules[:, 2] += to_modules[:, :2] @ low
     at, spans = _fitted_pixels(
         to_modules, float(modules), ring, height, width, np.array([left, top, right, bottom])
     )
-    return PhotographView(marker, levels, spans, rays_of(optics, height, width), at, PANEL_PX)
+    return PhotographView(
+        known, levels, spans, rays_of(optics, height, width), at, PANEL_PX, toned
+    )
+
+
+def from_unit_square(quads: Floats) -> Floats:
+    """Return the homographies (P, 3, 3) of the unit square to quadrilaterals (P, 4, 2).
+
+    (0, 0), (1, 0), (1, 1), (0, 1) become the corners in their order. From Heckbert, "Fundamentals
+    of texture mapping and image warping" (1989), section 2.2.3.
+    """
+    p0, p1, p2, p3 = (quads[:, k] for k in range(4))
+    d1, d2, total = p1 - p2, p3 - p2, p0 - p1 + p2 - p3
+
+    def cross(a: Floats, b: Floats) -> Floats:
+        return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+    area = cross(d1, d2)
+    g, h = (cross(total, d2) / area)[:, None], (cross(d1, total) / area)[:, None]
+    out = np.ones((len(quads), 3, 3))
+    out[:, :2, 0], out[:, :2, 1], out[:, :2, 2] = p1 - p0 + g * p1, p3 - p0 + h * p3, p0
+    out[:, 2, :2] = np.column_stack([g, h])
+    return out
 
 
 @compiled
@@ -695,11 +716,12 @@ def binned_photograph(view: PhotographView) -> PhotographView:
             _halve(
                 view.rays[k, 2 * i], view.rays[k, 2 * i + 1], 0.25 if k < 2 else 0.125, rays[k, i]
             )
+    known = view.marker
     marker = MarkerView(
-        view.marker.edges, view.marker.extent, view.marker.modules, view.marker.size_m, optics,
-        view.marker.variance,
+        known.edges, known.extent, known.modules, known.size_m, optics, known.variance,
+        known.least_spread_px,
     )
-    return PhotographView(marker, levels, spans, rays, at, COARSE_PANEL_PX)
+    return PhotographView(marker, levels, spans, rays, at, COARSE_PANEL_PX, view.toned)
 
 
 @compiled

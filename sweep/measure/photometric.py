@@ -1,9 +1,11 @@
-"""Pose from pixels: maximum likelihood with the exact image."""
+"""Pose of a marker or a board from pixels: by the exact image, or by a photograph's model."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -13,17 +15,21 @@ from sweep.measure.estimation import Detections, Estimates, covariance_elsewhere
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.likelihood import (
     BACKGROUND_MARGIN_PX,
+    BLACK,
     DEPTH,
+    GREY_LEVELS,
     MIN_NOISE,
     NEARLY_SETTLED,
     POSITION,
     SETTLED,
     SPREAD,
     STATE_LENGTH,
+    WHITE,
     MarkerView,
+    Pixels,
     binned,
     binned_view,
-    fit,
+    descend,
     is_before_camera,
     marker_view,
     middle_m,
@@ -35,48 +41,77 @@ from sweep.measure.likelihood import (
     squares,
     state_of,
     turn_between,
+    unit_of,
+)
+from sweep.measure.photograph import judge
+from sweep.measure.photograph_model import (
+    LINEAR,
+    MOVED,
+    PhotographView,
+    binned_photograph,
+    photograph_view,
+    pixel_count,
+    system,
 )
 from sweep.measure.solver import (
     MIN_POINTS,
     Pose,
     both_planar_solutions,
     guarded_poses,
-    one_by_one,
     poses_of_each_marker,
-    reprojection_errors_px,
     reprojection_px,
 )
+from sweep.measure.surroundings import BoardMarker
+from sweep.model.board import Board
+from sweep.model.camera import Cameras
 from sweep.model.derivatives import LEVELS, POSE, known_pixels, work_space
 from sweep.model.marker import module_count
 from sweep.model.pose import transform_points
 from sweep.model.printed import box_corners, extent_of, unit_m
-from sweep.typing import Floats, Grey
+from sweep.typing import Floats, Grey, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
-# Pose from pixels: maximum likelihood with the exact image, started from the detector's corners.
+# The best minimum and the next one, from several starts.
 #
-# The chi-square of a small image has several minima: the two planar solutions, and poses with
+# The sum of squares of a small image has several minima: the two planar solutions, and poses with
 # edges on wrong pixels. So there are several starts. Each is first fitted to the means of 2 x 2
-# pixels, for which the exact model holds as well and whose minima are wider. Starts that end far
-# above the best are dropped, the others are fitted to the pixels; the best is compared with the
-# minimum that is reached from its mirror. If none explains the pixels, the starts are fitted to
-# them directly.
+# pixels, for which the model holds as well and whose minima are wider. Starts that end far above
+# the best are dropped, the others are fitted to the pixels; the best is compared with the minimum
+# that is reached from its mirror. If none explains the pixels, the starts are fitted to them
+# directly.
 
-COARSE_STEPS = 15
-FINE_STEPS = 30
-
-HOPELESS = 100.0
-"""Excess of chi-square over the best coarse fit's above which a start is abandoned."""
+COARSE_STEPS, FINE_STEPS = 15, 30
 
 SAME_TURN_RAD = 1e-3
-"""Coarse fits whose rotations differ by less than this are the same."""
-
-LIKELY_SPREAD_PX = 0.5
-"""Smallest start of an estimated point spread: 0 is a minimum of its own."""
+"""Fits whose rotations differ by less than this are the same."""
 
 EXCESS = 5.0
 """Deviation of the residuals' variance, in its standard deviations, above which the model does not
 explain the pixels."""
+
+
+class Search(NamedTuple):
+    """How far fits go.
+
+    Attributes
+    ----------
+    coarsely_settled, settled
+        Squared standard deviations of the last undamped step, of means of 2 x 2 pixels and of
+        pixels.
+    hopeless
+        Excess of chi-square over the best coarse fit's above which a start is abandoned.
+    """
+
+    coarsely_settled: float
+    settled: float
+    hopeless: float
+
+
+EXACT = Search(NEARLY_SETTLED, SETTLED, 100.0)
+
+REAL = Search(4.0, 16.0, 50.0)
+"""Of photographs. The last step is taken: near the minimum the one after it is a hundredth as long.
+Fits of all pixels chose the mirror at an excess of at most 44."""
 
 
 @compiled
@@ -92,100 +127,103 @@ def least(values: Floats) -> float:
 
 
 @compiled
-def is_settled(chi_square: Floats, states: Floats, k: int) -> bool:
+def is_settled(levels: Floats, most: float, states: Floats, k: int) -> bool:
     """Return whether the k-th coarse fit is hopeless, or the same as an earlier one."""
-    most = least(chi_square) + HOPELESS
-    if not chi_square[k] < most:
+    if not levels[k] < most:
         return True
     for m in range(k):
-        same = turn_between(states[k], states[m]) < SAME_TURN_RAD
-        if same and chi_square[m] < most:
+        if turn_between(states[k], states[m]) < SAME_TURN_RAD and levels[m] < most:
             return True
     return False
 
 
 @compiled
 def locate(
-    image: Floats, starts: Floats, view: MarkerView, spread_free: bool, information: Floats
-) -> tuple[Floats, float, bool, Floats, float]:
-    """Return the most likely pose, and the next minimum.
+    seen: Any, work: Any, freedom: int, coarse: Any, coarse_work: Any, starts: Floats,
+    search: Search, information: Floats,
+) -> tuple[Floats, float, bool, Floats]:
+    """Return the best minimum of the sum of squared residuals, and the next one.
 
     Parameters
     ----------
-    image
-        (height, width) grey levels; pixels that are NaN are left out.
+    seen, work, freedom
+        As :func:`sweep.measure.likelihood.descend` takes them.
+    coarse, coarse_work
+        What is seen in the means of 2 x 2 pixels.
     starts
-        (K, 16) states; those behind the camera are skipped.
-    view
-        The image's known parameters.
-    spread_free
-        Whether the point spread is estimated.
+        (K, 18) states; those behind the camera are skipped.
+    search
+        How far fits go.
     information
-        Overwritten, as by :func:`sweep.measure.likelihood.fit`.
+        Overwritten, as by :func:`sweep.measure.likelihood.descend`.
 
     Returns
     -------
     tuple
-        The state (16,), its chi-square, whether it is a maximum of the likelihood, and state and
-        chi-square of the next best minimum; NaN if there is none.
+        The state (18,), its sum of squares, infinite without a pose, whether the minimum was
+        reached, and the state of the next best minimum; NaN if there is none.
     """
     count, free = len(starts), len(information)
-    coarse, coarse_view = binned(image), binned_view(view)
-    coarse_work = work_space(coarse.shape[0], coarse.shape[1])
-    coarse_total = squares(coarse)
+    coarse_freedom = max(freedom // 4, 1)
     states = starts.copy()
     trial_information = np.empty((free, free))
 
     def coarse_fit(state: Floats, worth: float) -> float:
         """Fit a state to the means of 2 x 2 pixels, whose point spread is half as wide."""
         state[SPREAD] *= 0.5
-        level, _ = fit(
-            coarse, coarse_total, state, coarse_view, coarse_work, spread_free, COARSE_STEPS,
-            NEARLY_SETTLED, worth, trial_information,
+        state[GREY_LEVELS] = 0.0
+        level, _ = descend(
+            coarse, state, coarse_work, coarse_freedom, COARSE_STEPS,
+            search.coarsely_settled, worth, trial_information,
         )
         state[SPREAD] *= 2.0
         return level
 
-    chi_square = np.full(count, math.inf)
+    def most_of(levels: Floats) -> float:
+        """Return the sum of squares from which a coarse fit is hopeless."""
+        lowest = least(levels)
+        return lowest + search.hopeless * unit_of(coarse.marker, lowest, coarse_freedom)
+
+    levels = np.full(count, math.inf)
     for k in range(count):
-        if is_before_camera(states[k], view):
-            chi_square[k] = coarse_fit(states[k], least(chi_square) + HOPELESS)
-    work = work_space(image.shape[0], image.shape[1])
-    total, count_px = squares(image), known_pixels(image)
+        if is_before_camera(states[k], seen.marker):
+            levels[k] = coarse_fit(states[k], most_of(levels))
+    most = most_of(levels)
     best, other = np.full(STATE_LENGTH, math.nan), np.full(STATE_LENGTH, math.nan)
     lowest = next_lowest = math.inf
     reached = False
-    freedom = count_px - free - LEVELS
     likely = freedom + EXCESS * math.sqrt(2.0 * freedom)
     for k in range(2 * count + 1):
-        worth = lowest + HOPELESS
+        unit = unit_of(seen.marker, lowest, freedom)
+        worth = lowest + search.hopeless * unit
         if k < count:
-            if is_settled(chi_square, states, k):
+            if is_settled(levels, most, states, k):
                 continue
             state = states[k].copy()
         elif k == count:
             state = mirrored_state(best)
-            if not is_before_camera(state, view):
+            if not is_before_camera(state, seen.marker):
                 continue
             # Not worth a fit if it was reached before, or if the coarse pixels rule it out.
             away = turn_between(state, best)
             if turn_between(state, other) < 0.5 * away:
                 continue
-            tried, most = state.copy(), least(chi_square) + HOPELESS
+            tried = state.copy()
             if not coarse_fit(tried, most) < most:
                 continue
             if turn_between(tried, best) > 0.5 * away:
                 state = tried
         else:
             # The coarse fits misled all starts, or the model is wrong.
-            if lowest <= likely:
+            if lowest <= likely * unit:
                 break
             state, worth = starts[k - count - 1].copy(), math.inf
-        if not is_before_camera(state, view):
+        if not is_before_camera(state, seen.marker):
             continue
-        level, converged = fit(
-            image, total, state, view, work, spread_free, FINE_STEPS, SETTLED,
-            worth, trial_information,
+        state[GREY_LEVELS] = 0.0
+        level, converged = descend(
+            seen, state, work, freedom, FINE_STEPS, search.settled, worth,
+            trial_information,
         )
         same = turn_between(state, best) < SAME_TURN_RAD
         if level < lowest:
@@ -199,7 +237,44 @@ def locate(
         elif not same and level < next_lowest:
             overwrite(other, state)
             next_lowest = level
-    return best, lowest, reached, other, next_lowest
+    return best, lowest, reached, other
+
+
+@compiled
+def locate_exactly(
+    image: Floats, starts: Floats, view: MarkerView, information: Floats
+) -> tuple[Floats, float, bool, Floats, int]:
+    """Return what :func:`locate` does by the exact image (height, width), and the freedom."""
+    freedom = known_pixels(image) - len(information) - LEVELS
+    small = binned(image)
+    found = locate(
+        Pixels(image, squares(image), view),
+        work_space(image.shape[0], image.shape[1]), freedom,
+        Pixels(small, squares(small), binned_view(view)),
+        work_space(small.shape[0], small.shape[1]), starts, EXACT, information,
+    )
+    return *found, freedom
+
+
+@compiled
+def locate_photograph(
+    view: PhotographView, starts: Floats, covariance: Floats
+) -> tuple[Floats, float, bool, Floats, int, float]:
+    """Return what :func:`locate` does on a photograph, the freedom, and the misfit.
+
+    ``covariance`` (6, 6) gets that of the pose in radians and metres; the misfit is NaN if there is
+    none.
+    """
+    freedom = pixel_count(view) - MOVED - LINEAR
+    coarse = binned_photograph(view)
+    work = system(view.levels.shape[0], view.levels.shape[1])
+    state, level, reached, other = locate(
+        view, work, freedom, coarse,
+        system(coarse.levels.shape[0], coarse.levels.shape[1]), starts, REAL,
+        np.empty((MOVED, MOVED)),
+    )
+    misfit = judge(view, state, work, covariance) if reached else math.nan
+    return state, level, reached, other, freedom, misfit
 
 
 def explains(chi_square: float, freedom: int, noise_grey: float) -> bool:
@@ -212,58 +287,186 @@ def explains(chi_square: float, freedom: int, noise_grey: float) -> bool:
     return abs(deviation) <= EXCESS if noise_grey >= MIN_NOISE else deviation <= EXCESS
 
 
-def start_states(
-    rotation: Floats, translation: Floats, spread_px: float, spread_free: bool
-) -> Floats:
-    """Return the states (K, 16) of the finite ones of M poses (M, 3, 3), (M, 3)."""
-    spread = max(spread_px, LIKELY_SPREAD_PX) if spread_free else spread_px
-    none = np.zeros(LEVELS)
-    states = np.array(
-        [state_of(*pose, spread, none) for pose in zip(rotation, translation, strict=True)]
-    )
-    return np.asarray(states[np.isfinite(states).all(axis=1)])
+# --------------------------------------------------------------------------------------------------
+# What was found of a target, marker or board: a marker is a board of one square.
 
+class Found(NamedTuple):
+    """One target, and what was found of it.
 
-def write_most_likely(
-    image: Floats, starts: Floats, view: MarkerView, spread_free: bool, noise_grey: float,
-    out: Estimates, i: int,
-) -> tuple[Floats, Floats] | None:
-    """Write the most likely pose of an image as estimate ``i``, but for reprojection errors.
-
-    Arguments as :func:`locate` and :func:`explains` take them. Returns the state (16,) and that of
-    the next minimum, NaN if there is none; None if no pose was written.
+    Attributes
+    ----------
+    key, size_m, middle_m
+        What is printed, its first marker's side, and the middle (3,) of it in its own frame.
+    objects_m, corners
+        (k, 4, 3) corners of the markers that were found in the target's frame, and (k, 4, 2) px.
+    cameras, noise_grey, blur_px
+        The camera, and what is assumed of its pixels.
+    image, origin, beside
+        The window that was searched, its first pixel in the frame, and which pixels show something
+        beside the target.
+    on_board, planar
+        Of a marker that of a board which it is, None for one alone, and both planar solutions.
     """
-    free = POSE + 1 if spread_free else POSE
-    information = np.empty((free, free))
-    state, chi_square, reached, other, _ = locate(image, starts, view, spread_free, information)
-    freedom = known_pixels(image) - free - LEVELS
-    if not math.isfinite(chi_square) or freedom < 1:
+
+    key: Board
+    size_m: float
+    middle_m: Floats
+    objects_m: Floats
+    corners: Floats
+    cameras: Cameras
+    noise_grey: float
+    blur_px: float
+    image: Grey
+    origin: Integers
+    beside: Masks | None = None
+    on_board: BoardMarker | None = None
+    planar: tuple[Pose, ...] = ()
+
+
+def found_targets(detections: Detections) -> Iterator[Found]:
+    """Yield what was found of each target."""
+    planar = both_planar_solutions(
+        detections.corners, detections.cameras, detections.size_m
+    ) if detections.are_markers else None
+    for i, target in enumerate(detections.targets):
+        one, scale = detections.take(np.array([i])), float(detections.scale[i])
+        size_m = scale * unit_m(target) * module_count(target.dictionary)
+        yield Found(
+            target, float(one.size_m[0]) if target.is_marker else size_m,
+            scale * middle_m(target), one.objects_m, one.corners, one.cameras,
+            float(one.noise_grey[0]), float(one.blur_px[0]), one.images[0], one.origins[0],
+            one.beside[0] if len(one.beside) else None,
+            None if one.on_board is None else one.on_board[0],
+            () if planar is None else tuple(zip(*(each[i] for each in planar), strict=True)),
+        )
+
+
+def first_poses(found: Found, *, refined: bool) -> list[Pose]:
+    """Return poses of a target from its corners, and from those after ``cv2.cornerSubPix``.
+
+    Of one marker both planar solutions. Of several the poses from the corners of all of them, and
+    that of the marker on which most of the others agree: one marker that is wrong spoils the
+    former.
+    """
+    if found.key.is_marker:
+        poses = [*found.planar]
+        if refined:
+            rotation, translation = both_planar_solutions(
+                refined_corners(found), found.cameras, np.array([found.size_m])
+            )
+            poses += zip(rotation[0], translation[0], strict=True)
+        return poses
+    poses = []
+    for corners in (found.corners, refined_corners(found)) if refined else (found.corners,):
+        points, pixels = found.objects_m.reshape(-1, 3), corners.reshape(-1, 2)
+        for method in (cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_ITERATIVE):
+            poses += guarded_poses(points, pixels, found.cameras, method)
+        if len(corners) > 1:
+            each = poses_of_each_marker(points, pixels, found.cameras)
+            away = [_typical_error_px(pose, found, corners) for pose in each]
+            poses += [each[k] for k in np.argsort(away)[:1].tolist() if math.isfinite(away[k])]
+    return poses
+
+
+def _typical_error_px(pose: Pose, found: Found, corners: Floats) -> float:
+    """Return the median of the markers' reprojection errors; NaN becomes infinite."""
+    errors = [
+        reprojection_px(*pose, objects, pixels, found.cameras)
+        for objects, pixels in zip(found.objects_m, corners, strict=True)
+    ]
+    return float(np.median(np.nan_to_num(errors, nan=math.inf)))
+
+
+def refined_corners(found: Found) -> Floats:
+    """Return the corners (k, 4, 2) after ``cv2.cornerSubPix``, its window OpenCV's for markers."""
+    refined = found.corners.copy()
+    for k, corners in enumerate(found.corners - found.origin):
+        moved = refined_quad(found.image, corners, module_count(found.key.dictionary))
+        if moved is not None:
+            refined[k] = moved + found.origin
+    return refined
+
+
+def refined_quad(image: Grey, corners: Floats, modules: float) -> Floats | None:
+    """As :func:`refined_corners`, of corners (4, 2) in the image; None if one is not in it."""
+    if not ((corners >= 0) & (corners <= np.array(image.shape[::-1]) - 1)).all():
         return None
-    if not reached:
-        out.status[i] = EstimateStatus.not_converged
-        return None
-    out.status[i] = (
-        EstimateStatus.solved if explains(chi_square, freedom, noise_grey)
-        else EstimateStatus.not_explained
+    side = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
+    half = min(5, max(1, round(0.3 * (side / modules))))
+    moved = cv2.cornerSubPix(
+        image, np.ascontiguousarray(corners[:, None], dtype=np.float32), (half, half),
+        (-1, -1), (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 30, 0.1),
     )
-    out.rotation[i], out.translation[i] = rotation_of(state), state[POSITION]
-    out.alternative_rotation[i] = rotation_of(other)
-    covariance, exists = pose_covariance(information, view.variance, abs(state[DEPTH]))
-    if exists:
-        out.covariance[i] = covariance
-    out.residual_ratio[i] = chi_square / freedom
-    return state, other
+    return np.asarray(moved[:, 0], dtype=np.float64)
+
+
+def start_states(
+    poses: list[Pose], middle_m: Floats, spread_px: float
+) -> Floats:
+    """Return the states (K, 18) of a target's middle at the finite ones of some poses."""
+    states = [
+        state_of(rotation, translation + rotation @ middle_m, spread_px, np.zeros(LEVELS))
+        for rotation, translation in poses
+    ]
+    return np.array([each for each in states if np.isfinite(each).all()])
+
+
+def window_of(found: Found, poses: list[Pose]) -> list[int]:
+    """Return what is fitted of the image: left, top, right, bottom.
+
+    Of a marker its quiet zone, as a share of the corners' extent, and half of that for perspective;
+    of a board its sheet in any of the poses.
+    """
+    if found.key.is_marker:
+        dictionary, quiet = found.key.dictionary, found.key.margin or 0.0
+        low, high = found.corners[0].min(axis=0), found.corners[0].max(axis=0)
+        share = 1.5 * quiet / module_count(dictionary)
+        margin = BACKGROUND_MARGIN_PX + share * (high - low)
+        low, high = low - margin, high + margin
+    else:
+        scale = found.size_m / module_count(found.key.dictionary)
+        sheet = box_corners(extent_of(found.key).target[None]) * scale
+        pixels = np.concatenate([
+            found.cameras.project(transform_points(sheet, rotation[None], translation[None]))[0]
+            for rotation, translation in poses
+        ])
+        if not np.isfinite(pixels).any():
+            return [0, 0, 0, 0]
+        low = np.nanmin(pixels, axis=0) - BACKGROUND_MARGIN_PX
+        high = np.nanmax(pixels, axis=0) + BACKGROUND_MARGIN_PX
+    size = np.array(found.image.shape[::-1])
+    window: list[int] = np.concatenate([
+        np.clip(np.floor(low) - found.origin, 0, size),
+        np.clip(np.ceil(high) + 1 - found.origin, 0, size),
+    ]).astype(np.int64).tolist()
+    return window
+
+
+# --------------------------------------------------------------------------------------------------
+# The estimators.
+
+LIKELY_SPREAD_PX = 0.5
+"""Smallest start of an estimated point spread: 0 is a minimum of its own."""
+
+FIRST_SPREAD_PX = 0.7
+"""Point spread at which fits of photographs start."""
+
+MIN_CONTRAST = 1.0
+"""Difference of white and black in grey levels below which there is no marker in the pixels."""
+
+MAX_MISFIT_PX = 0.5
+"""Standard deviation of the shifts of the marker's parts above which a pose is not explained."""
 
 
 @dataclass(frozen=True, slots=True)
 class Photometric:
-    """Maximum likelihood on the pixels as a pose estimator.
+    """Maximum likelihood on the pixels as a pose estimator of markers and boards.
 
     Attributes
     ----------
     refined
-        Whether it also starts from both planar solutions of the corners after
-        ``cv2.cornerSubPix``, beside those of the corners as detected.
+        Whether it also starts from poses of the corners after ``cv2.cornerSubPix``, beside those of
+        the corners as detected.
     spread_free
         Whether the point spread is estimated.
     """
@@ -277,197 +480,107 @@ class Photometric:
         return True
 
     def __call__(self, detections: Detections) -> Estimates:
-        """Return the poses, with covariances from the curvature of the likelihood."""
-        if not detections.are_markers:
-            return one_by_one(detections, self._estimate)
-        count = len(detections.corners)
-        out = Estimates.none(count, EstimateStatus.solver_failed)
-        sets = [detections.corners]
-        if self.refined:
-            sets.append(refined_corners(detections))
-        poses = [
-            both_planar_solutions(corners, detections.cameras, detections.size_m)
-            for corners in sets
-        ]
-        turns = np.concatenate([rotation for rotation, _ in poses], axis=1)
-        shifts = np.concatenate([translation for _, translation in poses], axis=1)
-        windows = _windows(detections)
-        for i in range(count):
-            starts = start_states(
-                turns[i], shifts[i], float(detections.blur_px[i]), self.spread_free
-            )
-            left, top, right, bottom = windows[i]
-            if not len(starts) or right - left < 2 or bottom - top < 2:
+        """Return the poses, with their covariances."""
+        out = Estimates.none(len(detections.origins), EstimateStatus.solver_failed)
+        for i, found in enumerate(found_targets(detections)):
+            if found.corners.size < 2 * MIN_POINTS:
+                out.status[i] = EstimateStatus.too_few_points
                 continue
-            noise = float(detections.noise_grey[i])
-            view = marker_view(
-                detections.targets[i], detections.size_m[i], detections.cameras.optics(i),
-                detections.origins[i] + (left, top), noise_variance(noise),
+            poses = first_poses(found, refined=self.refined)
+            states = self._fitted(found, poses, out, i) if poses else None
+            if states is None:
+                continue
+            points, pixels = found.objects_m.reshape(-1, 3), found.corners.reshape(-1, 2)
+            out.rotation[i], out.translation[i] = rotation_of(states[0]), states[0][POSITION]
+            out.alternative_rotation[i] = rotation_of(states[1])
+            out.reprojection_px[i], out.alternative_reprojection_px[i] = (
+                reprojection_px(
+                    rotation_of(state), state[POSITION] - rotation_of(state) @ found.middle_m,
+                    points, pixels, found.cameras,
+                ) for state in states
             )
-            image = detections.images[i][top:bottom, left:right].astype(np.float64)
-            fitted = write_most_likely(image, starts, view, self.spread_free, noise, out, i)
-            if fitted is not None:
-                state, other = fitted
-                out.alternative_reprojection_px[i] = self._reprojection_px(other, detections, i)
-                out.reprojection_px[i] = self._reprojection_px(state, detections, i)
+            out.point_count[i] = len(pixels)
+            arm = -out.rotation[i] @ found.middle_m
+            if arm.any():
+                out.translation[i] += arm
+                out.covariance[i] = covariance_elsewhere(out.covariance[i], arm)
         return out
 
-    def _estimate(self, one: Detections, i: int, out: Estimates) -> None:
-        """Write the estimate of a single board as number ``i``.
+    def _fitted(
+        self, found: Found, poses: list[Pose], out: Estimates, i: int
+    ) -> tuple[Floats, Floats] | None:
+        """Write all but poses of an estimate; return the states of the best and next minimum.
 
-        Pixels that show something beside the board are left out. The starts are poses from the
-        corners of all detected markers, and that of the marker on which most of the others agree:
-        one marker that is wrong spoils the former.
+        Returns None if there is no pose.
         """
-        board, scale = one.targets[0], float(one.scale[0])
-        if one.corners.size < 2 * MIN_POINTS:
-            out.status[i] = EstimateStatus.too_few_points
-            return
-        sets = [one.corners]
-        if self.refined:
-            sets.append(_refined(one))
-        poses = [pose for corners in sets for pose in _starts(one, corners)]
-        middle = scale * middle_m(board)
-        if not poses:
-            return
-        starts = start_states(
-            np.array([rotation for rotation, _ in poses]),
-            np.array([shift + rotation @ middle for rotation, shift in poses]),
-            float(one.blur_px[0]), self.spread_free,
-        )
-        left, top, right, bottom = _window(one, poses)
+        spread = max(found.blur_px, LIKELY_SPREAD_PX) if self.spread_free else found.blur_px
+        starts = start_states(poses, found.middle_m, spread)
+        left, top, right, bottom = window_of(found, poses)
         if not len(starts) or right - left < 2 or bottom - top < 2:
-            return
-        noise = float(one.noise_grey[0])
+            return None
         view = marker_view(
-            board, scale * unit_m(board) * module_count(board.dictionary), one.cameras.optics(0),
-            one.origins[0] + (left, top), noise_variance(noise),
+            found.key, found.size_m, found.cameras.optics(0), found.origin + np.array([left, top]),
+            noise_variance(found.noise_grey),
         )
-        image = one.images[0][top:bottom, left:right].astype(np.float64)
-        if len(one.beside):
-            image[one.beside[0][top:bottom, left:right]] = np.nan
-        fitted = write_most_likely(image, starts, view, self.spread_free, noise, out, i)
-        if fitted is None:
-            return
-        points, pixels = one.objects_m.reshape(-1, 3), one.corners.reshape(-1, 2)
-        out.point_count[i] = len(pixels)
-        errors = []
-        for state in fitted:
-            rotation = rotation_of(state)
-            errors.append(reprojection_px(
-                rotation, state[POSITION] - rotation @ middle, points, pixels, one.cameras
-            ))
-        out.reprojection_px[i], out.alternative_reprojection_px[i] = errors
-        arm = -out.rotation[i] @ middle
-        if arm.any():
-            out.translation[i] += arm
-            out.covariance[i] = covariance_elsewhere(out.covariance[i], arm)
-
-    @staticmethod
-    def _reprojection_px(state: Floats, detections: Detections, i: int) -> float:
-        """Return the RMS reprojection error of a state over the corners of one detection."""
-        row = np.array([i])
-        return float(
-            reprojection_errors_px(
-                rotation_of(state)[None], state[None, POSITION], detections.size_m[row],
-                detections.corners[row], detections.cameras.take(row),
-            )[0]
+        image = found.image[top:bottom, left:right].astype(np.float64)
+        if found.beside is not None:
+            image[found.beside[top:bottom, left:right]] = np.nan
+        free = POSE + 1 if self.spread_free else POSE
+        information = np.empty((free, free))
+        state, level, reached, other, freedom = locate_exactly(image, starts, view, information)
+        if not math.isfinite(level) or freedom < 1:
+            return None
+        if not reached:
+            out.status[i] = EstimateStatus.not_converged
+            return None
+        chi_square = level / view.variance
+        out.status[i] = (
+            EstimateStatus.solved if explains(chi_square, freedom, found.noise_grey)
+            else EstimateStatus.not_explained
         )
+        covariance, exists = pose_covariance(information, view.variance, abs(state[DEPTH]))
+        if exists:
+            out.covariance[i] = covariance
+        out.residual_ratio[i] = chi_square / freedom
+        return state, other
 
 
-def _windows(detections: Detections) -> list[list[int]]:
-    """Return the part of each image that is fitted: left, top, right, bottom of the quiet zone.
+@dataclass(frozen=True, slots=True)
+class PhotometricReal(Photometric):
+    """Least squares on the pixels of photographs of markers as a pose estimator.
 
-    A share of the corners' extent as wide as the quiet zone, and half of that for perspective.
+    Attributes
+    ----------
+    tone
+        Whether the tone curve is estimated.
     """
-    low, high = detections.corners.min(axis=1), detections.corners.max(axis=1)
-    extents = [extent_of(target) for target in detections.targets]
-    share = np.array([-1.5 * each.sheet[0] / each.modules for each in extents])
-    margin = BACKGROUND_MARGIN_PX + share[:, None] * (high - low)
-    sizes = np.array([image.shape[::-1] for image in detections.images]).reshape(-1, 2)
-    low = np.clip(np.floor(low - margin) - detections.origins, 0, sizes)
-    high = np.clip(np.ceil(high + margin) + 1 - detections.origins, 0, sizes)
-    windows: list[list[int]] = np.concatenate([low, high], axis=1).astype(np.int64).tolist()
-    return windows
 
+    tone: bool
 
-def refined_corners(detections: Detections) -> Floats:
-    """Return the corners (N, 4, 2) after ``cv2.cornerSubPix``, its window OpenCV's for markers."""
-    refined = detections.corners.copy()
-    for i, image in enumerate(detections.images):
-        moved = refined_quad(
-            image, detections.corners[i] - detections.origins[i],
-            extent_of(detections.targets[i]).modules,
+    def _fitted(
+        self, found: Found, poses: list[Pose], out: Estimates, i: int
+    ) -> tuple[Floats, Floats] | None:
+        # The first of the two planar solutions of each set of corners: the other one is its mirror.
+        starts = start_states(poses[::2], found.middle_m, FIRST_SPREAD_PX)
+        view = photograph_view(
+            found.key, found.on_board, found.size_m, found.corners[0], found.cameras.optics(0),
+            found.image, found.origin, self.tone,
+        ) if len(starts) and found.key.is_marker else None
+        if view is None or pixel_count(view) <= MOVED + LINEAR:
+            return None
+        covariance = np.empty((POSE, POSE))
+        state, level, reached, other, freedom, misfit = locate_photograph(view, starts, covariance)
+        if not math.isfinite(level):
+            return None
+        if not reached:
+            out.status[i] = EstimateStatus.not_converged
+            return None
+        largest = math.inf if math.isnan(misfit) else covariance.diagonal()[:3].max()
+        if abs(state[WHITE] - state[BLACK]) < MIN_CONTRAST or not largest < math.pi**2:
+            return None
+        out.status[i] = (
+            EstimateStatus.not_explained if misfit > MAX_MISFIT_PX else EstimateStatus.solved
         )
-        if moved is not None:
-            refined[i] = moved + detections.origins[i]
-    return refined
-
-
-def refined_quad(image: Grey, corners: Floats, modules: float) -> Floats | None:
-    """As :func:`refined_corners`, of corners (4, 2) in pixels of the image; None if one is not."""
-    if not ((corners >= 0) & (corners <= np.array(image.shape[::-1]) - 1)).all():
-        return None
-    side = float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
-    half = min(5, max(1, round(0.3 * (side / modules))))
-    moved = cv2.cornerSubPix(
-        image, np.ascontiguousarray(corners[:, None], dtype=np.float32), (half, half),
-        (-1, -1), (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 30, 0.1),
-    )
-    return np.asarray(moved[:, 0], dtype=np.float64)
-
-
-def _starts(one: Detections, corners_px: Floats) -> list[Pose]:
-    """Return poses from corners (K, 4, 2): of all together, and the one that fits most markers."""
-    objects = one.objects_m
-    points, pixels = objects.reshape(-1, 3), corners_px.reshape(-1, 2)
-    poses = [
-        pose for method in (cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_ITERATIVE)
-        for pose in guarded_poses(points, pixels, one.cameras, method)
-    ]
-    if len(corners_px) > 1:
-        each = poses_of_each_marker(points, pixels, one.cameras)
-        away = [_typical_error_px(pose, one, objects, corners_px) for pose in each]
-        poses += [each[k] for k in np.argsort(away)[:1].tolist() if math.isfinite(away[k])]
-    return poses
-
-
-def _typical_error_px(
-    pose: Pose, one: Detections, objects: Floats, corners_px: Floats
-) -> float:
-    """Return the median of K markers' reprojection errors; NaN becomes infinite."""
-    errors = [
-        reprojection_px(*pose, corners, pixels, one.cameras)
-        for corners, pixels in zip(objects, corners_px, strict=True)
-    ]
-    return float(np.median(np.nan_to_num(errors, nan=math.inf)))
-
-
-def _refined(one: Detections) -> Floats:
-    """Return the markers' corners (K, 4, 2) after ``cv2.cornerSubPix``."""
-    modules, corners_px = module_count(one.targets[0].dictionary), one.corners
-    refined = [
-        refined_quad(one.images[0], corners - one.origins[0], modules) for corners in corners_px
-    ]
-    return np.array(
-        [corners if moved is None else moved + one.origins[0]
-         for corners, moved in zip(corners_px, refined, strict=True)]
-    )
-
-
-def _window(one: Detections, poses: list[Pose]) -> list[int]:
-    """Return what is fitted of the image: left, top, right, bottom around the sheet in any pose."""
-    board = one.targets[0]
-    sheet = box_corners(extent_of(board).target[None]) * unit_m(board) * float(one.scale[0])
-    size = np.array(one.images[0].shape[::-1])
-    pixels = np.concatenate([
-        one.cameras.project(transform_points(sheet, rotation[None], translation[None]))[0]
-        for rotation, translation in poses
-    ]) - one.origins[0]
-    if not np.isfinite(pixels).any():
-        return [0, 0, 0, 0]
-    low, high = np.nanmin(pixels, axis=0), np.nanmax(pixels, axis=0)
-    low = np.clip(np.floor(low - BACKGROUND_MARGIN_PX), 0, size)
-    high = np.clip(np.ceil(high + BACKGROUND_MARGIN_PX) + 1, 0, size)
-    window: list[int] = np.concatenate([low, high]).astype(np.int64).tolist()
-    return window
+        out.covariance[i], out.misfit_px[i] = covariance, misfit
+        out.residual_ratio[i] = level / (noise_variance(found.noise_grey) * freedom)
+        return state, other

@@ -6,7 +6,6 @@ import dataclasses
 import itertools
 import tomllib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -23,11 +22,11 @@ from sweep.model.board import Board
 from sweep.model.marker import opencv_dictionary_names
 from sweep.model.polygon import side_lengths
 from sweep.model.pose import rotation_of_vector
-from sweep.photographs.folder import FoundCorners, Photograph, detect_markers
+from sweep.photographs.folder import FoundCorners, KnownCamera, Photograph, detect_markers
 from sweep.photographs.pose_fit import Lens
 from sweep.photographs.truth import fitted_board
 from sweep.plan.board_rules import board_of
-from sweep.typing import Floats, Integers
+from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
 # Whether photographs show the board that was described; if not, which one fits better.
@@ -105,11 +104,15 @@ def fitting_share(board: Board, seen: Seen) -> float:
     fitting = total = 0
     for ids, quads in seen:
         total += len(ids)
-        transform, known = _homography(board, ids, quads)
+        known, flat = _on_board(board, ids)
+        if len(flat) < 2:
+            continue
+        transform, _ = cv2.findHomography(
+            flat.reshape(-1, 2), quads[known].reshape(-1, 2), cv2.RANSAC,
+            FITTING_SHARE * float(side_lengths(quads).mean()) / 2,
+        )
         if transform is None:
             continue
-        index = {each: k for k, each in enumerate(board.marker_ids)}
-        flat = board.corners_m[[index[each] for each in ids[known].tolist()]][..., :2]
         mapped = cv2.perspectiveTransform(flat.reshape(1, -1, 2), transform).reshape(-1, 4, 2)
         side = side_lengths(quads[known]).mean(axis=1)
         distance = np.linalg.norm(mapped - quads[known], axis=2).max(axis=1)
@@ -120,12 +123,10 @@ def fitting_share(board: Board, seen: Seen) -> float:
 def measured_side(board: Board, seen: Seen) -> float:
     """Return the side of the markers over the board's, by the distances of their centres."""
     ratios: list[float] = []
-    index = {each: k for k, each in enumerate(board.marker_ids)}
     for ids, quads in seen:
-        known = np.array([each in index for each in ids.tolist()], dtype=bool)
-        if known.sum() < 4:
+        known, flat = _on_board(board, ids)
+        if len(flat) < 4:
             continue
-        flat = board.corners_m[[index[each] for each in ids[known].tolist()]][..., :2]
         tolerance = float(np.ptp(flat[0], axis=0).max()) / 4
         transform, _ = cv2.findHomography(
             quads[known].mean(axis=1), flat.mean(axis=1), cv2.RANSAC, tolerance
@@ -135,24 +136,15 @@ def measured_side(board: Board, seen: Seen) -> float:
         back = cv2.perspectiveTransform(
             quads[known].reshape(1, -1, 2), np.asarray(transform)
         ).reshape(-1, 4, 2)
-        sides = [side_lengths(each).mean(axis=1)
-                 for each in (back, flat)]
-        ratios += (sides[0] / sides[1]).tolist()
+        ratios += (side_lengths(back).mean(axis=1) / side_lengths(flat).mean(axis=1)).tolist()
     return float(np.median(ratios)) if ratios else 1.0
 
 
-def _homography(board: Board, ids: Integers, quads: Floats) -> tuple[Any, Any]:
-    """Return what takes the board's plane to a photograph, and which markers it has."""
-    index = {each: k for k, each in enumerate(board.marker_ids)}
+def _on_board(board: Board, ids: Integers) -> tuple[Masks, Floats]:
+    """Return which markers a board has, and the corners (k, 4, 2) of these in its plane, in m."""
+    index = {marker_id: k for k, marker_id in enumerate(board.marker_ids)}
     known = np.array([each in index for each in ids.tolist()], dtype=bool)
-    if known.sum() < 2:
-        return None, known
-    flat = board.corners_m[[index[each] for each in ids[known].tolist()]][..., :2]
-    side = float(side_lengths(quads).mean())
-    transform, _ = cv2.findHomography(
-        flat.reshape(-1, 2), quads[known].reshape(-1, 2), cv2.RANSAC, FITTING_SHARE * side / 2
-    )
-    return transform, known
+    return known, board.corners_m[[index[each] for each in ids[known].tolist()], :, :2]
 
 
 def _others(path: Path) -> Iterator[tuple[str, Board]]:
@@ -299,32 +291,7 @@ MIN_CORNERS = 12
 """Corners of a board in a photograph that is used."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CalibratedCamera:
-    """A camera that was calibrated.
-
-    Attributes
-    ----------
-    lens
-        Its numbers.
-    sd
-        Standard deviations of fx, fy, cx, cy (px) and of the five coefficients.
-    covariance
-        Their covariance (9, 9).
-    rms_px
-        Root mean square of the residuals' lengths.
-    photographs
-        How many were used.
-    """
-
-    lens: Lens
-    sd: tuple[float, ...]
-    covariance: Floats
-    rms_px: float
-    photographs: int
-
-
-def calibrate(size: tuple[int, int], found: Sequence[FoundCorners]) -> CalibratedCamera:
+def calibrate(size: tuple[int, int], found: Sequence[FoundCorners]) -> KnownCamera:
     """Calibrate a camera with five coefficients (:func:`sweep.measure.intrinsics.calibrate`).
 
     Parameters
@@ -358,10 +325,16 @@ def calibrate(size: tuple[int, int], found: Sequence[FoundCorners]) -> Calibrate
         )
     fx, fy, cx, cy, *distortion = made.values.tolist()
     lens = Lens.of(fx, fy, cx, cy, tuple(distortion))
-    return CalibratedCamera(
-        lens, tuple(made.std.tolist()), _covariance(lens, [used[i] for i in made.used], made),
-        made.rms_px, made.views,
+    numbers = ", ".join(
+        f"{name} {value:.1f} ± {sd:.1f}"
+        for name, value, sd in zip(("fx", "fy", "cx", "cy"), made.values, made.std, strict=False)
     )
+    line = (
+        f"camera: calibrated from {made.views} photographs, {made.rms_px:.2f} px RMS: {numbers} px "
+        "(standard deviations; truth_std has of them what truth and estimates do not share)"
+    )
+    covariance = _covariance(lens, [used[i] for i in made.used], made)
+    return KnownCamera(lens, tuple(made.std.tolist()), line, covariance)
 
 
 def _covariance(lens: Lens, used: Sequence[FoundCorners], made: intrinsics.Intrinsics) -> Floats:

@@ -18,7 +18,7 @@ from sweep.measure.flags import TruthSource
 from sweep.messages import plain
 from sweep.model.board import Board
 from sweep.model.image_file import Part
-from sweep.photographs.board_check import CalibratedCamera, calibrate, check_board, check_resolution
+from sweep.photographs.board_check import calibrate, check_board, check_resolution
 from sweep.photographs.folder import (
     Folder,
     KnownCamera,
@@ -261,13 +261,9 @@ def _with_one_camera(
     if str(camera) == CALIBRATE:
         if corners is None:
             raise AssertionError(camera)
-        calibrated = calibrate(folder.size, corners)
-        known = KnownCamera(
-            calibrated.lens, calibrated.sd, _camera_line(calibrated), calibrated.covariance
-        )
+        known = calibrate(folder.size, corners)
     else:
-        calibration = camera_of_file(str(camera), folder.size)
-        known = known_camera(calibration)
+        known = known_camera(camera_of_file(str(camera), folder.size))
     lines = [known.line] if known.line else []
     if board is None or corners is None or not need_board:
         return known, None, lines
@@ -289,16 +285,6 @@ def _with_one_camera(
         poses.rotation[:, order], poses.translation[:, order], poses.std[:, order],
         poses.source[:, order],
     ), lines
-
-
-def _camera_line(camera: CalibratedCamera) -> str:
-    matrix, sd = camera.lens.matrix, camera.sd
-    return (
-        f"camera: calibrated from {camera.photographs} photographs, {camera.rms_px:.2f} px RMS: "
-        f"fx {matrix[0, 0]:.1f} ± {sd[0]:.1f}, fy {matrix[1, 1]:.1f} ± {sd[1]:.1f}, "
-        f"cx {matrix[0, 2]:.1f} ± {sd[2]:.1f}, cy {matrix[1, 2]:.1f} ± {sd[3]:.1f} px (standard "
-        "deviations; truth_std has of them what truth and estimates do not share)"
-    )
 
 
 def _summary(found: Sequence[Folder], truth: Sequence[Poses]) -> list[str]:

@@ -22,10 +22,7 @@ from sweep.plan.pipeline import Pipeline
 
 PIXEL_SETTINGS = {
     "photometric": frozenset({"refined_starts", "estimate_blur"}),
-    "photometric_real": frozenset({
-        "refined_starts", "estimate_light", "estimate_tone", "estimate_sharpening",
-        "assumed_sharpening_px",
-    }),
+    "photometric_real": frozenset({"refined_starts", "estimate_tone"}),
 }
 """Solver on pixels -> the settings that it has beside those of all solvers."""
 

@@ -1,4 +1,4 @@
-"""Time of a pose by ``photometric_real`` on boards: levels and blur alone, and all nuisances.
+"""Time of a pose by ``photometric_real`` on boards: levels and blur alone, and the tone curve.
 
 python -m tests.benchmarks photograph
 """
@@ -18,7 +18,7 @@ from support.photographs import drawn_pose, photograph
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.measure.estimation import Detections
 from sweep.measure.flags import EstimateStatus
-from sweep.measure.photograph import PhotometricReal
+from sweep.measure.photometric import PhotometricReal
 from sweep.measure.surroundings import BoardMarker
 from sweep.model.board import single_marker
 from sweep.model.board_kinds import Charuco
@@ -65,13 +65,13 @@ def detections(side, effects):
 @single_threaded()
 def main():
     """Print the table."""
-    print("| side, px | levels and blur, ms | light, tone and sharpening too, ms | solved, % |")
+    print("| side, px | levels and blur, ms | tone and other effects too, ms | solved, % |")
     print("| --- | --- | --- | --- |")
     for side in SIDES:
         row, solved = [], []
         for every, effects in ((False, EFFECTS), (True, WEBCAM)):
             found = detections(side, effects)
-            solver = PhotometricReal(False, every, every, every, 1.0)
+            solver = PhotometricReal(refined=False, spread_free=True, tone=every)
             solved.append(np.mean(solver(found).status == EstimateStatus.solved))
             row.append(best_ms(lambda s=solver, f=found: s(f), len(found.corners)))
         print(f"| {side} | {row[0]:.3g} | {row[1]:.3g} | {100 * min(solved):.0f} |", flush=True)

@@ -12,14 +12,9 @@ from support.board_scenes import BoardPose, board_scene, levels_of
 from sweep.evaluation.block import run_cells
 from sweep.measure.estimation import Detections
 from sweep.measure.flags import EstimateStatus
-from sweep.measure.photograph import PhotometricReal, from_unit_square
-from sweep.measure.photograph_model import (
-    STATE_LENGTH,
-    Nuisances,
-    draw,
-    photograph_view,
-    system,
-)
+from sweep.measure.likelihood import state_of
+from sweep.measure.photograph_model import draw, photograph_view, system
+from sweep.measure.photometric import PhotometricReal
 from sweep.measure.surroundings import BoardMarker, clear_modules, surroundings
 from sweep.model.board import single_marker
 from sweep.model.board_kinds import Charuco, Grid
@@ -38,10 +33,8 @@ GRID = Grid(
 ).board()
 VIEW = np.array([600.0, 610.0, 159.5, 119.5])
 LENS = (-0.2, 0.05, 0.001, -0.001)
-EVERYTHING = PhotometricReal(
-    refined=False, light=True, tone=True, sharpening=True, radius_px=1.0
-)
-PLAIN = PhotometricReal(refined=False, light=False, tone=False, sharpening=False, radius_px=1.0)
+TONED = PhotometricReal(refined=False, spread_free=True, tone=True)
+PLAIN = PhotometricReal(refined=False, spread_free=True, tone=False)
 
 
 def rotation(tilt, azimuth, roll):
@@ -59,8 +52,7 @@ def camera_of(view, lens):
 
 
 def photograph(
-    board, pose, rng, *, blur=0.8, noise=2.0, light=0.0, tone=0.0, amount=0.0, correlation=0.0,
-    lens=(), shift=None,
+    board, pose, rng, *, blur=0.8, noise=2.0, tone=0.0, correlation=0.0, lens=(), shift=None
 ):
     """Return an image of a board with what cameras do to levels, by plain NumPy and SciPy."""
     scenes = board_scene(board, camera_of(VIEW, lens), pose, blur_px=blur)
@@ -68,8 +60,6 @@ def photograph(
     if shift is not None:
         share = cv2.remap(share.astype(np.float32), *shift, cv2.INTER_CUBIC).astype(np.float64)
     level = 40 + 150 * (share + tone * share * (1 - share))
-    level += amount * (level - gaussian_filter(level, 1.0, truncate=6))
-    level *= 1 + light * np.linspace(-1, 1, 320)
     white = rng.normal(size=(240, 320 + 50))
     for column in range(1, white.shape[1]):
         white[:, column] = (
@@ -162,12 +152,13 @@ def test_image_and_slopes_are_those_of_dense_sampling(lens):
     rng = np.random.default_rng(2)
     image = photograph(CHARUCO, pose, rng, lens=lens)
     found = detections(CHARUCO, [5], image, pose, rng, lens=lens, error_px=0.0)
-    view = photograph_view(found, 0, from_unit_square(found.corners)[0], 2.0)
+    view = photograph_view(
+        found.targets[0], found.on_board[0], found.size_m[0], found.corners[0],
+        found.cameras.optics(0), image, np.zeros(2, dtype=np.int64), toned=False,
+    )
     turn, position = pose_of(CHARUCO, 5, pose)
     work = system(*view.levels.shape)
-    state = np.zeros(STATE_LENGTH)
-    state[:9], state[9:12], state[12] = turn.ravel(), position, 0.8
-    draw(view, state, Nuisances(False, False, False, False, 1.0), work)
+    draw(view, state_of(turn, position, 0.8, np.zeros(3)), work)
     shifts = found.cameras.view[0, 2:] - view.marker.optics.intrinsics[2:]
     left, top = np.rint(shifts).astype(int)
     height, width = view.levels.shape
@@ -198,9 +189,9 @@ def test_image_and_slopes_are_those_of_dense_sampling(lens):
     ("board", "numbers", "lens", "solver", "effects"),
     [
         (CHARUCO, [3, 5, 6, 8], (), PLAIN, {}),
-        (CHARUCO, [3, 5, 6, 8], LENS, EVERYTHING,
-         {"light": 0.2, "tone": 0.3, "amount": 0.8, "correlation": 0.5}),
-        (GRID, [1, 4, 5], (), EVERYTHING, {"light": -0.2, "tone": -0.2, "amount": 0.5}),
+        (CHARUCO, [3, 5, 6, 8], LENS, TONED,
+         {"tone": 0.3, "correlation": 0.5}),
+        (GRID, [1, 4, 5], (), TONED, {"tone": -0.2}),
     ],
 )
 def test_poses_on_boards_have_the_errors_that_they_expect(board, numbers, lens, solver, effects):
@@ -231,8 +222,7 @@ def test_the_bound_is_attained_with_levels_and_blur():
         "scene": {"bound": "unknown_blur", "noise_grey": 2, "blur_px": 0.7, "black": 40,
                   "white": 200, "background": 200},
         "detector": {"cornerRefinementMethod": "subpix"},
-        "estimator": {"solver": "photometric_real", "estimate_light": False,
-                      "estimate_tone": False, "estimate_sharpening": False},
+        "estimator": {"solver": "photometric_real", "estimate_tone": False},
         "axes": {"trial": 300},
     })
     cells = run_cells(pipeline, [np.arange(300)])
@@ -262,7 +252,7 @@ def test_misfit_is_the_shift_of_the_markers_parts():
         fields *= std / fields.std(axis=(1, 2), keepdims=True)
         moved = ((columns + fields[0]).astype(np.float32), (rows + fields[1]).astype(np.float32))
         image = photograph(CHARUCO, pose, rng, shift=moved)
-        estimates = EVERYTHING(detections(CHARUCO, [5, 6], image, pose, rng))
+        estimates = TONED(detections(CHARUCO, [5, 6], image, pose, rng))
         assert (estimates.misfit_px > 0.25 * std).all()
         assert (estimates.misfit_px < 2 * std).all()
     assert (estimates.status == EstimateStatus.not_explained).any()
@@ -278,7 +268,7 @@ def test_images_without_a_marker_have_no_pose_that_passes():
     for image in images:
         for alone in (False, True):
             found = detections(CHARUCO, [5], image, pose, rng, alone=alone)
-            estimates = EVERYTHING(found)
+            estimates = TONED(found)
             if estimates.status[0] == EstimateStatus.solved:
                 assert np.isfinite(estimates.rotation[0]).all()
                 assert np.isfinite(estimates.covariance[0]).all()

@@ -13,8 +13,7 @@ BOARD = {
 CAMERA = {"width_px": 360, "height_px": 270, "fx_px": 390.0}
 LEVELS = {"black": 60.0, "white": 175.0, "background": 100.0}
 TRUTH = {
-    "blur_px": 0.6, "sharpening": 0.6, "sharpening_px": 1.5, "bloom": 0.15,
-    "illumination_gradient": 0.2, "illumination_deg": 30.0, "noise_correlation": 0.5,
+    "blur_px": 0.6, "sharpening": 0.6, "bloom": 0.15,
     "geometry_px": 0.15, "geometry_length_px": 60.0, **LEVELS,
 }
 EFFECTS = TRUTH | {"noise_grey": 2.0}

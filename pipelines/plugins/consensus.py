@@ -4,13 +4,12 @@ import numpy as np
 from sweep.plugins import EstimatorPlugin
 
 def solve(detections):
-    count = len(detections.boards)
+    count = len(detections)
     rotation, translation = np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan)
     for i in range(count):
-        board, found = detections.boards[i], detections.points[i]
-        on_board = board.corners_m[found.marker, :, :2].reshape(-1, 2) * detections.scale[i]
-        camera = detections.cameras.take(np.array([i]))
-        seen = camera.normalise(found.corners_px.reshape(1, -1, 2))[0]
+        found = detections.take(np.array([i]))
+        on_board = found.objects_m[..., :2].reshape(-1, 2)
+        seen = found.cameras.normalise(found.corners.reshape(1, -1, 2))[0]
         columns, _ = cv2.findHomography(on_board, seen, cv2.LMEDS)
         if columns is None:
             continue

@@ -104,10 +104,12 @@ def make_board_estimator(settings: LocusBoardSettings) -> Callable[[Any], Poses]
         return estimators[board, scale]
 
     def solve(detections: Any) -> Poses:
-        count = len(detections.boards)
+        count = len(detections.targets)
         rotation, translation = np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan)
         covariance = np.full((count, 6, 6), np.nan)
-        for i, (board, image) in enumerate(zip(detections.boards, detections.images, strict=True)):
+        for i, (board, image) in enumerate(
+            zip(detections.targets, detections.images, strict=True)
+        ):
             if detections.cameras.distorted[i]:
                 raise ValueError("locus-tag is built without lenses: expected none")
             detector, estimator = estimator_of(board, float(detections.scale[i]))

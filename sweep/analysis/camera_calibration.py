@@ -17,7 +17,6 @@ import xarray as xr
 from sweep.analysis.dataset import DRAWS, axes_of, describes, stored_pipeline
 from sweep.analysis.intervals import DEVIATIONS, wilson
 from sweep.errors import ArgumentError, DatasetError, SweepError
-from sweep.measure.board_solver import guarded_poses
 from sweep.measure.flags import CalibrationStatus
 from sweep.measure.intrinsics import (
     FREE_COEFFICIENTS,
@@ -26,6 +25,7 @@ from sweep.measure.intrinsics import (
     Intrinsics,
     calibrate,
 )
+from sweep.measure.solver import guarded_poses
 from sweep.model.board import Board
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -195,21 +194,6 @@ MAX_BEARING_DEG = 8.0
 SOURCE = "plugins check"
 """What lines on faults begin with."""
 
-SOLVER = """
-        cornerRefinementMethod = "subpix"
-        [estimator]
-        solver = {}
-"""
-
-BOARD = """
-        [board]
-        kind = "grid"
-        rows = 2
-        columns = 2
-        gap_m = 0.002
-"""
-
-
 @dataclass(frozen=True)
 class TrialScenes:
     """N scenes, and the detector's setting.
@@ -267,24 +251,17 @@ def trial_pipeline(
     ids = rng.integers(marker_count(dictionary) if known else 1, size=half).tolist()
     if not board:
         written["marker_id"] = [*ids, *ids]
-    zipped = ", ".join(f"{name} = {json.dumps(values)}" for name, values in written.items())
-    text = f"""
-        title = "Conformance"
-        [camera]
-        width_px = {WIDTH_PX}
-        height_px = {HEIGHT_PX}
-        fx_px = {FOCAL_PX}
-        fy_px = {FOCAL_PX}
-        [marker]
-        dictionary = {json.dumps(dictionary)}
-        [detector]
-        detector = {json.dumps(detector)}
-        {"" if solver is None else SOLVER.format(json.dumps(solver))}
-        {BOARD if board else ""}
-        [axes]
-        trial_scene = {{ zip = {{ {zipped} }} }}
-    """
-    pipeline = Pipeline.from_text(text, settings, source=SOURCE, folder=folder)
+    size = {"width_px": WIDTH_PX, "height_px": HEIGHT_PX, "fx_px": FOCAL_PX, "fy_px": FOCAL_PX}
+    document: dict[str, Any] = {
+        "title": "Conformance", "camera": size, "marker": {"dictionary": dictionary},
+        "detector": {"detector": detector}, "axes": {"trial_scene": {"zip": written}},
+    }
+    if solver is not None:
+        document["detector"]["cornerRefinementMethod"] = "subpix"
+        document["estimator"] = {"solver": solver}
+    if board:
+        document["board"] = {"kind": "grid", "rows": 2, "columns": 2, "gap_m": 0.002}
+    pipeline = Pipeline.from_dict(document, settings, source=SOURCE, folder=folder)
     if len(pipeline.axes) > 1:
         raise PipelineError([f"{SOURCE}: a plug-in is tried with one setting: no axes"])
     return pipeline
@@ -410,12 +387,12 @@ def check_plugin(
             child.call(_open, arguments, limit_s=time_limit_s)
             findings.extend(
                 child.call(_run, kind, number, limit_s=time_limit_s)
-                for number in range(len(CHECKS[kind]))
+                for number in range(len(CHECKS))
             )
         except MachineFaultError:
             raise
         except (ChildDiedError, ChildRaisedError, SweepError) as error:
-            findings.append(Finding(_names(kind)[len(findings)], FAULT, _ending(error)))
+            findings.append(Finding(NAMES[kind][len(findings)], FAULT, _ending(error)))
     versions = {} if plugin is None else dict(plugin.versions)
     return ConformanceReport(name, kind, dictionary, versions, findings)
 
@@ -425,7 +402,7 @@ def _declared(name: str, folder: str) -> DeclaredPlugin | None:
     if name == OPENCV or name in SOLVERS:
         return None
     for each in described(name, folder):
-        if each.kind in CHECKS:
+        if each.kind in NAMES:
             return each
     raise ArgumentError("name", name, "expected a detector or a solver; runs check the others")
 
@@ -448,7 +425,7 @@ def _ending(error: ChildDiedError | ChildRaisedError | SweepError) -> str:
 
 # In the child process.
 
-_trials: list[Any] = []
+_trials: list[DetectorTrial | SolverTrial] = []
 
 
 @single_threaded()
@@ -464,30 +441,35 @@ def _open(arguments: tuple[str, str, str, tuple[str, ...], str, bool]) -> None:
 @single_threaded()
 def _run(kind: str, number: int) -> Finding:
     """Return what a check finds."""
-    check = CHECKS[kind][number]
-    verdict, text, *numbers = check(_trials[0])
-    return Finding(_names(kind)[number], verdict, text, *numbers)
+    verdict, text, *numbers = CHECKS[number](_trials[0])
+    return Finding(NAMES[kind][number], verdict, text, *numbers)
 
 
 class DetectorTrial:
     """A detector, the scenes, and what it returns for their images."""
 
+    returned = "corners and IDs of the right shapes"
+    found_key, found_what, found_hint = "detected", "a marker", ""
+    order, survived = "in reverse, after noise", "plain, black, noise, down to 8 x 8 px"
+
     def __init__(self, pipeline: Pipeline) -> None:
         self.scenes = trial_scenes(pipeline)
         self.find = make_detector(self.scenes.setting)
-        setting = detector_settings(pipeline)[0]
+        setting = self.scenes.setting
         self.record = setting.record() if isinstance(setting, PluginSetting) else None
         self.faults: list[str] = []
-        self.first = self.search(range(len(self.scenes.images)))
+        self.first = self.results(range(len(self.scenes.images)))
+        self.asked, self.found = len(self.first), sum(map(bool, self.first))
 
-    def search(self, order: Sequence[int]) -> list[Found]:
-        """Search the scenes in an order; return the markers of each, in the scenes' order."""
-        found: list[Found] = [[] for _ in order]
-        for row in order:
+    def results(self, rows: Sequence[int]) -> list[Found]:
+        """Search scenes in an order; return the markers of each."""
+        found: list[Found] = []
+        for row in rows:
             try:
-                found[row] = self.markers(self.scenes.images[row])
+                found.append(self.markers(self.scenes.images[row]))
             except PluginError as error:
                 self.faults.append(str(error))
+                found.append([])
         return found
 
     def markers(self, image: NDArray[np.uint8]) -> Found:
@@ -499,88 +481,75 @@ class DetectorTrial:
             for number, quad in zip(numbers, corners, strict=True)
         ]
 
+    def differing(self, rows: Sequence[int], second: list[Found]) -> int:
+        """Return of how many of some scenes the second results differ by a bit."""
+        return sum(
+            [number for number, _ in self.first[row]] != [number for number, _ in other]
+            or any((a != b).any() for (_, a), (_, b) in zip(self.first[row], other, strict=True))
+            for row, other in zip(rows, second, strict=True)
+        )
 
-def detector_returns_markers(trial: DetectorTrial) -> Outcome:
-    """Demand right shapes and types; nothing is raised, and no image is changed."""
-    faults = list(dict.fromkeys(trial.faults))
-    return (FAULT, "; ".join(faults)) if faults else (OK, "corners and IDs of the right shapes")
+    def in_order(self) -> int:
+        """Return how many results differ when all are searched again."""
+        return self.differing(range(self.asked), self.results(range(self.asked)))
 
+    def out_of_order(self) -> int:
+        """Return how many results differ in reverse order, after images of noise."""
+        self.odd()
+        backwards = range(self.asked)[::-1]
+        return self.differing(backwards, self.results(backwards))
 
-def detector_finds_markers(trial: DetectorTrial) -> Outcome:
-    """Demand that large, sharp markers are found."""
-    return _share(sum(map(bool, trial.first)), len(trial.first), "detected", "a marker")
+    def judged(self) -> Outcome:
+        """Demand IDs, order of corners and centre of the first pixel as they are declared."""
+        result = conventions(self.first, self.scenes.marker_id, self.scenes.corners_px)
+        if result is None:
+            return FAULT, "no marker was found"
+        declared, center = (None, None) if self.record is None else (
+            self.record.corner_order, self.record.pixel_center)
+        numbers = {"offset_px": result.offset_px.tolist(), "rms_px": result.rms_px}
+        if faults := order_faults(result, declared, center):
+            if self.record is None and faults == offset_fault(result, None):
+                return NOTE, f"{faults[0]}: OpenCV's own, which stays in its results", numbers
+            return FAULT, "; ".join(faults), numbers
+        x, y = result.offset_px
+        return OK, (
+            f"IDs and order of corners; mean offset ({x:+.3f}, {y:+.3f}) px, RMS beside it "
+            f"{result.rms_px:.3f} px"
+        ), numbers
 
-
-def detector_keeps_conventions(trial: DetectorTrial) -> Outcome:
-    """Demand IDs, order of corners and centre of the first pixel as they are declared."""
-    result = conventions(trial.first, trial.scenes.marker_id, trial.scenes.corners_px)
-    if result is None:
-        return FAULT, "no marker was found"
-    record = trial.record
-    declared, center = (None, None) if record is None else (
-        record.corner_order, record.pixel_center)
-    numbers = {"offset_px": result.offset_px.tolist(), "rms_px": result.rms_px}
-    if faults := order_faults(result, declared, center):
-        if record is None and faults == offset_fault(result, None):
-            return NOTE, f"{faults[0]}: OpenCV's own, which stays in its results", numbers
-        return FAULT, "; ".join(faults), numbers
-    x, y = result.offset_px
-    return OK, (
-        f"IDs and order of corners; mean offset ({x:+.3f}, {y:+.3f}) px, RMS beside it "
-        f"{result.rms_px:.3f} px"
-    ), numbers
-
-
-def detector_repeats_itself(trial: DetectorTrial) -> Outcome:
-    """Demand the same bits of the same images."""
-    return _same_markers(trial, trial.search(range(len(trial.first))), "called again")
-
-
-def detector_has_no_memory(trial: DetectorTrial) -> Outcome:
-    """Demand the same bits of the same images in reverse order, after images of noise."""
-    _odd_images(trial)
-    return _same_markers(
-        trial, trial.search(range(len(trial.first))[::-1]), "called in reverse, after noise")
-
-
-def detector_survives_odd_images(trial: DetectorTrial) -> Outcome:
-    """Search plain, black, noisy and small images; what is raised is noted."""
-    lines = _odd_images(trial)
-    return (NOTE, "; ".join(lines)) if lines else (OK, "plain, black, noise, down to 8 x 8 px")
-
-
-def _odd_images(trial: DetectorTrial) -> list[str]:
-    generator = np.random.default_rng(1)
-    lines = []
-    for height, width, low, high in (
-        (480, 640, 128, 129), (480, 640, 0, 1), (480, 640, 0, 256), (241, 319, 0, 256),
-        (37, 53, 0, 256), (8, 8, 0, 256),
-    ):
-        image = generator.integers(low, high, (height, width)).astype(np.uint8)
-        try:
-            trial.markers(image)
-        except PluginError as error:
-            lines.append(f"an image of {width} x {height} px: {error}")
-    return lines
-
-
-def _same_markers(trial: DetectorTrial, second: list[Found], how: str) -> Outcome:
-    different = sum(
-        [number for number, _ in one] != [number for number, _ in other]
-        or any((a != b).any() for (_, a), (_, b) in zip(one, other, strict=True))
-        for one, other in zip(trial.first, second, strict=True)
-    )
-    return _same(different, len(second), how)
+    def odd(self) -> list[str]:
+        """Search plain, black, noisy and small images; return what is raised."""
+        generator = np.random.default_rng(1)
+        lines = []
+        for height, width, low, high in (
+            (480, 640, 128, 129), (480, 640, 0, 1), (480, 640, 0, 256), (241, 319, 0, 256),
+            (37, 53, 0, 256), (8, 8, 0, 256),
+        ):
+            image = generator.integers(low, high, (height, width)).astype(np.uint8)
+            try:
+                self.markers(image)
+            except PluginError as error:
+                lines.append(f"an image of {width} x {height} px: {error}")
+        return lines
 
 
 class SolverTrial:
     """A solver, and what it makes of the scenes' detections."""
 
+    returned = "poses of the right shapes, rotations that are rotations"
+    found_key, found_what = "solved", "a pose that reprojects to the corners"
+    found_hint = "; expected marker to camera, OpenCV's axes, metres"
+    order, survived = "alone, or in reverse order", "tilts of 80 to 85 degrees"
+
     def __init__(self, pipeline: Pipeline, steep: Pipeline) -> None:
         self.pipeline, self.steep = pipeline, steep
-        self.first = self.solve(range(SCENES))
+        self.first = self.results(range(SCENES))
+        self.faults = _raised(self.first) or self._faults_of_all()
+        self.solved = self.column("estimate") == EstimateStatus.solved
+        self.asked = int((self.column("detection") == DetectionStatus.detected).sum())
+        self.found = int(self.solved.sum())
 
-    def solve(self, rows: Sequence[int]) -> CellsResult:
+    def results(self, rows: Sequence[int]) -> CellsResult:
         """Return results of scenes that are solved together."""
         return run_cells(self.pipeline, [np.array(rows, dtype=np.intp)])
 
@@ -588,11 +557,13 @@ class SolverTrial:
         """Return a variable of all scenes."""
         return self.first.columns[name][0]
 
-    def fault_of_all(self) -> str:
-        """Return what is raised if all single markers are solved in one call; empty for nothing.
+    def _faults_of_all(self) -> list[str]:
+        """Return what is raised if all single markers are solved in one call.
 
         A run solves them one by one then, which takes long and hides it.
         """
+        if shows_boards(self.pipeline):
+            return []
         values = scene_values(self.pipeline, [np.arange(SCENES)])
         scenes = build_scenes(values, SCENES)
         (searched,), _, _ = search(
@@ -604,8 +575,8 @@ class SolverTrial:
         try:
             build(setting)(detections_for(setting, values, scenes, searched, rows))
         except PluginError as error:
-            return str(error)
-        return ""
+            return [str(error)]
+        return []
 
     def differing(self, rows: Sequence[int], second: CellsResult) -> int:
         """Return of how many of some scenes the second results differ by a bit."""
@@ -617,85 +588,93 @@ class SolverTrial:
                 differ |= unlike.reshape(len(rows), -1).any(axis=1)
         return int(differ.sum())
 
+    def in_order(self) -> int:
+        """Return how many results differ when all are solved again."""
+        return self.differing(range(SCENES), self.results(range(SCENES)))
 
-def solver_returns_poses(trial: SolverTrial) -> Outcome:
-    """Demand right shapes, and rotations that are rotations; nothing is raised."""
-    lines = [failure.text.strip().splitlines()[-1] for failure in trial.first.failures]
-    if not lines and not shows_boards(trial.pipeline):
-        lines = [line for line in [trial.fault_of_all()] if line]
-    return (FAULT, "; ".join(dict.fromkeys(lines))) if lines else (
-        OK, "poses of the right shapes, rotations that are rotations")
+    def out_of_order(self) -> int:
+        """Return how many results differ in reverse order, or alone."""
+        backwards = range(SCENES)[::-1]
+        alone = sum(self.differing([row], self.results([row])) for row in range(SCENES))
+        return max(alone, self.differing(backwards, self.results(backwards)))
 
+    def judged(self) -> Outcome:
+        """Demand poses of the marker in the camera's frame, in metres."""
+        if not self.solved.any():
+            return FAULT, "no pose was solved"
+        turned = float(np.median(self.column("rotation_error_deg")[self.solved]))
+        distance = np.linalg.norm(self.column("true_tvec_m")[self.solved], axis=1)
+        away = np.linalg.norm(self.column("translation_error_m")[self.solved], axis=1)
+        percent = float(np.median(100 * away / distance))
+        wrong = turned > MAX_ROTATION_DEG or percent > MAX_POSITION_PERCENT
+        return FAULT if wrong else OK, (
+            f"median errors {turned:.2g} deg and {percent:.2g} % of the distance"
+        )
 
-def solver_solves_scenes(trial: SolverTrial) -> Outcome:
-    """Demand poses that reproject to the corners of large, sharp markers."""
-    detected = trial.column("detection") == DetectionStatus.detected
-    solved = trial.column("estimate") == EstimateStatus.solved
-    return _share(
-        int(solved.sum()), int(detected.sum()), "solved", "a pose that reprojects to the corners",
-        "; expected marker to camera, OpenCV's axes, metres")
-
-
-def solver_keeps_frames(trial: SolverTrial) -> Outcome:
-    """Demand poses of the marker in the camera's frame, in metres."""
-    solved = trial.column("estimate") == EstimateStatus.solved
-    if not solved.any():
-        return FAULT, "no pose was solved"
-    turned = float(np.median(trial.column("rotation_error_deg")[solved]))
-    distance = np.linalg.norm(trial.column("true_tvec_m")[solved], axis=1)
-    away = np.linalg.norm(trial.column("translation_error_m")[solved], axis=1)
-    percent = float(np.median(100 * away / distance))
-    text = f"median errors {turned:.2g} deg and {percent:.2g} % of the distance"
-    wrong = turned > MAX_ROTATION_DEG or percent > MAX_POSITION_PERCENT
-    return (FAULT if wrong else OK), text
+    def odd(self) -> list[str]:
+        """Solve markers that are seen nearly from the side; return what is raised."""
+        return _raised(run_cells(self.steep, [np.arange(SCENES)]))
 
 
-def solver_repeats_itself(trial: SolverTrial) -> Outcome:
-    """Demand the same bits of the same detections."""
-    rows = range(SCENES)
-    return _same(trial.differing(rows, trial.solve(rows)), SCENES, "called again")
+def _raised(result: CellsResult) -> list[str]:
+    """Return the last lines of what was raised."""
+    return [failure.text.strip().splitlines()[-1] for failure in result.failures]
 
 
-def solver_ignores_the_batch(trial: SolverTrial) -> Outcome:
-    """Demand the same bits of a detection alone, and among others in another order."""
-    backwards = range(SCENES)[::-1]
-    different = trial.differing(backwards, trial.solve(backwards))
-    alone = sum(trial.differing([row], trial.solve([row])) for row in range(SCENES))
-    return _same(max(different, alone), SCENES, "called alone, or in reverse order")
+Trial = DetectorTrial | SolverTrial
 
 
-def solver_survives_odd_detections(trial: SolverTrial) -> Outcome:
-    """Solve markers that are seen nearly from the side; what is raised is noted."""
-    result = run_cells(trial.steep, [np.arange(SCENES)])
-    lines = [failure.text.strip().splitlines()[-1] for failure in result.failures]
-    return (NOTE, "; ".join(dict.fromkeys(lines))) if lines else (OK, "tilts of 80 to 85 degrees")
+def returns_what_it_should(trial: Trial) -> Outcome:
+    """Demand right shapes and types; nothing is raised, and no image is changed."""
+    faults = "; ".join(dict.fromkeys(trial.faults))
+    return (FAULT, faults) if faults else (OK, trial.returned)
 
 
-def _share(count: int, scenes: int, key: str, what: str, hint: str = "") -> Outcome:
-    text = f"{what} in {count} of {scenes} scenes"
-    if count < max(1, FEWEST_SHARE * scenes):
-        return FAULT, text + hint, {key: count}
-    return OK if count == scenes else NOTE, text, {key: count}
+def finds_markers(trial: Trial) -> Outcome:
+    """Demand that large, sharp markers are found, or solved."""
+    text, numbers = f"{trial.found_what} in {trial.found} of {trial.asked} scenes", {
+        trial.found_key: trial.found}
+    if trial.found < max(1, FEWEST_SHARE * trial.asked):
+        return FAULT, text + trial.found_hint, numbers
+    return OK if trial.found == trial.asked else NOTE, text, numbers
 
 
-def _same(different: int, scenes: int, how: str) -> Outcome:
+def keeps_conventions(trial: Trial) -> Outcome:
+    """Demand the conventions that are declared, or the frames of poses."""
+    return trial.judged()
+
+
+def repeats_itself(trial: Trial) -> Outcome:
+    """Demand the same bits for the same input."""
+    return _same(trial.in_order(), "again")
+
+
+def ignores_order(trial: Trial) -> Outcome:
+    """Demand the same bits in another order, and among other input."""
+    return _same(trial.out_of_order(), trial.order)
+
+
+def survives_odd_input(trial: Trial) -> Outcome:
+    """Try odd input; what is raised is noted."""
+    lines = "; ".join(dict.fromkeys(trial.odd()))
+    return (NOTE, lines) if lines else (OK, trial.survived)
+
+
+def _same(different: int, how: str) -> Outcome:
     if different:
-        return FAULT, f"{how}, it gives other results in {different} of {scenes} scenes"
-    return OK, f"the same bits, {how}"
+        return FAULT, f"called {how}, it gives other results in {different} of {SCENES} scenes"
+    return OK, f"the same bits, called {how}"
 
 
-CHECKS: dict[str, tuple[Callable[[Any], Outcome], ...]] = {
-    "detector": (
-        detector_returns_markers, detector_finds_markers, detector_keeps_conventions,
-        detector_repeats_itself, detector_has_no_memory, detector_survives_odd_images,
-    ),
-    "estimator": (
-        solver_returns_poses, solver_solves_scenes, solver_keeps_frames, solver_repeats_itself,
-        solver_ignores_the_batch, solver_survives_odd_detections,
-    ),
+CHECKS: tuple[Callable[[Trial], Outcome], ...] = (
+    returns_what_it_should, finds_markers, keeps_conventions, repeats_itself, ignores_order,
+    survives_odd_input,
+)
+
+NAMES = {
+    "detector": ("returns markers", "finds markers", "keeps conventions", "repeats itself",
+                 "has no memory", "survives odd images"),
+    "estimator": ("returns poses", "solves scenes", "keeps frames", "repeats itself",
+                  "ignores the batch", "survives odd detections"),
 }
-"""Kind of plug-in -> its checks. A check returns a verdict, a line, and maybe numbers."""
-
-
-def _names(kind: str) -> list[str]:
-    return [check.__name__.partition("_")[2].replace("_", " ") for check in CHECKS[kind]]
+"""Kind of plug-in -> the names of its checks."""

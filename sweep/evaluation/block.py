@@ -6,7 +6,7 @@ import dataclasses
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -23,17 +23,14 @@ from sweep.evaluation.machine_faults import (
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import CellsResult, Failure, concatenate, exception_text
 from sweep.evaluation.search import (
-    BoardFindings,
-    BoardScenes,
     SearchResult,
-    any_recorded,
-    board_scenes,
+    is_recorded,
     search,
     visibility_flags,
     whole_frames,
 )
-from sweep.measure.board_solver import BoardDetections
 from sweep.measure.bound import Bounds, bounds, outside_model
+from sweep.measure.classify import Findings, TargetScenes, target_scenes
 from sweep.measure.estimation import (
     Detections,
     Estimates,
@@ -42,7 +39,7 @@ from sweep.measure.estimation import (
     rotation_difference,
     squared_deviations,
 )
-from sweep.measure.estimators import EstimatorSetting, build, build_for_boards
+from sweep.measure.estimators import EstimatorSetting, build
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.model.calibration import COEFFICIENTS, VIEW
 from sweep.model.camera import Cameras, Column
@@ -129,43 +126,26 @@ def detections_for(
     estimator: EstimatorSetting, values: Mapping[str, Column], scenes: Scenes,
     result: SearchResult, rows: NDArray[np.intp],
 ) -> Detections:
-    """Return the detections of the scenes ``rows`` (n,), with what an estimator assumes of them."""
+    """Return what was found in scenes ``rows`` (n,), with what an estimator assumes of them."""
     cameras, size = assumed_cameras(estimator, values, scenes)
     noise, blur = _assumed_noise_and_blur(estimator, scenes)
+    found, targets = result.found, result.targets.targets
     on_board = values["on_board"].values if "on_board" in values else None
-    return Detections(
-        result.corners[rows], cameras.take(rows), size[rows], noise[rows], blur[rows],
-        [scenes.markers[k] for k in scenes.marker[rows]],
-        [result.images[row] for row in rows.tolist()] if result.images else [],
-        result.origins[rows],
-        None if result.poses is None else result.poses.rotation[rows],
-        None if result.poses is None else result.poses.translation[rows],
-        None if on_board is None else [on_board[row] for row in rows.tolist()],
-    )
-
-
-def board_detections_for(
-    estimator: EstimatorSetting, values: Mapping[str, Column], scenes: Scenes,
-    boards: BoardScenes, result: SearchResult, rows: NDArray[np.intp],
-) -> BoardDetections:
-    """Return what was found of the boards of scenes ``rows`` (n,), and what is assumed of them."""
-    if result.boards is None:
-        raise TypeError("no boards were searched")
-    cameras, size = assumed_cameras(estimator, values, scenes)
-    noise, blur = _assumed_noise_and_blur(estimator, scenes)
     images = [result.images[row] for row in rows.tolist()] if result.images else []
     beside: list[Masks] = []
-    if images and any(boards.boards[row].distractors for row in rows.tolist()):
+    if images and any(each.distractors for each in targets):
         for row, image in zip(rows.tolist(), images, strict=True):
             left, top = result.origins[row].tolist()
             box = left, top, left + image.shape[1], top + image.shape[0]
             beside.append(beside_pixels(scenes, row, box))
-    return BoardDetections(
-        [boards.boards[row] for row in rows.tolist()],
-        [result.boards.points[row] for row in rows.tolist()],
-        cameras.take(rows), noise[rows], blur[rows], (size / scenes.size_m)[rows], images,
-        result.origins[rows], beside,
+    # The detections of all scenes, of which those of the rows are taken.
+    everything = Detections(
+        found.corners, cameras, size, noise, blur, targets, [], result.origins, found.owner,
+        found.square, size / scenes.size_m, found.chessboard_px, (),
+        None if result.poses is None else result.poses.rotation,
+        None if result.poses is None else result.poses.translation, on_board,
     )
+    return dataclasses.replace(everything.take(rows), images=images, beside=beside)
 
 
 def estimate_poses(
@@ -199,41 +179,28 @@ def estimate_poses(
 
 @dataclass(frozen=True, slots=True)
 class SceneResults:
-    """N scenes and their accuracy bounds."""
+    """N scenes, their targets and their accuracy bounds."""
 
     scenes: Scenes
+    targets: TargetScenes
     bounds: Bounds
 
 
 @dataclass(frozen=True, slots=True)
 class DetectionResults:
-    """Detections of N scenes with one detector setting: flags (N,), corners (N, 4, 2) px."""
-
-    scenes: Scenes
-    flags: NDArray[np.uint8]
-    corners: Floats
-
-
-@dataclass(frozen=True, slots=True)
-class BoardResults:
-    """Detections of N boards with one detector setting.
+    """Detections of N scenes with one detector setting.
 
     Attributes
     ----------
-    boards, found
-        The boards, and what was found of each.
+    targets, found
+        What the scenes show, and what was found of it.
     flags
-        (N,) those of the boards as a whole.
+        (N,) those of the targets as a whole.
     """
 
-    boards: BoardScenes
-    found: BoardFindings
+    targets: TargetScenes
+    found: Findings
     flags: NDArray[np.uint8]
-
-    @property
-    def searched(self) -> Masks:
-        """(N,) which scenes were searched without a fault."""
-        return np.asarray(self.flags == self.found.flags)
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,11 +238,12 @@ def _alternative_angle_deg(results: EstimationResults) -> Floats:
     return np.asarray(np.degrees(np.linalg.norm(other, axis=1)))
 
 
-def _board_area_px(boards: BoardScenes) -> Floats:
+def _board_area_px(results: SceneResults) -> Floats:
     """Return the total area (N,) of the squares of a board's markers that are seen, px²."""
-    on_board = boards.marker_id >= 0
-    unseen = ~on_board | (boards.flags == DetectionStatus.not_visible)
-    seen = np.where(unseen[..., None, None], 0.0, boards.corners_px)
+    targets = results.targets
+    on_board = targets.marker_id >= 0
+    unseen = ~on_board | (targets.flags == DetectionStatus.not_visible)
+    seen = np.where(unseen[..., None, None], 0.0, targets.corners_px)
     area = np.abs(signed_areas(seen.reshape(-1, 4, 2))).reshape(unseen.shape)
     sizes = on_board.sum(axis=1)
     total = np.full(len(area), np.nan)
@@ -285,22 +253,21 @@ def _board_area_px(boards: BoardScenes) -> Floats:
     return np.where(unseen.all(axis=1), np.nan, total)
 
 
-def _marker_flags(results: BoardResults) -> NDArray[np.uint8]:
-    """Return the flags of the markers (N, M): the board's where it was not searched."""
-    known = results.searched[:, None] | (
-        results.boards.flags == DetectionStatus.not_on_board
-    )
+def _marker_flags(results: DetectionResults) -> NDArray[np.uint8]:
+    """Return the flags of the markers (N, M): the target's where it was not searched."""
+    searched = results.flags == results.found.flags
+    known = searched[:, None] | (results.targets.flags == DetectionStatus.not_on_board)
     return np.where(known, results.found.marker_flags, results.flags[:, None])
 
 
-def _marker_errors_px(results: BoardResults) -> Floats:
-    errors = results.found.marker_corners - results.boards.corners_px
+def _marker_errors_px(results: DetectionResults) -> Floats:
+    errors = results.found.marker_corners - results.targets.corners_px
     errors[_marker_flags(results) != DetectionStatus.detected] = np.nan
     return errors
 
 
-def _chessboard_errors_px(results: BoardResults) -> Floats:
-    errors = results.found.chessboard_px - results.boards.chessboard_px
+def _chessboard_errors_px(results: DetectionResults) -> Floats:
+    errors = results.found.chessboard_px - results.targets.chessboard_px
     errors[results.flags != DetectionStatus.detected] = np.nan
     return errors
 
@@ -338,25 +305,28 @@ def photograph_variables(scenes: Scenes, values: Mapping[str, Column]) -> dict[s
     }
 
 
-DETECTION: dict[str, Callable[[DetectionResults], NDArray[Any]]] = {
-    "detection": lambda results: results.flags,
-    "corner_error_px": lambda results: results.corners - results.scenes.corners_px,
-}
-"""Variable of the detection -> its values (N, ...)."""
-
-BOARD_SCENE: dict[str, Callable[[BoardScenes], NDArray[Any]]] = {
+BOARD_SCENE: dict[str, Callable[[SceneResults], NDArray[Any]]] = {
     "marker_area_px": _board_area_px,
-    "board_marker_id": lambda boards: np.where(boards.marker_id < 0, np.nan, boards.marker_id),
+    "board_marker_id": lambda results: np.where(
+        results.targets.marker_id < 0, np.nan, results.targets.marker_id
+    ),
 }
 """Variable of the scene that boards have, or have otherwise -> its values (N, ...)."""
 
-BOARD_DETECTION: dict[str, Callable[[BoardResults], NDArray[Any]]] = {
+DETECTION: dict[str, Callable[[DetectionResults], NDArray[Any]]] = {
     "detection": lambda results: results.flags,
+    "corner_error_px": lambda results: (
+        results.found.marker_corners - results.targets.corners_px
+    )[:, 0],
+}
+"""Variable of the detection -> its values (N, ...)."""
+
+BOARD_DETECTION: dict[str, Callable[[DetectionResults], NDArray[Any]]] = {
     "marker_detection": _marker_flags,
     "marker_corner_error_px": _marker_errors_px,
     "chessboard_corner_error_px": _chessboard_errors_px,
 }
-"""Variable of the detection of boards -> its values (N, ...)."""
+"""Variable of the detection that boards alone have -> its values (N, ...)."""
 
 ESTIMATION: dict[str, Callable[[EstimationResults], NDArray[Any]]] = {
     "estimate": lambda results: results.estimates.status,
@@ -407,14 +377,15 @@ Results = TypeVar("Results")
 
 
 def compute(
-    table: Mapping[str, Callable[[Results], NDArray[Any]]], results: Results
+    table: Mapping[str, Callable[[Results], NDArray[Any]]], results: Results,
+    names: Collection[str],
 ) -> dict[str, NDArray[Any]]:
-    """Return every variable of a table."""
-    return {name: function(results) for name, function in table.items()}
+    """Return every variable of a table that is among ``names``."""
+    return {name: function(results) for name, function in table.items() if name in names}
 
 
 def compute_estimation(
-    results: EstimationResults, rows: NDArray[np.intp], needed: Masks, *, on_boards: bool = False
+    results: EstimationResults, rows: NDArray[np.intp], needed: Masks, names: Collection[str]
 ) -> dict[str, NDArray[Any]]:
     """Return the estimation variables (N, ...) over all scenes.
 
@@ -426,12 +397,11 @@ def compute_estimation(
         (n,) their numbers among the N scenes.
     needed
         (N,) scenes whose estimate was asked for; the flags of the others are ``not_run``.
-    on_boards
-        Whether the variables of boards belong to it.
+    names
+        The variables that are wanted.
     """
     columns = {}
-    table = ESTIMATION | BOARD_ESTIMATION if on_boards else ESTIMATION
-    for name, values in compute(table, results).items():
+    for name, values in compute(ESTIMATION | BOARD_ESTIMATION, results, names).items():
         variable = VARIABLES[name]
         fill = WITHOUT_DETECTION.get(name, variable.fill)
         column = np.full((len(needed), *values.shape[1:]), fill, dtype=values.dtype)
@@ -525,23 +495,19 @@ def _run_batch(
     values = scene_values(pipeline, indices)
     scenes = build_scenes(values, count, scene_plugins(pipeline))
     visibility = visibility_flags(scenes)
-    boards = None
-    if "board" in values:
-        boards = board_scenes(
-            scenes, values["board"].listed(count), visibility, largest_board(pipeline)
-        )
+    boards = values["board"].listed(count) if "board" in values else None
+    targets = target_scenes(
+        scenes, visibility, boards, (1, 0) if boards is None else largest_board(pipeline)
+    )
     to_search = searched & (visibility == DetectionStatus.not_run)[:, None]
     geometry_s = time.perf_counter() - start
 
-    builds = [
-        build(estimator) if boards is None else build_for_boards(estimator)
-        for estimator in estimating
-    ]
-    keep = any(each.needs_images for each in builds)
+    builds = [build(estimator) for estimator in estimating]
     results, render_s, row_s = search(
-        scenes, to_search, settings, whole_frames(values, count), failures, keep=keep,
-        keys=image_keys(pipeline, indices) if any_recorded(settings) else None,
-        boards=boards, board_settings=() if boards is None else board_settings(pipeline),
+        scenes, to_search, settings, whole_frames(values, count), failures,
+        keep=any(each.needs_images for each in builds), targets=targets,
+        keys=image_keys(pipeline, indices) if any(map(is_recorded, settings)) else None,
+        board_settings=board_settings(pipeline),
     )
     columns: dict[str, list[NDArray[Any]]] = {
         variable.name: [] for variable in variables_of(pipeline)
@@ -552,8 +518,9 @@ def _run_batch(
             columns[name].append(column)
 
     start = time.perf_counter()
-    of_scene = compute(SCENE, SceneResults(scenes, _bounds(values, scenes, visibility)))
-    add(of_scene if boards is None else of_scene | compute(BOARD_SCENE, boards))
+    table = SCENE if boards is None else SCENE | BOARD_SCENE
+    of_scenes = SceneResults(scenes, targets, _bounds(values, scenes, visibility))
+    add(compute(table, of_scenes, columns))
     add({
         variable.name: values[variable.drawn_as].broadcast(count)
         for variable in drawn_variables(pipeline)
@@ -569,19 +536,12 @@ def _run_batch(
         flags = np.where(visibility == DetectionStatus.not_run, result.flags, visibility)
         flags[~searched[:, k]] = DetectionStatus.not_run
         flags = flags.astype(np.uint8)
-        if result.boards is None or boards is None:
-            add(compute(DETECTION, DetectionResults(scenes, flags, result.corners)))
-        else:
-            of_boards = {name: function for name, function in BOARD_DETECTION.items()
-                         if name in columns}  # without chessboards their corners are no variable
-            add(compute(of_boards, BoardResults(boards, result.boards, flags)))
+        of_search = DetectionResults(targets, result.found, flags)
+        add(compute(DETECTION | BOARD_DETECTION, of_search, columns))
         for j, estimator in enumerate(estimating):
             rows = np.flatnonzero((flags == DetectionStatus.detected) & need[:, k, j])
             start = time.perf_counter()
-            detections: Detections | BoardDetections = (
-                detections_for(estimator, values, scenes, result, rows) if boards is None
-                else board_detections_for(estimator, values, scenes, boards, result, rows)
-            )
+            detections = detections_for(estimator, values, scenes, result, rows)
             known = len(failures)
             estimates = estimate_poses(detections, builds[j], rows, failures)
             failures[known:] = [
@@ -589,7 +549,7 @@ def _run_batch(
                 for failure in failures[known:]
             ]
             compared = _compare(estimates, scenes, rows)
-            add(compute_estimation(compared, rows, need[:, k, j], on_boards=boards is not None))
+            add(compute_estimation(compared, rows, need[:, k, j], columns))
             seconds["estimation"].append(time.perf_counter() - start)
     return CellsResult(columns, seconds, row_s, failures)
 

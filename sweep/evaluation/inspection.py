@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.errors import RunError
+from sweep.errors import PluginError, RunError
 from sweep.evaluation.block import assumed_cameras, run_cells
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import (
-    board_scenes,
-    recorded_candidates,
-    recording_of,
+    RecordedSearch,
+    detection_source,
+    is_recorded,
     search_windows,
     visibility_flags,
     whole_frames,
 )
-from sweep.measure.detectors import make_detector
+from sweep.measure.classify import target_scenes
+from sweep.measure.detectors import SearchOutput
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.camera import Column
 from sweep.model.extent import marker_boxes
@@ -27,7 +29,13 @@ from sweep.model.pose import rotation_of_vector, transform_points
 from sweep.model.renderers import render
 from sweep.model.scene import Scenes, build_scenes
 from sweep.plan.experiment import largest_board, scene_plugins
-from sweep.plan.grid import detector_settings, estimators, image_keys, scene_values
+from sweep.plan.grid import (
+    board_settings,
+    detector_settings,
+    estimators,
+    image_keys,
+    scene_values,
+)
 from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.schema import variables_of
@@ -137,35 +145,30 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
     full = whole_frames(values, 1) | rendered.invisible
     searched = search_windows(scenes, rendered.boxes, setting, full)
     x0, y0, x1, y1 = searched[0].tolist()
-    recording = recording_of(setting)
-    if recording is None:
-        quads, ids, rejected = make_detector(setting)(
-            image[y0 - top : y1 - top, x0 - left : x1 - left],
-            scenes.dictionary[0],
-            int(scenes.frame[0].max()),
-        )
-        origin = np.array([x0, y0], dtype=np.float64)
+    boards = values["board"].listed(1) if "board" in values else None
+    targets = target_scenes(
+        scenes, visibility_flags(scenes), boards,
+        (1, 0) if boards is None else largest_board(pipeline),
+    )
+    keys = image_keys(pipeline, indices) if is_recorded(setting) else None
+    source = detection_source(setting, scenes, targets, keys, board_settings(pipeline)[0])
+    output, origin = SearchOutput([], None, []), np.zeros(2)
+    if isinstance(source, RecordedSearch):  # in pixels of the frame
+        with suppress(PluginError):  # flagged "failed" by the run
+            output = source(0)
     else:
-        found, _ = recorded_candidates(
-            recording, scenes, np.zeros(1, dtype=np.intp), image_keys(pipeline, indices), [], 0
-        )
-        quads, ids, rejected = found[0][1:] if found else ((), None, ())
-        origin = np.zeros(2)
+        origin = np.array([x0, y0], dtype=np.float64)
+        output = source(0, image[y0 - top : y1 - top, x0 - left : x1 - left])
     columns = {name: parts[0][0] for name, parts in result.columns.items()}
-    true_markers = scenes.corners_px
     chessboard, length = np.zeros((0, 2)), float(scenes.size_m[0])
-    if "board" in values:
-        (board,) = values["board"].listed(1)
-        boards = board_scenes(
-            scenes, [board], visibility_flags(scenes), largest_board(pipeline)
-        )
-        true_markers = boards.corners_px[0]
+    true_markers = targets.corners_px[0]
+    if boards is None:
+        markers = true_markers + columns["corner_error_px"]
+    else:
         markers = true_markers + columns["marker_corner_error_px"]
         if "chessboard_corner_error_px" in columns:
-            chessboard = boards.chessboard_px[0] + columns["chessboard_corner_error_px"]
-        length = float(np.ptp(board.corners_m.reshape(-1, 3), axis=0)[:2].min())
-    else:
-        markers = true_markers + columns["corner_error_px"]
+            chessboard = targets.chessboard_px[0] + columns["chessboard_corner_error_px"]
+        length = float(np.ptp(boards[0].corners_m.reshape(-1, 3), axis=0)[:2].min())
     axes_px = np.full((4, 2), np.nan)
     if columns["estimate"] == EstimateStatus.solved:
         cameras, _ = assumed_cameras(estimator, values, scenes)
@@ -184,9 +187,11 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
         area_px=float(columns["marker_area_px"]),
         decoded=[
             (int(marker_id), quad[0] + origin)
-            for marker_id, quad in zip(() if ids is None else ids.ravel(), quads, strict=True)
+            for marker_id, quad in zip(
+                () if output.ids is None else output.ids.ravel(), output.corners, strict=True
+            )
         ],
-        rejected=[quad[0] + origin for quad in rejected],
+        rejected=[quad[0] + origin for quad in output.rejected],
         detection=DetectionStatus(int(columns["detection"])),
         estimate=EstimateStatus(int(columns["estimate"])),
         axes_px=axes_px,

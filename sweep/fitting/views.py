@@ -289,18 +289,19 @@ def marker_view(
     scenes: Scenes, row: int, board: Board | None, image: Grey
 ) -> FittedMarker | None:
     """Return the pixels of the marker of a scene in a photograph (height, width); None for few."""
-    dictionary, marker_id, margin = scenes.markers[scenes.marker[row]]
+    marker = scenes.target(row)
+    dictionary, marker_id = marker.dictionary, marker.marker_ids[0]
     modules = module_count(dictionary)
     on_board = None
     if board is not None and marker_id in board.marker_ids:
         on_board = BoardMarker(board, board.marker_ids.index(marker_id))
     corners = scenes.corners_px[row]
     side = float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean())
-    clear = margin if on_board is None else clear_modules(on_board)
+    clear = marker.margin or 0.0 if on_board is None else clear_modules(on_board)
     ring = min(max(clear, overhang(dictionary) + 0.5), overhang(dictionary) + RING_MODULES)
     extent = np.ceil(4.0 * (ring + MODELLED_PX * modules / side)) / 4.0
     edges = (
-        edges_alone((dictionary, marker_id, margin), extent) if on_board is None
+        edges_alone(marker, extent) if on_board is None
         else surroundings(on_board, extent)
     )
     to_pixels = cv2.getPerspectiveTransform(

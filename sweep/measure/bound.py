@@ -35,7 +35,6 @@ from sweep.measure.likelihood import (
     state_of,
 )
 from sweep.model import coverage
-from sweep.model.board import Board
 from sweep.model.derivatives import (
     LEVELS,
     POSE,
@@ -48,7 +47,7 @@ from sweep.model.polygon import Optics, Projection
 from sweep.model.printed import moving_edges, own_sheets, side_m, visible_prints
 from sweep.model.renderers import beside_pixels
 from sweep.model.scene import Scenes
-from sweep.model.scene_sheet import solid_board, solid_planes
+from sweep.model.scene_sheet import solid_planes
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
@@ -74,7 +73,7 @@ def solid_covariance(
     variance
         Of a pixel, in squared grey levels.
     """
-    board, planes = solid_board(scenes, row), solid_planes(scenes, row)
+    board, planes = scenes.target(row), solid_planes(scenes, row)
     optics = scenes.cameras.optics(row)
     local = optics.intrinsics.copy()
     local[2:] -= corner
@@ -266,22 +265,22 @@ def bounds(
         status[i] = outside_model(scenes, row)
         if status[i] != BoundStatus.given:
             continue
-        key = scenes.markers[scenes.marker[row]]
+        target = scenes.target(row)
         view = marker_view(
-            key, side_m(key, float(scenes.size_m[row])), scenes.cameras.optics(row), low[i],
+            target, side_m(target, float(scenes.size_m[row])), scenes.cameras.optics(row), low[i],
             noise_variance(noise),
         )
-        arm = scenes.rotation[row] @ middle_m(key) if isinstance(key, Board) else np.zeros(3)
+        arm = scenes.rotation[row] @ middle_m(target)
         state = state_of(scenes.rotation[row], scenes.translation[row] + arm, blur, levels)
         width, height = (high[i] - low[i]).tolist()
         if unknown_blur:
             state[SPREAD] = max(state[SPREAD], MIN_SPREAD_PX)
         image = np.zeros((height, width))
-        if isinstance(key, Board) and key.distractors:
+        if target.distractors:
             left, top = low[i].tolist()
             box = left, top, left + width, top + height
             image[beside_pixels(scenes, row, box)] = np.nan
-        if isinstance(key, Board) and not key.is_planar:
+        if not target.is_planar:
             state[POSITION] = scenes.translation[row]
             covariance, exists = solid_covariance(
                 scenes, row, state, low[i], image, view.variance, spread_free=unknown_blur

@@ -1,97 +1,232 @@
-"""Classification of detections: detected, or why not."""
+"""Classification of detections: which of a target's squares were detected, or why not."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.measure.detectors import DetectorOutput
+from sweep.measure.detectors import SearchOutput
 from sweep.measure.flags import DetectionStatus
-from sweep.typing import Floats
+from sweep.model.board import Board
+from sweep.model.extent import outside_of_frame
+from sweep.model.pose import transform_points
+from sweep.model.printed import unseen_markers
+from sweep.model.scene import Scenes
+from sweep.model.scene_sheet import solid_planes
+from sweep.typing import Floats, Integers, Masks
 
-_TURNS = np.array([np.roll(np.arange(4), -turn) for turn in range(4)])
-"""The corners' order after each quarter turn, (4, 4)."""
+# --------------------------------------------------------------------------------------------------
+# The targets of scenes: where the images of their squares and corners are.
+
+@dataclass(frozen=True, slots=True)
+class TargetScenes:
+    """The targets of N scenes, padded to the most squares M and chessboard corners C.
+
+    Attributes
+    ----------
+    targets
+        Each scene's: a marker, which has one square, or a board.
+    marker_id
+        (N, M) IDs; -1 beyond a target's squares.
+    corners_px, chessboard_px
+        (N, M, 4, 2) and (N, C, 2) true images; NaN beyond a target's.
+    flags
+        (N, M) why a square is not searched; ``not_run`` for those that are.
+    """
+
+    targets: Sequence[Board]
+    marker_id: Integers
+    corners_px: Floats
+    chessboard_px: Floats
+    flags: NDArray[np.uint8]
+
+
+def target_scenes(
+    scenes: Scenes, visibility: NDArray[np.uint8], boards: Sequence[Board] | None = None,
+    shape: tuple[int, int] = (1, 0),
+) -> TargetScenes:
+    """Return the targets of N scenes: markers, or the boards that are given.
+
+    ``visibility`` (N,) are the flags of the targets as a whole; ``shape`` are the most squares and
+    chessboard corners of a board.
+    """
+    count, (most, corners) = len(scenes), shape
+    if boards is None:
+        return TargetScenes(
+            [scenes.target(row) for row in range(count)],
+            np.array(scenes.marker_id, dtype=np.int64)[:, None], scenes.corners_px[:, None],
+            np.empty((count, 0, 2)), visibility[:, None],
+        )
+    ids = np.full((count, most), -1, dtype=np.int64)
+    corners_px = np.full((count, most, 4, 2), np.nan)
+    chessboard_px = np.full((count, corners, 2), np.nan)
+    flags = np.full((count, most), DetectionStatus.not_on_board, dtype=np.uint8)
+    for board in dict.fromkeys(boards):
+        rows = np.flatnonzero([each is board for each in boards])
+        size = len(board)
+        points = np.concatenate([board.corners_m.reshape(-1, 3), board.chessboard_m])
+        pixels = scenes.cameras.take(rows).project(transform_points(
+            np.broadcast_to(points, (len(rows), *points.shape)), scenes.rotation[rows],
+            scenes.translation[rows],
+        ))
+        ids[rows, :size] = board.marker_ids
+        corners_px[rows, :size] = pixels[:, : 4 * size].reshape(-1, size, 4, 2)
+        chessboard_px[rows, : len(board.chessboard_m)] = pixels[:, 4 * size :]
+        flags[rows, :size] = visibility[rows, None]
+        for row in rows[visibility[rows] == DetectionStatus.not_run].tolist():
+            outside = outside_of_frame(scenes, row, board.corners_m, corners_px[row, :size])
+            flags[row, :size][outside] = DetectionStatus.not_visible
+            if scenes.solid[row]:
+                unseen = unseen_markers(board, solid_planes(scenes, row))
+                flags[row, :size][unseen] = DetectionStatus.not_visible
+    return TargetScenes(boards, ids, corners_px, chessboard_px, flags)
+
+
+# --------------------------------------------------------------------------------------------------
+# What a search found of targets: flags, corners, and what estimators get.
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """What one detector setting found of N targets.
+
+    Attributes
+    ----------
+    flags
+        (N,) of the targets: ``detected`` if a square is, else the flag of the square that came
+        nearest to it.
+    marker_flags, marker_corners, chessboard_px
+        (N, M), (N, M, 4, 2) and (N, C, 2) px of the frame; NaN for what was not found.
+    owner, square, corners
+        (K,), (K,) and (K, 4, 2): the squares that estimators get, as
+        :class:`sweep.measure.estimation.Detections` has them.
+    """
+
+    flags: NDArray[np.uint8]
+    marker_flags: NDArray[np.uint8]
+    marker_corners: Floats
+    chessboard_px: Floats
+    owner: Integers
+    square: Integers
+    corners: Floats
 
 
 class Quads(NamedTuple):
-    """Quadrilaterals that lie at markers, perhaps the same one at several.
+    """Quadrilaterals that were found.
 
     Attributes
     ----------
     owner
-        (M,) rows of the markers.
+        (Q,) the row of each: of a scene, or of a square.
     corners_px
-        (M, 4, 2) px of the frame.
+        (Q, 4, 2) px of the frame.
     ids
-        (M,) decoded IDs; -1 for rejected candidates.
+        (Q,) decoded IDs; -1 for rejected candidates.
     """
 
     owner: NDArray[np.intp]
     corners_px: Floats
-    ids: NDArray[np.int64]
+    ids: Integers
+
+
+_NEAREST = (
+    DetectionStatus.detected, DetectionStatus.wrong_id, DetectionStatus.rejected,
+    DetectionStatus.no_candidate, DetectionStatus.not_visible, DetectionStatus.not_modelled,
+)
+"""Flags of a square in the order in which they tell most about its target."""
+
+_TURNS = np.array([np.roll(np.arange(4), -turn) for turn in range(4)])
+"""The corners' order after each quarter turn, (4, 4)."""
+
+_MOST_PAIRS = 1 << 17
+"""Pairs of a square and a quadrilateral that are compared at a time."""
 
 
 def classify(
-    true_corners: Floats, marker_id: NDArray[np.int64],
-    searched: Sequence[tuple[int, *DetectorOutput]], origin: Floats,
-) -> tuple[NDArray[np.uint8], Floats]:
-    """Return the flags (N,) of N markers, and the corners (N, 4, 2) of those detected (else NaN).
+    targets: TargetScenes, searched: Mapping[int, SearchOutput], origin: Floats
+) -> Findings:
+    """Return what was found of N targets.
 
     Parameters
     ----------
-    true_corners, marker_id
-        (N, 4, 2) px and (N,): the truth.
+    targets
+        The truth.
     searched
-        Row and detector's output of each scene that was searched. Of several right markers the
+        Row -> the search's output, of each scene that was searched. Of several right markers the
         nearest counts.
     origin
         (N, 2) px: the top left pixel of the window that was searched.
     """
+    marker_flags = targets.flags.copy()
+    marker_flags[marker_flags == DetectionStatus.not_run] = DetectionStatus.no_candidate
+    marker_corners = np.full_like(targets.corners_px, np.nan)
+    chessboard_px = np.full_like(targets.chessboard_px, np.nan)
+    for row, output in searched.items():
+        if len(output.chessboard_ids):
+            chessboard_px[row, output.chessboard_ids] = output.chessboard_px + origin[row]
     decoded = _in_frame(
-        [(row, quads, ids) for row, quads, ids, _ in searched if ids is not None], origin
+        [(row, each.corners, each.ids) for row, each in searched.items()
+         if each.ids is not None], origin
     )
-    flags, corners = classify_decoded(true_corners, marker_id, decoded)
-    rejected = _in_frame([
-        (row, quads, np.full(len(quads), -1)) for row, _, _, quads in searched
-        if quads and flags[row] == DetectionStatus.no_candidate
-    ], origin)
-    flag_rejected(flags, true_corners, rejected)
-    return flags, corners
-
-
-def classify_decoded(
-    true_corners: Floats, marker_id: NDArray[np.int64], decoded: Quads
-) -> tuple[NDArray[np.uint8], Floats]:
-    """Return the flags (N,) and corners (N, 4, 2) of N markers, ``no_candidate`` if not decoded."""
-    flags = np.full(len(true_corners), DetectionStatus.no_candidate, dtype=np.uint8)
-    corners = np.full_like(true_corners, np.nan)
-    owner, quads, claimed = decoded
-    at_marker = _is_at_marker(quads, true_corners[owner])
-    flags[owner[at_marker]] = DetectionStatus.wrong_id
-    right = np.flatnonzero(at_marker & (claimed == marker_id[owner]))
-    offset = quads[right][:, _TURNS] - true_corners[owner[right]][:, None]
+    # Squares as one list, whichever target they are on.
+    visible = targets.flags == DetectionStatus.not_run
+    true_px, true_ids = targets.corners_px[visible], targets.marker_id[visible]
+    flags = np.full(len(true_px), DetectionStatus.no_candidate, dtype=np.uint8)
+    corners = np.full_like(true_px, np.nan)
+    number = visible.sum(axis=1)
+    first = np.cumsum(number) - number
+    at = _at_squares(decoded, first, number, true_px)
+    flags[at.owner] = DetectionStatus.wrong_id
+    right = np.flatnonzero(at.ids == true_ids[at.owner])
+    offset = at.corners_px[right][:, _TURNS] - true_px[at.owner[right]][:, None]
     squared = (offset**2).sum(axis=(2, 3))
     upright = np.argmin(squared, axis=1) == 0
     # From far to near, so that the nearest is written last.
     order = right[upright][np.argsort(-squared[upright, 0], kind="stable")]
-    flags[owner[order]] = DetectionStatus.detected
-    corners[owner[order]] = quads[order]
-    return flags, corners
-
-
-def flag_rejected(flags: NDArray[np.uint8], true_corners: Floats, rejected: Quads) -> None:
-    """Write the flags of markers (N,) of which no more than a rejected candidate was found."""
-    at_marker = _is_at_marker(rejected.corners_px, true_corners[rejected.owner])
-    missed = rejected.owner[at_marker]
+    flags[at.owner[order]] = DetectionStatus.detected
+    corners[at.owner[order]] = at.corners_px[order]
+    marker_flags[visible], marker_corners[visible] = flags, corners
+    missing = (marker_flags == DetectionStatus.no_candidate).any(axis=1)
+    rejected = _in_frame([
+        (row, each.rejected, np.full(len(each.rejected), -1)) for row, each in searched.items()
+        if missing[row] and len(each.rejected)
+    ], origin)
+    missed = _at_squares(rejected, first, number, true_px).owner
     flags[missed[flags[missed] == DetectionStatus.no_candidate]] = DetectionStatus.rejected
+    marker_flags[visible] = flags
+    of_targets = np.full(len(visible), DetectionStatus.not_visible, dtype=np.uint8)
+    for flag in reversed(_NEAREST):
+        of_targets[(marker_flags == flag).any(axis=1)] = flag
+    return Findings(
+        of_targets, marker_flags, marker_corners, chessboard_px,
+        *_found_squares(targets.targets, decoded, of_targets, marker_corners),
+    )
 
 
-def stacked(quads: Sequence[NDArray[np.floating[Any]]]) -> Floats:
-    """Return quadrilaterals (1, 4, 2) each as an array (M, 4, 2)."""
-    return np.concatenate([np.zeros((0, 4, 2)), *quads])
+def _found_squares(
+    targets: Sequence[Board], decoded: Quads, flags: NDArray[np.uint8], corners: Floats
+) -> tuple[Integers, Integers, Floats]:
+    """Return the squares that estimators get: target, number and corners of each, by target.
+
+    Of a marker its detection; of a board all that have an ID of it, wherever they lie.
+    """
+    numbers = {
+        board: {each: k for k, each in enumerate(board.marker_ids)}
+        for board in dict.fromkeys(each for each in targets if not each.is_marker)
+    }
+    if not numbers:
+        rows = np.flatnonzero(flags == DetectionStatus.detected)
+        return rows, np.zeros(len(rows), dtype=np.int64), corners[rows, 0]
+    square = np.array([
+        numbers[targets[row]].get(each, -1)
+        for row, each in zip(decoded.owner.tolist(), decoded.ids.tolist(), strict=True)
+    ], dtype=np.int64)
+    known = np.flatnonzero(square >= 0)
+    known = known[np.argsort(decoded.owner[known], kind="stable")]
+    return decoded.owner[known], square[known], decoded.corners_px[known]
 
 
 def _in_frame(
@@ -100,15 +235,37 @@ def _in_frame(
     ],
     origin: Floats,
 ) -> Quads:
-    """Return the quadrilaterals that windows of rows hold, with their IDs, in the frame."""
+    """Return the quadrilaterals (1, 4, 2) each that windows of rows hold, with their IDs."""
     rows = np.array([row for row, _, _ in found], dtype=np.intp)
     owner = np.repeat(rows, [len(quads) for _, quads, _ in found])
-    corners = stacked([quad for _, quads, _ in found for quad in quads])
+    corners = np.concatenate(
+        [np.zeros((0, 4, 2)), *(quad for _, quads, _ in found for quad in quads)]
+    )
     ids = np.concatenate([np.zeros(0, np.int64), *(np.ravel(each) for _, _, each in found)])
     return Quads(owner, corners + origin[owner, None], ids)
 
 
-def _is_at_marker(quads: Floats, truth: Floats) -> NDArray[np.bool_]:
+def _at_squares(quads: Quads, first: Integers, number: Integers, true_px: Floats) -> Quads:
+    """Return each quadrilateral at each square of its scene in which its centre lies.
+
+    Row r has the squares ``first[r]`` to ``first[r] + number[r]`` of those with corners ``true_px``
+    (S, 4, 2).
+    """
+    pairs = number[quads.owner]
+    parts = []
+    for some in np.split(
+        np.arange(len(pairs)), np.flatnonzero(np.diff(np.cumsum(pairs) // _MOST_PAIRS)) + 1
+    ):
+        quad = np.repeat(some, pairs[some])
+        before = np.cumsum(pairs[some]) - pairs[some]
+        square = np.arange(len(quad)) + np.repeat(first[quads.owner[some]] - before, pairs[some])
+        inside = _is_at_square(quads.corners_px[quad], true_px[square])
+        parts.append((square[inside], quad[inside]))
+    square, quad = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Quads(square, quads.corners_px[quad], quads.ids[quad])
+
+
+def _is_at_square(quads: Floats, truth: Floats) -> Masks:
     """Return (M,) whether a quadrilateral's centre lies in the true, convex one or on its edge.
 
     Both (M, 4, 2).

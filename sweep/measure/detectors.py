@@ -165,33 +165,6 @@ ALIGNMENT_PX = 4
 MIN_WINDOW_PX = 8
 
 
-def opencv_full_frame_reason(setting: DetectorSetting) -> str | None:
-    """Return why a setting must search the whole frame; None if it can search a window."""
-    if setting.useAruco3Detection:
-        return "useAruco3Detection scales the image by the frame's size"
-    if setting.cornerRefinementMethod == "apriltag" and setting.aprilTagQuadDecimate > 1:
-        return "aprilTagQuadDecimate resamples the frame"
-    if setting.adaptiveThreshConstant < 1:
-        return "adaptiveThreshConstant below 1 turns the plain background into candidates"
-    return None
-
-
-def opencv_margin_px(setting: DetectorSetting) -> int:
-    """Return the width of the border around the marker whose pixels can change the detection.
-
-    Half the largest threshold window and the border in which no corner may lie, plus the
-    contour's own pixel and one to spare; at least the reach of the sub-pixel refinement and of the
-    apriltag search's tiles and blur, if they are used (measured: 2 of 1,500 searches differed at
-    24 px, none from 32). With OpenCV's defaults: 16.
-    """
-    margin = setting.adaptiveThreshWinSizeMax // 2 + setting.minDistanceToBorder + 2
-    if setting.cornerRefinementMethod == "subpix":
-        margin = max(margin, 2 * setting.cornerRefinementWinSize + 3)
-    if setting.cornerRefinementMethod == "apriltag":
-        margin = max(margin, 36 + int(4 * abs(setting.aprilTagQuadSigma)))
-    return margin
-
-
 NOISE_MARGIN_PX = 32
 """Added to the margin if there is noise: its candidates around the marker affect one another.
 
@@ -310,23 +283,22 @@ class BoardDetectorSetting:
     )
 
 
-class BoardOutput(NamedTuple):
-    """What is found on a board in one image: markers, and a chessboard's corners.
+class SearchOutput(NamedTuple):
+    """What is found in one image: markers, and a chessboard's corners.
 
     Attributes
     ----------
-    markers
+    corners, ids, rejected
         The detector's output, with the markers that were found by means of the board.
     chessboard_ids, chessboard_px
         (C,) and (C, 2) indices and pixels of the chessboard's corners that were found.
     """
 
-    markers: DetectorOutput
-    chessboard_ids: Integers
-    chessboard_px: Floats
-
-
-_NO_IDS, _NO_CORNERS = np.zeros(0, dtype=np.int64), np.zeros((0, 2))
+    corners: Sequence[NDArray[np.floating[Any]]]
+    ids: NDArray[np.integer[Any]] | None
+    rejected: Sequence[NDArray[np.floating[Any]]]
+    chessboard_ids: Integers = np.zeros(0, dtype=np.int64)
+    chessboard_px: Floats = np.zeros((0, 2))
 
 
 class BoardDetector:
@@ -350,7 +322,7 @@ class BoardDetector:
 
     def complete(
         self, image: NDArray[np.uint8], board: Board, markers: DetectorOutput
-    ) -> BoardOutput:
+    ) -> SearchOutput:
         """Return what is found on a board in an image (h, w) in which ``markers`` were detected.
 
         ``cv2.aruco.ArucoDetector.refineDetectedMarkers`` and
@@ -359,22 +331,22 @@ class BoardDetector:
         """
         corners, ids, rejected = markers
         if ids is None or not len(ids):
-            return BoardOutput(markers, _NO_IDS, _NO_CORNERS)
+            return SearchOutput(*markers)
         if self._setting.refineDetectedMarkers and rejected:
             refine: Any = self._refining_detector(board.dictionary).refineDetectedMarkers
             corners, ids, rejected, _ = refine(
                 image, _opencv_board(board), list(corners), ids, list(rejected)
             )
-            markers = list(corners), ids, list(rejected)
+            corners, rejected = list(corners), list(rejected)
         if board.chessboard is None:
-            return BoardOutput(markers, _NO_IDS, _NO_CORNERS)
+            return SearchOutput(corners, ids, rejected)
         pixels, found, _, _ = self._charuco_detector(board).detectBoard(
             image, markerCorners=list(corners), markerIds=ids
         )
         if found is None or not len(found):
-            return BoardOutput(markers, _NO_IDS, _NO_CORNERS)
-        return BoardOutput(
-            markers, np.asarray(found, dtype=np.int64).ravel(),
+            return SearchOutput(corners, ids, rejected)
+        return SearchOutput(
+            corners, ids, rejected, np.asarray(found, dtype=np.int64).ravel(),
             np.asarray(pixels, dtype=np.float64).reshape(-1, 2),
         )
 
@@ -599,18 +571,34 @@ def _kept_plugin(setting: PluginSetting) -> PluggedDetector:
 
 def full_frame_reason(setting: AnyDetectorSetting) -> str | None:
     """Return why a setting must search the whole frame; None if it can search a window."""
-    if isinstance(setting, DetectorSetting):
-        return opencv_full_frame_reason(setting)
-    if _margin_px(setting) is None:
-        return f"{setting.plugin.name} declares no margin_px"
+    if isinstance(setting, PluginSetting):
+        none = _margin_px(setting) is None
+        return f"{setting.plugin.name} declares no margin_px" if none else None
+    if setting.useAruco3Detection:
+        return "useAruco3Detection scales the image by the frame's size"
+    if setting.cornerRefinementMethod == "apriltag" and setting.aprilTagQuadDecimate > 1:
+        return "aprilTagQuadDecimate resamples the frame"
+    if setting.adaptiveThreshConstant < 1:
+        return "adaptiveThreshConstant below 1 turns the plain background into candidates"
     return None
 
 
 def margin_px(setting: AnyDetectorSetting) -> int:
-    """Return the width of the border around the marker whose pixels can change the detection."""
-    if isinstance(setting, DetectorSetting):
-        return opencv_margin_px(setting)
-    return _margin_px(setting) or 0
+    """Return the width of the border around the marker whose pixels can change the detection.
+
+    Of OpenCV's detector half the largest threshold window and the border in which no corner may
+    lie, plus the contour's own pixel and one to spare; at least the reach of the sub-pixel
+    refinement and of the apriltag search's tiles and blur, if they are used (measured: 2 of 1,500
+    searches differed at 24 px, none from 32). With OpenCV's defaults: 16.
+    """
+    if isinstance(setting, PluginSetting):
+        return _margin_px(setting) or 0
+    margin = setting.adaptiveThreshWinSizeMax // 2 + setting.minDistanceToBorder + 2
+    if setting.cornerRefinementMethod == "subpix":
+        margin = max(margin, 2 * setting.cornerRefinementWinSize + 3)
+    if setting.cornerRefinementMethod == "apriltag":
+        margin = max(margin, 36 + int(4 * abs(setting.aprilTagQuadSigma)))
+    return margin
 
 
 def uneven_light_needs_frame(setting: AnyDetectorSetting, gain: Any) -> Any:

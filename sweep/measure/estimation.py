@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,37 +15,51 @@ from sweep.compilation import compiled
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.likelihood import pose_covariance, solve_positive
 from sweep.measure.surroundings import BoardMarker
+from sweep.model.board import Board
 from sweep.model.camera import Cameras
 from sweep.model.derivatives import POSE, velocity
-from sweep.model.marker import MarkerKey, marker_corners
-from sweep.model.polygon import Optics
+from sweep.model.marker import marker_corners
+from sweep.model.polygon import Optics, side_lengths
 from sweep.model.pose import angle_between, mirrored, transform_points, vector_of_rotation
-from sweep.typing import Floats
+from sweep.typing import Floats, Grey, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
 # The interface of pose estimators: detections in, estimates out.
 
 @dataclass(frozen=True, slots=True)
 class Detections:
-    """N detected markers, with the camera, size and noise that the estimator assumes.
+    """What was found of N targets, with the camera, size and noise that the estimator assumes.
+
+    A marker is a target of one square: of markers alone K is N and all arrays have a row a marker.
 
     Attributes
     ----------
     corners
-        (N, 4, 2) detected corners in px of the frame.
+        (K, 4, 2) corners of the squares that were found, in px of the frame, target by target: TL,
+        TR, BR, BL. Of a board all decoded markers with an ID that it has, false ones included, as
+        OpenCV's ``Board.matchImagePoints`` takes them.
     cameras, size_m, noise_grey, blur_px
-        N cameras and (N,) each: camera, black square's side, noise of a pixel in grey levels, and
-        point spread, as the estimator assumes them.
-    markers
-        Dictionary, ID and quiet zone of each.
+        N cameras and (N,) each: camera, black square's side (of a board, of markers without a side
+        of their own), noise of a pixel in grey levels, and point spread, as the estimator assumes
+        them.
+    targets
+        What is printed.
     images, origins
         The windows that were searched, and (N, 2) their first pixels in the frame; no images for
         estimators that do not need them.
-    on_board
-        The marker of a board that each is, None for one alone; None if all are alone.
+    owner, square
+        (K,) the target that each square was found of, ascending, and its number on the target.
+    scale
+        (N,) assumed size of the target relative to the true one.
+    chessboard_px
+        (N, C, 2) px of the inner corners of the targets' chessboards; NaN where none was found.
+    beside
+        Of each image which pixels show something beside the target; empty if none does.
     recorded_rotation, recorded_translation
         (N, 3, 3) and (N, 3) in metres: poses that came with recorded detections, NaN where none
         did; None where images were searched.
+    on_board
+        The marker of a board that each is, None for one alone; None if all are alone.
     """
 
     corners: Floats
@@ -53,22 +67,92 @@ class Detections:
     size_m: Floats
     noise_grey: Floats
     blur_px: Floats
-    markers: Sequence[MarkerKey]
-    images: Sequence[NDArray[np.uint8]]
-    origins: NDArray[np.int64]
+    targets: Sequence[Board]
+    images: Sequence[Grey]
+    origins: Integers
+    owner: Integers
+    square: Integers
+    scale: Floats
+    chessboard_px: Floats
+    beside: Sequence[Masks] = ()
     recorded_rotation: Floats | None = None
     recorded_translation: Floats | None = None
     on_board: Sequence[BoardMarker | None] | None = None
 
-    def take(self, rows: NDArray[np.intp]) -> Detections:
-        """Return the detections of the given rows."""
+    @staticmethod
+    def of_markers(
+        corners: Floats, cameras: Cameras, size_m: Floats, noise_grey: Floats, blur_px: Floats,
+        markers: Sequence[Board], images: Sequence[Grey], origins: Integers,
+    ) -> Detections:
+        """Return the detections of N markers whose corners (N, 4, 2) were all found."""
+        count = len(corners)
         return Detections(
-            self.corners[rows], self.cameras.take(rows), self.size_m[rows], self.noise_grey[rows],
-            self.blur_px[rows], [self.markers[row] for row in rows],
-            [self.images[row] for row in rows] if len(self.images) else [], self.origins[rows],
-            None if self.recorded_rotation is None else self.recorded_rotation[rows],
-            None if self.recorded_translation is None else self.recorded_translation[rows],
-            None if self.on_board is None else [self.on_board[row] for row in rows],
+            corners, cameras, size_m, noise_grey, blur_px, markers, images, origins,
+            np.arange(count), np.zeros(count, dtype=np.int64), np.ones(count),
+            np.empty((count, 0, 2)),
+        )
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+    @property
+    def are_markers(self) -> bool:
+        """Whether each target is a marker, upright at the origin of its frame."""
+        return all(target.is_marker for target in self.targets)
+
+    @property
+    def objects_m(self) -> Floats:
+        """(K, 4, 3) the found squares' corners in their targets' frames, of the assumed size."""
+        if self.are_markers:
+            return marker_corners(self.size_m)
+        corners = [
+            target.corners_m[self.square[self.owner == row]] * self.scale[row]
+            for row, target in enumerate(self.targets)
+        ]
+        return np.concatenate([np.empty((0, 4, 3)), *corners])
+
+    def mean_of_each(self, values: Floats) -> Floats:
+        """Return the means (N,) over each target's squares of values (K,); NaN without one."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(
+                np.bincount(self.owner, values, len(self))
+                / np.bincount(self.owner, minlength=len(self))
+            )
+
+    def side_px(self) -> Floats:
+        """Return the mean side (N,) of each target's squares in px; NaN without one."""
+        return self.mean_of_each(side_lengths(self.corners).mean(axis=1))
+
+    def reprojection_px(self, rotation: Floats, translation: Floats) -> Floats:
+        """Return the RMS reprojection error (N,) of poses (N, 3, 3), (N, 3) over all corners.
+
+        NaN for poses with a corner behind the camera, and without a square.
+        """
+        owner = self.owner
+        pixels = self.cameras.take(owner).project(
+            transform_points(self.objects_m, rotation[owner], translation[owner])
+        )
+        squared = ((pixels - self.corners) ** 2).sum(axis=2).mean(axis=1)
+        return np.sqrt(self.mean_of_each(squared))
+
+    def take(self, rows: NDArray[np.intp]) -> Detections:
+        """Return the detections of the given targets."""
+        first = np.searchsorted(self.owner, rows)
+        counts = np.searchsorted(self.owner, rows, side="right") - first
+        squares = np.arange(counts.sum()) + np.repeat(first - np.cumsum(counts) + counts, counts)
+
+        def of_rows(values: Any) -> Any:
+            if values is None or isinstance(values, np.ndarray):
+                return None if values is None else values[rows]
+            return [values[row] for row in rows] if len(values) else []
+
+        return Detections(
+            self.corners[squares], self.cameras.take(rows), self.size_m[rows],
+            self.noise_grey[rows], self.blur_px[rows], of_rows(self.targets),
+            of_rows(self.images), self.origins[rows], np.repeat(np.arange(len(rows)), counts),
+            self.square[squares], self.scale[rows], self.chessboard_px[rows],
+            of_rows(self.beside), of_rows(self.recorded_rotation),
+            of_rows(self.recorded_translation), of_rows(self.on_board),
         )
 
 
@@ -100,7 +184,7 @@ class Estimates:
     misfit_px: Floats
     """(N,) standard deviation in px of the shifts of a marker's parts that the residuals show"""
     point_count: Floats
-    """(N,) points of a board that the pose was estimated from; NaN for single markers"""
+    """(N,) points of the target that the pose was estimated from"""
 
     @staticmethod
     def none(count: int, status: EstimateStatus) -> Estimates:
@@ -129,8 +213,52 @@ class PoseEstimator(Protocol):
         ...
 
     def __call__(self, detections: Detections, /) -> Estimates:
-        """Return one estimate for each detection; its status says why a pose is missing."""
+        """Return one estimate for each target; its status says why a pose is missing."""
         ...
+
+
+def credible_estimates(
+    detections: Detections, rotation: Floats, translation: Floats, limit: float, *,
+    alternative: tuple[Floats, Floats] | None = None, covariance: Floats | None = None,
+    corner_noise_px: float | None = None,
+) -> Estimates:
+    """Return the estimates of N targets whose poses are credible; ``solver_failed`` without one.
+
+    NaN, a corner behind the camera, and an RMS reprojection error above ``limit``, a share of the
+    mean side of the detected squares, are no solution.
+
+    Parameters
+    ----------
+    detections, rotation, translation
+        N targets, and their poses (N, 3, 3) and (N, 3).
+    alternative
+        The other planar solutions, (N, 3, 3) and (N, 3).
+    covariance, corner_noise_px
+        (N, 6, 6), or the standard deviation of a corner's coordinates that gives them.
+    """
+    count = len(detections)
+    out = Estimates.none(count, EstimateStatus.solver_failed)
+    side_px = detections.side_px()
+    with np.errstate(invalid="ignore", over="ignore"):
+        reprojection = detections.reprojection_px(rotation, translation)
+        solved = reprojection <= limit * side_px
+        rows = np.flatnonzero(solved)
+        out.status[rows], out.reprojection_px[rows] = EstimateStatus.solved, reprojection[rows]
+        out.rotation[rows], out.translation[rows] = rotation[rows], translation[rows]
+        out.point_count[rows] = 4.0 * np.bincount(detections.owner, minlength=count)[rows]
+        if alternative is not None:
+            reprojection = detections.reprojection_px(*alternative)
+            rows = np.flatnonzero(solved & (reprojection <= limit * side_px))
+            out.alternative_rotation[rows] = alternative[0][rows]
+            out.alternative_reprojection_px[rows] = reprojection[rows]
+    if covariance is None and corner_noise_px is not None:
+        covariance = point_covariance(
+            out.rotation, out.translation, detections.objects_m, detections.owner,
+            detections.cameras, corner_noise_px,
+        )
+    if covariance is not None:
+        out.covariance[solved] = covariance[solved]
+    return out
 
 
 # --------------------------------------------------------------------------------------------------
@@ -177,54 +305,59 @@ def pose_error(
 # --------------------------------------------------------------------------------------------------
 # The covariance of a pose by a model of the corners' noise, and errors relative to it.
 
-def corner_covariance(
-    rotation: Floats, translation: Floats, cameras: Cameras, size_m: Floats, noise_px: float
-) -> Floats:
-    """Return the first-order covariance (N, 6, 6) of poses (N, 3, 3), (N, 3) from four corners.
-
-    That of least squares, noise_px² (JᵀJ)⁻¹, for corners whose coordinates have independent errors
-    of ``noise_px``; J (8, 6) are the corners' velocities in pixels by turn about the camera's
-    axes (radians) and shift along them (metres). Hartley and Zisserman, "Multiple view geometry",
-    2nd edition, section 5.2.1. NaN if the pose is NaN or J does not have full rank.
-    """
-    points = transform_points(marker_corners(size_m), rotation, translation)
-    return _corner_covariance(
-        points, np.ascontiguousarray(translation), cameras.view, cameras.lenses,
-        cameras.distorted, float(noise_px),
-    )
-
-
 def point_covariance(
-    rotation: Floats, translation: Floats, points: Floats, cameras: Cameras, noise_px: float
+    rotation: Floats, translation: Floats, points: Floats, owner: Integers, cameras: Cameras,
+    noise_px: float,
 ) -> Floats:
-    """As :func:`corner_covariance`, (6, 6) of one pose (3, 3), (3,) from points (k, 3)."""
-    moved = transform_points(points[None], rotation[None], translation[None])
-    return np.asarray(_corner_covariance(
-        moved, np.ascontiguousarray(translation[None]), cameras.view, cameras.lenses,
-        cameras.distorted, float(noise_px),
-    )[0])
+    """Return the first-order covariance (N, 6, 6) of poses (N, 3, 3), (N, 3) from points.
+
+    That of least squares, noise_px² (JᵀJ)⁻¹, for points whose pixels have independent errors of
+    ``noise_px`` in both coordinates; the two rows of J (., 6) for a point are its pixel's
+    velocities by turn about the camera's axes (radians) and shift along them (metres). Hartley and
+    Zisserman, "Multiple view geometry", 2nd edition, section 5.2.1. NaN if the pose is NaN or J
+    does not have full rank.
+
+    Parameters
+    ----------
+    rotation, translation, cameras
+        N poses and cameras.
+    points, owner
+        (K, k, 3) in the frames of the poses ``owner`` (K,), ascending: corners of squares.
+    noise_px
+        Standard deviation of a coordinate.
+    """
+    return np.asarray(_point_covariance(
+        transform_points(points, rotation[owner], translation[owner]), owner,
+        np.ascontiguousarray(translation), cameras.view, cameras.lenses, cameras.distorted,
+        float(noise_px),
+    ))
 
 
 @compiled
-def _corner_covariance(
-    points: Floats, translation: Floats, view: Floats, lenses: Floats,
-    distorted: NDArray[np.bool_], noise_px: float,
+def _point_covariance(
+    points: Floats, owner: Integers, translation: Floats, view: Floats, lenses: Floats,
+    distorted: Masks, noise_px: float,
 ) -> Floats:
-    """As :func:`corner_covariance`, for points (N, k, 3) in the camera frame."""
-    covariance = np.full((points.shape[0], POSE, POSE), np.nan)
+    """As :func:`point_covariance`, for points (K, k, 3) in the camera frame."""
+    covariance = np.full((len(translation), POSE, POSE), np.nan)
     rates = np.empty((2, POSE))
-    for n in range(points.shape[0]):
+    part = 0
+    for n in range(len(translation)):
         distance = abs(translation[n, 2])
         information = np.zeros((POSE, POSE))
-        for corner in range(points.shape[1]):
-            x, y, z = points[n, corner, 0], points[n, corner, 1], points[n, corner, 2]
-            velocity(x, y, z, translation[n], Optics(view[n], lenses[n], distorted[n]), rates)
-            # Shifts as shares of the distance, so that all numbers are of one size.
-            for axis in range(2):
-                for i in range(POSE):
-                    for j in range(POSE):
-                        unit = (distance if i >= 3 else 1.0) * (distance if j >= 3 else 1.0)
-                        information[i, j] += rates[axis, i] * rates[axis, j] * unit
+        while part < len(owner) and owner[part] == n:
+            for k in range(points.shape[1]):
+                x, y, z = points[part, k, 0], points[part, k, 1], points[part, k, 2]
+                velocity(
+                    x, y, z, translation[n], Optics(view[n], lenses[n], distorted[n]), rates
+                )
+                # Shifts as shares of the distance, so that all numbers are of one size.
+                for axis in range(2):
+                    for i in range(POSE):
+                        for j in range(POSE):
+                            unit = (distance if i >= 3 else 1.0) * (distance if j >= 3 else 1.0)
+                            information[i, j] += rates[axis, i] * rates[axis, j] * unit
+            part += 1
         of_pose, exists = pose_covariance(information, noise_px**2, distance)
         if exists:
             for i in range(POSE):

@@ -5,34 +5,23 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sweep.declaration import parameter
 from sweep.errors import PluginError
-from sweep.measure.board_solver import (
-    BOARD_METHODS,
-    BoardDetections,
-    BoardEstimator,
-    BoardPoints,
-    BoardSolver,
-    reprojection_px,
-)
 from sweep.measure.estimation import (
     Detections,
     Estimates,
     PoseEstimator,
-    corner_covariance,
-    point_covariance,
+    credible_estimates,
 )
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.photometric import Photometric, PhotometricReal
-from sweep.measure.solver import OPENCV_SOLVERS, CornerSolver, OpenCVSolver, reprojection_errors_px
+from sweep.measure.solver import OPENCV_SOLVERS, OpenCVSolver, PointSolver
 from sweep.model.lens import COUNTS
-from sweep.model.polygon import side_lengths
 from sweep.plugins import EstimatorPlugin, Poses
 from sweep.plugins.declared import PluginSetting
 from sweep.plugins.loading import call, real_numbers
@@ -46,7 +35,10 @@ ROTATION_ATOL = 1e-6
 
 
 class PluggedEstimator:
-    """One setting of a plug-in's solver of single markers in this process.
+    """One setting of a plug-in's solver in this process.
+
+    Errors and covariances are those of the corners of all squares that were found, whichever of
+    them the plug-in uses.
 
     Parameters
     ----------
@@ -57,7 +49,7 @@ class PluggedEstimator:
     settings
         An instance of its settings; None without.
     reprojection_limit, corner_noise_px
-        As :class:`sweep.measure.solver.CornerSolver` has them.
+        As :class:`sweep.measure.solver.PointSolver` has them.
     """
 
     def __init__(
@@ -74,46 +66,27 @@ class PluggedEstimator:
                 f"{name}: make returns a {type(self._solve).__name__}, not a function"
             )
 
-    def __call__(self, detections: Any) -> Estimates:
+    def __call__(self, detections: Detections) -> Estimates:
         """Return the poses that the plug-in finds, those that are credible.
-
-        NaN, a corner behind the camera, and a reprojection error above the limit are no solution.
 
         Raises
         ------
         PluginError
             If the plug-in raises, or returns what cannot be poses; in one line.
         """
-        count = len(detections.origins)
+        count = len(detections)
         if count == 0:
             return Estimates.none(0, EstimateStatus.solver_failed)
-        poses = self._checked(call(self._name, self._solve, self._copied(detections)), count)
-        rotation, translation = poses.rotation, poses.translation
-        reprojection = self._reprojection_px(rotation, translation, detections)
-        solved = self._is_credible(reprojection, detections)
-        rotation[~solved], translation[~solved], reprojection[~solved] = np.nan, np.nan, np.nan
-        alternative = np.full((count, 3, 3), np.nan)
-        alternative_px = np.full(count, np.nan)
+        # Of a copy: what a plug-in does to it reaches nobody else.
+        copied = detections.take(np.arange(count))
+        copied = dataclasses.replace(copied, images=[np.array(image) for image in copied.images])
+        poses = self._checked(call(self._name, self._solve, copied), count)
+        alternative = None
         if poses.alternative_rotation is not None:
-            alternative = poses.alternative_rotation
-            alternative_px = self._reprojection_px(
-                alternative, poses.alternative_translation, detections
-            )
-            missing = ~(solved & self._is_credible(alternative_px, detections))
-            alternative[missing], alternative_px[missing] = np.nan, np.nan
-        covariance = poses.covariance
-        if covariance is None and self._noise_px is not None:
-            covariance = self._covariance(rotation, translation, detections, self._noise_px)
-        if covariance is None:
-            covariance = np.full((count, 6, 6), np.nan)
-        covariance[~solved] = np.nan
-        status = np.where(solved, EstimateStatus.solved, EstimateStatus.solver_failed)
-        return dataclasses.replace(
-            Estimates.none(count, EstimateStatus.solver_failed),
-            status=status.astype(np.uint8), rotation=rotation, translation=translation,
-            reprojection_px=reprojection, alternative_rotation=alternative,
-            alternative_reprojection_px=alternative_px, covariance=covariance,
-            point_count=np.where(solved, self._point_counts(detections), np.nan),
+            alternative = poses.alternative_rotation, poses.alternative_translation
+        return credible_estimates(
+            detections, poses.rotation, poses.translation, self._limit, alternative=alternative,
+            covariance=poses.covariance, corner_noise_px=self._noise_px,
         )
 
     def _checked(self, returned: Any, count: int) -> Poses:
@@ -157,103 +130,6 @@ class PluggedEstimator:
                 f"{self._name}: returned a {name} that is no rotation matrix ({off:.2g} off)"
             )
 
-    def _copied(self, detections: Any) -> Any:
-        """Return a copy: what a plug-in does to it reaches nobody else."""
-        copied = detections.take(np.arange(len(detections.origins)))
-        return dataclasses.replace(copied, images=[np.array(image) for image in copied.images])
-
-    def _point_counts(self, detections: Any) -> Floats:
-        """Return (N,) points of boards; NaN for single markers."""
-        return np.full(len(detections.origins), np.nan)
-
-    def _covariance(
-        self, rotation: Floats, translation: Floats, detections: Any, noise_px: float
-    ) -> Floats:
-        return corner_covariance(
-            rotation, translation, detections.cameras, detections.size_m, noise_px
-        )
-
-    def _reprojection_px(
-        self, rotation: Floats, translation: Floats, detections: Any
-    ) -> Floats:
-        with np.errstate(invalid="ignore", over="ignore"):
-            return reprojection_errors_px(
-                rotation, translation, detections.size_m, detections.corners, detections.cameras
-            )
-
-    def _is_credible(self, reprojection_px: Floats, detections: Any) -> NDArray[np.bool_]:
-        side_px = side_lengths(detections.corners).mean(axis=1)
-        with np.errstate(invalid="ignore"):
-            return np.asarray(reprojection_px <= self._limit * side_px)
-
-
-# --------------------------------------------------------------------------------------------------
-# A plug-in's solver of boards: its poses are checked on the markers that were detected.
-
-class PluggedBoardEstimator(PluggedEstimator):
-    """One setting of a plug-in's solver of boards in this process.
-
-    Errors and covariances are those of the corners of all decoded markers with an ID of the board,
-    whichever of them the plug-in uses.
-    """
-
-    def _copied(self, detections: BoardDetections) -> BoardDetections:
-        copied: BoardDetections = super()._copied(detections)
-        points = [
-            BoardPoints(
-                each.marker.copy(), each.corners_px.copy(), each.chessboard.copy(),
-                each.chessboard_px.copy(),
-            )
-            for each in copied.points
-        ]
-        return dataclasses.replace(copied, points=points)
-
-    def _point_counts(self, detections: BoardDetections) -> Floats:
-        return np.array([4.0 * len(each.marker) for each in detections.points])
-
-    def _covariance(
-        self, rotation: Floats, translation: Floats, detections: BoardDetections, noise_px: float
-    ) -> Floats:
-        return np.array([
-            point_covariance(*pose, _corners_m(one), one.cameras, noise_px)
-            for pose, one in zip(
-                zip(rotation, translation, strict=True), _each(detections), strict=True
-            )
-        ])
-
-    def _reprojection_px(
-        self, rotation: Floats, translation: Floats, detections: BoardDetections
-    ) -> Floats:
-        with np.errstate(invalid="ignore", over="ignore"):
-            return np.array([
-                reprojection_px(
-                    *pose, _corners_m(one), one.points[0].corners_px.reshape(-1, 2), one.cameras
-                )
-                for pose, one in zip(
-                    zip(rotation, translation, strict=True), _each(detections), strict=True
-                )
-            ])
-
-    def _is_credible(
-        self, reprojection_px: Floats, detections: BoardDetections
-    ) -> NDArray[np.bool_]:
-        side_px = np.array([
-            side_lengths(each.corners_px).mean() if len(each.marker) else np.nan
-            for each in detections.points
-        ])
-        with np.errstate(invalid="ignore"):
-            return np.asarray(reprojection_px <= self._limit * side_px)
-
-
-def _each(detections: BoardDetections) -> list[BoardDetections]:
-    return [detections.take(np.array([row])) for row in range(len(detections.boards))]
-
-
-def _corners_m(one: BoardDetections) -> Floats:
-    """Return the corners (k, 3) of a board's detected markers, of the size that is believed."""
-    corners = one.boards[0].corners_m[one.points[0].marker].reshape(-1, 3)
-    return np.asarray(corners * one.scale[0])
-
 
 # --------------------------------------------------------------------------------------------------
 # Poses that another program estimated, as an estimator.
@@ -278,26 +154,10 @@ class RecordedPose:
 
     def __call__(self, detections: Detections) -> Estimates:
         """Return the poses; solver_failed where there is none, or none in front of the camera."""
-        corners = detections.corners
-        none = Estimates.none(len(corners), EstimateStatus.solver_failed)
         rotation, translation = detections.recorded_rotation, detections.recorded_translation
         if rotation is None or translation is None:
-            return none
-        error = reprojection_errors_px(
-            rotation, translation, detections.size_m, corners, detections.cameras
-        )
-        side = side_lengths(corners).mean(axis=1)
-        with np.errstate(invalid="ignore"):
-            solved = error <= self.reprojection_limit * side
-        return dataclasses.replace(
-            none,
-            status=np.where(solved, EstimateStatus.solved, EstimateStatus.solver_failed).astype(
-                np.uint8
-            ),
-            rotation=np.where(solved[:, None, None], rotation, np.nan),
-            translation=np.where(solved[:, None], translation, np.nan),
-            reprojection_px=np.where(solved, error, np.nan),
-        )
+            return Estimates.none(len(detections), EstimateStatus.solver_failed)
+        return credible_estimates(detections, rotation, translation, self.reprojection_limit)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -323,7 +183,7 @@ class Solver:
     recorded
         Whether it estimates nothing, and takes poses of recorded detections.
     of_boards
-        Whether it estimates the pose of a board from all its points.
+        Whether it estimates the pose of a board from all its points, too.
     corners_alone
         Whether it estimates the pose of a marker from its corners alone.
     """
@@ -338,21 +198,20 @@ class Solver:
     corners_alone: bool = False
 
 
-def _corner_solver(name: str, setting: EstimatorSetting) -> PoseEstimator:
-    return CornerSolver(
-        name, setting.guarded, setting.reprojection_limit, setting.corner_noise_px
-    )
-
-
-def _of_opencv(name: str, each: OpenCVSolver) -> Solver:
+def _of_opencv(each: OpenCVSolver) -> Solver:
     return Solver(
-        each.meaning, partial(_corner_solver, name), guarded=each.guarded,
-        planar_only=each.planar_only, of_boards=name in BOARD_METHODS, corners_alone=True,
+        each.meaning,
+        lambda setting: PointSolver(
+            setting.solver, setting.guarded, setting.reprojection_limit, setting.corner_noise_px,
+            setting.points, setting.refine,
+        ),
+        guarded=each.guarded, planar_only=each.planar_only, of_boards=each.any_points,
+        corners_alone=True,
     )
 
 
 SOLVERS: dict[str, Solver] = {
-    **{name: _of_opencv(name, each) for name, each in OPENCV_SOLVERS.items()},
+    **{name: _of_opencv(each) for name, each in OPENCV_SOLVERS.items()},
     "photometric": Solver(
         "maximum likelihood on the pixels, started from ippe",
         lambda setting: Photometric(setting.refined_starts, setting.estimate_blur),
@@ -486,23 +345,9 @@ def build(setting: EstimatorSetting) -> PoseEstimator:
     return SOLVERS[setting.solver].build(setting)
 
 
-def build_for_boards(setting: EstimatorSetting) -> BoardEstimator:
-    """Return the estimator of boards' poses that a setting describes."""
-    if isinstance(setting, PluggedEstimatorSetting):
-        return _kept_plugin(setting)
-    if setting.solver == "photometric":
-        return Photometric(setting.refined_starts, setting.estimate_blur)
-    return BoardSolver(
-        setting.solver, setting.points, setting.refine, setting.guarded,
-        setting.reprojection_limit, setting.corner_noise_px,
-    )
-
-
 @lru_cache(maxsize=1024)
 def _kept_plugin(setting: PluggedEstimatorSetting) -> PluggedEstimator:
-    record = setting.own.record()
-    kind = PluggedBoardEstimator if record.of_boards else PluggedEstimator
-    return kind(
-        setting.solver, record, setting.own.instance(), setting.reprojection_limit,
+    return PluggedEstimator(
+        setting.solver, setting.own.record(), setting.own.instance(), setting.reprojection_limit,
         setting.corner_noise_px,
     )

@@ -22,7 +22,7 @@ from sweep.model.derivatives import (
 )
 from sweep.model.polygon import Optics, Projection
 from sweep.model.pose import rotations, vectors
-from sweep.model.printed import PrintKey, edges_of, extent_of, target_edges, unit_m
+from sweep.model.printed import extent_of, target_edges, unit_m
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
@@ -153,38 +153,35 @@ class MarkerView(NamedTuple):
 
 
 def marker_view(
-    key: PrintKey, size_m: float, optics: Optics, corner: NDArray[np.int64], variance: float
+    target: Board, size_m: float, optics: Optics, corner: NDArray[np.int64], variance: float
 ) -> MarkerView:
-    """Return the view of a marker in an image whose first pixel is ``corner`` (2,) of the frame.
+    """Return the view of a target in an image whose first pixel is ``corner`` (2,) of the frame.
 
-    Of a board, ``size_m`` is its first marker's side, and the pose is that of its middle, which
+    ``size_m`` is its first marker's side, and the pose is that of its middle, which
     :func:`middle_m` gives: its perspective and the pose's mirror are those of a marker there.
     """
-    extent = extent_of(key)
-    outline, box = _around_middle(key) if isinstance(key, Board) else (edges_of(key), extent.sheet)
+    outline, box = _around_middle(target)
     local = optics.intrinsics.copy()
     local[2:] -= corner
     return MarkerView(
-        outline, box, extent.modules, float(size_m),
+        outline, box, extent_of(target).modules, float(size_m),
         Optics(local, optics.lens, optics.distorted), float(variance), 0.0,
     )
 
 
-def middle_m(board: Board) -> Floats:
-    """Return the middle (3,) of a board's sheet in its frame, in metres."""
-    left, top, right, bottom = extent_of(board).target
-    return np.array([(left + right) / 2, -(top + bottom) / 2, 0.0]) * unit_m(board)
+def middle_m(target: Board) -> Floats:
+    """Return the middle (3,) of a target's sheet in its frame, in metres; 0 of a marker alone."""
+    extent = extent_of(target)
+    across, down = (extent.middle - extent.origin).tolist()
+    return np.array([across, -down, 0.0]) * unit_m(target)
 
 
-@lru_cache(maxsize=64)
-def _around_middle(board: Board) -> tuple[MarkerEdges, Floats]:
-    """Return edges and extent of a board as :class:`MarkerView` has them."""
-    outline, extent = target_edges(board), extent_of(board)
-    shift = extent.modules / 2 - (extent.target[:2] + extent.target[2:]) / 2
-    return (
-        MarkerEdges(outline.ends + np.tile(shift, 2), outline.sides),
-        extent.target + np.tile(shift, 2),
-    )
+@lru_cache(maxsize=8192)
+def _around_middle(target: Board) -> tuple[MarkerEdges, Floats]:
+    """Return edges and extent of a target as :class:`MarkerView` has them."""
+    outline, extent = target_edges(target), extent_of(target)
+    shift = np.tile(extent.modules / 2 - extent.middle, 2)
+    return MarkerEdges(outline.ends + shift, outline.sides), extent.target + shift
 
 
 def noise_variance(noise_grey: float) -> float:

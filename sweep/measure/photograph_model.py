@@ -22,10 +22,11 @@ from sweep.measure.likelihood import (
     plane_of,
 )
 from sweep.measure.surroundings import BoardMarker, clear_modules, edges_alone, surroundings
+from sweep.model.board import Board
 from sweep.model.coverage import NODES, WEIGHTS, MarkerEdges
 from sweep.model.derivatives import POSE
 from sweep.model.lens import jacobian, undistort
-from sweep.model.marker import MarkerKey, module_count, overhang
+from sweep.model.marker import module_count, overhang
 from sweep.model.polygon import (
     ModuleEdge,
     Optics,
@@ -568,7 +569,7 @@ MODELLED_PX = 5.0
 
 
 def photograph_view(
-    marker: MarkerKey, on_board: BoardMarker | None, size_m: float, corners: Floats, optics: Optics,
+    marker: Board, on_board: BoardMarker | None, size_m: float, corners: Floats, optics: Optics,
     image: Grey, origin: Integers, toned: bool,
 ) -> PhotographView | None:
     """Return what is fitted of one marker, and what is known of it; None if that is nothing.
@@ -588,7 +589,7 @@ def photograph_view(
     toned
         Whether the tone curve is estimated.
     """
-    dictionary, _, margin = marker
+    dictionary, margin = marker.dictionary, marker.margin or 0.0
     modules = module_count(dictionary)
     with np.errstate(invalid="ignore", divide="ignore"):  # three corners on a line
         square = from_unit_square(corners[None])[0]

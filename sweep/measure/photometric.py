@@ -11,14 +11,6 @@ import cv2
 import numpy as np
 
 from sweep.compilation import compiled
-from sweep.measure.board_solver import (
-    MIN_POINTS,
-    BoardDetections,
-    Pose,
-    guarded_poses,
-    poses_of_each_marker,
-    reprojection_px,
-)
 from sweep.measure.estimation import Detections, Estimates, covariance_elsewhere
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.likelihood import (
@@ -61,13 +53,21 @@ from sweep.measure.photograph_model import (
     pixel_count,
     system,
 )
-from sweep.measure.solver import both_planar_solutions
+from sweep.measure.solver import (
+    MIN_POINTS,
+    Pose,
+    both_planar_solutions,
+    guarded_poses,
+    poses_of_each_marker,
+    reprojection_px,
+)
 from sweep.measure.surroundings import BoardMarker
+from sweep.model.board import Board
 from sweep.model.camera import Cameras
 from sweep.model.derivatives import LEVELS, POSE, known_pixels, work_space
-from sweep.model.marker import marker_corners, module_count
+from sweep.model.marker import module_count
 from sweep.model.pose import transform_points
-from sweep.model.printed import PrintKey, box_corners, extent_of, unit_m
+from sweep.model.printed import box_corners, extent_of, unit_m
 from sweep.typing import Floats, Grey, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -308,7 +308,7 @@ class Found(NamedTuple):
         Of a marker that of a board which it is, None for one alone, and both planar solutions.
     """
 
-    key: PrintKey
+    key: Board
     size_m: float
     middle_m: Floats
     objects_m: Floats
@@ -323,31 +323,21 @@ class Found(NamedTuple):
     planar: tuple[Pose, ...] = ()
 
 
-def found_targets(detections: Detections | BoardDetections) -> Iterator[Found]:
+def found_targets(detections: Detections) -> Iterator[Found]:
     """Yield what was found of each target."""
-    if isinstance(detections, Detections):
-        planar = both_planar_solutions(
-            detections.corners, detections.cameras, detections.size_m
-        )
-    for i in range(len(detections.origins)):
-        of_both = (
-            detections.cameras.take(np.array([i])), float(detections.noise_grey[i]),
-            float(detections.blur_px[i]), detections.images[i], detections.origins[i],
-        )
-        if isinstance(detections, Detections):
-            row = slice(i, i + 1)
-            yield Found(
-                detections.markers[i], float(detections.size_m[i]), np.zeros(3),
-                marker_corners(detections.size_m[row]), detections.corners[row], *of_both,
-                on_board=None if detections.on_board is None else detections.on_board[i],
-                planar=tuple(zip(*(each[i] for each in planar), strict=True)),
-            )
-            continue
-        board, scale = detections.boards[i], float(detections.scale[i])
+    planar = both_planar_solutions(
+        detections.corners, detections.cameras, detections.size_m
+    ) if detections.are_markers else None
+    for i, target in enumerate(detections.targets):
+        one, scale = detections.take(np.array([i])), float(detections.scale[i])
+        size_m = scale * unit_m(target) * module_count(target.dictionary)
         yield Found(
-            board, scale * unit_m(board) * module_count(board.dictionary), scale * middle_m(board),
-            scale * board.corners_m[detections.points[i].marker], detections.points[i].corners_px,
-            *of_both, detections.beside[i] if len(detections.beside) else None,
+            target, float(one.size_m[0]) if target.is_marker else size_m,
+            scale * middle_m(target), one.objects_m, one.corners, one.cameras,
+            float(one.noise_grey[0]), float(one.blur_px[0]), one.images[0], one.origins[0],
+            one.beside[0] if len(one.beside) else None,
+            None if one.on_board is None else one.on_board[0],
+            () if planar is None else tuple(zip(*(each[i] for each in planar), strict=True)),
         )
 
 
@@ -358,7 +348,7 @@ def first_poses(found: Found, *, refined: bool) -> list[Pose]:
     that of the marker on which most of the others agree: one marker that is wrong spoils the
     former.
     """
-    if isinstance(found.key, tuple):
+    if found.key.is_marker:
         poses = [*found.planar]
         if refined:
             rotation, translation = both_planar_solutions(
@@ -389,10 +379,9 @@ def _typical_error_px(pose: Pose, found: Found, corners: Floats) -> float:
 
 def refined_corners(found: Found) -> Floats:
     """Return the corners (k, 4, 2) after ``cv2.cornerSubPix``, its window OpenCV's for markers."""
-    dictionary = found.key[0] if isinstance(found.key, tuple) else found.key.dictionary
     refined = found.corners.copy()
     for k, corners in enumerate(found.corners - found.origin):
-        moved = refined_quad(found.image, corners, module_count(dictionary))
+        moved = refined_quad(found.image, corners, module_count(found.key.dictionary))
         if moved is not None:
             refined[k] = moved + found.origin
     return refined
@@ -428,8 +417,8 @@ def window_of(found: Found, poses: list[Pose]) -> list[int]:
     Of a marker its quiet zone, as a share of the corners' extent, and half of that for perspective;
     of a board its sheet in any of the poses.
     """
-    if isinstance(found.key, tuple):
-        dictionary, _, quiet = found.key
+    if found.key.is_marker:
+        dictionary, quiet = found.key.dictionary, found.key.margin or 0.0
         low, high = found.corners[0].min(axis=0), found.corners[0].max(axis=0)
         share = 1.5 * quiet / module_count(dictionary)
         margin = BACKGROUND_MARGIN_PX + share * (high - low)
@@ -490,7 +479,7 @@ class Photometric:
         """Whether detections must carry their images: yes."""
         return True
 
-    def __call__(self, detections: Detections | BoardDetections) -> Estimates:
+    def __call__(self, detections: Detections) -> Estimates:
         """Return the poses, with their covariances."""
         out = Estimates.none(len(detections.origins), EstimateStatus.solver_failed)
         for i, found in enumerate(found_targets(detections)):
@@ -510,8 +499,7 @@ class Photometric:
                     points, pixels, found.cameras,
                 ) for state in states
             )
-            if not isinstance(found.key, tuple):
-                out.point_count[i] = len(pixels)
+            out.point_count[i] = len(pixels)
             arm = -out.rotation[i] @ found.middle_m
             if arm.any():
                 out.translation[i] += arm
@@ -577,7 +565,7 @@ class PhotometricReal(Photometric):
         view = photograph_view(
             found.key, found.on_board, found.size_m, found.corners[0], found.cameras.optics(0),
             found.image, found.origin, self.tone,
-        ) if len(starts) and isinstance(found.key, tuple) else None
+        ) if len(starts) and found.key.is_marker else None
         if view is None or pixel_count(view) <= MOVED + LINEAR:
             return None
         covariance = np.empty((POSE, POSE))

@@ -1,23 +1,32 @@
-"""Pose from four corners: OpenCV's solvers, guarded or as plain calls."""
+"""Pose from points: OpenCV's solvers, guarded or as plain calls, for markers and for boards."""
 
 from __future__ import annotations
 
-import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.measure.estimation import Detections, Estimates, corner_covariance
+from sweep.measure.estimation import (
+    Detections,
+    Estimates,
+    credible_estimates,
+    point_covariance,
+)
 from sweep.measure.flags import EstimateStatus
 from sweep.model.camera import Cameras
 from sweep.model.marker import marker_corners
-from sweep.model.polygon import side_lengths
+from sweep.model.polygon import side_lengths, signed_areas
 from sweep.model.pose import rotation_of_vector, transform_points, vector_of_rotation
 from sweep.typing import Floats
 
+# --------------------------------------------------------------------------------------------------
+# OpenCV's solvers, and poses of N markers at once, from four corners each.
 
 @dataclass(frozen=True, slots=True)
 class OpenCVSolver:
@@ -35,6 +44,8 @@ class OpenCVSolver:
         Whether it solves for coplanar points alone.
     two_solutions
         Whether it returns both planar solutions.
+    any_points
+        Whether it takes any number of points, as boards have them.
     """
 
     method: int
@@ -42,12 +53,13 @@ class OpenCVSolver:
     guarded: bool = True
     planar_only: bool = False
     two_solutions: bool = False
+    any_points: bool = False
 
 
 OPENCV_SOLVERS = {
     "ippe": OpenCVSolver(
         cv2.SOLVEPNP_IPPE, "both planar solutions from the homography", planar_only=True,
-        two_solutions=True,
+        two_solutions=True, any_points=True,
     ),
     "ippe_square": OpenCVSolver(
         cv2.SOLVEPNP_IPPE_SQUARE, "ippe for the corners of a square", planar_only=True,
@@ -55,19 +67,21 @@ OPENCV_SOLVERS = {
     ),
     "iterative": OpenCVSolver(
         cv2.SOLVEPNP_ITERATIVE, "Levenberg-Marquardt on the reprojection error, started from the "
-        "homography",
+        "homography", any_points=True,
     ),
-    "sqpnp": OpenCVSolver(cv2.SOLVEPNP_SQPNP, "SQPnP, a quadratic program over rotations"),
+    "sqpnp": OpenCVSolver(
+        cv2.SOLVEPNP_SQPNP, "SQPnP, a quadratic program over rotations", any_points=True
+    ),
     "p3p": OpenCVSolver(cv2.SOLVEPNP_P3P, "three corners; the fourth selects the solution"),
     "ap3p": OpenCVSolver(
         cv2.SOLVEPNP_AP3P, "three corners, algebraic; the fourth selects the solution"
     ),
     "epnp": OpenCVSolver(
         cv2.SOLVEPNP_EPNP, "EPnP, unreliable for a single marker: it is not made for four coplanar "
-        "points", guarded=False,
+        "points", guarded=False, any_points=True,
     ),
 }
-"""The solvers of OpenCV that estimate a pose from four corners."""
+"""The solvers of OpenCV."""
 
 _TWO_SOLUTIONS = {each.method for each in OPENCV_SOLVERS.values() if each.two_solutions}
 
@@ -80,88 +94,19 @@ def reprojection_errors_px(
     return np.asarray(np.sqrt(((pixels - corners) ** 2).sum(axis=2).mean(axis=1)))
 
 
-def estimate(
-    corners: Floats, cameras: Cameras, size_m: Floats, solver: str, guarded: bool, limit: float
-) -> Estimates:
-    """Estimate N poses from corners (N, 4, 2) px with assumed cameras and sizes (N,).
+def square_poses(
+    corners: Floats, cameras: Cameras, size_m: Floats, solver: str, guarded: bool
+) -> tuple[Floats, Floats]:
+    """Return rotations (N, 2, 3, 3) and translations (N, 2, 3) of N markers; NaN if missing.
 
-    ``limit`` is the largest RMS reprojection error of a solution, as a share of the mean side of
-    the detected quadrilateral.
+    From corners (N, 4, 2) px with assumed cameras and sizes (N,). The second is the other planar
+    solution.
     """
     # OpenCV raises on strided corners, and the guard would take that for no solution.
     corners = np.ascontiguousarray(corners, dtype=np.float64)
     method = OPENCV_SOLVERS[solver]
     call = _guarded if guarded and method.guarded else _plain
-    rotation, translation = call(corners, cameras, size_m, method.method)
-    reprojection = np.stack(
-        [
-            reprojection_errors_px(rotation[:, k], translation[:, k], size_m, corners, cameras)
-            for k in range(2)
-        ],
-        axis=1,
-    )
-    side = side_lengths(corners).mean(axis=1)
-    with np.errstate(invalid="ignore"):
-        solved = reprojection <= limit * side[:, None]
-    rotation[~solved], translation[~solved], reprojection[~solved] = np.nan, np.nan, np.nan
-    solved[:, 1] &= solved[:, 0]
-    for k in range(2):
-        rotation[~solved[:, 0], k] = np.nan
-        reprojection[~solved[:, 0], k] = np.nan
-    count = len(corners)
-    return Estimates(
-        status=np.where(solved[:, 0], EstimateStatus.solved, EstimateStatus.solver_failed).astype(
-            np.uint8
-        ),
-        rotation=rotation[:, 0],
-        translation=translation[:, 0],
-        reprojection_px=reprojection[:, 0],
-        alternative_rotation=rotation[:, 1],
-        alternative_reprojection_px=reprojection[:, 1],
-        covariance=np.broadcast_to(np.nan, (count, 6, 6)),
-        residual_ratio=np.broadcast_to(np.nan, (count,)),
-        misfit_px=np.broadcast_to(np.nan, (count,)),
-        point_count=np.broadcast_to(np.nan, (count,)),
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class CornerSolver:
-    """An OpenCV solver as a pose estimator: poses from corners alone.
-
-    Attributes
-    ----------
-    solver
-        A key of :data:`OPENCV_SOLVERS`.
-    guarded, reprojection_limit
-        As :func:`estimate` takes them.
-    corner_noise_px
-        Standard deviation of a corner's coordinates for the poses' covariances; None for none.
-    """
-
-    solver: str
-    guarded: bool
-    reprojection_limit: float
-    corner_noise_px: float | None
-
-    @property
-    def needs_images(self) -> bool:
-        """Whether detections must carry their images: no."""
-        return False
-
-    def __call__(self, detections: Detections) -> Estimates:
-        """Return the poses, with covariances if the corners' noise is given."""
-        estimates = estimate(
-            detections.corners, detections.cameras, detections.size_m, self.solver, self.guarded,
-            self.reprojection_limit,
-        )
-        if self.corner_noise_px is None:
-            return estimates
-        covariance = corner_covariance(
-            estimates.rotation, estimates.translation, detections.cameras, detections.size_m,
-            self.corner_noise_px,
-        )
-        return dataclasses.replace(estimates, covariance=covariance)
+    return call(corners, cameras, size_m, method.method)
 
 
 def both_planar_solutions(
@@ -372,3 +317,342 @@ def _solve_turned(
     back[:, 0, 0], back[:, 0, 1], back[:, 1, 0], back[:, 1, 1] = c, -s, s, c
     back[:, 2, 2] = 1.0
     return np.asarray(rotation @ (back * _Z_OUT)[:, None]), translation.copy()
+
+
+# --------------------------------------------------------------------------------------------------
+# Poses of one target from any number of points: OpenCV's solvers, called plainly or guarded.
+
+Pose = tuple[Floats, Floats]
+"""Rotation (3, 3) and translation (3,) in metres."""
+
+
+def lens_of(cameras: Cameras) -> Floats | None:
+    """Return the lens of the first camera as OpenCV's calls take it; None if it has none."""
+    return cameras.lenses[0, :14] if cameras.distorted[0] else None
+
+
+def reprojection_px(
+    rotation: Floats, translation: Floats, objects: Floats, pixels: Floats, cameras: Cameras
+) -> float:
+    """Return the RMS reprojection error of points (k, 3); NaN if one is behind the camera."""
+    projected = cameras.project(
+        transform_points(objects[None], rotation[None], translation[None])
+    )[0]
+    return float(np.sqrt(((projected - pixels) ** 2).sum(axis=1).mean()))
+
+
+def marker_frame(corners_m: Floats) -> tuple[float, Pose]:
+    """Return a marker's side, and the pose (3, 3), (3,) of its frame on the board."""
+    right = corners_m[1] - corners_m[0]
+    up = corners_m[0] - corners_m[3]
+    size = float(np.linalg.norm(right))
+    x, y = right / size, up / np.linalg.norm(up)
+    return size, (np.stack([x, y, np.cross(x, y)], axis=1), corners_m.mean(axis=0))
+
+
+def of_board(rotation: Floats, translation: Floats, to_board: Pose) -> Pose:
+    """Return the board's pose from that of a marker whose frame is ``to_board`` on it."""
+    turned = rotation @ to_board[0].T
+    return turned, translation - turned @ to_board[1]
+
+
+def poses_of_each_marker(
+    objects: Floats, pixels: Floats, cameras: Cameras
+) -> list[Pose]:
+    """Return the board's poses from both planar solutions of each marker."""
+    corners_m, corners = objects.reshape(-1, 4, 3), pixels.reshape(-1, 4, 2)
+    frames = [marker_frame(each) for each in corners_m]
+    same = cameras.take(np.zeros(len(corners), dtype=np.intp))
+    rotation, translation = both_planar_solutions(
+        corners, same, np.array([size for size, _ in frames])
+    )
+    return [
+        of_board(rotation[k, solution], translation[k, solution], frames[k][1])
+        for k in range(len(corners)) for solution in range(2)
+    ]
+
+
+def plain_poses(
+    objects: Floats, pixels: Floats, cameras: Cameras, method: int
+) -> list[Pose]:
+    """Call ``cv2.solvePnPGeneric`` plainly: the board's frame, metres, OpenCV's lens inverse."""
+    return _called(objects, pixels, cameras.matrix(0), lens_of(cameras), method)
+
+
+def _called(
+    objects: Floats, pixels: Floats, matrix: Floats, lens: Floats | None, method: int
+) -> list[Pose]:
+    try:
+        success, vectors, positions, _ = cv2.solvePnPGeneric(
+            np.ascontiguousarray(objects), np.ascontiguousarray(pixels), matrix, lens, flags=method
+        )
+    except cv2.error:
+        return []
+    if not success:
+        return []
+    return [
+        (rotation_of_vector(np.asarray(r, dtype=np.float64).reshape(1, 3))[0],
+         np.asarray(t, dtype=np.float64).ravel())
+        for r, t in zip(vectors, positions, strict=True)
+    ]
+
+
+COLLINEAR = 1e-6
+"""Least extent of points across their line, of unit size along it: points of a line leave the turn
+about it open, and SQPnP and EPnP return any."""
+
+_Z_IN = np.diag([1.0, -1.0, -1.0])
+
+
+def guarded_poses(
+    objects: Floats, pixels: Floats, cameras: Cameras, method: int
+) -> list[Pose]:
+    """Solve in a stable frame: undistorted pixels, points of unit size, z in, roll within 45°.
+
+    For the reasons that the guard of a single marker has (:mod:`sweep.measure.solver`).
+    """
+    flat = pixels
+    if cameras.distorted[0]:
+        view = cameras.view[0]
+        flat = cameras.normalise(pixels[None])[0] * view[:2] + view[2:]
+    middle = objects.mean(axis=0)
+    size = float(np.sqrt(((objects - middle) ** 2).sum(axis=1).mean()))
+    if not size > 0 or not np.isfinite(flat).all():
+        return []
+    unit = (objects - middle) / size @ _Z_IN
+    if np.linalg.svd(unit[:, :2], compute_uv=False)[1] < COLLINEAR:
+        _, extents, axes = np.linalg.svd(objects - middle, full_matrices=False)
+        if extents[1] < COLLINEAR * size:
+            return []
+        # In a plane across the board's, such as one face of a cube: solved in their own.
+        axes *= np.sign(np.linalg.det(axes))
+        own = guarded_poses((objects - middle) @ axes.T, pixels, cameras, method)
+        return [of_board(*pose, (axes.T, middle)) for pose in own]
+    planar = np.column_stack([unit[:, :2], np.ones(len(unit))])
+    (right, _, _), *_ = np.linalg.lstsq(planar, flat, rcond=None)
+    turn = round(math.atan2(right[1], right[0]) / (math.pi / 2)) % 4
+    cosine, sine = (1.0, 0.0, -1.0, 0.0)[turn], (0.0, 1.0, 0.0, -1.0)[turn]
+    back = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    poses = []
+    for rotation, position in _called(unit @ back.T, flat, cameras.matrix(0), None, method):
+        turned = rotation @ back @ _Z_IN
+        poses.append((turned, position * size - turned @ middle))
+    return poses
+
+
+# --------------------------------------------------------------------------------------------------
+# The estimator of poses from corners.
+
+MIN_POINTS = 4
+"""The fewest points that a pose is estimated from."""
+
+
+def one_by_one(
+    detections: Detections, write: Callable[[Detections, int, Estimates], None]
+) -> Estimates:
+    """Return the estimates that ``write`` writes of each target, as the number that it gets."""
+    count = len(detections)
+    out = Estimates.none(count, EstimateStatus.solver_failed)
+    for i in range(count):
+        write(detections.take(np.array([i])), i, out)
+    return out
+
+
+class _Solution(NamedTuple):
+    """A pose (3, 3), (3,) in metres, its reprojection error, and the points (k, 3) that gave it.
+
+    All are NaN if there is none.
+    """
+
+    rotation: Floats
+    translation: Floats
+    error_px: float
+    objects: Floats
+
+
+_NONE = _Solution(np.full((3, 3), np.nan), np.full(3, np.nan), math.nan, np.zeros((0, 3)))
+
+
+@dataclass(frozen=True, slots=True)
+class PointSolver:
+    """An OpenCV solver as an estimator of poses from corners alone.
+
+    Markers are solved together, each from its four corners; boards one by one, from the points that
+    the setting chooses.
+
+    Attributes
+    ----------
+    solver, guarded, reprojection_limit, corner_noise_px, points, refine
+        As :class:`sweep.measure.estimators.EstimatorSetting` has them.
+    """
+
+    solver: str
+    guarded: bool
+    reprojection_limit: float
+    corner_noise_px: float | None = None
+    points: str = "markers"
+    refine: str = "none"
+
+    @property
+    def needs_images(self) -> bool:
+        """Whether detections must carry their images: no."""
+        return False
+
+    def __call__(self, detections: Detections) -> Estimates:
+        """Return the poses, with covariances if the corners' noise is given."""
+        if not detections.are_markers:
+            return one_by_one(detections, self._estimate)
+        rotation, translation = square_poses(
+            detections.corners, detections.cameras, detections.size_m, self.solver, self.guarded
+        )
+        return credible_estimates(
+            detections, rotation[:, 0], translation[:, 0], self.reprojection_limit,
+            alternative=(rotation[:, 1], translation[:, 1]),
+            corner_noise_px=self.corner_noise_px,
+        )
+
+    def _estimate(self, one: Detections, i: int, out: Estimates) -> None:
+        """Write the estimate of a single board as number ``i``."""
+        objects, pixels = self._points(one)
+        if len(pixels) < MIN_POINTS:
+            out.status[i] = EstimateStatus.too_few_points
+            return
+        side = float(one.side_px()[0])
+        solutions = self._solutions(one, objects, pixels, side)
+        limit = self.reprojection_limit * side
+        if not solutions or not solutions[0].error_px <= limit:
+            return
+        best = solutions[0]
+        other = next((each for each in solutions[1:] if each.error_px <= limit), _NONE)
+        out.status[i], out.point_count[i] = EstimateStatus.solved, len(pixels)
+        out.rotation[i], out.translation[i], out.reprojection_px[i], used = best
+        out.alternative_rotation[i], _, out.alternative_reprojection_px[i], _ = other
+        if self.corner_noise_px is not None:
+            out.covariance[i] = point_covariance(
+                best.rotation[None], best.translation[None], used[None],
+                np.zeros(1, dtype=np.int64), one.cameras, self.corner_noise_px,
+            )[0]
+
+    def _points(self, one: Detections) -> tuple[Floats, Floats]:
+        """Return the points (k, 3) in the board's frame and their pixels (k, 2)."""
+        if self.points == "chessboard":
+            found = np.isfinite(one.chessboard_px[0, :, 0])
+            board = one.targets[0]
+            return board.chessboard_m[found] * one.scale[0], one.chessboard_px[0, found]
+        objects, corners = one.objects_m, one.corners
+        if self.points == "largest_marker" and len(corners):
+            largest = np.argmax(np.abs(signed_areas(corners)))
+            objects, corners = objects[[largest]], corners[[largest]]
+        return objects.reshape(-1, 3), corners.reshape(-1, 2)
+
+    def _solutions(
+        self, one: Detections, objects: Floats, pixels: Floats, side_px: float
+    ) -> list[_Solution]:
+        """Return the poses by their reprojection error, the best first.
+
+        ``side_px`` is the mean side of the detected markers.
+        """
+        cameras, used, solve = one.cameras, None, plain_poses
+        if self.points == "largest_marker":
+            poses = self._of_marker(objects, pixels, cameras)
+        elif self.points == "each_marker":
+            poses = poses_of_each_marker(objects, pixels, cameras)
+            used = np.repeat(objects.reshape(-1, 4, 3), 2, axis=0)
+        else:
+            solve = guarded_poses if self.guarded else plain_poses
+            poses = solve(objects, pixels, cameras, OPENCV_SOLVERS[self.solver].method)
+        ordered = _by_error(poses, objects, pixels, cameras, used)
+        if solve is guarded_poses and self.solver == "iterative":
+            ordered = _least_of(ordered, objects, pixels, cameras, side_px)
+        if solve is guarded_poses and self.solver != "epnp":
+            ordered = _or_others(ordered, objects, pixels, cameras, CREDIBLE_SHARE * side_px)
+        if self.refine != "none" and ordered:
+            ordered[0] = _refined(ordered[0], self.refine, objects, pixels, cameras)
+        return ordered[:2]
+
+    def _of_marker(self, objects: Floats, pixels: Floats, cameras: Cameras) -> list[Pose]:
+        """Return the board's poses from the corners (4, 3) and (4, 2) of a single marker."""
+        size, to_board = marker_frame(objects)
+        (rotations,), (positions,) = square_poses(
+            pixels[None], cameras, np.array([size]), self.solver, self.guarded
+        )
+        return [of_board(*pose, to_board) for pose in zip(rotations, positions, strict=True)]
+
+
+def _refined(
+    start: _Solution, refine: str, objects: Floats, pixels: Floats, cameras: Cameras
+) -> _Solution:
+    """Return a pose after OpenCV's refinement, lm or vvs, on all points; the start if it fails."""
+    call: Any = cv2.solvePnPRefineLM if refine == "lm" else cv2.solvePnPRefineVVS
+    vector = vector_of_rotation(start.rotation[None])[0][:, None]
+    try:
+        r, t = call(
+            objects, pixels, cameras.matrix(0), lens_of(cameras), vector,
+            start.translation[:, None].copy(),
+        )
+    except cv2.error:
+        return start
+    rotation, translation = rotation_of_vector(r.reshape(1, 3))[0], t.ravel()
+    error = reprojection_px(rotation, translation, objects, pixels, cameras)
+    found = _Solution(rotation, translation, error, objects)
+    return found if math.isfinite(error) else start
+
+
+def _least_of(
+    ordered: list[_Solution], objects: Floats, pixels: Floats, cameras: Cameras,
+    side_px: float,
+) -> list[_Solution]:
+    """Return ITERATIVE's solutions, or other solvers' refined where it missed the least error.
+
+    As for single markers, and about as often if one marker of the board is detected.
+    """
+    starts = _by_error(
+        [pose for method in (cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_SQPNP)
+         for pose in guarded_poses(objects, pixels, cameras, method)],
+        objects, pixels, cameras,
+    )
+    if not starts:
+        return ordered
+    credible = max(
+        ASTRAY_RATIO[cv2.SOLVEPNP_ITERATIVE] * starts[0].error_px, ASTRAY_SHARE * side_px
+    )
+    if ordered and ordered[0].error_px <= credible:
+        return ordered
+    refined = [_refined(each, "lm", objects, pixels, cameras) for each in starts]
+    return [min([*refined, *starts], key=lambda each: each.error_px)]
+
+
+def _by_error(
+    poses: Sequence[Pose], objects: Floats, pixels: Floats, cameras: Cameras,
+    used: Iterable[Floats] | None = None,
+) -> list[_Solution]:
+    """Return the finite poses, the best first; ``used`` gave each, by default all points."""
+    given = itertools.repeat(objects, len(poses)) if used is None else used
+    found = [
+        _Solution(*pose, reprojection_px(*pose, objects, pixels, cameras), points)
+        for pose, points in zip(poses, given, strict=True)
+    ]
+    return sorted((each for each in found if math.isfinite(each.error_px)),
+                  key=lambda each: each.error_px)
+
+
+def _or_others(
+    ordered: list[_Solution], objects: Floats, pixels: Floats, cameras: Cameras,
+    credible_px: float,
+) -> list[_Solution]:
+    """Return solutions, or those of ITERATIVE or IPPE where the best is not credible.
+
+    As for single markers: IPPE is not finite for a fifth of the boards that face the camera
+    exactly, and SQPnP has no solution of boards of a few pixels.
+    """
+    if ordered and ordered[0].error_px <= credible_px:
+        return ordered
+    for method in (cv2.SOLVEPNP_ITERATIVE, cv2.SOLVEPNP_IPPE):
+        others = _by_error(
+            guarded_poses(objects, pixels, cameras, method), objects, pixels, cameras
+        )
+        if others and not (
+            ordered and ordered[0].error_px <= CREDIBLE_RATIO * others[0].error_px
+        ):
+            ordered = others
+    return ordered

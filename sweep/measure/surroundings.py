@@ -13,7 +13,8 @@ import numpy as np
 
 from sweep.model.board import Board
 from sweep.model.coverage import MarkerEdges
-from sweep.model.marker import BLACK, OUTSIDE, MarkerKey, edges, module_count
+from sweep.model.marker import BLACK, OUTSIDE, module_count
+from sweep.model.printed import target_edges
 from sweep.typing import Floats, Integers
 
 
@@ -37,10 +38,10 @@ def surroundings(marker: BoardMarker, margin: float) -> MarkerEdges:
 
 
 @lru_cache(maxsize=4096)
-def edges_alone(marker: MarkerKey, margin: float) -> MarkerEdges:
+def edges_alone(marker: Board, margin: float) -> MarkerEdges:
     """Return the edges of a marker on a sheet of its own, as :func:`surroundings` does."""
-    modules = module_count(marker[0])
-    return clipped(edges(*marker), -margin, modules + margin)
+    modules = module_count(marker.dictionary)
+    return clipped(target_edges(marker), -margin, modules + margin)
 
 
 @lru_cache(maxsize=4096)

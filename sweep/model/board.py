@@ -1,10 +1,11 @@
-"""A target: markers, chessboard and sheet, and the edges of all that is printed on it."""
+"""A target: a marker, or a board of them; and the edges of all that is printed on it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -90,6 +91,8 @@ class Chessboard(NamedTuple):
 class Board:
     """A target: flat, or of markers that each have a plane and a sheet of their own.
 
+    A marker alone is a target of one square, whose side is 1 here: scenes say how large it is.
+
     Attributes
     ----------
     dictionary
@@ -108,6 +111,9 @@ class Board:
         A ChArUco board's squares; None of other boards.
     distractors
         What stands beside it and is no part of it, each on a sheet of its own.
+    margin
+        How far a marker alone extends beyond its square, its overhang and its quiet zone, in
+        modules; None of a board.
     """
 
     dictionary: str
@@ -117,9 +123,15 @@ class Board:
     chessboard_m: Floats
     chessboard: Chessboard | None = None
     distractors: tuple[Print, ...] = ()
+    margin: float | None = None
 
     def __len__(self) -> int:
         return len(self.marker_ids)
+
+    @property
+    def is_marker(self) -> bool:
+        """Whether it is a marker alone, as large as its scene says."""
+        return self.margin is not None
 
     @property
     def is_flat(self) -> bool:
@@ -147,6 +159,19 @@ class Board:
         return edges_on_sheet(
             [each for i, each in enumerate(self.prints) if i not in set(leave_out)]
         )
+
+
+@lru_cache(maxsize=8192)
+def single_marker(dictionary: str, marker_id: int, margin: float) -> Board:
+    """Return a marker alone, the same for the same arguments; ``margin`` as :class:`Board` has it.
+
+    Its edges are in modules, from the top left corner of its square.
+    """
+    printed = Print(edges(dictionary, marker_id, margin), 1 / module_count(dictionary), 0.5)
+    return Board(
+        dictionary, (marker_id,), marker_corners(np.ones(1)), (printed,), np.empty((0, 3)),
+        margin=margin,
+    )
 
 
 def edges_on_sheet(prints: Sequence[Print]) -> MarkerEdges:

@@ -510,21 +510,8 @@ class Grid:
     def board(self) -> Board:
         """Return the board; ValueError with its faults, a line each."""
         refuse(self.faults())
-        step = self.marker_m + self.gap_m
-        row, column = np.indices((self.rows, self.columns)).reshape(2, -1)
-        shape = np.array([self.columns, self.rows])
-        middle = (shape * step - self.gap_m) / 2
-        centres = np.stack([column, row], axis=1) * step + self.marker_m / 2 - middle
-        others = []
-        half = middle
-        if self.corner_squares:
-            row, column = np.indices((self.rows + 1, self.columns + 1)).reshape(2, -1)
-            low = np.stack([column, row], axis=1) * step - self.gap_m - middle
-            others = [rectangles_print(np.hstack([low, low + self.gap_m]), WHITE, BLACK)]
-            half = middle + self.gap_m
-        return _on_sheet(
-            self.dictionary, _ids_of(self, len(centres)), centres * [1.0, -1.0], self.marker_m,
-            others, half, self.margin_m, np.empty((0, 2)),
+        return _grid_board(
+            self, (self.rows, self.columns), self.marker_m, self.gap_m, self.corner_squares
         )
 
 
@@ -571,18 +558,33 @@ class AprilGrid:
     def board(self) -> Board:
         """Return the board; ValueError with its faults, a line each."""
         refuse(self.faults())
-        gap = self.tagSize * self.tagSpacing
-        step = self.tagSize + gap
-        up, column = np.indices((self.tagRows, self.tagCols)).reshape(2, -1)
-        middle = (np.array([self.tagCols, self.tagRows]) * step - gap) / 2
-        centres = np.stack([column, up], axis=1) * step + self.tagSize / 2 - middle
-        up, column = np.indices((self.tagRows + 1, self.tagCols + 1)).reshape(2, -1)
-        low = np.stack([column, up], axis=1) * step - gap - middle
-        return _on_sheet(
-            self.dictionary, _ids_of(self, len(centres)), centres, self.tagSize,
-            [rectangles_print(np.hstack([low, low + gap]), WHITE, BLACK)], middle + gap,
-            self.margin_m, np.empty((0, 2)), roll_deg=180.0,
-        )
+        gap_m = self.tagSize * self.tagSpacing
+        return _grid_board(self, (self.tagRows, self.tagCols), self.tagSize, gap_m, True)
+
+
+def _grid_board(
+    kind: Grid | AprilGrid, shape: tuple[int, int], marker_m: float, gap_m: float, squares: bool
+) -> Board:
+    """Return rows and columns of markers, with black ``squares`` between them if wanted.
+
+    In reading order; of an AprilGrid from the bottom left upwards, each turned by 180 degrees.
+    """
+    kalibr = isinstance(kind, AprilGrid)
+    step = marker_m + gap_m
+    row, column = np.indices(shape).reshape(2, -1)
+    middle = (np.array(shape[::-1]) * step - gap_m) / 2
+    centres = np.stack([column, row], axis=1) * step + marker_m / 2 - middle
+    others, half = [], middle
+    if squares:
+        row, column = np.indices((shape[0] + 1, shape[1] + 1)).reshape(2, -1)
+        low = np.stack([column, row], axis=1) * step - gap_m - middle
+        others = [rectangles_print(np.hstack([low, low + gap_m]), WHITE, BLACK)]
+        half = middle + gap_m
+    return _on_sheet(
+        kind.dictionary, _ids_of(kind, len(centres)),
+        centres if kalibr else centres * [1.0, -1.0], marker_m, others, half, kind.margin_m,
+        np.empty((0, 2)), 180.0 if kalibr else 0.0,
+    )
 
 
 Kind = Charuco | Grid | AprilGrid | Markers
@@ -725,22 +727,6 @@ class BoardValues:
     )
 
 
-NEEDED: dict[str, tuple[str, ...]] = {
-    SINGLE: (),
-    "grid": ("rows", "columns", "gap_m"),
-    "aprilgrid": ("tagCols", "tagRows", "tagSpacing"),
-    "charuco": ("squares_x", "squares_y", "square_m"),
-    "diamond": ("square_m",),
-    "markers": ("markers",),
-}
-"""Kind -> the parameters that it must have."""
-
-OPTIONAL: dict[str, tuple[str, ...]] = {
-    "grid": ("corner_squares", "ids"), "aprilgrid": ("ids",),
-    "charuco": ("legacy_pattern", "ids"), "diamond": ("ids",),
-}
-"""Kind -> the parameters that it may have."""
-
 FROM_MARKER = ("dictionary", "marker_id", "size_m", "quiet_zone_modules")
 """Parameters of [marker] that a board takes."""
 
@@ -750,47 +736,60 @@ PIPELINE_NAMES = {
 }
 """Key of a board's file -> the parameter of a pipeline that says the same."""
 
+_DECLARED = {kind: declared_fields(declaring) for kind, declaring in KINDS.items()}
+
+DIAMOND = {"squares_x": 3, "squares_y": 3, "legacy_pattern": False}
+"""What makes a ChArUco diamond of a charuco."""
+
+
+def _own_keys(kind: str, needed: bool) -> tuple[str, ...]:
+    """Return the keys of a kind of board that [board] has, those that it needs or the others."""
+    declared = _DECLARED["charuco" if kind == "diamond" else kind].items()
+    return tuple(
+        name for name, each in declared if (each.default is dataclasses.MISSING) == needed
+        and PIPELINE_NAMES.get(name, name) not in FROM_MARKER
+        and not (kind == "diamond" and name in DIAMOND)
+    )
+
+
+_ARRANGED = ("grid", "aprilgrid", "charuco", "diamond", "markers")
+
+NEEDED = {SINGLE: (), **{kind: _own_keys(kind, needed=True) for kind in _ARRANGED}}
+"""Kind -> the parameters that it must have."""
+
+OPTIONAL = {kind: _own_keys(kind, needed=False) for kind in _ARRANGED}
+"""Kind -> the parameters that it may have."""
+
 
 def arranged(values: Sequence[Any]) -> Kind:
     """Return the board that values of :data:`ARRANGING` declare, unchecked."""
-    (kind, dictionary, marker_id, size_m, quiet, rows, columns, gap_m, corner_squares, squares_x,
-     squares_y, square_m, legacy_pattern, ids, tag_columns, tag_rows, spacing, markers, _) = values
-    margin_m = quiet * size_m / module_count(dictionary)
-    # Along an axis, numbers are floating-point.
-    counts: list[Any] = [
-        None if each is None else int(each)
-        for each in (marker_id, rows, columns, squares_x, squares_y, tag_columns, tag_rows)
-    ]
-    marker_id, rows, columns, squares_x, squares_y, tag_columns, tag_rows = counts
-    first_id = marker_id if ids is None else None
-    if kind == "aprilgrid":
-        return AprilGrid(
-            dictionary=dictionary, tagCols=tag_columns, tagRows=tag_rows, tagSize=size_m,
-            tagSpacing=spacing, first_id=first_id, ids=ids, margin_m=margin_m,
+    given = dict(zip(ARRANGING, values, strict=True))
+    kind, ids, size_m = given["kind"], given["ids"], given["size_m"]
+    cell = given["rows"], given["columns"], given["corner_squares"], ids
+    if kind in (SINGLE, "markers") or (kind == "grid" and cell == (1, 1, False, None)):
+        alone = ((given["marker_id"], 0.0, 0.0, None, 0.0, 0.0, 0.0, 0.0),)
+        return Markers(
+            dictionary=given["dictionary"], quiet_zone_modules=given["quiet_zone_modules"],
+            markers=tuple(
+                BoardMarker(
+                    marker_id=int(number), x_m=x, y_m=y, size_m=size_m if side is None else side,
+                    roll_deg=roll, z_m=z, tilt_deg=tilt, azimuth_deg=azimuth,
+                )
+                for number, x, y, side, roll, z, tilt, azimuth
+                in (given["markers"] if kind == "markers" else alone)
+            ),
         )
-    if kind == "grid" and (rows, columns, corner_squares, ids) != (1, 1, False, None):
-        return Grid(
-            dictionary=dictionary, rows=rows, columns=columns, marker_m=size_m, gap_m=gap_m,
-            first_id=first_id, ids=ids, corner_squares=corner_squares, margin_m=margin_m,
-        )
-    if kind in ("charuco", "diamond"):
-        across, down = (3, 3) if kind == "diamond" else (squares_x, squares_y)
-        return Charuco(
-            dictionary=dictionary, squares_x=across, squares_y=down, square_m=square_m,
-            marker_m=size_m, first_id=first_id, ids=ids, legacy_pattern=legacy_pattern,
-            margin_m=margin_m,
-        )
-    listed = markers if kind == "markers" else ((marker_id, 0.0, 0.0, size_m, 0.0, 0.0, 0.0, 0.0),)
-    return Markers(
-        dictionary=dictionary, quiet_zone_modules=quiet,
-        markers=tuple(
-            BoardMarker(
-                marker_id=int(number), x_m=x, y_m=y, size_m=size_m if side is None else side,
-                roll_deg=roll, z_m=z, tilt_deg=tilt, azimuth_deg=azimuth,
-            )
-            for number, x, y, side, roll, z, tilt, azimuth in listed
-        ),
-    )
+    if kind == "diamond":
+        kind, given = "charuco", given | DIAMOND
+    made: dict[str, Any] = {}
+    for name, declared in _DECLARED[kind].items():
+        value = given[PIPELINE_NAMES.get(name, name)]
+        # Along an axis, numbers are floating-point.
+        made[name] = int(value) if int in declared.types and value is not None else value
+    made["margin_m"] = given["quiet_zone_modules"] * size_m / module_count(given["dictionary"])
+    if ids is not None:
+        made["first_id"] = None
+    return KINDS[kind](**made)
 
 
 def used_by(kind: Any) -> tuple[str, ...]:

@@ -79,7 +79,7 @@ def marker_exposure(
     effect = scenes.effect(row)
     if scenes.solid[row]:
         return _solid_exposure(scenes, row, box, levels, math.hypot(effect["blur_px"], added_px))
-    key = scenes.markers[scenes.marker[row]]
+    key = scenes.target(row)
     outlines = (
         occluded_edges(key, effect["occlusion"], effect["occlusion_deg"])
         if effect["occlusion"] > 0 else edges_of(key)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from sweep.compilation import compiled
 from sweep.model import lens as lens_model
-from sweep.model.board import Board
 from sweep.model.coverage import REACH
 from sweep.model.lens import distort, jacobian
 from sweep.model.polygon import Projection, half_plane, signed_areas
@@ -464,8 +463,7 @@ def hidden(scenes: Scenes) -> NDArray[np.bool_]:
         facing[row] = board_faces(scenes, row)
     behind: Masks = np.asarray(~np.isfinite(scenes.outline_px).all(axis=(1, 2)))
     for row in np.flatnonzero(behind).tolist():
-        key = scenes.markers[scenes.marker[row]]
-        if isinstance(key, Board) and key.distractors:
+        if scenes.target(row).distractors:
             behind[row] = _own_sheet_behind(scenes, row)
     return np.asarray(~facing | behind)
 
@@ -474,7 +472,7 @@ def _own_sheet_behind(scenes: Scenes, row: int) -> bool:
     """Return whether a board has a corner at z <= 0, whatever stands beside it."""
     if scenes.solid[row]:
         return not np.isfinite(scenes.corners_px[row]).all()
-    target = extent_of(scenes.markers[scenes.marker[row]]).target
+    target = extent_of(scenes.target(row)).target
     (corners,), depth = _rectangle(target[None], 1), scenes.plane[row][2]
     return bool((corners @ depth[:2] + depth[2] <= 0).any())
 

@@ -501,7 +501,3 @@ def _stag_edges(dictionary: str, marker_id: int, margin: float) -> MarkerEdges:
              *[(BLACK, WHITE)] * sum(len(dot) for dot in dots)], dtype=np.int64,
         ),
     )
-
-
-MarkerKey = tuple[str, int, float]
-"""Dictionary, ID and margin (overhang and quiet zone) in modules: they determine its edges."""

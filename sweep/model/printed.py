@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,6 @@ from sweep.model.marker import (
     BLACK,
     OCCLUDER,
     OUTSIDE,
-    MarkerKey,
-    edges,
     module_count,
     overhang,
 )
@@ -32,10 +30,6 @@ from sweep.typing import Floats, Integers, Masks
 # Lengths are in units: modules of a marker, those of its first one for a board. Columns count to
 # the right and rows downwards, from the top left corner of a marker's square or from a board's
 # origin.
-
-PrintKey: TypeAlias = MarkerKey | Board
-"""A marker or a board: it determines what is printed."""
-
 
 class Extent(NamedTuple):
     """Where a print's parts end, in units.
@@ -50,8 +44,8 @@ class Extent(NamedTuple):
         The same of a marker's black square, or of a board's markers and squares.
     modules_beyond
         How far data extends beyond ``ink``.
-    origin
-        (2,) the pose's origin.
+    origin, middle
+        (2,) each: the pose's origin, and the middle of the target.
     modules
         Units along the black square's side.
     """
@@ -61,24 +55,25 @@ class Extent(NamedTuple):
     ink: Floats
     modules_beyond: float
     origin: Floats
+    middle: Floats
     modules: float
 
 
 @lru_cache(maxsize=8192)
-def extent_of(key: PrintKey) -> Extent:
-    """Return where the parts of a print end."""
-    if isinstance(key, Board):
-        outline = target_edges(key)
-        black = (outline.sides == BLACK).any(axis=1)
-        return Extent(
-            _box(edges_of(key).ends), _box(outline.ends), _box(outline.ends[black]), 0.0,
-            np.zeros(2), float(module_count(key.dictionary)),
-        )
-    n, margin = float(module_count(key[0])), key[2]
-    sheet = np.array([-margin, -margin, n + margin, n + margin])
+def extent_of(target: Board) -> Extent:
+    """Return where the parts of a target end."""
+    n = float(module_count(target.dictionary))
+    if target.margin is not None:
+        margin, middle = target.margin, np.array([n / 2, n / 2])
+        sheet = np.array([-margin, -margin, n + margin, n + margin])
+        ink = np.array([0.0, 0.0, n, n])
+        return Extent(sheet, sheet, ink, float(overhang(target.dictionary)), middle, middle, n)
+    outline = target_edges(target)
+    black = (outline.sides == BLACK).any(axis=1)
+    own = _box(outline.ends)
     return Extent(
-        sheet, sheet, np.array([0.0, 0.0, n, n]), float(overhang(key[0])),
-        np.array([n / 2, n / 2]), n,
+        _box(edges_of(target).ends), own, _box(outline.ends[black]), 0.0, np.zeros(2),
+        (own[:2] + own[2:]) / 2, n,
     )
 
 
@@ -96,56 +91,54 @@ def box_corners(boxes: Floats) -> Floats:
     return np.stack([across, up, np.zeros_like(up)], axis=2)
 
 
-def unit_m(board: Board) -> float:
-    """Return the unit of a board in metres: a module of its first marker."""
-    side = float(np.linalg.norm(board.corners_m[0, 1] - board.corners_m[0, 0]))
-    return side / module_count(board.dictionary)
+def unit_m(target: Board) -> float:
+    """Return the unit in metres: a module of the first marker; in sides of a marker alone."""
+    side = float(np.linalg.norm(target.corners_m[0, 1] - target.corners_m[0, 0]))
+    return side / module_count(target.dictionary)
 
 
-def side_m(key: PrintKey, size_m: float) -> float:
-    """Return the side of a print's first marker in metres: ``size_m`` unless it has its own."""
-    if not isinstance(key, Board):
+def side_m(target: Board, size_m: float) -> float:
+    """Return the side of a target's first marker in metres: ``size_m`` unless it has its own."""
+    if target.is_marker:
         return size_m
-    side = unit_m(key) * module_count(key.dictionary)
+    side = unit_m(target) * module_count(target.dictionary)
     return size_m if math.isclose(side, size_m, rel_tol=1e-9) else side
 
 
-def sides_m(keys: Sequence[PrintKey], number: NDArray[np.intp], size_m: Floats) -> Floats:
-    """Return :func:`side_m` of N prints, ``keys[number]`` with sizes (N,)."""
-    if not any(isinstance(key, Board) for key in keys):
+def sides_m(targets: Sequence[Board], number: NDArray[np.intp], size_m: Floats) -> Floats:
+    """Return :func:`side_m` of N targets, ``targets[number]`` with sizes (N,)."""
+    if all(each.is_marker for each in targets):
         return size_m
     each = zip(number.tolist(), size_m.tolist(), strict=True)
-    return np.array([side_m(keys[k], size) for k, size in each])
+    return np.array([side_m(targets[k], size) for k, size in each])
 
 
-@lru_cache(maxsize=64)
-def target_edges(board: Board) -> MarkerEdges:
-    """Return the edges of a board, without what stands beside it, in units."""
-    outline = board.edges()
-    return MarkerEdges(outline.ends / unit_m(board), outline.sides)
+@lru_cache(maxsize=8192)
+def target_edges(target: Board) -> MarkerEdges:
+    """Return the edges of a target, without what stands beside it, in units."""
+    if target.is_marker:
+        return target.prints[0].edges
+    outline = target.edges()
+    return MarkerEdges(outline.ends / unit_m(target), outline.sides)
 
 
-@lru_cache(maxsize=64)
-def _board_edges(board: Board) -> MarkerEdges:
-    own = target_edges(board)
-    if not board.distractors:
+@lru_cache(maxsize=8192)
+def edges_of(target: Board) -> MarkerEdges:
+    """Return the edges of all that is printed, beside a board too, in units."""
+    own = target_edges(target)
+    if not target.distractors:
         return own
-    beside = edges_on_sheet(board.distractors)
+    beside = edges_on_sheet(target.distractors)
     return MarkerEdges(
-        np.concatenate([own.ends, beside.ends / unit_m(board)]),
+        np.concatenate([own.ends, beside.ends / unit_m(target)]),
         np.concatenate([own.sides, beside.sides]),
     )
 
 
-def edges_of(key: PrintKey) -> MarkerEdges:
-    """Return the edges of all that is printed, beside a board too, in units."""
-    return _board_edges(key) if isinstance(key, Board) else edges(*key)
-
-
 @lru_cache(maxsize=64)
-def edge_table(prints: tuple[PrintKey, ...]) -> tuple[MarkerEdges, NDArray[np.int64]]:
-    """Return the edges of K prints in one table, and (K, 2) first and last + 1 row of each."""
-    each = [edges_of(key) for key in prints]
+def edge_table(targets: tuple[Board, ...]) -> tuple[MarkerEdges, NDArray[np.int64]]:
+    """Return the edges of K targets in one table, and (K, 2) first and last + 1 row of each."""
+    each = [edges_of(target) for target in targets]
     stops = np.cumsum([len(outline.ends) for outline in each])
     starts = np.concatenate([[0], stops[:-1]])
     table = MarkerEdges(
@@ -156,14 +149,14 @@ def edge_table(prints: tuple[PrintKey, ...]) -> tuple[MarkerEdges, NDArray[np.in
 
 
 @lru_cache(maxsize=8192)
-def occluded_edges(key: PrintKey, occlusion: float, occlusion_deg: float) -> MarkerEdges:
-    """Return the edges of a print under a sheet that hides everything beyond a straight line.
+def occluded_edges(target: Board, occlusion: float, occlusion_deg: float) -> MarkerEdges:
+    """Return the edges of a target under a sheet that hides everything beyond a straight line.
 
     Parts of edges under the sheet are projected onto its edge at a right angle: they then enclose
     the visible part of their area, since the projection moves nothing else. The sheet ends where
-    the print does.
+    the target does.
     """
-    extent = extent_of(key)
+    extent = extent_of(target)
     angle = math.radians(occlusion_deg)
     towards = np.array([math.cos(angle), -math.sin(angle)])
     # Rows count downwards; the sheet's edge lies where towards · (column, row) = limit.
@@ -192,7 +185,7 @@ def occluded_edges(key: PrintKey, occlusion: float, occlusion_deg: float) -> Mar
 
     ends: list[list[float]] = []
     sides: list[tuple[int, int]] = []
-    plain = edges_of(key)
+    plain = edges_of(target)
     for edge, codes in zip(plain.ends.tolist(), plain.sides.tolist(), strict=True):
         parts = split(edge, hidden=False)
         ends += parts
@@ -484,14 +477,12 @@ def _squares(board: Board) -> list[list[tuple[int, Floats]]]:
 
 
 def boxes_px(
-    board: Board | object, camera: Cameras, rotation: Floats, translation: Floats, scale: float
+    board: Board, camera: Cameras, rotation: Floats, translation: Floats, scale: float
 ) -> Floats:
     """Return rectangles (2, 4, 2) in px about the images of a solid board's sheets, and of all.
 
     Of those that face the camera, if any does; NaN if a part of one is not before it.
     """
-    if not isinstance(board, Board):
-        raise TypeError("a single marker is flat")
     planes = sheet_planes(board, rotation, translation, scale)
     boxes = []
     for count in (own_sheets(board), len(planes)):

@@ -21,7 +21,7 @@ from sweep.model.extent import WARP_PX_PER_MODULE
 from sweep.model.image_file import decode_grey, photograph_image
 from sweep.model.marker import modules, overhang
 from sweep.model.polygon import Optics, Projection
-from sweep.model.printed import PrintKey, edge_table, edges_of, extent_of, own_sheets, unit_m
+from sweep.model.printed import edge_table, edges_of, extent_of, own_sheets, unit_m
 from sweep.model.scene import RENDERERS, SUPERSAMPLE, Box, Scenes
 from sweep.model.scene_sheet import accumulate_solid
 from sweep.model.sensor import (
@@ -381,16 +381,16 @@ _NO_EDGES = np.empty((0, 6))
 
 def _sampled_marker(scenes: Scenes, row: int) -> SampledMarker:
     """Return the marker or the board of a scene as samples see it."""
-    key = scenes.markers[scenes.marker[row]]
+    key = scenes.target(row)
     inverse = np.linalg.inv(scenes.plane[row])
     levels, optics = scenes.levels[row], scenes.cameras.optics(row)
-    if isinstance(key, Board):
+    if not key.is_marker:
         return SampledMarker(_NO_MODULES, 0.0, *_board_table(key), levels, inverse, optics)
-    beyond = overhang(key[0])
+    beyond = overhang(key.dictionary)
     inverse[:2] += beyond * inverse[2]
+    bits = modules(key.dictionary, key.marker_ids[0])
     return SampledMarker(
-        modules(*key[:2]), float(scenes.margin[row] - beyond), _NO_EDGES, _NO_EDGES, levels,
-        inverse, optics,
+        bits, float(scenes.margin[row] - beyond), _NO_EDGES, _NO_EDGES, levels, inverse, optics
     )
 
 
@@ -430,7 +430,7 @@ def _cover(
     if scenes.solid[row]:
         accumulate_solid(cover, scenes, row, levels, box, 0.0)
         return cover
-    outlines = edges_of(scenes.markers[scenes.marker[row]])
+    outlines = edges_of(scenes.target(row))
     coverage.accumulate(
         cover, outlines, levels, scenes.projection(row), box[0], box[1], 0.0
     )
@@ -439,20 +439,19 @@ def _cover(
 
 @lru_cache(maxsize=1024)
 def _bitmap(
-    key: PrintKey, black: float, white: float
+    key: Board, black: float, white: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return a print's bitmap (height, width) at 10 px a module, and its black square's corners.
 
     The corners (4, 2) are TL, TR, BR, BL in pixels of the bitmap, whose pixels' edges lie at
     halves; of a board they are those of what is black.
     """
-    if isinstance(key, Board):
+    if key.margin is None:
         return _board_bitmap(key, black, white)
-    dictionary, marker_id, margin = key
-    beyond = overhang(dictionary)
-    pad = round(WARP_PX_PER_MODULE * (margin - beyond))
+    beyond = overhang(key.dictionary)
+    pad = round(WARP_PX_PER_MODULE * (key.margin - beyond))
     cells = np.kron(
-        modules(dictionary, marker_id),
+        modules(key.dictionary, key.marker_ids[0]),
         np.ones((WARP_PX_PER_MODULE, WARP_PX_PER_MODULE), dtype=bool),
     )
     bitmap = np.where(np.pad(cells, pad, constant_values=True), white, black)
@@ -498,20 +497,19 @@ def _board_bitmap(
     return bitmap.astype(np.float32), corners
 
 
-def _bitmap_share(key: PrintKey, bitmap: NDArray[np.float32]) -> NDArray[np.float32]:
+def _bitmap_share(target: Board) -> NDArray[np.float32]:
     """Return the share (height, width) of each pixel of a bitmap that is printed on a sheet."""
-    return _bitmap(key, 1.0, 1.0)[0] if isinstance(key, Board) else np.ones_like(bitmap)
+    return _bitmap(target, 1.0, 1.0)[0]
 
 
 @lru_cache(maxsize=1024)
 def _grey_bitmap(
-    key: PrintKey, black: float, white: float, behind: float
+    key: Board, black: float, white: float, behind: float
 ) -> tuple[Grey, NDArray[np.float32]]:
     """As :func:`_bitmap`, in 8 bits; ``behind`` is the level between a board's sheets."""
     bitmap, corners = _bitmap(key, black, white)
     levels = bitmap.astype(np.float64)
-    if isinstance(key, Board):
-        levels += (1.0 - _bitmap_share(key, bitmap)) * behind
+    levels += (1.0 - _bitmap_share(key)) * behind
     return quantise(levels), corners
 
 
@@ -526,9 +524,9 @@ def _perspective(
 def _warp_grey(scenes: Scenes, row: int, box: Box, view: Grey) -> None:
     """Take the paper's steps 5-8: only the corners are projected, and OpenCV warps the bitmap."""
     background, black, white = scenes.levels[row].tolist()
-    key = scenes.markers[scenes.marker[row]]
+    key = scenes.target(row)
     bitmap, corners = _grey_bitmap(
-        key, black, white, background if isinstance(key, Board) else 0.0
+        key, black, white, 0.0 if key.is_marker else background
     )
     transform = _perspective(scenes, row, box, corners)
     size = (box[2] - box[0], box[3] - box[1])
@@ -542,13 +540,13 @@ def _warp_levels(
     scenes: Scenes, row: int, box: Box, mean: NDArray[np.float64], share: NDArray[np.float64]
 ) -> None:
     """As :func:`_warp_grey`, not quantised, with the marker's share as the warp of its own."""
-    key = scenes.markers[scenes.marker[row]]
+    key = scenes.target(row)
     bitmap, corners = _bitmap(key, *scenes.levels[row, 1:].tolist())
     transform = _perspective(scenes, row, box, corners)
     size = (box[2] - box[0], box[3] - box[1])
     mean[:] = cv2.warpPerspective(bitmap, transform, size, flags=cv2.INTER_LINEAR)
     share[:] = cv2.warpPerspective(
-        _bitmap_share(key, bitmap), transform, size, flags=cv2.INTER_LINEAR
+        _bitmap_share(key), transform, size, flags=cv2.INTER_LINEAR
     )
 
 
@@ -565,8 +563,8 @@ def beside_pixels(scenes: Scenes, row: int, box: Box) -> Masks:
     With blur and motion, and the pixels next to these: to renderers that are not exact, and to
     what mixes neighbours, it is not sharper.
     """
-    key = scenes.markers[scenes.marker[row]]
-    if not isinstance(key, Board) or not key.distractors:
+    key = scenes.target(row)
+    if not key.distractors:
         return np.zeros((box[3] - box[1], box[2] - box[0]), dtype=bool)
     if scenes.solid[row]:
         sigma = scenes.effect(row)["blur_px"] if scenes.affected[row] else 0.0

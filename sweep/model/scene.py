@@ -13,13 +13,19 @@ from numpy.typing import NDArray
 
 from sweep.declaration import parameter
 from sweep.model import lens as lens_model
-from sweep.model.board import Board
+from sweep.model.board import Board, single_marker
 from sweep.model.camera import VIEW_PARAMETERS, Camera, Cameras, Column, intrinsics, map_columns
 from sweep.model.effects import CODED, NEUTRAL, NO_PLUGINS, PLAIN, VELOCITIES, Effect, ScenePlugins
 from sweep.model.marker import marker_corners, overhang
 from sweep.model.polygon import Projection
 from sweep.model.pose import rotation_of_angles, transform_points
-from sweep.model.printed import PrintKey, box_corners, boxes_px, extent_of, side_m, sides_m
+from sweep.model.printed import (
+    box_corners,
+    boxes_px,
+    extent_of,
+    side_m,
+    sides_m,
+)
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
@@ -104,7 +110,7 @@ class Scenes:
         One value for each scene. The margin is how far the marker extends beyond the square, in
         modules: data outside it, and the quiet zone unless the background has its level.
     markers, marker
-        The distinct markers (dictionary, ID, margin) and boards, and (N,) the index of each
+        The distinct targets, markers and boards, and (N,) the index of each
         scene's.
     modules
         (N,) modules along the black square's side.
@@ -143,7 +149,7 @@ class Scenes:
     dictionary: Sequence[str]
     marker_id: Sequence[int]
     margin: Floats
-    markers: tuple[PrintKey, ...]
+    markers: tuple[Board, ...]
     marker: NDArray[np.int64]
     modules: Floats
     sheet: Floats
@@ -204,6 +210,10 @@ class Scenes:
             if self.effects is not None and concerned(effect):
                 active |= effect.is_active(self.effects[effect.switch])
         return active
+
+    def target(self, row: int) -> Board:
+        """Return what one scene shows."""
+        return self.markers[int(self.marker[row])]
 
     def projection(self, row: int) -> Projection:
         """Return the camera and the marker's plane of one scene as compiled functions take them."""
@@ -298,11 +308,13 @@ def build_scenes(
     size = numbers("size_m")
     # A quiet zone on a background of its own level is invisible, unless a sheet hides a part of
     # it: it is not modelled.
-    keys: list[PrintKey] = mapped(
+    keys: list[Board] = mapped(
         lambda board, dictionary, marker_id, size_m, width, white, background, occlusion: (
-            (dictionary, int(marker_id) if board is None else board.marker_ids[0],
-             overhang(dictionary)
-             + (0.0 if background == white and occlusion == 0 else float(width)))
+            single_marker(
+                dictionary, int(marker_id) if board is None else board.marker_ids[0],
+                overhang(dictionary)
+                + (0.0 if background == white and occlusion == 0 else float(width)),
+            )
             if board is None or (board.is_single and side_m(board, size_m) == size_m) else board
         ),
         "board", "dictionary", "marker_id", "size_m", "quiet_zone_modules", "white", "background",
@@ -317,7 +329,7 @@ def build_scenes(
     side = sides_m(markers, marker, size)
     printed = side * numbers("marker_scale")
     half, module = printed / 2, printed / modules
-    on_board = np.array([isinstance(key, Board) for key in markers])[marker]
+    on_board = np.array([not each.is_marker for each in markers])[marker]
     half[on_board] = margin[on_board] = 0.0
     plane = np.empty((count, 3, 3))
     plane[:, :, 0] = rotation[:, :, 0] * module[:, None]
@@ -332,7 +344,7 @@ def build_scenes(
     outline_m = transform_points(around_m, rotation, translation)
     corners_px = cameras.project(transform_points(square_m, rotation, translation))
     outline_px = cameras.project(outline_m)
-    solid = np.array([isinstance(key, Board) and not key.is_flat for key in markers])[marker]
+    solid = np.array([not each.is_flat for each in markers])[marker]
     for row in np.flatnonzero(solid).tolist():
         camera, scale = cameras.take(np.array([row])), float(printed[row] / side[row])
         corners_px[row], outline_px[row] = boxes_px(
@@ -365,8 +377,8 @@ def build_scenes(
     return Scenes(
         cameras=cameras,
         frame=np.stack([numbers("width_px"), numbers("height_px")], axis=1).astype(np.int64),
-        dictionary=[key.dictionary if isinstance(key, Board) else key[0] for key in keys],
-        marker_id=[key.marker_ids[0] if isinstance(key, Board) else key[1] for key in keys],
+        dictionary=[key.dictionary for key in keys],
+        marker_id=[key.marker_ids[0] for key in keys],
         margin=margin,
         markers=markers,
         marker=marker,

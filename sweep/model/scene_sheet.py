@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.model import coverage
-from sweep.model.board import Board
 from sweep.model.polygon import Projection
 from sweep.model.printed import (
     facing,
@@ -127,18 +126,10 @@ def sheet_folds(scenes: Scenes, row: int) -> bool:
 # --------------------------------------------------------------------------------------------------
 # Scenes of boards whose markers are in several planes: their planes, and their light.
 
-def solid_board(scenes: Scenes, row: int) -> Board:
-    """Return the board of one scene; TypeError if it shows a single marker."""
-    board = scenes.markers[scenes.marker[row]]
-    if not isinstance(board, Board):
-        raise TypeError("a single marker is flat")
-    return board
-
-
 def solid_planes(scenes: Scenes, row: int) -> Floats:
     """Return the planes (P, 3, 3) of the sheets of one scene's board."""
     return sheet_planes(
-        solid_board(scenes, row), scenes.rotation[row], scenes.translation[row],
+        scenes.target(row), scenes.rotation[row], scenes.translation[row],
         _scale(scenes, row),
     )
 
@@ -157,7 +148,7 @@ def accumulate_solid(
     :func:`sweep.model.coverage.accumulate` takes them.
     """
     optics = scenes.cameras.optics(row)
-    for seen in visible_prints(solid_board(scenes, row), solid_planes(scenes, row), first):
+    for seen in visible_prints(scenes.target(row), solid_planes(scenes, row), first):
         coverage.accumulate(
             cover, seen.edges, levels, Projection(seen.plane, optics), box[0], box[1], sigma
         )
@@ -165,13 +156,13 @@ def accumulate_solid(
 
 def facing_sheets(scenes: Scenes, row: int) -> Floats:
     """Return the corners (P, 4, 3) in the camera frame of the sheets that face the camera."""
-    board, planes = solid_board(scenes, row), solid_planes(scenes, row)
+    board, planes = scenes.target(row), solid_planes(scenes, row)
     return np.ascontiguousarray(outlines(board, planes)[facing(board, planes)])
 
 
 def board_faces(scenes: Scenes, row: int) -> bool:
     """Return whether a sheet of one scene's board faces the camera, and is not behind it."""
-    board = solid_board(scenes, row)
+    board = scenes.target(row)
     return bool(facing(board, solid_planes(scenes, row))[: own_sheets(board)].any())
 
 
@@ -192,8 +183,7 @@ def _outlines_px(scenes: Scenes, row: int, corners: Floats, per_side: int) -> Fl
 
 def _separate_sheets(scenes: Scenes, row: int) -> bool:
     """Return whether a scene's board is on several sheets, and nothing is between their images."""
-    board = scenes.markers[scenes.marker[row]]
-    if not isinstance(board, Board) or len(sheets_of(board)) == 1 or scenes.renderer[row] == "warp":
+    if len(sheets_of(scenes.target(row))) == 1 or scenes.renderer[row] == "warp":
         return False
     return scenes.effects is None or (
         scenes.motion(row) is None and scenes.effects["occlusion"][row] == 0
@@ -210,7 +200,7 @@ def extent_in_frame(
     """
     if not _separate_sheets(scenes, row):
         return low, high
-    corners = sheets_m(solid_board(scenes, row)) * _scale(scenes, row)
+    corners = sheets_m(scenes.target(row)) * _scale(scenes, row)
     points = _outlines_px(
         scenes, row, corners @ scenes.rotation[row].T + scenes.translation[row],
         per_side if scenes.cameras.distorted[row] else 1,

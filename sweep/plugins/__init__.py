@@ -147,13 +147,12 @@ class EstimatorPlugin(Plugin):
     make
         Called once for each setting and process, and never pickled: ``make(settings)`` with an
         instance of `settings` (None without). Returns a function of
-        :class:`sweep.measure.estimation.Detections`, N of them, that returns :class:`Poses`.
+        :class:`sweep.measure.estimation.Detections` of N targets that returns :class:`Poses`.
     needs_images
         Whether it uses the pixels: the detections' images are kept for it.
     of_boards
-        Whether it estimates boards: the function gets
-        :class:`sweep.measure.board_solver.BoardDetections` in place of single markers, and the
-        poses are the boards'.
+        Whether it estimates boards: the targets are boards then, of any number of squares; else
+        markers, all of one.
     """
 
     kind: ClassVar[str] = "estimator"

@@ -7,6 +7,7 @@ nuisances. The first: black 40, white 220, background 120, noise 2, tilts 0 to 7
 medians over tilts.
 """
 
+import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -28,6 +29,7 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.measure.likelihood import BACKGROUND_MARGIN_PX, marker_view, noise_variance, state_of
 from sweep.measure.photometric import Photometric, PhotometricReal
 from sweep.measure.surroundings import BoardMarker
+from sweep.model.board import single_marker
 from sweep.model.board_kinds import Charuco
 from sweep.model.extent import marker_boxes
 from sweep.model.scene import build_scenes
@@ -124,12 +126,14 @@ def detections(side, effects):
             images.append(taken.image)
     count, markers = len(corners), len(BOARD)
     cameras = board_scene(BOARD, camera, pose).cameras.take(np.zeros(count, dtype=int))
-    return Detections(
+    found = Detections.of_markers(
         np.array(corners), cameras, np.full(count, 0.03), np.full(count, 2.0), np.zeros(count),
-        [(BOARD.dictionary, BOARD.marker_ids[k % markers], 1.0) for k in range(count)], images,
+        [single_marker(BOARD.dictionary, BOARD.marker_ids[k % markers], 1.0)
+         for k in range(count)], images,
         np.zeros((count, 2), dtype=np.int64),
-        on_board=[BoardMarker(BOARD, k % markers) for k in range(count)],
     )
+    return dataclasses.replace(
+        found, on_board=[BoardMarker(BOARD, k % markers) for k in range(count)])
 
 
 def of_photographs(side):

@@ -40,10 +40,11 @@ from scipy import stats
 
 from support.blocks import run_block
 from support.lengths import lengths
+from support.solving import estimate
 from sweep.evaluation.block import assumed_cameras
 from sweep.measure.estimation import pose_error
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.measure.solver import OPENCV_SOLVERS, estimate
+from sweep.measure.solver import OPENCV_SOLVERS
 from sweep.model.scene import build_scenes
 from sweep.plan.grid import Block, block_indices, estimators, scene_axes, scene_values
 from sweep.plan.parameters import Stage

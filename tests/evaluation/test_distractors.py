@@ -6,7 +6,8 @@ import pytest
 
 from support.lengths import lengths
 from sweep.evaluation.block import run_cells
-from sweep.evaluation.search import board_scenes, search, search_windows, visibility_flags
+from sweep.evaluation.search import search, search_windows, visibility_flags
+from sweep.measure.classify import target_scenes
 from sweep.measure.detectors import BoardDetectorSetting, DetectorSetting
 from sweep.measure.flags import DetectionStatus
 from sweep.model.extent import marker_boxes
@@ -53,13 +54,13 @@ def searched(chosen, count, window):
     values = scene_values(chosen, block_indices(Block((0,) * len(shape), shape)))
     scenes = build_scenes(values, count)
     flags = visibility_flags(scenes)
-    boards = board_scenes(scenes, values["board"].listed(count), flags, largest_board(chosen))
+    boards = target_scenes(scenes, flags, values["board"].listed(count), largest_board(chosen))
     results, _, _ = search(
         scenes, (flags == DetectionStatus.not_run)[:, None], [DetectorSetting()],
-        np.full(count, window == "full"), [], boards=boards,
+        np.full(count, window == "full"), [], targets=boards,
         board_settings=[BoardDetectorSetting()],
     )
-    return scenes, results[0].boards
+    return scenes, results[0].found
 
 
 @lengths(4, 80)
@@ -84,7 +85,8 @@ def test_what_is_found_in_windows_is_what_a_plain_loop_finds_in_frames(count):
         )
         got = sorted(
             (k, *quad.ravel()) for k, quad in
-            zip(found.points[row].marker.tolist(), found.points[row].corners_px, strict=True)
+            zip(found.square[found.owner == row].tolist(), found.corners[found.owner == row],
+                strict=True)
         )
         np.testing.assert_allclose(got, expected, atol=1e-3)
         twice += [each[0] for each in expected].count(2) == 2
@@ -130,7 +132,7 @@ def test_an_id_of_the_board_elsewhere_is_no_detection_of_its_marker():
     assert flags[0] == DetectionStatus.detected
     assert flags[1] in (DetectionStatus.no_candidate, DetectionStatus.rejected)
     _, found = searched(chosen, 1, "auto")
-    assert found.points[0].marker.tolist().count(1) == 1  # as OpenCV's matchImagePoints takes it
+    assert found.square.tolist().count(1) == 1  # as OpenCV's matchImagePoints takes it
 
 
 @pytest.mark.parametrize(("beside", "tilt", "expected"), [
@@ -144,5 +146,5 @@ def test_what_comes_behind_the_camera_is_not_modelled_in_the_board_s_plane(besid
     scenes, values = shown(chosen)
     flags = visibility_flags(scenes)
     assert flags[0] == expected
-    boards = board_scenes(scenes, values["board"].listed(1), flags, largest_board(chosen))
+    boards = target_scenes(scenes, flags, values["board"].listed(1), largest_board(chosen))
     assert (boards.flags == expected).all()

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from support.blocks import run_block
-from sweep.measure.classify import classify
+from sweep.measure.classify import TargetScenes, classify
+from sweep.measure.detectors import SearchOutput
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
+from sweep.model.board import single_marker
 from sweep.plan.grid import Block, scene_axes
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.schema import SCHEMA
@@ -220,15 +222,26 @@ def search_result(row, *found):
         )
 
     ids = [found_id for found_id, _ in found if found_id is not None]
-    return row, quads(True), np.array(ids, dtype=np.int32) if ids else None, quads(False)
+    return row, SearchOutput(
+        quads(True), np.array(ids, dtype=np.int32) if ids else None, quads(False)
+    )
+
+
+def markers(truth, marker_id):
+    """N visible markers with corners (N, 4, 2) and IDs (N,)."""
+    return TargetScenes(
+        [single_marker("DICT_4X4_50", each, 1.0) for each in marker_id],
+        np.array(marker_id)[:, None],
+        truth[:, None], np.empty((len(truth), 0, 2)), np.zeros((len(truth), 1), dtype=np.uint8),
+    )
 
 
 def classified(*found, truth=SQUARE, marker_id=7):
     """Classify what was found, (ID, corners) each, in one scene."""
-    flag, corners = classify(
-        truth[None], np.array([marker_id]), [search_result(0, *found)], ORIGIN[:1]
+    found = classify(
+        markers(truth[None], [marker_id]), dict([search_result(0, *found)]), ORIGIN[:1]
     )
-    return DetectionStatus(flag[0]), corners[0]
+    return DetectionStatus(found.flags[0]), found.marker_corners[0, 0]
 
 
 def test_right_marker_is_detected_with_its_own_corners():
@@ -276,10 +289,11 @@ def test_scenes_are_told_apart():
     found = [
         search_result(2, (3, SQUARE + 200)), search_result(0, (2, SQUARE), (REJECTED_ID, SQUARE)),
     ]
-    flag, corners = classify(truth, np.array([1, 2, 3]), found, ORIGIN)
-    assert flag.tolist() == [
+    result = classify(markers(truth, [1, 2, 3]), dict(found), ORIGIN)
+    assert result.flags.tolist() == [
         DetectionStatus.wrong_id,
         DetectionStatus.no_candidate,
         DetectionStatus.detected,
     ]
-    np.testing.assert_array_equal(np.isnan(corners).all(axis=(1, 2)), [True, True, False])
+    missing = np.isnan(result.marker_corners).all(axis=(1, 2, 3))
+    np.testing.assert_array_equal(missing, [True, True, False])

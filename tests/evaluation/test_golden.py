@@ -4,7 +4,7 @@ import hashlib
 
 import numpy as np
 
-from sweep.measure.solver import estimate
+from support.solving import estimate
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes

@@ -6,11 +6,11 @@ import pytest
 
 from support.blocks import run_block
 from support.lengths import lengths
-from support.windows import outcomes_elsewhere
+from support.windows import corners_of, outcomes_elsewhere
 from sweep.errors import PipelineError
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search, search_windows, visibility_flags
-from sweep.measure.detectors import REFINEMENTS, DetectorSetting, opencv_full_frame_reason, windows
+from sweep.measure.detectors import REFINEMENTS, DetectorSetting, full_frame_reason, windows
 from sweep.measure.flags import DetectionStatus
 from sweep.model.extent import marker_boxes
 from sweep.model.marker import opencv_dictionary
@@ -82,7 +82,7 @@ def compare(count, width, height, refinement):
     windowed, framed = both_searches(scenes, setting)
     exceptions = np.flatnonzero(windowed.flags != framed.flags)
     both = (windowed.flags == DetectionStatus.detected) & (framed.flags == DetectionStatus.detected)
-    difference = np.abs(windowed.corners - framed.corners)[both].max(axis=(1, 2))
+    difference = np.abs(corners_of(windowed) - corners_of(framed))[both].max(axis=(1, 2))
     median, high, worst = np.quantile(difference, [0.5, 0.99, 1.0])
     cut = (scenes.outline_px < -0.5) | (scenes.outline_px > scenes.frame[:, None] - 0.5)
     print(
@@ -186,9 +186,9 @@ def test_window_finds_what_the_frame_holds_under_other_settings(count, given):
     windowed, framed = both_searches(scenes, setting)
     assert (windowed.flags != framed.flags).sum() <= 0.001 * count
     both = (windowed.flags == DetectionStatus.detected) & (framed.flags == DetectionStatus.detected)
-    difference = np.abs(windowed.corners - framed.corners)[both]
+    difference = np.abs(corners_of(windowed) - corners_of(framed))[both]
     exact = (
-        opencv_full_frame_reason(setting) is not None or setting.cornerRefinementMethod == "none"
+        full_frame_reason(setting) is not None or setting.cornerRefinementMethod == "none"
     )
     # As above: one float32 ulp of the frame's width for apriltag's corners.
     assert difference.max(initial=0.0) <= (0.0 if exact else np.spacing(np.float32(640)))
@@ -200,7 +200,7 @@ def test_window_finds_what_the_frame_holds_without_quiet_zone_and_through_a_lens
     scenes = visible_scenes(count, settings=[changed])
     windowed, framed = both_searches(scenes, DetectorSetting())
     np.testing.assert_array_equal(windowed.flags, framed.flags)
-    np.testing.assert_array_equal(windowed.corners, framed.corners)
+    np.testing.assert_array_equal(corners_of(windowed), corners_of(framed))
 
 
 PAIRED = """

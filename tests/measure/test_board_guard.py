@@ -9,8 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.lengths import lengths
-from sweep.measure.board_solver import BOARD_METHODS, BoardDetections, BoardPoints, BoardSolver
+from support.solving import BOARD_METHODS, BoardPoints, detected
 from sweep.measure.flags import EstimateStatus
+from sweep.measure.solver import PointSolver
 from sweep.model.board_kinds import BoardMarker, Charuco, Grid, Markers
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
@@ -49,10 +50,7 @@ BOARDS = {
 
 def detections(board, points, lens=()):
     camera = Cameras(VIEW[None], pack(lens)[None], np.array([bool(lens)]))
-    return BoardDetections(
-        [board], [points], camera, np.zeros(1), np.zeros(1), np.ones(1), [],
-        np.zeros((1, 2), dtype=np.int64),
-    )
+    return detected(board, points, camera)
 
 
 def settings(board, refines):
@@ -60,12 +58,12 @@ def settings(board, refines):
     flat = board.is_flat
     for solver, refine in itertools.product(BOARD_METHODS, refines):
         if flat or solver != "ippe":
-            yield BoardSolver(solver, "markers", refine, True, 0.25, 0.3)
+            yield PointSolver(solver, True, 0.25, 0.3, "markers", refine)
             if board.chessboard is not None:
-                yield BoardSolver(solver, "chessboard", refine, True, 0.25, 0.3)
+                yield PointSolver(solver, True, 0.25, 0.3, "chessboard", refine)
     for points, solver in (("each_marker", "ippe"), ("largest_marker", "ippe_square"),
                            ("largest_marker", "ap3p")):
-        yield BoardSolver(solver, points, "none", True, 0.25, 0.3)
+        yield PointSolver(solver, True, 0.25, 0.3, points, "none")
 
 
 def judged(solver, asked):
@@ -89,9 +87,9 @@ def judged(solver, asked):
     assert np.linalg.det(rotation) > 0, context
     assert np.isfinite(translation).all(), context
     assert np.isfinite(found.reprojection_px[0]), context
-    board, points = asked.boards[0], asked.points[0]
-    used = (board.chessboard_m[points.chessboard] if solver.points == "chessboard"
-            else board.corners_m[points.marker].reshape(-1, 3))
+    board, known = asked.targets[0], np.isfinite(asked.chessboard_px[0, :, 0])
+    used = (board.chessboard_m[known] if solver.points == "chessboard"
+            else asked.objects_m.reshape(-1, 3))
     depth = (used @ rotation.T + translation)[:, 2]
     if solver.points == "largest_marker":
         depth = depth.reshape(-1, 4)[depth.reshape(-1, 4).min(axis=1).argmax()]  # the one used
@@ -163,9 +161,9 @@ def test_what_opencv_cannot_solve_is_solved_by_another_method(solver):
         translation = np.array([0.0, 0.0, 0.15 * 600 / span_px])
         points = sighted(board, rotation, translation)
         asked = detections(board, points)
-        plain = BoardSolver(solver, "markers", "none", False, 0.25, None)(asked)
+        plain = PointSolver(solver, False, 0.25, None, "markers", "none")(asked)
         unsolved += plain.status[0] != EstimateStatus.solved
-        found = judged(BoardSolver(solver, "markers", "none", True, 0.25, None), asked)
+        found = judged(PointSolver(solver, True, 0.25, None, "markers", "none"), asked)
         error = Rotation.from_matrix(found.rotation[0] @ rotation.T).magnitude()
         assert np.degrees(error) < 0.05
     assert unsolved > 0
@@ -255,7 +253,7 @@ def test_iterative_finds_the_least_error_of_few_coarse_corners(count, rows):
         exact = sighted(board, rotation, translation)
         asked = detections(board, exact._replace(corners_px=np.round(exact.corners_px)))
         errors = [
-            judged(BoardSolver(solver, "markers", "lm", True, 0.25, None), asked).reprojection_px[0]
+            judged(PointSolver(solver, True, 0.25, None, "markers", "lm"), asked).reprojection_px[0]
             for solver in ("iterative", "sqpnp", "ippe")
         ]
         assert errors[0] <= max(1.25 * min(errors), 1e-3 * 600 * 0.02 / depth)

@@ -105,8 +105,8 @@ def test_board_with_a_wrong_marker_is_solved_from_the_others(monkeypatch):
     estimate = Photometric.__call__
 
     def spoiled(self, detections):
-        for found in detections.points:
-            found.corners_px[0] += [15.0, -10.0]
+        first = np.searchsorted(detections.owner, np.arange(len(detections)))
+        detections.corners[first] += [15.0, -10.0]
         return estimate(self, detections)
 
     monkeypatch.setattr(Photometric, "__call__", spoiled)

@@ -7,9 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.lengths import lengths
+from support.solving import BOARD_METHODS, BoardPoints, detected
 from sweep.evaluation.block import run_cells
-from sweep.measure.board_solver import BOARD_METHODS, BoardDetections, BoardPoints, BoardSolver
 from sweep.measure.flags import DetectionStatus, EstimateStatus
+from sweep.measure.solver import PointSolver
 from sweep.model.board_kinds import Charuco
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
@@ -38,11 +39,8 @@ def solved(solver, points, chessboard, rotation, translation, distortion, refine
         np.arange(len(BOARD)), pixels(BOARD.corners_m.reshape(-1, 3)).reshape(-1, 4, 2),
         chessboard, pixels(BOARD.chessboard_m[chessboard]),
     )
-    detections = BoardDetections(
-        [BOARD], [found], Cameras(VIEW[None], packed[None], np.array([bool(distortion)])),
-        np.zeros(1), np.zeros(1), np.ones(1), [], np.zeros((1, 2), dtype=np.int64),
-    )
-    return BoardSolver(solver, points, refine, True, 0.25, noise_px)(detections)
+    camera = Cameras(VIEW[None], packed[None], np.array([bool(distortion)]))
+    return PointSolver(solver, True, 0.25, noise_px, points, refine)(detected(BOARD, found, camera))
 
 
 @pytest.mark.parametrize("solver", BOARD_METHODS)

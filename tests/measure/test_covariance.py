@@ -10,12 +10,20 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
 from support.exact_image import LENSES
-from sweep.measure.estimation import corner_covariance, squared_deviations
+from sweep.measure.estimation import point_covariance, squared_deviations
 from sweep.measure.likelihood import solve_positive, state_of, turn_between
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
+from sweep.model.marker import marker_corners
 
 CORNERS = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5, -0.5, 0]])
+
+
+def corner_covariance(rotation, translation, cameras, size_m, noise_px):
+    """The covariances of poses from the corners of one marker each."""
+    return point_covariance(
+        rotation, translation, marker_corners(size_m), np.arange(len(size_m)), cameras, noise_px
+    )
 
 
 def drawn_poses(count, seed, size_m=0.1):

@@ -24,13 +24,15 @@ from mpmath import mp, mpf
 import sweep
 from support.blocks import run_block
 from support.lengths import lengths
+from support.solving import estimate
+from support.windows import corners_of
 from sweep.evaluation import search as search_module
 from sweep.evaluation.search import search, visibility_flags
 from sweep.measure import estimation as accuracy
-from sweep.measure.detectors import DetectorSetting, opencv_margin_px
+from sweep.measure.detectors import DetectorSetting, margin_px
 from sweep.measure.estimation import pose_error
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.measure.solver import OPENCV_SOLVERS, estimate
+from sweep.measure.solver import OPENCV_SOLVERS
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.pose import rotation_of_vector, vector_of_rotation
@@ -63,7 +65,7 @@ def cameras(count, lens=()):
 PLACES = {
     "solvePnP": {"measure/solver.py"},
     "solvePnPGeneric": {
-        "measure/solver.py", "measure/board_solver.py",
+        "measure/solver.py",
         "photographs/truth.py",  # starts a fit
     },
     "Rodrigues": set(),
@@ -419,8 +421,8 @@ def half_windows(corners, modules, share=0.3, largest=5):
 def check_refined(start, refined, modules):
     """Hold refined corners to lie within 0.3 modules (at least 1 px) of where they started."""
     rows = start.flags == DetectionStatus.detected
-    moved = np.abs(refined.corners - start.corners)[rows].max(axis=2)
-    limit = half_windows(start.corners[rows], modules[rows])[:, None]
+    moved = np.abs(corners_of(refined) - corners_of(start))[rows].max(axis=2)
+    limit = half_windows(corners_of(start)[rows], modules[rows])[:, None]
     beyond = moved > limit * (1 + 1e-6)  # float32
     print(f"\n{beyond.sum()} of {moved.size} corners moved beyond the half window")
     assert not beyond.any()
@@ -441,14 +443,14 @@ def test_refined_corners_stay_near_their_start_and_change_no_flag(count):
     refined = searched(scenes, cornerRefinementMethod="subpix")
     rows = start.flags == DetectionStatus.detected
     np.testing.assert_array_equal(refined.flags, start.flags)
-    assert np.isfinite(refined.corners[rows]).all()
-    assert np.isnan(refined.corners[~rows]).all()
-    for truth, found in zip(scenes.corners_px[rows], refined.corners[rows], strict=True):
+    assert np.isfinite(corners_of(refined)[rows]).all()
+    assert np.isnan(corners_of(refined)[~rows]).all()
+    for truth, found in zip(scenes.corners_px[rows], corners_of(refined)[rows], strict=True):
         centre = found.mean(axis=0)
         assert cv2.pointPolygonTest(truth.astype(np.float32), tuple(centre), True) > -1e-3
-    moved = np.linalg.norm(refined.corners - start.corners, axis=2)[rows]
+    moved = np.linalg.norm(corners_of(refined) - corners_of(start), axis=2)[rows]
     before, after = (
-        np.linalg.norm(found.corners - scenes.corners_px, axis=2)[rows]
+        np.linalg.norm(corners_of(found) - scenes.corners_px, axis=2)[rows]
         for found in (start, refined)
     )
     worse = after - before
@@ -504,6 +506,6 @@ def test_window_leaves_room_for_the_refinement(count, monkeypatch):
     """cornerSubPix refuses images narrower than its window: with the usual 16 px, for 40 %."""
     scenes = scenes_of(Pipeline.from_text(MARGINS.format(count=count)))
     framed = searched(scenes, full=True, **WIDE_REFINEMENT)
-    check_margin(scenes, framed, opencv_margin_px, monkeypatch)
+    check_margin(scenes, framed, margin_px, monkeypatch)
     with pytest.raises(AssertionError):
         check_margin(scenes, framed, lambda _: 16, monkeypatch)

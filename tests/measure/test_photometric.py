@@ -33,6 +33,7 @@ from sweep.measure.likelihood import (
     state_of,
 )
 from sweep.measure.photometric import Photometric, explains, found_targets, window_of
+from sweep.model.board import single_marker
 from sweep.model.derivatives import LEVELS, POSE, work_space
 from sweep.plan.pipeline import Pipeline
 
@@ -180,7 +181,7 @@ def chi_square_from(seen, rotation, translation):
     left, top, right, bottom = window_of(found, [])
     image = seen.images[0][top:bottom, left:right].astype(np.float64)
     view = marker_view(
-        seen.markers[0], seen.size_m[0], seen.cameras.optics(0), seen.origins[0] + (left, top),
+        seen.targets[0], seen.size_m[0], seen.cameras.optics(0), seen.origins[0] + (left, top),
         noise_variance(float(seen.noise_grey[0])),
     )
     chi_square, _ = fit(
@@ -497,7 +498,7 @@ def test_an_estimator_of_one_s_own_gets_what_is_believed_and_seen(monkeypatch):
     assert (seen.cameras.view == [500.0, 4 / 3.6 * 480, 319.5, 239.5]).all()
     assert seen.cameras.lenses[:, :2] == pytest.approx(np.tile([-0.1, 0.01], (n, 1)))
     assert seen.cameras.distorted.all()
-    assert list(seen.markers) == [("DICT_5X5_50", 7, 1.0)] * n
+    assert list(seen.targets) == [single_marker("DICT_5X5_50", 7, 1.0)] * n
     assert len(seen.images) == len(seen.origins) == n
 
     keeper.seen.clear()
@@ -583,7 +584,7 @@ def test_nonsense_is_not_solved(monkeypatch):
     plain = dataclasses.replace(seen, images=[np.full_like(one, 120) for one in seen.images])
     turned = dataclasses.replace(seen, corners=np.roll(seen.corners, 1, axis=1))
     mirrored = dataclasses.replace(seen, corners=seen.corners[:, ::-1])
-    other = dataclasses.replace(seen, markers=[("DICT_5X5_50", 1, 1.0)] * 5)
+    other = dataclasses.replace(seen, targets=[single_marker("DICT_5X5_50", 1, 1.0)] * 5)
     for nonsense in (point, beside, plain, turned, mirrored, other):
         estimates = estimator(nonsense)
         assert (estimates.status != EstimateStatus.solved).all()

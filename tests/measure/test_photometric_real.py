@@ -1,5 +1,7 @@
 """Solver ``photometric_real`` against OpenCV's boards, dense sampling, and images of known pose."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from sweep.measure.likelihood import state_of
 from sweep.measure.photograph_model import draw, photograph_view, system
 from sweep.measure.photometric import PhotometricReal
 from sweep.measure.surroundings import BoardMarker, clear_modules, surroundings
+from sweep.model.board import single_marker
 from sweep.model.board_kinds import Charuco, Grid
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
@@ -84,17 +87,19 @@ def detections(board, numbers, image, pose, rng, *, lens=(), error_px=0.3, alone
         )[0].reshape(4, 2)
         for k in numbers
     ])
-    return Detections(
+    found = Detections.of_markers(
         corners + rng.normal(0, error_px, corners.shape),
         Cameras(
             np.repeat(VIEW[None], count, axis=0), np.repeat(pack(lens)[None], count, axis=0),
             np.full(count, bool(lens)),
         ),
         np.full(count, size), np.full(count, 2.0), np.zeros(count),
-        [(board.dictionary, board.marker_ids[k], 1.0) for k in numbers], [image] * count,
+        [single_marker(board.dictionary, board.marker_ids[k], 1.0) for k in numbers],
+        [image] * count,
         np.zeros((count, 2), dtype=np.int64),
-        on_board=None if alone else [BoardMarker(board, k) for k in numbers],
     )
+    on_board = None if alone else [BoardMarker(board, k) for k in numbers]
+    return dataclasses.replace(found, on_board=on_board)
 
 
 def errors_of(board, numbers, estimates, pose):
@@ -148,7 +153,7 @@ def test_image_and_slopes_are_those_of_dense_sampling(lens):
     image = photograph(CHARUCO, pose, rng, lens=lens)
     found = detections(CHARUCO, [5], image, pose, rng, lens=lens, error_px=0.0)
     view = photograph_view(
-        found.markers[0], found.on_board[0], found.size_m[0], found.corners[0],
+        found.targets[0], found.on_board[0], found.size_m[0], found.corners[0],
         found.cameras.optics(0), image, np.zeros(2, dtype=np.int64), toned=False,
     )
     turn, position = pose_of(CHARUCO, 5, pose)

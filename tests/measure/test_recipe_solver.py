@@ -81,7 +81,7 @@ def test_solver_is_one_class_and_one_record(tmp_path):
     folder = added(
         tmp_path,
         ("measure/frontal.py", None, SOLVER),
-        (file, "    PoseEstimator,\n    corner_covariance,\n    point_covariance,\n)\n",
+        (file, "    PoseEstimator,\n    credible_estimates,\n)\n",
          "from sweep.measure.frontal import FrontalSolver\n"),
         (file, "SOLVERS: dict[str, Solver] = {", RECORD),
     )

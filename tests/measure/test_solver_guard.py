@@ -8,9 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from support.lengths import first_of, lengths
+from support.solving import estimate
 from sweep.measure.estimation import pose_error
 from sweep.measure.flags import EstimateStatus
-from sweep.measure.solver import OPENCV_SOLVERS, estimate
+from sweep.measure.solver import OPENCV_SOLVERS
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.plan.parameters import PARAMETERS

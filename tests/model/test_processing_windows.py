@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from support.windows import outcomes_elsewhere
+from support.windows import corners_of, outcomes_elsewhere
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search, visibility_flags
 from sweep.measure.detectors import DetectorSetting
@@ -68,7 +68,7 @@ def test_window_finds_what_the_frame_holds(name, refinement):
     assert not failures
     exceptions = np.flatnonzero(windowed.flags != framed.flags)
     both = (windowed.flags == DetectionStatus.detected) & (framed.flags == DetectionStatus.detected)
-    difference = np.abs(windowed.corners - framed.corners)[both].max(axis=(1, 2))
+    difference = np.abs(corners_of(windowed) - corners_of(framed))[both].max(axis=(1, 2))
     print(
         f"\n{name}, {refinement}: {both.sum()} of {count} detected, {len(exceptions)} exceptions; "
         f"corners differ by {difference.max():.2g} px at worst"

@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from sweep.errors import PipelineError
 from sweep.evaluation.block import run_cells
-from sweep.evaluation.search import board_scenes, visibility_flags
+from sweep.evaluation.search import visibility_flags
+from sweep.measure.classify import target_scenes
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.marker import modules
 from sweep.model.renderers import marker_levels
@@ -168,7 +169,7 @@ def test_sheets_behind_others_and_backs_are_not_visible():
               marker(3, -0.05, 0, 0, tilt=180)]
     chosen = pipeline(hidden, tilt_deg=0.0)
     scenes, values = scenes_of(chosen), scene_values(chosen, [])
-    boards = board_scenes(scenes, values["board"].listed(1), visibility_flags(scenes), (4, 0))
+    boards = target_scenes(scenes, visibility_flags(scenes), values["board"].listed(1), (4, 0))
     not_visible = DetectionStatus.not_visible
     assert boards.flags[0].tolist() == [
         not_visible, DetectionStatus.not_run, DetectionStatus.not_run, not_visible
@@ -179,7 +180,7 @@ def test_a_marker_of_a_sheet_that_a_distractor_hides_is_not_visible():
     boards = {"kind": "grid", "rows": 1, "columns": 2, "gap_m": 0.02}
     chosen = pipeline([], 0.0, board={**boards, "distractors": [marker(9, 0.03, 0.0, 0.05)]})
     scenes, values = scenes_of(chosen), scene_values(chosen, [])
-    boards = board_scenes(scenes, values["board"].listed(1), visibility_flags(scenes), (2, 0))
+    boards = target_scenes(scenes, visibility_flags(scenes), values["board"].listed(1), (2, 0))
     assert boards.flags[0].tolist() == [DetectionStatus.not_run, DetectionStatus.not_visible]
 
 

@@ -113,58 +113,10 @@ def test_the_solver_finds_the_pose_of_perfect_corners():
     text = SCENE + '[estimator]\nsolver = "homography:SOLVER"\n[axes]\nroll_deg = [0, 40, 200]\n'
     pipeline = pipeline_of(text.replace("roll_deg = 12\n", ""))
     scenes = build_scenes(scene_values(pipeline, [np.arange(3)]), 3)
-    found = build(estimators(pipeline)[0])(Detections(
+    found = build(estimators(pipeline)[0])(Detections.of_markers(
         scenes.corners_px, scenes.cameras, scenes.size_m, np.zeros(3), np.zeros(3),
         [scenes.markers[0]] * 3, [], np.zeros((3, 2), dtype=np.int64),
     ))
     np.testing.assert_allclose(found.rotation, scenes.rotation, atol=1e-6)
     np.testing.assert_allclose(found.translation, scenes.translation, atol=1e-7)
     assert found.reprojection_px.max() < 1e-4
-
-
-BOARD = """
-[marker]
-size_m = 0.03
-[board]
-kind = "grid"
-rows = 3
-columns = 4
-gap_m = 0.01
-[pose]
-distance_m = 0.4
-tilt_deg = 30
-jitter_px = 5
-[axes]
-trial = 3
-"""
-
-
-NONSENSE = """
-import numpy as np
-from sweep.plugins import EstimatorPlugin
-
-def near(of):
-    def solve(detections):
-        for each in detections.points:
-            each.corners_px[:] = 0
-        count = len(detections.boards)
-        return np.tile(np.eye(3), (count, 1, 1)), np.full((count, 3), of)
-    return EstimatorPlugin(make=lambda _: solve, of_boards=True)
-
-FAR, BEHIND, NOWHERE = near(1e9), near(-1.0), near(np.nan)
-SHORT = EstimatorPlugin(make=lambda _: lambda __: (np.eye(3), 0), of_boards=True)
-"""
-
-
-def test_what_a_solver_of_boards_returns_is_checked(tmp_path):
-    (tmp_path / "odd.py").write_text(NONSENSE)
-    pipeline = Pipeline.from_text(
-        BOARD + 'solver = ["sqpnp", "odd:FAR", "odd:BEHIND", "odd:NOWHERE", "odd:SHORT"]',
-        folder=tmp_path,
-    )
-    result = run_cells(pipeline, [np.arange(3)])
-    ours, *odd, short = result.columns["estimate"]
-    assert (ours == EstimateStatus.solved).all()
-    assert all((each == EstimateStatus.solver_failed).all() for each in odd)
-    assert (short == EstimateStatus.failed).all()
-    assert "returned a rotation of shape (3, 3); expected (1, 3, 3)" in result.failures[0].text

@@ -52,3 +52,8 @@ def outcomes_elsewhere(scenes, row, setting):
             if len(seen) > 1:
                 return seen
     return seen
+
+
+def corners_of(result):
+    """The detected corners (N, 4, 2) of the scenes' markers, NaN where there are none."""
+    return result.found.marker_corners[:, 0]

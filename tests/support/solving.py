@@ -1,0 +1,40 @@
+"""Detections that a test makes by itself, and poses from corners alone."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sweep.measure.estimation import Detections
+from sweep.measure.solver import OPENCV_SOLVERS, PointSolver
+from sweep.model.board import single_marker
+
+BOARD_METHODS = tuple(name for name, each in OPENCV_SOLVERS.items() if each.any_points)
+
+
+def estimate(corners, cameras, size_m, solver, guarded, limit):
+    """The estimates of N markers from corners (N, 4, 2)."""
+    count = len(corners)
+    return PointSolver(solver, guarded, limit)(Detections.of_markers(
+        corners, cameras, size_m, np.zeros(count), np.zeros(count),
+        [single_marker("DICT_4X4_50", 0, 1.0)] * count, [], np.zeros((count, 2), dtype=np.int64),
+    ))
+
+
+class BoardPoints(NamedTuple):
+    """Markers (K,) of a board with their corners (K, 4, 2), and corners of its chessboard."""
+
+    marker: np.ndarray
+    corners_px: np.ndarray
+    chessboard: np.ndarray
+    chessboard_px: np.ndarray
+
+
+def detected(board, points, cameras):
+    """The detections of a single board with one camera."""
+    chessboard = np.full((1, len(board.chessboard_m), 2), np.nan)
+    chessboard[0, points.chessboard] = points.chessboard_px
+    return Detections(
+        points.corners_px, cameras, np.ones(1), np.zeros(1), np.zeros(1), [board], [],
+        np.zeros((1, 2), dtype=np.int64), np.zeros(len(points.marker), dtype=np.int64),
+        points.marker, np.ones(1), chessboard,
+    )

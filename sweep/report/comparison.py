@@ -24,12 +24,12 @@ from sweep.report.report_data import (
     is_numeric,
     settings_of,
 )
-from sweep.report.table import Table, column_texts
+from sweep.report.table import Columns, Table, column_texts
 
 MIN_FLIPPED = 10
 """Poses flipped in one of two configurations alone from which an RMSE with flips is compared."""
 
-COLUMNS = {
+COLUMNS: Columns = {
     "n": ("looked_for", 1.0),
     "detected, %": ("detection_rate", 100.0),
     "solved, %": ("solved_rate", 100.0),

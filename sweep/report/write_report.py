@@ -28,15 +28,8 @@ from sweep.plan.axes import TRIAL, Axis
 from sweep.plan.facts import camera_facts, camera_notes
 from sweep.report.answer import Answer, answer
 from sweep.report.charts import css_variables, panel_svg, write_panels
-from sweep.report.comparison_figures import (
-    AMBIGUITY,
-    BOUND,
-    COMPARED,
-    CONFIGURATIONS,
-    PRECISION,
-    RANKING,
-)
-from sweep.report.figure import FigureKind, RenderedFigure
+from sweep.report.figure import Figure
+from sweep.report.figures import figures_of
 from sweep.report.formatting import coordinates
 from sweep.report.output_file import (
     check_output_file,
@@ -44,16 +37,6 @@ from sweep.report.output_file import (
     write_output_file,
 )
 from sweep.report.report_data import AREA, ReportData, store_errors
-from sweep.report.scene_figures import (
-    BIAS,
-    DETECTION,
-    ERRORS_BY_SIZE,
-    FAILURES,
-    FLIPS,
-    FRAME,
-    MAPS,
-    effect_of,
-)
 from sweep.report.scenes import (
     CHESSBOARD_LEGEND,
     LEGEND,
@@ -63,30 +46,7 @@ from sweep.report.scenes import (
     scenes_of,
 )
 from sweep.report.table import Table, markdown_text
-from sweep.report.tradeoff_figure import TRADE
 from sweep.store.locations import enclosing_store, is_remote
-
-# --------------------------------------------------------------------------------------------------
-# The kinds of figures of a report, in the order in which they stand.
-
-KINDS: tuple[FigureKind, ...] = (
-    DETECTION, ERRORS_BY_SIZE, BIAS, CONFIGURATIONS, COMPARED, TRADE, MAPS, FLIPS, AMBIGUITY,
-    FAILURES, FRAME, RANKING, BOUND, PRECISION,
-)
-"""Add a kind of figure here; what no kind covers of axes and draws gets a figure of its effect."""
-
-
-def figure_kinds(data: ReportData) -> Iterator[FigureKind]:
-    """Yield the kinds of figures of a store, such that one shows each axis and drawn parameter."""
-    covered: set[str] = set()
-    for kind in KINDS:
-        if kind.applies(data):
-            covered.update(kind.covers(data))
-            yield kind
-    for name in (*data.scene_axes, *data.setting_axes, *data.drawn_parameters):
-        if name not in covered:
-            yield effect_of(name)
-
 
 # --------------------------------------------------------------------------------------------------
 # Origin of a report's numbers: versions, dates, axes, and the commands that reproduce it.
@@ -216,17 +176,8 @@ def _texts(values: Sequence[Any]) -> list[str]:
 # --------------------------------------------------------------------------------------------------
 # The report as Markdown, with its figures and scenes as files in a folder beside it.
 
-def write_figure(figure: RenderedFigure, folder: Path) -> None:
-    """Write a figure as NAME.svg and NAME.png into a folder."""
-    if figure.write is not None:
-        for suffix in ("svg", "png"):
-            figure.write(str(folder / f"{figure.name}.{suffix}"))
-    else:
-        write_panels(figure.panels, folder / figure.name)
-
-
 def markdown(
-    title: str, answer: Answer, provenance: Provenance, figures: Sequence[RenderedFigure],
+    title: str, answer: Answer, provenance: Provenance, figures: Sequence[Figure],
     scenes: Iterable[Scene], folder: Path, link_folder: str, require: Sequence[str] = (),
 ) -> str:
     """Return the report as Markdown; pictures of scenes are written into ``folder``.
@@ -306,7 +257,7 @@ POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
 def page(
-    title: str, answer: Answer, provenance: Provenance, figures: Sequence[RenderedFigure],
+    title: str, answer: Answer, provenance: Provenance, figures: Sequence[Figure],
     scenes: Iterable[Scene], require: Sequence[str] = (),
 ) -> str:
     """Return the report as HTML, from the templates beside this module; all text is escaped."""
@@ -452,7 +403,7 @@ def write_report(
     _check_complete(data)
     title = data.pipeline.heading
     numbers, origin = answer(data), provenance(data, str(output))
-    rendered = [kind.render(data) for kind in figure_kinds(data)]
+    rendered = figures_of(data)
     folder = figures_folder(output) if form == "md" else None
     with contextlib.ExitStack() as stack:
         stack.enter_context(write_errors_explained(output))
@@ -461,7 +412,7 @@ def write_report(
             beside = Path(os.path.realpath(folder or figures or output)).parent
             temporary = stack.enter_context(_temporary_folder(beside))
             for figure in rendered:
-                write_figure(figure, temporary / "figures")
+                write_panels(figure.panels, temporary / "figures" / figure.name)
         drawn = [] if temporary is None else sorted((temporary / "figures").iterdir())
         scenes = scenes_of(data)
         if folder is not None and temporary is not None:

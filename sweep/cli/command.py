@@ -8,7 +8,6 @@ import io
 import itertools
 import logging
 import os
-import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -318,23 +317,8 @@ OTHER_FORMATS = {
 """Suffixes of files that a PNG image would not be taken for."""
 
 
-_names: list[str] = []
-"""Parts of the names on the command line that hold control characters, the longest first."""
-
-
-def remember_names(words: Sequence[str]) -> None:
-    """Remember the words of a command line, for :func:`lines_of`."""
-    parts = {Path(part).stem for word in words for part in re.split(r"[/=,]", word)}
-    _names[:] = sorted((part for part in parts if not part.isprintable()), key=len, reverse=True)
-
-
 def lines_of(text: str) -> list[str]:
-    """Return the lines of a text without control characters, whosever names and texts they quote.
-
-    A newline in a name on the command line makes no line of its own.
-    """
-    for name in _names:
-        text = text.replace(name, plain(name, len(name)))
+    """Return the lines of a text without control characters, whosever names they quote."""
     return [plain(line, len(line)) for line in text.split("\n")]
 
 

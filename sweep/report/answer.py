@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-import numpy as np
 import xarray as xr
 
 from sweep.analysis.limits import requirement_limits
@@ -38,7 +37,7 @@ from sweep.report.limit_figure import as_json as limits_as_json
 from sweep.report.limit_figure import interval_text as limit_interval
 from sweep.report.limit_figure import limit_table, limit_text, values_met
 from sweep.report.report_data import CONFIGURATION, ReportData, configurations, course_of
-from sweep.report.table import Table
+from sweep.report.table import Table, each_cell
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,15 +121,7 @@ def answer(data: ReportData) -> Answer:
         k for k, each in enumerate(known.settings.combinations)
         if each.items() <= compared.indices[compared.best].items())
     one = compared.summary.isel({CONFIGURATION: compared.best})
-    tiles = (
-        _share_tile("detected", one, "detection_rate"),
-        _share_tile("solved", one, "solved_rate"),
-        _error_tile("rotation error, median", one, "rotation_median_deg", "\u00b0"),
-        _error_tile("rotation error, RMSE", one, "rotation_rmse_deg", "\u00b0"),
-        _error_tile("range error, RMSE", one, "range_rmse_percent", " %"),
-        _error_tile("range bias", one, "range_bias_percent", " %"),
-        _share_tile("flips", one, "flip_rate", "solved"),
-    )
+    tiles = tuple(_tile(one, heading, *card) for heading, card in CARDS.items())
     name = compared.names[compared.best] if compared.several else ""
     return Answer(
         _headline(data, decided, compared, one), _notes(data), name, tiles,
@@ -252,12 +243,8 @@ def _reached(limits: Sequence[xr.Dataset], others: Sequence[str]) -> str:
     line = f"; along {one.attrs['along']}{together}: {met(one)}"
     if not by_condition or values_met(one):
         return line
-    farthest = max((by_condition[0].isel(dict(zip(others, index, strict=True))) for index in
-                    np.ndindex(*(by_condition[0].sizes[name] for name in others))), key=values_met)
-    if not values_met(farthest):
-        return line
-    where = described({name: farthest[name].item() for name in others})
-    return f"{line}; at {where}: {met(farthest)}"
+    at, farthest = max(each_cell(by_condition[0], others), key=lambda cell: values_met(cell[1]))
+    return f"{line}; at {described(at)}: {met(farthest)}" if values_met(farthest) else line
 
 
 # --------------------------------------------------------------------------------------------------
@@ -274,12 +261,11 @@ def _headline(
         return decided.line
     if compared.line:
         return f"{compared.line}."
+    detected, median, rmse = (_tile(one, heading, *CARDS[heading]) for heading in (
+        "detected", "rotation error, median", "range error, RMSE"))
     errors = "".join(
         f"; {tile.heading} {tile.value}{f' ({tile.detail})' if tile.detail else ''}"
-        for tile in (_error_tile("rotation error, median", one, "rotation_median_deg", "\u00b0"),
-                     _error_tile("range error, RMSE", one, "range_rmse_percent", " %"))
-        if math.isfinite(float(one["solved_rate"])) and float(one["solved_rate"]))
-    detected = _share_tile("detected", one, "detection_rate")
+        for tile in (median, rmse) if float(one["solved_rate"]) > 0)
     return f"Detected in {detected.value} ({detected.detail}){errors}."
 
 
@@ -303,23 +289,29 @@ def _numbers(decided: Required | None, compared: Comparison) -> dict[str, Any]:
     return numbers
 
 
-def _share_tile(
-    heading: str, summary: xr.Dataset, name: str, counted: str = "looked_for"
-) -> Tile:
-    value, low, high = (float(end) for end in values_with_ends(summary, name, 100))
-    interval = f"{interval_text(low, high, ' %')}, " if math.isfinite(low) else ""
-    count = int(summary[counted])
-    return Tile(heading, "\u2013" if math.isnan(value) else f"{number(value)} %",
-                f"{interval}of {count:,} {counted.replace('_', ' ')}",
-                {"value": value, "low": low, "high": high, "unit": "%", counted: count})
+CARDS = {
+    "detected": ("detection_rate", " %", "looked_for"),
+    "solved": ("solved_rate", " %", "looked_for"),
+    "rotation error, median": ("rotation_median_deg", "\u00b0"),
+    "rotation error, RMSE": ("rotation_rmse_deg", "\u00b0"),
+    "range error, RMSE": ("range_rmse_percent", " %"),
+    "range bias": ("range_bias_percent", " %"),
+    "flips": ("flip_rate", " %", "solved"),
+}
+"""Heading -> variable, unit, and of a share what it is of."""
 
 
-def _error_tile(heading: str, summary: xr.Dataset, name: str, unit: str) -> Tile:
-    value, low, high = (float(end) for end in values_with_ends(summary, name))
-    numbers = {"value": value, "low": low, "high": high, "unit": unit.strip()}
+def _tile(one: xr.Dataset, heading: str, name: str, unit: str, counted: str = "") -> Tile:
+    ends = values_with_ends(one, name, 100 if counted else 1)
+    value, low, high = (float(end) for end in ends)
+    numbers: dict[str, Any] = {
+        "value": value, "low": low, "high": high, "unit": unit.strip()}
     if math.isinf(value):
         return Tile(heading, "\u221e", "more than half not solved", numbers)
-    text = f"{number(value)}{unit}" if math.isfinite(value) else "\u2013"
     known = math.isfinite(low) and not math.isnan(high)
-    return Tile(heading, text, interval_text(low, high, unit) if known else "",
-                numbers)
+    details = [interval_text(low, high, unit)] if known else []
+    if counted:
+        numbers[counted] = int(one[counted])
+        details.append(f"of {int(one[counted]):,} {counted.replace('_', ' ')}")
+    text = "\u2013" if math.isnan(value) else f"{number(value)}{unit}"
+    return Tile(heading, text, ", ".join(details), numbers)

@@ -287,12 +287,6 @@ def panel_svg(panel: Panel, prefix: str) -> Markup:
         return inline_svg(_svg(figure), panel.alt, prefix)
 
 
-def write_panels(panels: Sequence[Panel], stem: Path) -> None:
-    """Write a figure of all panels as ``stem``.svg and ``stem``.png."""
-    for suffix in (".svg", ".png"):
-        stem.with_suffix(suffix).write_bytes(panels_file(panels, suffix))
-
-
 def write_figure(panels: Sequence[Panel], path: Path) -> None:
     """Write a figure of all panels into a file that a user asked for: PNG or SVG."""
     write_output_file(path, panels_file(panels, path.suffix.lower()))

@@ -230,7 +230,7 @@ def comparison(data: ReportData, among: Sequence[int] | None = None) -> Comparis
         Numbers of `configurations` of which one may be the best, as those that reach as far in
         what is required; by default all. Targets are then pooled as there.
     """
-    return data.remembered(f"comparison {among}", lambda: _comparison(data, among))
+    return data.once(f"comparison {among}", lambda: _comparison(data, among))
 
 
 def target_axes(data: ReportData) -> tuple[str, ...]:

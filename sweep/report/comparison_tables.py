@@ -22,7 +22,7 @@ from sweep.analysis.simulation_gaps import (
 from sweep.report.charts import Panel, Series, draw_lines
 from sweep.report.formatting import bin_text, coordinate, interval_text, number, plural
 from sweep.report.report_data import axis_label, group_labels
-from sweep.report.table import Findings, Table
+from sweep.report.table import Findings, Table, each_cell
 from sweep.tradeoff.pareto import configuration_label
 from sweep.typing import Floats
 
@@ -310,10 +310,7 @@ def store_difference_json(table: xr.Dataset) -> dict[str, Any]:
 
 def _cells(table: xr.Dataset, name: str) -> Iterator[tuple[dict[str, Any], xr.Dataset]]:
     """Yield the settings, and the results, of each configuration that a variable has."""
-    dims = [str(dim) for dim in table[name].dims]
-    for index in np.ndindex(*(table.sizes[dim] for dim in dims)):
-        one = table.isel(dict(zip(dims, index, strict=True)))
-        yield {dim: one[dim].item() for dim in dims}, one
+    return each_cell(table, [str(dim) for dim in table[name].dims])
 
 
 def _configurations(table: xr.Dataset, name: str) -> Iterator[tuple[str, xr.Dataset]]:

@@ -104,7 +104,8 @@ def decision_table(found: Sequence[Verdict]) -> Table:
         ("", "requirement", "configuration", "value", "condition", "met at", "draws"),
         [[WORDS[each.decision], each.requirement, described(each.configuration),
           valued(each.value, each.low, each.high, each.units), described(each.condition),
-          f"{each.counts.get(Decision.met, 0)} of {each.conditions}", needs(each)]
+          f"{each.counts.get(Decision.met, 0)} of {each.conditions}",
+          needs(each) or f"{each.draws:,}"]
          for each in found], words=True)
 
 

@@ -62,7 +62,7 @@ from sweep.report.report_data import (
     group_labels,
     is_numeric,
 )
-from sweep.report.table import Columns, Table, cells, table_of
+from sweep.report.table import Columns, Table, cells, each_cell, table_of
 from sweep.report.tradeoff_figure import trade_panels, trade_table_and_text
 
 # --------------------------------------------------------------------------------------------------
@@ -634,12 +634,11 @@ def precision_table(table: xr.Dataset) -> Table:
     rows = []
     for k, name in enumerate(table["quantity"].values):
         one = table.isel(quantity=k)
-        for at in np.ndindex(*(table.sizes[dim] for dim in configuration)):
-            part = one.isel(dict(zip(configuration, at, strict=True)))
+        for at, part in each_cell(one, configuration):
             half = part["half_width"].where(part["reached"].isin(
                 (Reached.reached, Reached.not_reached)))
             rows.append([
-                str(name), " · ".join(str(part[dim].values) for dim in configuration) or "all",
+                str(name), " · ".join(map(str, at.values())) or "all",
                 number(float(one["wanted"])), number(float(half.max())),
                 *(f"{int((part['reached'] == flag).sum()):,}" for flag in Reached)])
     return Table.of(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from functools import partial
@@ -18,7 +17,7 @@ from sweep.report.charts import Panel, Series, draw_dots, draw_lines, rows_heigh
 from sweep.report.figure import map_panel
 from sweep.report.formatting import coordinate, coordinates, number, short_coordinate
 from sweep.report.report_data import axis_label
-from sweep.report.table import Findings, Table
+from sweep.report.table import Findings, Table, each_cell
 
 # --------------------------------------------------------------------------------------------------
 # Limits that requirements have along an axis, as a table for a terminal, a page, or JSON.
@@ -30,9 +29,8 @@ def limit_table(limits: xr.Dataset) -> Table:
     """Return a row for each configuration and condition of `sweep.analysis.requirement_limits`."""
     along, dims = str(limits.attrs["along"]), dimensions(limits)
     rows = []
-    for index in np.ndindex(*(limits.sizes[name] for name in dims)):
-        one = limits.isel(dict(zip(dims, index, strict=True)))
-        rows.append([*(coordinate(one[name].item()) for name in dims), limit_text(one),
+    for at, one in each_cell(limits, dims):
+        rows.append([*map(coordinate, at.values()), limit_text(one),
                      interval_text(one), "yes" if one["settled"] else "no", cause_text(one),
                      beyond_text(one), f"{int(one['poses']):,}"])
     required = " and ".join(map(str, limits.attrs["require"]))
@@ -171,14 +169,10 @@ def as_json(limits: xr.Dataset) -> dict[str, Any]:
     dims = dimensions(limits)
     names = ("value", "low", "high", "start", "fails_at", "failing_value", "limited_by",
              "fails_where", "met_beyond", "farthest_beyond", "settled", "poses")
-    listed = []
-    for index in np.ndindex(*(limits.sizes[name] for name in dims)):
-        one = limits.isel(dict(zip(dims, index, strict=True)))
-        listed.append({
-            "condition": {name: one[name].item() for name in dims},
-            "reach": Reach(int(one["reach"])).name,
-            "decided": bool(one["settled"]), "met_to": met_to(one),
-            **{name: one[name].item() for name in names}})
+    listed = [
+        {"condition": at, "reach": Reach(int(one["reach"])).name,
+         "decided": bool(one["settled"]), "met_to": met_to(one),
+         **{name: one[name].item() for name in names}} for at, one in each_cell(limits, dims)]
     return {"along": limits.attrs["along"], "harder": limits.attrs["harder"],
             "require": list(limits.attrs["require"]), "at_all": list(limits.attrs["at_all"]),
             "units": str(limits[limits.attrs["along"]].attrs.get("units", "")), "limits": listed}
@@ -223,13 +217,10 @@ def limit_panels(limits: xr.Dataset) -> list[Panel]:
 
 def _parts(limits: xr.Dataset, others: Sequence[str]) -> list[tuple[str, xr.Dataset]]:
     """Return the limits at each combination of some dimensions, and its name."""
-    found = []
-    for index in itertools.product(*(range(limits.sizes[name]) for name in others)):
-        part = limits.isel(dict(zip(others, index, strict=True)))
-        found.append((", ".join(
-            f"{name.removesuffix('_deg')} {coordinate(part[name].item())}" for name in others),
-            part))
-    return found
+    return [
+        (", ".join(f"{name.removesuffix('_deg')} {coordinate(value)}"
+                   for name, value in at.items()), part)
+        for at, part in each_cell(limits, others)]
 
 
 def _line(name: str, part: xr.Dataset, axis: str) -> Series:

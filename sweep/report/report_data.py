@@ -218,8 +218,7 @@ class ReportData:
     require: tuple[str, ...] = ()
     per: tuple[str, ...] = ()
     command: str = ""
-    _analyses: dict[Any, xr.Dataset] = field(default_factory=dict, repr=False)
-    _remembered: dict[str, Any] = field(default_factory=dict, repr=False)
+    _made: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         """Give a single pose, which has no axes, the one draw that it is."""
@@ -379,24 +378,18 @@ class ReportData:
         key = (analysis.__name__, grouping.per, grouping.bins, grouping.chosen)
         return self.once(key, compute).transpose(*grouping.dims, ...)
 
-    def remembered(self, key: str, make: Callable[[], T]) -> T:
-        """Return what ``make`` returns; it is called once for each key."""
-        if key not in self._remembered:
-            self._remembered[key] = make()
-        value: T = self._remembered[key]
-        return value
-
-    def once(self, key: Any, compute: Callable[[], xr.Dataset]) -> xr.Dataset:
-        """Return what ``compute`` returns, loaded; it is called once for each key."""
-        if key not in self._analyses:
-            lazy = compute()
+    def once(self, key: Any, make: Callable[[], T]) -> T:
+        """Return what ``make`` returns, a dataset loaded; it is called once for each key."""
+        if key not in self._made:
+            made = make()
             with store_errors(self.store):
-                self._analyses[key] = lazy.compute()
-        return self._analyses[key]
+                self._made[key] = made.compute() if isinstance(made, xr.Dataset) else made
+        found: T = self._made[key]
+        return found
 
-    def known(self, key: Any) -> xr.Dataset | None:
+    def known(self, key: Any) -> Any:
         """Return what `once` has returned for a key; None if it was not called."""
-        return self._analyses.get(key)
+        return self._made.get(key)
 
 
 def course_of(
@@ -582,7 +575,7 @@ class Configurations:
 
 def configurations(data: ReportData) -> Configurations:
     """Return the configurations of a store, in order."""
-    return data.remembered("configurations", lambda: _configurations(data))
+    return data.once("configurations", lambda: _configurations(data))
 
 
 def _configurations(data: ReportData) -> Configurations:

@@ -17,19 +17,15 @@ from numpy.typing import NDArray
 
 from sweep.errors import SweepError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene
-from sweep.integrity.sample_check import StoredValues, compare, current_pipeline
+from sweep.integrity.sample_check import StoredValues, compare
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, Flipped, uncounted_values
 from sweep.plan.cell_selection import cell, coordinates_text, selection_text
 from sweep.plan.experiment import target_word
-from sweep.plan.grid import Block, scene_axes
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.schema import VARIABLES, Variable, variables_of
-from sweep.processor import processor
 from sweep.report.figure import uncapitalised
 from sweep.report.formatting import coordinate, degrees, number, plural
 from sweep.report.report_data import AREA, ReportData, store_errors
-from sweep.store.blocks import receipts
-from sweep.store.lifecycle import open_store
 
 # --------------------------------------------------------------------------------------------------
 # One scene as a picture, with the truth and the detections drawn on it.
@@ -379,7 +375,7 @@ def _text_scene_values(variable: Variable, value: NDArray[Any]) -> str:
 
 
 # --------------------------------------------------------------------------------------------------
-# One cell of a report's store, and how a recomputation of it differs.
+# One cell of a report's store.
 
 def stored_cell(data: ReportData, index: Mapping[str, int]) -> StoredValues:
     """Return the stored values of the cell at an index along each axis, by variable.
@@ -394,39 +390,6 @@ def stored_cell(data: ReportData, index: Mapping[str, int]) -> StoredValues:
     with store_errors(data.store):
         cell = data.results[names].isel(index).load()
     return {name: np.asarray(cell[name].values) for name in names}
-
-
-def difference_from_store(
-    data: ReportData, recomputed: StoredValues, stored: StoredValues, index: Mapping[str, int]
-) -> str:
-    """Return how recomputed values differ from the stored ones; empty if they agree.
-
-    As in `sweep verify`, every bit must agree if the stored ones were computed by the same
-    versions on a processor with the same features; otherwise they must lie within the tolerances.
-
-    Raises
-    ------
-    StoreError
-        If the store cannot be read.
-    PipelineError
-        If a file of the pipeline is missing.
-    """
-    exact = _computed_alike(data, index)
-    variables = variables_of(data.pipeline)
-    difference = compare(recomputed, stored, variables, same_processor=exact).difference
-    if not difference or exact:
-        return difference
-    return f"{difference}, outside the tolerance for another processor or version"
-
-
-def _computed_alike(data: ReportData, index: Mapping[str, int]) -> bool:
-    """Return whether a cell was computed by these versions, on a processor with these features."""
-    with store_errors(data.store):
-        store = open_store(data.store)
-        corner = tuple(index[axis.name] for axis in scene_axes(store.pipeline))
-        number = store.blocks.number(Block(corner, corner))
-        _, receipt = next(iter(receipts(store, [number])))
-    return tuple(receipt.processors) == (processor(),) and not current_pipeline(store)[1]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -568,7 +531,9 @@ def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
         inspected = inspect_scene(single)
         scene = dataclasses.replace(scene, coordinates=coordinates_text(data.pipeline, single))
         picture = draw_outlines(cut_to_marker(inspected))  # the page has a caption of its own
-        difference = difference_from_store(data, inspected.values, stored, index)
+        # The store may be another machine's: as `sweep verify`, within the tolerances for those.
+        difference = compare(inspected.values, stored, variables_of(data.pipeline),
+                             same_processor=False).difference
     except (SweepError, OSError, ValueError, cv2.error, np.linalg.LinAlgError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         return dataclasses.replace(scene, problem=f"Cannot be drawn on this machine: {reason}")

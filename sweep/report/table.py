@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -218,6 +218,15 @@ def table_of(
     headings = [axis_label(sources if sources is not None else summary, dim) for dim in dims]
     rows = [[*name, *values] for name, *values in zip(names, *texts.values(), strict=True)]
     return Table.of(caption, [*headings, *texts], rows, stub=len(dims))
+
+
+def each_cell(
+    dataset: xr.Dataset, dims: Sequence[str]
+) -> Iterator[tuple[dict[str, Any], xr.Dataset]]:
+    """Yield the coordinates along some dimensions, and the part of a dataset, of each cell."""
+    for index in np.ndindex(*(dataset.sizes[dim] for dim in dims)):
+        cell = dataset.isel(dict(zip(dims, index, strict=True)))
+        yield {dim: cell[dim].item() for dim in dims}, cell
 
 
 def column_texts(summary: xr.Dataset, wanted: Columns) -> dict[str, list[str]]:

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from sweep.report.charts import Panel, Series, draw_points
-from sweep.report.table import Columns, Table, column_texts
+from sweep.report.table import Columns, Table, column_texts, each_cell
 from sweep.tradeoff.pareto import (
     CRITERIA,
     UNITS,
@@ -229,7 +229,6 @@ def _renderer_rows(renderers: xr.Dataset) -> Iterator[list[str]]:
         if name == renderers.attrs["reference"]:
             yield [name, *images, "", *[""] * len(CHANGES)]
             continue
-        for index in np.ndindex(*(one.sizes[dim] for dim in settings)):
-            at = one.isel(dict(zip(settings, index, strict=True)))
-            yield [name, *images, configuration_label({dim: at[dim].item() for dim in settings}),
-                   *(digits(float(at[variable]) * factor) for variable, factor in CHANGES.values())]
+        for at, cell in each_cell(one, settings):
+            yield [name, *images, configuration_label(at), *(
+                digits(float(cell[variable]) * factor) for variable, factor in CHANGES.values())]

@@ -496,10 +496,10 @@ def size(
     """
     if not 0.0 < limit_s < float("inf"):
         raise ArgumentError("limit_s", limit_s, "expected a finite number above 0")
-    with Child(BLOCK_TASK) as child, library.progress.progress_report(progress) as report:
-
+    with (Child(BLOCK_TASK) as child, library.progress.progress_report(progress) as report,
+          library.progress.stage_display() if progress else contextlib.nullcontext() as stage):
         found = library.choice_search.search_choice(
-            _pipeline(pipeline), store, limit_s=limit_s, progress=report, child=child,
+            _pipeline(pipeline), store, limit_s=limit_s, progress=report, stage=stage, child=child,
             workers=workers, reuse=reuse, overwrite=overwrite, yes=yes)
     for line in found.notes:
         notice(line)

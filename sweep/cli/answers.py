@@ -86,17 +86,15 @@ def require(options: argparse.Namespace) -> int:
     *new_store(), *LARGE_RUN, seconds(20, "time limit of the measurement of costs"), FORM)
 def size(options: argparse.Namespace) -> int:
     """Find the smallest or cheapest choice that will do."""
-    library.questions.check_positive("limit_s", options.limit_s)
     pipeline = read_pipeline(options)
     library.choice_search.chosen_by(pipeline)
     announce_compilation(pipeline)
     options.stopped = CONTINUES
-    with (Child(BLOCK_TASK) as child, library.progress.progress_display() as bar,
-          library.progress.stage_display() as stage):
-        choice = library.choice_search.search_choice(
-            pipeline, store_of(options), limit_s=options.limit_s, progress=bar, stage=stage,
-            child=child, workers=options.workers, reuse=options.reuse,
-            overwrite=options.overwrite, yes=options.yes)
+    with library.progress.progress_display() as bar:
+        choice = sweep.size(
+            pipeline, store=store_of(options), limit_s=options.limit_s, progress=bar,
+            workers=options.workers, reuse=options.reuse, overwrite=options.overwrite,
+            yes=options.yes)
     return answered(options, library.decisions.choice_findings(choice))
 
 

@@ -195,7 +195,7 @@ def required(data: ReportData) -> Required:
     courses = [((), others), *([(others, ())] if others else [])] if along else []
     limits = [
         data.once(("limits", per), partial(
-            requirement_limits, results, data.require, along, per=per, at_all=at_all))
+            requirement_limits, results, data.require, str(along), per=per, at_all=at_all))
         for per, at_all in courses]
 
     def rank(k: int) -> tuple[object, ...]:

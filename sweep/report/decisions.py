@@ -260,8 +260,7 @@ def choice_findings(choice: Choice) -> Findings:
     return Findings(
         [alternatives(choice),
          (f"{choice.poses:,} poses; {choice.most_trials:,} trials of every cell, which the hardest "
-          f"one took, are {choice.grid_poses:,} poses ({factor:.1f} times as many)"),
-         *choice.notes],
+          f"one took, are {choice.grid_poses:,} poses ({factor:.1f} times as many)")],
         as_json(choice), None, {Decision.met: 0, Decision.undecided: 3}.get(choice.decision, 1),
         (f"sweep report {quoted(choice.store)}", ""))
 

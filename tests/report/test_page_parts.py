@@ -26,7 +26,7 @@ from sweep.report.charts import (
 from sweep.report.figure import Figure as ReportFigure
 from sweep.report.figure import interval_sentence
 from sweep.report.scenes import FAILURES, Scene
-from sweep.report.table import MAX_ROWS, Table
+from sweep.report.table import MAX_ROWS, Findings, Table
 from sweep.report.write_report import Provenance, page
 
 HOSTILE = "<script>alert('x')</script>\"&{{ 7 * 7 }}"
@@ -113,6 +113,11 @@ def test_every_printer_keeps_hostile_text_in_its_cell():
     assert len(lines) == 5
     assert all(line.isprintable() for line in lines)
     assert table.as_json()["rows"][0] == [nasty, "1"]
+    found = Findings([table, nasty, Table.of("none", ["n"], [])], {"share": float("inf")})
+    assert "<i>" not in found._repr_html_() + found.markdown()
+    assert str(found).startswith(table.text())
+    assert "none" not in str(found)
+    assert '"share_flag": "infinite"' in found.to_json()
 
 
 @pytest.mark.parametrize(("values", "scale"), [

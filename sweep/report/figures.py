@@ -378,7 +378,8 @@ SIZE_COLUMNS = 12
 
 def error_over_bound(results: xr.Dataset, per: Sequence[str], bins: Bins) -> xr.Dataset:
     """Return RMSE over bound, the inverse of efficiency, with the ends of its intervals."""
-    summary = efficiency(results, per, bins)
+    # Computed first: of a store without errors the efficiency is 0, and the ratio infinite.
+    summary = efficiency(results, per, bins).compute()
     ratios: dict[str, Any] = {
         f"{quantity}_over_bound{end}": 1 / summary[f"{quantity}_efficiency{other}"]
         for quantity in ("rotation", "range")

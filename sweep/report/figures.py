@@ -380,10 +380,11 @@ def error_over_bound(results: xr.Dataset, per: Sequence[str], bins: Bins) -> xr.
     """Return RMSE over bound, the inverse of efficiency, with the ends of its intervals."""
     # Computed first: of a store without errors the efficiency is 0, and the ratio infinite.
     summary = efficiency(results, per, bins).compute()
-    ratios: dict[str, Any] = {
-        f"{quantity}_over_bound{end}": 1 / summary[f"{quantity}_efficiency{other}"]
-        for quantity in ("rotation", "range")
-        for end, other in (("", ""), ("_low", "_high"), ("_high", "_low"))}
+    with np.errstate(divide="ignore"):
+        ratios: dict[str, Any] = {
+            f"{quantity}_over_bound{end}": 1 / summary[f"{quantity}_efficiency{other}"]
+            for quantity in ("rotation", "range")
+            for end, other in (("", ""), ("_low", "_high"), ("_high", "_low"))}
     return xr.Dataset(ratios, summary.coords)
 
 

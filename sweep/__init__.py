@@ -6,6 +6,7 @@ them. It has more than 400 lines, for each public function stands here with all 
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import sys
@@ -42,12 +43,13 @@ if TYPE_CHECKING:
     from sweep.execution.progress import Progress
     from sweep.fitting.folders import FittedScene
     from sweep.plan.pipeline import Pipeline
+    from sweep.report.table import Findings
     from sweep.tradeoff.choice_search import Choice
 
 __all__ = [
     "ArgumentError", "DatasetError", "Pipeline", "PipelineError", "Progress", "RunError",
-    "StoreError", "SweepError", "__version__", "decode_flags",
-    "fit", "limit", "open", "photos", "run", "size", "twins",
+    "StoreError", "SweepError", "__version__", "compare", "decode_flags", "fit", "limit",
+    "measure_tradeoff", "open", "photos", "require", "run", "size", "twins", "write_report",
 ]
 
 _IMPORTED_ON_USE = {"Pipeline": "sweep.plan.pipeline", "Progress": "sweep.execution.progress",
@@ -62,7 +64,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted(__all__)
 
 
 def run(
@@ -494,11 +496,213 @@ def size(
     """
     if not 0.0 < limit_s < float("inf"):
         raise ArgumentError("limit_s", limit_s, "expected a finite number above 0")
-    with Child(BLOCK_TASK) as child, library.progress.progress_report(progress) as report:
-
+    with (Child(BLOCK_TASK) as child, library.progress.progress_report(progress) as report,
+          library.progress.stage_display() if progress else contextlib.nullcontext() as stage):
         found = library.choice_search.search_choice(
-            _pipeline(pipeline), store, limit_s=limit_s, progress=report, child=child,
+            _pipeline(pipeline), store, limit_s=limit_s, progress=report, stage=stage, child=child,
             workers=workers, reuse=reuse, overwrite=overwrite, yes=yes)
     for line in found.notes:
         notice(line)
     return found
+
+
+def require(
+    store: str | os.PathLike[str],
+    requirements: Sequence[str] = (),
+    *,
+    per: Sequence[str] | None = None,
+    at: Sequence[str] = (),
+    against: str | os.PathLike[str] | None = None,
+) -> Findings:
+    """Decide whether a store's results meet requirements.
+
+    Parameters
+    ----------
+    store
+        Path or URL of a finished store.
+    requirements
+        Such as "detection >= 0.95" (default: the section [require] of the store's pipeline).
+    per
+        Axes whose values are conditions, at each of which all must hold; others are pooled
+        (default: those of [require], else the axes of size, angle and boards).
+    at
+        "name=value": only these values of axes.
+    against
+        An older store, with which it is compared pose by pose: significantly worse is not met.
+
+    Returns
+    -------
+    Findings
+        The decisions as tables and numbers; ``numbers["decision"]`` is that on all together, and
+        ``data`` the dataset of `sweep.analysis.check_requirements`.
+
+    Raises
+    ------
+    ArgumentError, StoreError, DatasetError
+        For what cannot be required, and stores that cannot be read.
+
+    Examples
+    --------
+    >>> found = sweep.require(folder / "two_sizes.zarr", ["detection >= 0.01"], per=[])
+    >>> found.numbers["decision"].name
+    'met'
+    """
+    older = None if against is None else os.fspath(against)
+    return library.questions.require(
+        os.fspath(store), requirements, per=per, at=at, against=older, every=True)
+
+
+def measure_tradeoff(
+    store: str | os.PathLike[str],
+    *,
+    per: Sequence[str] = (),
+    criterion: str = "rotation_p95_deg",
+    limit_s: float = 60.0,
+    budget_ms: float | None = None,
+    output: str | os.PathLike[str] | None = None,
+    progress: bool = False,
+) -> Findings:
+    """Measure what each configuration of a store costs, beside its accuracy on the same images.
+
+    Parameters
+    ----------
+    store
+        Path or URL of a finished store, or a TOML file, which is run first.
+    per
+        Axes of the scene whose values are conditions of their own.
+    criterion
+        The error that ranks configurations.
+    limit_s
+        Seconds of the measurement.
+    budget_ms
+        Most milliseconds a frame: the most accurate configuration within them is named.
+    output
+        PNG or SVG file of a figure.
+    progress
+        Whether progress is told on stderr.
+
+    Returns
+    -------
+    Findings
+        A row for each configuration and condition; ``data`` is the dataset that the store keeps in
+        its group ``cost/tradeoff``.
+
+    Raises
+    ------
+    ArgumentError, PipelineError, StoreError, RunError
+        As for :func:`run`; also if costs cannot be measured here.
+    """
+    library.questions.check_trade(criterion, limit_s, budget_ms)
+    figure = None if output is None else os.fspath(output)
+    library.output_file.figure_file(figure)
+    source = os.fspath(store)
+    if source.lower().endswith(".toml"):
+        with library.progress.progress_report(progress) as report:
+            summary = library.runner.execute(_pipeline(source), None, progress=report)
+        for line in summary.warnings:
+            notice(line)
+        source = summary.store
+    with library.progress.stage_display() if progress else contextlib.nullcontext() as stage:
+        return library.questions.tradeoff(
+            source, per=per, criterion=criterion, limit_s=limit_s, budget_ms=budget_ms,
+            output=figure, progress=stage)
+
+
+def compare(
+    first: str | os.PathLike[str],
+    second: str | os.PathLike[str],
+    *,
+    bins: Mapping[str, Sequence[float]] | None = None,
+    output: str | os.PathLike[str] | None = None,
+    repeats: int = 1,
+    store: str | os.PathLike[str] | None = None,
+    workers: int | None = None,
+    overwrite: bool = False,
+    progress: bool | Callable[[Progress], None] | None = None,
+) -> Findings:
+    """Compare photographs with a simulation, or two stores of one pipeline.
+
+    Parameters
+    ----------
+    first
+        Store of photographs, or any store.
+    second
+        Store of a simulation; a TOML file with a section [scene], with which the photographs'
+        markers are then simulated; or another store of the first one's pipeline, such as that of
+        another version of OpenCV.
+    bins
+        Variable of the scene -> edges of bins in which photographs and simulation are compared.
+    output
+        PNG or SVG file of the distributions of the errors.
+    repeats, store, workers, overwrite, progress
+        As for :func:`twins`.
+
+    Returns
+    -------
+    Findings
+        What differs; ``data`` is the dataset of `sweep.analysis.simulation_gap` or
+        `sweep.analysis.store_differences`.
+
+    Raises
+    ------
+    ArgumentError, PipelineError, StoreError, RunError, DatasetError
+        As for :func:`twins`; also for stores that are no pair.
+    """
+    figure = None if output is None else os.fspath(output)
+    library.output_file.figure_file(figure)
+    one, other = os.fspath(first), os.fspath(second)
+    library.lifecycle.open_finished(one)
+    if other.endswith(".toml"):
+        place = os.fspath(store or library.twins.twin_store(one, other))
+        twins(one, other, repeats=repeats, store=place, workers=workers, overwrite=overwrite,
+              progress=progress)
+        other = place
+    elif store:
+        raise ArgumentError("store", store, "expected photographs and a TOML file to simulate")
+    return library.questions.compare(one, other, bins=bins or None, output=figure)
+
+
+def write_report(
+    store: str | os.PathLike[str],
+    output: str | os.PathLike[str] | None = None,
+    *,
+    require: Sequence[str] = (),
+    per: Sequence[str] | None = None,
+    form: str | None = None,
+    figures: str | os.PathLike[str] | None = None,
+    error_model: Sequence[str] = (),
+    command: str = "",
+) -> Findings:
+    """Write the report of a store: answer, figures, example scenes.
+
+    Parameters
+    ----------
+    store
+        Path or URL of a finished store.
+    output
+        File to write (default: ``report.html``, or ``report.md`` with the form "md").
+    require, per
+        As for :func:`require`: the report begins with whether, and how far, it is met.
+    form
+        "html": one page; "md": Markdown with a folder of figures (default: by the file's suffix).
+    figures
+        Folder into which each figure is written as SVG and PNG, too.
+    error_model
+        JSON files of the error models to write, too.
+    command
+        The command line that asked for it, which the report shows.
+
+    Returns
+    -------
+    Findings
+        The first line and the numbers of the report.
+
+    Raises
+    ------
+    ArgumentError, StoreError, DatasetError
+        For what cannot be required, or written.
+    """
+    return library.questions.report(
+        os.fspath(store), None if output is None else os.fspath(output), require=require, per=per,
+        form=form, figures=None if figures is None else os.fspath(figures),
+        error_model=error_model, command=command)

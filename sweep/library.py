@@ -15,9 +15,7 @@ if TYPE_CHECKING:
     from sweep import compilation as compilation
     from sweep import processor as processor
     from sweep.analysis import camera_calibration as camera_calibration
-    from sweep.analysis import comparisons as comparisons
     from sweep.analysis import requirements as requirements
-    from sweep.analysis import simulation_gaps as simulation_gaps
     from sweep.conformance import check as check
     from sweep.evaluation import block as block
     from sweep.evaluation import inspection as inspection
@@ -43,32 +41,27 @@ if TYPE_CHECKING:
     from sweep.plan import pipeline as pipeline
     from sweep.plan import sampling as sampling
     from sweep.plugins import declared as declared
-    from sweep.report import answer_tables as answer_tables
     from sweep.report import charts as charts
+    from sweep.report import comparison_tables as comparison_tables
+    from sweep.report import decisions as decisions
     from sweep.report import error_model_file as error_model_file
     from sweep.report import formatting as formatting
-    from sweep.report import gap_figure as gap_figure
     from sweep.report import limit_figure as limit_figure
     from sweep.report import output_file as output_file
+    from sweep.report import questions as questions
     from sweep.report import report_data as report_data
     from sweep.report import scenes as scenes
     from sweep.report import table as table
-    from sweep.report import tradeoff_figure as tradeoff_figure
-    from sweep.report import write_report as write_report
     from sweep.sampling import rules as rules
     from sweep.store import lifecycle as lifecycle
     from sweep.store import locations as locations
     from sweep.store import lock as lock
     from sweep.tradeoff import choice_search as choice_search
-    from sweep.tradeoff import measurement as measurement
-    from sweep.tradeoff import pareto as pareto
 
 _MODULES = (
     "sweep.analysis",
     "sweep.analysis.camera_calibration",
-    "sweep.analysis.comparisons",
     "sweep.analysis.requirements",
-    "sweep.analysis.simulation_gaps",
     "sweep.compilation",
     "sweep.conformance.check",
     "sweep.evaluation.block",
@@ -96,25 +89,22 @@ _MODULES = (
     "sweep.plan.sampling",
     "sweep.plugins.declared",
     "sweep.processor",
-    "sweep.report.answer_tables",
     "sweep.report.charts",
+    "sweep.report.comparison_tables",
+    "sweep.report.decisions",
     "sweep.report.error_model_file",
     "sweep.report.formatting",
-    "sweep.report.gap_figure",
     "sweep.report.limit_figure",
     "sweep.report.output_file",
+    "sweep.report.questions",
     "sweep.report.report_data",
     "sweep.report.scenes",
     "sweep.report.table",
-    "sweep.report.tradeoff_figure",
-    "sweep.report.write_report",
     "sweep.sampling.rules",
     "sweep.store.lifecycle",
     "sweep.store.locations",
     "sweep.store.lock",
     "sweep.tradeoff.choice_search",
-    "sweep.tradeoff.measurement",
-    "sweep.tradeoff.pareto",
 )
 
 

@@ -53,7 +53,7 @@ def test_every_public_name_exists_and_is_listed():
 def test_examples_of_the_docstrings_run(tmp_path):
     runner = doctest.DocTestRunner()
     finder = doctest.DocTestFinder(recurse=False)
-    for function in (sweep.run, sweep.open):
+    for function in (sweep.run, sweep.open, sweep.require):
         (test,) = finder.find(function, globs={"sweep": sweep, "folder": tmp_path})
         assert test.examples
         assert runner.run(test).failed == 0

@@ -35,7 +35,7 @@ from sweep.photographs.twins import read_scene, twin_pipeline
 from sweep.plan.board_rules import read_board
 from sweep.plan.experiment import scene_plugins
 from sweep.plan.grid import scene_axes, scene_values
-from sweep.report.gap_figure import gap_table
+from sweep.report.comparison_tables import gap_table
 from sweep.store.lifecycle import read_pipeline
 
 FOLDER = Path(__file__).parent

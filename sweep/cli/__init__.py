@@ -15,7 +15,6 @@ from sweep.cli.command import (
     flushed,
     print_error,
     print_system_error,
-    remember_names,
 )
 from sweep.cli.parser import build_parser, parse
 from sweep.errors import SweepError
@@ -35,7 +34,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = argparse.Namespace()
     try:
         given = list(sys.argv[1:] if arguments is None else arguments)
-        remember_names(given)
         options = parse(parser, arguments)
         options.given = given
         if options.command is None:

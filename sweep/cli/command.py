@@ -8,9 +8,8 @@ import io
 import itertools
 import logging
 import os
-import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,7 +27,7 @@ from sweep.messages import plain, quoted, to_json
 
 if TYPE_CHECKING:
     from sweep.plan.pipeline import Pipeline
-    from sweep.report.table import Table
+    from sweep.report.table import Findings
 
 
 # --------------------------------------------------------------------------------------------------
@@ -36,6 +35,25 @@ if TYPE_CHECKING:
 
 CONTINUES = "stopped; the same command continues"
 """Told after Ctrl-C where it does; a command sets ``options.stopped`` to it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Argument:
+    """One argument of a command: names and options of argparse's ``add_argument``."""
+
+    names: tuple[str, ...]
+    options: Mapping[str, Any]
+
+
+def argument(*names: str, **options: Any) -> Argument:
+    """Return an argument. One that may be repeated is empty by default.
+
+    Its ``dest`` is the name of the Python function's argument that it sets, so that an
+    :class:`~sweep.errors.ArgumentError` can be reported by its flag.
+    """
+    if options.get("action") == "append":
+        options.setdefault("default", [])
+    return Argument(names, options)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +78,8 @@ class Command:
         Path of the page that explains it, from the top of the repository.
     examples
         Two command lines, shown at the end of its help.
-    add_arguments
-        Declares its arguments. The ``dest`` of each is the name of the Python function's argument
-        that it sets, so that an :class:`~sweep.errors.ArgumentError` can be reported by its flag.
+    arguments
+        Its arguments; of those in a tuple only one may be given.
     execute
         Runs it; returns the exit status.
     """
@@ -70,34 +87,138 @@ class Command:
     name: str
     summary: str
     guide: str
-    examples: tuple[Example, Example]
-    add_arguments: Callable[[argparse.ArgumentParser], None]
+    examples: tuple[Example, ...]
+    arguments: tuple[Argument | tuple[Argument, ...], ...]
     execute: Callable[[argparse.Namespace], int]
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Add the arguments to a parser."""
+        for entry in self.arguments:
+            group = parser.add_mutually_exclusive_group() if isinstance(entry, tuple) else parser
+            for each in entry if isinstance(entry, tuple) else (entry,):
+                group.add_argument(*each.names, **each.options)
+
+
+def command(
+    guide: str, examples: Mapping[str, str], *arguments: Argument | tuple[Argument, ...]
+) -> Callable[[Callable[[argparse.Namespace], int]], Command]:
+    """Return a decorator that makes a command of the function that runs it.
+
+    The function's name is that of the command, its docstring says what the command does.
+    ``examples`` has command line -> what it does.
+    """
+    def declared(execute: Callable[[argparse.Namespace], int]) -> Command:
+        text = (execute.__doc__ or " ").strip()
+        return Command(
+            execute.__name__.replace("_", "-"), text[:1].lower() + text[1:].removesuffix("."),
+            guide, tuple(Example(*each) for each in examples.items()), arguments, execute)
+
+    return declared
 
 
 # --------------------------------------------------------------------------------------------------
 # Arguments that several commands share.
 
-def add_pipeline(parser: argparse.ArgumentParser) -> None:
-    """Add the pipeline file and the settings that replace its values."""
-    parser.add_argument(
-        "pipeline", metavar="PIPELINE",
-        help="TOML file of the experiment, or a store that was made from it",
-    )
-    add_settings(parser, "replace a value of the file by this TOML value; a list makes an axis")
+def settings_argument(meaning: str) -> Argument:
+    """Return the argument of TOML values that replace or give others."""
+    return argument(
+        "--set", action="append", metavar="KEY=VALUE", dest="settings",
+        help=f"{meaning}; may be repeated")
 
 
-def add_precision(parser: argparse.ArgumentParser) -> None:
-    """Add how well quantities are to be known, in the place of a number of trials."""
-    parser.add_argument(
-        "--precision", action="append", default=[], metavar="NAME=WIDTH",
+PIPELINE = (
+    argument("pipeline", metavar="PIPELINE",
+             help="TOML file of the experiment, or a store that was made from it"),
+    settings_argument("replace a value of the file by this TOML value; a list makes an axis"),
+)
+PRECISION = (
+    argument(
+        "--precision", action="append", metavar="NAME=WIDTH",
         help="compute trials until the interval of this quantity is as narrow at each condition: "
         "half-width of a rate, of another quantity as a share of it, such as "
-        "'detection_rate = 0.02' or 'rotation_error_rmse_deg = 5 %%'; may be repeated",
+        "'detection_rate = 0.02' or 'rotation_error_rmse_deg = 5 %%'; may be repeated"),
+    argument("--max-trials", type=int, metavar="N", help="the most trials of a condition"),
+)
+STORE = argument("store", metavar="STORE", help="path or URL of the store")
+WORKERS = argument(
+    "--workers", type=int, metavar="N",
+    help="number of worker processes (default: one for each processor)")
+OVERWRITE = argument("--overwrite", action="store_true", help="replace an existing store")
+SCHEDULER = argument("--scheduler", metavar="ADDRESS", help="address of a Dask scheduler")
+
+
+def new_store(default: str = "runs/NAME.zarr") -> tuple[Argument, ...]:
+    """Return where a store is written, whether it replaces another one, and the processes."""
+    place = f"path or URL of the store (default: {default})"
+    return argument("--store", metavar="STORE", help=place), OVERWRITE, WORKERS
+
+
+LARGE_RUN = (
+    argument(
+        "--reuse", action="append", metavar="STORE",
+        help="copy the finished cells that this store shares with the experiment; may be "
+        "repeated"),
+    argument(
+        "--yes", action="store_true",
+        help="run also what would take more than a day, or more than is free on the disk"),
+)
+PHOTOGRAPHS = (
+    argument(
+        "folders", metavar="FOLDER", nargs="+",
+        help="photographs (PNG, JPEG, BMP, PGM) of one camera; with --stereo two folders, or one "
+        "of images whose halves are the left and the right camera's"),
+    argument(
+        "--camera", metavar="FILE",
+        help="file of the camera's calibration, or `calibrate`: from the board in the "
+        "photographs"),
+    argument(
+        "--board", metavar="FILE",
+        help="TOML file of the board; the truth of a marker is the pose by all corners but its "
+        "own"),
+    argument("--poses", metavar="FILE", help="the true poses, CSV as `sweep score` reads it"),
+    argument(
+        "--stereo", metavar="FILE",
+        help="calibration of a stereo camera (K1, D1, K2, D2, R, T); the truth is the pose in the "
+        "other camera's image"),
+)
+
+
+def cell_argument(meaning: str, others: str = ", with other names") -> Argument:
+    """Return the argument that selects one cell, or several."""
+    return argument(
+        "--at", metavar="NAME=VALUE,...", action="append",
+        help=f"{meaning}; an axis that is not named takes its first value; may be "
+        f"repeated{others}")
+
+
+def picture(default: str | None = None) -> tuple[Argument, ...]:
+    """Return where and how one scene is drawn; without a default, nothing is unless asked for."""
+    written = f"default: {default}" if default else "default: no file is written"
+    return (
+        argument("-o", "--output", default=default, metavar="PNG",
+                 help=f"file to write the image to ({written})"),
+        argument("--plain", action="store_true", help="draw the image without annotations"),
+        argument("--full", action="store_true",
+                 help="draw the whole frame instead of the marker's surroundings"),
     )
-    parser.add_argument(
-        "--max-trials", type=int, metavar="N", help="the most trials of a condition",
-    )
+
+
+def seconds(default: float, meaning: str) -> Argument:
+    """Return the time limit of a measurement."""
+    return argument(
+        "--seconds", type=float, default=default, metavar="S", dest="limit_s",
+        help=f"{meaning}, in seconds (default: {default:g})")
+
+
+def figure_argument(meaning: str) -> Argument:
+    """Return the file of a figure."""
+    return argument("-o", "--output", metavar="FIGURE", help=f"{meaning} into this PNG or SVG file")
+
+
+JSON = argument("--json", action="store_true", help="print one JSON object")
+MARKDOWN = argument("--markdown", action="store_true", help="print Markdown")
+FORM = (JSON, MARKDOWN)
+"""The choice of JSON or Markdown on standard output."""
 
 
 def precision_settings(precision: Sequence[str], max_trials: int | None) -> list[str]:
@@ -179,110 +300,6 @@ def names_of(text: str | None) -> list[str] | None:
     return [name for part in text.split(",") if (name := part.strip())]
 
 
-def add_store(parser: argparse.ArgumentParser) -> None:
-    """Add the store that is read."""
-    parser.add_argument("store", metavar="STORE", help="path or URL of the store")
-
-
-def add_workers(parser: argparse.ArgumentParser) -> None:
-    """Add the number of worker processes."""
-    parser.add_argument(
-        "--workers", type=int, metavar="N",
-        help="number of worker processes (default: one for each processor)",
-    )
-
-
-def add_new_store(parser: argparse.ArgumentParser, default: str = "runs/NAME.zarr") -> None:
-    """Add where a store is written, whether it replaces another one, and the processes."""
-    parser.add_argument(
-        "--store", metavar="STORE", help=f"path or URL of the store (default: {default})"
-    )
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing store")
-    add_workers(parser)
-
-
-def add_large_run(parser: argparse.ArgumentParser) -> None:
-    """Add the stores whose cells are reused, and the consent to a run that takes long."""
-    parser.add_argument(
-        "--reuse", action="append", default=[], metavar="STORE",
-        help="copy the finished cells that this store shares with the experiment; may be repeated",
-    )
-    parser.add_argument(
-        "--yes", action="store_true",
-        help="run also what would take more than a day, or more than is free on the disk",
-    )
-
-
-def add_settings(parser: argparse.ArgumentParser, meaning: str) -> None:
-    """Add TOML values that replace or give others."""
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
-        help=f"{meaning}; may be repeated",
-    )
-
-
-def add_photographs(parser: argparse.ArgumentParser) -> None:
-    """Add folders of photographs, their camera, and where the truth comes from."""
-    parser.add_argument(
-        "folders", metavar="FOLDER", nargs="+",
-        help="photographs (PNG, JPEG, BMP, PGM) of one camera; with --stereo two folders, or one "
-        "of images whose halves are the left and the right camera's",
-    )
-    parser.add_argument(
-        "--camera", metavar="FILE",
-        help="file of the camera's calibration, or `calibrate`: from the board in the photographs",
-    )
-    parser.add_argument(
-        "--board", metavar="FILE",
-        help="TOML file of the board; the truth of a marker is the pose by all corners but its own",
-    )
-    parser.add_argument(
-        "--poses", metavar="FILE",
-        help="the true poses, CSV as `sweep score` reads it",
-    )
-    parser.add_argument(
-        "--stereo", metavar="FILE",
-        help="calibration of a stereo camera (K1, D1, K2, D2, R, T); the truth is the pose in the "
-        "other camera's image",
-    )
-
-
-def add_cell(parser: argparse.ArgumentParser, meaning: str, *, several: bool = False) -> None:
-    """Add the selection of one cell, or of several."""
-    parser.add_argument(
-        "--at", metavar="NAME=VALUE,...",
-        help=f"{meaning}; an axis that is not named takes its first value"
-        + ("; may be repeated" if several else "; may be repeated, with other names"),
-        action="append", default=[],
-    )
-
-
-def add_picture(parser: argparse.ArgumentParser, default: str | None = None) -> None:
-    """Add where and how one scene is drawn; without a default, nothing is unless asked for."""
-    written = f"default: {default}" if default else "default: no file is written"
-    parser.add_argument(
-        "-o", "--output", default=default, metavar="PNG",
-        help=f"file to write the image to ({written})",
-    )
-    parser.add_argument("--plain", action="store_true", help="draw the image without annotations")
-    parser.add_argument(
-        "--full", action="store_true",
-        help="draw the whole frame instead of the marker's surroundings",
-    )
-
-
-def add_json(parser: argparse._ActionsContainer) -> None:
-    """Add the choice of JSON on standard output."""
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-
-
-def add_form(parser: argparse.ArgumentParser) -> None:
-    """Add the choice of JSON or Markdown on standard output."""
-    form = parser.add_mutually_exclusive_group()
-    add_json(form)
-    form.add_argument("--markdown", action="store_true", help="print Markdown")
-
-
 # --------------------------------------------------------------------------------------------------
 # Output that commands share: lines, JSON, and a picture.
 
@@ -300,23 +317,8 @@ OTHER_FORMATS = {
 """Suffixes of files that a PNG image would not be taken for."""
 
 
-_names: list[str] = []
-"""Parts of the names on the command line that hold control characters, the longest first."""
-
-
-def remember_names(words: Sequence[str]) -> None:
-    """Remember the words of a command line, for :func:`lines_of`."""
-    parts = {Path(part).stem for word in words for part in re.split(r"[/=,]", word)}
-    _names[:] = sorted((part for part in parts if not part.isprintable()), key=len, reverse=True)
-
-
 def lines_of(text: str) -> list[str]:
-    """Return the lines of a text without control characters, whosever names and texts they quote.
-
-    A newline in a name on the command line makes no line of its own.
-    """
-    for name in _names:
-        text = text.replace(name, plain(name, len(name)))
+    """Return the lines of a text without control characters, whosever names they quote."""
     return [plain(line, len(line)) for line in text.split("\n")]
 
 
@@ -325,10 +327,19 @@ def say(text: str = "") -> None:
     print("\n".join(lines_of(text)))
 
 
-def print_table(table: Table, options: argparse.Namespace) -> None:
-    """Print a table, as Markdown if that is asked for, and an empty line."""
-    say(table.markdown() if options.markdown else table.text())
-    say()
+def answered(options: argparse.Namespace, found: Findings) -> int:
+    """Print findings as JSON, Markdown or text, and what to do next; return the exit status."""
+    if getattr(options, "json", False):
+        print(found.to_json())
+        return found.status
+    if getattr(options, "markdown", False):
+        say(found.markdown())
+        return found.status
+    if text := str(found):
+        say(text)
+    if found.then[0]:
+        say_next(*found.then)
+    return found.status
 
 
 def say_next(command: str, meaning: str = "") -> None:

@@ -4,25 +4,27 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import sys
 from typing import TYPE_CHECKING
 
 from sweep import library
 from sweep.cli.command import (
     CONTINUES,
+    JSON,
+    LARGE_RUN,
     MAX_LINES,
-    Command,
-    Example,
-    add_cell,
-    add_json,
-    add_large_run,
-    add_new_store,
-    add_picture,
-    add_pipeline,
-    add_precision,
-    add_store,
-    add_workers,
+    PIPELINE,
+    PRECISION,
+    SCHEDULER,
+    STORE,
+    WORKERS,
+    argument,
+    cell_argument,
     check_png,
+    command,
+    new_store,
+    picture,
     print_json,
     read_pipeline,
     say,
@@ -46,25 +48,23 @@ if TYPE_CHECKING:
 # --------------------------------------------------------------------------------------------------
 # ``sweep run``.
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_pipeline(parser)
-    add_precision(parser)
-    add_new_store(parser)
-    add_large_run(parser)
-    parser.add_argument("--scheduler", metavar="ADDRESS", help="address of a Dask scheduler")
-    parser.add_argument(
+@command(
+    "sweep/execution/README.md", {
+        "sweep run pipelines/smoke.toml": "writes runs/smoke.zarr",
+        "sweep run pipelines/smoke.toml --set 'tilt_deg=[0, 30, 60]' --store runs/tilts.zarr":
+            "runs the same experiment at other tilts"},
+    *PIPELINE, *PRECISION, *new_store(), *LARGE_RUN, SCHEDULER,
+    argument(
         "--time-limit", type=float, metavar="S", dest="time_limit_s",
-        help="block timeout in seconds (default: 600, or ten times a block's work)",
-    )
-    parser.add_argument(
+        help="block timeout in seconds (default: 600, or ten times a block's work)"),
+    argument(
         "--retry-failed", action="store_true",
-        help="compute the blocks again in which cells failed or crashed, also of a finished store",
-    )
-    add_json(parser)
-
-
+        help="compute the blocks again in which cells failed or crashed, also of a finished "
+        "store"),
+    JSON)
 @beside_child
-def _execute(options: argparse.Namespace, child: Child) -> int:
+def run(options: argparse.Namespace, child: Child) -> int:
+    """Run a pipeline into a store, or continue an interrupted run."""
     pipeline = read_pipeline(options)
 
     announce_compilation(pipeline)
@@ -140,31 +140,17 @@ def _requiring_command(pipeline: Pipeline, url: str) -> str:
                   *(["--per", ",".join(per)] if per else []))
 
 
-RUN = Command(
-    "run", "run a pipeline into a store, or continue an interrupted run",
-    "sweep/execution/README.md",
-    (
-        Example("sweep run pipelines/smoke.toml", "writes runs/smoke.zarr"),
-        Example(
-            "sweep run pipelines/smoke.toml --set 'tilt_deg=[0, 30, 60]' --store runs/tilts.zarr",
-            "runs the same experiment at other tilts",
-        ),
-    ),
-    _add_arguments, _execute,
-)
-
-
 # --------------------------------------------------------------------------------------------------
 # ``sweep plan``.
 
-def _add_arguments_plan(parser: argparse.ArgumentParser) -> None:
-    add_pipeline(parser)
-    add_precision(parser)
-    add_workers(parser)
-    add_json(parser)
-
-
-def _execute_plan(options: argparse.Namespace) -> int:
+@command(
+    "pipelines/README.md", {
+        "sweep plan pipelines/smoke.toml": "shows the grid, memory and time",
+        "sweep plan pipelines/smoke.toml --set trial=1000 --workers 16 --json":
+            "shows the same of a larger run, as JSON"},
+    *PIPELINE, *PRECISION, WORKERS, JSON)
+def plan(options: argparse.Namespace) -> int:
+    """Show a pipeline's grid, active parts and expected cost."""
     pipeline = read_pipeline(options)
 
     announce_compilation(pipeline)
@@ -298,30 +284,18 @@ def _pilot_lines(pipeline: Pipeline, expected: Forecast) -> list[str]:
     return lines
 
 
-PLAN = Command(
-    "plan", "show a pipeline's grid, active parts and expected cost",
-    "pipelines/README.md",
-    (
-        Example("sweep plan pipelines/smoke.toml", "shows the grid, memory and time"),
-        Example(
-            "sweep plan pipelines/smoke.toml --set trial=1000 --workers 16 --json",
-            "shows the same of a larger run, as JSON",
-        ),
-    ),
-    _add_arguments_plan, _execute_plan,
-)
-
-
 # --------------------------------------------------------------------------------------------------
 # ``sweep show``.
 
-def _add_arguments_show(parser: argparse.ArgumentParser) -> None:
-    add_pipeline(parser)
-    add_cell(parser, "the pose and its configuration")
-    add_picture(parser, "scene.png")
-
-
-def _execute_show(options: argparse.Namespace) -> int:
+@command(
+    "pipelines/README.md", {
+        "sweep show pipelines/smoke.toml --at distance_m=0.3,tilt_deg=45":
+            "draws this pose into scene.png",
+        "sweep show pipelines/faults.toml --full --plain -o frame.png":
+            "writes the whole frame of the first pose, without annotations"},
+    *PIPELINE, cell_argument("the pose and its configuration"), *picture("scene.png"))
+def show(options: argparse.Namespace) -> int:
+    """Draw the image of one pose with the detections in it."""
     pipeline = read_pipeline(options)
     check_png(options.output)
 
@@ -341,39 +315,20 @@ def _execute_show(options: argparse.Namespace) -> int:
     return 0
 
 
-SHOW = Command(
-    "show", "draw the image of one pose with the detections in it",
-    "pipelines/README.md",
-    (
-        Example(
-            "sweep show pipelines/smoke.toml --at distance_m=0.3,tilt_deg=45",
-            "draws this pose into scene.png",
-        ),
-        Example(
-            "sweep show pipelines/faults.toml --full --plain -o frame.png",
-            "writes the whole frame of the first pose, without annotations",
-        ),
-    ),
-    _add_arguments_show, _execute_show,
-)
-
-
 # --------------------------------------------------------------------------------------------------
 # ``sweep repro``.
 
-def _add_arguments_repro(parser: argparse.ArgumentParser) -> None:
-    add_store(parser)
-    add_cell(parser, "the cell", several=True)
-    add_picture(parser)
-    parser.add_argument(
-        "--time-limit", type=float, default=60.0, metavar="S", dest="time_limit_s",
-        help="timeout in seconds for each cell (default: 60)",
-    )
-
-
-def _execute_repro(options: argparse.Namespace) -> int:
-    import math  # noqa: PLC0415
-
+@command(
+    "sweep/integrity/README.md", {
+        "sweep repro runs/smoke.zarr --at distance_m=0.3,tilt_deg=45 -o cell.png":
+            "prints both values of each variable, and draws the image into cell.png",
+        "sweep repro runs/faults.zarr --time-limit 10":
+            "recomputes the first cell, for 10 seconds at most"},
+    STORE, cell_argument("the cell", ""), *picture(),
+    argument("--time-limit", type=float, default=60.0, metavar="S", dest="time_limit_s",
+             help="timeout in seconds for each cell (default: 60)"))
+def repro(options: argparse.Namespace) -> int:
+    """Recompute one cell of a store, compared with the stored one."""
     if not 0 < options.time_limit_s < math.inf:
         raise ArgumentError("time_limit_s", options.time_limit_s, "expected seconds above 0")
     chosen: list[str] = options.at or [""]
@@ -464,32 +419,16 @@ def _say_next(options: argparse.Namespace, again: Reproduction, status: int) -> 
         say_next(f"sweep verify {store}", "checks the rest of the store")
 
 
-REPRO = Command(
-    "repro", "recompute one cell of a store, compared with the stored one",
-    "sweep/integrity/README.md",
-    (
-        Example(
-            "sweep repro runs/smoke.zarr --at distance_m=0.3,tilt_deg=45 -o cell.png",
-            "prints both values of each variable, and draws the image into cell.png",
-        ),
-        Example(
-            "sweep repro runs/faults.zarr --time-limit 10",
-            "recomputes the first cell, for 10 seconds at most",
-        ),
-    ),
-    _add_arguments_repro, _execute_repro,
-)
-
-
 # --------------------------------------------------------------------------------------------------
 # ``sweep status``.
 
-def _add_arguments_status(parser: argparse.ArgumentParser) -> None:
-    add_store(parser)
-    add_json(parser)
-
-
-def _execute_status(options: argparse.Namespace) -> int:
+@command(
+    "sweep/execution/README.md", {
+        "sweep status runs/smoke.zarr": "shows the progress, also of a run in progress",
+        "sweep status runs/smoke.zarr --json": "prints the same as JSON"},
+    STORE, JSON)
+def status(options: argparse.Namespace) -> int:
+    """Show how far a run is, its rate, and the cells that failed."""
     state = library.status.status(options.store)
     if options.json:
         print_json(state)
@@ -533,36 +472,24 @@ def _execute_status(options: argparse.Namespace) -> int:
     return 0
 
 
-STATUS = Command(
-    "status", "show how far a run is, its rate, and the cells that failed",
-    "sweep/execution/README.md",
-    (
-        Example("sweep status runs/smoke.zarr", "shows the progress, also of a run in progress"),
-        Example("sweep status runs/smoke.zarr --json", "prints the same as JSON"),
-    ),
-    _add_arguments_status, _execute_status,
-)
-
-
 # --------------------------------------------------------------------------------------------------
 # ``sweep verify``.
 
-def _add_arguments_verify(parser: argparse.ArgumentParser) -> None:
-    add_store(parser)
-    parser.add_argument(
-        "--repair", action="store_true",
-        help="recompute damaged blocks, and rewrite or delete other damaged files",
-    )
-    parser.add_argument(
+@command(
+    "sweep/integrity/README.md", {
+        "sweep verify runs/smoke.zarr": "checks every file, and recomputes 20 scenes",
+        "sweep verify runs/smoke.zarr --repair --sample 100":
+            "repairs what is damaged, and recomputes 100 scenes"},
+    STORE,
+    argument("--repair", action="store_true",
+             help="recompute damaged blocks, and rewrite or delete other damaged files"),
+    argument(
         "--sample", type=int, default=20, metavar="N",
         help="number of scenes to recompute and compare, beside all that failed (default: 20); "
-        "0 recomputes nothing",
-    )
-    add_workers(parser)
-    add_json(parser)
-
-
-def _execute_verify(options: argparse.Namespace) -> int:
+        "0 recomputes nothing"),
+    WORKERS, JSON)
+def verify(options: argparse.Namespace) -> int:
+    """Check a store's integrity; optionally repair it."""
     if options.repair:
         options.stopped = CONTINUES
 
@@ -631,17 +558,3 @@ def _following(url: str, *, finished: bool) -> str:
         if library.lock.holder(library.lifecycle.open_store(url).storage) is None
         else "status"
     )
-
-
-VERIFY = Command(
-    "verify", "check a store's integrity; optionally repair it",
-    "sweep/integrity/README.md",
-    (
-        Example("sweep verify runs/smoke.zarr", "checks every file, and recomputes 20 scenes"),
-        Example(
-            "sweep verify runs/smoke.zarr --repair --sample 100",
-            "repairs what is damaged, and recomputes 100 scenes",
-        ),
-    ),
-    _add_arguments_verify, _execute_verify,
-)

@@ -7,12 +7,19 @@ import re
 from collections.abc import Sequence
 from typing import NoReturn
 
-from sweep.cli.answers import LIMIT, REQUIRE, SIZE
-from sweep.cli.command import Command, Example, flushed
-from sweep.cli.comparisons import CALIBRATION, COMPARE, ERROR_MODEL, REPORT, TRADEOFF
-from sweep.cli.experiments import PLAN, REPRO, RUN, SHOW, STATUS, VERIFY
-from sweep.cli.photographs import FIT, PHOTOS
-from sweep.cli.programs import EXPORT, PLUGINS, SCORE
+from sweep.cli.answers import (
+    calibration,
+    compare,
+    error_model,
+    limit,
+    report,
+    require,
+    size,
+    tradeoff,
+)
+from sweep.cli.command import Command, argument, command, flushed
+from sweep.cli.experiments import plan, repro, run, show, status, verify
+from sweep.cli.programs import export, fit, photos, plugins, score
 from sweep.errors import MissingPackageError
 from sweep.messages import MAX_LINE_LENGTH, nearest, plain
 from sweep.version import __version__
@@ -27,42 +34,32 @@ FILES = ("PIPELINE", "STORE", "STORE|PIPELINE", "SIMULATION", "FOLDER", "DIR", "
 """Arguments for which names of files and folders are offered."""
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("shell", metavar="SHELL", choices=SHELLS, help="bash, zsh or fish")
-
-
-def _execute(options: argparse.Namespace) -> int:
+@command(
+    "pipelines/README.md", {
+        "sweep completion bash": "prints it for bash: source <(sweep completion bash)",
+        "sweep completion fish": "prints it for fish: sweep completion fish | source"},
+    argument("shell", metavar="SHELL", choices=SHELLS, help="bash, zsh or fish"))
+def completion(options: argparse.Namespace) -> int:
+    """Print a script by which a shell completes commands and files."""
     try:
         import shtab  # noqa: PLC0415
     except ImportError:
         raise MissingPackageError("sweep completion needs shtab: pip install shtab") from None
     parser, commands = build_parser()
-    for command in commands:
-        for action in command._actions:  # noqa: SLF001  (argparse offers no other list)
+    for added in commands:
+        for action in added._actions:  # noqa: SLF001  (argparse offers no other list)
             if action.metavar in FILES:
                 action.complete = shtab.FILE  # type: ignore[attr-defined]
     print(shtab.complete(parser, options.shell))
     return 0
 
 
-COMPLETION = Command(
-    "completion", "print a script by which a shell completes commands and files",
-    "pipelines/README.md",
-    (
-        Example("sweep completion bash", "prints it for bash: source <(sweep completion bash)"),
-        Example("sweep completion fish", "prints it for fish: sweep completion fish | source"),
-    ),
-    _add_arguments, _execute,
-)
-
-
 # --------------------------------------------------------------------------------------------------
 # The parser of the command line, assembled from the commands' own declarations.
 
 COMMANDS = (
-    RUN, PLAN, SIZE, LIMIT, SHOW, REPRO, TRADEOFF, REPORT, REQUIRE, ERROR_MODEL, CALIBRATION,
-    VERIFY, STATUS, EXPORT, SCORE, PHOTOS, FIT, COMPARE, PLUGINS,
-    COMPLETION,
+    run, plan, size, limit, show, repro, tradeoff, report, require, error_model, calibration,
+    verify, status, export, score, photos, fit, compare, plugins, completion,
 )
 """Every command, in the order in which the help lists them."""
 
@@ -108,7 +105,7 @@ def _hint(message: str) -> str:
     if chosen := INVALID_COMMAND.match(message):
         if chosen[1] == "help":
             return "; `sweep --help` and `sweep COMMAND --help` print the help"
-        return nearest(chosen[1], [command.name for command in COMMANDS])
+        return nearest(chosen[1], [each.name for each in COMMANDS])
     if unknown := re.match(r"unrecognized arguments: (.*)", message):
         return "".join(dict.fromkeys(_meant(word) for word in unknown[1].split()))
     return ""
@@ -119,9 +116,9 @@ def _meant(word: str) -> str:
         return "; `sweep plan PIPELINE` shows what would run"
     if word.startswith("-"):
         name, flags = word.partition("=")[0], set[str]()
-        for command in COMMANDS:
+        for each in COMMANDS:
             parser = argparse.ArgumentParser(add_help=False)
-            command.add_arguments(parser)
+            each.add_arguments(parser)
             flags.update(_flags(parser).values())
         return "" if name in flags else nearest(name, sorted(flags))
     if "=" in word:
@@ -144,13 +141,13 @@ def build_parser() -> tuple[argparse.ArgumentParser, list[argparse.ArgumentParse
     parser.add_argument("--version", action="version", version=f"sweep {__version__}")
     parser.set_defaults(command=None)
     commands = parser.add_subparsers(metavar="COMMAND")
-    for command in COMMANDS:
+    for each in COMMANDS:
         added = commands.add_parser(
-            command.name, help=command.summary, description=_sentence(command.summary),
-            epilog=_epilog(command), formatter_class=argparse.RawDescriptionHelpFormatter,
+            each.name, help=each.summary, description=each.execute.__doc__,
+            epilog=_epilog(each), formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        command.add_arguments(added)
-        added.set_defaults(command=command, flags=_flags(added))
+        each.add_arguments(added)
+        added.set_defaults(command=each, flags=_flags(added))
     return parser, list(commands.choices.values())
 
 
@@ -173,15 +170,11 @@ def parse(
         raise
 
 
-def _sentence(summary: str) -> str:
-    return f"{summary[0].upper()}{summary[1:]}."
-
-
-def _epilog(command: Command) -> str:
+def _epilog(declared: Command) -> str:
     examples = "\n".join(
-        f"  {example.line}\n      {example.meaning}" for example in command.examples
+        f"  {example.line}\n      {example.meaning}" for example in declared.examples
     )
-    return f"examples:\n{examples}\n\nguide: {command.guide}"
+    return f"examples:\n{examples}\n\nguide: {declared.guide}"
 
 
 def _flags(parser: argparse.ArgumentParser) -> dict[str, str]:

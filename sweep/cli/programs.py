@@ -1,51 +1,175 @@
-"""The commands for other programs: export, score, plugins."""
+"""The commands of your camera and of other programs: photos, fit, export, score, plugins."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import shlex
 import sys
+from pathlib import Path
 
 from sweep import library
 from sweep.cli.command import (
     CONTINUES,
-    Command,
-    Example,
-    add_json,
-    add_new_store,
-    add_pipeline,
-    add_settings,
+    JSON,
+    PHOTOGRAPHS,
+    PIPELINE,
+    argument,
+    command,
+    new_store,
     print_json,
     read_pipeline,
     say,
     say_next,
+    settings_argument,
 )
 from sweep.cli.prepared import announce_compilation, run_prepared, say_summary
 from sweep.errors import ArgumentError
-from sweep.messages import byte_count, quoted
+from sweep.messages import byte_count, notice, quoted
+
+# --------------------------------------------------------------------------------------------------
+# ``sweep photos``.
+
+@command(
+    "pipelines/photographs/README.md", {
+        "sweep photos shots --camera camera.yaml --board BOARD.toml":
+            "compares each marker with the board without it; writes runs/shots.zarr",
+        "sweep photos shots --camera calibrate --board BOARD.toml "
+        "--set 'cornerRefinementMethod=[\"none\", \"subpix\"]'":
+            "calibrates the camera from the same photographs; compares two refinements"},
+    *PHOTOGRAPHS,
+    settings_argument("set a parameter of detector or estimator; a list compares its values"),
+    *new_store("runs/NAME.zarr with the folder's name"), JSON)
+def photos(options: argparse.Namespace) -> int:
+    """Measure detectors and estimators on photographs of markers."""
+    options.stopped = "stopped before anything was computed"
+    home, name = library.folder.record_home(options.store)
+    prepared = library.prepare.prepare(
+        options.folders, options.camera, board=options.board, poses=options.poses,
+        stereo=options.stereo, settings=options.settings, home=home, name=name,
+        overwrite=options.overwrite,
+    )
+    store = options.store or str(Path(home) / f"{prepared.pipeline.name}.zarr")
+    summary = run_prepared(options, prepared.pipeline, store, prepared.lines)
+    if options.json:
+        print_json({**dataclasses.asdict(summary), "photographs": prepared.lines})
+        return int(summary.nothing_computed)
+    settings = prepared.pipeline.size(library.parameters.Stage.detection)
+    each = f" with {settings} detector settings" if settings > 1 else ""
+    say_summary(
+        summary, f"{prepared.markers:,} markers in {prepared.photographs:,} photographs: "
+        f"{summary.detected_line}{each}")
+    return int(summary.nothing_computed)
+
+
+# --------------------------------------------------------------------------------------------------
+# ``sweep fit``.
+
+@command(
+    "pipelines/photographs/README.md", {
+        "sweep fit shots --camera camera.yaml --board BOARD.toml":
+            "writes scene.toml: blur, sharpening, tone, noise, geometry",
+        "sweep fit shots --camera calibrate --board BOARD.toml -o webcam.toml":
+            "calibrates the camera from the same photographs"},
+    *PHOTOGRAPHS,
+    settings_argument(
+        "dictionary and size_m of single markers; detectors and estimators whose errors are "
+        "compared (default: two refinements)"),
+    argument(
+        "--markers", type=int, default=12, metavar="N",
+        help="the most markers of a photograph that are fitted, well spread over the frame "
+        "(default: 12)"),
+    argument(
+        "--no-check", dest="check", action="store_false",
+        help="do not hold half of the photographs out, to see which effects move their errors"),
+    argument("-o", "--output", default="scene.toml", metavar="FILE",
+             help="pipeline file to write (default: scene.toml)"),
+    JSON)
+def fit(options: argparse.Namespace) -> int:
+    """Estimate a camera's [scene] from photographs."""
+    output = Path(options.output)
+    library.output_file.check_output_file(output)
+    fitted = library.folders.fit_folder(
+        options.folders, options.camera, board=options.board, poses=options.poses,
+        stereo=options.stereo, settings=options.settings, markers=options.markers,
+        check=options.check,
+    )
+    for line in fitted.lines:
+        notice(line)
+    library.output_file.write_output_file(output, fitted.text.encode())
+    found = fitted.found
+    if options.json:
+        print_json({
+            "scene": found.scene, "photographs": found.photographs, "markers": found.markers,
+            "terms": [each.as_json() for each in found.terms], "lines": list(found.lines),
+            "check": [] if fitted.gap is None else library.gap_figure.gap_records(fitted.gap),
+            "output": str(output),
+        })
+        return 0
+    rows = [
+        (
+            each.name, each.parameter, library.formatting.number(each.estimate.value),
+            library.formatting.interval_text(each.estimate.low, each.estimate.high)
+            if math.isfinite(each.estimate.low) else "",
+            f"{'kept' if each.kept else 'left out'}{': ' if each.reason else ''}{each.reason}",
+        )
+        for each in found.terms
+    ]
+    say(library.table.Table.of(
+        f"{found.markers} markers in {found.photographs} photographs; 95 % intervals by photograph",
+        ("term", "parameter", "value", "interval", ""), rows, stub=2,
+    ).text())
+    say()
+    for line in found.lines:
+        say(f"- {line}")
+    if fitted.gap is not None:
+        say()
+        say("Half of the photographs, simulated with the scene of the others:")
+        say(library.gap_figure.gap_table(fitted.gap).text())
+        say()
+    say_next(f"sweep run {quoted(str(output))}", "simulates this camera")
+    store = f"runs/{fitted.pipeline.name}.zarr"
+    compare = quoted("sweep", "compare", store, str(output))
+    if library.locations.exists(store):
+        say_next(compare, "the photographs beside their simulation")
+    else:
+        say_next(_measuring_command(options), f"measures the photographs, for {compare}")
+    return 0
+
+
+def _measuring_command(options: argparse.Namespace) -> str:
+    """Return the command that measures the photographs of `sweep fit`."""
+    words = ["sweep", "photos", *options.folders]
+    for name in ("camera", "board", "poses", "stereo"):
+        if (value := getattr(options, name)) is not None:
+            words += [f"--{name}", value]
+    for setting in options.settings:
+        words += ["--set", setting]
+    return quoted(*words)
+
 
 # --------------------------------------------------------------------------------------------------
 # ``sweep export``.
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_pipeline(parser)
-    parser.add_argument("folder", metavar="DIR", help="new or empty folder, or one to continue")
-    parser.add_argument(
+@command(
+    "sweep/exchange/README.md", {
+        "sweep export pipelines/smoke.toml images": "writes every image as a whole frame",
+        "sweep export runs/smoke.zarr windows --windows":
+            "writes the marker's surroundings alone, of the experiment of a store"},
+    *PIPELINE,
+    argument("folder", metavar="DIR", help="new or empty folder, or one to continue"),
+    argument(
         "--windows", action="store_true", dest="windowed",
-        help="images of the marker's surroundings, as a run searches them (default: whole frames)",
-    )
-    parser.add_argument(
-        "--workers", type=int, metavar="N", help="number of processes that render (default: 1)"
-    )
-    parser.add_argument(
-        "--yes", action="store_true",
-        help="export also what takes more than 10 GB, or more than is free on the disk",
-    )
-    add_json(parser)
-
-
-def _execute(options: argparse.Namespace) -> int:
+        help="images of the marker's surroundings, as a run searches them (default: whole "
+        "frames)"),
+    argument("--workers", type=int, metavar="N",
+             help="number of processes that render (default: 1)"),
+    argument("--yes", action="store_true",
+             help="export also what takes more than 10 GB, or more than is free on the disk"),
+    JSON)
+def export(options: argparse.Namespace) -> int:
+    """Write an experiment's images and truth for other programs."""
     pipeline = read_pipeline(options)
 
     announce_compilation(pipeline)
@@ -75,59 +199,39 @@ def _execute(options: argparse.Namespace) -> int:
     return 0
 
 
-EXPORT = Command(
-    "export", "write an experiment's images and truth for other programs",
-    "sweep/exchange/README.md",
-    (
-        Example("sweep export pipelines/smoke.toml images", "writes every image as a whole frame"),
-        Example(
-            "sweep export runs/smoke.zarr windows --windows",
-            "writes the marker's surroundings alone, of the experiment of a store",
-        ),
-    ),
-    _add_arguments, _execute,
-)
-
-
 # --------------------------------------------------------------------------------------------------
 # ``sweep score``.
 
-def _add_arguments_score(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("folder", metavar="DIR", help="an export, made by `sweep export`")
-    parser.add_argument(
+@command(
+    "sweep/exchange/README.md", {
+        "sweep score images detections.csv --name mine":
+            "compares them with the truth; writes runs/mine.zarr",
+        "sweep score images tags.csv --pixel-center 0.5 --corner-order 'TR TL BL BR' --beside":
+            "in other conventions, and beside the experiment's own detector"},
+    argument("folder", metavar="DIR", help="an export, made by `sweep export`"),
+    argument(
         "files", metavar="FILE", nargs="+",
-        help="detections or poses, CSV; several files are compared on the same images",
-    )
-    parser.add_argument(
-        "--name", action="append", default=[], dest="names", metavar="NAME",
-        help="name of the program that made a file (default: the file's); may be repeated",
-    )
-    parser.add_argument(
-        "--pixel-center", default="0", metavar="C",
-        help="coordinate of the centre of the first pixel: 0 (default), or 0.5",
-    )
-    parser.add_argument(
+        help="detections or poses, CSV; several files are compared on the same images"),
+    argument(
+        "--name", action="append", dest="names", metavar="NAME",
+        help="name of the program that made a file (default: the file's); may be repeated"),
+    argument("--pixel-center", default="0", metavar="C",
+             help="coordinate of the centre of the first pixel: 0 (default), or 0.5"),
+    argument(
         "--corner-order", default="TL TR BR BL", metavar="ORDER",
-        help="order of the corners, as OpenCV draws the marker (default: TL TR BR BL)",
-    )
-    parser.add_argument(
+        help="order of the corners, as OpenCV draws the marker (default: TL TR BR BL)"),
+    argument(
         "--frame", default="right up out", metavar="XYZ",
-        help="directions of the marker's x, y, z for a viewer (default: right up out)",
-    )
-    parser.add_argument(
+        help="directions of the marker's x, y, z for a viewer (default: right up out)"),
+    argument(
         "--doubled", default="refuse", metavar="HOW",
-        help="what an ID counts that is twice in an image: refuse (default), or nearest",
-    )
-    parser.add_argument(
-        "--beside", action="store_true",
-        help="also search the images with the experiment's own detector",
-    )
-    add_settings(parser, "replace a value of the experiment, such as solver=ippe")
-    add_new_store(parser)
-    add_json(parser)
-
-
-def _execute_score(options: argparse.Namespace) -> int:
+        help="what an ID counts that is twice in an image: refuse (default), or nearest"),
+    argument("--beside", action="store_true",
+             help="also search the images with the experiment's own detector"),
+    settings_argument("replace a value of the experiment, such as solver=ippe"), *new_store(),
+    JSON)
+def score(options: argparse.Namespace) -> int:
+    """Score what another program detected in an export's images."""
     conventions = library.answers.Conventions.of(
         options.pixel_center, options.corner_order, options.frame
     )
@@ -145,53 +249,30 @@ def _execute_score(options: argparse.Namespace) -> int:
     return int(summary.nothing_computed)
 
 
-SCORE = Command(
-    "score", "score what another program detected in an export's images",
-    "sweep/exchange/README.md",
-    (
-        Example(
-            "sweep score images detections.csv --name mine",
-            "compares them with the truth; writes runs/mine.zarr",
-        ),
-        Example(
-            "sweep score images tags.csv --pixel-center 0.5 --corner-order 'TR TL BL BR' --beside",
-            "in other conventions, and beside the experiment's own detector",
-        ),
-    ),
-    _add_arguments_score, _execute_score,
-)
-
-
 # --------------------------------------------------------------------------------------------------
 # ``sweep plugins``.
 
-def _add_arguments_plugins(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
+@command(
+    "pipelines/plugins/README.md", {
+        "sweep plugins pyapriltags": "imports one, and lists its settings",
+        "sweep plugins check mine:SOLVER": "tries SOLVER of mine.py in this folder"},
+    argument(
         "name", metavar="NAME", nargs="?",
-        help="a plug-in to describe: the name of an installed one, or file:name in this folder; or "
-        "the word check, and the plug-in to try behind it",
-    )
-    parser.add_argument(
-        "tried", metavar="TRIED", nargs="?",
-        help="behind check: a detector or a solver, also opencv or one of our solvers",
-    )
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings",
-        help="check: give a setting of it this TOML value; may be repeated",
-    )
-    parser.add_argument(
+        help="a plug-in to describe: the name of an installed one, or file:name in this folder; "
+        "or the word check, and the plug-in to try behind it"),
+    argument("tried", metavar="TRIED", nargs="?",
+             help="behind check: a detector or a solver, also opencv or one of our solvers"),
+    settings_argument("check: give a setting of it this TOML value"),
+    argument(
         "--dictionary", metavar="DICTIONARY",
         help="check: dictionary of the markers (default: DICT_APRILTAG_36h11, or a detector's "
-        "first)",
-    )
-    parser.add_argument(
+        "first)"),
+    argument(
         "--time-limit", type=float, default=120.0, metavar="S", dest="time_limit_s",
-        help="check: seconds after which one of its steps is taken for endless (default: 120)",
-    )
-    add_json(parser)
-
-
-def _execute_plugins(options: argparse.Namespace) -> int:
+        help="check: seconds after which one of its steps is taken for endless (default: 120)"),
+    JSON)
+def plugins(options: argparse.Namespace) -> int:
+    """List, describe or check detectors and solvers of other packages."""
     if options.name == "check" and options.tried is not None:
         return _check(options)
     if options.tried is not None:
@@ -256,14 +337,3 @@ def _check(options: argparse.Namespace) -> int:
         chosen = shlex.quote(f'{key}="{report.name}"')
         say_next(f"sweep run PIPELINE --set {chosen}", "measures it on your scenes")
     return 0 if report.conforms else 1
-
-
-PLUGINS = Command(
-    "plugins", "list, describe or check detectors and solvers of other packages",
-    "pipelines/plugins/README.md",
-    (
-        Example("sweep plugins pyapriltags", "imports one, and lists its settings"),
-        Example("sweep plugins check mine:SOLVER", "tries SOLVER of mine.py in this folder"),
-    ),
-    _add_arguments_plugins, _execute_plugins,
-)

@@ -3,28 +3,41 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import xarray as xr
 
+from sweep.analysis.limits import requirement_limits
+from sweep.analysis.requirements import (
+    Decision,
+    Verdict,
+    check_requirements,
+    combined,
+    described,
+    verdicts,
+)
 from sweep.errors import DatasetError, StoreError
 from sweep.plan.experiment import shows_boards, target_word
 from sweep.report.comparison import Comparison, comparison, target_axes
+from sweep.report.decisions import WORDS, condition_table, decision_table, valued
 from sweep.report.error_model_file import error_model_tables
 from sweep.report.figure import sentences, values_with_ends
-from sweep.report.formatting import interval_text, number
-from sweep.report.limit_figure import as_json as limits_as_json
-from sweep.report.report_data import CONFIGURATION, ReportData, configurations
-from sweep.report.required import Required, required
-from sweep.report.scene_figures import (
+from sweep.report.figures import (
     board_tables,
     errors_table,
+    precision_tables,
     signed_errors_table,
     size_errors_table,
 )
-from sweep.report.table import Table
+from sweep.report.formatting import interval_text, number
+from sweep.report.limit_figure import as_json as limits_as_json
+from sweep.report.limit_figure import interval_text as limit_interval
+from sweep.report.limit_figure import limit_table, limit_text, values_met
+from sweep.report.report_data import CONFIGURATION, ReportData, configurations, course_of
+from sweep.report.table import Table, each_cell
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,25 +121,134 @@ def answer(data: ReportData) -> Answer:
         k for k, each in enumerate(known.settings.combinations)
         if each.items() <= compared.indices[compared.best].items())
     one = compared.summary.isel({CONFIGURATION: compared.best})
-    tiles = (
-        _share_tile("detected", one, "detection_rate"),
-        _share_tile("solved", one, "solved_rate"),
-        _error_tile("rotation error, median", one, "rotation_median_deg", "\u00b0"),
-        _error_tile("rotation error, RMSE", one, "rotation_rmse_deg", "\u00b0"),
-        _error_tile("range error, RMSE", one, "range_rmse_percent", " %"),
-        _error_tile("range bias", one, "range_bias_percent", " %"),
-        _share_tile("flips", one, "flip_rate", "solved"),
-    )
+    tiles = tuple(_tile(one, heading, *card) for heading, card in CARDS.items())
     name = compared.names[compared.best] if compared.several else ""
     return Answer(
         _headline(data, decided, compared, one), _notes(data), name, tiles,
         (*(decided.tables if decided is not None else ()), compared.table()),
         (*(decided.details if decided is not None else ()), *size_errors_table(data, best),
          *board_tables(data), errors_table(one, name), signed_errors_table(data),
-         *error_model_tables(data)),
+         *precision_tables(data), *error_model_tables(data)),
         _numbers(decided, compared),
     )
 
+
+# --------------------------------------------------------------------------------------------------
+# What is required of a report's store: the decision, how far it holds, with which configuration.
+
+ORDER = (Decision.met, Decision.undecided, Decision.not_applicable, Decision.not_met)
+"""Decisions, the best first."""
+
+
+@dataclass(frozen=True, eq=False)
+class Required:
+    """The decisions on all requirements.
+
+    Attributes
+    ----------
+    line
+        The answer in one line.
+    tables
+        How far, and the decisions, by configuration.
+    details
+        The decisions at each condition, of the configuration that is named.
+    best
+        Number of the configuration that is named.
+    decision
+        Its decision on all requirements at all conditions.
+    verdicts
+        As `sweep require` prints them, of all configurations.
+    limits
+        As `sweep limit` prints them, at all conditions together; None without an axis.
+    """
+
+    line: str
+    tables: tuple[Table, ...]
+    details: tuple[Table, ...]
+    best: int
+    decision: Decision
+    verdicts: tuple[Verdict, ...]
+    limits: xr.Dataset | None
+
+
+def required(data: ReportData) -> Required:
+    """Return the decisions on what is required of a store.
+
+    The configuration that is named meets all requirements, or else follows them farthest along the
+    axis of the conditions; of equals it is the one that the comparison on the same images names.
+
+    Raises
+    ------
+    ArgumentError, DatasetError
+        As `sweep.analysis.check_requirements`.
+    """
+    known = configurations(data)
+    axes = known.settings.axes
+    results = data.results.isel({name: list(some) for name, some in axes.items()})
+    table = data.once("required", lambda: check_requirements(results, data.require, data.per))
+    positions = [{name: axes[name].index(index) for name, index in each.items()}
+                 for each in known.settings.combinations]
+    found = [verdicts(table.isel({name: [k] for name, k in at.items()})) for at in positions]
+    decisions = [combined(each) for each in found]
+    along, others = course_of(data, data.per)
+    # At all other conditions together, and at each of them.
+    courses = [((), others), *([(others, ())] if others else [])] if along else []
+    limits = [
+        data.once(("limits", per), partial(
+            requirement_limits, results, data.require, str(along), per=per, at_all=at_all))
+        for per, at_all in courses]
+
+    def rank(k: int) -> tuple[object, ...]:
+        return (bool(known.wrong[k]), ORDER.index(decisions[k]),
+                *(-values_met(part.isel(positions[k])) for part in limits))
+
+    first = min(map(rank, range(len(known.names))))
+    equal = [k for k in range(len(known.names)) if rank(k) == first]
+    best = comparison(data, tuple(equal)).best if len(equal) > 1 else equal[0]
+    whose = f", with {known.names[best]}" if len(known.names) > 1 else ""
+    line = f"{' and '.join(data.require)}: {_decided(found[best], decisions[best])}"
+    if limits:
+        line += _reached([part.isel(positions[best]) for part in limits], others)
+    flat = tuple(each for part in found for each in part)
+    return Required(
+        f"{line}{whose}.", (*map(limit_table, limits), decision_table(flat)),
+        (condition_table(found[best], table, every=True),), best, decisions[best], flat,
+        limits[0] if limits else None)
+
+
+def _decided(found: Sequence[Verdict], decision: Decision) -> str:
+    """Return the decision, at how many conditions, and the value that decides a single one."""
+    one = next((each for each in found if each.decision is decision), found[0])
+    words = WORDS[decision]
+    if one.conditions > 1:
+        count = one.counts.get(one.decision, 0)
+        words += " at all " if decision is Decision.met else f" at {count:,} of "
+        words += f"{one.conditions:,} conditions"
+    elif one.decision is not Decision.not_applicable:
+        words += f" ({valued(one.value, one.low, one.high, one.units)})"
+    if math.isinf(one.draws_needed):
+        words += "; no number of draws would tell"
+    elif math.isfinite(one.draws_needed):
+        words += f"; {one.draws:,} draws, about {one.draws_needed:,.0f} would tell"
+    return words
+
+
+def _reached(limits: Sequence[xr.Dataset], others: Sequence[str]) -> str:
+    """Return how far along the axis: at all conditions, else at the one that reaches farthest."""
+    def met(one: xr.Dataset) -> str:
+        return limit_text(one) + (f" ({limit_interval(one)})" if values_met(one) else "")
+
+    one, *by_condition = limits
+    together = f" at all values of {', '.join(others)}" if others else ""
+    line = f"; along {one.attrs['along']}{together}: {met(one)}"
+    if not by_condition or values_met(one):
+        return line
+    at, farthest = max(each_cell(by_condition[0], others), key=lambda cell: values_met(cell[1]))
+    return f"{line}; at {described(at)}: {met(farthest)}" if values_met(farthest) else line
+
+
+# --------------------------------------------------------------------------------------------------
+# The line, the notes, and the numbers in the cards.
 
 def _headline(
     data: ReportData, decided: Required | None, compared: Comparison, one: xr.Dataset
@@ -139,12 +261,11 @@ def _headline(
         return decided.line
     if compared.line:
         return f"{compared.line}."
+    detected, median, rmse = (_tile(one, heading, *CARDS[heading]) for heading in (
+        "detected", "rotation error, median", "range error, RMSE"))
     errors = "".join(
         f"; {tile.heading} {tile.value}{f' ({tile.detail})' if tile.detail else ''}"
-        for tile in (_error_tile("rotation error, median", one, "rotation_median_deg", "\u00b0"),
-                     _error_tile("range error, RMSE", one, "range_rmse_percent", " %"))
-        if math.isfinite(float(one["solved_rate"])) and float(one["solved_rate"]))
-    detected = _share_tile("detected", one, "detection_rate")
+        for tile in (median, rmse) if float(one["solved_rate"]) > 0)
     return f"Detected in {detected.value} ({detected.detail}){errors}."
 
 
@@ -168,23 +289,29 @@ def _numbers(decided: Required | None, compared: Comparison) -> dict[str, Any]:
     return numbers
 
 
-def _share_tile(
-    heading: str, summary: xr.Dataset, name: str, counted: str = "looked_for"
-) -> Tile:
-    value, low, high = (float(end) for end in values_with_ends(summary, name, 100))
-    interval = f"{interval_text(low, high, ' %')}, " if math.isfinite(low) else ""
-    count = int(summary[counted])
-    return Tile(heading, "\u2013" if math.isnan(value) else f"{number(value)} %",
-                f"{interval}of {count:,} {counted.replace('_', ' ')}",
-                {"value": value, "low": low, "high": high, "unit": "%", counted: count})
+CARDS = {
+    "detected": ("detection_rate", " %", "looked_for"),
+    "solved": ("solved_rate", " %", "looked_for"),
+    "rotation error, median": ("rotation_median_deg", "\u00b0"),
+    "rotation error, RMSE": ("rotation_rmse_deg", "\u00b0"),
+    "range error, RMSE": ("range_rmse_percent", " %"),
+    "range bias": ("range_bias_percent", " %"),
+    "flips": ("flip_rate", " %", "solved"),
+}
+"""Heading -> variable, unit, and of a share what it is of."""
 
 
-def _error_tile(heading: str, summary: xr.Dataset, name: str, unit: str) -> Tile:
-    value, low, high = (float(end) for end in values_with_ends(summary, name))
-    numbers = {"value": value, "low": low, "high": high, "unit": unit.strip()}
+def _tile(one: xr.Dataset, heading: str, name: str, unit: str, counted: str = "") -> Tile:
+    ends = values_with_ends(one, name, 100 if counted else 1)
+    value, low, high = (float(end) for end in ends)
+    numbers: dict[str, Any] = {
+        "value": value, "low": low, "high": high, "unit": unit.strip()}
     if math.isinf(value):
         return Tile(heading, "\u221e", "more than half not solved", numbers)
-    text = f"{number(value)}{unit}" if math.isfinite(value) else "\u2013"
     known = math.isfinite(low) and not math.isnan(high)
-    return Tile(heading, text, interval_text(low, high, unit) if known else "",
-                numbers)
+    details = [interval_text(low, high, unit)] if known else []
+    if counted:
+        numbers[counted] = int(one[counted])
+        details.append(f"of {int(one[counted]):,} {counted.replace('_', ' ')}")
+    text = "\u2013" if math.isnan(value) else f"{number(value)}{unit}"
+    return Tile(heading, text, ", ".join(details), numbers)

@@ -22,6 +22,7 @@ from matplotlib.transforms import offset_copy
 from numpy.typing import NDArray
 
 from sweep.report.formatting import brief_number, coordinates, shortened
+from sweep.report.output_file import write_output_file
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
@@ -121,6 +122,11 @@ def grow_by_factors(values: Floats) -> bool:
     """Return whether distinct positive values lie more evenly on a logarithmic scale."""
     steps, factors = (np.diff(each) for each in (np.unique(values), np.log(np.unique(values))))
     return bool(np.std(factors) / np.mean(factors) <= np.std(steps) / np.mean(steps))
+
+
+def is_logarithmic(values: Floats) -> bool:
+    """Return whether the values of an axis are drawn on a logarithmic scale."""
+    return spans(values, 5) and bool((values > 0).all()) and grow_by_factors(values)
 
 
 def value_limits(values: Floats, *, logarithmic: bool, margin: float) -> tuple[float, float]:
@@ -281,10 +287,9 @@ def panel_svg(panel: Panel, prefix: str) -> Markup:
         return inline_svg(_svg(figure), panel.alt, prefix)
 
 
-def write_panels(panels: Sequence[Panel], stem: Path) -> None:
-    """Write a figure of all panels as ``stem``.svg and ``stem``.png."""
-    for suffix in (".svg", ".png"):
-        stem.with_suffix(suffix).write_bytes(panels_file(panels, suffix))
+def write_figure(panels: Sequence[Panel], path: Path) -> None:
+    """Write a figure of all panels into a file that a user asked for: PNG or SVG."""
+    write_output_file(path, panels_file(panels, path.suffix.lower()))
 
 
 def panels_file(panels: Sequence[Panel], suffix: str) -> bytes:
@@ -328,26 +333,17 @@ def _svg(figure: Figure) -> str:
     return encoded.getvalue()
 
 
-def inline_svg(svg: str, alt: str, prefix: str, *, clipped: bool = False) -> Markup:
+def inline_svg(svg: str, alt: str, prefix: str) -> Markup:
     """Return matplotlib's SVG as a self-contained part of a page.
 
-    Parameters
-    ----------
-    svg
-        What matplotlib wrote.
-    alt
-        The drawing in words.
-    prefix
-        Makes its identifiers unique on the page.
-    clipped
-        Whether parts that leave their axes must be cut off there; clip paths are large.
+    ``alt`` is the drawing in words; ``prefix`` makes its identifiers unique on the page.
     """
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>|<!--.*?-->", "", svg, flags=re.DOTALL)
     svg = svg.replace("xlink:href", "href")
-    if not clipped:
-        svg = re.sub(r'\s*clip-path="url\(#[^"]*\)"', "", svg)
-        svg = re.sub(r"<defs>\s*<clipPath.*?</defs>", "", svg, flags=re.DOTALL)
+    # Nothing leaves its axes, and clip paths are large.
+    svg = re.sub(r'\s*clip-path="url\(#[^"]*\)"', "", svg)
+    svg = re.sub(r"<defs>\s*<clipPath.*?</defs>", "", svg, flags=re.DOTALL)
     svg = _with_theme(_with_prefix(svg, prefix))
     # Hundredths of a point are enough.
     svg = re.sub(
@@ -404,7 +400,7 @@ MAX_OWN_TICKS = 7
 
 def draw_lines(
     axes: Axes, series: Sequence[Series], labels: tuple[str, str], *, share: bool = False,
-    level: float | None = None,
+    level: float | None = None, linear: bool = False,
 ) -> None:
     """Draw lines with their intervals; infinite values stand at the upper edge.
 
@@ -418,9 +414,11 @@ def draw_lines(
         Whether y is a share, drawn from 0 to 100 %.
     level
         y of a dashed line, such as the 0 of signed errors.
+    linear
+        Whether x is linear in any case.
     """
     x = np.concatenate([line.x for line in series])
-    logarithmic_x = spans(x, 5) and bool((x > 0).all()) and grow_by_factors(x)
+    logarithmic_x = not linear and is_logarithmic(x)
     axes.set_xscale("log" if logarithmic_x else "linear")
     axes.set_xlim(*value_limits(x, logarithmic=logarithmic_x, margin=0.05))
     logarithmic_y, (bottom, top) = value_scale(series, share=share, level=level)
@@ -550,13 +548,12 @@ def draw_map(
     scale if they span a wide range. NaN is a dash. Maps of many columns have a colour bar in place
     of the numbers.
     """
-    shown, norm = (
-        100 * values if share else values, colour_scale(values, share=share))
+    norm = colour_scale(values, share=share)
     colours = mpl.colormaps["viridis" if share else "cividis_r"]
-    finite = np.ma.masked_invalid(shown)
+    finite = np.ma.masked_invalid(values)
     mesh = axes.pcolormesh(finite, cmap=colours, norm=norm, edgecolors=PAPER, linewidth=0.8)
     few = len(columns) <= NUMBERED_COLUMNS
-    for (row, column), value in np.ndenumerate(shown):
+    for (row, column), value in np.ndenumerate(values):
         if few or not np.isfinite(value):
             text = f"{value:.0f}" if share and np.isfinite(value) else brief_number(value)
             axes.text(
@@ -583,6 +580,66 @@ def draw_map(
             bar.ax.yaxis.set_minor_locator(NullLocator())
             values_at = np.geomspace(*colour_ends(norm), 4)
             bar.set_ticks(list(values_at), labels=[brief_number(value) for value in values_at])
+
+
+def draw_points(
+    axes: Axes, names: Sequence[str], x: Series, y: Series, labels: tuple[str, str], *,
+    marked: NDArray[np.bool_], level: float | None = None, limit: float | None = None,
+) -> None:
+    """Draw numbered points with intervals along both axes, which are logarithmic.
+
+    Parameters
+    ----------
+    names
+        (n,) of the points, which are numbered from 1.
+    x, y
+        (n,) values; points whose y is infinite or NaN stand open at the upper edge.
+    labels
+        Of the x and the y axis.
+    marked
+        (n,) points that are filled, named, and joined by steps, such as a Pareto front.
+    level
+        y of a dashed line.
+    limit
+        x of a dotted line, beyond which the panel is shaded.
+    """
+    known = [values[np.isfinite(values) & (values > 0)] for values in (
+        x.y, np.append(y.y, np.nan if level is None else level))]
+    (left, right), (bottom, top) = (
+        value_limits(values, logarithmic=True, margin=0.15) if values.size else (0.1, 1.0)
+        for values in known)
+    axes.set(xscale="log", yscale="log", xlim=(left, right), ylim=(bottom, top))
+    if not known[1].size:
+        _note_nothing_finite(axes)
+    for k in np.flatnonzero(np.isfinite(x.y) & (x.y > 0)).tolist():
+        finite = bool(np.isfinite(y.y[k]) and y.y[k] > 0)
+        at, colour = (y.y[k] if finite else top), COLOURS[k % len(COLOURS)]
+        axes.plot(x.y[k], at, SHAPES[k % len(SHAPES)], color=colour, clip_on=finite,
+                  markersize=7 if marked[k] else 5, zorder=3 + marked[k],
+                  markerfacecolor=colour if marked[k] else PAPER)
+        for line, draw in ((x, axes.hlines), (y, axes.vlines)):
+            ends = clipped_intervals(line, (left, right) if line is x else (bottom, top))
+            if finite and np.isfinite(line.low[k]) and np.isfinite(line.high[k]):
+                draw(at if line is x else x.y[k], ends[0][k], ends[1][k], color=colour,
+                     linewidth=0.9, alpha=0.6, zorder=2)
+        axes.annotate(f"{k + 1} {names[k]}" if marked[k] else f"{k + 1}", (x.y[k], at),
+                      (5, 4 if k % 2 else -11), textcoords="offset points", fontsize=8,
+                      color=INK if marked[k] else FAINT)
+    front = np.flatnonzero(marked)[np.argsort(x.y[marked])]
+    if front.size:
+        axes.step([*x.y[front], right], [*y.y[front], y.y[front[-1]]], where="post", color=FAINT,
+                  linewidth=1.1, zorder=1.5)
+    if level is not None:
+        axes.axhline(level, color=INK, linewidth=0.9, linestyle=REFERENCE_DASHES, zorder=1.5)
+    if limit is not None and left < limit < right:
+        axes.axvspan(limit, right, color=STRIP, linewidth=0, zorder=0.5)
+        axes.axvline(limit, color=COLOURS[1], linewidth=1.3, linestyle=DASHES[2], zorder=1.6)
+    for axis in (axes.xaxis, axes.yaxis):
+        plain_ticks(axis, logarithmic=True)
+    axes.grid(visible=True)
+    _exclude_from_layout(axes)
+    axes.set_xlabel(labels[0])
+    axes.set_ylabel(labels[1])
 
 
 def draw_stack(
@@ -626,17 +683,12 @@ def _outcome_style(outcome: str, outcomes: Sequence[str]) -> tuple[str, str | No
     return COLOURS[others.index(outcome) % len(COLOURS)], "////"
 
 
-def legend_above(
-    axes: Axes, labels: Sequence[str] = (), *, columns: int = 0, handles: Any = None
-) -> None:
-    """Put the legend above the axes, in ``columns`` or in as few lines as the labels need."""
-    if not columns:
-        widest = max(map(len, labels)) + 6
-        columns = max(1, min(len(labels), LINE_WIDTH_CHARS // widest))
+def legend_above(axes: Axes, labels: Sequence[str]) -> None:
+    """Put the legend above the axes, in as few lines as the labels need."""
+    columns = max(1, min(len(labels), LINE_WIDTH_CHARS // (max(map(len, labels)) + 6)))
     axes.legend(
         loc="lower left", bbox_to_anchor=(-0.02, 1.02), ncols=columns, borderaxespad=0,
         handlelength=2.2, columnspacing=1.1, handletextpad=0.5, labelspacing=0.25, borderpad=0.2,
-        **({} if handles is None else {"handles": handles}),
     )
 
 

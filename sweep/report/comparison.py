@@ -24,12 +24,12 @@ from sweep.report.report_data import (
     is_numeric,
     settings_of,
 )
-from sweep.report.table import Table, column_texts
+from sweep.report.table import Columns, Table, column_texts
 
 MIN_FLIPPED = 10
 """Poses flipped in one of two configurations alone from which an RMSE with flips is compared."""
 
-COLUMNS = {
+COLUMNS: Columns = {
     "n": ("looked_for", 1.0),
     "detected, %": ("detection_rate", 100.0),
     "solved, %": ("solved_rate", 100.0),
@@ -230,7 +230,7 @@ def comparison(data: ReportData, among: Sequence[int] | None = None) -> Comparis
         Numbers of `configurations` of which one may be the best, as those that reach as far in
         what is required; by default all. Targets are then pooled as there.
     """
-    return data.remembered(f"comparison {among}", lambda: _comparison(data, among))
+    return data.once(f"comparison {among}", lambda: _comparison(data, among))
 
 
 def target_axes(data: ReportData) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from sweep.plan.facts import camera_facts
 from sweep.report.formatting import interval_text, number
 from sweep.report.output_file import check_output_file, write_output_file
 from sweep.report.report_data import ReportData
-from sweep.report.table import Table
+from sweep.report.table import Findings, Table
 from sweep.version import __version__
 
 SCHEMA = "sweep-error-model/2"
@@ -244,6 +244,16 @@ def written_error_models(data: ReportData, paths: Sequence[str]) -> xr.Dataset:
     for path in paths:
         write_output_file(Path(path), content)
     return models
+
+
+def model_findings(data: ReportData, paths: Sequence[str]) -> Findings:
+    """Write the error models of a store into files; return their table and warnings."""
+    models = written_error_models(data, paths)
+    return Findings(
+        [error_model_table(models),
+         *(f"- {line}" for line in (*exponent_lines(models), *warnings_of(models)))],
+        document(models, facts_of(data)), models, 0,
+        (f"look at {', '.join(paths)}", "sigma and bias anywhere in the store's domain"))
 
 
 def models_of(data: ReportData) -> xr.Dataset:

@@ -1,22 +1,34 @@
-"""Figures of a report: for which stores they are made, their tables, panels, curves."""
+"""Figures of a report as data: an analysis by configuration along axes, and what shows it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from markupsafe import Markup
 
 from sweep.analysis.dataset import of_photographs
 from sweep.analysis.quantiles import IntervalOf
 from sweep.plan.parameters import Stage
-from sweep.report.charts import Panel, Series, draw_dots, draw_lines, draw_map, rows_height
+from sweep.report.charts import (
+    FLOOR_NOTE,
+    Panel,
+    Series,
+    below_floor,
+    draw_dots,
+    draw_lines,
+    draw_map,
+    draw_stack,
+    rows_height,
+)
 from sweep.report.report_data import (
     BOTH,
     CONFIGURATION,
+    MAX_CONFIGURATIONS,
+    MAX_LINES,
     Analysis,
     Grouping,
     ReportData,
@@ -24,18 +36,15 @@ from sweep.report.report_data import (
     by_configuration,
     group_labels,
     is_numeric,
+    most_exact_first,
     settings_of,
-    shown_lines,
-    shown_note,
 )
-from sweep.report.table import Table, table_of
+from sweep.report.table import Columns, Table, table_of
 from sweep.typing import Floats
 
-# --------------------------------------------------------------------------------------------------
-# Columns of rates and errors that several figures' tables share, and the curves of errors.
 
 class Curve(NamedTuple):
-    """A variable of an analysis that is drawn along an axis.
+    """A variable of an analysis that is drawn.
 
     Attributes
     ----------
@@ -44,72 +53,29 @@ class Curve(NamedTuple):
     title, unit
         As they stand on the chart.
     scale
-        What it is multiplied by.
+        Factor by which it is multiplied.
     share
         Whether it is drawn from 0 to 100 %.
-    signed
-        Whether a line is drawn at 0.
+    level
+        Where a dashed line is drawn, such as at 0 for a bias; None for none.
     """
 
     variable: str
     title: str
-    unit: str
+    unit: str = ""
     scale: float = 1.0
     share: bool = False
-    signed: bool = False
+    level: float | None = None
 
+    @property
+    def label(self) -> str:
+        """Title and unit as they stand on an axis."""
+        words = uncapitalised(self.title)
+        return f"{words}, {self.unit}" if self.unit else words
 
-Columns = dict[str, tuple[str, float]]
-"""Heading -> variable of an analysis, and the factor that it is multiplied by."""
-
-LOOKED_FOR: Columns = {"looked for": ("looked_for", 1.0)}
-RATES: Columns = LOOKED_FOR | {"detected, %": ("detection_rate", 100.0)}
-ERRORS: Columns = {
-    "solved, %": ("solved_rate", 100.0),
-    "rotation median, deg": ("rotation_median_deg", 1.0),
-    "rotation p95, deg": ("rotation_p95_deg", 1.0),
-    "rotation RMSE without flips, deg": ("rotation_rmse_unflipped_deg", 1.0),
-    "range median, %": ("range_median_percent", 1.0),
-    "range p95, %": ("range_p95_percent", 1.0),
-    "range RMSE without flips, %": ("range_rmse_unflipped_percent", 1.0),
-    "range bias, %": ("range_bias_percent", 1.0),
-}
-SIGNED_GROUPS = ("range", "camera_frame", "yaw_pitch_roll")
-"""Kinds of errors, as `sweep.analysis.error_statistics` takes them."""
-
-IN_MM, IN_DEG = ("x", "y", "z"), ("yaw", "pitch", "roll")
-SIGNED_COLUMNS: Columns = {"solved": ("solved", 1.0)} | {
-    f"{name} {words}, {unit}": (f"{name}_{statistic}_{stored}", scale)
-    for names, unit, stored, scale in ((IN_MM, "mm", "m", 1000.0), (IN_DEG, "deg", "deg", 1.0))
-    for name in names for words, statistic in (("bias", "bias"), ("SD", "sd"))
-}
-"""Bias and standard deviation along the camera's axes and about the angles."""
-
-DETECTED = Curve("detection_rate", "Detected", "%", 100.0, share=True)
-ERROR_CURVES = (
-    Curve("rotation_median_deg", "Rotation error, median", "deg"),
-    Curve("rotation_p95_deg", "Rotation error, p95", "deg"),
-    Curve("range_median_percent", "Range error, median", "%"),
-    Curve("range_p95_percent", "Range error, p95", "%"),
-)
-RANGE_BIAS = Curve("range_bias_percent", "Range bias", "%", signed=True)
-SIGNED_CURVES = (
-    RANGE_BIAS,
-    *(Curve(f"{name}_bias_m", f"{name} bias", "mm", 1000.0, signed=True) for name in IN_MM),
-    Curve("yaw_bias_deg", "Yaw bias", "deg", signed=True),
-)
-INFINITE_ERRORS = (
-    "In median and p95 a pose that is not solved counts as an infinite error (drawn at the edge); "
-    "an interval that reaches the edge ends beyond all draws."
-)
-"""Sentence of captions."""
-
-
-# --------------------------------------------------------------------------------------------------
-# Figures of a report: for which stores they are made, their tables, panels and captions.
 
 @dataclass(frozen=True, slots=True)
-class RenderedFigure:
+class Figure:
     """A figure of one store.
 
     Attributes
@@ -122,54 +88,16 @@ class RenderedFigure:
         The numbers that it shows.
     panels
         Its drawings.
-    svg
-        Returns one drawing in place of panels as inline SVG; takes a prefix for its identifiers.
-    write
-        Writes that drawing into a file; the suffix of the path is the format.
+    covers
+        Axes that need no figure of their own beside this one.
     """
 
     name: str
     title: str
     caption: str
     table: Table
-    panels: Sequence[Panel] = ()
-    svg: Callable[[str], Markup] | None = None
-    write: Callable[[str], None] | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class FigureKind:
-    """A kind of figure.
-
-    Attributes
-    ----------
-    name
-        Name of its figures.
-    applies
-        Whether a store has such a figure.
-    render
-        Makes the figure of a store to which the kind applies.
-    covers
-        The axes that need no figure of their own if the kind applies.
-    """
-
-    name: str
-    applies: Callable[[ReportData], bool]
-    render: Callable[[ReportData], RenderedFigure]
-    covers: Callable[[ReportData], Sequence[str]] = lambda _: ()
-
-
-def group_positions(summary: xr.Dataset, name: str) -> Floats:
-    """Return the positions (n,) of groups on a numeric axis: values, or the middles of bins.
-
-    The middle of a bin is the geometric mean of its ends if both are positive.
-    """
-    if f"{name}_low" in summary.coords:
-        low, high = (
-            np.asarray(summary[f"{name}_{end}"], dtype=np.float64) for end in ("low", "high")
-        )
-        return np.asarray(np.where(low > 0, np.sqrt(np.abs(low * high)), (low + high) / 2))
-    return np.asarray(summary[name].values, dtype=np.float64)
+    panels: Sequence[Panel]
+    covers: Sequence[str] = ()
 
 
 def values_with_ends(
@@ -185,15 +113,19 @@ def values_with_ends(
     return scale * value, scale * low, scale * high
 
 
+def dots_of(summary: xr.Dataset, name: str, scale: float = 1.0) -> Series:
+    """Return a variable (n,) and its intervals as the dots of n rows."""
+    value, low, high = values_with_ends(summary, name, scale)
+    return Series("", value, value, low, high)
+
+
 def map_panel(
     title: str, rows: Sequence[str], columns: Sequence[str], values: Floats,
     labels: tuple[str, str], *, share: bool = False, upwards: bool = False,
-    most_columns: int = 6, height: float | None = None,
 ) -> Panel:
     """Return a map of values (rows, columns), the first row at the top or, ``upwards``, lowest.
 
-    ``labels`` are those of columns and rows; rows without one are configurations. A map of more
-    columns than ``most_columns`` takes the whole width.
+    ``labels`` are those of columns and rows; rows without one are configurations.
     """
     step = 1 if upwards else -1
     shown = np.asarray(values, dtype=np.float64).reshape(len(rows), -1)[::step]
@@ -201,67 +133,35 @@ def map_panel(
     return Panel(
         title, f"Map of {uncapitalised(title)} over {over}.",
         lambda axes: draw_map(axes, rows[::step], columns, shown, labels, share=share),
-        wide=len(columns) > most_columns,
-        height=rows_height(len(rows)) + 0.5 if height is None else height,
+        wide=len(columns) > WIDE_FROM, height=max(2.6, rows_height(len(rows)) + 0.5),
     )
 
 
-def dots_of(summary: xr.Dataset, name: str, scale: float = 1.0) -> Series:
-    """Return a variable (n,) and its intervals as the dots of n rows."""
-    value, low, high = values_with_ends(summary, name, scale)
-    return Series("", value, value, low, high)
-
-
-def lines_of(
-    summary: xr.Dataset, along: str, name: str, by: str | None, scale: float = 1.0
-) -> list[Series]:
-    """Return a line of ``name`` along an axis for each value of ``by``, without NaN."""
-    x = group_positions(summary, along)
-    order = np.argsort(x)
-    parts = (
-        [(f"{by.removesuffix('_deg')} {label}\u00b0" if by.endswith("_deg") else f"{label}",
-          summary.isel({by: k})) for k, label in enumerate(group_labels(summary, by))]
-        if by is not None else [("", summary)]
-    )
-    lines = []
-    for label, part in parts:
-        value, low, high = values_with_ends(part, name, scale)
-        known = order[~np.isnan(value[order])]
-        lines.append(Series(label, x[known], value[known], low[known], high[known]))
-    return lines
-
-
-def interval_sentence(
-    data: ReportData, summary: xr.Dataset, *names: str, marks: str = "Bars"
-) -> str:
-    """Return a sentence that says what the drawn intervals are, or why there are none."""
-    ends = [summary[f"{name}_{end}"] for name in names for end in ("low", "high")
-            if f"{name}_{end}" in summary]
-    photographs = of_photographs(data.results)
-    if any(bool(np.isfinite(end).any()) for end in ends):
-        drawn = (
-            "photographs, each with all its markers one draw" if photographs
-            else "random draws, conditional on the grid"
-        )
-        return f"{marks} are 95 % intervals over the {drawn}."
-    if photographs:
-        return "No intervals: too few photographs."
-    few = "median_interval" in summary and bool(
-        (summary["median_interval"] == IntervalOf.too_few_draws).any())
-    return "No intervals: too few draws." if few else (
-        "No intervals: nothing was drawn at random.")
-
-
-def denominators(
-    summary: xr.Dataset, name: str = "looked_for", what: str = "poses looked for"
-) -> str:
+def denominators(summary: xr.Dataset, name: str = "looked_for") -> str:
     """Return a sentence with the denominators: ``Each value is of 40 to 200 poses ...``."""
+    what = {"looked_for": "poses looked for", "solved": "solved poses"}[name]
     counts = summary[name].values[summary[name].values > 0]
     if not counts.size:
         return f"No {what}."
     low, high = int(counts.min()), int(counts.max())
     span = f"{low:,}" if low == high else f"{low:,} to {high:,}"
     return f"Each value is of {span} {what}."
+
+
+def interval_sentence(data: ReportData, summary: xr.Dataset) -> str:
+    """Return a sentence that says what intervals are over, or why there are none."""
+    photographs = of_photographs(data.results)
+    ends = [each for name, each in summary.items() if str(name).endswith(("_low", "_high"))]
+    if any(bool(np.isfinite(end).any()) for end in ends):
+        return "Intervals have 95 % and are over the " + (
+            "photographs, each with all its markers one draw." if photographs
+            else "random draws, conditional on the grid.")
+    if photographs:
+        return "No intervals: too few photographs."
+    few = "median_interval" in summary and bool(
+        (summary["median_interval"] == IntervalOf.too_few_draws).any())
+    return "No intervals: too few draws." if few else (
+        "No intervals: nothing was drawn at random.")
 
 
 def uncapitalised(title: str) -> str:
@@ -275,7 +175,7 @@ def sentences(*parts: str) -> str:
 
 
 # --------------------------------------------------------------------------------------------------
-# Rates and errors along one axis, a line for each configuration: none of them is pooled.
+# An analysis by configuration and groups: what lines, rows, maps, bars and tables show.
 
 MAX_BINS, MAX_ROWS = 40, 24
 """Groups of a numeric axis, and of any other."""
@@ -283,136 +183,208 @@ MAX_BINS, MAX_ROWS = 40, 24
 MAX_ANGLES, MAX_ANGLE_PANELS = 6, 2
 """Angles that are lines of one configuration, and panels of several."""
 
+MAX_MAPPED = 3
+"""Configurations that have a map, or bars, of their own."""
+
 WIDE_FROM = 8
-"""A figure of one panel takes the whole width if it has more groups."""
+"""A panel alone, or a map, takes the whole width if it has more groups along x."""
 
 
 @dataclass(frozen=True, eq=False)
-class Curves:
-    """An analysis along an axis.
+class Grouped:
+    """An analysis by configuration and groups of poses. No configuration is pooled.
 
     Attributes
     ----------
     data
         The store.
-    along
-        The axis, the area, or a drawn parameter.
-    by
-        The axis of angles that are told apart, or None.
     settings
         The configurations.
     summary
-        The analysis (configuration, by, along).
+        The analysis (configuration, *dims).
+    dims
+        Dimensions of the groups; the last one is along x.
     notes
         Sentences for the reader on bins and chosen values.
     """
 
     data: ReportData
-    along: str
-    by: str | None
     settings: Settings
     summary: xr.Dataset
+    dims: tuple[str, ...]
     notes: tuple[str, ...]
 
     @property
-    def numeric(self) -> bool:
-        """Whether the axis is one of numbers."""
-        axis = self.data.pipeline.axis(self.along)
-        return axis is None or is_numeric(axis)
+    def names(self) -> list[str]:
+        """The labels of the configurations."""
+        return [str(name) for name in self.summary[CONFIGURATION].values]
 
     @property
     def several(self) -> bool:
         """Whether there is more than one configuration."""
-        return self.summary.sizes[CONFIGURATION] > 1
+        return len(self.names) > 1
 
-    @property
-    def dims(self) -> tuple[str, ...]:
-        """The dimensions that tell rows of a table apart."""
-        return tuple(name for name in (CONFIGURATION, self.by, self.along)
-                     if name and (name != CONFIGURATION or self.several))
+    def shown(self, most: int) -> list[int]:
+        """Return which configurations are drawn: the first in order, as they stand in the grid."""
+        return sorted(most_exact_first(self.data, self.settings)[:most])
+
+    def labels(self, name: str) -> list[str]:
+        """Return the groups of a dimension as text."""
+        return group_labels(self.summary, name)
 
     def panels(self, curves: Sequence[Curve]) -> list[Panel]:
-        """Return the charts of some variables; those of several configurations by angle."""
-        if not self.numeric:
-            return [self._rows(curve) for curve in curves if curve.variable in self.summary]
+        """Return charts of some variables.
+
+        Along a numeric axis they are lines, of several configurations one for each, in a panel for
+        each angle; targets, words, or configurations alone are rows with intervals.
+        """
+        curves = [curve for curve in curves if curve.variable in self.summary]
+        axis = self.data.pipeline.axis(self.dims[-1]) if self.dims else None
+        if not self.dims or (axis is not None and not is_numeric(axis)):
+            return [self._rows(curve) for curve in curves]
+        by = self.dims[0] if len(self.dims) > 1 else None
         parts: list[tuple[str, xr.Dataset, str | None]] = [("", self.summary, CONFIGURATION)]
         if not self.several:
-            parts = [("", self.summary.isel({CONFIGURATION: 0}), self.by)]
-        elif self.by is not None:
-            parts = [
-                (f", {self.by.removesuffix('_deg').replace('_', ' ')} {label}\u00b0",
-                 self.summary.isel({self.by: k}), CONFIGURATION)
-                for k, label in enumerate(group_labels(self.summary, self.by))
-            ]
+            parts = [("", self.summary.isel({CONFIGURATION: 0}), by)]
+        elif by is not None:
+            parts = [(f", {by.removesuffix('_deg').replace('_', ' ')} {label}\u00b0",
+                      self.summary.isel({by: k}), CONFIGURATION)
+                     for k, label in enumerate(self.labels(by))]
         if self.several:
-            shown = shown_lines(self.data, self.settings)
+            shown = self.shown(MAX_LINES)
             parts = [(label, part.isel({CONFIGURATION: shown}), by) for label, part, by in parts]
         alone = len(curves) * len(parts) == 1
-        return [self._lines(curve, *part, alone=alone) for curve in curves for part in parts
-                if curve.variable in self.summary]
+        return [self._lines(curve, *part, alone=alone) for curve in curves for part in parts]
 
     def _lines(
         self, curve: Curve, suffix: str, part: xr.Dataset, by: str | None, *, alone: bool
     ) -> Panel:
-        lines = lines_of(part, self.along, curve.variable, by, curve.scale)
-        label = self.data.label(self.along)
-        quantity = f"{uncapitalised(curve.title)}, {curve.unit}"
+        along = self.dims[-1]
+        x = _positions(part, along)
+        order = np.argsort(x)
+        lines = []
+        for k, label in enumerate([""] if by is None else group_labels(part, by)):
+            one = part if by is None else part.isel({by: k})
+            value, low, high = values_with_ends(one, curve.variable, curve.scale)
+            known = order[~np.isnan(value[order])]
+            name = f"{by.removesuffix('_deg')} {label}\u00b0" if (by or "").endswith("_deg") and (
+                by is not None) else label
+            lines.append(Series(name, x[known], value[known], low[known], high[known]))
+        label = self.data.label(along)
         return Panel(
-            curve.title + suffix,
-            f"Lines of {uncapitalised(curve.title)}{suffix} in {curve.unit} against {label}.",
-            lambda axes: draw_lines(axes, lines, (label, quantity), share=curve.share,
-                                    level=0.0 if curve.signed else None),
-            wide=alone and self.summary.sizes[self.along] > WIDE_FROM,
+            curve.title + suffix, f"Lines of {curve.label}{suffix} against {label}.",
+            lambda axes: draw_lines(
+                axes, lines, (label, curve.label), share=curve.share, level=curve.level),
+            wide=alone and len(x) > WIDE_FROM,
         )
 
     def _rows(self, curve: Curve) -> Panel:
-        """Return the chart of an axis of words: a row for each value and configuration."""
-        shown = shown_lines(self.data, self.settings)
-        part = self.summary.isel({CONFIGURATION: shown})
-        rows = part.stack(row=[self.along, CONFIGURATION], create_index=False)
-        values = group_labels(self.summary, self.along)
-        names = [f"{value}, {name}" if self.several else value
-                 for value in values for name in part[CONFIGURATION].values.tolist()]
+        part = self.summary.isel(
+            {CONFIGURATION: self.shown(MAX_LINES if self.dims else MAX_CONFIGURATIONS)})
+        rows = part.stack(row=[*self.dims, CONFIGURATION], create_index=False)
+        groups = [group_labels(part, name) for name in self.dims]
+        if self.several or not groups:
+            groups.append([str(name) for name in part[CONFIGURATION].values])
+        names = list(map(", ".join, itertools.product(*groups)))
         dots = dots_of(rows, curve.variable, curve.scale)
-        quantity = f"{uncapitalised(curve.title)}, {curve.unit}"
         return Panel(
-            curve.title, f"Rows of {uncapitalised(curve.title)} in {curve.unit} for each "
-                         f"{self.along}.",
-            lambda axes: draw_dots(axes, names, dots, quantity, share=curve.share,
-                                   level=0.0 if curve.signed else None),
+            curve.title, f"Rows of {curve.label} for each "
+                         f"{self.dims[-1] if self.dims else CONFIGURATION}.",
+            lambda axes: draw_dots(
+                axes, names, dots, curve.label, share=curve.share, level=curve.level),
             height=rows_height(len(names)),
         )
 
+    def maps(self, curve: Curve, *, upwards: bool = True) -> list[Panel]:
+        """Return a map of a variable over two dimensions for each configuration that is shown."""
+        values = curve.scale * self.summary[curve.variable].transpose(
+            CONFIGURATION, *self.dims).values
+        down, across = self.dims
+        return [
+            map_panel(f"{curve.title}, {curve.unit}" + f", {self.names[k]}" * self.several,
+                      self.labels(down), self.labels(across), values[k],
+                      (self.data.label(across), self.data.label(down)), share=curve.share,
+                      upwards=upwards)
+            for k in self.shown(MAX_MAPPED)
+        ]
+
+    def bars(self, title: str, parts: Mapping[str, str]) -> list[Panel]:
+        """Return stacked bars of shares, name -> variable, for each configuration that is shown."""
+        bars = self.labels(self.dims[-1]) if self.dims else ["all"]
+        label = self.data.label(self.dims[-1]) if self.dims else "all poses"
+
+        def panel(k: int) -> Panel:
+            one = self.summary.isel({CONFIGURATION: k})
+            shares = {name: np.atleast_1d(one[variable].values.astype(np.float64))
+                      for name, variable in parts.items()}
+            whose = f", {self.names[k]}" if self.several else ""
+            return Panel(
+                title + whose,
+                f"Stacked bars of the shares of {', '.join(parts) or 'nothing'}{whose}.",
+                lambda axes: draw_stack(axes, bars, shares, label),
+                wide=len(bars) > WIDE_FROM and not self.several)
+
+        return [panel(k) for k in self.shown(MAX_MAPPED)]
+
     def table(self, caption: str, columns: Columns) -> Table:
-        """Return the table of all configurations."""
-        summary = self.summary if self.several else self.summary.isel({CONFIGURATION: 0})
-        return table_of(summary, caption, self.dims, columns, self.data.results)
+        """Return the table of all configurations, with 95 % intervals."""
+        summary = self.summary if self.several or not self.dims else (
+            self.summary.isel({CONFIGURATION: 0}))
+        named = [CONFIGURATION] if CONFIGURATION in summary.dims else []
+        return table_of(summary, f"{caption}, with 95 % intervals", [*named, *self.dims], columns,
+                        self.data.results)
 
-    def remarks(self, counted: str = "looked_for", what: str = "poses looked for") -> str:
-        """Return sentences on denominators, what is shown, and what is pooled."""
-        count = self.summary.sizes[CONFIGURATION]
-        note = shown_note(shown_lines(self.data, self.settings), count)
+    def caption(self, text: str, curves: Sequence[Curve] = (), counted: str = "looked_for") -> str:
+        """Return ``text`` with what holds of every figure: intervals, counts, what is pooled."""
+        count, lines = len(self.names), MAX_LINES if curves else MAX_MAPPED
+        tiny = any(below_floor(self.summary[curve.variable].values) for curve in curves
+                   if not curve.share and curve.level is None and curve.variable in self.summary)
         return sentences(
-            denominators(self.summary, counted, what), note, *self.notes,
-            self.data.pooled(self.along, *self.dims))
+            text, FLOOR_NOTE if tiny else "", interval_sentence(self.data, self.summary),
+            denominators(self.summary, counted) if counted in self.summary else "",
+            f"Drawn are the {lines} of {count:,} configurations with the smallest median rotation "
+            "error; the table has all." if self.dims and count > lines else "",
+            *self.notes, self.data.pooled(*self.dims))
 
 
-def curves_of(
-    data: ReportData, analysis: Analysis, along: str, stages: Sequence[Stage] = BOTH, *,
-    angles: bool = True,
-) -> Curves:
-    """Return an analysis along an axis by configuration and, if ``angles``, by angle.
+def _positions(summary: xr.Dataset, name: str) -> Floats:
+    """Return the positions (n,) of groups on a numeric axis: values, or the middles of bins.
+
+    The middle of a bin is the geometric mean of its ends if both are positive.
+    """
+    if f"{name}_low" in summary.coords:
+        low, high = (
+            np.asarray(summary[f"{name}_{end}"], dtype=np.float64) for end in ("low", "high")
+        )
+        return np.asarray(np.where(low > 0, np.sqrt(np.abs(low * high)), (low + high) / 2))
+    return np.asarray(summary[name].values, dtype=np.float64)
+
+
+def grouped(
+    data: ReportData, analysis: Analysis, groups: Grouping | None = None,
+    stages: Sequence[Stage] = BOTH, without: Sequence[str] = (),
+) -> Grouped:
+    """Return an analysis by configuration and groups.
 
     ``stages`` are those whose settings make a difference: of the detection rate the detector's.
     """
-    settings = settings_of(data, stages, without=(along,))
-    several = len(settings.combinations) > 1
-    axis = data.pipeline.axis(along)
-    groups = data.along(along, MAX_BINS if axis is None or is_numeric(axis) else MAX_ROWS)
-    by = Grouping()
-    if angles and along != data.angle_axis:
-        by = data.by_angle(MAX_ANGLE_PANELS if several else MAX_ANGLES, binned=not several)
-    grouping = settings.grouping + by + groups
+    groups = groups or Grouping()
+    settings = settings_of(data, stages, without)
+    grouping = settings.grouping + groups
     _, summary = by_configuration(
         data.pipeline, data.analysed(analysis, grouping), settings.grouping.dims)
-    return Curves(data, along, by.dims[0] if by.dims else None, settings, summary, grouping.notes)
+    return Grouped(data, settings, summary, groups.dims, grouping.notes)
+
+
+def along_axis(
+    data: ReportData, analysis: Analysis, along: str, stages: Sequence[Stage] = BOTH, *,
+    angles: bool = True,
+) -> Grouped:
+    """Return an analysis along an axis, the area, or a drawn parameter; if ``angles``, by angle."""
+    axis = data.pipeline.axis(along)
+    groups = data.along(along, MAX_BINS if axis is None or is_numeric(axis) else MAX_ROWS)
+    if angles and data.angle_axis and along != data.angle_axis:
+        several = len(settings_of(data, stages, (along,)).combinations) > 1
+        groups = data.by_angle(
+            MAX_ANGLE_PANELS if several else MAX_ANGLES, binned=not several) + groups
+    return grouped(data, analysis, groups, stages, (along,))

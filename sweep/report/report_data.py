@@ -17,7 +17,12 @@ from numpy.typing import NDArray
 
 from sweep.analysis import error_statistics
 from sweep.analysis.detection_limits import SIZE_AXES
-from sweep.analysis.requirements import conditions, parse_requirements
+from sweep.analysis.requirements import (
+    SIZES_BESIDE,
+    conditions,
+    parse_requirements,
+    usual_conditions,
+)
 from sweep.errors import StoreError, SweepError
 from sweep.evaluation.block import bound_notes
 from sweep.measure.flags import DetectionStatus, uncounted_values
@@ -26,7 +31,7 @@ from sweep.plan.axes import TRIAL, Axis, Distribution
 from sweep.plan.parameters import WORLD, Stage
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.same_meaning import distinct, used_settings, wrong_configurations
-from sweep.report.formatting import bin_text, coordinates, plural
+from sweep.report.formatting import bin_text, coordinates
 from sweep.store.lifecycle import open_dataset, open_store, unfinished_line
 from sweep.store.outcome import outcome_of_finished
 from sweep.tradeoff.pareto import WRONG, configuration_label
@@ -82,13 +87,13 @@ class Grouping:
         )
 
 
-def area_bins(low: float, high: float) -> Grouping:
+def area_bins(low: float, high: float, count: int) -> Grouping:
     """Return the grouping by bins of the area, of equal ratio, between two areas in px²."""
-    areas = np.geomspace(low, high, AREA_BINS + 1)
+    areas = np.geomspace(low, high, count + 1)
     areas[[0, -1]] = low, np.nextafter(high, np.inf)
     return Grouping(
         bins=((AREA, tuple(areas.tolist())),),
-        notes=(f"Areas are grouped into {AREA_BINS} bins of equal ratio.",),
+        notes=(f"Areas are grouped into {count} bins of equal ratio.",),
     )
 
 
@@ -100,14 +105,6 @@ def drawn_bins(name: str, distribution: Distribution) -> Grouping:
         ends = (distribution.a, float(np.nextafter(distribution.b, np.inf)))
     note = f"The draws of {name} are grouped into {DRAWN_BINS} bins of equal probability."
     return Grouping(bins=((name, (ends[0], *edges.tolist(), ends[1])),), notes=(note,))
-
-
-def equal_bins(name: str, low: float, high: float, width: float) -> Grouping:
-    """Return the grouping by bins of equal width between multiples of it, around two values."""
-    first, last = np.floor(low / width), max(np.ceil(high / width), np.floor(low / width) + 1)
-    edges = width * np.arange(first, last + 1)
-    edges[-1] = max(edges[-1], np.nextafter(high, np.inf))
-    return Grouping(bins=((name, tuple(edges.tolist())),))
 
 
 def bins_of(name: str, values: Floats, most: int) -> Grouping:
@@ -133,7 +130,10 @@ def is_numeric(axis: Axis) -> bool:
 
 def axis_label(results: xr.Dataset, name: str) -> str:
     """Return the name of a coordinate or variable in words, with its unit: ``distance, m``."""
-    names = {AREA: "area of the marker", "side_px": "side of the marker"}
+    names = {
+        AREA: "area of the marker", "side_px": "side of the marker",
+        "frame_u_percent": "from the left, %", "frame_v_percent": "from the top, %",
+    }
     units = str(results[name].attrs.get("units", "")) if name in results.variables else ""
     words = names.get(name, name)
     for ending in ("_deg", "_m", "_px", "_s", "_mm", "_e", "_m_s"):
@@ -218,8 +218,7 @@ class ReportData:
     require: tuple[str, ...] = ()
     per: tuple[str, ...] = ()
     command: str = ""
-    _analyses: dict[Any, xr.Dataset] = field(default_factory=dict, repr=False)
-    _remembered: dict[str, Any] = field(default_factory=dict, repr=False)
+    _made: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         """Give a single pose, which has no axes, the one draw that it is."""
@@ -320,7 +319,7 @@ class ReportData:
             If the axis does not exist.
         """
         if name == AREA:
-            return area_bins(*self.area_range)
+            return area_bins(*self.area_range, min(most, AREA_BINS))
         if name in self.drawn_parameters:
             return drawn_bins(name, self.pipeline.distributions[name])
         axis = self.pipeline.axis(name)
@@ -379,23 +378,40 @@ class ReportData:
         key = (analysis.__name__, grouping.per, grouping.bins, grouping.chosen)
         return self.once(key, compute).transpose(*grouping.dims, ...)
 
-    def remembered(self, key: str, make: Callable[[], T]) -> T:
-        """Return what ``make`` returns; it is called once for each key."""
-        if key not in self._remembered:
-            self._remembered[key] = make()
-        value: T = self._remembered[key]
-        return value
-
-    def once(self, key: Any, compute: Callable[[], xr.Dataset]) -> xr.Dataset:
-        """Return what ``compute`` returns, loaded; it is called once for each key."""
-        if key not in self._analyses:
+    def once(self, key: Any, make: Callable[[], T]) -> T:
+        """Return what ``make`` returns, a dataset loaded; it is called once for each key."""
+        if key not in self._made:
             with store_errors(self.store):
-                self._analyses[key] = compute()
-        return self._analyses[key]
+                made = make()
+                self._made[key] = made.compute() if isinstance(made, xr.Dataset) else made
+        found: T = self._made[key]
+        return found
 
-    def known(self, key: Any) -> xr.Dataset | None:
+    def known(self, key: Any) -> Any:
         """Return what `once` has returned for a key; None if it was not called."""
-        return self._analyses.get(key)
+        return self._made.get(key)
+
+
+def course_of(
+    data: ReportData, per: Sequence[str] | None = None
+) -> tuple[str | None, tuple[str, ...]]:
+    """Return how requirements are followed over conditions, by default the usual ones.
+
+    Returns
+    -------
+    The axis along which a limit is looked for, None if there is none; and the other axes of
+    conditions, those of angles first.
+    """
+    axes = {axis.name: axis for axis in data.pipeline.axes}
+    per = usual_conditions(data.results) if per is None else per
+    conditions = [name for name in per if name not in data.setting_axes]
+    ordered = [name for name in conditions
+               if name in data.scene_axes and is_numeric(axes[name])]
+    ordered.sort(key=lambda name: (
+        name != data.size_axis, name not in SIZES_BESIDE, name in ANGLES))
+    along = ordered[0] if ordered else None
+    others = [name for name in conditions if name != along]
+    return along, tuple(sorted(others, key=lambda name: name not in ANGLES))
 
 
 @contextlib.contextmanager
@@ -559,7 +575,7 @@ class Configurations:
 
 def configurations(data: ReportData) -> Configurations:
     """Return the configurations of a store, in order."""
-    return data.remembered("configurations", lambda: _configurations(data))
+    return data.once("configurations", lambda: _configurations(data))
 
 
 def _configurations(data: ReportData) -> Configurations:
@@ -591,19 +607,6 @@ def most_exact_first(data: ReportData, settings: Settings) -> list[int]:
 
     ranks = [rank_of(each) for each in settings.combinations]
     return sorted(range(len(ranks)), key=lambda k: (ranks[k], k))
-
-
-def shown_lines(data: ReportData, settings: Settings, most: int = MAX_LINES) -> list[int]:
-    """Return which combinations a chart shows: the first in order, as they stand in the grid."""
-    return sorted(most_exact_first(data, settings)[:most])
-
-
-def shown_note(shown: Sequence[int], count: int) -> str:
-    """Return a sentence that says which of the configurations a chart shows, if not all."""
-    if len(shown) == count:
-        return ""
-    return (f"Drawn: the {len(shown):,} of {plural(count, 'configuration')} with the smallest "
-            "median rotation error; the table has all.")
 
 
 def first_detector(data: ReportData) -> tuple[dict[str, int], str]:

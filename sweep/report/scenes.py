@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -18,20 +17,15 @@ from numpy.typing import NDArray
 
 from sweep.errors import SweepError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene
-from sweep.integrity.sample_check import StoredValues, compare, current_pipeline
+from sweep.integrity.sample_check import StoredValues, compare
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, Flipped, uncounted_values
 from sweep.plan.cell_selection import cell, coordinates_text, selection_text
 from sweep.plan.experiment import target_word
-from sweep.plan.grid import Block, scene_axes
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.schema import VARIABLES, Variable, variables_of
-from sweep.processor import processor
 from sweep.report.figure import uncapitalised
 from sweep.report.formatting import coordinate, degrees, number, plural
 from sweep.report.report_data import AREA, ReportData, store_errors
-from sweep.store.blocks import receipts
-from sweep.store.lifecycle import open_store
-from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
 # One scene as a picture, with the truth and the detections drawn on it.
@@ -381,7 +375,7 @@ def _text_scene_values(variable: Variable, value: NDArray[Any]) -> str:
 
 
 # --------------------------------------------------------------------------------------------------
-# One cell of a report's store, and how a recomputation of it differs.
+# One cell of a report's store.
 
 def stored_cell(data: ReportData, index: Mapping[str, int]) -> StoredValues:
     """Return the stored values of the cell at an index along each axis, by variable.
@@ -398,50 +392,8 @@ def stored_cell(data: ReportData, index: Mapping[str, int]) -> StoredValues:
     return {name: np.asarray(cell[name].values) for name in names}
 
 
-def difference_from_store(
-    data: ReportData, recomputed: StoredValues, stored: StoredValues, index: Mapping[str, int]
-) -> str:
-    """Return how recomputed values differ from the stored ones; empty if they agree.
-
-    As in `sweep verify`, every bit must agree if the stored ones were computed by the same
-    versions on a processor with the same features; otherwise they must lie within the tolerances.
-
-    Raises
-    ------
-    StoreError
-        If the store cannot be read.
-    PipelineError
-        If a file of the pipeline is missing.
-    """
-    exact = _computed_alike(data, index)
-    variables = variables_of(data.pipeline)
-    difference = compare(recomputed, stored, variables, same_processor=exact).difference
-    if not difference or exact:
-        return difference
-    return f"{difference}, outside the tolerance for another processor or version"
-
-
-def _computed_alike(data: ReportData, index: Mapping[str, int]) -> bool:
-    """Return whether a cell was computed by these versions, on a processor with these features."""
-    with store_errors(data.store):
-        store = open_store(data.store)
-        corner = tuple(index[axis.name] for axis in scene_axes(store.pipeline))
-        number = store.blocks.number(Block(corner, corner))
-        _, receipt = next(iter(receipts(store, [number])))
-    return tuple(receipt.processors) == (processor(),) and not current_pipeline(store)[1]
-
-
 # --------------------------------------------------------------------------------------------------
 # Example scenes of a store: the best, the median, the worst, a flip, and one of each failure.
-#
-# The store is read a piece at a time; only the best candidate of each kind is kept.
-
-MAX_PIECE = 2_000_000
-"""Results that are read at once."""
-
-BINS = 1200
-MIN_ERROR, MAX_ERROR = 1e-9, 180.0
-"""Degrees; the median is known to one of :data:`BINS` bins between them, 2 % wide."""
 
 MIN_FLIP_DEG = 5.0
 """The rotation error of a flip that is shown exceeds this: others are hardly visible."""
@@ -460,123 +412,54 @@ def _failures() -> Iterator[Flag]:
 FAILURES: tuple[Flag, ...] = tuple(_failures())
 
 
-@dataclass(slots=True)
-class _Candidates:
-    """The best candidate of each kind so far, with its merit and its index."""
-
-    best: dict[str, tuple[float, Index]] = field(default_factory=dict)
-    counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(BINS, dtype=np.int64))
-    members: dict[int, Index] = field(default_factory=dict)
-
-    def offer(self, kind: str, merits: Floats, index: Mapping[str, NDArray[np.intp]]) -> None:
-        """Keep the candidate with the largest of ``merits`` (n,) if it exceeds the kept one's."""
-        if not merits.size:
-            return
-        k = int(np.argmax(merits))
-        if kind not in self.best or merits[k] > self.best[kind][0]:
-            self.best[kind] = float(merits[k]), {d: int(i[k]) for d, i in index.items()}
-
-    def count(self, errors: Floats, index: Mapping[str, NDArray[np.intp]]) -> None:
-        """Add errors (n,), in degrees, to the bins, and keep a member of each bin."""
-        clipped = np.clip(errors, MIN_ERROR, MAX_ERROR)
-        share = np.log(clipped / MIN_ERROR) / math.log(MAX_ERROR / MIN_ERROR)
-        bins, first, counts = np.unique(
-            np.minimum((share * BINS).astype(np.int64), BINS - 1), return_index=True,
-            return_counts=True)
-        self.counts[bins] += counts
-        for bin_number, k in zip(bins.tolist(), first.tolist(), strict=True):
-            self.members.setdefault(bin_number, {d: int(i[k]) for d, i in index.items()})
-
-    def median(self) -> Index | None:
-        """Return the index of an error in the median's bin; None without errors."""
-        total = int(self.counts.sum())
-        if total == 0:
-            return None
-        return self.members[int(np.searchsorted(np.cumsum(self.counts), (total + 1) // 2))]
-
-
 def select_scenes(results: xr.Dataset) -> Iterator[tuple[str, Index]]:
-    """Yield a title and the index along each axis, for each kind of scene that occurs."""
-    candidates = _scan(results)
-    titles = {
-        "best": "best: the smallest rotation error", "worst": "worst: the largest rotation error",
-        "worst_unflipped": "worst without a flip", "flipped": "flipped to the mirrored pose",
+    """Yield a title and the index along each axis, for each kind of scene that occurs.
+
+    Of failures, and of flips, it is the pose with the largest marker: the more surprising.
+    """
+    dims = tuple(str(dim) for dim in results["estimate"].dims)
+
+    def values(name: str) -> NDArray[Any]:
+        column = results[name].reset_coords(drop=True)
+        return np.ravel(column.broadcast_like(results["estimate"]).transpose(*dims).values)
+
+    estimate, detection, area = values("estimate"), values("detection"), values(AREA)
+    error = values("rotation_error_deg").astype(np.float64)
+    area = np.nan_to_num(area, nan=-1.0, posinf=-1.0)
+    solved = (estimate == EstimateStatus.solved) & np.isfinite(error)
+    flipped = values("flipped") == Flipped.flipped
+
+    def first(order: NDArray[np.intp]) -> Index:
+        at = np.unravel_index(order[0], [results.sizes[dim] for dim in dims])
+        return dict(zip(dims, map(int, at), strict=True))
+
+    def largest(mask: NDArray[np.bool_], merit: NDArray[Any]) -> NDArray[np.intp]:
+        """Return the cell of a mask with the largest merit; none without cells."""
+        rows = np.flatnonzero(mask)
+        return rows[[np.argmax(merit[rows])]] if rows.size else rows
+
+    by_error = np.flatnonzero(solved)
+    middle = (by_error.size - 1) // 2
+    by_error = by_error[np.argpartition(error[by_error], middle)] if by_error.size else by_error
+    kinds = {
+        "best: the smallest rotation error": largest(solved, -error),
+        "median rotation error of the solved": by_error[middle : middle + 1],
+        "worst: the largest rotation error": largest(solved, error),
+        "worst without a flip": largest(solved & ~flipped, error),
+        "flipped to the mirrored pose": largest(
+            solved & flipped & (error > MIN_FLIP_DEG), area),
     }
-    if "best" in candidates.best:
-        yield titles.pop("best"), candidates.best["best"][1]
-    median = candidates.median()
-    if median is not None:
-        yield "median rotation error of the solved", median
-    for kind, title in titles.items():
-        if kind in candidates.best:
-            yield title, candidates.best[kind][1]
+    shown = set[str]()
     for flag in FAILURES:
-        if _kind(flag) in candidates.best:
-            meaning = uncapitalised(flag.meaning).removesuffix(".")
-            yield f"{flag.name.replace('_', ' ')}: {meaning}", candidates.best[_kind(flag)][1]
-
-
-def _kind(flag: Flag) -> str:
-    return f"{type(flag).__name__}.{flag.name}"
-
-
-def _scan(results: xr.Dataset) -> _Candidates:
-    candidates = _Candidates()
-    names = ("estimate", "rotation_error_deg", "flipped", "detection", AREA)
-    for offsets, piece in _pieces(results[list(names)].reset_coords(drop=True)):
-        dims = tuple(str(dim) for dim in piece["estimate"].dims)
-        estimate, error, flipped = (piece[name].values for name in names[:3])
-        area = piece[AREA].broadcast_like(piece["estimate"]).transpose(*dims).values
-        area = np.nan_to_num(area, nan=-1.0, posinf=-1.0)
-
-        def indices(
-            mask: NDArray[np.bool_], dims: tuple[str, ...] = dims, offsets: Index = offsets
-        ) -> dict[str, NDArray[np.intp]]:
-            return {
-                dim: indices + offsets[dim]
-                for dim, indices in zip(dims, np.nonzero(mask), strict=True)
-            }
-
-        solved = (estimate == EstimateStatus.solved) & np.isfinite(error)
-        index = indices(solved)
-        errors = error[solved].astype(np.float64)
-        candidates.offer("best", -errors, index)
-        candidates.offer("worst", errors, index)
-        mirrored = flipped == Flipped.flipped
-        unflipped = solved & ~mirrored
-        candidates.offer("worst_unflipped", error[unflipped].astype(np.float64), indices(unflipped))
-        mirrored &= solved & (error > MIN_FLIP_DEG)
-        candidates.offer("flipped", area[mirrored], indices(mirrored))
-        candidates.count(errors, index)
-        detection = piece["detection"].broadcast_like(piece["estimate"]).transpose(*dims).values
-        for flag in FAILURES:
-            flagged = (detection if isinstance(flag, DetectionStatus) else estimate) == flag
-            # The larger the marker, the more surprising the failure.
-            candidates.offer(_kind(flag), area[flagged], indices(flagged))
-    for flag in EstimateStatus:
         # A failure of the detection is flagged in the estimate, too: it is shown once.
-        name = flag.name
-        if name in DetectionStatus.__members__ and _kind(DetectionStatus[name]) in candidates.best:
-            candidates.best.pop(_kind(flag), None)
-    return candidates
-
-
-def _pieces(results: xr.Dataset) -> Iterator[tuple[Index, xr.Dataset]]:
-    """Yield the results in pieces of whole chunks, each with the index of its first cell."""
-    sizes = {str(dim): size for dim, size in results["estimate"].sizes.items()}
-    chunks = {str(dim): edges for dim, edges in results["estimate"].chunksizes.items()}
-    quota = MAX_PIECE
-    cuts: dict[str, list[int]] = {}
-    for dim in reversed(list(sizes)):
-        length = chunks.get(dim, (sizes[dim],))[0]
-        step = min(sizes[dim], max(length, quota // length * length))
-        cuts[dim] = list(range(0, sizes[dim], step))
-        quota = max(1, quota // step)
-        sizes[dim] = step
-    for starts in itertools.product(*(cuts[dim] for dim in sizes)):
-        offsets = dict(zip(sizes, starts, strict=True))
-        box = {dim: slice(start, start + sizes[dim]) for dim, start in offsets.items()}
-        yield offsets, results.isel(box).load()
+        flags = detection if isinstance(flag, DetectionStatus) else estimate
+        if flag.name not in shown and (rows := largest(flags == flag, area)).size:
+            shown.add(flag.name)
+            meaning = uncapitalised(flag.meaning).removesuffix(".")
+            kinds[f"{flag.name.replace('_', ' ')}: {meaning}"] = rows
+    for title, rows in kinds.items():
+        if rows.size:
+            yield title, first(rows)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -648,7 +531,9 @@ def _scene(data: ReportData, index: Index, titles: tuple[str, ...]) -> Scene:
         inspected = inspect_scene(single)
         scene = dataclasses.replace(scene, coordinates=coordinates_text(data.pipeline, single))
         picture = draw_outlines(cut_to_marker(inspected))  # the page has a caption of its own
-        difference = difference_from_store(data, inspected.values, stored, index)
+        # The store may be another machine's: as `sweep verify`, within the tolerances for those.
+        difference = compare(inspected.values, stored, variables_of(data.pipeline),
+                             same_processor=False).difference
     except (SweepError, OSError, ValueError, cv2.error, np.linalg.LinAlgError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         return dataclasses.replace(scene, problem=f"Cannot be drawn on this machine: {reason}")

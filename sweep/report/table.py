@@ -1,9 +1,9 @@
-"""Tables: data frames of texts with headings, units and intervals, and their printers."""
+"""Tables: data frames of texts with units and intervals, and findings, with their printers."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from sweep.messages import columns, plain
+from sweep.messages import columns, plain, to_json
 from sweep.report.formatting import interval_text, number
 from sweep.report.report_data import axis_label, group_labels
 from sweep.tradeoff.pareto import interval
@@ -22,6 +22,9 @@ MAX_ROWS = 300
 
 MAX_WIDTH, GAP = 140, "  "
 """Characters of a line of plain text, and between columns."""
+
+Columns = dict[str, tuple[str, float]]
+"""Heading -> variable of an analysis, and the factor by which it is multiplied."""
 
 MAX_LINE_CHARS = 28
 """Characters of a cell that stand in one line."""
@@ -120,10 +123,63 @@ class Table:
         table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
         return f"{markdown_text(self.full_caption)}\n\n{table}"
 
+    def html(self) -> str:
+        """Return it as an HTML table."""
+        table: str = self.frame.to_html(index=False, border=0, max_rows=MAX_ROWS)
+        return f"<p>{escape(self.full_caption)}</p>{table}"
+
     def as_json(self) -> dict[str, Any]:
         """Return caption, headings and rows, with the minus sign of ASCII."""
         return {"caption": self.caption, "headings": self.headings,
                 "rows": [[cell.replace("\u2212", "-") for cell in row] for row in self.rows]}
+
+
+UNDECIDED = 3
+"""Exit status where draws are too few to tell."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Findings:
+    """The answer to a question, which prints itself as text, Markdown, HTML or JSON.
+
+    Attributes
+    ----------
+    parts
+        Lines and tables, in order; empty tables are not printed.
+    numbers
+        The same as JSON values.
+    data
+        The dataset behind them, or None.
+    status
+        Exit status of the command.
+    then
+        The command to go on with, and what it does.
+    """
+
+    parts: Sequence[Table | str]
+    numbers: Mapping[str, Any]
+    data: xr.Dataset | None = None
+    status: int = 0
+    then: tuple[str, str] = ("", "")
+
+    def __str__(self) -> str:
+        return self._printed(Table.text, str)
+
+    def markdown(self) -> str:
+        """Return it as Markdown."""
+        return self._printed(Table.markdown, markdown_text)
+
+    def _repr_html_(self) -> str:
+        return self._printed(Table.html, lambda line: f"<p>{escape(line)}</p>")
+
+    def _printed(self, table: Callable[[Table], str], line: Callable[[str], str]) -> str:
+        texts = [line(part) if isinstance(part, str) else f"{table(part)}\n"
+                 for part in self.parts if isinstance(part, str) or len(part.frame)]
+        return "\n".join(texts).rstrip("\n")
+
+    def to_json(self) -> str:
+        """Return its numbers as the text of a JSON object."""
+        return to_json(self.numbers)
 
 
 def markdown_text(text: str) -> str:
@@ -142,7 +198,7 @@ def _markdown_cell(text: str) -> str:
 
 def table_of(
     summary: xr.Dataset, caption: str, dims: Sequence[str],
-    wanted: Mapping[str, tuple[str, float]], sources: xr.Dataset | None = None,
+    wanted: Columns, sources: xr.Dataset | None = None,
 ) -> Table:
     """Return a table with a row for each combination of ``dims``.
 
@@ -168,9 +224,16 @@ def table_of(
     return Table.of(caption, [*headings, *texts], rows, stub=len(dims))
 
 
-def column_texts(
-    summary: xr.Dataset, wanted: Mapping[str, tuple[str, float]]
-) -> dict[str, list[str]]:
+def each_cell(
+    dataset: xr.Dataset, dims: Sequence[str]
+) -> Iterator[tuple[dict[str, Any], xr.Dataset]]:
+    """Yield the coordinates along some dimensions, and the part of a dataset, of each cell."""
+    for index in np.ndindex(*(dataset.sizes[dim] for dim in dims)):
+        cell = dataset.isel(dict(zip(dims, index, strict=True)))
+        yield {dim: cell[dim].item() for dim in dims}, cell
+
+
+def column_texts(summary: xr.Dataset, wanted: Columns) -> dict[str, list[str]]:
     """Return the cells of columns by heading, without variables that ``summary`` lacks."""
     return {heading: cells(summary, name, scale)
             for heading, (name, scale) in wanted.items() if name in summary}

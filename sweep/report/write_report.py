@@ -3,40 +3,30 @@
 from __future__ import annotations
 
 import base64
-import contextlib
 import hashlib
 import json
 import os
 import shlex
-import shutil
 import time
-import uuid
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import xarray as xr
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from sweep.analysis.dataset import sampling_text
 from sweep.errors import ArgumentError, StoreError
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import label
-from sweep.plan.axes import TRIAL, Axis
+from sweep.plan.axes import Axis
 from sweep.plan.facts import camera_facts, camera_notes
 from sweep.report.answer import Answer, answer
-from sweep.report.charts import css_variables, panel_svg, write_panels
-from sweep.report.comparison_figures import (
-    AMBIGUITY,
-    BOUND,
-    COMPARED,
-    CONFIGURATIONS,
-    PRECISION,
-    RANKING,
-)
-from sweep.report.figure import FigureKind, RenderedFigure
+from sweep.report.charts import css_variables, panel_svg, panels_file
+from sweep.report.figure import Figure
+from sweep.report.figures import figures_of
 from sweep.report.formatting import coordinates
 from sweep.report.output_file import (
     check_output_file,
@@ -44,16 +34,6 @@ from sweep.report.output_file import (
     write_output_file,
 )
 from sweep.report.report_data import AREA, ReportData, store_errors
-from sweep.report.scene_figures import (
-    BIAS,
-    DETECTION,
-    ERRORS_BY_SIZE,
-    FAILURES,
-    FLIPS,
-    FRAME,
-    MAPS,
-    effect_of,
-)
 from sweep.report.scenes import (
     CHESSBOARD_LEGEND,
     LEGEND,
@@ -63,31 +43,8 @@ from sweep.report.scenes import (
     scenes_of,
 )
 from sweep.report.table import Table, markdown_text
-from sweep.report.tradeoff_figure import TRADE
-from sweep.store.files import write_whole
+from sweep.store.files import check_folder_writable, write_whole
 from sweep.store.locations import enclosing_store, is_remote
-
-# --------------------------------------------------------------------------------------------------
-# The kinds of figures of a report, in the order in which they stand.
-
-KINDS: tuple[FigureKind, ...] = (
-    DETECTION, ERRORS_BY_SIZE, BIAS, CONFIGURATIONS, COMPARED, TRADE, MAPS, FLIPS, AMBIGUITY,
-    FAILURES, FRAME, RANKING, BOUND, PRECISION,
-)
-"""Add a kind of figure here; what no kind covers of axes and draws gets a figure of its effect."""
-
-
-def figure_kinds(data: ReportData) -> Iterator[FigureKind]:
-    """Yield the kinds of figures of a store, such that one shows each axis and drawn parameter."""
-    covered: set[str] = set()
-    for kind in KINDS:
-        if kind.applies(data):
-            covered.update(kind.covers(data))
-            yield kind
-    for name in (*data.scene_axes, *data.setting_axes, *data.drawn_parameters):
-        if name not in covered:
-            yield effect_of(name)
-
 
 # --------------------------------------------------------------------------------------------------
 # Origin of a report's numbers: versions, dates, axes, and the commands that reproduce it.
@@ -178,19 +135,10 @@ def _per(data: ReportData) -> str:
 def _axes(data: ReportData) -> Table | None:
     if not data.pipeline.axes:
         return None
-    rows = [
-        [axis.name, f"{len(axis):,}", _values(axis), axis.unit,
-         _section(axis), _meaning(axis)]
-        for axis in data.pipeline.axes
-    ]
-    return Table.of("Axes of the grid", ["axis", "values", "which", "unit", "of", "meaning"], rows,
-                 words=True)
-
-
-def _section(axis: Axis) -> str:
-    """Return the sections of an axis' parameters."""
-    names = [name for name in axis.columns if name != TRIAL]
-    return ", ".join(dict.fromkeys(axis.parameter(name).section for name in names)) or "draws"
+    rows = [[axis.name, f"{len(axis):,}", _values(axis), axis.unit, _meaning(axis)]
+            for axis in data.pipeline.axes]
+    return Table.of(
+        "Axes of the grid", ["axis", "values", "which", "unit", "meaning"], rows, words=True)
 
 
 def _meaning(axis: Axis) -> str:
@@ -204,136 +152,55 @@ def _meaning(axis: Axis) -> str:
 
 def _values(axis: Axis) -> str:
     """Return an axis' values as text; of many the first three and the last."""
-    if len(axis) <= 7:
-        return ", ".join(_texts(axis.values))
-    texts = _texts([*axis.values[:3], axis.values[-1]])
-    return f"{', '.join(texts[:3])}, \u2026, {texts[-1]}"
-
-
-def _texts(values: Sequence[Any]) -> list[str]:
-    return coordinates([label(v) if isinstance(v, (tuple, str)) else v for v in values])
+    shown = list(axis.values) if len(axis) <= 7 else [*axis.values[:3], axis.values[-1]]
+    texts = coordinates([label(v) if isinstance(v, (tuple, str)) else v for v in shown])
+    return ", ".join([*texts[:-1], *(["\u2026"] if len(axis) > 7 else []), texts[-1]])
 
 
 # --------------------------------------------------------------------------------------------------
-# The report as Markdown, with its figures and scenes as files in a folder beside it.
-
-def write_figure(figure: RenderedFigure, folder: Path) -> None:
-    """Write a figure as NAME.svg and NAME.png into a folder."""
-    if figure.write is not None:
-        for suffix in ("svg", "png"):
-            figure.write(str(folder / f"{figure.name}.{suffix}"))
-    else:
-        write_panels(figure.panels, folder / figure.name)
-
-
-def markdown(
-    title: str, answer: Answer, provenance: Provenance, figures: Sequence[RenderedFigure],
-    scenes: Iterable[Scene], folder: Path, link_folder: str, require: Sequence[str] = (),
-) -> str:
-    """Return the report as Markdown; pictures of scenes are written into ``folder``.
-
-    ``link_folder`` is the name of the folder with figures and pictures in the links of the text.
-    """
-    base = quote(link_folder)
-    parts = [
-        f"# {markdown_text(title)}", f"**{markdown_text(answer.headline)}**",
-        *([f"Required: {markdown_text('; '.join(require))}."] if require else []),
-        markdown_text(answer.paragraph),
-        *(table.markdown() for table in answer.tables),
-        *([f"With {markdown_text(answer.of)}, over the whole grid:"] if answer.of else []),
-        "\n".join(
-            f"- {markdown_text(tile.heading)}: **{markdown_text(tile.value)}**"
-            + (f" ({markdown_text(tile.detail)})" if tile.detail else "")
-            for tile in answer.tiles
-        ),
-    ]
-    parts.append("## Figures")
-    for figure in figures:
-        parts += [
-            f"### {markdown_text(figure.title)}",
-            f"![{markdown_text(figure.title)}]({base}/{quote(figure.name)}.png)",
-            markdown_text(figure.caption),
-            _folded("The numbers", figure.table.markdown()),
-        ]
-    for number, scene in enumerate(scenes):
-        if number == 0:
-            parts.append("## Scenes")
-        parts.append("### " + ", ".join(markdown_text(text.capitalize()) for text in scene.titles))
-        if scene.picture is not None:
-            name = f"scene-{number + 1}.png"
-            (folder / name).write_bytes(scene.picture)
-            parts.append(f"![{markdown_text(scene.alt)}]({base}/{name})")
-        parts += [
-            markdown_text(text) for text in (scene.result, scene.coordinates, scene.problem) if text
-        ]
-        parts.append(_code(scene.command, "sh"))
-    parts += ["## More numbers", *(table.markdown() for table in answer.details)]
-    parts += _origin(provenance)
-    return "\n\n".join(parts) + "\n"
-
-
-def _origin(provenance: Provenance) -> list[str]:
-    """Return the origin of the numbers, and the commands that make them again."""
-    parts = [
-        "## Origin of the numbers",
-        "\n".join(f"- {name}: {markdown_text(text)}" for name, text in provenance.facts.items()),
-        "Commands that reproduce the store and this report:",
-        _code("\n".join(provenance.commands), "sh"),
-        _folded(f"The pipeline, {provenance.file}", _code(provenance.pipeline, "toml")),
-    ]
-    if provenance.axes is not None:
-        parts.append(provenance.axes.markdown())
-    if provenance.drawn:
-        parts.append(f"Drawn in each trial: {markdown_text(provenance.drawn)}.")
-    return parts
-
-
-def _code(text: str, language: str) -> str:
-    fence = "```"
-    while fence in text:
-        fence += "`"
-    return f"{fence}{language}\n{text.rstrip()}\n{fence}"
-
-
-def _folded(summary: str, content: str) -> str:
-    return f"<details><summary>{markdown_text(summary)}</summary>\n\n{content}\n\n</details>"
-
-
-# --------------------------------------------------------------------------------------------------
-# The report as one self-contained HTML page: no network, no script, no other file.
+# The report as one self-contained HTML page (no network, no script, no other file), or as Markdown
+# with its figures and scenes as files in a folder beside it: from the templates beside this module.
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 """Content security policy: a browser refuses and logs every request of the page."""
 
 
 def page(
-    title: str, answer: Answer, provenance: Provenance, figures: Sequence[RenderedFigure],
-    scenes: Iterable[Scene], require: Sequence[str] = (),
+    title: str, answer: Answer, provenance: Provenance, figures: Sequence[Figure],
+    scenes: Sequence[Scene], require: Sequence[str] = (), folder: str = "",
 ) -> str:
-    """Return the report as HTML, from the templates beside this module; all text is escaped."""
-    scenes = list(scenes)
+    """Return the report as HTML; all text is escaped.
+
+    With ``folder``, the name of the folder of figures and scenes, it is Markdown.
+    """
     legend = (*LEGEND, *([CHESSBOARD_LEGEND] if any(scene.chessboard for scene in scenes) else []))
-    return _environment().get_template("page.html").render(
-        policy=POLICY, title=title, answer=answer, provenance=provenance, figures=figures,
-        scenes=scenes, require=require,
-        legend=[(text, css_colour(colour)) for text, colour in legend],
-    )
-
-
-def _environment() -> Environment:
+    html = not folder
     environment = Environment(
-        loader=PackageLoader("sweep.report"), autoescape=True, undefined=StrictUndefined,
-    )
+        loader=PackageLoader("sweep.report"), autoescape=select_autoescape(["html"]),
+        undefined=StrictUndefined, trim_blocks=not html, lstrip_blocks=not html)
     environment.filters |= {
-        "base64": _base64, "panel_svg": panel_svg, "sentence_case": str.capitalize,
+        "base64": _base64, "code": _code, "md": markdown_text, "panel_svg": panel_svg,
+        "quote": quote, "sentence_case": str.capitalize,
     }
     environment.globals["css_variables"] = css_variables
-    return environment
+    text = environment.get_template("page.html" if html else "page.jinja").render(
+        policy=POLICY, title=title, answer=answer, provenance=provenance, figures=figures,
+        scenes=scenes, require=require, base=quote(folder),
+        legend=[(text, css_colour(colour)) for text, colour in legend])
+    return text.rstrip("\n") + "\n"
 
 
 def _base64(content: bytes | str) -> str:
     encoded = content.encode() if isinstance(content, str) else content
     return base64.b64encode(encoded).decode()
+
+
+def _code(text: str, language: str) -> str:
+    """Return text as a fenced block of Markdown."""
+    fence = "```"
+    while fence in text:
+        fence += "`"
+    return f"{fence}{language}\n{text.rstrip()}\n{fence}"
 
 
 # --------------------------------------------------------------------------------------------------
@@ -414,9 +281,7 @@ def _check_folder(wanted: Path) -> None:
     folder = wanted if wanted.is_dir() else Path(os.path.realpath(wanted)).parent
     if not folder.is_dir():
         raise StoreError(f"{wanted}: cannot be written: folder {folder} not found")
-    trial = _temporary_path(folder)
-    trial.mkdir()
-    trial.rmdir()
+    check_folder_writable(folder)
 
 
 def write_report(
@@ -453,38 +318,35 @@ def write_report(
     _check_complete(data)
     title = data.pipeline.heading
     numbers, origin = answer(data), provenance(data, str(output))
-    rendered = [kind.render(data) for kind in figure_kinds(data)]
+    rendered = figures_of(data)
     folder = figures_folder(output) if form == "md" else None
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(write_errors_explained(output))
-        temporary = None
-        if folder is not None or figures is not None:
-            beside = Path(os.path.realpath(folder or figures or output)).parent
-            temporary = stack.enter_context(_temporary_folder(beside))
-            for figure in rendered:
-                write_figure(figure, temporary / "figures")
-        drawn = [] if temporary is None else sorted((temporary / "figures").iterdir())
-        scenes = scenes_of(data)
-        if folder is not None and temporary is not None:
-            text = markdown(
-                title, numbers, origin, rendered, scenes, temporary / "figures", folder.name,
-                data.require,
-            )
-        else:
-            text = page(title, numbers, origin, rendered, scenes, data.require)
-        # Files are moved to their final paths only after all were written.
-        if figures is not None:
-            figures.mkdir(exist_ok=True)
-            for path in drawn:
-                with write_errors_explained(figures / path.name):  # through no link there
-                    write_whole(figures / path.name, path.read_bytes())
-        if folder is not None and temporary is not None:
-            _replace_folder(
-                Path(os.path.realpath(folder)), temporary / "figures", temporary / "old"
-            )
-        # Invalid Unicode, which a file's name may hold, is written as a question mark.
-        write_output_file(output, text.encode("utf-8", errors="replace"))
+    pictures = {
+        f"{figure.name}{suffix}": panels_file(figure.panels, suffix)
+        for figure in rendered for suffix in PICTURES if folder is not None or figures is not None}
+    scenes = list(scenes_of(data))
+    text = page(title, numbers, origin, rendered, scenes, data.require,
+                "" if folder is None else folder.name)
+    # Files are written after all of them were made.
+    if figures is not None:
+        _write_pictures(figures, pictures)
+    if folder is not None:
+        with write_errors_explained(folder):
+            for path in folder.iterdir() if folder.is_dir() else ():
+                path.unlink()
+        _write_pictures(folder, pictures | {
+            f"scene-{number}.png": scene.picture for number, scene in enumerate(scenes, 1)
+            if scene.picture is not None})
+    # Invalid Unicode, which a file's name may hold, is written as a question mark.
+    write_output_file(output, text.encode("utf-8", errors="replace"))
     return len(rendered), numbers
+
+
+def _write_pictures(folder: Path, pictures: Mapping[str, bytes]) -> None:
+    """Write files into a folder, in the place of what has their names, links too."""
+    with write_errors_explained(folder):
+        folder.mkdir(exist_ok=True)
+        for name, content in pictures.items():
+            write_whole(folder / name, content)
 
 
 def _check_complete(data: ReportData) -> None:
@@ -499,30 +361,3 @@ def _check_complete(data: ReportData) -> None:
     if count:
         poses = "1 pose is" if count == 1 else f"{count:,} poses are"
         raise StoreError(f"{data.store}: {poses} missing; {REPAIR}")
-
-
-def _replace_folder(folder: Path, new: Path, old: Path) -> None:
-    """Move ``new`` to ``folder``; an existing folder goes to ``old``, and back on failure."""
-    if folder.exists():
-        folder.rename(old)
-    try:
-        new.rename(folder)
-    except OSError:
-        if old.exists():
-            old.rename(folder)
-        raise
-
-
-@contextlib.contextmanager
-def _temporary_folder(parent: Path) -> Iterator[Path]:
-    """Yield a folder with an empty folder ``figures``, which is removed in the end."""
-    path = _temporary_path(parent)
-    try:
-        (path / "figures").mkdir(parents=True)
-        yield path
-    finally:
-        shutil.rmtree(path, ignore_errors=True)
-
-
-def _temporary_path(folder: Path) -> Path:
-    return folder / f".sweep-{uuid.uuid4().hex}"

@@ -16,7 +16,7 @@ from sweep.analysis.statistic import Output
 from sweep.analysis.summaries import ErrorStatistic
 from sweep.errors import DatasetError
 from sweep.measure.flags import EstimateStatus
-from sweep.report.scene_figures import errors_table
+from sweep.report.figures import errors_table
 
 SIZES = {"marker_id": 2, "tilt_deg": 2, "noise_grey": 2, "trial": 30, "solver": 2}
 RESULTS = mixed(SIZES, 7)

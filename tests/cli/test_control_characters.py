@@ -1,6 +1,5 @@
 """Names and texts of a store steer no terminal, whichever command prints them."""
 
-import contextlib
 import shutil
 
 import pytest
@@ -40,26 +39,6 @@ def folder(tmp_path_factory):
 
 
 LONG = {"plan", "repro", "report", "show", "tradeoff"}
-
-
-@pytest.mark.parametrize("name", ["x\nFORGED", "x\u202e\r"])
-@pytest.mark.parametrize("command", [
-    ["status", "{}.zarr"], ["plan", "{}.toml"], ["plan", "{}/{}.toml"], ["run", "{}"],
-    ["plan", "empty.toml", "--set", "{}=3"], ["plan", "empty.toml", "--set", "solver={}"],
-    ["report", "{}.zarr", "-o", "{}"], ["export", "empty.toml", "{}", "{}"], ["{}"],
-    ["score", "{}", "{}.csv"], ["photos", "{}", "--camera", "{}"], ["plugins", "{}"],
-    ["compare", "{}.zarr", "{}.toml"], ["require", "{}.zarr", "{}"], ["show", "{}"],
-])
-def test_a_name_makes_no_line_of_its_own(command, name, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "empty.toml").write_text("")
-    with contextlib.suppress(SystemExit):
-        assert main([word.format(name, name) for word in command]) == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert said.err
-    assert not [line for line in said.err.split("\n")
-                if line.startswith("FORGED") or not line.isprintable()]
 
 
 @pytest.mark.long

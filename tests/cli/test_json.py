@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import sweep.cli
 from sweep.analysis import calibration_summary
 from sweep.messages import to_json
-from sweep.report.gap_figure import calibration_records
+from sweep.report.comparison_tables import calibration_records
 
 HERE = Path(sweep.cli.__file__).parent
 

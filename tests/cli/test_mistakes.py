@@ -28,6 +28,7 @@ axes = { side_px = [30, 60], solver = ["ippe_square", "iterative"], trial = 2 }
 def stores(tmp_path_factory):
     folder = tmp_path_factory.mktemp("mistakes")
     (folder / "small.toml").write_text(TEXT)
+    (folder / "few.toml").write_text(TEXT.replace(", trial = 2", ""))
     (folder / "pipelines").mkdir()
     (folder / "pipelines/other.toml").write_text(TEXT)
     pipeline = Pipeline.from_toml(folder / "small.toml")
@@ -100,6 +101,11 @@ def test_a_removed_command_or_flag_says_in_one_line_what_to_do_instead(line, ins
          "sweep run small.toml --set trial=5 --store runs/small-2.zarr --reuse runs/small.zarr"),
         ("run small.toml --set 'dictionary=[\"DICT_5X5_50\", \"DICT_4X4_50\"]'",
          "--store runs/small-2.zarr --reuse runs/small.zarr"),
+        ("run small.toml --set trial=5 --store=runs/small.zarr",
+         "sweep run small.toml --set trial=5 --store runs/small-2.zarr --reuse runs/small.zarr"),
+        ("run few.toml --precision 'detection_rate = 0.1'",
+         "--max-trials: expected max_trials, too: the most trials of a condition, such as 2400"),
+        ("limit small.toml --require 'detektion >= 0.1' --along side_px", "limit.require"),
         ("run small.toml --set seed=5", "holds another experiment; choose another store"),
     ],
 )

@@ -7,8 +7,8 @@ import pytest
 from support.stores import by_hand
 from sweep import Pipeline, cli
 from sweep.execution.status import close
+from sweep.report.answer import required
 from sweep.report.report_data import read_report_data
-from sweep.report.required import required
 from sweep.store.lifecycle import create_store
 
 TEXT = """

@@ -23,9 +23,10 @@ from sweep.report.charts import (
     draw_stack,
     value_scale,
 )
-from sweep.report.figure import RenderedFigure, interval_sentence
+from sweep.report.figure import Figure as ReportFigure
+from sweep.report.figure import interval_sentence
 from sweep.report.scenes import FAILURES, Scene
-from sweep.report.table import MAX_ROWS, Table
+from sweep.report.table import MAX_ROWS, Findings, Table
 from sweep.report.write_report import Provenance, page
 
 HOSTILE = "<script>alert('x')</script>\"&{{ 7 * 7 }}"
@@ -36,7 +37,7 @@ def hostile_table():
 
 
 def hostile_page():
-    figure = RenderedFigure(
+    figure = ReportFigure(
         "name", HOSTILE, HOSTILE, hostile_table(),
         [Panel(HOSTILE, HOSTILE, lambda axes: axes.set_xlabel(HOSTILE), wide=True)])
     scenes = [Scene((HOSTILE,), HOSTILE, HOSTILE, HOSTILE, HOSTILE, picture, problem=HOSTILE)
@@ -112,6 +113,11 @@ def test_every_printer_keeps_hostile_text_in_its_cell():
     assert len(lines) == 5
     assert all(line.isprintable() for line in lines)
     assert table.as_json()["rows"][0] == [nasty, "1"]
+    found = Findings([table, nasty, Table.of("none", ["n"], [])], {"share": float("inf")})
+    assert "<i>" not in found._repr_html_() + found.markdown()
+    assert str(found).startswith(table.text())
+    assert "none" not in str(found)
+    assert '"share_flag": "infinite"' in found.to_json()
 
 
 @pytest.mark.parametrize(("values", "scale"), [
@@ -145,6 +151,6 @@ def test_intervals_are_said_to_be_over_what_was_drawn():
         ({"photographs": "shots"}, "over the photographs, each with all its markers one draw."),
     ):
         data = SimpleNamespace(results=xr.Dataset(coords=coordinates))
-        assert interval_sentence(data, summary, "rate") == f"Bars are 95 % intervals {words}"
-        none = interval_sentence(data, summary + np.nan, "rate")
+        assert interval_sentence(data, summary).endswith(words)
+        none = interval_sentence(data, summary + np.nan)
         assert ("photographs" in none) == bool(coordinates)

@@ -1,11 +1,11 @@
-"""The figure of the poses that a wanted precision needed."""
+"""The table of the poses that a wanted precision needed."""
 
 import numpy as np
 import pytest
 import xarray as xr
 
 from sweep.analysis.precision import Reached
-from sweep.report.comparison_figures import _poses_of_conditions, _rows
+from sweep.report.figures import precision_table
 
 
 @pytest.fixture
@@ -22,13 +22,12 @@ def table():
 
 
 def test_each_configuration_has_the_number_of_conditions_by_flag(table):
-    rows = _rows(table.set_coords("wanted"))
+    shown = precision_table(table.set_coords("wanted"))
+    rows = shown.rows
+    assert "3 conditions, which took 50 to 300 poses each" in shown.caption
     assert [row[:2] for row in rows] == [
         ["detection_rate", "ippe"], ["detection_rate", "sqpnp"]]
     assert [row[4:] for row in rows] == [["0", "1", "1", "1", "0"], ["0", "2", "0", "0", "1"]]
     assert len(rows[0]) == 4 + len(Reached)
     assert [row[3] for row in rows] == ["0.0200", "0.0100"]  # the widest of those that are known
 
-
-def test_poses_of_conditions_are_in_increasing_order(table):
-    assert _poses_of_conditions(table).tolist() == [50, 100, 300]

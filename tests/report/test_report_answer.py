@@ -21,9 +21,9 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.pipeline import Pipeline
 from sweep.report import comparison as comparisons
 from sweep.report.answer import answer
+from sweep.report.figures import figures_of
 from sweep.report.formatting import number
 from sweep.report.report_data import ReportData, read_report_data
-from sweep.report.write_report import figure_kinds
 from sweep.store.lifecycle import open_dataset
 
 GUIDE = (Path(__file__).parents[2] / "pipelines" / "README.md").read_text(encoding="utf-8")
@@ -348,7 +348,7 @@ def test_what_cannot_be_required_is_told_in_one_line(arguments, message, small, 
 
 
 def test_every_kind_of_axis_has_a_figure(small):
-    data = read_report_data(small)
-    assert [kind.name for kind in figure_kinds(data)][:3] == ["detection", "errors", "bias"]
+    names = [figure.name for figure in figures_of(read_report_data(small))]
+    assert names[:3] == ["detection", "errors", "bias"]
     beliefs = synthetic(np.ones((4, 2, 2)), believed_focal_scale=[0.99, 1.0, 1.01])
-    assert "effect-believed_focal_scale" in [kind.name for kind in figure_kinds(beliefs)]
+    assert "effect-believed_focal_scale" in [figure.name for figure in figures_of(beliefs)]

@@ -13,7 +13,7 @@ from sweep.errors import PipelineError
 from sweep.execution.runner import execute
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.plan.pipeline import Pipeline
-from sweep.report import answer_tables as size_lines
+from sweep.report import decisions as size_lines
 from sweep.sampling.rules import GroupResults, make_rule
 from sweep.sampling.searches import group_dataset, store_cells
 from sweep.tradeoff import choice_search

@@ -49,7 +49,7 @@ def test_what_is_wrong_is_neither_on_the_front_nor_advised():
     front = mark_front(trade, "rotation_p95_deg")["on_front"].values.tolist()
     assert front == [False, True, False]
     (sentence,) = advice(trade, "rotation_p95_deg")
-    assert "scale 1.0 " in sentence
+    assert sentence.startswith("most accurate scale 1.0: ")
     assert "wrong" not in sentence
     (sentence,) = budget_advice(trade, "rotation_p95_deg", 1.0)
     assert sentence.startswith("within 1 ms a frame take scale 1.0: ")

@@ -1,10 +1,10 @@
-"""Tables of decisions: what is required, and what is chosen, with their JSON."""
+"""Decisions on requirements, and on a choice, as lines, tables and JSON."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from sweep.messages import label, nearest, quoted
 from sweep.plan.cell_selection import parse_selection
 from sweep.plan.draws import REPLICATES
 from sweep.report.formatting import coordinate, interval_text, number, plural
-from sweep.report.table import Table
+from sweep.report.table import Findings, Table
 from sweep.tradeoff.pareto import digits
 
 if TYPE_CHECKING:
@@ -27,16 +27,13 @@ if TYPE_CHECKING:
     from sweep.plan.pipeline import Pipeline
     from sweep.tradeoff.choice_search import Choice
 
-# --------------------------------------------------------------------------------------------------
-# Tables that ``sweep require`` prints: verdicts, comparisons, conditions.
-
-MAX_ROWS = 500
-"""Conditions that JSON lists."""
+WORDS = {Decision.met: "met", Decision.not_met: "not met", Decision.undecided: "not decided",
+         Decision.not_applicable: "nothing to judge"}
 
 UNITS = {"1": "", "percent": " %", "degree": "\u00b0"}
 
-WORDS = {Decision.met: "met", Decision.not_met: "not met", Decision.undecided: "not decided",
-         Decision.not_applicable: "nothing to judge"}
+MAX_ROWS = 500
+"""Conditions that JSON lists."""
 
 
 def selected(results: xr.Dataset, at: Sequence[str], pipeline: Pipeline) -> xr.Dataset:
@@ -72,16 +69,18 @@ def pooled_axes(results: xr.Dataset, per: Sequence[str]) -> list[str]:
     return [name for name in axes_of(results) if name not in named and results.sizes[name] > 1]
 
 
-def failing(
-    each: Verdict, table: xr.Dataset | None, *, every: bool = False
+# --------------------------------------------------------------------------------------------------
+# Requirements: a row for each, with its worst condition, and rows for conditions.
+
+def conditions_of(
+    each: Verdict, table: xr.Dataset, *, every: bool = False
 ) -> list[dict[str, Any]]:
     """Return the conditions at which a requirement is not met, or else undecided; worst first.
 
     ``table`` is that of `sweep.analysis.check_requirements`. Each has its condition, decision,
     value, interval and draws. ``every``: all conditions.
     """
-    decided = each.decision not in (Decision.not_met, Decision.undecided)
-    if table is None or (decided and not every):
+    if not every and each.decision not in (Decision.not_met, Decision.undecided):
         return []
     one = table.isel(requirement=table["requirement"].values.tolist().index(each.requirement))
     one = one.sel({name: value for name, value in each.configuration.items() if name in one.dims})
@@ -98,35 +97,39 @@ def failing(
     return sorted(found, key=lambda row: -sign * np.nan_to_num(row["value"], nan=sign * np.inf))
 
 
-def tables(
-    found: Sequence[Verdict], worse: Sequence[Regression], table: xr.Dataset | None, *,
-    every: bool,
-) -> Iterator[Table]:
-    """Yield tables of verdicts, of comparisons, and of conditions.
+def decision_table(found: Sequence[Verdict]) -> Table:
+    """Return a row for each requirement and configuration, at its worst condition."""
+    return Table.of(
+        "Requirements, with the worst condition",
+        ("", "requirement", "configuration", "value", "condition", "met at", "draws"),
+        [[WORDS[each.decision], each.requirement, described(each.configuration),
+          valued(each.value, each.low, each.high, each.units), described(each.condition),
+          f"{each.counts.get(Decision.met, 0)} of {each.conditions}",
+          needs(each) or f"{each.draws:,}"]
+         for each in found], words=True)
 
-    These are all with ``every``, else those at which a requirement fails, where there are several.
-    """
-    if found:
-        yield Table.of("Requirements, with the worst condition", (
-            "", "requirement", "configuration", "value", "condition", "met at", "draws"), [
-                [WORDS[each.decision], each.requirement, described(each.configuration),
-                 valued(each.value, each.low, each.high, each.units), described(each.condition),
-                 f"{each.counts.get(Decision.met, 0)} of {each.conditions}", needs(each)]
-                for each in found], words=True)
-    if worse:
-        yield Table.of("Compared with the older store pose by pose, new minus old", (
-            "", "quantity", "configuration", "difference", "condition"), [
-                ["worse" if one.worse else "not worse", one.quantity, described(one.configuration),
-                 valued(one.difference, one.low, one.high, one.units), described(one.condition)]
-                for one in worse], words=True)
-    listed = [(each, failing(each, table, every=every)) for each in found]
-    rows = [[WORDS[row["decision"]], each.requirement, described(each.configuration),
-             described(row["condition"]),
-             valued(row["value"], row["low"], row["high"], each.units), f"{row['draws']:,}"]
-            for each, listing in listed for row in listing if every or len(listing) > 1]
-    if rows:
-        yield Table.of("All conditions" if every else "Conditions that fail, the worst first", (
-            "", "requirement", "configuration", "condition", "value", "draws"), rows, words=True)
+
+def condition_table(found: Sequence[Verdict], table: xr.Dataset, *, every: bool) -> Table:
+    """Return all conditions with ``every``, else those at which a requirement fails, if several."""
+    listed = [(each, conditions_of(each, table, every=every)) for each in found]
+    return Table.of(
+        "All conditions" if every else "Conditions that fail, the worst first",
+        ("", "requirement", "configuration", "condition", "value", "draws"),
+        [[WORDS[row["decision"]], each.requirement, described(each.configuration),
+          described(row["condition"]),
+          valued(row["value"], row["low"], row["high"], each.units),
+          f"{np.nan_to_num(row['draws']):,.0f}"]
+         for each, rows in listed for row in rows if every or len(rows) > 1], words=True)
+
+
+def regression_table(worse: Sequence[Regression]) -> Table:
+    """Return how results differ from those of an older store, pose by pose."""
+    return Table.of(
+        "Compared with the older store pose by pose, new minus old",
+        ("", "quantity", "configuration", "difference", "condition"),
+        [["worse" if one.worse else "not worse", one.quantity, described(one.configuration),
+          valued(one.difference, one.low, one.high, one.units), described(one.condition)]
+         for one in worse], words=True)
 
 
 def valued(value: float, low: float, high: float, units: str) -> str:
@@ -248,11 +251,18 @@ def alternatives(choice: Choice) -> Table:
          "why not better" if along else "why not"], rows, stub=len(choice.rule.among), words=True)
 
 
-def poses_line(choice: Choice) -> str:
-    """Return how many poses the search took, and a grid of equally many trials."""
+def choice_findings(choice: Choice) -> Findings:
+    """Return a choice as findings, which print themselves.
+
+    Exit status: 0 there is one, 1 none meets everything, 3 not decided.
+    """
     factor = choice.grid_poses / max(choice.poses, 1)
-    return (f"{choice.poses:,} poses; {choice.most_trials:,} trials of every cell, which the "
-            f"hardest one took, are {choice.grid_poses:,} poses ({factor:.1f} times as many)")
+    return Findings(
+        [alternatives(choice),
+         (f"{choice.poses:,} poses; {choice.most_trials:,} trials of every cell, which the hardest "
+          f"one took, are {choice.grid_poses:,} poses ({factor:.1f} times as many)")],
+        as_json(choice), None, {Decision.met: 0, Decision.undecided: 3}.get(choice.decision, 1),
+        (f"sweep report {quoted(choice.store)}", ""))
 
 
 def as_json(choice: Choice) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Photographs beside their simulation, calibrations and renderers, as tables and figures."""
+"""Photographs beside their simulation, calibrations, two stores: tables, JSON, and a figure."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from matplotlib.axes import Axes
 
 from sweep.analysis.binning import Bins
 from sweep.analysis.poses import QUANTITIES, Poses
@@ -19,13 +18,12 @@ from sweep.analysis.simulation_gaps import (
     RATES,
     SOURCES,
     Compared,
-    PairedUnits,
     paired_units,
 )
-from sweep.report.charts import COLOURS, DASHES, Panel, legend_above, plain_ticks
+from sweep.report.charts import Panel, Series, draw_lines
 from sweep.report.formatting import bin_text, coordinate, interval_text, number, plural
 from sweep.report.report_data import axis_label, group_labels
-from sweep.report.table import Table
+from sweep.report.table import Findings, Table, each_cell
 from sweep.tradeoff.pareto import configuration_label
 from sweep.typing import Floats
 
@@ -127,8 +125,8 @@ def _ends(one: xr.Dataset, name: str) -> list[float]:
 MAX_CONFIGURATIONS = 6
 """Configurations that are drawn, two panels each."""
 
-FIRST_SHARE, LAST_SHARE = 0.02, 0.98
-"""Shares of the errors between which the axis lies."""
+PERCENT = np.arange(2.0, 99.0, 2.0)
+"""Percent of the solved poses at which the errors' distributions are drawn."""
 
 
 def gap_panels(
@@ -142,54 +140,30 @@ def gap_panels(
     pair = paired_units(photographs, simulated, bins)
     inside = [np.logical_or.reduce(masks) for masks in zip(*pair.bins(), strict=True)]
     sides = [Poses(arrays) for arrays in pair.within(inside)]
+    values = ([f"{name} {coordinate(each)}" for each in pair.coordinates[name].values.tolist()]
+              for name in pair.configurations)
     panels = []
-    for k, name in enumerate(_names(pair)[:MAX_CONFIGURATIONS]):
-        for errors, words, absolute in (
-            (QUANTITIES[0].norm, "rotation error [degree]", True),
-            (lambda poses: poses.range_percent[..., 0], "depth error [% of the true depth]", False),
+    for k, names in enumerate(itertools.product(*values)):
+        for errors, words in (
+            (QUANTITIES[0].norm, "rotation error, deg"),
+            (lambda poses: poses.range_percent[..., 0], "depth error, % of the true depth"),
         ):
-            values = [_ascending(errors(side)[k][side.solved[k]]) for side in sides]
+            lines = [_distribution(source, errors(side)[k][side.solved[k]])
+                     for source, side in zip(SOURCES, sides, strict=True)]
             panels.append(Panel(
-                name or "All markers",
+                ", ".join(names) or "All markers",
                 f"Share of the solved poses with at most this {words}: photographs and simulation.",
-                partial(draw_distributions, values=values, label=words, logarithmic=absolute)))
-    return panels
+                partial(draw_lines, series=lines, labels=(words, "share of solved poses, %"),
+                        share=True)))
+    return panels[:2 * MAX_CONFIGURATIONS]
 
 
-def _names(pair: PairedUnits) -> list[str]:
-    values = (
-        [f"{name} {coordinate(each)}" for each in pair.coordinates[name].values.tolist()]
-        for name in pair.configurations
-    )
-    return [", ".join(each) for each in itertools.product(*values)]
-
-
-def _ascending(values: Floats) -> Floats:
-    return np.asarray(np.sort(values[np.isfinite(values)]))
-
-
-def draw_distributions(
-    axes: Axes, values: list[Floats], label: str, *, logarithmic: bool
-) -> None:
-    """Draw the distribution functions of ascending values of both sources."""
-    for k, (source, ascending) in enumerate(zip(SOURCES, values, strict=True)):
-        shares = 100.0 * np.arange(1, len(ascending) + 1) / max(len(ascending), 1)
-        axes.plot(ascending, shares, color=COLOURS[k], linestyle=DASHES[k], label=source,
-                  drawstyle="steps-post")
-    known = [each for each in values if len(each)]
-    if known:
-        ends = [np.quantile(each, [FIRST_SHARE, LAST_SHARE]) for each in known]
-        low, high = min(end[0] for end in ends), max(end[1] for end in ends)
-        logarithmic = logarithmic and low > 0
-        axes.set_xscale("log" if logarithmic else "linear")
-        if low < high:
-            axes.set_xlim(low, high)
-    axes.set_ylim(0.0, 100.0)
-    plain_ticks(axes.xaxis, logarithmic=logarithmic and bool(known))
-    plain_ticks(axes.yaxis, logarithmic=False, share=True)
-    axes.set_xlabel(label)
-    axes.set_ylabel("share of solved poses [%]")
-    legend_above(axes, columns=2)
+def _distribution(source: str, errors: Floats) -> Series:
+    """Return the distribution of errors (n,) as a line; none without errors."""
+    errors = errors[np.isfinite(errors)]
+    shares = PERCENT if errors.size else PERCENT[:0]
+    x = np.percentile(errors, shares) if errors.size else shares
+    return Series(source, x, shares, shares * np.nan, shares * np.nan)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -266,6 +240,16 @@ def calibration_table(summary: xr.Dataset) -> Table:
     ], rows, stub=len(dims) + 3)
 
 
+def calibration_findings(summary: xr.Dataset, store: str) -> Findings:
+    """Return a `calibration_summary` as findings, which print themselves."""
+    return Findings(
+        [calibration_table(summary)],
+        {"points": summary.attrs["points"], "target_m": summary.attrs["target_m"],
+         "rows": calibration_records(summary)}, summary, 0,
+        (f"sweep.analysis.camera_calibrations(sweep.open({store!r}), [20]) in Python",
+         "the errors of each calibration"))
+
+
 # --------------------------------------------------------------------------------------------------
 # Differences between two stores of one pipeline, as tables for a terminal, and as JSON.
 
@@ -328,10 +312,7 @@ def store_difference_json(table: xr.Dataset) -> dict[str, Any]:
 
 def _cells(table: xr.Dataset, name: str) -> Iterator[tuple[dict[str, Any], xr.Dataset]]:
     """Yield the settings, and the results, of each configuration that a variable has."""
-    dims = [str(dim) for dim in table[name].dims]
-    for index in np.ndindex(*(table.sizes[dim] for dim in dims)):
-        one = table.isel(dict(zip(dims, index, strict=True)))
-        yield {dim: one[dim].item() for dim in dims}, one
+    return each_cell(table, [str(dim) for dim in table[name].dims])
 
 
 def _configurations(table: xr.Dataset, name: str) -> Iterator[tuple[str, xr.Dataset]]:

@@ -1,0 +1,219 @@
+"""Questions to stores, each answered with findings that print themselves.
+
+They are behind `sweep.require`, `sweep.measure_tradeoff`, `sweep.compare`, `sweep.write_report`
+and behind the commands.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from sweep.analysis import simulation_gap
+from sweep.analysis.comparisons import regressions, store_differences
+from sweep.analysis.requirements import (
+    Decision,
+    check_required,
+    check_requirements,
+    combined,
+    conditions,
+    parse_requirements,
+    verdicts,
+)
+from sweep.analysis.simulation_gaps import is_measured
+from sweep.errors import ArgumentError
+from sweep.execution.progress import StageReport
+from sweep.messages import byte_count, nearest, quoted
+from sweep.plan.pipeline import Pipeline
+from sweep.report import decisions
+from sweep.report.charts import write_figure
+from sweep.report.comparison_tables import (
+    gap_lines,
+    gap_panels,
+    gap_records,
+    gap_table,
+    store_difference_json,
+    store_difference_tables,
+)
+from sweep.report.error_model_file import check_error_model_file, written_error_models
+from sweep.report.formatting import plural
+from sweep.report.output_file import figure_file, is_standard_stream
+from sweep.report.report_data import read_report_data
+from sweep.report.table import UNDECIDED, Findings
+from sweep.report.tradeoff_figure import headlines, renderer_table, trade_panels, tradeoff_table
+from sweep.report.write_report import write_report
+from sweep.store.lifecycle import open_dataset, open_finished, read_pipeline
+from sweep.tradeoff.measurement import measure_trade
+from sweep.tradeoff.pareto import CRITERIA, advice, budget_advice
+
+# --------------------------------------------------------------------------------------------------
+# Whether requirements are met.
+
+
+def require(
+    store: str, requirements: Sequence[str] = (), *, per: Sequence[str] | None = None,
+    at: Sequence[str] = (), pipeline: str | None = None, against: str | None = None,
+    every: bool = False,
+) -> Findings:
+    """Decide whether a store's results meet requirements; parameters as for `sweep.require`."""
+    results, stored = _selected(store, at)
+    if pipeline is not None:
+        stored = read_pipeline(pipeline)
+        check_required(stored.requirements, pipeline)
+    texts = list(requirements) or list(stored.requirements)
+    axes = list(conditions(results, per, stored.require_per))
+    if not texts and against is None:
+        raise ArgumentError(
+            "requirements", "[]", "the pipeline has no section [require]; give some, such as "
+            "'detection >= 0.95' 'range_error_p95_percent <= 1'")
+    required = parse_requirements(texts) if texts else ()
+    table = check_requirements(results, required, axes) if required else None
+    found = [] if table is None else verdicts(table)
+    worse = [] if against is None else regressions(
+        _selected(against, at)[0], results, [each.variable for each in required], axes)
+    decision = combined(found) if found else Decision.met
+    if any(each.worse for each in worse):
+        decision = Decision.not_met
+    pooled = decisions.pooled_axes(results, axes)
+    lines = []
+    if per is None and list(stored.require_per) != axes and axes:
+        lines.append(f"at each value of {', '.join(axes)}; --per '' pools all")
+    if pooled:
+        lines.append(f"pooled over {', '.join(pooled)}; --per keeps axes apart as conditions")
+    tables = [decisions.decision_table(found), decisions.regression_table(worse)]
+    if table is not None:
+        tables.append(decisions.condition_table(found, table, every=every))
+    return Findings(
+        [*tables, *lines], {
+            "decision": decision, "per": axes, "pooled": pooled,
+            "requirements": [
+                {**dataclasses.asdict(each), "failing": [] if table is None else
+                 decisions.conditions_of(each, table)[:decisions.MAX_ROWS]} for each in found],
+            "against": worse},
+        table, {Decision.met: 0, Decision.not_met: 1}.get(decision, UNDECIDED),
+        (decisions.more_draws(found, results, store), ""))
+
+
+def _selected(url: str, at: Sequence[str]) -> tuple[xr.Dataset, Pipeline]:
+    """Return a finished store's results at some values of axes, and its pipeline."""
+    store = open_finished(url)
+    return decisions.selected(open_dataset(url), at, store.pipeline), store.pipeline
+
+
+# --------------------------------------------------------------------------------------------------
+# What each configuration costs.
+
+def check_trade(criterion: str, limit_s: float, budget_ms: float | None) -> None:
+    """Check what is asked of a tradeoff; ArgumentError for what cannot be."""
+    if criterion not in CRITERIA:
+        raise ArgumentError("criterion", criterion, f"expected one of {', '.join(CRITERIA)}"
+                            + nearest(criterion, CRITERIA))
+    check_positive("budget_ms", 1.0 if budget_ms is None else budget_ms)
+    check_positive("limit_s", limit_s)
+
+
+def check_positive(name: str, value: float) -> None:
+    """Check the value of an argument; ArgumentError if it is no finite number above 0."""
+    if not 0 < value < math.inf:
+        raise ArgumentError(name, value, "expected a finite number above 0")
+
+
+def tradeoff(
+    store: str, *, per: Sequence[str], criterion: str, limit_s: float,
+    budget_ms: float | None = None, output: str | None = None, progress: StageReport | None = None,
+) -> Findings:
+    """Measure cost and accuracy of a store's configurations; as `sweep.measure_tradeoff`."""
+    check_trade(criterion, limit_s, budget_ms)
+    figure = figure_file(output)
+    question: dict[str, str | float] = {"criterion": criterion}
+    if budget_ms is not None:
+        question["budget_ms"] = budget_ms
+    trade, renderers = measure_trade(store, per, limit_s, progress, question=question)
+    if figure is not None:
+        write_figure(trade_panels(trade, criterion, budget_ms), figure)
+    budget = [] if budget_ms is None else budget_advice(trade, criterion, budget_ms)
+    found = advice(trade, criterion)
+    frames, sampled = trade.attrs["frames"], trade.attrs["sampled"]
+    few = [] if frames >= sampled else [
+        (f"costs are those of {frames:,} of {sampled:,} sampled images; more --seconds, or markers "
+         "that are seen, give more")]
+    return Findings(
+        [*headlines(trade, criterion), tradeoff_table(trade, criterion),
+         *([] if renderers is None else [renderer_table(renderers)]), *few, *budget, *found],
+        trade.to_dict() | ({} if renderers is None else {"renderers": renderers.to_dict()})
+        | {"advice": found} | ({"budget": budget} if budget else {}),
+        trade, 0, (f"sweep report {quoted(store)}", "with these costs and a figure of them"))
+
+
+# --------------------------------------------------------------------------------------------------
+# How two stores differ: photographs and their simulation, or two versions.
+
+def compare(
+    first: str, second: str, *, bins: Mapping[str, Sequence[float]] | None = None,
+    output: str | None = None,
+) -> Findings:
+    """Compare photographs with a simulation, or two stores of one pipeline; as `sweep.compare`."""
+    figure = figure_file(output)
+    one, other = (_selected(url, ())[0] for url in (first, second))
+    then = (f"sweep report {quoted(second)}", "")
+    if is_measured(one) == is_measured(other):
+        for name, value in (("bins", bins), ("output", output)):
+            if value:
+                raise ArgumentError(name, "", "expected a store of photographs and a simulation")
+        table = store_differences(one, other)
+        return Findings(store_difference_tables(table), {
+            "first": first, "second": second, **store_difference_json(table)}, table, 0, then)
+    gap = simulation_gap(one, other, bins).load()
+    if figure is not None:
+        write_figure(gap_panels(one, other, bins), figure)
+    return Findings(
+        [gap_table(gap), *gap_lines(gap)],
+        {"photographs": first, "simulated": second, "paired": bool(gap.attrs["paired"]),
+         "rows": gap_records(gap)}, gap, 0, then)
+
+
+# --------------------------------------------------------------------------------------------------
+# The report of a store.
+
+NO_REPORTS = {
+    ".pdf", ".png", ".svg", ".jpg", ".jpeg", ".docx", ".odt", ".tex", ".ipynb", ".csv",
+}
+"""Suffixes of files that neither HTML nor Markdown would be taken for."""
+
+
+def report(
+    store: str, output: str | None = None, *, require: Sequence[str] = (),
+    per: Sequence[str] | None = None, form: str | None = None, figures: str | None = None,
+    error_model: Sequence[str] = (), command: str = "",
+) -> Findings:
+    """Write the report of a store; parameters as for `sweep.write_report`."""
+    for name, value in (("output", output), ("figures", figures)):
+        if value is not None and not value.strip():
+            raise ArgumentError(name, repr(value), "expected a name")
+    for path in error_model:
+        check_error_model_file(path)
+    if Path(output or "").suffix.lower() in NO_REPORTS:
+        raise ArgumentError("output", output, "expected a file that ends in .html or .md")
+    form = form or ("md" if str(output).lower().endswith(".md") else "html")
+    page = Path(output or f"report.{form}")
+    data = read_report_data(store, require, per, command)
+    if error_model:
+        data = data.in_memory()
+        written_error_models(data, error_model)
+    count, answer = write_report(data, page, form, Path(figures) if figures else None)
+    size = f", {byte_count(page.stat().st_size)}" if page.is_file() else ""
+    then = (f"look at {page}", "")
+    if data.trade is None and data.setting_axes:
+        then = (f"sweep tradeoff {quoted(store)}", "what each configuration costs")
+    content: dict[str, Any] = {
+        "report": str(page), "figures": count, "store": data.store,
+        "required": list(data.require), "per": list(data.per)}
+    # Into the page's own stream a line more would not be HTML.
+    lines = [] if is_standard_stream(page) else [
+        f"{page}: {plural(count, 'figure')}{size}", *data.warnings, answer.headline]
+    return Findings(lines, content | answer.as_json(), None, 0, then if lines else ("", ""))

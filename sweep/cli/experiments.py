@@ -276,11 +276,8 @@ def _poses_plan(pipeline: Pipeline, expected: Forecast) -> str:
         return f"{expected.poses:,}"
     if expected.pilot is None:
         return f"at most {expected.poses:,}"
-    likely, low, high = (
-        f"{float(f'{share * expected.poses:.2g}'):,.0f}" for share in (
-            expected.pilot.share, expected.pilot.share_low, expected.pilot.share_high)
-    )
-    return f"about {likely} ({low} to {high}) of at most {expected.poses:,}"
+    likely = float(f"{expected.pilot.share * expected.poses:.2g}")
+    return f"about {likely:,.0f} of at most {expected.poses:,}"
 
 
 def _pilot_lines(pipeline: Pipeline, expected: Forecast) -> list[str]:

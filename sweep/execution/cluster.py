@@ -37,7 +37,13 @@ from sweep.execution.limits import (
     VERSIONS_S,
 )
 from sweep.isolation.child_process import SINGLE_THREADED, in_main_thread
-from sweep.isolation.machine import be_killed_before_others, control_groups, number_in, text_of
+from sweep.isolation.machine import (
+    be_killed_before_others,
+    control_groups,
+    default_workers,
+    number_in,
+    text_of,
+)
 from sweep.messages import notice
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.plugins import lacking_plugins
@@ -532,13 +538,6 @@ class Cluster(Protocol):
     @property
     def scheduler_address(self) -> str:
         """The address of its scheduler."""
-
-
-def default_workers() -> int:
-    """Return how many processors this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 @contextlib.contextmanager

@@ -44,23 +44,20 @@ TIME_LIMIT_S = 600.0
 """Block timeout in seconds, more if blocks are long (:data:`MAX_BLOCK_SHARE`); the search for a
 scene that never returns keeps within it."""
 
-CALIBRATION_S = 0.6
-"""Seconds spent on measuring what scenes cost before blocks are cut."""
+TIMING_S = 0.2
+"""Seconds of the batch of scenes that is timed before blocks are cut."""
 
-QUICK_CALIBRATION_S = 0.1
-"""Seconds spent on finding out whether a run is small."""
+TIMING_SHARE = 1 / 8
+"""Share of a block's time limit after which a batch is abandoned."""
 
-CALIBRATION_SHARE = 1 / 8
-"""Share of a block's time limit after which the measurement is abandoned."""
-
-CALIBRATION_LIMIT_S = 5.0
+TIMING_LIMIT_S = 5.0
 """Seconds after which it is abandoned in any case: it is known by then that blocks are small."""
 
-PLAN_LIMIT_S = 3.2
-"""Time limit of all measurements of a forecast, which is answered within 5 s."""
+PLAN_SCENES_S = 1.5
+"""The same for a forecast, which is answered within 5 s."""
 
-PLAN_SCENES_LIMIT_S = 2.5
-"""The part of it that the cost of a scene may take; the rest is for the effects."""
+PLAN_EFFECTS_S = 1.5
+"""Seconds of a forecast in which effects are measured, and a pilot of a run in waves is made."""
 
 # The cluster (`sweep.execution.cluster`)
 
@@ -85,7 +82,7 @@ STALL_S = 60.0
 STATES_INTERVAL_S = 10.0
 """How often the scheduler is asked what workers do while no block is finished."""
 
-# The size of blocks (`sweep.execution.calibration`)
+# The size of blocks (`sweep.execution.forecast`)
 
 BLOCK_S = 2.0
 """Work in a block of most runs: a lost block costs its work."""

@@ -10,6 +10,7 @@ import os
 import time
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,21 +25,16 @@ from sweep.errors import (
     StoreReplacedError,
 )
 from sweep.execution import BLOCK_TASK
-from sweep.execution.calibration import (
-    Calibration,
-    block_extents,
-    block_time_limit_s,
-    calibrate_isolated,
-)
 from sweep.execution.engines import BlocksInChild
-from sweep.execution.forecast import block_s_of, check_new, check_rest, thread_count_of, work_s
-from sweep.execution.limits import (
-    CALIBRATION_S,
-    CALIBRATION_SHARE,
-    QUICK_CALIBRATION_S,
-    SMALL_RUN_S,
-    TIME_LIMIT_S,
+from sweep.execution.forecast import (
+    Timing,
+    block_time_limit_s,
+    blocks_of,
+    check_affordable,
+    measured_or_assumed,
+    scene_s_of,
 )
+from sweep.execution.limits import SMALL_RUN_S, TIME_LIMIT_S, TIMING_SHARE
 from sweep.execution.progress import AnyOrder, InWaves, ProgressReport, Tally, Waiting
 from sweep.execution.reuse import is_reusable, match
 from sweep.execution.status import (
@@ -54,6 +50,7 @@ from sweep.isolation.child_process import Child, Interrupts
 from sweep.isolation.crash_isolation import check_plugins
 from sweep.messages import notice
 from sweep.plan.facts import notes
+from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.sampling import MAX_TRIALS
 from sweep.sampling.rules import make_rule
@@ -216,41 +213,45 @@ def execute(
         if pipeline.plugins:
             interrupts.await_result(thread.submit(check_plugins, child, pipeline))
 
-        def measuring(budget_s: float) -> Future[Calibration]:
-            limit_s = CALIBRATION_SHARE * (time_limit_s or TIME_LIMIT_S)
-            return thread.submit(calibrate_isolated, child, pipeline, budget_s, limit_s)
-
-        calibration: Calibration | None = None
+        timing: Timing | None = None
+        measuring: Future[Timing] | None = None
+        if not done:
+            limit_s = TIMING_SHARE * (time_limit_s or TIME_LIMIT_S)
+            measuring = thread.submit(measured_or_assumed, child, pipeline, limit_s)
         connection: Client | None = None
         embedded = workers is None and scheduler is None and client is None
-        if embedded and not done:
-            calibration = interrupts.await_result(measuring(QUICK_CALIBRATION_S))
-        if not (embedded and work_s(pipeline, unfinished, done, calibration) < SMALL_RUN_S):
+        if embedded and measuring is not None:
+            timing = interrupts.await_result(measuring)
+        if not (embedded and _work_s(pipeline, unfinished, done, timing) < SMALL_RUN_S):
             from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
 
-            # Measured while the workers' processes start.
-            better = not done and not (calibration is not None and calibration.over)
-            future = measuring(CALIBRATION_S) if better else None
+            # Scenes are timed while the workers' processes start.
             connection = stack.enter_context(
                 connected(pipeline, workers=workers, scheduler=scheduler, client=client)
             )
-            if future is not None:
-                calibration = interrupts.await_result(future)
+        if timing is None and measuring is not None:
+            timing = interrupts.await_result(measuring)
+        threads = 1 if connection is None else _thread_count(connection)
         if unfinished is None:
-            if calibration is None:
+            if timing is None:
                 raise AssertionError(url)
-            unfinished = _new_store(
-                url, pipeline, calibration, connection, block_s, time_limit_s, overwrite,
-                yes=yes or bool(sources), child=child,
-            )
-        elif not (yes or sources):
-            check_rest(unfinished, done, calibration, connection, child)
+            blocks = blocks_of(pipeline, timing.scene_s, threads, block_s, time_limit_s)
+            scene_s = timing.scene_s
+        else:
+            blocks, scene_s = unfinished.blocks, scene_s_of(unfinished, done, timing)
+        if not (yes or sources):
+            left = len(blocks) - len(done)
+            check_affordable(url, pipeline, scene_s, threads, len(blocks), left, child)
+        if unfinished is None:
+            if overwrite and exists(url):
+                remove_store(url)
+            unfinished = create_store(url, pipeline, blocks.extents)
         retry = Retry()
         if stricter:
             unfinished = tighten(unfinished, pipeline)
         if again:  # once nothing refuses the run
             unfinished, retry = drop_failed(unfinished)
-        limit_s = block_time_limit_s(time_limit_s, block_s_of(unfinished, done, calibration))
+        limit_s = block_time_limit_s(time_limit_s, scene_s * len(unfinished.blocks[0]))
         with _continuable_errors(without=" without overwrite" if overwrite else ""):
             computed = _compute_and_close(
                 unfinished, child, connection, sources, limit_s, interrupts, progress
@@ -278,7 +279,7 @@ def recompute(
         interrupts = stack.enter_context(Interrupts())
         child = stack.enter_context(Child(BLOCK_TASK))
         connection: Client | None = None
-        each_s = block_s_of(store, committed(store))
+        each_s = scene_s_of(store, committed(store)) * len(store.blocks[0])
         if workers is not None or each_s * len(chosen) >= SMALL_RUN_S:
             from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
 
@@ -336,19 +337,28 @@ def _matching_sources(
     return sources
 
 
-def _new_store(
-    url: str, pipeline: Pipeline, calibration: Calibration, client: Client | None,
-    block_s: float | None, time_limit_s: float | None, overwrite: bool, *,
-    yes: bool = False, child: Child | None = None,
-) -> RunStore:
-    """Create an empty store whose blocks suit the calibration and the cluster, if there is one."""
-    threads = thread_count_of(client)
-    extents = block_extents(pipeline, calibration, threads, block_s, time_limit_s)
-    if not yes:
-        check_new(url, pipeline, calibration, threads, extents, child)
-    if overwrite and exists(url):
-        remove_store(url)
-    return create_store(url, pipeline, extents)
+def _work_s(
+    pipeline: Pipeline, unfinished: RunStore | None, done: AbstractSet[int], timing: Timing | None
+) -> float:
+    """Return the estimated seconds of work that are left when the blocks ``done`` are committed.
+
+    In waves, at least the first one is left.
+    """
+    if unfinished is not None:
+        blocks = unfinished.blocks
+        each_s = scene_s_of(unfinished, done, timing) * len(blocks[0])
+        return (len(blocks) - len(done)) * each_s
+    if timing is None:
+        return math.inf
+    rule = make_rule(pipeline)
+    share = 1.0 if rule is None else rule.ends[0] / rule.ends[-1]
+    return share * pipeline.size(Stage.scene) * timing.scene_s
+
+
+def _thread_count(client: Client) -> int:
+    from sweep.execution.cluster import thread_count  # noqa: PLC0415  (slow to import)
+
+    return max(thread_count(client), 1)
 
 
 # In the child, or on the cluster

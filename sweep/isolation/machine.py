@@ -1,4 +1,4 @@
-"""Limits of the machine: memory, and control groups."""
+"""Limits of the machine: processors, memory, and control groups."""
 
 from __future__ import annotations
 
@@ -7,6 +7,14 @@ import os
 import resource
 from collections.abc import Iterator
 from pathlib import Path
+
+
+def default_workers() -> int:
+    """Return how many processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
 
 # --------------------------------------------------------------------------------------------------
 # What Linux says of the control groups of this process, which limit memory, processes, threads.

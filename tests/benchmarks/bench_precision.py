@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from sweep.execution.block_task import compute_blocks
-from sweep.execution.calibration import block_extents, calibrate
+from sweep.execution.forecast import blocks_of, seconds_of
 from sweep.execution.progress import InWaves
 from sweep.plan.pipeline import Pipeline
 from sweep.sampling.rules import Decider, make_rule
@@ -36,7 +36,8 @@ def measure(wanted, options):
     pipeline = Pipeline.from_text(TEXT.format(
         sides=options.sides, most=options.max_trials, wanted=wanted.format(width=options.width)))
     rule = make_rule(pipeline)
-    extents = block_extents(pipeline, calibrate(pipeline, 0.6), 2)
+    (spent_s,), sampled = seconds_of([pipeline], 1536)
+    extents = blocks_of(pipeline, spent_s / sampled, 2).extents
     spent = {"deciding": 0.0, "scheduling": 0.0}
     decide = Decider.needed
 

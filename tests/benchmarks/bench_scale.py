@@ -39,8 +39,8 @@ from numcodecs.zstd import Zstd
 
 import sweep
 from sweep.execution import engines as in_flight
-from sweep.execution.calibration import block_work_s
 from sweep.execution.cluster import QUIET_DASK_CONFIG
+from sweep.execution.forecast import block_work_s
 from sweep.execution.progress import Tally
 from sweep.execution.status import close, status
 from sweep.integrity.verification import verify

@@ -493,8 +493,8 @@ def _execute_status(options: argparse.Namespace) -> int:
         return 0
     if state.finished:
         what = "finished"
-    elif state.writer is not None:
-        what = f"being written by {plain(state.writer)}"
+    elif state.being_written:
+        what = "being written"
     else:
         what = "stopped"
     say(f"{state.title}: {what}")
@@ -523,7 +523,7 @@ def _execute_status(options: argparse.Namespace) -> int:
         say(line)
     store = quoted(options.store)
     if not state.finished:
-        again = f"sweep status {store}" if state.writer is not None else f"sweep run {store}"
+        again = f"sweep status {store}" if state.being_written else f"sweep run {store}"
         say_next(again)
     else:
         say_next(state.advice or f"sweep report {store}")
@@ -625,7 +625,7 @@ def _following(url: str, *, finished: bool) -> str:
 
     return (
         "run"
-        if library.lock.holder(library.lifecycle.open_store(url).storage) is None
+        if not library.lock.is_written(library.lifecycle.open_store(url).storage)
         else "status"
     )
 

@@ -365,19 +365,17 @@ class InWaves:
         What the pipeline's section says, and the rule that samples by it.
     only
         The blocks that may be computed; all by default.
-    check
-        Called before each work; it raises if this process may not write any more.
     """
 
     def __init__(
         self, store: RunStore, rule: StoppingRule, sampling: Stopping, *,
-        only: AbstractSet[int] | None = None, check: Callable[[], None] = lambda: None,
+        only: AbstractSet[int] | None = None,
     ) -> None:
         self._rule = rule
         self._waves = Waves.of(store.pipeline, sampling, store.blocks)
         self._names = sorted({"detection", *sampling.variables})
         self._first = zlib.crc32(digest_of(rule).encode())
-        self._only, self._check = only, check
+        self._only = only
         self._known: dict[int, _Known] = {}
         self._ready: deque[Work] = deque()
         self._groups: dict[int, _Group] = {}
@@ -409,7 +407,6 @@ class InWaves:
                 return None
             self._groups[group] = _Group()
             self._advance(group)
-        self._check()
         return self._ready.popleft()
 
     def put_back(self, work: Work) -> None:

@@ -55,9 +55,16 @@ from sweep.plan.pipeline import Pipeline
 from sweep.plan.sampling import MAX_TRIALS
 from sweep.sampling.rules import make_rule
 from sweep.store.blocks import RunStore, committed, drop_block, missing_chunks
-from sweep.store.lifecycle import create_store, open_store, read_run_metadata, remove_store, reopen
+from sweep.store.lifecycle import (
+    create_store,
+    open_store,
+    read_attributes,
+    read_run_metadata,
+    remove_store,
+    reopen,
+)
 from sweep.store.locations import check_writable, checked_url, exists, is_remote, open_storage
-from sweep.store.lock import locked, refuse_if_held
+from sweep.store.lock import changing, closing, is_written, writing
 from sweep.store.provenance import differences
 
 if TYPE_CHECKING:
@@ -81,7 +88,7 @@ def tighten(store: RunStore, pipeline: Pipeline) -> RunStore:
         If another process writes the store, or it cannot be written.
     """
     text = tightened_text(store.pipeline, pipeline)
-    with locked(store):
+    with changing(store.url, store.storage):
         reopen(store, dataclasses.replace(store.pipeline, text=text))
     return open_store(store.url, "r+")
 
@@ -200,6 +207,8 @@ def execute(
         return summary_of_complete(unfinished, started)
     for line in notes(pipeline):
         notice(line)
+    if unfinished is not None and is_written(unfinished.storage):
+        notice(f"{url}: another process is writing it, too: each of the two may compute a block")
     sources = _matching_sources(url, pipeline, reuse)
     done = set() if unfinished is None else committed(unfinished) - again
     if unfinished is None:
@@ -266,7 +275,7 @@ def recompute(
     workers: int | None = None,
     time_limit_s: float | None = None,
 ) -> None:
-    """Compute blocks of a store whose lock this process holds, as :func:`execute` does.
+    """Compute blocks of a store that this process holds alone, as :func:`execute` does.
 
     Raises
     ------
@@ -315,10 +324,9 @@ def _store_to_continue(url: str, pipeline: Pipeline, overwrite: bool) -> RunStor
         # It is deleted once everything else is known to work, just before the new one is made.
         storage = open_storage(url, "r+")
         read_run_metadata(url, storage)
-        refuse_if_held(url, storage)
-        return None
+        with changing(url, storage):
+            return None
     store = open_store(url, "r+")
-    refuse_if_held(url, store.storage)
     lines = differences(pipeline, store.pipeline, store.fingerprint)
     if lines:
         raise OtherExperimentError(url, lines, is_reusable(pipeline, store))
@@ -369,22 +377,30 @@ def _compute_and_close(
     time_limit_s: float, interrupts: Interrupts, progress: ProgressReport | None,
 ) -> Mapping[str, int]:
     """Compute the blocks that are not committed; return counts of what was computed."""
-    with ThreadPoolExecutor(1) as thread, locked(store) as lock:
+    with ThreadPoolExecutor(1) as thread, writing(store.url, store.storage):
         for module in ("xarray", "dask.array"):  # to close the store; xarray imports the second
             thread.submit(importlib.import_module, module)
         done = _committed_whole(store)
         tally = Tally(store, progress)
         left = (number for number in range(len(store.blocks)) if number not in done)
-        waiting: Waiting = AnyOrder(lock.checked(left))
+        waiting: Waiting = AnyOrder(left)
         if (sampling := make_rule(store.pipeline)) is not None and store.pipeline.stopping:
-            waiting = InWaves(store, store.pipeline.stopping, sampling, check=lock.check)
+            waiting = InWaves(store, store.pipeline.stopping, sampling)
             done = waiting.current
             tally.watch(waiting)
         tally.begin(done)
         _compute(store, waiting, tally, child, client, sources, time_limit_s, interrupts)
-        lock.check(now=True)
-        close(store)
+        with closing(store.url, store.storage):
+            _check_same_rule(store)
+            if not store.finished:  # by another process that wrote it, too
+                close(store)
     return tally.computed
+
+
+def _check_same_rule(store: RunStore) -> None:
+    """Raise StoreError if another process gave the store another rule, as it may on S3."""
+    if read_attributes(store.url, store.storage)["pipeline"] != store.pipeline.text:
+        raise StoreError(f"{store.url}: another run has changed when its sampling stops")
 
 
 def _committed_whole(store: RunStore) -> set[int]:

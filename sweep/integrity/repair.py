@@ -20,7 +20,7 @@ from sweep.store.files import delete_files, sync, write_files
 from sweep.store.layout import documents, planned_arrays
 from sweep.store.lifecycle import MEASURED, linked_arrays, open_store, write_root
 from sweep.store.locations import translate_errors
-from sweep.store.lock import locked
+from sweep.store.lock import changing
 
 
 def repair(
@@ -65,7 +65,7 @@ def repair(
         )
     if numbers:
         computable(verification.store)
-    with locked(verification.store):
+    with changing(url, verification.storage):
         with translate_errors(url, "written"):
             _rewrite_files(verification, before.damage, before.left_over)
         store = open_store(url, "r+")

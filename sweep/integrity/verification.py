@@ -55,7 +55,7 @@ from sweep.store.files import absent_files, parsed, read_files, read_json, sync
 from sweep.store.layout import PlannedArray, checksum_of, documents, planned_arrays
 from sweep.store.lifecycle import GROUPS, read_attributes, root_attributes, schema_faults, store_of
 from sweep.store.locations import open_storage
-from sweep.store.lock import KEY, holder
+from sweep.store.lock import KEY, is_written
 from sweep.store.provenance import environment
 from sweep.store.receipt import Receipt, decoded
 from sweep.typing import Masks
@@ -763,7 +763,7 @@ class Verification:
         damage += sampled.damage
         retried = FailureCheck(store).run(doubtful if sample else [])
         damage += retried.damage
-        held = holder(self.storage) is not None
+        held = is_written(self.storage)
         return IntegrityReport(
             store.url, store.finished, len(store.blocks), len(done), listed - len(left), size,
             sampled.count, sampled.reason, retried.count, damage,

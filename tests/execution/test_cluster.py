@@ -30,7 +30,6 @@ from sweep.isolation import machine as machine_memory
 from sweep.isolation.child_process import Interrupts
 from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import create_store, open_store
-from sweep.store.lock import locked
 from sweep.store.provenance import fingerprint
 
 PIPELINE = sweep.Pipeline.from_dict(
@@ -346,7 +345,7 @@ def test_run_whose_workers_are_all_paused_ends_in_a_line(monkeypatch, tmp_path):
         store = create_store(str(tmp_path / "paused.zarr"), PIPELINE, (40,))
         while worker_states(client, 10.0) != {next(iter(client.nthreads())): "paused"}:
             time.sleep(0.05)
-        with locked(store), Interrupts() as interrupts, pytest.raises(RunError) as raised:
+        with Interrupts() as interrupts, pytest.raises(RunError) as raised:
             BlocksInFlight(store, client, store.url, interrupts=interrupts).compute(
                 [0], Tally(store)
             )

@@ -17,7 +17,7 @@ from sweep.isolation.child_process import Child, ChildRaisedError, Interrupts
 from sweep.plan.pipeline import Pipeline
 from sweep.store.blocks import drop_block
 from sweep.store.lifecycle import open_store
-from sweep.store.lock import locked
+from sweep.store.lock import writing
 
 TEXT = """
 seed = 3
@@ -60,7 +60,7 @@ def test_small_run_and_small_repair_start_no_cluster(pipeline, undisturbed, tmp_
     assert (summary.computed_scenes, summary.failed, summary.crashed) == (12, 0, 0)
     assert same(url, undisturbed)
     store = open_store(url, "r+")
-    with locked(store):
+    with writing(store.url, store.storage):
         drop_block(store, store.blocks[0])
         recompute(store, [0])
     assert same(url, undisturbed)

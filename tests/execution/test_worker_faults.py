@@ -20,7 +20,7 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.store.blocks import committed
 from sweep.store.lifecycle import create_store, open_store
 from sweep.store.locations import exists
-from sweep.store.lock import locked
+from sweep.store.lock import writing
 
 PIPELINE = sweep.Pipeline.from_dict(
     {"seed": 5, "pose": {"side_px": 40, "jitter_px": 0.5},
@@ -58,7 +58,7 @@ def run_on(client, url):
     )
     done = committed(store)
     waiting = [number for number in range(len(store.blocks)) if number not in done]
-    with locked(store), Interrupts() as interrupts:
+    with writing(store.url, store.storage), Interrupts() as interrupts:
         tally = Tally(store)
         tally.begin(done)
         BlocksInFlight(store, client, str(url), interrupts=interrupts).compute(waiting, tally)

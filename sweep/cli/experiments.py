@@ -571,14 +571,8 @@ def _execute_verify(options: argparse.Namespace) -> int:
         print_json(report.to_json())
         return 1 if report.damage else 0
 
-    unstable = [
-        each for each in report.damage if isinstance(each, library.sample_check.NotDeterministic)
-    ]
-    damaged = [
-        each
-        for each in report.damage
-        if not isinstance(each, library.sample_check.NotDeterministic)
-    ]
+    unstable = [each for each in report.damage if each.kind == "not deterministic"]
+    damaged = [each for each in report.damage if each not in unstable]
     for what, listed in (("repaired", report.repaired), ("damaged", damaged)):
         for damage in listed[:MAX_LINES]:
             say(f"{what:9} {plain(damage.where, 300)}: {plain(damage.what, 300)}")
@@ -608,7 +602,7 @@ def _execute_verify(options: argparse.Namespace) -> int:
         say(line)
     store = quoted(options.store)
     if unstable and not damaged:
-        say_next(f"sweep plugins check {quoted(unstable[0].name)}", "tries it on its own")
+        say_next(f"sweep plugins check {quoted(unstable[0].where)}", "tries it on its own")
     elif (report.damage or report.left_over) and not options.repair:
         say_next(f"sweep verify {store} --repair", "repairs it")
     elif report.damage:

@@ -7,7 +7,7 @@ keeps in :mod:`sweep.store.outcome`. This module imports nothing.
 
 from __future__ import annotations
 
-# Blocks in flight (`sweep.execution.engines`)
+# Blocks on a cluster (`sweep.execution.on_cluster`)
 
 BLOCKS_PER_THREAD = 3
 """Blocks in flight per worker thread: enough that none waits, few enough that none pile up."""
@@ -23,9 +23,6 @@ MAX_WORKER_FAULTS = 3
 
 FAULT_WINDOW = 10
 """Blocks that each worker computes meanwhile: more seldom faults are not the worker's alone."""
-
-MAX_WORKER_DEATHS = 3
-"""Deaths of workers, on average of each, without a finished block, after which a run ends."""
 
 MAX_FAILED_BLOCKS = 10
 """Failed blocks after which no more are submitted."""
@@ -68,19 +65,16 @@ VERSIONS_S = 60.0
 """How long all workers may take to report their versions, for which they import this package."""
 
 THREAD_COUNT_INTERVAL_S = 1.0
-"""How often the scheduler is asked how many worker threads it has."""
+"""How often the scheduler is asked what workers it has."""
 
 THREAD_COUNT_TIMEOUT_S = 2.0
 """How long a run waits for that answer."""
 
 NO_WORKERS_TIMEOUT_S = 60.0
-"""How long a run waits for a first worker, or for another after the last one left."""
+"""How long a run waits for a first worker, or after the last one left or was paused."""
 
 STALL_S = 60.0
-"""How long no block may be finished before a line says why, and all workers may be paused."""
-
-STATES_INTERVAL_S = 10.0
-"""How often the scheduler is asked what workers do while no block is finished."""
+"""How long no block may be finished before a line says what the workers do."""
 
 # The size of blocks (`sweep.execution.forecast`)
 

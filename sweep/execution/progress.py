@@ -311,11 +311,6 @@ class AnyOrder:
         """Nothing follows from it."""
 
 
-def in_any_order(numbers: Iterable[int] | Waiting) -> Waiting:
-    """Return blocks that wait; numbers are of blocks that do not depend on each other."""
-    return AnyOrder(numbers) if isinstance(numbers, Iterable) else numbers
-
-
 @dataclass(slots=True)
 class _Known:
     """What is kept of a committed block's receipt."""

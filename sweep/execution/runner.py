@@ -12,7 +12,6 @@ import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import tomlkit
@@ -25,7 +24,7 @@ from sweep.errors import (
     StoreReplacedError,
 )
 from sweep.execution import BLOCK_TASK
-from sweep.execution.engines import BlocksInChild
+from sweep.execution.engines import InChild
 from sweep.execution.forecast import (
     Timing,
     block_time_limit_s,
@@ -63,7 +62,7 @@ from sweep.store.lifecycle import (
     remove_store,
     reopen,
 )
-from sweep.store.locations import check_writable, checked_url, exists, is_remote, open_storage
+from sweep.store.locations import absolute_url, check_writable, exists, open_storage
 from sweep.store.lock import changing, closing, is_written, writing
 from sweep.store.provenance import differences
 
@@ -123,13 +122,8 @@ def tightened_text(begun: Pipeline, ours: Pipeline) -> str:
 # --------------------------------------------------------------------------------------------------
 # A run from a pipeline to a finished store: what is prepared, computed and finished, in order.
 
-# `sweep.execution.cluster` and `in_flight` are imported where they are used: Dask is slow to
+# `sweep.execution.cluster` and `on_cluster` are imported where they are used: Dask is slow to
 # import, and finished stores and small runs need none of it.
-
-
-def absolute_url(url: str) -> str:
-    """Return a store's address as every process of this machine understands it."""
-    return url if is_remote(checked_url(url)) else str(Path(url).absolute())
 
 
 def execute(
@@ -430,12 +424,9 @@ def _compute(
     sources: Sequence[str], time_limit_s: float, interrupts: Interrupts,
 ) -> None:
     """Compute blocks on a cluster; without one in the child, as long as that is quick."""
-    url = absolute_url(store.url)
     with contextlib.ExitStack() as stack:
         if client is None:
-            BlocksInChild(
-                store, child, url, sources, time_limit_s, interrupts=interrupts
-            ).compute(waiting, tally)
+            InChild(store, child, sources, time_limit_s).run(waiting, tally, interrupts)
             following = waiting.next()
             if following is None:
                 return
@@ -443,11 +434,9 @@ def _compute(
             from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
 
             client = stack.enter_context(connected(store.pipeline))
-        from sweep.execution.engines import BlocksInFlight  # noqa: PLC0415  (slow to import)
+        from sweep.execution.on_cluster import OnCluster  # noqa: PLC0415  (slow to import)
 
-        BlocksInFlight(
-            store, client, url, sources, time_limit_s, interrupts=interrupts
-        ).compute(waiting, tally)
+        OnCluster(store, client, sources, time_limit_s).run(waiting, tally, interrupts)
 
 
 @contextlib.contextmanager

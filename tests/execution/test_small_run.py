@@ -105,15 +105,14 @@ class Failing(Here):
 
 def compute(store, child):
     with child, Interrupts() as interrupts:
-        small_run.BlocksInChild(
-            store, child, store.url, time_limit_s=60, interrupts=interrupts
-        ).compute(iter(range(len(store.blocks))), Tally(store))
+        small_run.InChild(store, child, time_limit_s=60).run(
+            range(len(store.blocks)), Tally(store), interrupts)
 
 
 @pytest.mark.long
 def test_block_that_ends_its_process_each_time_is_named(undisturbed, monkeypatch):
     monkeypatch.setattr(small_run, "MAX_DEATHS", 1)
-    monkeypatch.setattr(small_run, "compute_block", suicide)
+    monkeypatch.setattr(small_run, "compute_blocks", suicide)
     failed = r"block 0-2,0-6: its process ended: SIGKILL, as where memory runs out \(limit "
     with pytest.raises(RunError, match=failed):
         compute(open_store(undisturbed), Child())

@@ -24,7 +24,7 @@ from sweep.isolation.child_process import (
     Interrupts,
     last_line,
 )
-from sweep.isolation.machine import explained, memory_kills
+from sweep.isolation.machine import explained
 from sweep.store.blocks import RunStore
 from sweep.store.locations import absolute_url
 from sweep.store.receipt import Receipt
@@ -186,7 +186,6 @@ class InChild(Engine[Future[Any]]):
         self._child, self._thread = child, ThreadPoolExecutor(1)
         self._deaths: Counter[int] = Counter()
         self._faults: Counter[int] = Counter()
-        self._kills = memory_kills()
         self._deadline: float | None = None
 
     def room(self) -> int:
@@ -220,7 +219,7 @@ class InChild(Engine[Future[Any]]):
                 self._child.restart()
             if self._deaths[number] <= MAX_DEATHS:
                 return Again()
-            reason = f"its process ended: {explained(error, self._kills)}"
+            reason = f"its process ended: {explained(error)}"
             return Failed(reason, machine_fault=error.from_outside)
         except MachineFaultError as error:
             self._faults[number] += 1

@@ -30,7 +30,7 @@ from sweep.execution.limits import (
     TIME_LIMIT_S,
 )
 from sweep.execution.progress import Work
-from sweep.isolation.machine import deaths_reason, memory_kills
+from sweep.isolation.machine import ADVICE
 from sweep.messages import notice
 from sweep.store.blocks import RunStore
 from sweep.store.receipt import Receipt
@@ -57,7 +57,6 @@ class OnCluster(Engine[Future[Any]]):
     ) -> None:
         super().__init__(store, sources, time_limit_s)
         self._client = client
-        self._kills = memory_kills()
         self._deaths: Counter[int] = Counter()
         self._faults = WorkerFaults(client)
         self._states: dict[str, WorkerState] = {}
@@ -140,8 +139,9 @@ class OnCluster(Engine[Future[Any]]):
                 self._deaths[number] += 1
                 if self._deaths[number] <= MAX_DEATHS:
                     return Again()
-                reason = deaths_reason(self._kills)
-                return Failed(f"its workers died again and again; {reason}", machine_fault=True)
+                return Failed(
+                    "its workers died again and again; their logs may tell why; if memory ran out, "
+                    f"{ADVICE}", machine_fault=True)
             fault = None if error is None else machine_fault(error)
             if fault is None:
                 return Failed(f"{type(error).__name__}: {error}")

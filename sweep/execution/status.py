@@ -362,12 +362,6 @@ RATE_S = 60.0
 RATE_BLOCKS = 10
 """At least so many times the longest block is measured: with many workers, blocks come in waves."""
 
-RATE_RECEIPTS = 1000
-"""Blocks of which the longest counts for that."""
-
-PAUSE_S = 2.0
-"""Seconds in which no block was computed: the run was stopped and continued in between."""
-
 
 @dataclass(frozen=True, slots=True)
 class Status:
@@ -535,17 +529,12 @@ def poses_per_second(blocks: Iterable[WrittenBlock]) -> float | None:
     >>> poses_per_second([WrittenBlock(at, 2.0, 100) for at in (12.0, 14.0, 9000.0, 9002.0)])
     50.0
     """
-    ordered = sorted(blocks, key=lambda block: -block.at)
-    if not ordered:
+    written = list(blocks)
+    if not written:
         return None
-    last = ordered[0].at
-    window_s = max(RATE_S, RATE_BLOCKS * max(block.took_s for block in ordered[:RATE_RECEIPTS]))
-    earliest = last - window_s
-    begin, scenes = last, 0
-    for block in ordered:
-        if block.at < max(earliest, begin - PAUSE_S):
-            break
-        begin = min(begin, block.at - block.took_s)
-        scenes += block.scenes
-    begin = max(begin, earliest)
-    return scenes / (last - begin) if last > begin else None
+    last = max(block.at for block in written)
+    recent = [block for block in written if block.at > last - RATE_S]
+    window_s = max(RATE_S, RATE_BLOCKS * max(block.took_s for block in recent))
+    recent = [block for block in written if block.at > last - window_s]
+    begin = max(min(block.at - block.took_s for block in recent), last - window_s)
+    return sum(block.scenes for block in recent) / (last - begin) if last > begin else None

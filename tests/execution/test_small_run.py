@@ -113,7 +113,7 @@ def compute(store, child):
 def test_block_that_ends_its_process_each_time_is_named(undisturbed, monkeypatch):
     monkeypatch.setattr(small_run, "MAX_DEATHS", 1)
     monkeypatch.setattr(small_run, "compute_blocks", suicide)
-    failed = r"block 0-2,0-6: its process ended: SIGKILL, as where memory runs out \(limit "
+    failed = r"block 0-2,0-6: its process ended: SIGKILL, as where memory runs out: use "
     with pytest.raises(RunError, match=failed):
         compute(open_store(undisturbed), Child())
 

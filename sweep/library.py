@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from sweep.fitting import folders as folders
     from sweep.integrity import repair as repair
     from sweep.integrity import reproduction as reproduction
-    from sweep.integrity import sample_check as sample_check
     from sweep.integrity import verification as verification
     from sweep.photographs import folder as folder
     from sweep.photographs import prepare as prepare
@@ -77,7 +76,6 @@ _MODULES = (
     "sweep.fitting.folders",
     "sweep.integrity.repair",
     "sweep.integrity.reproduction",
-    "sweep.integrity.sample_check",
     "sweep.integrity.verification",
     "sweep.photographs.folder",
     "sweep.photographs.prepare",

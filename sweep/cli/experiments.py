@@ -262,11 +262,8 @@ def _poses_plan(pipeline: Pipeline, expected: Forecast) -> str:
         return f"{expected.poses:,}"
     if expected.pilot is None:
         return f"at most {expected.poses:,}"
-    likely, low, high = (
-        f"{float(f'{share * expected.poses:.2g}'):,.0f}" for share in (
-            expected.pilot.share, expected.pilot.share_low, expected.pilot.share_high)
-    )
-    return f"about {likely} ({low} to {high}) of at most {expected.poses:,}"
+    likely = float(f"{expected.pilot.share * expected.poses:.2g}")
+    return f"about {likely:,.0f} of at most {expected.poses:,}"
 
 
 def _pilot_lines(pipeline: Pipeline, expected: Forecast) -> list[str]:
@@ -435,8 +432,8 @@ def status(options: argparse.Namespace) -> int:
         return 0
     if state.finished:
         what = "finished"
-    elif state.writer is not None:
-        what = f"being written by {plain(state.writer)}"
+    elif state.being_written:
+        what = "being written"
     else:
         what = "stopped"
     say(f"{state.title}: {what}")
@@ -465,7 +462,7 @@ def status(options: argparse.Namespace) -> int:
         say(line)
     store = quoted(options.store)
     if not state.finished:
-        again = f"sweep status {store}" if state.writer is not None else f"sweep run {store}"
+        again = f"sweep status {store}" if state.being_written else f"sweep run {store}"
         say_next(again)
     else:
         say_next(state.advice or f"sweep report {store}")
@@ -501,14 +498,8 @@ def verify(options: argparse.Namespace) -> int:
         print_json(report.to_json())
         return 1 if report.damage else 0
 
-    unstable = [
-        each for each in report.damage if isinstance(each, library.sample_check.NotDeterministic)
-    ]
-    damaged = [
-        each
-        for each in report.damage
-        if not isinstance(each, library.sample_check.NotDeterministic)
-    ]
+    unstable = [each for each in report.damage if each.kind == "not deterministic"]
+    damaged = [each for each in report.damage if each not in unstable]
     for what, listed in (("repaired", report.repaired), ("damaged", damaged)):
         for damage in listed[:MAX_LINES]:
             say(f"{what:9} {plain(damage.where, 300)}: {plain(damage.what, 300)}")
@@ -538,7 +529,7 @@ def verify(options: argparse.Namespace) -> int:
         say(line)
     store = quoted(options.store)
     if unstable and not damaged:
-        say_next(f"sweep plugins check {quoted(unstable[0].name)}", "tries it on its own")
+        say_next(f"sweep plugins check {quoted(unstable[0].where)}", "tries it on its own")
     elif (report.damage or report.left_over) and not options.repair:
         say_next(f"sweep verify {store} --repair", "repairs it")
     elif report.damage:
@@ -555,6 +546,6 @@ def _following(url: str, *, finished: bool) -> str:
 
     return (
         "run"
-        if library.lock.holder(library.lifecycle.open_store(url).storage) is None
+        if not library.lock.is_written(library.lifecycle.open_store(url).storage)
         else "status"
     )

@@ -260,11 +260,10 @@ def compute_block(
     """
     with _local_faults(url):
         store = _opened(url, run_id)
-        needed, before = np.ones(len(block), dtype=bool), None
+        needed, before = np.ones(len(block), dtype=bool), receipt_of(store, block)
+        if before is not None and (decision is None or before.basis == decision.basis):
+            return before  # another process may write the store, too
         if decision is not None:
-            before = receipt_of(store, block)
-            if before is not None and before.basis == decision.basis:
-                return before
             needed = _decider(url, run_id, decision.rule).needed(block, decision)
         begun_before = begin_block(store, block)
         try:

@@ -37,7 +37,13 @@ from sweep.execution.limits import (
     VERSIONS_S,
 )
 from sweep.isolation.child_process import SINGLE_THREADED, in_main_thread
-from sweep.isolation.machine import be_killed_before_others, control_groups, number_in, text_of
+from sweep.isolation.machine import (
+    be_killed_before_others,
+    control_groups,
+    default_workers,
+    number_in,
+    text_of,
+)
 from sweep.messages import notice
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.plugins import lacking_plugins
@@ -137,24 +143,15 @@ async def peer_type(address: str, options: dict[str, Any]) -> str:
     return str(identity["type"])
 
 
-def thread_counts(client: Client, timeout_s: float) -> dict[str, int]:
-    """Return the number of threads of each worker, by address.
+class WorkerState(NamedTuple):
+    """A worker's number of threads, and its status: "running", "paused", ..."""
 
-    ``Client.nthreads`` returns the same, but cannot be given a timeout.
-
-    Raises
-    ------
-    TimeoutError
-        If the scheduler does not answer in time.
-    OSError
-        If the client is not connected.
-    """
-    counts: dict[str, int] = client.sync(_scheduler(client).ncores, callback_timeout=timeout_s)
-    return counts
+    threads: int
+    status: str
 
 
-def worker_states(client: Client, timeout_s: float) -> dict[str, str]:
-    """Return the status of each worker, by address: "running", "paused", ...
+def worker_states(client: Client, timeout_s: float) -> dict[str, WorkerState]:
+    """Return the state of each worker, by address.
 
     Raises
     ------
@@ -166,26 +163,10 @@ def worker_states(client: Client, timeout_s: float) -> dict[str, str]:
     identity: dict[str, Any] = client.sync(
         _scheduler(client).identity, n_workers=-1, callback_timeout=timeout_s
     )
-    return {address: str(worker["status"]) for address, worker in identity["workers"].items()}
-
-
-def worker_deaths(client: Client, timeout_s: float) -> int:
-    """Return how many workers went away unasked since the scheduler was started.
-
-    Raises
-    ------
-    TimeoutError
-        If the scheduler does not answer in time.
-    OSError
-        If the client is not connected.
-    """
-    events: list[tuple[float, Any]] = client.sync(
-        _scheduler(client).events, topic="all", callback_timeout=timeout_s
-    )
-    return sum(
-        isinstance(event, dict) and event.get("action") == "remove-worker"
-        and not event.get("expected") for _, event in events
-    )
+    return {
+        address: WorkerState(int(worker["nthreads"]), str(worker["status"]))
+        for address, worker in identity["workers"].items()
+    }
 
 
 def _scheduler(client: Client) -> Any:
@@ -534,13 +515,6 @@ class Cluster(Protocol):
         """The address of its scheduler."""
 
 
-def default_workers() -> int:
-    """Return how many processors this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 @contextlib.contextmanager
 def connected(
     pipeline: Pipeline, *, workers: int | None = None, scheduler: str | None = None,
@@ -721,7 +695,8 @@ def thread_count(client: Client) -> int:
         If the scheduler went away.
     """
     try:
-        return sum(thread_counts(client, THREAD_COUNT_TIMEOUT_S).values())
+        states = worker_states(client, THREAD_COUNT_TIMEOUT_S)
+        return sum(state.threads for state in states.values())
     except TimeoutError:
         return 0
     except OSError:

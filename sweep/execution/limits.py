@@ -7,7 +7,7 @@ keeps in :mod:`sweep.store.outcome`. This module imports nothing.
 
 from __future__ import annotations
 
-# Blocks in flight (`sweep.execution.engines`)
+# Blocks on a cluster (`sweep.execution.on_cluster`)
 
 BLOCKS_PER_THREAD = 3
 """Blocks in flight per worker thread: enough that none waits, few enough that none pile up."""
@@ -23,9 +23,6 @@ MAX_WORKER_FAULTS = 3
 
 FAULT_WINDOW = 10
 """Blocks that each worker computes meanwhile: more seldom faults are not the worker's alone."""
-
-MAX_WORKER_DEATHS = 3
-"""Deaths of workers, on average of each, without a finished block, after which a run ends."""
 
 MAX_FAILED_BLOCKS = 10
 """Failed blocks after which no more are submitted."""
@@ -44,23 +41,20 @@ TIME_LIMIT_S = 600.0
 """Block timeout in seconds, more if blocks are long (:data:`MAX_BLOCK_SHARE`); the search for a
 scene that never returns keeps within it."""
 
-CALIBRATION_S = 0.6
-"""Seconds spent on measuring what scenes cost before blocks are cut."""
+TIMING_S = 0.2
+"""Seconds of the batch of scenes that is timed before blocks are cut."""
 
-QUICK_CALIBRATION_S = 0.1
-"""Seconds spent on finding out whether a run is small."""
+TIMING_SHARE = 1 / 8
+"""Share of a block's time limit after which a batch is abandoned."""
 
-CALIBRATION_SHARE = 1 / 8
-"""Share of a block's time limit after which the measurement is abandoned."""
-
-CALIBRATION_LIMIT_S = 5.0
+TIMING_LIMIT_S = 5.0
 """Seconds after which it is abandoned in any case: it is known by then that blocks are small."""
 
-PLAN_LIMIT_S = 3.2
-"""Time limit of all measurements of a forecast, which is answered within 5 s."""
+PLAN_SCENES_S = 1.5
+"""The same for a forecast, which is answered within 5 s."""
 
-PLAN_SCENES_LIMIT_S = 2.5
-"""The part of it that the cost of a scene may take; the rest is for the effects."""
+PLAN_EFFECTS_S = 1.5
+"""Seconds of a forecast in which effects are measured, and a pilot of a run in waves is made."""
 
 # The cluster (`sweep.execution.cluster`)
 
@@ -71,21 +65,18 @@ VERSIONS_S = 60.0
 """How long all workers may take to report their versions, for which they import this package."""
 
 THREAD_COUNT_INTERVAL_S = 1.0
-"""How often the scheduler is asked how many worker threads it has."""
+"""How often the scheduler is asked what workers it has."""
 
 THREAD_COUNT_TIMEOUT_S = 2.0
 """How long a run waits for that answer."""
 
 NO_WORKERS_TIMEOUT_S = 60.0
-"""How long a run waits for a first worker, or for another after the last one left."""
+"""How long a run waits for a first worker, or after the last one left or was paused."""
 
 STALL_S = 60.0
-"""How long no block may be finished before a line says why, and all workers may be paused."""
+"""How long no block may be finished before a line says what the workers do."""
 
-STATES_INTERVAL_S = 10.0
-"""How often the scheduler is asked what workers do while no block is finished."""
-
-# The size of blocks (`sweep.execution.calibration`)
+# The size of blocks (`sweep.execution.forecast`)
 
 BLOCK_S = 2.0
 """Work in a block of most runs: a lost block costs its work."""

@@ -76,18 +76,9 @@ StageReport = Callable[[str, float], None]
 @contextlib.contextmanager
 def stage_display() -> Iterator[StageReport]:
     """Show what is being done on stderr: a bar on a terminal, else a line for each new thing."""
-    if sys.stderr is not None and sys.stderr.isatty():
-        from rich.console import Console  # noqa: PLC0415  (slow to import)
-        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn  # noqa: PLC0415
-        from rich.progress import Progress as Bar  # noqa: PLC0415
-
-        bar = Bar(
-            TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(),
-            console=Console(stderr=True), transient=True,
-        )
-        with bar:
-            task = bar.add_task("starting", total=1.0)
-            yield lambda what, share: bar.update(task, description=what, completed=share)
+    if _on_terminal():
+        with _bar() as update:
+            yield lambda what, share: update(what, share, 1.0, "")
         return
     printed: list[str] = []
 
@@ -131,14 +122,29 @@ def progress_display(*, ends: bool = False) -> Iterator[ProgressReport]:
 
     ``ends``: with a line for the beginning and one for the end, however short the run is.
     """
-    terminal = sys.stderr is not None and sys.stderr.isatty()
-    with _bar() if terminal else _lines(ends=ends) as display:
-        yield display
+    if not _on_terminal():
+        with _lines(ends=ends) as display:
+            yield display
+        return
+    with _bar() as update:
+        def report(progress: Progress) -> None:
+            if progress.conditions is None:
+                count = f"{progress.done:,} of {progress.total:,} poses"
+                update("running", progress.done, progress.total, count)
+            else:
+                update("running", progress.settled or 0, progress.conditions,
+                       _of_conditions(progress))
+
+        yield report
+
+
+def _on_terminal() -> bool:
+    return sys.stderr is not None and sys.stderr.isatty()
 
 
 @contextlib.contextmanager
-def _bar() -> Iterator[ProgressReport]:
-    """Show a bar on stderr; it disappears at the end."""
+def _bar() -> Iterator[Callable[[str, float, float, str], None]]:
+    """Show a bar on stderr, which disappears at the end; update it by what, done, total, count."""
     from rich.console import Console  # noqa: PLC0415  (slow to import)
     from rich.progress import (  # noqa: PLC0415
         BarColumn,
@@ -157,19 +163,10 @@ def _bar() -> Iterator[ProgressReport]:
     with bar:
         task = bar.add_task("starting", total=None, count="")
 
-        def report(progress: Progress) -> None:
-            if progress.conditions is not None:
-                bar.update(
-                    task, description="running", total=progress.conditions,
-                    completed=progress.settled, count=_of_conditions(progress),
-                )
-                return
-            bar.update(
-                task, description="running", total=progress.total, completed=progress.done,
-                count=f"{progress.done:,} of {progress.total:,} poses",
-            )
+        def update(what: str, done: float, total: float, count: str) -> None:
+            bar.update(task, description=what, completed=done, total=total, count=count)
 
-        yield report
+        yield update
 
 
 def _of_conditions(progress: Progress) -> str:
@@ -311,11 +308,6 @@ class AnyOrder:
         """Nothing follows from it."""
 
 
-def in_any_order(numbers: Iterable[int] | Waiting) -> Waiting:
-    """Return blocks that wait; numbers are of blocks that do not depend on each other."""
-    return AnyOrder(numbers) if isinstance(numbers, Iterable) else numbers
-
-
 @dataclass(slots=True)
 class _Known:
     """What is kept of a committed block's receipt."""
@@ -365,19 +357,17 @@ class InWaves:
         What the pipeline's section says, and the rule that samples by it.
     only
         The blocks that may be computed; all by default.
-    check
-        Called before each work; it raises if this process may not write any more.
     """
 
     def __init__(
         self, store: RunStore, rule: StoppingRule, sampling: Stopping, *,
-        only: AbstractSet[int] | None = None, check: Callable[[], None] = lambda: None,
+        only: AbstractSet[int] | None = None,
     ) -> None:
         self._rule = rule
         self._waves = Waves.of(store.pipeline, sampling, store.blocks)
         self._names = sorted({"detection", *sampling.variables})
         self._first = zlib.crc32(digest_of(rule).encode())
-        self._only, self._check = only, check
+        self._only = only
         self._known: dict[int, _Known] = {}
         self._ready: deque[Work] = deque()
         self._groups: dict[int, _Group] = {}
@@ -409,7 +399,6 @@ class InWaves:
                 return None
             self._groups[group] = _Group()
             self._advance(group)
-        self._check()
         return self._ready.popleft()
 
     def put_back(self, work: Work) -> None:

@@ -10,8 +10,8 @@ import os
 import time
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import tomlkit
@@ -24,21 +24,16 @@ from sweep.errors import (
     StoreReplacedError,
 )
 from sweep.execution import BLOCK_TASK
-from sweep.execution.calibration import (
-    Calibration,
-    block_extents,
+from sweep.execution.engines import InChild
+from sweep.execution.forecast import (
+    Timing,
     block_time_limit_s,
-    calibrate_isolated,
+    blocks_of,
+    check_affordable,
+    measured_or_assumed,
+    scene_s_of,
 )
-from sweep.execution.engines import BlocksInChild
-from sweep.execution.forecast import block_s_of, check_new, check_rest, thread_count_of, work_s
-from sweep.execution.limits import (
-    CALIBRATION_S,
-    CALIBRATION_SHARE,
-    QUICK_CALIBRATION_S,
-    SMALL_RUN_S,
-    TIME_LIMIT_S,
-)
+from sweep.execution.limits import SMALL_RUN_S, TIME_LIMIT_S, TIMING_SHARE
 from sweep.execution.progress import AnyOrder, InWaves, ProgressReport, Tally, Waiting
 from sweep.execution.reuse import is_reusable, match
 from sweep.execution.status import (
@@ -54,13 +49,21 @@ from sweep.isolation.child_process import Child, Interrupts
 from sweep.isolation.crash_isolation import check_plugins
 from sweep.messages import notice
 from sweep.plan.facts import notes
+from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.sampling import MAX_TRIALS
 from sweep.sampling.rules import make_rule
 from sweep.store.blocks import RunStore, committed, drop_block, missing_chunks
-from sweep.store.lifecycle import create_store, open_store, read_run_metadata, remove_store, reopen
-from sweep.store.locations import check_writable, checked_url, exists, is_remote, open_storage
-from sweep.store.lock import locked, refuse_if_held
+from sweep.store.lifecycle import (
+    create_store,
+    open_store,
+    read_attributes,
+    read_run_metadata,
+    remove_store,
+    reopen,
+)
+from sweep.store.locations import absolute_url, check_writable, exists, open_storage
+from sweep.store.lock import changing, closing, is_written, writing
 from sweep.store.provenance import differences
 
 if TYPE_CHECKING:
@@ -84,7 +87,7 @@ def tighten(store: RunStore, pipeline: Pipeline) -> RunStore:
         If another process writes the store, or it cannot be written.
     """
     text = tightened_text(store.pipeline, pipeline)
-    with locked(store):
+    with changing(store.url, store.storage):
         reopen(store, dataclasses.replace(store.pipeline, text=text))
     return open_store(store.url, "r+")
 
@@ -119,13 +122,8 @@ def tightened_text(begun: Pipeline, ours: Pipeline) -> str:
 # --------------------------------------------------------------------------------------------------
 # A run from a pipeline to a finished store: what is prepared, computed and finished, in order.
 
-# `sweep.execution.cluster` and `in_flight` are imported where they are used: Dask is slow to
+# `sweep.execution.cluster` and `on_cluster` are imported where they are used: Dask is slow to
 # import, and finished stores and small runs need none of it.
-
-
-def absolute_url(url: str) -> str:
-    """Return a store's address as every process of this machine understands it."""
-    return url if is_remote(checked_url(url)) else str(Path(url).absolute())
 
 
 def execute(
@@ -203,6 +201,8 @@ def execute(
         return summary_of_complete(unfinished, started)
     for line in notes(pipeline):
         notice(line)
+    if unfinished is not None and is_written(unfinished.storage):
+        notice(f"{url}: another process is writing it, too: each of the two may compute a block")
     sources = _matching_sources(url, pipeline, reuse)
     done = set() if unfinished is None else committed(unfinished) - again
     if unfinished is None:
@@ -216,41 +216,45 @@ def execute(
         if pipeline.plugins:
             interrupts.await_result(thread.submit(check_plugins, child, pipeline))
 
-        def measuring(budget_s: float) -> Future[Calibration]:
-            limit_s = CALIBRATION_SHARE * (time_limit_s or TIME_LIMIT_S)
-            return thread.submit(calibrate_isolated, child, pipeline, budget_s, limit_s)
-
-        calibration: Calibration | None = None
+        timing: Timing | None = None
+        measuring: Future[Timing] | None = None
+        if not done:
+            limit_s = TIMING_SHARE * (time_limit_s or TIME_LIMIT_S)
+            measuring = thread.submit(measured_or_assumed, child, pipeline, limit_s)
         connection: Client | None = None
         embedded = workers is None and scheduler is None and client is None
-        if embedded and not done:
-            calibration = interrupts.await_result(measuring(QUICK_CALIBRATION_S))
-        if not (embedded and work_s(pipeline, unfinished, done, calibration) < SMALL_RUN_S):
+        if embedded and measuring is not None:
+            timing = interrupts.await_result(measuring)
+        if not (embedded and _work_s(pipeline, unfinished, done, timing) < SMALL_RUN_S):
             from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
 
-            # Measured while the workers' processes start.
-            better = not done and not (calibration is not None and calibration.over)
-            future = measuring(CALIBRATION_S) if better else None
+            # Scenes are timed while the workers' processes start.
             connection = stack.enter_context(
                 connected(pipeline, workers=workers, scheduler=scheduler, client=client)
             )
-            if future is not None:
-                calibration = interrupts.await_result(future)
+        if timing is None and measuring is not None:
+            timing = interrupts.await_result(measuring)
+        threads = 1 if connection is None else _thread_count(connection)
         if unfinished is None:
-            if calibration is None:
+            if timing is None:
                 raise AssertionError(url)
-            unfinished = _new_store(
-                url, pipeline, calibration, connection, block_s, time_limit_s, overwrite,
-                yes=yes or bool(sources), child=child,
-            )
-        elif not (yes or sources):
-            check_rest(unfinished, done, calibration, connection, child)
+            blocks = blocks_of(pipeline, timing.scene_s, threads, block_s, time_limit_s)
+            scene_s = timing.scene_s
+        else:
+            blocks, scene_s = unfinished.blocks, scene_s_of(unfinished, done, timing)
+        if not (yes or sources):
+            left = len(blocks) - len(done)
+            check_affordable(url, pipeline, scene_s, threads, len(blocks), left, child)
+        if unfinished is None:
+            if overwrite and exists(url):
+                remove_store(url)
+            unfinished = create_store(url, pipeline, blocks.extents)
         retry = Retry()
         if stricter:
             unfinished = tighten(unfinished, pipeline)
         if again:  # once nothing refuses the run
             unfinished, retry = drop_failed(unfinished)
-        limit_s = block_time_limit_s(time_limit_s, block_s_of(unfinished, done, calibration))
+        limit_s = block_time_limit_s(time_limit_s, scene_s * len(unfinished.blocks[0]))
         with _continuable_errors(without=" without overwrite" if overwrite else ""):
             computed = _compute_and_close(
                 unfinished, child, connection, sources, limit_s, interrupts, progress
@@ -265,7 +269,7 @@ def recompute(
     workers: int | None = None,
     time_limit_s: float | None = None,
 ) -> None:
-    """Compute blocks of a store whose lock this process holds, as :func:`execute` does.
+    """Compute blocks of a store that this process holds alone, as :func:`execute` does.
 
     Raises
     ------
@@ -278,7 +282,7 @@ def recompute(
         interrupts = stack.enter_context(Interrupts())
         child = stack.enter_context(Child(BLOCK_TASK))
         connection: Client | None = None
-        each_s = block_s_of(store, committed(store))
+        each_s = scene_s_of(store, committed(store)) * len(store.blocks[0])
         if workers is not None or each_s * len(chosen) >= SMALL_RUN_S:
             from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
 
@@ -314,10 +318,9 @@ def _store_to_continue(url: str, pipeline: Pipeline, overwrite: bool) -> RunStor
         # It is deleted once everything else is known to work, just before the new one is made.
         storage = open_storage(url, "r+")
         read_run_metadata(url, storage)
-        refuse_if_held(url, storage)
-        return None
+        with changing(url, storage):
+            return None
     store = open_store(url, "r+")
-    refuse_if_held(url, store.storage)
     lines = differences(pipeline, store.pipeline, store.fingerprint)
     if lines:
         raise OtherExperimentError(url, lines, is_reusable(pipeline, store))
@@ -336,19 +339,28 @@ def _matching_sources(
     return sources
 
 
-def _new_store(
-    url: str, pipeline: Pipeline, calibration: Calibration, client: Client | None,
-    block_s: float | None, time_limit_s: float | None, overwrite: bool, *,
-    yes: bool = False, child: Child | None = None,
-) -> RunStore:
-    """Create an empty store whose blocks suit the calibration and the cluster, if there is one."""
-    threads = thread_count_of(client)
-    extents = block_extents(pipeline, calibration, threads, block_s, time_limit_s)
-    if not yes:
-        check_new(url, pipeline, calibration, threads, extents, child)
-    if overwrite and exists(url):
-        remove_store(url)
-    return create_store(url, pipeline, extents)
+def _work_s(
+    pipeline: Pipeline, unfinished: RunStore | None, done: AbstractSet[int], timing: Timing | None
+) -> float:
+    """Return the estimated seconds of work that are left when the blocks ``done`` are committed.
+
+    In waves, at least the first one is left.
+    """
+    if unfinished is not None:
+        blocks = unfinished.blocks
+        each_s = scene_s_of(unfinished, done, timing) * len(blocks[0])
+        return (len(blocks) - len(done)) * each_s
+    if timing is None:
+        return math.inf
+    rule = make_rule(pipeline)
+    share = 1.0 if rule is None else rule.ends[0] / rule.ends[-1]
+    return share * pipeline.size(Stage.scene) * timing.scene_s
+
+
+def _thread_count(client: Client) -> int:
+    from sweep.execution.cluster import thread_count  # noqa: PLC0415  (slow to import)
+
+    return max(thread_count(client), 1)
 
 
 # In the child, or on the cluster
@@ -359,22 +371,30 @@ def _compute_and_close(
     time_limit_s: float, interrupts: Interrupts, progress: ProgressReport | None,
 ) -> Mapping[str, int]:
     """Compute the blocks that are not committed; return counts of what was computed."""
-    with ThreadPoolExecutor(1) as thread, locked(store) as lock:
+    with ThreadPoolExecutor(1) as thread, writing(store.url, store.storage):
         for module in ("xarray", "dask.array"):  # to close the store; xarray imports the second
             thread.submit(importlib.import_module, module)
         done = _committed_whole(store)
         tally = Tally(store, progress)
         left = (number for number in range(len(store.blocks)) if number not in done)
-        waiting: Waiting = AnyOrder(lock.checked(left))
+        waiting: Waiting = AnyOrder(left)
         if (sampling := make_rule(store.pipeline)) is not None and store.pipeline.stopping:
-            waiting = InWaves(store, store.pipeline.stopping, sampling, check=lock.check)
+            waiting = InWaves(store, store.pipeline.stopping, sampling)
             done = waiting.current
             tally.watch(waiting)
         tally.begin(done)
         _compute(store, waiting, tally, child, client, sources, time_limit_s, interrupts)
-        lock.check(now=True)
-        close(store)
+        with closing(store.url, store.storage):
+            _check_same_rule(store)
+            if not store.finished:  # by another process that wrote it, too
+                close(store)
     return tally.computed
+
+
+def _check_same_rule(store: RunStore) -> None:
+    """Raise StoreError if another process gave the store another rule, as it may on S3."""
+    if read_attributes(store.url, store.storage)["pipeline"] != store.pipeline.text:
+        raise StoreError(f"{store.url}: another run has changed when its sampling stops")
 
 
 def _committed_whole(store: RunStore) -> set[int]:
@@ -404,12 +424,9 @@ def _compute(
     sources: Sequence[str], time_limit_s: float, interrupts: Interrupts,
 ) -> None:
     """Compute blocks on a cluster; without one in the child, as long as that is quick."""
-    url = absolute_url(store.url)
     with contextlib.ExitStack() as stack:
         if client is None:
-            BlocksInChild(
-                store, child, url, sources, time_limit_s, interrupts=interrupts
-            ).compute(waiting, tally)
+            InChild(store, child, sources, time_limit_s).run(waiting, tally, interrupts)
             following = waiting.next()
             if following is None:
                 return
@@ -417,11 +434,9 @@ def _compute(
             from sweep.execution.cluster import connected  # noqa: PLC0415  (slow to import)
 
             client = stack.enter_context(connected(store.pipeline))
-        from sweep.execution.engines import BlocksInFlight  # noqa: PLC0415  (slow to import)
+        from sweep.execution.on_cluster import OnCluster  # noqa: PLC0415  (slow to import)
 
-        BlocksInFlight(
-            store, client, url, sources, time_limit_s, interrupts=interrupts
-        ).compute(waiting, tally)
+        OnCluster(store, client, sources, time_limit_s).run(waiting, tally, interrupts)
 
 
 @contextlib.contextmanager

@@ -28,7 +28,8 @@ from sweep.store.blocks import (
     receipts,
 )
 from sweep.store.lifecycle import finish, open_store, reopen
-from sweep.store.lock import holder, locked
+from sweep.store.locations import is_remote
+from sweep.store.lock import changing, is_written
 from sweep.store.outcome import (
     MAX_ROWS,
     FailedCell,
@@ -192,7 +193,7 @@ def drop_failed(store: RunStore) -> tuple[RunStore, Retry]:
     StoreError
         If a receipt is damaged, another process writes the store, or it cannot be written.
     """
-    with locked(store):
+    with changing(store.url, store.storage):
         failed = failed_blocks(store)
         if failed:
             if store.finished:
@@ -361,12 +362,6 @@ RATE_S = 60.0
 RATE_BLOCKS = 10
 """At least so many times the longest block is measured: with many workers, blocks come in waves."""
 
-RATE_RECEIPTS = 1000
-"""Blocks of which the longest counts for that."""
-
-PAUSE_S = 2.0
-"""Seconds in which no block was computed: the run was stopped and continued in between."""
-
 
 @dataclass(frozen=True, slots=True)
 class Status:
@@ -378,8 +373,8 @@ class Status:
         The store's URL; the pipeline's title or name.
     finished
         Whether every block is committed and the store is closed.
-    writer
-        The process that holds the store's lock, None if nobody does.
+    being_written
+        Whether a process writes it; of a remote store, whether one did in the last minute.
     blocks, blocks_done, poses, poses_done
         Sizes of the grid, and how much of it is committed.
     detection, estimate
@@ -387,8 +382,8 @@ class Status:
     looked_for
         Cells of the detection that count in its rates, as in `sweep.execution.status.Summary`.
     poses_per_s, seconds_left
-        Rate of the run that writes now, over its last minute; time to the end at that rate. Of a
-        store that nobody writes, the rate of the last minute of work, and None. None if unknown.
+        Rate over the last minute of work; time to the end at that rate. None if unknown, and of a
+        store that nobody writes.
     crashed, failed
         Cells whose process died and cells that raised, at most 1,000 of each.
     needed, settled, conditions
@@ -404,7 +399,7 @@ class Status:
     store: str
     title: str
     finished: bool
-    writer: str | None
+    being_written: bool
     blocks: int
     blocks_done: int
     poses: int
@@ -458,8 +453,10 @@ def status(url: str) -> Status:
             if len(cells[cell.kind]) < MAX_ROWS:
                 cells[cell.kind].append(cell)
     total = store.pipeline.size(Stage.scene)
-    writer = holder(store.storage)
-    rate = poses_per_second(written, writer.get("since", 0.0) if writer else 0.0)
+    recent = max((block.at for block in written), default=0.0) > time.time() - RATE_S
+    writing = not store.finished and (
+        recent if is_remote(url) else is_written(store.storage))
+    rate = poses_per_second(written)
     outcome = outcome_of(
         url, [detection[flag.name] for flag in DetectionStatus],
         [estimate[flag.name] for flag in EstimateStatus],
@@ -469,7 +466,7 @@ def status(url: str) -> Status:
         store=url,
         title=store.pipeline.heading,
         finished=store.finished,
-        writer=f"process {writer.get('pid')} on {writer.get('host')}" if writer else None,
+        being_written=writing,
         blocks=len(store.blocks),
         blocks_done=done,
         poses=total,
@@ -479,7 +476,7 @@ def status(url: str) -> Status:
         estimate={name: count for name, count in estimate.items() if count},
         poses_per_s=rate,
         seconds_left=(
-            (total - poses) / rate if rate and writer and store.pipeline.stopping is None else None
+            (total - poses) / rate if rate and writing and store.pipeline.stopping is None else None
         ),
         crashed=cells["crashed"],
         failed=cells["failed"],
@@ -519,33 +516,25 @@ class WrittenBlock:
     scenes: int
 
 
-def poses_per_second(blocks: Iterable[WrittenBlock], since: float = 0.0) -> float | None:
+def poses_per_second(blocks: Iterable[WrittenBlock]) -> float | None:
     """Return the rate at the last of some blocks, None if it is not known.
 
     Parameters
     ----------
     blocks
         Committed blocks, in any order.
-    since
-        When the run that writes took the store over (s since 1970); what was written before counts
-        only where nothing was written since.
 
     Examples
     --------
     >>> poses_per_second([WrittenBlock(at, 2.0, 100) for at in (12.0, 14.0, 9000.0, 9002.0)])
     50.0
     """
-    ordered = sorted(blocks, key=lambda block: -block.at)
-    if not ordered or ordered[0].at < since:
+    written = list(blocks)
+    if not written:
         return None
-    last = ordered[0].at
-    window_s = max(RATE_S, RATE_BLOCKS * max(block.took_s for block in ordered[:RATE_RECEIPTS]))
-    earliest = max(since, last - window_s)
-    begin, scenes = last, 0
-    for block in ordered:
-        if block.at < max(earliest, begin - PAUSE_S):
-            break
-        begin = min(begin, block.at - block.took_s)
-        scenes += block.scenes
-    begin = max(begin, earliest)
-    return scenes / (last - begin) if last > begin else None
+    last = max(block.at for block in written)
+    recent = [block for block in written if block.at > last - RATE_S]
+    window_s = max(RATE_S, RATE_BLOCKS * max(block.took_s for block in recent))
+    recent = [block for block in written if block.at > last - window_s]
+    begin = max(min(block.at - block.took_s for block in recent), last - window_s)
+    return sum(block.scenes for block in recent) / (last - begin) if last > begin else None

@@ -7,20 +7,14 @@ from collections.abc import Sequence
 from sweep.errors import StoreError
 from sweep.execution.runner import recompute
 from sweep.execution.status import close
-from sweep.integrity.sample_check import (
-    Damage,
-    FileDamage,
-    NotDeterministic,
-    SampleDamage,
-    computable,
-)
-from sweep.integrity.verification import SAMPLE, IntegrityReport, Verification
-from sweep.store.blocks import drop_block
+from sweep.integrity.recomputation import Damage, IntegrityReport, computable
+from sweep.integrity.verification import SAMPLE, damaged_store, report_on
+from sweep.store.blocks import RunStore, drop_block
 from sweep.store.files import delete_files, sync, write_files
 from sweep.store.layout import documents, planned_arrays
 from sweep.store.lifecycle import MEASURED, linked_arrays, open_store, write_root
 from sweep.store.locations import translate_errors
-from sweep.store.lock import locked
+from sweep.store.lock import changing
 
 
 def repair(
@@ -52,22 +46,22 @@ def repair(
     RunError
         If blocks failed.
     """
-    verification = Verification(url, "r+")
-    before = verification.report(sample)
-    lasting = [each for each in before.damage if isinstance(each, (SampleDamage, NotDeterministic))]
+    store = damaged_store(url, "r+")
+    before = report_on(store, sample)
+    lasting = [each for each in before.damage if each.lasting]
     if len(lasting) == len(before.damage) and not before.left_over:
         return before
     numbers = sorted({damage.block for damage in before.damage if damage.block is not None})
-    if links := linked_arrays(verification.store):
+    if links := linked_arrays(store):
         raise StoreError(
             f"{url}: {links[0]} is a link: nothing is written through it; put the folder in its "
             "place"
         )
     if numbers:
-        computable(verification.store)
-    with locked(verification.store):
+        computable(store)
+    with changing(url, store.storage):
         with translate_errors(url, "written"):
-            _rewrite_files(verification, before.damage, before.left_over)
+            _rewrite_files(store, before.damage, before.left_over)
         store = open_store(url, "r+")
         for number in numbers:
             drop_block(store, store.blocks[number])
@@ -75,7 +69,7 @@ def repair(
             recompute(store, numbers, workers=workers, time_limit_s=time_limit_s)
         if store.finished:
             close(store)
-    after = Verification(url, "r").report(0)
+    after = report_on(damaged_store(url), 0)
     after.sampled, after.not_sampled = before.sampled, before.not_sampled
     after.retried = before.retried
     after.damage += lasting
@@ -85,11 +79,11 @@ def repair(
 
 
 def _rewrite_files(
-    verification: Verification, damage: Sequence[Damage], left_over: Sequence[str]
+    store: RunStore, damage: Sequence[Damage], left_over: Sequence[str]
 ) -> None:
     """Write the damaged files that belong to no block, and delete those that are left over."""
-    storage, store = verification.storage, verification.store
-    keys = {each.key for each in damage if isinstance(each, FileDamage) and each.block is None}
+    storage = store.storage
+    keys = {each.where for each in damage if each.kind == "file" and each.block is None}
     planned = planned_arrays(store.pipeline, store.blocks.extents)
     expected = documents(planned)
     write_files(storage, {

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sweep.errors import RunError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene, scene_image
 from sweep.evaluation.results import Failure
-from sweep.integrity.sample_check import StoredValues, compare, current_pipeline, stored_cell
+from sweep.integrity.recomputation import StoredValues, compare, current_pipeline, stored_cell
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.measure.flags import DetectionStatus

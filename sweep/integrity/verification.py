@@ -5,28 +5,23 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from sweep.errors import ArgumentError, PipelineError, StoreError, SweepError
-from sweep.execution.limits import TIME_LIMIT_S
-from sweep.integrity.sample_check import (
-    ArrayDamage,
-    BlockDamage,
+from sweep.errors import ArgumentError, PipelineError, StoreError
+from sweep.integrity.recomputation import (
     Damage,
-    FileDamage,
-    SampleCheck,
-    as_json,
-    computable,
+    IntegrityReport,
+    SoundBlock,
+    check_scenes,
+    is_doubtful,
 )
-from sweep.isolation.child_process import OUTSIDE_SIGNALS
-from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.measure.flags import (
     BoundStatus,
     DetectionStatus,
@@ -34,11 +29,7 @@ from sweep.measure.flags import (
     Flipped,
     present_values,
 )
-from sweep.plan.cell_selection import selection_text
-from sweep.plan.grid import Block, block_indices, scene_axes
-from sweep.plan.parameters import Stage
 from sweep.plan.pipeline import Pipeline
-from sweep.plan.reader import StoppingRule
 from sweep.plan.schema import LOST, UNSEEN, VARIABLES, Variable, with_description
 from sweep.sampling.rules import Decider, Decision, scenes_needed
 from sweep.store.blocks import (
@@ -47,15 +38,13 @@ from sweep.store.blocks import (
     committed,
     names_written,
     parsed_receipt,
-    receipts,
-    region,
 )
 from sweep.store.chunks import receipt_key
 from sweep.store.files import absent_files, parsed, read_files, read_json, sync
 from sweep.store.layout import PlannedArray, checksum_of, documents, planned_arrays
 from sweep.store.lifecycle import GROUPS, read_attributes, root_attributes, schema_faults, store_of
 from sweep.store.locations import open_storage
-from sweep.store.lock import KEY, holder
+from sweep.store.lock import KEY, is_written
 from sweep.store.provenance import environment
 from sweep.store.receipt import Receipt, decoded
 from sweep.typing import Masks
@@ -202,97 +191,63 @@ THREADS, WINDOW = 4, 256
 CHANGED = "changed: does not fit its checksum"
 
 
-@dataclass(frozen=True, slots=True)
-class CheckedBlock:
-    """A block that was checked.
+def check_blocks(
+    store: RunStore, numbers: Sequence[int], report: IntegrityReport
+) -> dict[int, SoundBlock]:
+    """Check blocks in several threads; return those without damage, by number."""
+    sound: dict[int, SoundBlock] = {}
+    processors: Counter[str] = Counter()
+    with ThreadPoolExecutor(THREADS) as pool:
+        # A window at a time: there may be very many.
+        for start in range(0, len(numbers), WINDOW):
+            some = numbers[start : start + WINDOW]
+            checked = pool.map(partial(_checked_block, store), some)
+            for number, (size, receipt, damage) in zip(some, checked, strict=True):
+                report.bytes += size
+                report.damage += damage
+                if receipt is not None and not damage:
+                    processors.update(receipt.processors)
+                    sound[number] = SoundBlock(
+                        tuple(receipt.processors), receipt.scenes_needed, is_doubtful(receipt))
+    report.processors = dict(processors)
+    return sound
 
-    Attributes
-    ----------
-    number
-        Its number.
-    bytes
-        Size of its receipt and its chunks.
-    receipt
-        Its receipt; None if that is damaged.
-    damage
-        What is damaged.
-    """
 
-    number: int
-    bytes: int
-    receipt: Receipt | None
-    damage: Sequence[Damage]
-
-
-class BlockCheck:
-    """Checks blocks of a store in several threads."""
-
-    def __init__(self, store: RunStore) -> None:
-        self._store = store
-
-    def run(self, numbers: Sequence[int]) -> Iterator[CheckedBlock]:
-        """Yield the blocks of these numbers in order, checked."""
-        with ThreadPoolExecutor(THREADS) as pool:
-            # A window at a time: there may be very many.
-            for start in range(0, len(numbers), WINDOW):
-                yield from pool.map(self._check, numbers[start : start + WINDOW])
-
-    def _check(self, number: int) -> CheckedBlock:
-        """Check one block; called in any thread."""
-        store, block = self._store, self._store.blocks[number]
-        key = receipt_key(number)
-        chunks = store.chunks.keys(number)
-        keys = [key, *chunks.values()]
-        contents = dict(zip(keys, read_files(store.storage, keys), strict=True))
-        faults = {key: "missing" for key, content in contents.items() if content is None}
-        receipt = self._receipt(number, contents[key])
-        if receipt is None and key not in faults:
+def _checked_block(store: RunStore, number: int) -> tuple[int, Receipt | None, list[Damage]]:
+    """Return the size of a block's files, its receipt if that is sound, and what is damaged."""
+    key = receipt_key(number)
+    chunks = store.chunks.keys(number)
+    keys = [key, *chunks.values()]
+    contents = dict(zip(keys, read_files(store.storage, keys), strict=True))
+    faults = {key: "missing" for key, content in contents.items() if content is None}
+    receipt: Receipt | None = None
+    if (content := contents[key]) is not None:
+        try:
+            receipt = parsed_receipt(store, number, decoded(content))
+        except Exception:  # decoding a damaged chunk may raise anything
             faults[key] = CHANGED
-        values: dict[str, NDArray[Any]] = {}
-        written = store.variable_names if receipt is None else names_written(store, receipt)
-        for name, chunk in chunks.items():
-            content = contents[chunk]
-            if name not in written:
-                faults.pop(chunk, None)
-                if content is not None:
-                    faults[chunk] = "numbers of a block of which none was needed"
-                values[name] = store.chunks.fill(name, number)
-            elif content is not None:
-                values_read = self._values(content, name, number, receipt)
-                if values_read is None:
-                    faults[chunk] = CHANGED
-                else:
-                    values[name] = values_read
-        damage: list[Damage] = [FileDamage(key, what, number) for key, what in faults.items()]
-        if not faults and receipt is not None:
-            fault = contradiction(store.pipeline, store.variables, values, receipt)
-            if fault:
-                damage.append(BlockDamage(number, str(block), fault))
-        return CheckedBlock(
-            number, sum(len(content) for content in contents.values() if content is not None),
-            receipt, damage,
-        )
-
-    def _receipt(self, number: int, content: bytes | None) -> Receipt | None:
-        """Return a block's receipt from its chunk; None if it is missing or damaged."""
-        if content is None:
-            return None
-        try:
-            return parsed_receipt(self._store, number, decoded(content))
-        except Exception:
-            # Decoding a damaged chunk may raise anything.
-            return None
-
-    def _values(
-        self, content: bytes, name: str, number: int, receipt: Receipt | None
-    ) -> NDArray[Any] | None:
-        """Return a chunk's values within the grid; None if it fails a checksum."""
-        if receipt is not None and checksum_of(content) != receipt.checksums[name]:
-            return None
-        try:
-            return self._store.chunks.decoded(name, number, content)
-        except (ValueError, RuntimeError):
-            return None
+    values: dict[str, NDArray[Any]] = {}
+    written = store.variable_names if receipt is None else names_written(store, receipt)
+    for name, chunk in chunks.items():
+        content = contents[chunk]
+        if name not in written:
+            faults.pop(chunk, None)
+            if content is not None:
+                faults[chunk] = "numbers of a block of which none was needed"
+            values[name] = store.chunks.fill(name, number)
+        elif content is not None:
+            try:
+                if receipt is not None and checksum_of(content) != receipt.checksums[name]:
+                    raise ValueError("checksum")
+                values[name] = store.chunks.decoded(name, number, content)
+            except (ValueError, RuntimeError):
+                faults[chunk] = CHANGED
+    damage = [Damage("file", key, what, number) for key, what in faults.items()]
+    if not faults and receipt is not None and (
+        fault := contradiction(store.pipeline, store.variables, values, receipt)
+    ):
+        damage.append(Damage("block", f"block {store.blocks[number]}", fault, number))
+    return sum(len(content or b"") for content in contents.values()), receipt, damage
 
 
 # --------------------------------------------------------------------------------------------------
@@ -302,25 +257,6 @@ TABLES = ("cost", "failures")
 """Groups that a finished store has."""
 
 
-@dataclass(slots=True)
-class FileFindings:
-    """The result of the check.
-
-    Attributes
-    ----------
-    keys
-        Keys of the files that belong to the store and to no block.
-    bytes
-        Size of them.
-    damage
-        What is damaged.
-    """
-
-    keys: set[str] = field(default_factory=set)
-    bytes: int = 0
-    damage: list[Damage] = field(default_factory=list)
-
-
 class FileCheck:
     """Checks the files of a store that belong to no block.
 
@@ -328,40 +264,43 @@ class FileCheck:
     ----------
     store
         The store, which may be damaged.
+    report
+        Takes what is damaged.
+
+    Attributes
+    ----------
+    keys
+        Keys of the files that belong to the store and to no block.
     """
 
-    def __init__(self, store: RunStore) -> None:
-        self._store, self._storage = store, store.storage
+    def __init__(self, store: RunStore, report: IntegrityReport) -> None:
+        self._store, self._storage, self._report = store, store.storage, report
         self._planned = planned_arrays(store.pipeline, store.blocks.extents)
         self._expected = {key: parsed(each.to_bytes())
                           for key, each in documents(self._planned).items()}
         self._root = read_json(self._storage, "zarr.json") or {}
-        metadata = store.run_metadata
-        self._finished = bool(metadata["finished"])
         # Another version of sweep may word the attributes otherwise.
-        self._same_version = metadata["environment"].get("sweep") == environment()["sweep"]
+        self._same_version = (
+            store.run_metadata["environment"].get("sweep") == environment()["sweep"])
         self._copies = self._consolidated()
-        self._findings = FileFindings(keys={"zarr.json"})
+        self.keys = {"zarr.json"}
 
-    def run(self) -> FileFindings:
+    def run(self) -> None:
         """Check the files."""
         self._check_root()
         faults = schema_faults(self._store)
         for planned in self._planned:
             self._check_array(planned, faults.pop(planned.path, ""))
-        for path, fault in faults.items():
-            if path in GROUPS:
-                continue
-            self._findings.damage.append(ArrayDamage(path, fault))
+        self._report.damage += [
+            Damage("array", path, fault) for path, fault in faults.items() if path not in GROUPS]
         for name in GROUPS:
-            if self._finished or name not in TABLES:
+            if self._report.finished or name not in TABLES:
                 self._check_group(name)
-        contents = read_files(self._storage, sorted(self._findings.keys))
-        self._findings.bytes = sum(len(content) for content in contents if content is not None)
-        return self._findings
+        contents = read_files(self._storage, sorted(self.keys))
+        self._report.bytes += sum(len(content or b"") for content in contents)
 
     def _add(self, key: str, what: str) -> None:
-        self._findings.damage.append(FileDamage(key, what))
+        self._report.damage.append(Damage("file", key, what))
 
     def _consolidated(self) -> dict[str, Any] | None:
         """Return the root's copy of all metadata; None if it has none, as an unfinished store."""
@@ -382,36 +321,34 @@ class FileCheck:
             attributes.get(name) != value for name, value in expected.items() if name != "sweep"
         ):
             self._add("zarr.json", "its attributes differ from the pipeline's")
-        elif self._finished and self._copies is None:
+        elif self._report.finished and self._copies is None:
             self._add("zarr.json", "lacks its copy of the metadata")
 
     def _check_array(self, planned: PlannedArray, fault: str) -> None:
         key = f"{planned.path}/zarr.json"
-        self._findings.keys.add(key)
+        self.keys.add(key)
         document = read_json(self._storage, key)
         array = None if fault or document is None else self._store.array(planned.path)
         if not fault and self._same_version:
             attributes = with_description(planned.path, (document or {}).get("attributes") or {})
             if attributes != planned.attributes:
                 fault = "its attributes differ from the schema's"
-        if fault or not self._fits_copy(key, document, self._expected.get(key)):
+        if fault or not self._fits_copy(key, document):
             self._add(key, fault or "changed")
         for chunk, part, values in planned.pieces():
-            self._findings.keys.add(chunk)
+            self.keys.add(chunk)
             if list(absent_files(self._storage, [chunk], planned.path)):
                 self._add(chunk, "missing")
             elif array is not None and (fault := _value_fault(array, part, values)):
                 self._add(chunk, fault)
 
-    def _fits_copy(
-        self, key: str, document: dict[str, Any] | None, expected: dict[str, Any] | None = None
-    ) -> bool:
+    def _fits_copy(self, key: str, document: dict[str, Any] | None) -> bool:
         """Return whether a document is as the root's copy has it, or the copy alone is wrong."""
         if self._copies is None:
             return document is not None
         if self._copies.get(key.removesuffix("/zarr.json")) == document:
             return True
-        if document is not None and document == expected:
+        if document is not None and document == self._expected.get(key):
             self._add("zarr.json", f"its copy of {key} differs from that document")
             self._copies = None
             return True
@@ -424,9 +361,9 @@ class FileCheck:
             paths += [path for path in self._copies if path.startswith(f"{name}/")]
         for path in paths:
             key = f"{path}/zarr.json"
-            self._findings.keys.add(key)
+            self.keys.add(key)
             document = read_json(self._storage, key)
-            if document is None or not self._fits_copy(key, document, self._expected.get(key)):
+            if document is None or not self._fits_copy(key, document):
                 self._add(key, "missing or changed")
             elif document.get("node_type") == "array":
                 self._check_table(path)
@@ -438,7 +375,7 @@ class FileCheck:
             array.shape, array.chunks, strict=True)]
         for number in itertools.product(*map(range, counts)):
             key = f"{path}/{array.metadata.encode_chunk_key(number)}"
-            self._findings.keys.add(key)
+            self.keys.add(key)
             if list(absent_files(self._storage, [key], path)):
                 self._add(key, "missing")
                 continue
@@ -463,164 +400,49 @@ def _value_fault(array: zarr.Array[Any], part: Any, values: Any) -> str:
 # --------------------------------------------------------------------------------------------------
 # The check of what was not needed: the rule of stopping is applied to the stored results again.
 
-class NeededCheck:
-    """Finds blocks whose scenes were needed, or not, against the rule of their pipeline."""
+def check_needed(store: RunStore, sound: Container[int], report: IntegrityReport) -> None:
+    """Find blocks whose scenes were needed, or not, against the rule of their pipeline.
 
-    def __init__(self, store: RunStore) -> None:
-        self._store = store
-
-    def run(self, sound: Container[int]) -> Iterator[Damage]:
-        """Yield the damage of blocks; a group is followed as far as its blocks are sound."""
-        rule = self._store.pipeline.stopping
-        if rule is None:
-            return
-        try:
-            decider = Decider.of(self._store, rule)
-        except (PipelineError, ValueError) as error:
-            yield BlockDamage(0, str(self._store.blocks[0]), f"no rule of stopping: {error}")
-            return
-        waves = decider.waves
-        for group in range(waves.groups):
-            for wave in range(len(waves.ends)):
-                numbers = list(waves.numbers(group, wave))
-                if not all(number in sound for number in numbers):
-                    break
-                if (damage := list(self._of_wave(decider, rule, numbers, wave))):
-                    yield from damage
-                    break
-
-    def _of_wave(
-        self, decider: Decider, rule: StoppingRule, numbers: list[int], wave: int
-    ) -> Iterator[Damage]:
-        # Bases only have to differ from wave to wave here: one process reads a store as it is.
-        decision = Decision(rule, wave, tuple(range(wave)))
-        for number in numbers:
-            block = self._store.blocks[number]
-            stored = scenes_needed(self._store, block)
-            try:
-                needed = decider.needed(block, decision) if wave else np.ones_like(stored)
-            except StoreError as error:
-                yield BlockDamage(number, str(block), str(error))
-                return
-            if (wrong := int((stored != needed).sum())):
-                yield BlockDamage(
-                    number, str(block),
-                    f"{wrong:,} scenes are not flagged as the results of earlier trials demand",
-                )
+    A group is followed as far as its blocks are sound.
+    """
+    rule = store.pipeline.stopping
+    if rule is None:
+        return
+    try:
+        decider = Decider.of(store, rule)
+    except (PipelineError, ValueError) as error:
+        report.damage.append(Damage(
+            "block", f"block {store.blocks[0]}", f"no rule of stopping: {error}", 0))
+        return
+    waves = decider.waves
+    for group in range(waves.groups):
+        for wave in range(len(waves.ends)):
+            numbers = list(waves.numbers(group, wave))
+            if not all(number in sound for number in numbers):
+                break
+            # Bases only have to differ from wave to wave: one process reads a store as it is.
+            decision = Decision(rule, wave, tuple(range(wave)))
+            damage = [
+                Damage("block", f"block {store.blocks[number]}", fault, number)
+                for number in numbers
+                if (fault := _needed_fault(store, decider, decision, number))
+            ]
+            report.damage += damage
+            if damage:
+                break
 
 
-# --------------------------------------------------------------------------------------------------
-# The check of failures: scenes that failed are recomputed, since a machine may have been at
-# fault.
-#
-# A scene that ended its process is recomputed only if a signal from outside did so.
-
-FLAGS = {
-    "detection": (DetectionStatus.failed, DetectionStatus.crashed),
-    "estimate": (EstimateStatus.failed, EstimateStatus.crashed),
-}
-"""Variable -> its flags of scenes that raised, and of those that ended their process."""
-
-
-@dataclass(slots=True)
-class FailureFindings:
-    """How many scenes were recomputed, and the blocks of those that succeed now."""
-
-    count: int = 0
-    damage: list[Damage] = field(default_factory=list)
-
-
-def is_doubtful(receipt: Receipt) -> bool:
-    """Return whether a block has scenes that this check recomputes."""
-    return bool(_killed(receipt)) or any(
-        len(counts) > failed and counts[failed]
-        for counts, (failed, _) in zip(
-            (receipt.detection, receipt.estimate), FLAGS.values(), strict=True
-        )
-    )
-
-
-class FailureCheck:
-    """Recomputes all scenes of blocks that failed, in child processes."""
-
-    def __init__(self, store: RunStore) -> None:
-        self._store = store
-
-    def run(self, numbers: Sequence[int]) -> FailureFindings:
-        """Recompute the failed scenes of blocks; none if this machine would give other numbers.
-
-        Raises
-        ------
-        MachineFaultError
-            If this machine cannot compute them.
-        """
-        findings = FailureFindings()
-        if not numbers:
-            return findings
-        try:
-            pipeline = computable(self._store)
-        except SweepError:
-            return findings  # as the report says of the sample
-        for number, receipt in receipts(self._store, numbers):
-            self._check(pipeline, number, receipt, findings)
-        return findings
-
-    def _check(
-        self, pipeline: Pipeline, number: int, receipt: Receipt, findings: FailureFindings
-    ) -> None:
-        block = self._store.blocks[number]
-        killed = np.zeros(len(block), dtype=bool)
-        killed[_killed(receipt)] = True
-        doubtful = {}
-        for name, (failed, crashed) in FLAGS.items():
-            flags = self._flags(name, block)
-            doubtful[name] = (flags == failed) | ((flags == crashed) & killed[:, None])
-        rows = np.flatnonzero(np.any([each.any(axis=1) for each in doubtful.values()], axis=0))
-        if not len(rows):
-            return
-        findings.count += len(rows)
-        shape = (len(rows), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
-        cells = run_cells_isolated(
-            pipeline, [index[rows] for index in block_indices(block)],
-            np.ones(shape, dtype=bool), TIME_LIMIT_S,
-        )
-        succeed = np.zeros(len(rows), dtype=bool)
-        for name, failures in FLAGS.items():
-            again = np.stack(cells.columns[name], axis=1)
-            succeed |= (doubtful[name][rows] & ~np.isin(again, failures)).any(axis=1)
-        if succeed.any():
-            example = self._at(block, int(rows[np.argmax(succeed)]))
-            findings.damage.append(BlockDamage(
-                number, str(block),
-                f"scenes that had failed and succeed when recomputed: {int(succeed.sum())}, such "
-                f"as --at {example}",
-            ))
-
-    def _flags(self, name: str, block: Block) -> NDArray[np.uint8]:
-        """Return a flag variable of a block: (scenes, configurations)."""
-        pipeline = self._store.pipeline
-        variable: Variable = next(v for v in self._store.variables if v.name == name)
-        values = np.asarray(self._store.array(name)[region(variable, pipeline, block)])
-        scene = [axis.name for axis in scene_axes(pipeline)]
-        names = list(variable.dimensions(pipeline))
-        configurations = [axis.name for axis in variable.configuration_axes(pipeline)]
-        order = [names.index(each) for each in (*scene, *configurations)]
-        return values.transpose(order).reshape(len(block), -1)
-
-    def _at(self, block: Block, scene: int) -> str:
-        axes = scene_axes(self._store.pipeline)
-        return selection_text({
-            axis.name: axis.values[index]
-            for axis, index in zip(axes, block.cell(scene), strict=True)
-        })
-
-
-def _killed(receipt: Receipt) -> list[int]:
-    """Return the scenes of a block that a signal from outside ended, as far as recorded."""
-    return sorted({
-        failure.scene for failure in receipt.failures
-        if failure.kind == "crashed" and failure.text.strip() in OUTSIDE_SIGNALS
-    })
+def _needed_fault(store: RunStore, decider: Decider, decision: Decision, number: int) -> str:
+    """Return how the scenes of a block that were needed differ from the rule's; else nothing."""
+    block = store.blocks[number]
+    stored = scenes_needed(store, block)
+    try:
+        needed = decider.needed(block, decision) if decision.wave else np.ones_like(stored)
+    except StoreError as error:
+        return str(error)
+    wrong = int((stored != needed).sum())
+    what = f"{wrong:,} scenes are not flagged as the results of earlier trials demand"
+    return what if wrong else ""
 
 
 # --------------------------------------------------------------------------------------------------
@@ -628,63 +450,6 @@ def _killed(receipt: Receipt) -> list[int]:
 
 SAMPLE = 20
 """Scenes that are recomputed by default."""
-
-
-@dataclass(slots=True)
-class IntegrityReport:
-    """The result of a verification.
-
-    Attributes
-    ----------
-    store
-        The store's URL.
-    finished
-        Whether the store is finished.
-    blocks, blocks_done
-        Blocks of the grid, and how many are committed.
-    files, bytes
-        Stored files that belong to the store, and their size.
-    sampled
-        Scenes that were recomputed.
-    not_sampled
-        Why none was, if none was.
-    retried
-        Scenes flagged ``failed``, or ended by a signal from outside, that were recomputed.
-    damage
-        What is damaged; empty for a sound store.
-    repaired
-        What was damaged and has been repaired.
-    left_over
-        Files that do not belong to the store, such as those that a killed process was writing.
-    processors
-        Features of the processors that computed the blocks -> how many blocks.
-    """
-
-    store: str
-    finished: bool
-    blocks: int
-    blocks_done: int
-    files: int = 0
-    bytes: int = 0
-    sampled: int = 0
-    not_sampled: str = ""
-    retried: int = 0
-    damage: list[Damage] = field(default_factory=list)
-    repaired: list[Damage] = field(default_factory=list)
-    left_over: list[str] = field(default_factory=list)
-    processors: dict[str, int] = field(default_factory=dict)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the report as ``sweep verify --json`` prints it."""
-        return {
-            "store": self.store, "finished": self.finished, "blocks": self.blocks,
-            "blocks_done": self.blocks_done, "files": self.files, "bytes": self.bytes,
-            "sampled": self.sampled, "not_sampled": self.not_sampled,
-            "retried": self.retried,
-            "damage": [as_json(damage) for damage in self.damage],
-            "repaired": [as_json(damage) for damage in self.repaired],
-            "left_over": self.left_over, "processors": self.processors,
-        }
 
 
 def verify(url: str, sample: int = SAMPLE) -> IntegrityReport:
@@ -707,90 +472,59 @@ def verify(url: str, sample: int = SAMPLE) -> IntegrityReport:
     """
     if sample < 0:
         raise ArgumentError("sample", sample, "expected at least 0")
-    return Verification(url, "r").report(sample)
+    return report_on(damaged_store(url), sample)
 
 
-class Verification:
-    """A store that is being verified.
+def damaged_store(url: str, mode: str = "r") -> RunStore:
+    """Open a store that may be damaged."""
+    storage = open_storage(url, mode)
+    return store_of(url, storage, read_attributes(url, storage), mode)
 
-    Parameters
-    ----------
-    url
-        The store.
-    mode
-        "r", or "r+" to repair it afterwards.
 
-    Attributes
-    ----------
-    storage
-        The storage that holds its files.
-    store
-        The store.
+def report_on(store: RunStore, sample: int) -> IntegrityReport:
+    """Check a store, and recompute up to ``sample`` scenes and all that failed.
+
+    With a sample of 0, nothing is recomputed.
     """
-
-    def __init__(self, url: str, mode: str) -> None:
-        self.storage = open_storage(url, mode)
-        self.store = store_of(url, self.storage, read_attributes(url, self.storage), mode)
-
-    def report(self, sample: int) -> IntegrityReport:
-        """Check the store, and recompute up to ``sample`` scenes and all that failed.
-
-        With a sample of 0, nothing is recomputed.
-        """
-        store = self.store
-        done = committed(store)
-        numbers: Sequence[int] = range(len(store.blocks)) if store.finished else sorted(done)
-        checked: Container[int] = numbers if store.finished else done
-        listed, left = sync(self._listed(checked))
-        files = FileCheck(store).run()
-        left -= {KEY, *files.keys}
-        damage, size = files.damage, files.bytes
-        sound: dict[int, Sequence[str]] = {}
-        needed: dict[int, int] = {}
-        processors: Counter[str] = Counter()
-        doubtful = []
-        for block in BlockCheck(store).run(numbers):
-            size += block.bytes
-            damage += block.damage
-            if not block.damage and block.receipt is not None:
-                sound[block.number] = block.receipt.processors
-                needed[block.number] = block.receipt.scenes_needed
-                processors.update(block.receipt.processors)
-                if is_doubtful(block.receipt):
-                    doubtful.append(block.number)
-        damage += NeededCheck(store).run(sound)
-        sampled = SampleCheck(store).run(sample, sound, needed)
-        damage += sampled.damage
-        retried = FailureCheck(store).run(doubtful if sample else [])
-        damage += retried.damage
-        held = holder(self.storage) is not None
-        return IntegrityReport(
-            store.url, store.finished, len(store.blocks), len(done), listed - len(left), size,
-            sampled.count, sampled.reason, retried.count, damage,
-            left_over=[] if held else sorted(
-                key for key in left if not self._of_unfinished_block(key, done)
-            ),
-            processors=dict(processors),
+    done = committed(store)
+    report = IntegrityReport(store.url, store.finished, len(store.blocks), len(done))
+    numbers: Sequence[int] = range(len(store.blocks)) if report.finished else sorted(done)
+    listed, left = sync(_listed(store, numbers if report.finished else done))
+    files = FileCheck(store, report)
+    files.run()
+    left -= {KEY, *files.keys}
+    report.files = listed - len(left)
+    sound = check_blocks(store, numbers, report)
+    check_needed(store, sound, report)
+    check_scenes(store, sample, sound, report)
+    if not is_written(store.storage):
+        report.left_over = sorted(
+            key for key in left
+            if not _of_unfinished_block(store, key, done, finished=report.finished)
         )
+    return report
 
-    async def _listed(self, checked: Container[int]) -> tuple[int, set[str]]:
-        """Return how many files there are, and the keys of those that belong to no checked block.
 
-        There may be 25 million files.
-        """
-        count, others = 0, set()
-        async for key in self.storage.list_prefix(""):
-            count += 1
-            number = self.store.chunks.number(key)
-            if number is None or number not in checked:
-                others.add(key)
-        return count, others
+async def _listed(store: RunStore, checked: Container[int]) -> tuple[int, set[str]]:
+    """Return how many files there are, and the keys of those that belong to no checked block.
 
-    def _of_unfinished_block(self, key: str, done: set[int]) -> bool:
-        """Return whether a key belongs to a block that a run will write again."""
-        store = self.store
-        if key.startswith(f"{BEGUN}/"):
-            number = key.removeprefix(f"{BEGUN}/")
-            return number.isdecimal() and int(number) not in done
-        written = store.chunks.number(key)
-        return written is not None and not store.finished and written not in done
+    There may be 25 million files.
+    """
+    count, others = 0, set()
+    async for key in store.storage.list_prefix(""):
+        count += 1
+        number = store.chunks.number(key)
+        if number is None or number not in checked:
+            others.add(key)
+    return count, others
+
+
+def _of_unfinished_block(
+    store: RunStore, key: str, done: Container[int], finished: bool
+) -> bool:
+    """Return whether a key belongs to a block that a run will write again."""
+    if key.startswith(f"{BEGUN}/"):
+        number = key.removeprefix(f"{BEGUN}/")
+        return number.isdecimal() and int(number) not in done
+    written = store.chunks.number(key)
+    return written is not None and not finished and written not in done

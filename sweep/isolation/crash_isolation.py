@@ -15,7 +15,7 @@ from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import CellsResult, Failure, concatenate
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
-from sweep.isolation.machine import explained, memory_kills
+from sweep.isolation.machine import explained
 from sweep.measure.detectors import make_detector
 from sweep.measure.estimators import PluggedEstimatorSetting, build
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
@@ -82,7 +82,6 @@ class _IsolatedCells:
         self._pipeline = pipeline
         self.limit_s = limit_s
         self._child: Child | None = None
-        self._kills = memory_kills()
         self.chances: list[str] = []
         """Deaths that did not come again when the same part of a scene was repeated."""
 
@@ -104,7 +103,7 @@ class _IsolatedCells:
                 child.call(_hold, self._pipeline, limit_s=HOLD_S)
             except (ChildDiedError, ChildRaisedError) as error:
                 child.close()
-                how = explained(last_line(error), self._kills)
+                how = explained(last_line(error))
                 raise local_fault(
                     f"a child process ended before it computed anything: {how}"
                 ) from None
@@ -120,7 +119,7 @@ class _IsolatedCells:
     def fault(self, death: ChildDiedError, indices: Sequence[NDArray[np.intp]]) -> Exception:
         """Return the machine's fault that ended the child again while it computed one scene."""
         return local_fault(
-            f"two processes that computed one scene were ended by {explained(death, self._kills)}; "
+            f"two processes that computed one scene were ended by {explained(death)}; "
             f"it is --at {self.selected(indices)}"
         )
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sweep.errors import SweepError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene
-from sweep.integrity.sample_check import StoredValues, compare
+from sweep.integrity.recomputation import StoredValues, compare
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, Flipped, uncounted_values
 from sweep.plan.cell_selection import cell, coordinates_text, selection_text
 from sweep.plan.experiment import target_word

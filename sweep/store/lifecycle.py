@@ -65,7 +65,7 @@ from sweep.store.locations import (
     storage_at,
     translate_errors,
 )
-from sweep.store.lock import hold, holder
+from sweep.store.lock import changing, is_written
 from sweep.store.provenance import environment, fingerprint
 from sweep.store.receipt import are_counts
 
@@ -410,7 +410,7 @@ def utc_now() -> str:
 
 
 def remove_store(url: str) -> None:
-    """Delete a sweep store of which this process can take the lock, and nothing else.
+    """Delete a sweep store that no process writes, and nothing else.
 
     Raises
     ------
@@ -422,13 +422,13 @@ def remove_store(url: str) -> None:
     with translate_errors(url, "overwritten"):
         if is_remote(url):
             pointer = storage_at(url, read_only=False)
-            with hold(url, storage):
+            with changing(url, storage):
                 delete_files(pointer, ["zarr.json"])
             sync(pointer.delete_dir(str(metadata["run_id"])))
             return
         # Renamed at once, then deleted: a kill in between leaves no partial store.
         doomed = _beside(url, "deleted")
-        with hold(url, storage):
+        with changing(url, storage):
             Path(url).resolve().rename(doomed)
         shutil.rmtree(doomed, ignore_errors=True)
 
@@ -576,13 +576,12 @@ def _write_groups(
 def unfinished_line(store: RunStore) -> str:
     """Return a line on a store that is not finished: its blocks, and what to do.
 
-    A store that a living client holds is being written; any other is continued by a run.
+    A run continues one that no process writes.
     """
     done, blocks = len(committed(store)), len(store.blocks)
-    writer = holder(store.storage)
-    after = "`sweep run` continues it" if writer is None else (
-        f"it is being written by {writer['host']}, process {writer['pid']}: wait until it is "
-        "finished")
+    after = "`sweep run` continues it"
+    if is_written(store.storage):
+        after = "it is being written: wait until it is finished"
     return f"{store.url}: unfinished: {done:,} of {blocks:,} blocks; {after}"
 
 

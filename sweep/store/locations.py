@@ -178,6 +178,11 @@ def checked_url(url: str) -> str:
     return url
 
 
+def absolute_url(url: str) -> str:
+    """Return a store's address as every process of this machine understands it."""
+    return url if is_remote(checked_url(url)) else str(Path(url).absolute())
+
+
 def storage_at(url: str, *, read_only: bool) -> Store:
     """Return the Zarr storage at a URL, whatever lies there."""
     check_zarr()

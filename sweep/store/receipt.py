@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -20,12 +20,6 @@ from sweep.store.layout import ZSTD_LEVEL, checksum_of
 #
 # A receipt is the last thing that is written of a block, as JSON. It names its block, so that it
 # commits no other one.
-
-REQUIRED = {
-    "run_id", "processors", "scenes", "computed", "detection", "estimate", "seconds", "failures",
-    "wall_s", "written", "checksums", "block",
-}
-"""Keys that every receipt has."""
 
 STAGES = ("scene", "detection", "estimation")
 
@@ -156,41 +150,19 @@ class Receipt:
             content = json.loads(text)
         except RecursionError:
             raise ValueError("nested too deeply") from None
-        if not isinstance(content, dict) or not content.keys() >= REQUIRED:
+        if not isinstance(content, dict) or not content.keys() >= CHECKS.keys():
             raise ValueError("incomplete")
-        valid = (
-            isinstance(content["run_id"], str)
-            and isinstance(content["processors"], list)
-            and all(isinstance(each, str) for each in content["processors"])
-            and _is_count(content["scenes"])
-            and are_counts(content["detection"])
-            and are_counts(content["estimate"])
-            and _are_seconds(content["seconds"])
-            and isinstance(content["failures"], list)
-            and _is_number(content["written"])
-            and _is_number(content["wall_s"])
-            and _are_named_counts(content["computed"])
-            and _are_named_counts(content["checksums"])
-            and _is_count(content["block"])
-            and (content.get("basis") is None or _is_count(content["basis"]))
-        )
-        if not valid:
-            raise ValueError("a value of a wrong type")
-        return cls(
-            run_id=content["run_id"],
-            processors=tuple(content["processors"]),
-            scenes=content["scenes"],
-            computed=content["computed"],
-            detection=content["detection"],
-            estimate=content["estimate"],
-            seconds={stage: content["seconds"][stage] for stage in STAGES},
-            failures=tuple(RecordedFailure.from_dict(each) for each in content["failures"]),
-            wall_s=content["wall_s"],
-            written=content["written"],
-            checksums=content["checksums"],
-            block=content["block"],
-            basis=content.get("basis"),
-        )
+        basis = content.get("basis")
+        if not (basis is None or _is_count(basis)):
+            raise ValueError("basis: a value of a wrong type")
+        for key, valid in CHECKS.items():
+            if not valid(content[key]):
+                raise ValueError(f"{key}: a value of a wrong type")
+        return cls(**{key: content[key] for key in CHECKS} | {
+            "processors": tuple(content["processors"]),
+            "seconds": {stage: content["seconds"][stage] for stage in STAGES},
+            "failures": tuple(RecordedFailure.from_dict(each) for each in content["failures"]),
+        }, basis=basis)
 
     def check(self, scenes: int, settings: int, estimates: int) -> None:
         """Raise ValueError if this is no receipt of a block of so many scenes.
@@ -228,6 +200,10 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float))
 
 
+def _are_texts(values: Any) -> bool:
+    return isinstance(values, list) and all(isinstance(each, str) for each in values)
+
+
 def _are_seconds(values: Any) -> bool:
     return isinstance(values, dict) and all(
         isinstance(values.get(stage), list) and all(_is_number(value) for value in values[stage])
@@ -237,6 +213,16 @@ def _are_seconds(values: Any) -> bool:
 
 def _are_named_counts(values: Any) -> bool:
     return isinstance(values, dict) and all(_is_count(value) for value in values.values())
+
+
+CHECKS: dict[str, Callable[[Any], bool]] = {
+    "run_id": lambda value: isinstance(value, str), "processors": _are_texts,
+    "scenes": _is_count, "computed": _are_named_counts, "detection": are_counts,
+    "estimate": are_counts, "seconds": _are_seconds,
+    "failures": lambda value: isinstance(value, list), "wall_s": _is_number,
+    "written": _is_number, "checksums": _are_named_counts, "block": _is_count,
+}
+"""Keys that every receipt has, and what their values must be."""
 
 
 # --------------------------------------------------------------------------------------------------

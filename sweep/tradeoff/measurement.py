@@ -32,7 +32,7 @@ from sweep.plan.same_meaning import distinct, used_settings, wrong_configuration
 from sweep.plugins.loading import printing_to_stderr
 from sweep.plugins.recording import is_recording
 from sweep.store.lifecycle import open_dataset, open_store, unfinished_line, write_group
-from sweep.store.lock import locked
+from sweep.store.lock import changing
 from sweep.store.provenance import differences
 from sweep.tradeoff.costs import (
     Indices,
@@ -124,7 +124,7 @@ def measure_trade(
     renderers = None
     report = progress or (lambda _what, _share: None)
     with contextlib.ExitStack() as stack:
-        stack.enter_context(locked(store))
+        stack.enter_context(changing(url, store.storage))
         interrupts = stack.enter_context(Interrupts())
         if pipeline.plugins:
             stack.enter_context(printing_to_stderr())

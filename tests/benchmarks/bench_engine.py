@@ -24,10 +24,9 @@ import numpy as np
 from tables import header, row
 
 from sweep.evaluation.block import run_cells
-from sweep.execution.calibration import calibrate
-from sweep.execution.cluster import default_workers
-from sweep.execution.forecast import forecast
+from sweep.execution.forecast import forecast, seconds_of
 from sweep.execution.runner import execute
+from sweep.isolation.machine import default_workers
 from sweep.plan.grid import Block, block_indices, scene_axes
 from sweep.plan.pipeline import Pipeline
 
@@ -69,7 +68,8 @@ def grid_for(seconds, workers):
     """Return a pipeline that keeps ``workers`` busy for about ``seconds``."""
     text, scenes = grid(2)
     one = Pipeline.from_text(text)
-    trials = max(int(seconds * workers / (calibrate(one, min(2.0, seconds)).scene_s * scenes)), 8)
+    (spent_s,), sampled = seconds_of([one], 1536)
+    trials = max(int(seconds * workers * sampled / (spent_s * scenes)), 8)
     return Pipeline.from_text(grid(trials)[0]), trials
 
 

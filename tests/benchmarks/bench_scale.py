@@ -38,9 +38,9 @@ from numcodecs.vlen import VLenUTF8
 from numcodecs.zstd import Zstd
 
 import sweep
-from sweep.execution import engines as in_flight
-from sweep.execution.calibration import block_work_s
+from sweep.execution import on_cluster
 from sweep.execution.cluster import QUIET_DASK_CONFIG
+from sweep.execution.forecast import block_work_s
 from sweep.execution.progress import Tally
 from sweep.execution.status import close, status
 from sweep.integrity.verification import verify
@@ -102,8 +102,9 @@ def share_of(number):
     return 0.5 + number * 0.6180339887498949 % 1.0
 
 
-def simulated_block(url, run_id, block, _sources, time_limit_s, *_others, **_options):
+def simulated_blocks(url, run_id, blocks, _decision, _sources, time_limit_s, *_others):
     """Wait a block's time, here passed as its time limit; write its receipt and return it."""
+    (block,) = blocks
     begun = time.perf_counter()
     idle_s = begun - getattr(LAST, "end", math.nan)
     store = opened(url, run_id)
@@ -113,7 +114,7 @@ def simulated_block(url, run_id, block, _sources, time_limit_s, *_others, **_opt
     time.sleep(max(wanted - (time.perf_counter() - begun), 0.0))
     store.array(RECEIPTS)[number : number + 1] = np.array([text], dtype=object)
     LAST.end = begun + wanted
-    return receipt
+    return [receipt]
 
 
 async def live(address, count):
@@ -201,10 +202,8 @@ def measured(store, client, block_s, interrupts, scheduler):
             halfway.extend([scheduler.memory_info().rss, client_process.memory_info().rss])
 
     begun = time.perf_counter()
-    running = in_flight.BlocksInFlight(
-        store, client, store.url, (), block_s, interrupts=interrupts
-    )
-    running.compute(range(number), Tally(store, report))
+    on_cluster.OnCluster(store, client, (), block_s).run(
+        range(number), Tally(store, report), interrupts)
     wall = time.perf_counter() - begun
     after = [process.memory_info().rss for process in (scheduler, client_process)]
     found = [receipt for _, receipt in receipts(store, range(number))]
@@ -345,7 +344,7 @@ def main():
     sys.path.insert(0, str(Path(__file__).parent))
     import bench_scale  # noqa: PLC0415  (tasks name their function by its module)
 
-    in_flight.compute_block = bench_scale.simulated_block
+    on_cluster.compute_blocks = bench_scale.simulated_blocks
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         many_files()

@@ -16,7 +16,7 @@ from sweep.execution.forecast import Demand, FreeDisk, objections
 from sweep.execution.status import close
 from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import open_store
-from sweep.store.lock import locked
+from sweep.store.lock import writing
 
 TEXT = """
 pose = { jitter_px = 0.5 }
@@ -173,7 +173,7 @@ def test_repro_writes_no_file_unasked(folder, capsys):
 @pytest.mark.usefixtures("folder")
 def test_verify_of_a_store_that_is_being_written_points_to_its_status(capsys):
     url = "runs/unfinished.zarr"
-    with locked(open_store(url, "r+")):
+    with writing(url, open_store(url, "r+").storage):
         _, out, _ = told(capsys, f"verify {url} --sample 0")
     assert out.splitlines()[-1] == f"next: sweep status {url}"
 

@@ -3,25 +3,20 @@
 import math
 import time
 
-import numpy as np
 import pytest
 
 from support.reports import command
 from sweep.execution import forecast as forecast_module
-from sweep.execution.calibration import (
-    MIN_LIMIT_S,
-    BatchCost,
-    Calibration,
-    block_extents,
+from sweep.execution.forecast import (
     block_time_limit_s,
-    calibrate,
-    calibrate_in,
-    calibrate_isolated,
+    blocks_of,
+    demand_of,
+    forecast,
+    measure,
+    measured_or_assumed,
 )
-from sweep.execution.forecast import files_of, forecast
 from sweep.execution.limits import BLOCK_S, BLOCKS_PER_S, MAX_BLOCKS
 from sweep.isolation.child_process import Child
-from sweep.plan.grid import Blocks
 from sweep.plan.pipeline import Pipeline
 
 HUGE = """
@@ -41,55 +36,26 @@ trial = 50
 """
 
 
-def grid(scenes):
-    return Pipeline.from_text(
-        f"[pose]\njitter_px = 0.5\n[axes]\nside_px = [20, 40]\ntrial = {scenes // 2}")
-
-
-def simulated(scene_s, endless=math.inf):
-    """Return a cost function whose scenes take ``scene_s``; the batch with the scene of number
-    ``endless`` is ended after 1 s. It notes the sizes of its batches."""
-    sizes = []
-
-    def cost(_, indices):
-        sizes.append(len(indices[0]))
-        if sum(sizes) > endless:
-            raise TimeoutError(1.0)
-        seconds = np.full(sizes[-1], scene_s)
-        time.sleep(min(seconds.sum(), 0.02))
-        return BatchCost(seconds.sum(), seconds, seconds.sum())
-
-    return cost, sizes
-
-
-def test_scenes_that_never_return_leave_what_was_measured_before():
-    cost, sizes = simulated(1e-3, endless=40)
-    measured = calibrate(grid(1000), 0.6, cost)
-    assert measured.over
-    # The mean is at least that of the scenes and of the batch that was ended.
-    assert 1.0 / sum(sizes) < measured.scene_s < 1.1 / sizes[-1]
-    assert calibrate(grid(1000), 0.6, simulated(1.0, endless=0)[0]).scene_s == 1.0
-
-
 @pytest.mark.long
 def test_a_scene_that_takes_too_long_ends_the_measurement_and_makes_blocks_of_single_scenes():
     pipeline = Pipeline.from_text(HUGE)
-    with Child("sweep.execution.calibration") as child:
+    with Child("sweep.execution.forecast") as child:
         began = time.monotonic()
-        measured = calibrate_in(child, pipeline, 0.1, limit_s=0.2)
-    assert measured.over
+        timing = measure(child, pipeline, 0.1, limit_s=0.2)
+    assert timing.over
     assert time.monotonic() - began < 30  # half of it if the machine is idle
-    assert min(0.2, MIN_LIMIT_S) <= measured.scene_s
-    assert math.prod(block_extents(pipeline, measured, 2)) <= max(BLOCK_S / measured.scene_s, 1)
+    assert timing.scene_s >= 0.2
+    assert math.prod(blocks_of(pipeline, timing.scene_s, 2).extents) <= max(
+        BLOCK_S / timing.scene_s, 1)
     with Child() as child:
         child.close()
-        unmeasured = calibrate_isolated(child, pipeline, 0.1, 1.0)
-    assert (unmeasured.sampled, unmeasured.over) == (0, False)
+        assumed = measured_or_assumed(child, pipeline, 1.0)
+    assert (assumed.sampled, assumed.over) == (0, False)
 
 
 @pytest.mark.long
 def test_plan_answers_whatever_a_scene_costs(tmp_path, monkeypatch):
-    monkeypatch.setattr(forecast_module, "PLAN_SCENES_LIMIT_S", 0.2)
+    monkeypatch.setattr(forecast_module, "PLAN_SCENES_S", 0.2)
     (tmp_path / "huge.toml").write_text(HUGE)
     code, out, err = command("plan", tmp_path / "huge.toml")
     assert (code, err) == (0, "")
@@ -125,16 +91,16 @@ def test_blocks_grow_with_the_cluster_and_with_the_run(poses, scene_s, workers, 
     pipeline = Pipeline.from_text(
         f"[pose]\njitter_px = 0.5\n[axes]\nside_px = [20, 40]\ntrial = {poses // 2}"
     )
-    extents = block_extents(pipeline, Calibration(scene_s, 0.0, 1, (0.0, 0.0)), workers)
+    cut = blocks_of(pipeline, scene_s, workers)
+    extents, blocks = cut.extents, len(cut)
     assert math.prod(extents) * scene_s == pytest.approx(block_s, rel=0.15)
-    blocks = len(Blocks((2, poses // 2), extents))
     assert blocks <= 1.1 * max(BLOCKS_PER_S * poses * scene_s / workers, 6 * workers)
     assert blocks <= MAX_BLOCKS or block_s == 3600.0
     assert block_time_limit_s(None, math.prod(extents) * scene_s) == pytest.approx(
         max(600.0, 10 * block_s), rel=0.15)
-    limited = block_extents(
-        pipeline, Calibration(scene_s, 0.0, 1, (0.0, 0.0)), workers, None, 30.0)
-    assert math.prod(limited) * scene_s == pytest.approx(min(block_s, 3.0), rel=0.15)
+    limited = blocks_of(pipeline, scene_s, workers, None, 30.0)
+    assert math.prod(limited.extents) * scene_s == pytest.approx(
+        min(block_s, 3.0), rel=0.15, abs=scene_s)
 
 
 @pytest.mark.parametrize("lengths", [
@@ -152,9 +118,7 @@ def test_no_grid_of_a_billion_poses_makes_more_blocks_and_files_than_a_disk_can_
     )
     pipeline = Pipeline.from_text(
         f"[pose]\njitter_px = 0.5\n[axes]\n{axes}\ntrial = {lengths[-1]}")
-    measured = Calibration(scene_s, 0.0, 1, (0.0,) * len(lengths))
-    extents = block_extents(pipeline, measured, 64)
-    blocks = len(Blocks(lengths, extents))
-    assert blocks <= MAX_BLOCKS
-    assert files_of(pipeline, blocks) <= 3_000_000
-    assert math.prod(extents) * scene_s < 2.5 * math.prod(lengths) * scene_s / MAX_BLOCKS
+    blocks = blocks_of(pipeline, scene_s, 64)
+    assert len(blocks) <= MAX_BLOCKS
+    assert demand_of(pipeline, scene_s, 64, len(blocks), len(blocks)).files <= 3_000_000
+    assert math.prod(blocks.extents) * scene_s < 2.5 * math.prod(lengths) * scene_s / MAX_BLOCKS

@@ -2,7 +2,6 @@
 
 import contextlib
 import copy
-import itertools
 import logging
 import os
 import signal
@@ -21,16 +20,14 @@ from support.commands import started
 from sweep.errors import ArgumentError, RunError
 from sweep.execution import cluster as clusters
 from sweep.execution import cluster as worker_versions
-from sweep.execution import engines as stall
-from sweep.execution.cluster import borrowed, embedded, worker_states
-from sweep.execution.engines import BlocksInFlight
+from sweep.execution import on_cluster
+from sweep.execution.cluster import WorkerState, borrowed, embedded, worker_states
+from sweep.execution.on_cluster import OnCluster
 from sweep.execution.progress import Tally
 from sweep.execution.runner import execute
-from sweep.isolation import machine as machine_memory
 from sweep.isolation.child_process import Interrupts
 from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import create_store, open_store
-from sweep.store.lock import locked
 from sweep.store.provenance import fingerprint
 
 PIPELINE = sweep.Pipeline.from_dict(
@@ -263,79 +260,27 @@ def test_embedded_cluster_computes_whatever_dask_is_configured_to_do(monkeypatch
     assert dask.config.config == before
 
 
-class Identity:
-    """A client whose scheduler tells what workers do."""
-
-    status = "running"
-
-    def __init__(self, *states, dying=False):
-        self.scheduler = self
-        self._states = states
-        self._deaths = [(0.0, {"action": "add-worker"}), (0.0, "of another kind"),
-                        (0.0, {"action": "remove-worker", "expected": True})]
-        self._dying = dying
-
-    def identity(self):
-        raise AssertionError("asked through sync")
-
-    def events(self, topic):
-        raise AssertionError(topic)
-
-    def sync(self, question, **_):
-        if self._states == (None,):
-            raise TimeoutError
-        if question == self.events:
-            if self._dying:
-                self._deaths.append((0.0, {"action": "remove-worker", "expected": False}))
-            return self._deaths
-        return {"workers": {str(k): {"status": state} for k, state in enumerate(self._states)}}
-
-
 @pytest.mark.parametrize(("states", "line"), [
-    (("running", "running"), "8 blocks are with 2 workers, which compute; a block ends after"),
-    (("paused", "running"), "1 of 2 workers are paused by Dask, because they use most"),
-    ((), "there are no workers; start some"),
-    ((None,), "the scheduler does not answer"),
+    (("running", "running"), "0 are with 2 workers; a block ends after at most 7 s"),
+    (("paused", "running"), "0 are with 2 workers, 1 of them paused by Dask"),
 ])
-def test_run_without_progress_says_why_once_in_a_while(states, line, monkeypatch, capsys):
-    monkeypatch.setattr(stall, "STALL_S", 0.1)
-    monkeypatch.setattr(stall, "STATES_INTERVAL_S", 0.0)
-    watch = stall.StallWatch(Identity(*states), 1.0)
-    watch.check(8)
-    assert capsys.readouterr().err == ""
+def test_run_without_progress_says_so_once_in_a_while(states, line, monkeypatch, capsys):
+    monkeypatch.setattr(on_cluster, "STALL_S", 0.1)
+    monkeypatch.setattr(on_cluster, "worker_states", lambda *_: {
+        str(k): WorkerState(1, state) for k, state in enumerate(states)})
+    engine = OnCluster(None, None, time_limit_s=7)
     deadline = time.monotonic() + 0.35
     while time.monotonic() < deadline:
-        watch.check(8)
+        engine.check()
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2  # after 0.1 s, and after 0.2 s
     assert all(f"no block was finished for 0 s: {line}" in each for each in lines)
-    watch.finished()
-    watch.check(8)
-    assert capsys.readouterr().err == ""
-
-
-def check_until(watch, deadline):
-    while time.monotonic() < deadline:
-        watch.check(8)
-
-
-def test_run_whose_workers_die_again_and_again_ends_in_a_line(monkeypatch):
-    monkeypatch.setattr(stall, "STALL_S", 0.1)
-    monkeypatch.setattr(stall, "STATES_INTERVAL_S", 0.01)
-    kills = itertools.count()
-    for counted, reason in ((lambda: 7, "if by SIGKILL, as where memory runs out, use fewer"),
-                            (lambda: next(kills), r"SIGKILL, because memory ran out \([0-9,]+ MB")):
-        monkeypatch.setattr(machine_memory, "memory_kills", counted)
-        monkeypatch.setattr(stall, "memory_kills", counted)
-        watch = stall.StallWatch(Identity("running", "running", dying=True), 600.0)
-        with pytest.raises(RunError, match=f"workers died [0-9]+ times meanwhile; {reason}"):
-            check_until(watch, time.monotonic() + 10)
 
 
 @pytest.mark.long
-def test_run_whose_workers_are_all_paused_ends_in_a_line(monkeypatch, tmp_path):
-    monkeypatch.setattr(stall, "STALL_S", 1.0)
-    monkeypatch.setattr(stall, "STATES_INTERVAL_S", 0.1)
+def test_run_whose_workers_are_all_paused_ends_in_a_line(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(on_cluster, "STALL_S", 1.0)
+    monkeypatch.setattr(on_cluster, "NO_WORKERS_TIMEOUT_S", 3.0)
     with (
         dask.config.set({"distributed.worker.memory.pause": 1e-6,
                          "distributed.worker.memory.terminate": False,
@@ -344,14 +289,14 @@ def test_run_whose_workers_are_all_paused_ends_in_a_line(monkeypatch, tmp_path):
         Client(cluster, set_as_default=False) as client,
     ):
         store = create_store(str(tmp_path / "paused.zarr"), PIPELINE, (40,))
-        while worker_states(client, 10.0) != {next(iter(client.nthreads())): "paused"}:
+        while [state.status for state in worker_states(client, 10.0).values()] != ["paused"]:
             time.sleep(0.05)
-        with locked(store), Interrupts() as interrupts, pytest.raises(RunError) as raised:
-            BlocksInFlight(store, client, store.url, interrupts=interrupts).compute(
-                [0], Tally(store)
-            )
+        with Interrupts() as interrupts, pytest.raises(RunError) as raised:
+            OnCluster(store, client).run([0], Tally(store), interrupts)
     (line,) = str(raised.value).splitlines()
-    assert "1 of 1 workers are paused by Dask" in line
+    assert "1 workers, 1 of them paused by Dask" in line
+    (first, *_) = capsys.readouterr().err.splitlines()
+    assert "no block was finished for 1 s: 1 are with 1 workers, 1 of them paused" in first
 
 
 @pytest.mark.long

@@ -26,11 +26,8 @@ from sweep.execution.runner import execute
 from sweep.plan.grid import Block, Blocks, scene_axes
 from sweep.plan.pipeline import Pipeline
 from sweep.plan.schema import variables_of
-from sweep.store import lock as locks
 from sweep.store.blocks import committed
-from sweep.store.files import read_json, write_document
 from sweep.store.lifecycle import create_store, open_store, remove_store
-from sweep.store.lock import KEY, locked
 
 TEXT = """
 title = "A small grid with every kind of axis"
@@ -302,27 +299,22 @@ def test_an_unwritable_path_is_told_in_a_line(tmp_path, capsys):
     assert capsys.readouterr().err == "--workers 0: expected at least 1\n"
 
 
-@pytest.mark.usefixtures("no_child")
-def test_store_in_use_is_refused_and_a_dead_lock_is_not(pipeline, tmp_path):
-    url = str(tmp_path / "held.zarr")
-    store = create_store(url, pipeline, (2, 4, 2, 3))
-    here = json.loads(locks._content("x"))
-    write_document(store.storage, KEY, here)
-    with pytest.raises(StoreError, match=f"process {os.getpid()} on .* is writing it"):
-        execute(pipeline, url)
-    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
-        pass
-    write_document(store.storage, KEY, {**here, "pid": ended.pid})
-    assert execute(pipeline, url).computed_blocks == 1
-    assert not (Path(url) / KEY).exists()
-
-
-def test_lock_that_was_taken_over_is_left_to_its_holder(pipeline, tmp_path):
-    store = create_store(str(tmp_path / "taken.zarr"), pipeline, (2, 4, 2, 3))
-    theirs = json.loads(locks._content("x"))
-    with locked(store):
-        write_document(store.storage, KEY, theirs)
-    assert read_json(store.storage, KEY) == theirs
+@pytest.mark.long
+def test_two_clients_at_once_on_one_store_make_the_same_bits(pipeline, undisturbed, tmp_path):
+    path, url = tmp_path / "twice.toml", tmp_path / "twice.zarr"
+    path.write_text(TEXT)
+    create_store(str(url), pipeline, (1, 2, 1, 1))
+    with contextlib.ExitStack() as stack:
+        clients = [
+            stack.enter_context(subprocess.Popen(
+                [sys.executable, "-m", "sweep", "run", path, "--store", url, "--workers", "1"],
+                cwd=tmp_path, stderr=subprocess.PIPE, text=True))
+            for _ in range(2)
+        ]
+        for client in clients:
+            assert client.communicate()[1].count("Error") == 0
+            assert client.returncode == 0
+    assert same(str(url), undisturbed)
 
 
 def test_silent_scheduler_is_given_up(pipeline, tmp_path, monkeypatch):
@@ -387,7 +379,7 @@ def test_interrupted_run_says_how_to_go_on_and_goes_on(workers, tmp_path, capsys
     assert 0 < done < len(store.blocks)
     assert main(["status", store.url, "--json"]) == 0
     state = json.loads(capsys.readouterr().out)
-    assert state["writer"] is None
+    assert not state["being_written"]
     assert state["blocks_done"] == done
 
 

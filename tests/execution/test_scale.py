@@ -32,9 +32,11 @@ import json, sys
 import synthetic
 synthetic.install()
 from sweep.execution.runner import execute
+from sweep.plan.grid import Blocks
 from sweep.plan.pipeline import Pipeline
 import sweep.execution.runner as engine
-engine.block_extents = lambda *_: (1, 200, max(int(sys.argv[4]) // 50, 1))
+extents = 1, 200, max(int(sys.argv[4]) // 50, 1)
+engine.blocks_of = lambda *_: Blocks((50, 200, int(sys.argv[4])), extents)
 summary = execute(Pipeline.from_toml(sys.argv[1]), sys.argv[2], scheduler=sys.argv[3])
 # Not ru_maxrss, which begins at the parent's size.
 status = dict(line.split(":", 1) for line in open("/proc/self/status"))

@@ -17,7 +17,7 @@ from sweep.isolation.child_process import Child, ChildRaisedError, Interrupts
 from sweep.plan.pipeline import Pipeline
 from sweep.store.blocks import drop_block
 from sweep.store.lifecycle import open_store
-from sweep.store.lock import locked
+from sweep.store.lock import writing
 
 TEXT = """
 seed = 3
@@ -60,7 +60,7 @@ def test_small_run_and_small_repair_start_no_cluster(pipeline, undisturbed, tmp_
     assert (summary.computed_scenes, summary.failed, summary.crashed) == (12, 0, 0)
     assert same(url, undisturbed)
     store = open_store(url, "r+")
-    with locked(store):
+    with writing(store.url, store.storage):
         drop_block(store, store.blocks[0])
         recompute(store, [0])
     assert same(url, undisturbed)
@@ -105,16 +105,15 @@ class Failing(Here):
 
 def compute(store, child):
     with child, Interrupts() as interrupts:
-        small_run.BlocksInChild(
-            store, child, store.url, time_limit_s=60, interrupts=interrupts
-        ).compute(iter(range(len(store.blocks))), Tally(store))
+        small_run.InChild(store, child, time_limit_s=60).run(
+            range(len(store.blocks)), Tally(store), interrupts)
 
 
 @pytest.mark.long
 def test_block_that_ends_its_process_each_time_is_named(undisturbed, monkeypatch):
     monkeypatch.setattr(small_run, "MAX_DEATHS", 1)
-    monkeypatch.setattr(small_run, "compute_block", suicide)
-    failed = r"block 0-2,0-6: its process ended: SIGKILL, as where memory runs out \(limit "
+    monkeypatch.setattr(small_run, "compute_blocks", suicide)
+    failed = r"block 0-2,0-6: its process ended: SIGKILL, as where memory runs out: use "
     with pytest.raises(RunError, match=failed):
         compute(open_store(undisturbed), Child())
 

@@ -11,7 +11,6 @@ from sweep.errors import RunError
 from sweep.execution import cluster as thread_limit
 from sweep.execution.cluster import check_threads, threads_left
 from sweep.isolation import machine as groups
-from sweep.isolation.machine import memory_kills, memory_limit_bytes
 
 TOP = Path(__file__).parents[2]
 
@@ -72,7 +71,3 @@ def test_limits_of_a_container_are_read(container, monkeypatch):
     check_threads(2)
     with pytest.raises(RunError, match=r"3 worker processes .* need 45 threads, .* allows 38 more"):
         check_threads(3)
-    (container / "memory.max").write_text("700000000\n")
-    assert memory_limit_bytes() == 700_000_000
-    (container / "inner" / "memory.events").write_text("low 0\noom 5\noom_kill 3\n")
-    assert memory_kills() == 3

@@ -10,9 +10,9 @@ import sweep
 from support import machine_faults
 from support.stores import by_hand, same
 from sweep.errors import MachineFaultError, RunError, StoreError
-from sweep.execution import engines as worker_faults
+from sweep.execution import on_cluster as worker_faults
 from sweep.execution.block_task import compute_block
-from sweep.execution.engines import BlocksInFlight, WorkerFaults
+from sweep.execution.on_cluster import OnCluster, WorkerFaults
 from sweep.execution.progress import Tally
 from sweep.execution.status import close
 from sweep.isolation.child_process import Interrupts
@@ -20,7 +20,7 @@ from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.store.blocks import committed
 from sweep.store.lifecycle import create_store, open_store
 from sweep.store.locations import exists
-from sweep.store.lock import locked
+from sweep.store.lock import writing
 
 PIPELINE = sweep.Pipeline.from_dict(
     {"seed": 5, "pose": {"side_px": 40, "jitter_px": 0.5},
@@ -58,10 +58,10 @@ def run_on(client, url):
     )
     done = committed(store)
     waiting = [number for number in range(len(store.blocks)) if number not in done]
-    with locked(store), Interrupts() as interrupts:
+    with writing(store.url, store.storage), Interrupts() as interrupts:
         tally = Tally(store)
         tally.begin(done)
-        BlocksInFlight(store, client, str(url), interrupts=interrupts).compute(waiting, tally)
+        OnCluster(store, client).run(waiting, tally, interrupts)
         close(store)
     counts = open_store(str(url)).run_metadata["counts"]
     return counts["detection"][DetectionStatus.failed] + counts["estimate"][EstimateStatus.failed]
@@ -129,7 +129,7 @@ def test_worker_that_cannot_write_the_store_is_used_no_more(
 
 def test_only_a_worker_that_fails_much_of_what_others_compute_is_retired(monkeypatch):
     retired = []
-    monkeypatch.setattr(worker_faults, "thread_counts", lambda *_: dict.fromkeys("ab", 1))
+    monkeypatch.setattr(worker_faults, "worker_states", lambda *_: dict.fromkeys("ab", 1))
     monkeypatch.setattr(worker_faults, "worker_that_failed", lambda _, key: key)
     monkeypatch.setattr(WorkerFaults, "_retire", lambda _, worker: retired.append(worker))
     fault = MachineFaultError("full", "here")
@@ -137,21 +137,21 @@ def test_only_a_worker_that_fails_much_of_what_others_compute_is_retired(monkeyp
     for number in range(300):
         if number % 10 == 0:
             assert seldom.others(number, "a", fault) == ["b"]
-        seldom.computed(number)
+        seldom.computed(number, 2)
     assert retired == []
     often = WorkerFaults(None)
     for number in range(30):
         others = often.others(number, "ab"[number % 2], fault)
         assert others == ["ba"[number % 2]]
-        often.computed(number)
-        monkeypatch.setattr(worker_faults, "thread_counts",
+        often.computed(number, 2 - len(retired))
+        monkeypatch.setattr(worker_faults, "worker_states",
                             lambda *_: dict.fromkeys(set("ab") - set(retired), 1))
         if retired:
             break
     assert retired == ["a"]
     for number in range(30, 40):  # the last one stays
         assert often.others(number, "b", fault) == []
-        often.computed(number)
+        often.computed(number, 2 - len(retired))
     assert retired == ["a"]
 
 

@@ -142,26 +142,14 @@ def test_receipts_of_something_else_are_told(change, copied, capsys):
     assert "sweep verify --repair" in capsys.readouterr().err
 
 
-def test_failures_and_locks_steer_no_terminal(copied, capsys):
+def test_failures_steer_no_terminal(copied, capsys):
     failure = {"scene": 0, "kind": "failed", "stage": "detection", "setting": 0,
                "estimator": None, "text": "Error: \x1b[2J\x1b]0;title\x07"}
     edit_receipt(copied, 0, lambda content: content.update(failures=[failure]))
-    lock = {"host": "\x1b[2J", "pid": os.getpid(), "beat": 1e300, "token": "x"}
-    (copied / "commits/receipt/lock.json").write_text(json.dumps(lock))
     assert main(["status", str(copied)]) == 0
     said = capsys.readouterr()
     assert "Error" in said.out
     assert all(line.isprintable() for line in (said.out + said.err).splitlines())
-
-
-@pytest.mark.parametrize("content", [
-    "garbage", "[]", '{"pid": 1e400, "beat": NaN, "host": []}', "[" * 100_000,
-    '{"token": "x", "host": "h", "pid": -1, "beat": 1}',
-])
-def test_locks_of_garbage_lock_nothing(content, copied, capsys):
-    (copied / "commits/receipt/lock.json").write_text(content)
-    assert main(["status", str(copied)]) == 0
-    assert "being written" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", ["detection", "commits", "nees/c"])

@@ -275,12 +275,3 @@ def test_receipts_keep_a_bounded_number_of_rows_and_the_end_of_a_long_traceback(
     assert [one.scene for one in failed] == list(range(5000, 5000 + 2 * len(failed), 2))
     assert all(one.text.endswith("last") and len(one.text) <= 4000 for one in kept)
     assert recorded(failures, rows, {"failed": 0, "crashed": 0}) == ()
-
-
-def test_no_more_than_a_thousand_rows_of_each_kind_are_kept():
-    from sweep.execution import block_task as task  # noqa: PLC0415
-    from sweep.execution import status as closing  # noqa: PLC0415
-    from sweep.store import outcome as failures  # noqa: PLC0415
-
-    assert failures.MAX_ROWS == closing.MAX_ROWS == 1000
-    assert task.FAILURE_QUOTA == {"failed": 1000, "crashed": 1000}

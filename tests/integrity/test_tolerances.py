@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sweep.integrity.sample_check import Comparison, compare
+from sweep.integrity.recomputation import Comparison, compare
 
 TURN = Rotation.from_rotvec([0.3, -0.2, 0.1])
 

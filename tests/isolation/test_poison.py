@@ -328,7 +328,7 @@ def test_scene_whose_process_is_killed_from_outside_is_no_result(pipeline, clean
     print(f"{seconds:.1f} s")
     assert ran.returncode == 1
     (line,) = ran.stderr.splitlines()
-    assert "SIGKILL, as where memory runs out (limit " in line
+    assert "SIGKILL, as where memory runs out: use fewer" in line
     assert "use fewer workers, or give them more memory; it is --at distance_m=" in line
     assert committed(store) == set(range(6)) - {block_of(store, 59)}
     ran, _, _ = run_poisoned(tmp_path, TEXT, [])

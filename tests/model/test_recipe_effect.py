@@ -32,7 +32,7 @@ import numpy as np
 from sweep.errors import PipelineError
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import search, search_windows, whole_frames
-from sweep.execution.forecast import effect_cost
+from sweep.execution.forecast import seconds_of, without_effect
 from sweep.measure.flags import BoundStatus
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import marker_levels
@@ -89,7 +89,8 @@ print(json.dumps({
     "parts": {part.name: [part.active, part.switch] for part in parts(pipeline)},
     "draws": next(part.reason for part in parts(pipeline) if part.name == "random draws"),
     "bound": [BoundStatus(int(flag)).name for flag in cells.columns["bound"][0]],
-    "costs": [effect_cost(pipeline, switch, 8, 0)[0] for switch in ("haze", "column_noise_grey")],
+    "costs": seconds_of([without_effect(pipeline, switch)
+                         for switch in ("haze", "column_noise_grey")], 8)[0],
     "broken": [broken("haze_x = 1"), broken("read_noise_e = 3")],
     "table": TABLES["effects"](),
     "parameters": TABLES["parameters.scene"](),

@@ -8,8 +8,7 @@ import pytest
 from support.here import Here, calls_here
 from support.stores import by_hand, in_waves, same
 from sweep.errors import OtherExperimentError, StoreError
-from sweep.execution.calibration import Calibration
-from sweep.execution.forecast import check_new
+from sweep.execution.forecast import check_affordable
 from sweep.execution.runner import execute, tighten
 from sweep.execution.status import close, status
 from sweep.integrity.repair import repair
@@ -127,10 +126,9 @@ def test_workers_and_blocks_and_tightening_change_no_bit(tmp_path):
 def test_a_run_in_waves_is_refused_for_what_it_needs_and_not_for_all_its_trials():
     """Two conditions of rates 0 and 1: a few hundred of three million poses."""
     pipeline = precise("0.02", ["side_px = [8, 30]", "precision.max_trials = 1_500_000"])
-    measured = Calibration(0.04, 0.0, 1, (0.04,))
-    with pytest.raises(StoreError, match="takes about 33"):
-        check_new("none.zarr", pipeline, measured, 1, (2, 50), None)
-    check_new("none.zarr", pipeline, measured, 1, (2, 50), Here())
+    with pytest.raises(StoreError, match="takes about"):
+        check_affordable("none.zarr", pipeline, 1.0, 1, 30_000, 30_000, Here())
+    check_affordable("none.zarr", pipeline, 0.04, 1, 30_000, 30_000, Here())
 
 
 @pytest.mark.long

@@ -23,7 +23,7 @@ from sweep.execution.status import close
 from sweep.plan.grid import block_indices
 from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import create_store, open_store
-from sweep.store.lock import locked
+from sweep.store.lock import closing as alone
 
 PATIENCE_S = 300
 
@@ -39,7 +39,7 @@ def closing(url, file, number):
     """Close one of several complete stores, as a run does."""
     del file
     store = open_store(f"{url}/{number}.zarr", "r+")
-    with locked(store):
+    with alone(store.url, store.storage):
         close(store)
 
 

@@ -27,9 +27,9 @@ def synthetic_cells(pipeline, indices, need=None):  # noqa: ARG001
 
 def install():
     import sweep.execution.block_task  # noqa: PLC0415
-    import sweep.execution.calibration  # noqa: PLC0415
+    import sweep.execution.forecast  # noqa: PLC0415
 
-    sweep.execution.calibration.run_cells = synthetic_cells
+    sweep.execution.forecast.run_cells = synthetic_cells
     sweep.execution.block_task.run_cells = synthetic_cells
 
 

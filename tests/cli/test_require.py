@@ -7,8 +7,6 @@ import pytest
 from support.stores import by_hand
 from sweep import Pipeline, cli
 from sweep.execution.status import close
-from sweep.report.answer import required
-from sweep.report.report_data import read_report_data
 from sweep.store.lifecycle import create_store
 
 TEXT = """
@@ -95,24 +93,6 @@ def test_every_condition_that_fails_has_a_line(require):
 def test_pooled_axes_are_named(require):
     out = require("two.zarr", "detection >= 0.3", "--per", "")[1]
     assert "pooled over side_px" in out
-
-
-@pytest.mark.long
-def test_without_conditions_each_size_is_one_as_in_the_report(folder, require):
-    code, out, _ = require("bare.zarr", "detection >= 0.45")
-    assert code == 1
-    assert "side_px=11  1 of 2" in out
-    assert "at each value of side_px; --per '' pools all" in out
-    url = str(folder / "bare.zarr")
-    for per in (None, [], ["side_px"]):
-        data = read_report_data(url, ["detection >= 0.45"], per)
-        pooled = require("bare.zarr", "detection >= 0.45", *(
-            [] if per is None else ["--per", ",".join(per)]), "--json")[1]
-        assert json.loads(pooled)["per"] == list(data.per)
-        found = required(data)
-        assert found.decision.name == json.loads(pooled)["decision"]
-        assert [each.decision.name for each in found.verdicts] == [
-            each["decision"] for each in json.loads(pooled)["requirements"]]
 
 
 def test_markdown_has_every_condition(require):

@@ -134,17 +134,6 @@ def test_a_scored_store_is_a_store(scored, capsys):
     assert (scene.decoded[0][1] == scene.markers[0]).all()
 
 
-@pytest.mark.long
-def test_a_scored_store_is_reported_and_its_cells_reproduced(scored, tmp_path, capsys):
-    assert cli.main(["verify", str(scored)]) == 0
-    assert re.search(r"sound: .* \d+ scenes recomputed", capsys.readouterr().out)
-    assert cli.main(["repro", str(scored), "--at", "tilt_deg=50"]) == 0
-    assert "agrees with the store bit for bit" in capsys.readouterr().out
-    page = tmp_path / "report.html"
-    assert cli.main(["report", str(scored), "-o", str(page)]) == 0
-    assert "Cannot be drawn" not in page.read_text()
-
-
 def test_verify_names_recorded_detections_that_were_changed_or_deleted(exported, tmp_path, capsys):
     ready = prepare(exported, [exported / "detections.csv"], names=["gone"])
     results_of(ready.pipeline, tmp_path / "gone.zarr")

@@ -1,7 +1,6 @@
 """The cluster of a run: embedded, on the loopback interface alone and quiet, or the caller's."""
 
 import contextlib
-import copy
 import logging
 import os
 import signal
@@ -10,7 +9,6 @@ import subprocess
 import sys
 import time
 
-import dask
 import psutil
 import pytest
 from distributed import Client, LocalCluster
@@ -21,9 +19,8 @@ from sweep.errors import ArgumentError, RunError
 from sweep.execution import cluster as clusters
 from sweep.execution import cluster as worker_versions
 from sweep.execution import on_cluster
-from sweep.execution.cluster import WorkerState, borrowed, embedded, worker_states
+from sweep.execution.cluster import WorkerState, borrowed, embedded
 from sweep.execution.on_cluster import OnCluster
-from sweep.execution.progress import Tally
 from sweep.execution.runner import execute
 from sweep.isolation.child_process import Interrupts
 from sweep.plan.pipeline import Pipeline
@@ -187,14 +184,6 @@ def test_run_that_is_stopped_takes_its_blocks_back_from_the_callers_client(tmp_p
         assert (results.detection == 1).all()
 
 
-@pytest.mark.long
-def test_cluster_that_adapts_starts_a_worker_for_a_run(tmp_path):
-    with local_cluster(0) as cluster:
-        cluster.adapt(minimum=0, maximum=2, interval="200ms")
-        results = sweep.run(PIPELINE, store=tmp_path / "adapted.zarr", client=cluster)
-        assert (results.detection == 1).all()
-
-
 HOSTILE = {
     "distributed.scheduler.idle-timeout": "1ms",
     "distributed.scheduler.no-workers-timeout": "1ms",
@@ -247,19 +236,6 @@ def computes():
         return client.submit(sum, [1, 2]).result(timeout=60) == 3
 
 
-@pytest.mark.long
-def test_embedded_cluster_computes_whatever_dask_is_configured_to_do(monkeypatch, tmp_path):
-    # As the worker processes read it by themselves: variables, and files.
-    monkeypatch.setenv("DASK_DISTRIBUTED__WORKER__LIFETIME__DURATION", "1s")
-    monkeypatch.setenv("DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION", "True")
-    (tmp_path / "hostile.yaml").write_text("distributed: {worker: {preload: [no_such_module]}}\n")
-    monkeypatch.setenv("DASK_CONFIG", str(tmp_path))
-    before = copy.deepcopy(dask.config.config)
-    with dask.config.set(HOSTILE):
-        assert computes()
-    assert dask.config.config == before
-
-
 @pytest.mark.parametrize(("states", "line"), [
     (("running", "running"), "0 are with 2 workers; a block ends after at most 7 s"),
     (("paused", "running"), "0 are with 2 workers, 1 of them paused by Dask"),
@@ -275,28 +251,6 @@ def test_run_without_progress_says_so_once_in_a_while(states, line, monkeypatch,
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2  # after 0.1 s, and after 0.2 s
     assert all(f"no block was finished for 0 s: {line}" in each for each in lines)
-
-
-@pytest.mark.long
-def test_run_whose_workers_are_all_paused_ends_in_a_line(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(on_cluster, "STALL_S", 1.0)
-    monkeypatch.setattr(on_cluster, "NO_WORKERS_TIMEOUT_S", 3.0)
-    with (
-        dask.config.set({"distributed.worker.memory.pause": 1e-6,
-                         "distributed.worker.memory.terminate": False,
-                         "distributed.worker.memory.monitor-interval": "50ms"}),
-        local_cluster(1, memory_limit="8GiB") as cluster,
-        Client(cluster, set_as_default=False) as client,
-    ):
-        store = create_store(str(tmp_path / "paused.zarr"), PIPELINE, (40,))
-        while [state.status for state in worker_states(client, 10.0).values()] != ["paused"]:
-            time.sleep(0.05)
-        with Interrupts() as interrupts, pytest.raises(RunError) as raised:
-            OnCluster(store, client).run([0], Tally(store), interrupts)
-    (line,) = str(raised.value).splitlines()
-    assert "1 workers, 1 of them paused by Dask" in line
-    (first, *_) = capsys.readouterr().err.splitlines()
-    assert "no block was finished for 1 s: 1 are with 1 workers, 1 of them paused" in first
 
 
 @pytest.mark.long

@@ -7,11 +7,8 @@ from scipy.spatial.transform import Rotation
 
 import sweep
 from sweep.analysis import compare, detection_rate, error_statistics
-from sweep.execution.block_task import compute_block
-from sweep.execution.status import close
 from sweep.integrity.reproduction import reproduce
 from sweep.integrity.verification import verify
-from sweep.store.lifecycle import create_store
 from tests.support.here import calls_here
 
 PIPELINE = {
@@ -119,30 +116,6 @@ def test_analyses_bin_by_what_was_drawn(results):
         results.sel(solver="ippe"), results.sel(solver="iterative"), bins={"side_px": [25, 40, 60]}
     )
     assert pair.compared.sum() == 2 * 40
-
-
-@pytest.mark.long
-def test_blocks_that_were_not_computed_have_no_draws(tmp_path):
-    pipeline = sweep.Pipeline.from_dict(PIPELINE)
-    url = str(tmp_path / "half.zarr")
-    store = create_store(url, pipeline, (1, 40))
-    compute_block(url, store.run_id, store.blocks[1])
-    half = sweep.open(url)
-    for name in DRAWN:
-        assert np.isnan(half[name].sel(azimuth_deg=0)).all()
-        assert np.isfinite(half[name].sel(azimuth_deg=30)).all()
-    grown = sweep.Pipeline.from_dict(
-        PIPELINE | {"axes": PIPELINE["axes"] | {"azimuth_deg": [30, 60]}}
-    )
-    other = str(tmp_path / "grown.zarr")
-    store = create_store(other, grown, (2, 10))
-    computed = [compute_block(other, store.run_id, block, (url,)) for block in store.blocks]
-    assert sum(receipt.computed["scenes"] for receipt in computed) == 40
-    close(store)
-    for name in DRAWN:
-        xr.testing.assert_identical(
-            half[name].sel(azimuth_deg=30), sweep.open(other)[name].sel(azimuth_deg=30)
-        )
 
 
 def test_tables_leave_out_what_is_fixed(results):

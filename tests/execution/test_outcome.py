@@ -1,13 +1,9 @@
 """What a run says of failures, of nothing detected, and of its rate."""
 
-import json
 
 import numpy as np
 import pytest
 
-from support.commands import command
-from support.poison import Poison, poisoned
-from sweep.cli import main
 from sweep.execution.progress import Progress, ProgressLines
 from sweep.execution.status import WrittenBlock, poses_per_second
 from sweep.measure.flags import DetectionStatus, EstimateStatus
@@ -93,32 +89,6 @@ def test_what_failed_is_said_first_and_loudest(detection, estimate, nothing, sha
     assert found.warnings[0].startswith(first)
     expected = "--at trial=3" if share else "--at trial=0 -o scene.png"
     assert found.advice == f"sweep repro 'a b.zarr' {expected}"
-
-
-@pytest.mark.long
-def test_solver_that_raises_on_every_scene_ends_with_status_1_and_one_command(tmp_path, capsys):
-    path, url = tmp_path / "bad.toml", str(tmp_path / "bad.zarr")
-    path.write_text(TEXT.replace('["ippe_square", "iterative"]', '["iterative"]').replace(
-        "[30, 60]", "[30]"))
-    poisons = [Poison(cell, "estimation", "raise") for cell in range(2)]
-    env = poisoned(poisons, tmp_path / "log")
-    ran = command("run", path, "--store", url, "--json", env=env)
-    assert (ran.returncode, ran.stderr) == (1, "")
-    told = json.loads(ran.stdout)
-    assert (told["nothing_computed"], told["failed_share"], told["failed"]) == (True, 1.0, 2)
-    assert [(group["count"], group["reason"]) for group in told["failures"]] == [
-        (2, "RuntimeError: poisoned")]
-    assert told["warnings"][0] == "nothing computed: all 2 estimates failed"
-    assert told["advice"].startswith(f"sweep repro {url} --at side_px=30.0,solver=iterative,trial=")
-    assert main(["run", str(path), "--store", url]) == 1  # a finished store tells it as well
-    assert capsys.readouterr().out.splitlines()[-3:] == [
-        *told["warnings"], f"next: {told['advice']}"]
-    assert main(["status", url]) == 0
-    assert capsys.readouterr().out.splitlines()[-3:] == [
-        *told["warnings"], f"next: {told['advice']}"]
-    assert main(["report", url, "-o", str(tmp_path / "report.html")]) == 0
-    assert capsys.readouterr().out.splitlines()[1:3] == told["warnings"]
-    assert "Nothing computed: all 2 estimates failed" in (tmp_path / "report.html").read_text()
 
 
 # Rates.

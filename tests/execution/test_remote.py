@@ -16,7 +16,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import boto3
-import dask
 import pytest
 import trustme
 
@@ -446,16 +445,6 @@ def test_server_that_refuses_is_told_in_a_line(case, bucket, small):
     assert not bucket.told_in(ran.stderr)
 
 
-@pytest.mark.long
-def test_missing_package_for_remote_stores_is_told_in_a_line(small):
-    ran = python(
-        "-c", "import sys; sys.modules['s3fs'] = None; from sweep.cli import main;"
-        f"sys.exit(main(['run', {str(small)!r}, '--store', 's3://bucket/no.zarr']))",
-    )
-    assert ran.returncode == 2, ran.stderr
-    assert re.fullmatch(r"s3://bucket/no\.zarr: .*s3fs.*\n", ran.stderr)
-
-
 @pytest.mark.parametrize(
     "url",
     [
@@ -480,43 +469,6 @@ def test_credentials_in_a_store_name_are_refused_and_not_repeated(
 # --- schedulers that refuse ---
 
 
-@pytest.mark.long
-def test_tls_scheduler_that_refuses_is_told_in_a_line(certificates, tmp_path):
-    ours, theirs = certificates["ours"], certificates["theirs"]
-    pipeline = Pipeline.from_text(SMALL)
-
-    def told(address, settings):
-        configuration = {
-            "distributed.comm.tls.ca-file": str(settings["ca"]),
-            "distributed.comm.tls.client.cert": str(settings["cert"]),
-            "distributed.comm.tls.client.key": str(settings["key"]),
-        } if settings else {}
-        with dask.config.set(configuration), pytest.raises(ArgumentError) as error, external(
-            address, pipeline
-        ):
-            pass
-        assert len(str(error.value).splitlines()) == 1
-        return str(error.value)
-
-    with Cluster(tmp_path / "cluster", ours) as cluster:
-        secure, plain = cluster.address, cluster.address.replace("tls://", "tcp://")
-        worker = cluster.worker()
-        log = tmp_path / "cluster" / "dask_worker-2.log"
-        wait_until(lambda: "Registered to" in log.read_text(), "the worker does not register")
-        assert "no certificates; name them in Dask's configuration" in told(secure, None)
-        assert "TLS failed (self-signed certificate" in told(secure, theirs)
-        assert "TLS failed (" in told(secure, {**theirs, "ca": ours["ca"]})
-        assert "cannot be read: No such file" in told(secure, {**ours, "cert": "/none"})
-        assert "cannot be read: key values mismatch" in told(secure, {**ours, "key": theirs["key"]})
-        assert "it closed the connection; does it expect tls://?" in told(plain, ours)
-        own = re.search(r"Start worker at: +(\S+)", log.read_text())[1]
-        assert "a Worker answers there, not a scheduler" in told(own, ours)
-        worker.terminate()
-    with Cluster(tmp_path / "plain") as cluster:
-        address = cluster.address.replace("tcp://", "tls://")
-        assert "TLS failed (" in told(address, ours)
-
-
 def test_server_that_never_answers_is_given_up(monkeypatch):
     monkeypatch.setattr("sweep.execution.cluster.ANSWER_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as silent:
@@ -533,20 +485,6 @@ def test_what_is_no_address_is_told(address):
         ArgumentError, match="expected an address such as tcp://host:8786"
     ), external(address, Pipeline.from_text(SMALL)):
         pass
-
-
-@pytest.mark.long
-def test_tls_scheduler_without_certificates_ends_the_command(certificates, small, tmp_path):
-    with Cluster(tmp_path / "cluster", certificates["ours"]) as cluster:
-        for environment in ({}, client_environment(certificates["theirs"])):
-            ran = sweep_command(
-                "run", small, "--store", tmp_path / "x.zarr", "--scheduler", cluster.address,
-                env={**os.environ, **environment},
-            )
-            assert ran.returncode == 2
-            assert ran.stderr.startswith(f"--scheduler {cluster.address}: ")
-            assert len(ran.stderr.splitlines()) == 1
-    assert not (tmp_path / "x.zarr").exists()
 
 
 # --- workers that come and go ---
@@ -588,23 +526,6 @@ def test_workers_join_and_leave_during_a_run(number, many, tmp_path):
             first.wait(TIMEOUT_S)
             after(5)
             cluster.worker()
-    assert digests(url) == expected(MANY)
-
-
-@pytest.mark.long
-def test_stalled_worker_is_done_without_and_may_wake_later(many, tmp_path):
-    url = str(tmp_path / "many.zarr")
-    with Cluster(tmp_path / "cluster") as cluster:
-        stalled = cluster.worker()
-        cluster.worker()
-        with being_run(cluster, many, url, tmp_path) as after:
-            after(2)
-            stalled.send_signal(signal.SIGSTOP)
-        assert digests(url) == expected(MANY)
-        # What it was in the middle of is written again, and is the same.
-        stalled.send_signal(signal.SIGCONT)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            stalled.wait(10)
     assert digests(url) == expected(MANY)
 
 

@@ -9,9 +9,7 @@ from support.here import calls_here
 from support.poison import Poison, poisoned
 from support.stores import by_hand, same
 from sweep.cli import main
-from sweep.errors import ArgumentError, StoreError
 from sweep.execution.block_task import compute_block
-from sweep.execution.forecast import FreeDisk
 from sweep.execution.runner import execute
 from sweep.execution.status import close, drop_failed, status
 from sweep.integrity.verification import verify
@@ -83,29 +81,6 @@ def test_retry_computes_what_failed_and_nothing_else(pipeline, clean, copied):
 
 
 @pytest.mark.long
-def test_what_fails_again_stays_as_it_was(pipeline, failed, copied, tmp_path, monkeypatch):
-    poisons = [Poison(1, "estimation", "raise", (), (("solver", "iterative"),))]
-    for name, value in poisoned(poisons, tmp_path / "notes").items():
-        monkeypatch.setenv(name, value)
-    summary = execute(pipeline, copied, retry_failed=True)
-    assert (summary.retried, summary.recovered, summary.failed, summary.crashed) == (2, 1, 1, 0)
-    assert not same(copied, failed)
-    with xr.open_zarr(copied, group="failures") as table:
-        assert table.sizes["failure"] == 1
-
-
-@pytest.mark.long
-def test_retry_that_is_refused_leaves_the_store_as_it_was(pipeline, failed, copied, monkeypatch):
-    free = FreeDisk(bytes=1, files=None)
-    monkeypatch.setattr("sweep.execution.forecast.free_disk", lambda _: free)
-    with calls_here(), pytest.raises(StoreError, match="confirm it with `--yes`"):
-        execute(pipeline, copied, retry_failed=True)
-    assert open_store(copied).finished
-    assert same(copied, failed)
-    assert len(status(copied).failures) == 2
-
-
-@pytest.mark.long
 def test_cells_that_failed_are_not_reused(pipeline, clean, failed, tmp_path):
     url = str(tmp_path / "grown.zarr")
     with calls_here():
@@ -169,9 +144,3 @@ def test_retry_that_is_stopped_at_any_write_is_continued(pipeline, clean, copied
     with calls_here():
         execute(pipeline, copied, retry_failed=True)
     assert same(copied, clean)
-
-
-@pytest.mark.long
-def test_retry_and_reuse_exclude_each_other(pipeline, copied, clean):
-    with pytest.raises(ArgumentError, match="expected no retry_failed beside it"):
-        execute(pipeline, copied, retry_failed=True, reuse=[clean])

@@ -3,7 +3,6 @@
 import contextlib
 import json
 import os
-import pty
 import signal
 import subprocess
 import sys
@@ -213,44 +212,6 @@ def test_grown_grid_reuses_what_there_is_bit_for_bit(settings, undisturbed, tmp_
                 shared *= min(size, 1)
         total = new.estimate.size
     assert sum(part["estimates"] for part in computed) == total - shared
-
-
-@pytest.mark.long
-def test_bound_is_reused_with_its_flag(tmp_path):
-    text = """
-        pose = { side_px = 30, jitter_px = 0.5 }
-        axes.trial = %d
-        [scene]
-        black = 40
-        white = 220
-        background = 120
-        noise_grey = 2
-        bound = "known_blur"
-    """
-    old, new, fresh = (str(tmp_path / f"{name}.zarr") for name in ("old", "new", "fresh"))
-    by_hand(old, Pipeline.from_text(text % 2), (2,))
-    grown = Pipeline.from_text(text % 4)
-    by_hand(fresh, grown, (4,))
-    store = create_store(new, grown, (2,))
-    computed = [compute_block(new, store.run_id, block, (old,)).computed["scenes"]
-                for block in store.blocks]
-    assert computed == [0, 2]
-    assert (sweep.open(fresh).bound == 1).all()
-    assert same(new, fresh)
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("no_child")
-def test_halves_of_a_grid_are_joined(pipeline, undisturbed, tmp_path):
-    halves = []
-    for name, tilts in (("left", "[0]"), ("right", "[50]")):
-        half = Pipeline.from_text(TEXT, [f"tilt_deg={tilts}"], name=name)
-        halves.append(str(tmp_path / f"{name}.zarr"))
-        by_hand(halves[-1], half, (2, 4, 1, 3))
-    joined = str(tmp_path / "joined.zarr")
-    summary = execute(pipeline, joined, reuse=halves)
-    assert summary.computed_estimates == 0
-    assert same(joined, undisturbed)
 
 
 @pytest.mark.usefixtures("no_child")
@@ -479,27 +440,6 @@ def test_cells_of_a_grid_without_scene_axes_are_reused(tmp_path):
     assert receipt.computed["estimates"] == 1
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "text",
-    [
-        "[pose]\nside_px = 40\n[axes]\ncy_px = [200, 240]",
-        "[axes]\nside_px = [40, 50]\nheight_px = [480, 500]",
-        (
-            "[pose]\ndistance_m = 0.2\n[axes]\nguarded = [true, false]\n"
-            "distortion = [[], [0.1, 0, 0, 0]]"
-        ),
-        "[pose]\ndistance_m = 0.2",
-    ],
-)
-def test_every_kind_of_axis_gives_a_store_that_opens(text, tmp_path):
-    url = str(tmp_path / "kinds.zarr")
-    pipeline = Pipeline.from_text(text)
-    by_hand(url, pipeline)
-    with sweep.open(url) as results:
-        assert (results.detection.to_numpy() == 1).all()
-
-
 def test_background_axis_of_levels_and_images(tmp_path):
     import cv2  # noqa: PLC0415
 
@@ -517,24 +457,3 @@ def test_background_axis_of_levels_and_images(tmp_path):
     other = create_store(str(tmp_path / "again.zarr"), pipeline, (2,))
     with pytest.raises(MachineFaultError, match=r"grey\.png: not in .* as it was when the run"):
         compute_block(other.url, other.run_id, next(iter(other.blocks)))
-
-
-@pytest.mark.long
-def test_progress_is_shown_on_a_terminal(tmp_path):
-    path = tmp_path / "small.toml"
-    path.write_text(TEXT)
-    ours, theirs = pty.openpty()
-    with subprocess.Popen(
-        [sys.executable, "-m", "sweep", "run", str(path)],
-        cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=theirs,
-        env={**os.environ, "TERM": "xterm", "COLUMNS": "100"},
-    ) as running:
-        os.close(theirs)
-        shown = b""
-        with contextlib.suppress(OSError):  # the terminal's other end closes with the process
-            while part := os.read(ours, 65536):
-                shown += part
-    os.close(ours)
-    assert running.returncode == 0, shown
-    assert b"of 48 poses" in shown
-    assert b"Traceback" not in shown

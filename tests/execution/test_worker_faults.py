@@ -4,7 +4,7 @@ import contextlib
 import random
 
 import pytest
-from distributed import Client, Future, LocalCluster
+from distributed import Client, LocalCluster
 
 import sweep
 from support import machine_faults
@@ -161,28 +161,6 @@ def outcome(client, url):
         return "", run_on(client, url)
     except (RunError, StoreError) as error:
         return str(error), 0
-
-
-@pytest.mark.long
-def test_block_whose_receipt_died_with_its_worker_is_submitted_again(
-    cluster, tmp_path, undisturbed, monkeypatch
-):
-    """Dask calls such a task lost, though its block is committed."""
-    original, lost = Future.status.fget, []
-
-    def status(future):
-        found = original(future)
-        if found == "finished" and not lost:
-            lost.append(future.key)
-        return "lost" if future.key in lost else found
-
-    monkeypatch.setattr(Future, "status", property(status))
-    url = tmp_path / "lost.zarr"
-    with Client(cluster, set_as_default=False) as client:
-        assert run_on(client, url) == 0
-    assert len(lost) == 1
-    assert same(str(url), undisturbed)
-    assert not list(url.glob("commits/receipt/begun/*"))
 
 
 @pytest.mark.long

@@ -19,14 +19,12 @@ from support.lengths import lengths
 from support.poison import Poison, poisoned
 from support.store_files import edit_receipt, editable, files, see_same
 from support.stores import by_hand
-from sweep.cli import main
 from sweep.errors import StoreError
 from sweep.execution.block_task import compute_block
 from sweep.execution.status import close
 from sweep.integrity.recomputation import is_doubtful
 from sweep.integrity.repair import repair
 from sweep.integrity.verification import verify
-from sweep.measure.flags import DetectionStatus
 from sweep.plan.grid import scene_axes
 from sweep.plan.pipeline import Pipeline
 from sweep.store.blocks import begin_block, receipts
@@ -252,29 +250,6 @@ def test_recomputed_sample_of_a_sound_store_agrees_to_the_bit(sound, tmp_path):
     assert 8 <= found.sampled <= 15
 
 
-@pytest.mark.long
-def test_scene_that_failed_and_succeeds_now_is_damage_of_its_block_and_repaired(
-    copied, tmp_path, monkeypatch
-):
-    with poison(tmp_path / "notes.jsonl"):
-        found = verify(str(copied), 1)
-    assert (found.retried, found.damage) == (1, [])  # it fails again
-
-    def recompute(store, numbers, **_):
-        for number in numbers:
-            compute_block(store.url, store.run_id, store.blocks[number])
-
-    monkeypatch.setattr("sweep.integrity.repair.recompute", recompute)
-    repaired = repair(str(copied), 1)
-    assert (repaired.retried, repaired.damage) == (1, [])
-    # The sample may have drawn that scene, too.
-    (damage,) = [each for each in repaired.repaired if "had failed" in each.what]
-    assert damage.block == FAILED_BLOCK
-    assert "scenes that had failed and succeed when recomputed: 1, such as --at " in damage.what
-    assert not (zarr.open_array(f"{copied}/detection", mode="r")[...] == DetectionStatus.failed
-                ).any()
-
-
 def test_scene_that_a_signal_from_outside_ended_is_tried_again(copied):
     edit_receipt(copied, FAILED_BLOCK, lambda content: content["failures"][0].update(
         kind="crashed", text="SIGKILL"))
@@ -296,15 +271,6 @@ def test_file_is_named_when_it_alone_is_damaged(sound, copied):
         assert named(verify(str(copied), 0)) == {(key, block)}
         shutil.copy2(sound / key, copied / key)
     assert verify(str(copied), 0).damage == []
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("manner", MANNERS.values(), ids=MANNERS)
-@pytest.mark.parametrize(("key", "block"), KINDS.values(), ids=KINDS)
-def test_one_damage_is_named_and_mended_alone(key, block, manner, sound, copied, here):
-    manner(copied / key, random.Random(key))
-    assert named(verify(str(copied), 0)) == {(key, block)}
-    see_repaired(copied, sound, {(key, block)}, here)
 
 
 def test_many_damages_at_once_are_named_and_mended(sound, copied, here):
@@ -474,36 +440,6 @@ def test_unfinished_store_is_sound_and_goes_on_after_a_repair(pipeline, sound, t
     found = verify(str(url), 0)
     assert (found.damage, found.finished, found.files) == ([], True, len(files(sound)))
     see_same(url, sound)
-
-
-@pytest.mark.long
-def test_exit_status_and_json_tell_what_there_is(sound, copied, tmp_path, capsys):
-    assert main(["verify", str(tmp_path / "none.zarr")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    assert main(["verify", str(sound), "--sample", "-1"]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    assert main(["verify", str(sound), "--sample", "0"]) == 0
-    assert "sound" in capsys.readouterr().out
-    key = "reprojection_error_px/c/0/0/0/2"
-    flip(copied / key, random.Random(4))
-    assert main(["verify", str(copied), "--sample", "0"]) == 1
-    told = capsys.readouterr().out
-    assert key in told
-    assert "damaged" in told
-    assert main(["verify", str(copied), "--sample", "0", "--json"]) == 1
-    told = json.loads(capsys.readouterr().out)
-    assert [(one["where"], one["block"]) for one in told["damage"]] == [(key, 2)]
-    # With a cluster, as a user repairs.
-    before = states(copied, files(sound))
-    assert main(["verify", str(copied), "--repair", "--sample", "0", "--workers", "1",
-                 "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert [(one["where"], one["block"]) for one in told["repaired"]] == [(key, 2)]
-    assert told["damage"] == []
-    after = states(copied, files(sound))
-    assert {block_of(name) for name in before if before[name] != after[name]} == {2}
-    see_same(copied, sound)
-    assert main(["verify", str(copied), "--sample", "0"]) == 0
 
 
 ELSEWHERE = {

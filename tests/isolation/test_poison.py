@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -224,47 +222,6 @@ def run_poisoned(tmp_path, text, poisons, *options, timeout=300):
     return ran, time.monotonic() - begun, log
 
 
-INERT = """
-import hashlib, sys
-import numpy as np
-from sweep.evaluation.block import run_cells
-from sweep.plan.grid import Block, block_indices
-from sweep.plan.pipeline import Pipeline
-
-pipeline = Pipeline.from_text(open(sys.argv[1]).read())
-block = Block((0, 0, 0), (1, 1, 20))
-need = np.ones((20, 2, 2), dtype=bool)
-need[3] = False       # rendering
-need[4, 1] = False    # search with subpix
-need[5, :, 1] = False # the iterative solver
-cells = run_cells(pipeline, block_indices(block), need)
-digest = hashlib.sha256()
-for name in sorted(cells.columns):
-    for column in cells.columns[name]:
-        digest.update(column.tobytes())
-print(digest.hexdigest())
-"""
-
-
-@pytest.mark.long
-def test_poison_does_nothing_where_its_scene_is_not_asked_for(tmp_path):
-    path, log = tmp_path / "p.toml", tmp_path / "notes.jsonl"
-    path.write_text(TEXT)
-    inert = [
-        Poison(3, "scene", "segv"), Poison(4, "detection", "abort", SUBPIX),
-        Poison(5, "estimation", "ill", (), ITERATIVE), Poison(33, "truth", "exit"),
-    ]
-    digests = []
-    for poisons in ([], inert):
-        ran = subprocess.run(
-            [sys.executable, "-c", INERT, path], env=poisoned(poisons, log), check=True,
-            capture_output=True, text=True, timeout=120,
-        )
-        digests.append(ran.stdout)
-    assert digests[0] == digests[1]
-    assert [note["event"] for note in notes(log)] == ["start", "start"]
-
-
 @pytest.mark.long
 def test_scene_that_raises_fails_alone(pipeline, clean, tmp_path):
     poisons = [
@@ -319,24 +276,6 @@ def test_scenes_that_end_their_process_are_found_and_no_other_is_touched(
 
 
 @pytest.mark.long
-def test_scene_whose_process_is_killed_from_outside_is_no_result(pipeline, clean, tmp_path):
-    """As by the system where memory runs out: the run says so, and another one computes it."""
-    url = str(tmp_path / "poisoned.zarr")
-    store = create_store(url, pipeline, EXTENTS)
-    poisons = [Poison(59, "detection", "kill", SUBPIX)]
-    ran, seconds, _ = run_poisoned(tmp_path, TEXT, poisons, "--workers", 2)
-    print(f"{seconds:.1f} s")
-    assert ran.returncode == 1
-    (line,) = ran.stderr.splitlines()
-    assert "SIGKILL, as where memory runs out: use fewer" in line
-    assert "use fewer workers, or give them more memory; it is --at distance_m=" in line
-    assert committed(store) == set(range(6)) - {block_of(store, 59)}
-    ran, _, _ = run_poisoned(tmp_path, TEXT, [])
-    assert (ran.returncode, ran.stderr) == (0, "")
-    assert differing(url, clean, pipeline, []) == {}
-
-
-@pytest.mark.long
 def test_scene_that_never_returns_is_found_within_the_time_limit(pipeline, clean, tmp_path):
     url = str(tmp_path / "poisoned.zarr")
     # It keeps the interpreter's lock, so that no other thread of its process can act.
@@ -350,28 +289,6 @@ def test_scene_that_never_returns_is_found_within_the_time_limit(pipeline, clean
     assert json.loads(ran.stdout)["crashed"] == 1
     print(f"{seconds:.1f} s; stalled: {see_who_died(log, poisons, store, 2)}")
     see_status(url, pipeline, poisons)
-
-
-@pytest.mark.long
-def test_poison_in_the_sample_that_is_measured_ends_no_client(pipeline, clean, tmp_path):
-    # A new store: of a grid as small as this every scene is in the sample.
-    poisons = [Poison(33, "scene", "segv")]
-    ran, _, log = run_poisoned(tmp_path, TEXT, poisons, "--workers", 2)
-    assert (ran.returncode, ran.stderr) == (0, "")
-    assert differing(tmp_path / "poisoned.zarr", clean, pipeline, poisons) == {}
-    see_who_died(log, poisons, open_store(str(tmp_path / "poisoned.zarr")), 2)
-
-
-@pytest.mark.long
-def test_endless_scene_in_the_sample_that_is_measured_ends_no_client(pipeline, clean, tmp_path):
-    poisons = [Poison(33, "estimation", "spin", (), ITERATIVE)]
-    ran, seconds, log = run_poisoned(
-        tmp_path, TEXT, poisons, "--workers", 2, "--time-limit", LIMIT_S
-    )
-    assert (ran.returncode, ran.stderr) == (0, "")
-    assert differing(tmp_path / "poisoned.zarr", clean, pipeline, poisons) == {}
-    see_who_died(log, poisons, open_store(str(tmp_path / "poisoned.zarr")), 2)
-    print(f"{seconds:.1f} s")
 
 
 THOUSANDS = TEXT.replace("distance_m = [0.2, 0.3, 0.4]", "distance_m = { linspace = [0.2, 0.4, 5] }"
@@ -448,14 +365,3 @@ def test_poison_among_ten_thousand_scenes_costs_itself_alone(poisons, thousands,
     if endless:
         # Half as much again, and the start of a few processes: seconds are noisy here.
         assert seconds < undisturbed_s + 1.5 * LIMIT_S + 30.0
-
-
-@pytest.mark.long
-def test_poison_in_a_grid_that_is_cut_as_the_run_likes(thousands, tmp_path):
-    pipeline, reference, _ = thousands
-    poisons = AMONG_THOUSANDS["three in three ways"]
-    ran, seconds, log = run_poisoned(tmp_path, THOUSANDS, poisons, "--workers", 2)
-    assert (ran.returncode, ran.stderr) == (0, "")
-    url = str(tmp_path / "poisoned.zarr")
-    assert differing(url, reference, pipeline, poisons) == {}
-    print(f"{seconds:.1f} s; deaths: {see_who_died(log, poisons, open_store(url), 2)}")

@@ -105,19 +105,6 @@ def test_corners_and_poses_are_those_of_a_plain_loop_over_the_files(made):
 
 
 @pytest.mark.long
-def test_coordinates_are_those_of_the_true_pose(made):
-    _, results = made
-    _, position = marker_poses(POSES[1])
-    side = VIEW[0] * BOARD["marker_m"] / position[:, 2]
-    shown = np.isfinite(results.side_px.values[1])
-    assert np.allclose(results.side_px.values[1][shown], side[shown], rtol=0.005)
-    assert np.allclose(results.tilt_deg.values[1][shown],
-                       np.degrees(np.arccos(-POSES[1][0][2, 2])), atol=0.5)
-    centre = position[:, :2] / position[:, 2:] * VIEW[:2] + VIEW[2:]
-    assert np.allclose(results.image_x_px.values[1][shown], centre[shown, 0], atol=0.3)
-
-
-@pytest.mark.long
 def test_a_photograph_is_the_draw_of_every_interval(made):
     _, results = made
     table = error_statistics(results, per="cornerRefinementMethod")

@@ -17,7 +17,7 @@ from sweep.store.lifecycle import open_store
 from sweep.store.provenance import differences, fingerprint
 from tests.plugins.test_detector_plugins import MINE
 from tests.support.here import calls_here
-from tests.support.stores import by_hand, same
+from tests.support.stores import by_hand
 
 TEXT = """
 [camera]
@@ -118,19 +118,6 @@ def test_verify_and_repro_recompute_with_the_plug_in(made, capsys):
     for detector in ("opencv", "mine:TURNED"):
         assert main(["repro", store, "--at", f"tilt_deg=40,detector={detector}"]) == 0
         assert "agrees with the store bit for bit" in capsys.readouterr().out
-
-
-@pytest.mark.long
-def test_cells_of_opencv_are_reused_beside_a_plug_in(made, tmp_path):
-    plain = Pipeline.from_text(TEXT.replace("shift_px = 0.25\n", "").replace(
-        'detector = ["opencv", "mine:TURNED"]\n', ""))
-    both = Pipeline.from_toml(made / "grid.toml")
-    with calls_here():
-        execute(plain, tmp_path / "plain.zarr")
-        assert "plugins" not in open_store(str(tmp_path / "plain.zarr")).fingerprint
-        summary = execute(both, tmp_path / "both.zarr", reuse=[tmp_path / "plain.zarr"])
-    assert summary.computed_estimates == 2  # of four: the others are OpenCV's
-    assert same(tmp_path / "both.zarr", made / "grid.zarr")
 
 
 FOG = """

@@ -24,12 +24,11 @@ from sweep.analysis import (
     failure_composition,
 )
 from sweep.errors import StoreError
-from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.model.renderers import background_image
+from sweep.measure.flags import EstimateStatus
 from sweep.report.figures import figures_of
 from sweep.report.formatting import number
 from sweep.report.report_data import ReportData, read_report_data
-from sweep.report.scenes import scenes_of, select_scenes
+from sweep.report.scenes import scenes_of
 from sweep.report.write_report import write_report
 from sweep.store.lifecycle import open_dataset, open_store, write_group
 
@@ -174,27 +173,6 @@ def kinds(url):
 
 
 @pytest.mark.long
-def test_each_figure_applies_where_it_should(full, odd):
-    assert kinds(full) == [
-        "detection", "errors", "bias", "configurations", "maps", "ambiguity", "failures",
-        "ranking", "bound", "effect-azimuth_deg",
-    ]
-    found = {name: kinds(odd(name)) for name in ODD if name != "long axes"}
-    assert found == {
-        "single pose": ["failures"],
-        "one axis of one value": ["failures"],
-        "only trial": ["failures"],
-        "nothing detected": ["detection", "errors", "bias", "maps", "failures"],
-        "nothing visible": ["detection", "errors", "bias", "failures"],
-        "no draws": ["detection", "errors", "bias", "configurations", "maps", "failures"],
-        "lists and words": ["configurations", "failures", "effect-distortion",
-                            "effect-renderer"],
-        "distances drawn": ["detection", "errors", "bias", "failures", "ranking",
-                            "effect-dictionary"],
-    }
-
-
-@pytest.mark.long
 @pytest.mark.parametrize("name", [
     name if name in ("nothing visible", "distances drawn")
     else pytest.param(name, marks=pytest.mark.long) for name in ODD
@@ -274,25 +252,6 @@ def test_the_table_of_thresholds_is_that_of_plain_counting(full, page):
 # Scenes.
 
 @pytest.mark.long
-def test_scenes_are_those_with_the_smallest_and_largest_errors(full):
-    data = opened(full)
-    results = data.results.load()
-    solved = results["rotation_error_deg"].where(results["estimate"] == EstimateStatus.solved)
-    chosen = dict(select_scenes(results))
-    found = {
-        title.split(":")[0]: float(results["rotation_error_deg"].isel(index))
-        for title, index in chosen.items()
-    }
-    assert found["best"] == float(solved.min())
-    assert found["worst"] == float(solved.max())
-    ordered = np.sort(solved.values[~np.isnan(solved.values)])
-    assert found["median rotation error of the solved"] == ordered[(len(ordered) - 1) // 2]
-    for flag in (DetectionStatus.rejected, DetectionStatus.no_candidate):
-        assert bool((results["detection"] == flag).any()) == any(
-            title.startswith(flag.name.replace("_", " ")) for title in chosen)
-
-
-@pytest.mark.long
 def test_scenes_looked_at_again_are_what_the_store_holds(full):
     scenes = list(scenes_of(opened(full)))
     assert len(scenes) >= 4
@@ -311,34 +270,6 @@ def test_a_scene_s_command_shows_it(full, tmp_path):
     code, out, err = command("show", pipeline, "--at", at, "-o", tmp_path / "scene.png")
     assert (code, err) == (0, "")
     assert out.splitlines()[0].endswith(": detected, solved")
-
-
-@pytest.mark.long
-def test_a_scene_that_differs_from_the_store_is_reported(full):
-    data = opened(full)
-    results = data.results.load()
-    data.results["rotation_error_deg"] = results["rotation_error_deg"] * 1.5
-    problems = [scene.problem for scene in scenes_of(data)]
-    assert any("Differs from the store: rotation_error_deg " in problem for problem in problems)
-
-
-@pytest.mark.long
-def test_a_crashed_scene_is_not_rendered_and_a_lost_background_is_told(full, tmp_path):
-    data = opened(full)
-    results = data.results.load()
-    results["detection"][0, 0, 0] = DetectionStatus.crashed
-    problems = {title: scene.problem for scene in scenes_of(data) for title in scene.titles}
-    assert problems["crashed: the process died"].startswith("Not drawn")
-    background = tmp_path / "wall.png"
-    cv2.imwrite(str(background), np.full((120, 160), 130, np.uint8))
-    text = f'{CAMERA}[pose]\nside_px = 40\n[scene]\nbackground = "{background}"\n'
-    url = made(tmp_path, text, "wall")
-    assert [scene.problem for scene in scenes_of(opened(url))] == [""]
-    background.unlink()
-    background_image.cache_clear()
-    (scene,) = scenes_of(opened(url))
-    assert scene.problem.startswith("Cannot be drawn on this machine: ")
-    assert scene.picture is None
 
 
 # Trade, Markdown, files.
@@ -421,34 +352,6 @@ def test_the_pipeline_can_be_taken_from_the_page(full, page):
 
 
 # What cannot be.
-
-@pytest.mark.long
-def test_what_cannot_be_reported_is_told_in_one_line(full, tmp_path):
-    unfinished = made(tmp_path, ODD["no draws"], "unfinished", finished=False)
-    folder, file = tmp_path / "folder", tmp_path / "file"
-    folder.mkdir()
-    file.write_text("mine")
-    wanted = {
-        (tmp_path / "none.zarr",): "store not found",
-        (folder,): "not a sweep store",
-        (unfinished,): f"{unfinished}: unfinished: 1 of 4 blocks; `sweep run` continues it",
-        (full, "-o", folder): "it is a folder",
-        (full, "-o", tmp_path / "missing" / "report.html"): " not found",
-        (full, "-o", file / "report.html"): " not found",
-        (full, "--figures", file): "it is a file",
-        (full, "--figures", tmp_path / "missing" / "pictures"): " not found",
-        (full, "--format", "pdf"): "invalid choice",
-    }
-    with contextlib.chdir(tmp_path):
-        before = sorted(path.name for path in tmp_path.iterdir())
-        for arguments, message in wanted.items():
-            code, out, err = command("report", *arguments)
-            assert (code, out) == (2, "")
-            assert message in err
-            assert len(err.splitlines()) == 1 or "usage" in err
-        assert sorted(path.name for path in tmp_path.iterdir()) == before
-    assert file.read_text() == "mine"
-
 
 @pytest.mark.long
 def test_a_report_is_never_written_into_a_store(tmp_path):

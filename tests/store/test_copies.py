@@ -8,14 +8,13 @@ import pytest
 
 from support.lengths import lengths
 from support.stores import by_hand, same
-from sweep.errors import StoreError, StoreReplacedError
-from sweep.execution.block_task import compute_block
+from sweep.errors import StoreError
 from sweep.execution.runner import execute
 from sweep.execution.status import close
 from sweep.integrity.verification import verify
 from sweep.plan.pipeline import Pipeline
 from sweep.store.blocks import committed, missing_chunks
-from sweep.store.lifecycle import create_store, open_store
+from sweep.store.lifecycle import open_store
 
 TEXT = """
 seed = 3
@@ -110,23 +109,3 @@ def test_store_without_scene_axes_has_its_chunks(tmp_path):
     assert missing_chunks(store, [0]) == {}
     Path(url, "true_rvec/c/0").unlink()
     assert missing_chunks(store, [0]) == {0: "true_rvec/c/0"}
-
-
-@pytest.mark.long
-def test_store_that_is_moved_while_it_is_written_is_told_in_a_line(
-    pipeline, finished, tmp_path
-):
-    url, moved = tmp_path / "here.zarr", tmp_path / "moved.zarr"
-    store = create_store(str(url), pipeline, EXTENTS)
-    compute_block(str(url), store.run_id, store.blocks[0])
-    url.rename(moved)
-    for work in (
-        lambda: compute_block(str(url), store.run_id, store.blocks[1]), lambda: close(store)
-    ):
-        with pytest.raises(StoreReplacedError, match="moved, or replaced by another run") as told:
-            work()
-        assert str(told.value).isprintable()
-    for block in list(store.blocks)[1:]:
-        compute_block(str(moved), store.run_id, block)
-    close(open_store(str(moved), "r+"))
-    assert same(moved, finished)

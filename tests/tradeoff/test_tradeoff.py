@@ -6,10 +6,6 @@ import io
 import itertools
 import json
 import math
-import re
-import shutil
-import subprocess
-import sys
 import threading
 from types import SimpleNamespace
 
@@ -82,21 +78,6 @@ solver = ["ippe_square", "iterative"]
 trial = 12
 """
 
-UNSEEN = f"""
-{CAMERA}
-side_px = 40
-[axes]
-tilt_deg = [0, 180]
-solver = ["ippe_square", "iterative"]
-trial = 3
-"""
-
-TREATMENTS = [
-    f"{refinement} \u00b7 {solver}" for refinement in ("none", "subpix")
-    for solver in ("ippe_square", "iterative", "photometric")
-]
-
-
 @pytest.fixture(scope="module", autouse=True)
 def _few_scenes():
     """Measure costs on few scenes: what is told is the same, and sooner."""
@@ -146,11 +127,6 @@ def renderer_store(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def unseen_store(tmp_path_factory):
-    return made(tmp_path_factory.mktemp("unseen"), UNSEEN, "unseen")
-
-
-@pytest.fixture(scope="module")
 def trade(store):
     """What the command says of the store as JSON, told apart by side_px."""
     return json.loads(told(store, "--per", "side_px", "--seconds", "0.5", "--json"))
@@ -168,27 +144,6 @@ def values(content, name):
 
 
 # From a store to what is printed.
-
-@pytest.mark.long
-def test_json_has_every_treatment_with_its_intervals(trade):
-    assert trade["coords"]["treatment"]["data"] == TREATMENTS
-    assert trade["coords"]["side_px"]["data"] == [18, 60]
-    assert trade["attrs"]["baseline"] == TREATMENTS[0]
-    assert trade["attrs"]["poses"] == 160
-    assert len(trade["advice"]) == 2
-    with_interval = [name for name in trade["data_vars"] if f"{name}_low" in trade["data_vars"]]
-    assert {"cost_ms", "cost_ratio", "detection_ms", "estimation_ms", "rotation_p95_deg",
-            "detection_rate"} <= {*with_interval}
-    for name in with_interval:
-        value, low, high = (values(trade, name + end) for end in ("", "_low", "_high"))
-        assert not (low > value).any(), name
-        assert not (high < value).any(), name
-    for name in ("cost_ms", "cost_ratio", "estimation_ms"):
-        value, low, high = (values(trade, name + end) for end in ("", "_low", "_high"))
-        assert value.shape == (2, len(TREATMENTS))
-        assert (low > 0).all()
-        assert np.isfinite(high).all()
-
 
 def test_the_baseline_costs_exactly_once_itself(trade):
     for end in ("", "_low", "_high"):
@@ -269,22 +224,6 @@ def test_the_group_holds_what_was_printed_and_the_store_is_as_before(store, trad
     assert execute(Pipeline.from_text(TRADE, name="trade"), store, workers=1).computed_blocks == 0
 
 
-@pytest.mark.long
-def test_text_markdown_and_figures_name_every_treatment(store, tmp_path):
-    text = told(store, "--seconds", "0.1", "-o", tmp_path / "trade.png")
-    markdown = told(store, "--seconds", "0.1", "--markdown", "-o", tmp_path / "trade.SVG",
-                    "--criterion", "range_rmse_percent")
-    for label in TREATMENTS:
-        assert f"{label} " in text
-        assert label in markdown
-    assert "rotation p95, deg" in text
-    assert text.rstrip().splitlines()[-2].startswith("most accurate ")
-    assert text.rstrip().splitlines()[-1].startswith("next: sweep report ")
-    assert "range RMSE, %" in markdown
-    assert (tmp_path / "trade.png").read_bytes().startswith(b"\x89PNG")
-    assert "<svg" in (tmp_path / "trade.SVG").read_text()
-
-
 # Renderers.
 
 @pytest.fixture(scope="module")
@@ -352,64 +291,9 @@ def test_a_figure_that_cannot_be_written_is_told_before_anything_is_measured(
     assert not measured
 
 
-@pytest.mark.long
-def test_what_is_no_finished_store_is_told_in_one_line(renderer_store, tmp_path):
-    made(tmp_path, UNSEEN, "unfinished", finished=False)
-    (tmp_path / "text.zarr").write_text("hello")
-    (tmp_path / "empty").mkdir()
-    for place, message in (
-        ("missing.zarr", "store not found; create one with `sweep run`"),
-        ("missing.toml", "cannot be read: No such file or directory"),
-        ("text.zarr", "not a sweep store; choose another path"),
-        ("empty", "not a sweep store; choose another path"),
-        ("unfinished.zarr", "unfinished: 0 of 1 blocks; `sweep run` continues it"),
-    ):
-        assert command(tmp_path / place) == (2, "", f"{tmp_path / place}: {message}\n")
-    code, _, err = command(renderer_store, "--per", "renderer")
-    assert (code, err.count("\n")) == (2, 1)
-    assert err.startswith("--per renderer: ")
-
-
-@pytest.mark.long
-def test_without_exact_images_renderers_are_not_compared(tmp_path):
-    text = RENDERERS.replace('"exact", ', "").replace("trial = 12", "trial = 2")
-    url = made(tmp_path, text, "inexact")
-    assert command(url) == (
-        2, "",
-        f"{url}: renderers are compared with exact, which is not among them: add it to the axis\n",
-    )
-
-
 # Nothing to be seen.
 
-@pytest.mark.long
-def test_where_nothing_is_to_be_seen_nothing_has_a_cost(unseen_store):
-    content = json.loads(told(unseen_store, "--per", "tilt_deg", "--seconds", "0.1", "--json"))
-    for name in ("cost_ms", "cost_ratio", "detection_ms", "estimation_ms"):
-        value = values(content, name)
-        assert np.isfinite(value[0]).all()
-        assert np.isnan(value[1]).all()
-
-
 # A pose that failed in the run.
-
-@pytest.mark.long
-def test_a_detector_that_raises_has_a_cost_all_the_same(tmp_path):
-    text = CAMERA + """
-side_px = 40
-[detector]
-cornerRefinementWinSize = 200
-relativeCornerRefinmentWinSize = 1000
-[axes]
-cornerRefinementMethod = ["none", "subpix"]
-trial = 2
-"""
-    url = made(tmp_path, text, "raising")
-    with xr.open_zarr(url) as results:
-        assert (results["detection"].sel(cornerRefinementMethod="subpix") == 7).all()
-    content = json.loads(told(url, "--seconds", "0.1", "--json"))
-    assert values(content, "detection_rate").tolist() == [1, 0]
-
 
 # Ctrl-C.
 
@@ -552,12 +436,6 @@ def test_the_medians_interval_covers_in_a_simulation(count):
 # Time limit and budget.
 
 @pytest.mark.long
-def test_a_short_time_limit_measures_fewer_scenes_and_says_so(store):
-    text = told(store, "--per", "side_px", "--seconds", "0.05")
-    assert re.search(r"costs are those of \d+ of 8 sampled images; more --seconds", text)
-
-
-@pytest.mark.long
 def test_budget_is_told_by_the_command_and_checked(store):
     text = told(store, "--seconds", "0.2", "--budget-ms", "1e-6")
     assert "nothing fits 1e-06 ms a frame; the nearest is " in text
@@ -568,27 +446,3 @@ def test_budget_is_told_by_the_command_and_checked(store):
 
 
 # Agreement.
-
-@pytest.mark.long
-def test_two_measurements_agree(tmp_path):
-    """Of honest 95 % intervals more than 99 % overlap; 95 % is asked of 7 treatments' ratios."""
-    text = TRADE.replace('["none", "subpix"]', '["none", "subpix", "contour", "apriltag"]')
-    text = text.replace('"iterative", "photometric"', '"iterative"')
-    url = made(tmp_path, text, "eight")
-    found = []
-    for number in range(2):
-        one = str(tmp_path / f"{number}.zarr")
-        shutil.copytree(url, one)
-        done = subprocess.run(
-            [sys.executable, "-m", "sweep", "tradeoff", one, "--seconds", "20", "--json"],
-            capture_output=True, text=True, check=True, timeout=300,
-        )
-        found.append(json.loads(done.stdout))
-    (low, high), (other_low, other_high) = (
-        (values(one, "cost_ratio_low"), values(one, "cost_ratio_high")) for one in found
-    )
-    overlap = (low <= other_high) & (other_low <= high)
-    print(f"\n{overlap.mean():.1%} of {overlap.size} overlap;",
-          " ".join(f"{a:.3f}..{b:.3f}/{c:.3f}..{d:.3f}" for a, b, c, d in
-                   zip(low, high, other_low, other_high, strict=True)))
-    assert overlap.mean() >= 0.95

@@ -123,7 +123,7 @@ class OnCluster(Engine[Future[Any]]):
         try:
             if done.status == "finished":
                 self._last_block, self._next_line_s = time.monotonic(), STALL_S
-                self._faults.computed(number, len(self._states))
+                self._faults.computed(number, len(self._states.keys() - self._faults.retired))
                 receipts: list[Receipt] = done.result()
                 return receipts
             # "lost": the worker died after it committed the block, and its receipt died with it.
@@ -162,7 +162,8 @@ class WorkerFaults:
     """Counts faults of machines by worker: those that fail what others compute are retired.
 
     :data:`~sweep.execution.limits.MAX_WORKER_FAULTS` are too many, while each worker computes about
-    :data:`~sweep.execution.limits.FAULT_WINDOW` blocks. The last worker stays.
+    :data:`~sweep.execution.limits.FAULT_WINDOW` blocks. The last worker stays. ``retired`` are the
+    addresses of those that went; the scheduler may list them for a while.
     """
 
     def __init__(self, client: Client) -> None:
@@ -171,6 +172,7 @@ class WorkerFaults:
         self._blamed: Counter[str] = Counter()
         self._computed = 0
         self._last: dict[str, MachineFaultError] = {}
+        self.retired: set[str] = set()
 
     def others(self, number: int, key: str, fault: MachineFaultError) -> list[str]:
         """Note that a block failed; return the workers that may compute it, empty if none is left.
@@ -196,7 +198,7 @@ class WorkerFaults:
         self._computed += 1
         if self._computed % (FAULT_WINDOW * max(workers, 1)) == 0:
             self._blamed.clear()
-        for worker in set(self._failed_on.pop(number, ())) - {UNKNOWN}:
+        for worker in set(self._failed_on.pop(number, ())) - {UNKNOWN} - self.retired:
             self._blamed[worker] += 1
             if self._blamed[worker] >= MAX_WORKER_FAULTS and workers > 1:
                 del self._blamed[worker]
@@ -204,6 +206,7 @@ class WorkerFaults:
                 return
 
     def _retire(self, worker: str) -> None:
+        self.retired.add(worker)
         fault = self._last[worker]
         notice(
             f"worker {worker} on {fault.machine} is used no more: {MAX_WORKER_FAULTS} blocks that "

@@ -228,7 +228,11 @@ def open_store(url: str, mode: str = "r") -> RunStore:
     url = checked_url(url)
     storage = open_storage(url, mode)
     store = store_of(url, storage, read_attributes(url, storage), mode)
-    faults = schema_faults(store)
+    try:
+        faults = schema_faults(store)
+    except (FileNotFoundError, zarr.errors.BaseZarrError):
+        raise StoreError(
+            f"{url}: was deleted or replaced while it was opened; try again") from None
     if faults:
         name, fault = next(iter(faults.items()))
         raise StoreError(

@@ -45,7 +45,6 @@ from support.small_datasets import (
 from sweep.analysis import detection_rate, error_statistics, failure_composition, flip_rate
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.pipeline import Pipeline
 
 
 def is_unflipped(pose):
@@ -301,7 +300,7 @@ EDGES = [100.0, 200.0, 450.0, 451.0, 2000.0]
     ("all", (), {"marker_area_px": EDGES}), ("all", ("tilt_deg",), {"marker_area_px": EDGES}),
     ("draws", (), {"marker_area_px": EDGES}), ("only trial", ("trial",), {"marker_area_px": EDGES}),
     ("plain", ("marker_id",), {"distance_m": [0.3, 0.8, 1.0]}),
-    ("all", (), {"side_px": [12.0, 100.0]}),
+    ("all", (), {"side_px": [12.0, 20.0]}),
 ])
 def test_bins_are_those_of_plain_loops(function, of, expected, grid, per, bins):
     results = GRIDS[grid]
@@ -313,14 +312,6 @@ def test_bins_are_those_of_plain_loops(function, of, expected, grid, per, bins):
         np.testing.assert_allclose(answer[name], (np.array(edges[1:]) + edges[:-1]) / 2)
         np.testing.assert_array_equal(answer[f"{name}_low"], edges[:-1])
         np.testing.assert_array_equal(answer[f"{name}_high"], edges[1:])
-
-
-def test_a_value_on_an_edge_is_in_the_bin_above_and_on_the_last_in_none():
-    results = mixed({"trial": 6}, 8).isel(trial=slice(6))
-    results["detection"].values[...] = DetectionStatus.detected
-    results["marker_area_px"].values[...] = [0.0, 1.0, 2.0, 3.0, np.nan, 2.5]
-    answer = detection_rate(results, bins={"marker_area_px": [1.0, 2.0, 3.0]})
-    assert answer["looked_for"].values.tolist() == [1, 2]
 
 
 def test_a_coordinate_that_is_no_dimension_can_be_binned():
@@ -338,15 +329,6 @@ def test_failures_in_bins_are_those_of_plain_loops():
     answer = failure_composition(results, ("solver",), bins=bins)
     groups = poses(results, "estimate", ("solver",), bins)
     assert_all_agree(by_outcome(answer), groups, ("solver", *bins), expected_composition)
-
-
-def test_the_detection_rate_is_the_same_for_every_solver():
-    results = GRIDS["all"]
-    answer = detection_rate(results, ("solver", "tilt_deg"))
-    alone = detection_rate(results, ("tilt_deg",))
-    for k in range(2):
-        for name in ("detected", "looked_for", "detection_rate", "detection_rate_low"):
-            np.testing.assert_array_equal(answer[name].isel(solver=k), alone[name])
 
 
 FUNCTIONS_OF_ONE = pytest.mark.parametrize(
@@ -435,11 +417,6 @@ def test_a_dimension_that_is_not_there_is_refused_in_one_line(function):
 
 
 # The references themselves.
-
-def test_the_pipelines_of_the_datasets_are_valid():
-    for results in GRIDS.values():
-        Pipeline.from_text(results.attrs["pipeline"])
-
 
 @pytest.mark.parametrize("n", [1, 2, 7, 50, 1000])
 def test_the_references_intervals_are_those_of_scipy(n):

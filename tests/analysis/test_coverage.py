@@ -99,22 +99,6 @@ def of_scipy(successes, n, method):
         stats.binomtest(k, n).proportion_ci(method=method) for k in successes.tolist()])
 
 
-@METHODS
-@pytest.mark.parametrize("n", LEAST)
-def test_intervals_of_rates_are_those_of_scipy(interval, n):
-    k = np.unique(np.concatenate([np.arange(min(n, 50) + 1), n - np.arange(min(n, 50) + 1),
-                                  np.linspace(0, n, 20).astype(int)]))
-    low, high = interval(k, n)
-    theirs = (stats.beta(k + 0.5, n - k + 0.5).interval(0.95) if interval is jeffreys
-              else of_scipy(k, n, "wilson"))
-    # Jeffreys: 0 at none and 1 at all of n (BCD section 3.1.3), where SciPy has quantiles.
-    # Wilson: there SciPy leaves what the formula cancels to, about 1e-18.
-    np.testing.assert_allclose(low[k > 0], theirs[0][k > 0], rtol=1e-9)
-    np.testing.assert_allclose(high[k < n], theirs[1][k < n], rtol=1e-9)
-    assert low[0] == 0
-    assert high[-1] == 1
-
-
 # By simulation.
 
 def holds(table, name, truth):

@@ -207,18 +207,18 @@ EVERY = [
     ("one trial", ()), ("one trial", ("tilt_deg",)), ("only trial", ()), ("only trial", ("trial",)),
     ("settings first", ()), ("settings first", ("distance_m",)),
 ]
-CASES = pytest.mark.parametrize(("grid", "per"), EVERY)
+OF_ESTIMATION = [
+    ("all", ("solver",)), ("all", ("tilt_deg", "solver", "noise_grey")), ("small", tuple(ALL)),
+    ("settings first", ("solver",)), ("settings first", ("cornerRefinementMethod", "solver")),
+]
+CASES = pytest.mark.parametrize(("grid", "per"), EVERY + OF_ESTIMATION)
 LAST = [case for case, following in zip(EVERY, [*EVERY[1:], ("", ())], strict=True)
         if case[0] != following[0]]
 SLOWER_CASES = pytest.mark.parametrize(("grid", "per"), [
-    pytest.param(*case, marks=() if case in LAST else pytest.mark.long) for case in EVERY
+    pytest.param(*case, marks=() if case in LAST + OF_ESTIMATION else pytest.mark.long)
+    for case in EVERY + OF_ESTIMATION
 ])
 """The same, of which by default one of each grid is tried."""
-
-ESTIMATION_CASES = pytest.mark.parametrize(("grid", "per"), [
-    ("all", ("solver",)), ("all", ("tilt_deg", "solver", "noise_grey")), ("small", tuple(ALL)),
-    ("settings first", ("solver",)), ("settings first", ("cornerRefinementMethod", "solver")),
-])
 
 
 @functools.cache
@@ -226,7 +226,7 @@ def poses_of(grid, of, per):
     return poses(GRIDS[grid], of, per)
 
 
-@CASES
+@pytest.mark.parametrize(("grid", "per"), EVERY)
 def test_detection_rates_are_those_of_plain_loops(grid, per):
     assert_all_agree(detection_rate(GRIDS[grid], per), poses_of(grid, "detection", per), per,
                      expected_detection)
@@ -236,11 +236,6 @@ def test_detection_rates_are_those_of_plain_loops(grid, per):
 def test_flip_rates_are_those_of_plain_loops(grid, per):
     assert_all_agree(flip_rate(GRIDS[grid], per), poses_of(grid, "estimate", per), per,
                      expected_flips)
-
-
-@ESTIMATION_CASES
-def test_flip_rates_of_solvers_are_those_of_plain_loops(grid, per):
-    test_flip_rates_are_those_of_plain_loops(grid, per)
 
 
 @SLOWER_CASES
@@ -256,20 +251,10 @@ def test_failures_are_those_of_plain_loops(grid, per):
             // math.prod(results.sizes[name] for name in per)).all()
 
 
-@ESTIMATION_CASES
-def test_failures_of_solvers_are_those_of_plain_loops(grid, per):
-    test_failures_are_those_of_plain_loops(grid, per)
-
-
 @SLOWER_CASES
 def test_errors_are_those_of_plain_loops(grid, per):
     assert_all_agree(error_statistics(GRIDS[grid], per), poses_of(grid, "estimate", per), per,
                      expected_errors)
-
-
-@ESTIMATION_CASES
-def test_errors_of_solvers_are_those_of_plain_loops(grid, per):
-    test_errors_are_those_of_plain_loops(grid, per)
 
 
 FUNCTIONS = pytest.mark.parametrize(("function", "of", "expected"), [

@@ -43,15 +43,6 @@ def least_coverage(low, high, n, within=(0.0, 1.0)):
     return exact_coverage(low, high, p, n).min()
 
 
-def test_the_coverage_is_the_sum_of_the_binomial_chances():
-    n, p = 12, np.linspace(0.001, 0.999, 999)
-    for interval in (wilson, jeffreys):
-        low, high = interval(np.arange(n + 1), n)
-        plain = [sum(math.comb(n, k) * q**k * (1 - q) ** (n - k) for k in range(n + 1)
-                     if low[k] <= q <= high[k]) for q in p.tolist()]
-        np.testing.assert_allclose(exact_coverage(low, high, p, n), plain, rtol=1e-12)
-
-
 # n: least coverage of Wilson and Jeffreys, least for p in 0.1 ... 0.9 (computed, rounded down).
 LEAST = {
     5: (0.831, 0.891, 0.892, 0.900), 10: (0.834, 0.915, 0.868, 0.868),

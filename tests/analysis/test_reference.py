@@ -32,7 +32,6 @@ from support.small_datasets import (
     looked_for,
     mean_of,
     mean_vector,
-    mixed,
     named,
     perfect,
     poses,
@@ -318,37 +317,6 @@ def test_failures_in_bins_are_those_of_plain_loops():
 
 FUNCTIONS_OF_ONE = pytest.mark.parametrize(
     "function", [detection_rate, flip_rate, failure_composition, error_statistics])
-
-
-@FUNCTIONS_OF_ONE
-def test_what_was_not_run_changes_nothing_but_its_own_count(function):
-    # An unfinished store: trials that were never reached are fill values.
-    short = GRIDS["draws"].isel(trial=slice(50))
-    longer = GRIDS["draws"].isel(trial=slice(80)).copy(deep=True)
-    longer["detection"][{"trial": slice(50, None)}] = DetectionStatus.not_run
-    longer["estimate"][{"trial": slice(50, None)}] = EstimateStatus.not_run
-    longer["flipped"][{"trial": slice(50, None)}] = Flipped.not_run
-    for name in longer.data_vars:
-        if longer[name].dtype.kind == "f":
-            longer[name][{"trial": slice(50, None)}] = np.nan
-    answer, expected = (function(results, ("tilt_deg",)).compute() for results in (longer, short))
-    if function is failure_composition:
-        more = (answer["count"] - expected["count"]).sel(outcome="not_run")
-        assert more.values.tolist() == [60, 60]
-        answer, expected = (table.drop_sel(outcome="not_run") for table in (answer, expected))
-    xr.testing.assert_allclose(answer, expected, rtol=1e-12)
-
-
-@FUNCTIONS_OF_ONE
-def test_settings_that_see_the_same_draws_add_no_certainty(function):
-    one = mixed({"marker_id": 2, "trial": 40, "solver": 1}, 9, good=0.9)
-    many = xr.concat(
-        [one.assign_coords(solver=[name]) for name in ("ippe", "iterative", "sqpnp")],
-        dim="solver", data_vars="minimal").transpose(*one.dims)
-    alone, pooled = function(one).compute(), function(many).compute()
-    for name in alone.data_vars:
-        if alone[name].dtype.kind == "f" and "_sd_" not in name:  # which has n - 1
-            np.testing.assert_allclose(pooled[name], alone[name], rtol=1e-7, err_msg=name)
 
 
 @FUNCTIONS_OF_ONE

@@ -115,30 +115,6 @@ def opencv_project(self, points):
     return pixels
 
 
-def check_projection(project, count):
-    """Hold points behind the camera or in its plane to have no image, and others to have one."""
-    rng = np.random.default_rng(42)
-    points = rng.normal(size=(count, 4, 3)) * [0.5, 0.5, 1.0]
-    points[:, 0, 2] = rng.choice([0.0, -0.0, -1e-12, -1e9], count)
-    for lens in ((), (-0.3, 0.1, 0.0, 0.0)):
-        pixels = project(cameras(count, lens), points)
-        finite = np.isfinite(pixels).all(axis=2)
-        behind = ~(points[..., 2] > 0)
-        framed = finite & (pixels > -0.5).all(axis=2) & (pixels < [639.5, 479.5]).all(axis=2)
-        print(f"\n{project.__name__}: {(finite & behind).sum()} of {behind.sum()} points behind "
-              f"the camera have an image, {(framed & behind).sum()} of them in the frame")
-        assert finite[~behind].all()
-        assert not finite[behind].any()
-
-
-@lengths(100, 10_000)
-def test_points_behind_the_camera_have_no_image(count):
-    """cv2.projectPoints gives all of 25,057 a finite one, and 9,959 of them one in the frame."""
-    check_projection(Cameras.project, count)
-    with pytest.raises(AssertionError):
-        check_projection(opencv_project, count)
-
-
 AROUND_THE_CAMERA = """
 seed = 7
 [pose]

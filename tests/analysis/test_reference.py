@@ -348,18 +348,6 @@ def test_a_single_pose_is_a_dataset_too(function, of, expected):
 
 
 @FUNCTIONS_OF_ONE
-def test_where_nothing_was_looked_for_nothing_is_said(function):
-    results = GRIDS["plain"].copy(deep=True)
-    results["detection"].values[...] = DetectionStatus.not_visible
-    results["estimate"].values[...] = EstimateStatus.no_detection
-    results["flipped"].values[...] = Flipped.no_estimate
-    for per in ((), ("distance_m",)):
-        for name, array in function(results, per).compute().data_vars.items():
-            if array.dtype.kind == "f":
-                assert array.isnull().all(), name
-
-
-@FUNCTIONS_OF_ONE
 def test_a_dimension_that_is_not_there_is_refused_in_one_line(function):
     with pytest.raises(ArgumentError, match=r"^per = speed: no such dimension; there") as refused:
         function(GRIDS["plain"], per=("speed",))

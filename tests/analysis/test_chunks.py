@@ -7,7 +7,7 @@ import pytest
 
 import sweep.analysis.aggregate as engine
 import sweep.analysis.statistic as blocks
-from support.small_datasets import mixed
+from support.small_datasets import ALL, mixed
 from sweep.analysis import (
     compare,
     detection_limit,
@@ -19,9 +19,7 @@ from sweep.analysis import (
     marker_ranking,
 )
 
-SIZES = {"dictionary": 2, "marker_id": 3, "tilt_deg": 2, "side_px": 3, "noise_grey": 2, "trial": 5,
-         "cornerRefinementMethod": 2, "solver": 2}
-RESULTS = mixed(SIZES, 20)
+RESULTS = mixed(ALL, 20)
 REPLICATED = mixed({"tilt_deg": 2, "noise_grey": 2, "trial": 64, "solver": 2}, 21).assign_attrs(
     sweep={"fingerprint": {"sampling": "sobol"}})
 BINS = {"marker_area_px": [100.0, 400.0, 500.0, 1001.0]}
@@ -71,7 +69,7 @@ def assert_same(answer, call):
             np.testing.assert_allclose(answer[name], array, rtol=1e-9, atol=1e-15, err_msg=name)
 
 
-@pytest.mark.parametrize("most", [1, 7, 500])
+@pytest.mark.parametrize("most", [1, 7, 100])
 @EVERY_CALL
 def test_blocks_of_any_size_give_the_same(call, most, monkeypatch):
     assert expected(call) is not None

@@ -43,15 +43,6 @@ def least_coverage(low, high, n, within=(0.0, 1.0)):
     return exact_coverage(low, high, p, n).min()
 
 
-def test_the_coverage_is_the_sum_of_the_binomial_chances():
-    n, p = 12, np.linspace(0.001, 0.999, 999)
-    for interval in (wilson, jeffreys):
-        low, high = interval(np.arange(n + 1), n)
-        plain = [sum(math.comb(n, k) * q**k * (1 - q) ** (n - k) for k in range(n + 1)
-                     if low[k] <= q <= high[k]) for q in p.tolist()]
-        np.testing.assert_allclose(exact_coverage(low, high, p, n), plain, rtol=1e-12)
-
-
 # n: least coverage of Wilson and Jeffreys, least for p in 0.1 ... 0.9 (computed, rounded down).
 LEAST = {
     5: (0.831, 0.891, 0.892, 0.900), 10: (0.834, 0.915, 0.868, 0.868),
@@ -97,22 +88,6 @@ def of_scipy(successes, n, method):
     """Return SciPy's intervals, low and high, of some numbers of n."""
     return np.transpose([
         stats.binomtest(k, n).proportion_ci(method=method) for k in successes.tolist()])
-
-
-@METHODS
-@pytest.mark.parametrize("n", LEAST)
-def test_intervals_of_rates_are_those_of_scipy(interval, n):
-    k = np.unique(np.concatenate([np.arange(min(n, 50) + 1), n - np.arange(min(n, 50) + 1),
-                                  np.linspace(0, n, 20).astype(int)]))
-    low, high = interval(k, n)
-    theirs = (stats.beta(k + 0.5, n - k + 0.5).interval(0.95) if interval is jeffreys
-              else of_scipy(k, n, "wilson"))
-    # Jeffreys: 0 at none and 1 at all of n (BCD section 3.1.3), where SciPy has quantiles.
-    # Wilson: there SciPy leaves what the formula cancels to, about 1e-18.
-    np.testing.assert_allclose(low[k > 0], theirs[0][k > 0], rtol=1e-9)
-    np.testing.assert_allclose(high[k < n], theirs[1][k < n], rtol=1e-9)
-    assert low[0] == 0
-    assert high[-1] == 1
 
 
 # By simulation.

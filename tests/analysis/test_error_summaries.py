@@ -9,85 +9,59 @@ import xarray as xr
 from scipy import stats
 
 from support.lengths import lengths
+from support.small_datasets import (
+    degrees,
+    is_solved,
+    length,
+    looked_for,
+    percent,
+    perfect,
+    with_every_flag,
+)
 from sweep.analysis import covariance_trust, efficiency, error_statistics, renderer_bias
 from sweep.errors import ArgumentError, DatasetError
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 
 INNER = {"corner": 4, "xy": 2, "xyz": 3, "pose_parameter": 6}
-LABELS = {
-    "xyz": ["x", "y", "z"],
-    "pose_parameter": [f"{kind}_{axis}" for kind in ("rotation", "translation") for axis in "xyz"],
-}
 SCENE = {"distance_m": 2, "marker_id": 3, "trial": 5}
-DETECTOR = {"refinement": 2}
-ESTIMATOR = {"solver": 2}
+SETTINGS = {"cornerRefinementMethod": 2, "solver": 2}
+SIZES = SCENE | SETTINGS
+RENDERED = {"renderer": 3, "marker_id": 8, "trial": 10} | SETTINGS
+SETTINGS = {"cornerRefinementMethod": 2, "solver": 2}
 
 
-def dataset(scene, detector, estimator, **arrays):
-    """Return a dataset of ``name=(dimensions, values)``, with coordinates."""
-    sizes = scene | detector | estimator
-    coordinates = {name: 10.0 * np.arange(size) for name, size in sizes.items()}
-    return xr.Dataset(arrays, coordinates | LABELS)
-
-
-def measured(
-    rng, scene=SCENE, detector=DETECTOR, estimator=ESTIMATOR, *, rotation=None, relative=None
-):
+def measured(rng, sizes, *, rotation=None, relative=None):
     """Return a dataset whose poses are all solved, of the given errors (..., xyz) and (...)."""
-    sizes = scene | detector | estimator
-    detected, estimated = tuple(scene) + tuple(detector), tuple(sizes)
     shape = tuple(sizes.values())
-    depth = rng.uniform(0.5, 2.0, tuple(scene.values()))
     if rotation is None:
         rotation = rng.normal(0.001, 0.01, (*shape, 3))
+    results = perfect(rng, sizes, rotation=rotation, position=np.zeros((*shape, 3)))
+    scene, detected, estimated = (
+        results[name].dims for name in ("marker_area_px", "detection", "estimate"))
     if relative is None:
         relative = rng.normal(0.001, 0.01, shape)
-    error = np.zeros((*shape, 3))
-    error[..., 2] = relative * depth.reshape(depth.shape + (1,) * (len(shape) - depth.ndim))
-    truth = np.stack([depth, depth, depth], axis=-1) * [0.1, 0.2, 1.0]
-    return dataset(
-        scene, detector, estimator,
-        true_tvec_m=((*scene, "xyz"), truth),
-        detection=(detected, np.full(shape[: len(detected)], DetectionStatus.detected, np.uint8)),
-        corner_error_px=((*detected, "corner", "xy"),
-                         rng.normal(0, 0.1, (*shape[: len(detected)], 4, 2)).astype("f4")),
-        estimate=(estimated, np.full(shape, EstimateStatus.solved, np.uint8)),
-        flipped=(estimated, np.full(shape, Flipped.not_flipped, np.uint8)),
-        rotation_error_rad=((*estimated, "xyz"), rotation),
-        translation_error_m=((*estimated, "xyz"), error),
+    depth = results["true_tvec_m"].sel(xyz="z", drop=True)
+    relative = xr.DataArray(np.broadcast_to(relative, shape), dims=estimated)
+    error = (depth * relative).transpose(*estimated)
+    results["translation_error_m"] = results["translation_error_m"].astype(float)
+    results["translation_error_m"].values[..., 2] = error
+    results["rotation_error_rad"] = (*estimated, "xyz"), rotation
+    labels = [f"{kind}_{axis}" for kind in ("rotation", "translation") for axis in "xyz"]
+    return results.drop_attrs(deep=False).assign(
+        corner_error_px=((*detected, "corner", "xy"), rng.normal(
+            0, 0.1, (*results["detection"].shape, 4, 2)).astype("f4")),
         nees=(estimated, rng.chisquare(6, shape)),
         bound_std=((*scene, "pose_parameter"), rng.uniform(0.001, 0.01, (*depth.shape, 6))),
-    )
-
-
-def _of_fixed_trials(flags):
-    """Return the flags but that of trials which a precision did not need."""
-    return [each for each in flags
-            if each.name not in ("not_needed", "not_on_board", "too_few_points")]
+    ).assign_coords(pose_parameter=labels)
 
 
 def with_flags_of_every_kind(rng, results):
     """Return the dataset with poses that went wrong in every way, mostly detected and solved."""
-    out = results.copy(deep=True)
-    kinds = [DetectionStatus.detected] * 12 + _of_fixed_trials(DetectionStatus)
-    out["detection"].values[...] = rng.choice(kinds, results["detection"].shape)
-    seen, _ = xr.broadcast(out["detection"], out["estimate"])
-    seen = seen.transpose(*out["estimate"].dims).values
-    solved = rng.choice(
-        [EstimateStatus.solved] * 8 + _of_fixed_trials(EstimateStatus), seen.shape)
-    estimate = np.where(seen == DetectionStatus.detected, solved, EstimateStatus.no_detection)
-    estimate[seen == DetectionStatus.not_run] = EstimateStatus.not_run
-    out["estimate"].values[...] = estimate
-    mirrored = rng.choice([Flipped.not_flipped] * 4 + [Flipped.flipped], seen.shape)
-    out["flipped"].values[...] = np.where(
-        estimate == EstimateStatus.solved, mirrored, Flipped.no_estimate
-    )
+    out = with_every_flag(rng, results)
     out["corner_error_px"] = out["corner_error_px"].where(
         out["detection"] == DetectionStatus.detected
     )
-    for name in ("rotation_error_rad", "translation_error_m", "nees"):
-        out[name] = out[name].where(out["estimate"] == EstimateStatus.solved)
-    out["nees"] = out["nees"].where(out["nees"] > 3)
+    out["nees"] = out["nees"].where((out["estimate"] == EstimateStatus.solved) & (out["nees"] > 3))
     out["bound_std"] = out["bound_std"].where(out["bound_std"].isel(pose_parameter=0) > 0.003)
     return out
 
@@ -107,27 +81,8 @@ def poses(results, **kept):
         }
 
 
-def looked_for(pose):
-    return pose["detection"] not in {
-        DetectionStatus.not_run, DetectionStatus.not_visible, DetectionStatus.not_modelled,
-        DetectionStatus.not_in_photograph, DetectionStatus.not_on_board,
-    }
-
-
-def is_solved(pose):
-    return pose["estimate"] == EstimateStatus.solved
-
-
 def is_unflipped(pose):
     return is_solved(pose) and pose["flipped"] == Flipped.not_flipped
-
-
-def percent(pose):
-    return 100 * float(pose["translation_error_m"][2]) / float(pose["true_tvec_m"][2])
-
-
-def degrees(pose):
-    return math.degrees(math.hypot(*pose["rotation_error_rad"].tolist()))
 
 
 def rms(values):
@@ -137,7 +92,7 @@ def rms(values):
 @pytest.fixture(scope="module")
 def mixed():
     rng = np.random.default_rng(1)
-    return with_flags_of_every_kind(rng, measured(rng))
+    return with_flags_of_every_kind(rng, measured(rng, SIZES))
 
 
 # Values.
@@ -147,7 +102,7 @@ def test_every_value_lies_in_its_interval_and_is_described(mixed):
     tables = [
         error_statistics(mixed, ["distance_m", "solver"]), efficiency(mixed, ["solver"]),
         covariance_trust(mixed, ["solver"]),
-        renderer_bias(mixed.rename(marker_id="renderer"), reference="10.0"),
+        renderer_bias(mixed.rename(marker_id="renderer"), reference="7"),
     ]
     for table in tables:
         for name, array in table.data_vars.items():
@@ -158,7 +113,7 @@ def test_every_value_lies_in_its_interval_and_is_described(mixed):
                 assert not (table[f"{name}_low"] > array).any(), name
                 assert not (table[f"{name}_high"] < array).any(), name
                 assert table[f"{name}_low"].attrs["units"] == array.attrs["units"]
-    assert tables[0]["distance_m"].values.tolist() == [0.0, 10.0]
+    assert tables[0]["distance_m"].values.tolist() == [0.2, 0.4]
     low = tables[0]["range_p95_percent_low"]
     assert low.attrs["description"].startswith("lower end of the 95 %")
 
@@ -185,9 +140,9 @@ def test_where_nothing_was_drawn_there_is_no_interval(mixed, how):
 
 @pytest.mark.parametrize("n", [2, 5, 6, 50, 72, 73, 367, 368, 1000])
 def test_quantiles_have_the_binomial_interval_of_order_statistics(n):
-    results = measured(np.random.default_rng(6), {"trial": n}, {}, {})
+    results = measured(np.random.default_rng(6), {"trial": n})
     answer = error_statistics(results, [])
-    values = np.array([degrees(pose) for pose in poses(results)])
+    values = np.array([length(degrees(pose)) for pose in poses(results)])
     for name, p in (("median", 0.5), ("p95", 0.95), ("p99", 0.99)):
         ends = stats.quantile_test(values, p=p).confidence_interval(0.95)
         for end, value in (("low", ends.low), ("high", ends.high)):
@@ -197,7 +152,7 @@ def test_quantiles_have_the_binomial_interval_of_order_statistics(n):
 
 def test_settings_that_are_pooled_see_the_same_draws_and_add_no_certainty(mixed):
     rng = np.random.default_rng(7)
-    one = with_flags_of_every_kind(rng, measured(rng, detector={}, estimator={}))
+    one = with_flags_of_every_kind(rng, measured(rng, SCENE))
     many = xr.concat([one] * 3, dim="solver", data_vars=["estimate", "flipped", "nees",
                      "rotation_error_rad", "translation_error_m"]).transpose("distance_m", ...)
     for function in (error_statistics, covariance_trust, efficiency):
@@ -230,7 +185,7 @@ def test_a_rotation_bias_is_covered_be_it_nothing_or_small(bias, count):
     rng = np.random.default_rng(9)
     rotation = rng.normal(size=(count, 5, 10, 3)) * [1.0, 0.3, 2.0] + [0.6 * bias, 0.0, 0.8 * bias]
     results = measured(
-        rng, {"regime": count, "marker_id": 5, "trial": 10}, {}, {}, rotation=0.01 * rotation
+        rng, {"regime": count, "marker_id": 5, "trial": 10}, rotation=0.01 * rotation
     )
     summary = error_statistics(results, ["regime"])
     hit = covered(summary, "rotation_bias_deg", math.degrees(0.01 * bias) - 1e-12)
@@ -245,7 +200,7 @@ def test_misses_at_random_widen_what_cells_of_other_means_leave_unsure(count):
     shape = (count, 4, 25)
     offsets, chances = np.array([-2.0, 0.0, 0.0, 3.0]), np.array([0.3, 0.9, 0.5, 0.6])
     results = measured(
-        rng, {"regime": count, "marker_id": 4, "trial": 25}, {}, {},
+        rng, {"regime": count, "marker_id": 4, "trial": 25},
         relative=0.01 * (rng.normal(size=shape) + offsets[:, None]),
     )
     missed = rng.random(shape) > chances[:, None]
@@ -267,9 +222,9 @@ def test_efficiency_is_that_of_plain_loops(mixed):
         chosen = [pose for pose in poses(mixed, distance_m=i, solver=j)
                  if is_unflipped(pose) and not np.isnan(pose["bound_std"]).any()]
         rotation = rms([rms(p["bound_std"][:3].tolist()) * math.sqrt(3) for p in chosen]) / rms(
-            [math.radians(degrees(p)) for p in chosen])
+            [math.radians(length(degrees(p))) for p in chosen])
         depth = rms([p["bound_std"][5] / p["true_tvec_m"][2] for p in chosen]) / rms(
-            [percent(p) / 100 for p in chosen])
+            [percent(p)[0] / 100 for p in chosen])
         told_here = answer.isel(distance_m=i, solver=j)
         assert told_here["rotation_efficiency"].item() == pytest.approx(rotation, rel=1e-12)
         assert told_here["range_efficiency"].item() == pytest.approx(depth, rel=1e-12)
@@ -280,7 +235,7 @@ def test_on_the_bound_the_interval_holds_one(count):
     # Chance of a false alarm below 1e-6, for a coverage of 0.93 to 0.97.
     rng = np.random.default_rng(12)
     scene = {"regime": count, "marker_id": 5, "trial": 60}  # one cell can make most of the error
-    results = measured(rng, scene, {}, {})
+    results = measured(rng, scene)
     results["bound_std"].values[...] = results["bound_std"].values[:1, :, :1]
     bound = results["bound_std"].values
     results["rotation_error_rad"].values[...] = rng.normal(size=(*bound.shape[:3], 3)) * (
@@ -302,7 +257,7 @@ def test_without_a_bound_there_is_no_efficiency(mixed):
 
 
 def test_no_error_at_all_is_infinitely_efficient():
-    answer = efficiency(measured(np.random.default_rng(13), relative=0.0, rotation=np.zeros(
+    answer = efficiency(measured(np.random.default_rng(13), SIZES, relative=0.0, rotation=np.zeros(
         (2, 3, 5, 2, 2, 3))), [])
     assert answer["range_efficiency"] == np.inf
     assert answer["rotation_efficiency_low"] == np.inf
@@ -312,7 +267,7 @@ def test_no_error_at_all_is_infinitely_efficient():
 
 def test_true_covariances_are_trusted_and_others_are_not():
     rng = np.random.default_rng(14)
-    results = measured(rng, {"marker_id": 5, "trial": 400}, {}, {"solver": 3})
+    results = measured(rng, {"marker_id": 5, "trial": 400, "solver": 3})
     results["nees"].values[..., 1] *= 1.5
     results["nees"].values[..., 2] *= 0.6
     answer = covariance_trust(results, ["solver"])
@@ -341,7 +296,7 @@ def test_true_covariances_are_trusted_and_others_are_not():
 
 @pytest.mark.parametrize("n", [49, 50, 200])
 def test_trust_is_an_interval_for_all_levels_together_within_the_tolerance(n):
-    levels, results = (0.5, 0.9, 0.99), measured(np.random.default_rng(17), {"trial": n}, {}, {})
+    levels, results = (0.5, 0.9, 0.99), measured(np.random.default_rng(17), {"trial": n})
     trusted = []
     for within in range(n // 2, n, 1 + n // 100):
         counts = (n // 2, within, max(within, n - 1))
@@ -358,7 +313,7 @@ def test_trust_is_an_interval_for_all_levels_together_within_the_tolerance(n):
 
 def test_flips_cost_the_trust_and_too_few_draws_give_none():
     rng = np.random.default_rng(15)
-    results = measured(rng, {"marker_id": 5, "trial": 100}, {}, {})
+    results = measured(rng, {"marker_id": 5, "trial": 100})
     assert covariance_trust(results, [])["covariance_trusted"]
     flipped = results.copy(deep=True)
     flipped["flipped"].values[:, :10] = Flipped.flipped
@@ -387,27 +342,28 @@ def test_a_level_that_is_no_probability_is_refused(mixed, levels):
 
 def test_renderers_are_compared_pose_by_pose():
     rng = np.random.default_rng(16)
-    scene = {"renderer": 3, "marker_id": 8, "trial": 10}
-    results = with_flags_of_every_kind(rng, measured(rng, scene))
-    results["true_tvec_m"].values[...] = results["true_tvec_m"].values[:1]
+    plain = measured(rng, RENDERED)
+    results = with_flags_of_every_kind(rng, plain)
+    results["true_tvec_m"].values[...] = plain["true_tvec_m"].values[:1]
     names = ["warp", "exact", "supersample-4"]
     answer = renderer_bias(results.assign_coords(renderer=names))
-    assert answer["corner_shift_rms_px"].dims == ("renderer", "refinement")
-    assert answer["range_bias_percent"].dims == ("renderer", "refinement", "solver")
+    assert answer["corner_shift_rms_px"].dims == ("renderer", "cornerRefinementMethod")
+    assert answer["range_bias_percent"].dims == ("renderer", "cornerRefinementMethod", "solver")
     exact = answer.sel(renderer="exact")
     assert (exact["differing"] == 0).all()
     assert (exact["rotation_shift_deg_high"] == 0).all()
     for r, d, s in itertools.product(range(3), range(2), range(2)):
-        pairs = list(zip(poses(results, renderer=r, refinement=d, solver=s),
-                         poses(results, renderer=1, refinement=d, solver=s), strict=True))
+        kept = {"cornerRefinementMethod": d, "solver": s}
+        pairs = list(zip(poses(results, renderer=r, **kept), poses(results, renderer=1, **kept),
+                         strict=True))
         aimed = [(a, b) for a, b in pairs if looked_for(a) and looked_for(b)]
         seen = [[p["detection"] == DetectionStatus.detected for p in pair] for pair in aimed]
         shifts = [a["corner_error_px"].astype(float) - b["corner_error_px"]
                   for (a, b), both in zip(aimed, seen, strict=True) if all(both)]
-        ranges = [percent(a) - percent(b) for a, b in aimed if is_solved(a) and is_solved(b)]
+        ranges = [(percent(a) - percent(b))[0] for a, b in aimed if is_solved(a) and is_solved(b)]
         turns = [np.degrees(a["rotation_error_rad"] - b["rotation_error_rad"])
                  for a, b in aimed if is_unflipped(a) and is_unflipped(b)]
-        here = answer.isel(renderer=r, refinement=d, solver=s)
+        here = answer.isel(renderer=r, **kept)
         assert here["compared"] == len(aimed)
         assert here["differing"] == sum(a != b for a, b in seen)
         assert here["detection_disagreement"] == sum(a != b for a, b in seen) / len(aimed)
@@ -420,17 +376,18 @@ def test_renderers_are_compared_pose_by_pose():
 
 
 def test_what_one_renderer_has_not_run_is_no_draw():
-    results = measured(np.random.default_rng(19), {"renderer": 2, "marker_id": 3, "trial": 9})
+    sizes = {"renderer": 2, "marker_id": 3, "trial": 9} | SETTINGS
+    results = measured(np.random.default_rng(19), sizes)
     results["estimate"].values[:, :, ::3] = (
         EstimateStatus.no_detection
     )  # so that draws without count
     results["detection"].values[:, :, ::3] = DetectionStatus.rejected
-    short = renderer_bias(results.isel(trial=slice(5)), reference="0.0")
+    short = renderer_bias(results.isel(trial=slice(5)), reference="0")
     results["detection"].values[0, :, 5:] = DetectionStatus.not_run
     results["estimate"].values[0, :, 5:] = EstimateStatus.not_run
     results["detection"].values[1, :, 8:] = DetectionStatus.not_run
     results["estimate"].values[1, :, 8:] = EstimateStatus.not_run
-    xr.testing.assert_allclose(renderer_bias(results, reference="0.0"), short, rtol=1e-12)
+    xr.testing.assert_allclose(renderer_bias(results, reference="0"), short, rtol=1e-12)
     flipped = results.assign_coords(renderer=["b", "a"])
     assert (renderer_bias(flipped, "a")["range_bias_percent_low"].sel(renderer="b").values
             == -renderer_bias(flipped, "b")["range_bias_percent_high"].sel(renderer="a")).all()

@@ -4,8 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from mpmath import mp, mpf
 
 from support.lengths import lengths
@@ -62,15 +60,6 @@ def test_wilson_keeps_its_digits_up_to_a_million_billion(count):
     assert worst < 2e-15  # measured 5e-16: a few roundings
 
 
-@pytest.mark.parametrize(("successes", "n", "low", "high"), [
-    (81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611),
-    (1, 29, 0.0061, 0.1718),
-])
-def test_wilson_is_that_of_newcombe(successes, n, low, high):
-    # Newcombe, Statistics in Medicine 17, 1998, the score method without continuity correction.
-    assert np.round(wilson(successes, n), 4).tolist() == [low, high]
-
-
 # Jeffreys.
 
 @pytest.mark.parametrize("n", [1, 2, 10, 1000])
@@ -109,27 +98,6 @@ def test_none_and_all_of_n_end_exactly_at_zero_and_one(interval, level):
     low, high = interval(n, n, level)
     assert (high == 1.0).all()
     assert ((low > 0) & (low <= 1)).all()
-
-
-@METHODS
-@lengths(20, 1000)
-def test_the_interval_holds_the_rate_and_mirrors_and_grows(interval, count):
-    @settings(derandomize=True, deadline=None, max_examples=count)
-    @given(st.integers(2, 10**12).flatmap(lambda n: st.tuples(st.integers(0, n - 1), st.just(n))))
-    def holds(counts):
-        successes, n = counts
-        low, high = interval([successes, successes + 1], n)
-        wide_low, wide_high = interval(successes, n, 0.99)
-        mirror_low, mirror_high = interval(n - successes, n)
-        assert low[0] <= successes / n <= high[0]
-        assert low[0] <= low[1]
-        assert high[0] <= high[1]
-        assert wide_low <= low[0]
-        assert wide_high >= high[0]
-        assert mirror_low == pytest.approx(1 - high[0], abs=1e-15)
-        assert mirror_high == pytest.approx(1 - low[0], abs=1e-15)
-
-    holds()
 
 
 @METHODS

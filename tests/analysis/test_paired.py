@@ -266,11 +266,6 @@ GOLDEN = pytest.mark.parametrize(("table", "low", "high"), [
 
 
 @GOLDEN
-def test_the_references_difference_is_the_published_one(table, low, high):
-    assert np.round(newcombe(*table)[1:], 4).tolist() == [low, high]
-
-
-@GOLDEN
 def test_the_difference_of_two_rates_is_the_published_one(table, low, high):
     results = perfect(np.random.default_rng(16), {"trial": sum(table)})
     seen = np.repeat([[1, 1], [1, 0], [0, 1], [0, 0]], table, axis=0).astype(bool)
@@ -433,19 +428,6 @@ def test_a_treatment_compared_with_itself_shows_no_difference():
             assert answer[f"{name}_rmse_ratio{end}"].item() == pytest.approx(1, rel=1e-12)
 
 
-def test_the_other_way_round_the_comparison_turns():
-    results = COMPARED["detectors"][0]
-    sides = [results.isel(cornerRefinementMethod=k) for k in range(2)]
-    one, other = compare(*sides).compute(), compare(*sides[::-1]).compute()
-    assert one["only_first_detected"] == other["only_second_detected"]
-    assert one["detection_p_value"] == other["detection_p_value"]
-    for name in ("detection_difference", "range_difference_percent", "position_difference_m"):
-        for end, turned in (("", ""), ("_low", "_high"), ("_high", "_low")):
-            assert one[name + end].item() == pytest.approx(-other[name + turned].item(), rel=1e-9)
-    assert one["rotation_rmse_ratio_low"].item() == pytest.approx(
-        1 / other["rotation_rmse_ratio_high"].item(), rel=1e-9)
-
-
 def test_scenes_of_two_ids_are_no_configurations_of_the_same_scenes():
     # Camera, marker and pose make the key of the draws: these are others, nothing is paired.
     results = mixed({"marker_id": 2, "tilt_deg": 2, "trial": 10, "noise_grey": 2}, 12)
@@ -508,18 +490,12 @@ def test_the_limit_is_the_smallest_side_from_which_on_all_are_found(axis, rates)
     flag, side, below = expected_limit(sides, along, 0.9)
     here = answer.isel(tilt_deg=0)
     assert here["limit"].item() == flag
+    np.testing.assert_allclose(here["side_px"], side, rtol=1e-12)
     if flag != 2:
-        assert here["side_px"].item() == pytest.approx(side, rel=1e-12)
         assert here["side_px_per_module"].item() == pytest.approx(side / 7, rel=1e-12)
-        for end, sign in (("low", -1), ("high", 1)):
-            limit = here[f"side_px_{end}"].item()
-            assert math.isnan(limit) or sign * (limit - side) >= 0
-    else:
-        assert here["side_px"].item() == math.inf
-    if flag == 1:
-        assert here["side_px_below"].item() == pytest.approx(below, rel=1e-12)
-    if flag == 3:
-        assert math.isnan(here["side_px_below"].item())
+        assert not here["side_px_low"].item() > side
+        assert not here["side_px_high"].item() < side
+        np.testing.assert_allclose(here["side_px_below"], below, rtol=1e-12)
 
 
 @pytest.mark.parametrize("per", [(), ("tilt_deg",), ("noise_grey", "tilt_deg")])

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from support.small_datasets import ALL, mixed, perfect
 from sweep.analysis import error_statistics
-from sweep.analysis.poses import SIGNED, SignedErrors, wrapped_deg
+from sweep.analysis.poses import SIGNED, SignedErrors
 from sweep.errors import ArgumentError
 from sweep.measure.flags import EstimateStatus, Flipped
 from sweep.model.pose import rotation_of_yaw_pitch_roll
@@ -122,32 +122,12 @@ def test_tiny_errors_and_half_turns_keep_their_digits(size, name, half_turn):
     assert found.in_plane_deg == pytest.approx(in_plane, abs=1e-13, rel=1e-12)
 
 
-def test_closed_forms_of_a_frontal_marker():
-    # 2 m ahead, upright; the estimate is turned by a about the camera's y axis (yaw), 0.1 m nearer.
-    a = 0.3
-    found = SignedErrors(np.array([math.pi, 0, 0]), np.array([0.0, 0.0, 2.0]),
-                         np.array([0.0, a, 0.0]), np.array([0.0, 0.0, -0.1]))
-    assert found.yaw_pitch_roll_deg == pytest.approx([math.degrees(a), 0, 0], abs=1e-12)
-    assert found.tilt_deg == pytest.approx(math.degrees(a))
-    assert found.viewing_angle_deg == pytest.approx(math.degrees(a))
-    assert found.in_plane_deg == pytest.approx(0, abs=1e-12)
-    assert found.along_marker_m == pytest.approx([0, 0, 0.1])
-    # The camera is 1.9 m from the marker, on a circle about it.
-    assert found.of_camera_m == pytest.approx(
-        [1.9 * math.sin(a), 0, 1.9 * math.cos(a) - 2], abs=1e-12)
-
-
 def test_nothing_is_made_of_what_is_missing():
     nan = np.full(3, np.nan)
     found = SignedErrors(np.array([math.pi, 0, 0]), np.array([0.0, 0.0, 1.0]), nan, nan)
     for name in ("in_camera_m", "along_marker_m", "of_camera_m", "yaw_pitch_roll_deg",
                  "tilt_deg", "viewing_angle_deg", "in_plane_deg"):
         assert np.isnan(getattr(found, name)).all(), name
-
-
-def test_wrapping():
-    assert wrapped_deg(np.radians([190.0, -190.0, 540.5, 0.0])) == pytest.approx(
-        [-170.0, 170.0, -179.5, 0.0])
 
 
 # The statistics.

@@ -203,20 +203,3 @@ def test_an_unset_belief_is_the_truth_where_cells_are_reused(name, tmp_path):
     with pytest.raises(StoreError, match=f"  {name}: the store has"):
         match(pipeline({}, {"solver": "ippe", name: wrong}, 1, **scene),
               open_store(str(tmp_path / "0.zarr")))
-
-
-@pytest.mark.long
-def test_an_axis_of_beliefs_reuses_the_cell_that_believed_the_truth(tmp_path):
-    axes = {"distance_m": [0.5], "believed_focal_scale": [0.99, 1.0]}
-    url = str(tmp_path / "old.zarr")
-    camera = {"camera": {"hfov_deg": 60}, "marker": {"size_m": 0.1}}
-    with calls_here():
-        execute(Pipeline.from_dict({**camera, "axes": {"distance_m": [0.5]}}), url)
-        fx = 320 / np.tan(np.radians(30))
-        grown = Pipeline.from_dict({
-            "camera": {"fx_px": float(fx)}, "marker": {"size_m": 0.1}, "axes": axes})
-        source = match(grown, open_store(url))
-        assert source.old_index["believed_focal_scale"].tolist() == [-1, 0]
-        execute(grown, str(tmp_path / "new.zarr"), reuse=[url])
-    old, new = (sweep.open(path)["translation_error_m"] for path in (url, tmp_path / "new.zarr"))
-    np.testing.assert_array_equal(new.sel(believed_focal_scale=1.0), old)

@@ -3,9 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
 
-from support.bent_sheets import flat_points
 from support.board_pictures import (
     KINDS,
     NAME,
@@ -143,48 +141,6 @@ ROUND = [f"{key}={round(level)}" for key, level in LEVELS.items()]
 LENS = "distortion=[-0.25, 0.08, 0.001, -0.0008]"
 
 
-@pytest.mark.parametrize("name", first_of(KINDS, 0))
-@pytest.mark.parametrize("settings", [[], [LENS]])
-@lengths(1, 6)
-def test_samples_of_a_board_are_its_exact_image(name, settings, count):
-    compared = 0
-    for pose in drawn(4 * count, 3):
-        scenes = scenes_of([*pose, *settings], board_text(name))
-        if not shown(scenes) or compared == count:
-            continue
-        compared += 1
-        text = board_text(name)
-        exact = image_of([*pose, *settings], text=text).astype(float)
-        sampled = image_of([*pose, *settings, "renderer='supersample-16-jittered'"], text=text)
-        # An edge of 210 levels crosses 16 to 32 of 256 cells, the sample of each on either side:
-        # 210 sqrt(32 / 6) / 256 = 1.9 levels of standard deviation, of which 5 hold.
-        off = exact - sampled
-        assert np.abs(off).max() < 10.5
-        assert np.sqrt(np.mean(off**2)) < 1.2
-        assert abs(off.mean()) < 0.1
-    assert compared == count
-
-
-@pytest.mark.parametrize("case", first_of(
-    [(name, lens) for lens in ([LENS], []) for name in ("charuco", "markers", "april", "beside")], 0
-))
-def test_a_blurred_board_is_its_finer_image_through_a_gaussian(case):
-    name, lens = case
-    fine, blur_px = 8, 0.9
-    pose = ["distance_m=0.24", "tilt_deg=35", "azimuth_deg=50", "roll_deg=25", *lens, *ROUND]
-    found = image_of([*pose, f"blur_px={blur_px}"], text=board_text(name)).astype(float)
-    finer = image_of(
-        [*pose, f"width_px={fine * SIZE[0]}", f"height_px={fine * SIZE[1]}", f"fx_px={fine * 110}",
-         f"fy_px={fine * 105}"],
-        text=board_text(name),
-    ).astype(float)
-    blurred = gaussian_filter(finer, fine * blur_px, mode="nearest", truncate=6)
-    mean = blurred.reshape(SIZE[1], fine, SIZE[0], fine).mean(axis=(1, 3))
-    # Rounding to a grey level, and what pixels of an eighth blur.
-    assert np.abs(found - mean).max() < 0.5 + 0.5
-    assert abs((found - mean).mean()) < 0.05
-
-
 def sampled(name, scenes, size, points, blur_px=0.0):
     """Levels (h, w) of the frame's first columns and rows, ``size``, by 12 x 12 samples a pixel.
 
@@ -244,24 +200,6 @@ def test_a_board_behind_a_lens_is_what_rays_meet(case):
 
     found = image_of(settings, text=board_text(name))[: size[1], : size[0]]
     agrees_with_samples(found - sampled(name, scenes, size, points, blur_px))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["charuco", "markers", "april", "beside"])
-@pytest.mark.parametrize(("bend", "curvature"), [("cylinder", 4.0), ("saddle", -3.0)])
-def test_a_bent_board_is_what_rays_meet(name, bend, curvature):
-    settings = ["distance_m=0.3", "tilt_deg=25", "azimuth_deg=50", "roll_deg=25",
-                f"curvature_per_m={curvature}", f"bend='{bend}'", "bend_deg=23", *ROUND]
-    scenes = scenes_of(settings, board_text(name))
-
-    def points(flat):
-        return flat_points(
-            np.column_stack([flat, np.ones(len(flat))]), scenes.rotation[0],
-            scenes.translation[0], bend, curvature, np.radians(23),
-        )
-
-    found = image_of(settings, text=board_text(name))
-    agrees_with_samples(found - sampled(name, scenes, SIZE, points))
 
 
 def test_an_image_behind_a_board_shows_beside_it_and_alone_where_there_is_none(tmp_path):

@@ -244,31 +244,23 @@ def classified(*found, truth=SQUARE, marker_id=7):
     return DetectionStatus(found.flags[0]), found.marker_corners[0, 0]
 
 
-def test_right_marker_is_detected_with_its_own_corners():
-    flag, corners = classified((7, SQUARE + 0.5))
-    assert flag == DetectionStatus.detected
-    np.testing.assert_array_equal(corners, SQUARE + 0.5)
+TILTED = np.array([[120.0, 90.0], [150.0, 118.0], [118.0, 131.0], [95.0, 115.0]])
+ELSEWHERE = [SQUARE + shift for shift in ([21.0, 0.0], [0.0, -21.0], [300.0, 200.0])]
 
 
-@pytest.mark.parametrize("found_id", [7, 3, REJECTED_ID])
-def test_what_lies_elsewhere_never_counts(found_id):
-    for shift in ([21.0, 0.0], [0.0, -21.0], [300.0, 200.0]):
-        flag, corners = classified((found_id, SQUARE + shift))
-        assert flag == DetectionStatus.no_candidate
-        assert np.isnan(corners).all()
-
-
-@pytest.mark.parametrize("turn", [1, 2, 3])
-def test_wrong_rotation_is_a_wrong_id(turn):
-    flag, corners = classified((7, np.roll(SQUARE, turn, axis=0)))
-    assert flag == DetectionStatus.wrong_id
-    assert np.isnan(corners).all()
-
-
-def test_other_id_there_is_a_wrong_id_and_outweighs_a_rejected_candidate():
-    assert classified((3, SQUARE))[0] == DetectionStatus.wrong_id
-    assert classified((3, SQUARE), (REJECTED_ID, SQUARE))[0] == DetectionStatus.wrong_id
-    assert classified((REJECTED_ID, SQUARE), (3, SQUARE))[0] == DetectionStatus.wrong_id
+@pytest.mark.parametrize(("found", "expected"), [
+    ([(7, SQUARE + 0.5)], DetectionStatus.detected),
+    *(([(each, quad)], DetectionStatus.no_candidate)
+      for each in (7, 3, REJECTED_ID) for quad in ELSEWHERE),
+    *(([(7, np.roll(SQUARE, turn, axis=0))], DetectionStatus.wrong_id) for turn in (1, 2, 3)),
+    *((found, DetectionStatus.wrong_id) for found in (
+        [(3, SQUARE)], [(3, SQUARE), (REJECTED_ID, SQUARE)], [(REJECTED_ID, SQUARE), (3, SQUARE)])),
+])
+def test_what_is_found_is_judged_by_its_id_its_place_and_its_turn(found, expected):
+    flag, corners = classified(*found)
+    assert flag == expected
+    right = found[0][1] if expected == DetectionStatus.detected else np.full((4, 2), np.nan)
+    np.testing.assert_array_equal(corners, right)
 
 
 def test_of_two_right_ones_the_nearest_counts():
@@ -278,10 +270,10 @@ def test_of_two_right_ones_the_nearest_counts():
 
 
 def test_truth_may_be_seen_turned_and_tilted():
-    truth = np.array([[120.0, 90.0], [150.0, 118.0], [118.0, 131.0], [95.0, 115.0]])
-    assert classified((7, truth + 0.3), truth=truth)[0] == DetectionStatus.detected
+    assert classified((7, TILTED + 0.3), truth=TILTED)[0] == DetectionStatus.detected
     # In the bounding box, but not in the quadrilateral.
-    assert classified((7, truth * 0.1 + [85, 82]), truth=truth)[0] == DetectionStatus.no_candidate
+    beside = classified((7, TILTED * 0.1 + [85, 82]), truth=TILTED)
+    assert beside[0] == DetectionStatus.no_candidate
 
 
 def test_scenes_are_told_apart():

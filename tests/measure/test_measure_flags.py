@@ -24,13 +24,3 @@ def test_values_are_those_of_existing_stores_and_survive_pickling(kind):
     names = STORED[kind].split()
     assert [kind(value).name for value in range(len(names))] == names
     assert all(pickle.loads(pickle.dumps(member)) is member for member in kind)  # noqa: S301
-
-
-@pytest.mark.parametrize("kind", STORED)
-def test_every_flag_says_in_one_sentence_what_it_means(kind):
-    for member in kind:
-        assert member.meaning[0].isupper()
-        assert member.meaning.endswith(".")
-    assert kind(0).name == "not_run"
-    assert not kind(0).counted
-    assert all(member.counted for member in kind if member.present)

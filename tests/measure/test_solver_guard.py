@@ -14,14 +14,10 @@ from sweep.measure.flags import EstimateStatus
 from sweep.measure.solver import OPENCV_SOLVERS
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
-from sweep.plan.parameters import PARAMETERS
 
 RELIABLE = tuple(name for name in OPENCV_SOLVERS if name != "epnp")
 FOCAL_PX = 1600 / 3
 SQUARE = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5, -0.5, 0]])
-LENS = (-0.3, 0.1, 0.0, 0.0)
-
-
 class View:
     """Poses (N,) over tilt, azimuth and roll at one bearing, and their exact corners."""
 
@@ -159,25 +155,6 @@ def test_guarded_solvers_are_right_at_any_focal_length(count, focal_px):
         assert (relative / view.translation[:, 2]).max() < 2e-5, solver
 
 
-@lengths(45, 15)
-def test_epnp_is_unreliable_and_says_so(count):
-    view = View(count, (0.0, 0.0), 0.1)
-    failed = wrong(view, view.estimates("epnp", guarded=True))
-    print(f"\nepnp: {failed.sum()} of {len(view)} wrong")
-    assert failed.mean() > 0.25
-    assert "epnp: EPnP, unreliable" in PARAMETERS["solver"].declaration.meaning
-
-
-@lengths(45, 15)
-@pytest.mark.parametrize("bearing", [(0.0, 0.0), (12.0, -9.0)], ids=["on-axis", "off-axis"])
-def test_guarded_solvers_are_right_through_a_lens(count, bearing):
-    view = View(count, bearing, 0.04, LENS)
-    straight = View(count, bearing, 0.04)
-    assert np.abs(view.corners - straight.corners).max() > 0.1  # the lens does something
-    for solver in RELIABLE:
-        assert not wrong(view, view.estimates(solver, guarded=True)).any(), solver
-
-
 @pytest.mark.parametrize("solver", RELIABLE)
 def test_relative_errors_are_the_same_at_millimetres_and_kilometres(solver):
     noise = np.random.default_rng(8).normal(0, 0.3, (2000, 4, 2))
@@ -263,52 +240,3 @@ def test_an_estimate_is_flipped_when_it_is_the_mirror():
     assert pose_error(
         second, view.translation[one], view.rotation[one], view.translation[one]
     ).flipped.all()
-
-
-def garbage(count):
-    """Return quadrilaterals (n, 4, 2) that no marker gave, by kind."""
-    rng = np.random.default_rng(31)
-    somewhere = rng.uniform(0, 600, (count, 1, 2))
-    kinds = {
-        "random": rng.uniform(-200, 800, (count, 4, 2)),
-        "whole numbers": 300.0 + rng.integers(0, 5, (count, 4, 2)),
-        "collinear": somewhere + rng.uniform(-1, 1, (count, 4, 1)) * rng.uniform(
-            -300, 300, (count, 1, 2)
-        ),
-        "in one row": np.stack([rng.uniform(0, 600, (count, 4)), np.full((count, 4), 9.0)], 2),
-        "identical": np.repeat(somewhere, 4, axis=1),
-        "at the principal point": np.full((count, 4, 2), [319.5, 239.5]),
-        "two identical": np.repeat(rng.uniform(0, 600, (count, 2, 2)), 2, axis=1),
-        "three identical": np.concatenate(
-            [np.repeat(somewhere, 3, axis=1), rng.uniform(0, 600, (count, 1, 2))], axis=1
-        ),
-        "tiny": 320 + rng.uniform(-1e-9, 1e-9, (count, 4, 2)),
-    }
-    # The detector's corners are float32.
-    for largest in (1e5, 1e9, 1e20, 3e38):
-        kinds[f"up to {largest:g}"] = rng.uniform(-largest, largest, (count, 4, 2))
-    return kinds
-
-
-@lengths(3, 150)
-@pytest.mark.parametrize("lens", [(), LENS, (-0.5, 0.0, 0.0, 0.0)], ids=["none", "mild", "folds"])
-@pytest.mark.parametrize("guarded", [True, False], ids=["guarded", "plain"])
-def test_garbage_is_solved_in_front_of_the_camera_or_not_at_all(count, guarded, lens):
-    for (kind, corners), solver in itertools.product(garbage(count).items(), OPENCV_SOLVERS):
-        estimates = estimate(
-            corners, cameras(count, lens), np.full(count, 0.05), solver, guarded, 0.25
-        )
-        solved = estimates.status == EstimateStatus.solved
-        told = f"{solver} on {kind}"
-        assert (solved | (estimates.status == EstimateStatus.solver_failed)).all(), told
-        points = in_space(estimates.rotation, estimates.translation, 0.05)
-        assert np.isfinite(points[solved]).all(), told
-        assert (points[solved][..., 2] > 0).all(), told
-        side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(axis=1)
-        assert (estimates.reprojection_px <= 0.25 * side)[solved].all(), told
-        assert np.isnan(points[~solved]).all(), told
-        assert np.isnan(estimates.reprojection_px[~solved]).all(), told
-        assert np.isnan(estimates.alternative_rotation[~solved]).all(), told
-        # What is solved is a rotation: 1e-12 is a hundred roundings.
-        product = estimates.rotation[solved] @ np.swapaxes(estimates.rotation[solved], 1, 2)
-        np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-12)

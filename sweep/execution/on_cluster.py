@@ -124,7 +124,10 @@ class OnCluster(Engine[Future[Any]]):
             if done.status == "finished":
                 self._last_block, self._next_line_s = time.monotonic(), STALL_S
                 self._faults.computed(number, len(self._states.keys() - self._faults.retired))
-                receipts: list[Receipt] = done.result()
+                try:
+                    receipts: list[Receipt] = done.result()
+                except OSError:  # they come through the scheduler
+                    raise RunError("the scheduler went away") from None
                 return receipts
             # "lost": the worker died after it committed the block, and its receipt died with it.
             lost = done.status == "lost" and self._client.status == "running"

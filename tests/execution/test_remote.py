@@ -73,7 +73,8 @@ import hashlib, json, sys
 import sweep
 with sweep.open(sys.argv[1]) as results:
     print(json.dumps(
-        {n: hashlib.sha256(v.to_numpy().tobytes()).hexdigest() for n, v in results.items()}
+        {n: hashlib.sha256(v.to_numpy().tobytes()).hexdigest()
+         for n, v in results.reset_coords().items()}
     ))
 """
 
@@ -104,10 +105,12 @@ def expected(text):
     return {name: hashlib.sha256(v.tobytes()).hexdigest() for name, v in values.items()}
 
 
-def digests(url):
+def digests(url, text=SMALL):
+    """Return the digests of the variables and draws that a store of a pipeline must hold."""
     ran = python("-c", DIGESTS, url)
     assert ran.returncode == 0, ran.stderr
-    return json.loads(ran.stdout)
+    found = json.loads(ran.stdout)
+    return {name: found.get(name) for name in expected(text)}
 
 
 @contextlib.contextmanager
@@ -338,7 +341,7 @@ def test_remote_store_of_a_tls_cluster_holds_what_a_local_one_does(
             env={**os.environ, **client_environment(certificates["ours"])},
         )
         assert ran.returncode == 0, ran.stderr
-        assert ran.stderr == ""
+        assert ran.stderr in ("", "starting\n")  # the latter on a busy machine
         assert json.loads(ran.stdout)["computed_scenes"] == 48
         told += ran.stdout + ran.stderr
         assert digests(url) == expected(SMALL)

@@ -56,11 +56,13 @@ _IMPORTED_ON_USE = {"Pipeline": "sweep.plan.pipeline", "Progress": "sweep.execut
                     "decode_flags": "sweep.analysis.dataset"}
 
 
-def __getattr__(name: str) -> Any:
-    """Import a public class when it is first used."""
-    if name not in _IMPORTED_ON_USE:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_IMPORTED_ON_USE[name]), name)
+if not TYPE_CHECKING:  # so that mypy knows the names above alone
+
+    def __getattr__(name: str) -> Any:
+        """Import a public class when it is first used."""
+        if name not in _IMPORTED_ON_USE:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(_IMPORTED_ON_USE[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -106,9 +106,11 @@ _MODULES = (
 )
 
 
-def __getattr__(name: str) -> ModuleType:
-    """Import a module when it is first used."""
-    for module in _MODULES:
-        if module.rpartition(".")[2] == name:
-            return importlib.import_module(module)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+if not TYPE_CHECKING:  # so that mypy knows the names above alone
+
+    def __getattr__(name: str) -> ModuleType:
+        """Import a module when it is first used."""
+        for module in _MODULES:
+            if module.rpartition(".")[2] == name:
+                return importlib.import_module(module)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -103,7 +103,8 @@ def fit(options: argparse.Namespace) -> int:
         print_json({
             "scene": found.scene, "photographs": found.photographs, "markers": found.markers,
             "terms": [each.as_json() for each in found.terms], "lines": list(found.lines),
-            "check": [] if fitted.gap is None else library.gap_figure.gap_records(fitted.gap),
+            "check": [] if fitted.gap is None
+            else library.comparison_tables.gap_records(fitted.gap),
             "output": str(output),
         })
         return 0
@@ -126,7 +127,7 @@ def fit(options: argparse.Namespace) -> int:
     if fitted.gap is not None:
         say()
         say("Half of the photographs, simulated with the scene of the others:")
-        say(library.gap_figure.gap_table(fitted.gap).text())
+        say(library.comparison_tables.gap_table(fitted.gap).text())
         say()
     say_next(f"sweep run {quoted(str(output))}", "simulates this camera")
     store = f"runs/{fitted.pipeline.name}.zarr"

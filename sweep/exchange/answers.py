@@ -340,13 +340,14 @@ def read_answers(
         (corners.abs() > MAX_PX).any(axis=1),
         lambda _: f"corners beyond {MAX_PX:.0e} px; expected pixels of the image",
     )
-    position = _numbers(table, "pose", (*angles, *POSITION))[[*POSITION]]
+    pose = _numbers(table, "pose", (*angles, *POSITION))
     table.refuse(
-        (position.abs() > MAX_M).any(axis=1),
+        (pose[[*POSITION]].abs() > MAX_M).any(axis=1),
         lambda _: f"a position beyond {MAX_M:.0e}; expected metres",
     )
-    rotation = _rotations(table, angles)
-    corners, position = corners.loc[table.rows.index], position.loc[table.rows.index]
+    rotation = _rotations(table, pose[[*angles]])
+    corners = corners.loc[table.rows.index]
+    position = pose.loc[table.rows.index, [*POSITION]]
     table.refuse(
         corners.isna().any(axis=1) & position.isna().any(axis=1),
         lambda _: "an ID without corners and without a pose",
@@ -412,25 +413,27 @@ def _numbers(table: _Table, what: str, names: Sequence[str]) -> pd.DataFrame:
     return table.rows[names].replace("", "nan").astype(np.float64)
 
 
-def _rotations(table: _Table, angles: tuple[str, ...]) -> Floats:
+def _rotations(table: _Table, angles: pd.DataFrame) -> Floats:
     """Return the rotations (n, 3, 3) of rotation vectors or quaternions; NaN where there are none.
 
     Rows with what is none of them are refused.
     """
-    if angles == QUATERNION:
-        length = np.sqrt((_numbers(table, "pose", angles) ** 2).sum(axis=1, skipna=False))
+    given = angles.loc[table.rows.index]
+    is_quaternion = tuple(given) == QUATERNION
+    if is_quaternion:
+        length = np.sqrt((given ** 2).sum(axis=1, skipna=False))
         table.refuse(
             (length - 1).abs() > 0.01,
             lambda row: f"a quaternion of length {length[row.name]:.3g}; expected w, x, y, z of "
             "length 1",
         )
-    given = _numbers(table, "pose", angles)
+        given = given.loc[table.rows.index]
     table.refuse(
         (given.abs() > 1e6).any(axis=1), lambda _: "a rotation vector beyond 1e6; expected radians")
     numbers = given.loc[table.rows.index].to_numpy(np.float64)
     rotations = np.full((len(numbers), 3, 3), np.nan)
     known = np.isfinite(numbers).all(axis=1)
-    if angles == QUATERNION:
+    if is_quaternion:
         w, xyz = numbers[known, :1], numbers[known, 1:]
         rotations[known] = Rotation.from_quat(np.hstack([xyz, w])).as_matrix()
     else:

@@ -1,5 +1,6 @@
 """The package as a user's script has it: its types, its arguments, its import."""
 
+import ast
 import doctest
 import shutil
 import subprocess
@@ -12,6 +13,7 @@ import pytest
 
 import sweep
 from support.here import calls_here
+from sweep import library
 from sweep.errors import ArgumentError, PipelineError, SweepError
 from sweep.execution.progress import progress_report
 
@@ -177,3 +179,14 @@ def test_mypy_sees_the_types_of_the_installed_package_in_a_users_script(tmp_path
     errors = [line for line in lines if ": error:" in line]
     assert all(line.startswith("wrong.py:") for line in errors), ran.stdout
     assert [int(line.split(":")[1]) for line in errors] == [4, 5, 6, 7], ran.stdout
+
+
+def test_every_module_that_mypy_sees_in_the_library_is_imported_on_use():
+    tree = ast.parse(Path(library.__file__).read_text(encoding="utf-8"))
+    seen = {
+        alias.name: f"{node.module}.{alias.name}" for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module.startswith("sweep")
+        for alias in node.names
+    }
+    assert len(seen) > 40
+    assert {name: getattr(library, name).__name__ for name in seen} == seen

@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from sweep.analysis.dataset import decode_flags
     from sweep.execution.cluster import Cluster
     from sweep.execution.progress import Progress
+    from sweep.experiment.pipeline import Pipeline
     from sweep.fitting.folders import FittedScene
-    from sweep.plan.pipeline import Pipeline
     from sweep.report.table import Findings
     from sweep.tradeoff.choice_search import Choice
 
@@ -52,7 +52,7 @@ __all__ = [
     "measure_tradeoff", "open", "photos", "require", "run", "size", "twins", "write_report",
 ]
 
-_IMPORTED_ON_USE = {"Pipeline": "sweep.plan.pipeline", "Progress": "sweep.execution.progress",
+_IMPORTED_ON_USE = {"Pipeline": "sweep.experiment.pipeline", "Progress": "sweep.execution.progress",
                     "decode_flags": "sweep.analysis.dataset"}
 
 

@@ -27,6 +27,11 @@ if TYPE_CHECKING:
     from sweep.execution import progress as progress
     from sweep.execution import runner as runner
     from sweep.execution import status as status
+    from sweep.experiment import cell_selection as cell_selection
+    from sweep.experiment import facts as facts
+    from sweep.experiment import parameters as parameters
+    from sweep.experiment import pipeline as pipeline
+    from sweep.experiment import sampling as sampling
     from sweep.fitting import folders as folders
     from sweep.integrity import repair as repair
     from sweep.integrity import reproduction as reproduction
@@ -34,11 +39,6 @@ if TYPE_CHECKING:
     from sweep.photographs import folder as folder
     from sweep.photographs import prepare as prepare
     from sweep.photographs import twins as twins
-    from sweep.plan import cell_selection as cell_selection
-    from sweep.plan import facts as facts
-    from sweep.plan import parameters as parameters
-    from sweep.plan import pipeline as pipeline
-    from sweep.plan import sampling as sampling
     from sweep.plugins import declared as declared
     from sweep.report import charts as charts
     from sweep.report import comparison_tables as comparison_tables
@@ -80,11 +80,11 @@ _MODULES = (
     "sweep.photographs.folder",
     "sweep.photographs.prepare",
     "sweep.photographs.twins",
-    "sweep.plan.cell_selection",
-    "sweep.plan.facts",
-    "sweep.plan.parameters",
-    "sweep.plan.pipeline",
-    "sweep.plan.sampling",
+    "sweep.experiment.cell_selection",
+    "sweep.experiment.facts",
+    "sweep.experiment.parameters",
+    "sweep.experiment.pipeline",
+    "sweep.experiment.sampling",
     "sweep.plugins.declared",
     "sweep.processor",
     "sweep.report.charts",

@@ -16,7 +16,7 @@ import pytest
 from sweep import compilation
 from sweep.cli.prepared import announce_compilation
 from sweep.errors import MachineFaultError
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline
 
 TOP = Path(compilation.__file__).parent.parent
 UNIT = "from sweep.model.exposure import _unit; print(_unit(5), _unit.py_func(5))"

@@ -19,10 +19,10 @@ import pytest
 from support.guide_tables import TABLES, outdated_tables
 from support.here import calls_here
 from sweep.cli import main
+from sweep.experiment.board_rules import read_board
+from sweep.experiment.parameters import PARAMETERS, SECTIONS, Stage
+from sweep.experiment.pipeline import Pipeline
 from sweep.photographs.twins import read_scene
-from sweep.plan.board_rules import read_board
-from sweep.plan.parameters import PARAMETERS, SECTIONS, Stage
-from sweep.plan.pipeline import Pipeline
 
 TOP = Path(__file__).parent.parent
 FOLDERS = ("pipelines", "sweep", "tests", "notebooks")

@@ -37,7 +37,7 @@ def test_rooms_import_one_way():
 @pytest.mark.parametrize(("lower", "upper"), [
     ("model/pose.py", "sweep.measure.flags"),
     ("store/layout.py", "sweep.evaluation"),      # neighbours are independent, too
-    pytest.param("plan/draws.py", "sweep.report.charts", marks=pytest.mark.long),
+    pytest.param("experiment/draws.py", "sweep.report.charts", marks=pytest.mark.long),
 ])
 def test_an_import_upwards_breaks_the_contract(copied, lower, upper):
     with (copied / "sweep" / lower).open("a") as file:
@@ -50,7 +50,7 @@ def test_an_import_upwards_breaks_the_contract(copied, lower, upper):
 
 @pytest.mark.parametrize(("imported", "importer"), [
     ("model/pose.py", "sweep.model.scene"),
-    pytest.param("plan/axes.py", "sweep.plan.pipeline", marks=pytest.mark.long),
+    pytest.param("experiment/axes.py", "sweep.experiment.pipeline", marks=pytest.mark.long),
 ])
 def test_a_circle_inside_a_room_breaks_the_contract(copied, imported, importer):
     with (copied / "sweep" / imported).open("a") as file:

@@ -174,7 +174,7 @@ def test_mypy_sees_the_types_of_the_installed_package_in_a_users_script(tmp_path
     revealed = [line.partition("Revealed type is ")[2] for line in lines if "Revealed" in line]
     assert revealed == [
         '"xarray.core.dataset.Dataset"', '"xarray.core.dataset.Dataset"',
-        '"sweep.plan.pipeline.Pipeline"', '"str"', '"str"',
+        '"sweep.experiment.pipeline.Pipeline"', '"str"', '"str"',
     ], ran.stdout + ran.stderr
     errors = [line for line in lines if ": error:" in line]
     assert all(line.startswith("wrong.py:") for line in errors), ran.stdout

@@ -8,9 +8,9 @@ import pytest
 
 from sweep.cli import main
 from sweep.evaluation.inspection import inspect_scene
-from sweep.plan.cell_selection import cell
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.cell_selection import cell
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
 
 TOP = Path(__file__).parent.parent
 README = (TOP / "README.md").read_text()

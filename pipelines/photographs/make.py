@@ -26,15 +26,15 @@ from numpy.typing import NDArray
 
 import sweep
 from sweep.analysis import simulation_gap
+from sweep.experiment.board_rules import read_board
+from sweep.experiment.experiment import scene_plugins
+from sweep.experiment.grid import scene_axes, scene_values
 from sweep.fitting.photograph_fit import START, VARIANCE, fit_photograph
 from sweep.fitting.views import is_saturated, photograph_scenes, photograph_views
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
 from sweep.photographs.twins import read_scene, twin_pipeline
-from sweep.plan.board_rules import read_board
-from sweep.plan.experiment import scene_plugins
-from sweep.plan.grid import scene_axes, scene_values
 from sweep.report.comparison_tables import gap_table
 from sweep.store.lifecycle import read_pipeline
 

@@ -28,8 +28,8 @@ from sweep.analysis.dataset import (
 from sweep.analysis.draws import Design, Unit, common_trials, replicate_order
 from sweep.analysis.poses import COMMON
 from sweep.analysis.statistic import MAX_BLOCK, Arrays, Blocks, Statistic, Variables, ViewT
-from sweep.plan.draws import REPLICATES
-from sweep.plan.schema import LABELS
+from sweep.experiment.draws import REPLICATES
+from sweep.experiment.schema import LABELS
 
 MAX_THREADS = 4
 """Blocks that are computed side by side; with more, reading memory is what takes time."""
@@ -126,8 +126,8 @@ def _table(
 # Named dimensions are kept, all others are pooled. Of these, ``trial`` counts random draws; the
 # other dimensions of camera, marker and pose make cells, a fixed grid; all others that are pooled
 # (effects, levels, renderers, settings of detector and estimator, and names that are no
-# parameter's) see the same draws (`sweep.plan.draws`), so that their values together count as one
-# draw.
+# parameter's) see the same draws (`sweep.experiment.draws`), so that their values together count
+# as one draw.
 
 @dataclass(frozen=True)
 class Layout:

@@ -32,8 +32,8 @@ from sweep.analysis.poses import ESTIMATE_INPUTS, Poses, pose_arrays
 from sweep.analysis.rates import FLIPPED, SOLVED
 from sweep.analysis.statistic import INTERVAL, Statistic
 from sweep.errors import ArgumentError
+from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
-from sweep.plan.schema import cf_attributes
 from sweep.typing import Floats, Integers, Masks
 
 THRESHOLDS = (

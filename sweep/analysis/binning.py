@@ -15,8 +15,8 @@ from sweep.analysis.dataset import DRAWS, axes_of, parameter_value, without_fixe
 from sweep.analysis.poses import INSIDE
 from sweep.analysis.statistic import Arrays
 from sweep.errors import ArgumentError, DatasetError
+from sweep.experiment.schema import LABELS
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
-from sweep.plan.schema import LABELS
 from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------

@@ -17,6 +17,11 @@ import xarray as xr
 from sweep.analysis.dataset import DRAWS, axes_of, describes, stored_pipeline
 from sweep.analysis.intervals import DEVIATIONS, wilson
 from sweep.errors import ArgumentError, DatasetError, SweepError
+from sweep.experiment.experiment import shows_boards
+from sweep.experiment.grid import scene_axes, scene_values
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import CalibrationStatus
 from sweep.measure.intrinsics import (
     FREE_COEFFICIENTS,
@@ -31,11 +36,6 @@ from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.pose import rotation_of_vector, transform_points
 from sweep.model.scene import build_cameras
-from sweep.plan.experiment import shows_boards
-from sweep.plan.grid import scene_axes, scene_values
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import cf_attributes
 from sweep.typing import Floats
 
 DIRECTIONS = ("centre", "corner")

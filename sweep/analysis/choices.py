@@ -24,10 +24,10 @@ from sweep.analysis.requirements import (
     parse_requirements,
     read_requirements,
 )
+from sweep.experiment.axes import TRIAL
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.sampling import CHOOSE, ChoiceRule
 from sweep.messages import shown
-from sweep.plan.axes import TRIAL
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.sampling import CHOOSE, ChoiceRule
 from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -199,7 +199,7 @@ def walk(decision: Decisions, keeps: Masks) -> Walk:
 # --------------------------------------------------------------------------------------------------
 # The choice that meets requirements at all conditions: of a size, and among other settings.
 #
-# What a choice is stands in `sweep.plan.sampling`, when one is answered in
+# What a choice is stands in `sweep.experiment.sampling`, when one is answered in
 # `sweep.analysis.choices`. Every alternative, a combination of the values of the axes ``among``,
 # has its own answer.
 

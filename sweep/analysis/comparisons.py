@@ -45,12 +45,12 @@ from sweep.analysis.poses import (
 )
 from sweep.analysis.statistic import INTERVAL, Arrays, Statistic
 from sweep.errors import ArgumentError, DatasetError, SweepError
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import LABELS, cf_attributes
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.messages import plain
 from sweep.model.pose import rotation_of_vector, vector_of_rotation
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import LABELS, cf_attributes
 from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------

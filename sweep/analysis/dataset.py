@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from sweep.analysis.poses import AXIS, DETECTION_INPUTS, REQUIRED_VARIABLES
 from sweep.errors import ArgumentError, DatasetError, SweepError
+from sweep.experiment.parameters import GEOMETRY_SECTIONS, PARAMETERS, PHOTOGRAPHS, Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.reader import StoppingRule
+from sweep.experiment.sampling import STOPPING_SECTIONS
+from sweep.experiment.schema import FIXED, LABELS, SCHEMA, with_descriptions
+from sweep.experiment.toml_text import read_document
 from sweep.messages import shown
-from sweep.plan.parameters import GEOMETRY_SECTIONS, PARAMETERS, PHOTOGRAPHS, Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.reader import StoppingRule
-from sweep.plan.sampling import STOPPING_SECTIONS
-from sweep.plan.schema import FIXED, LABELS, SCHEMA, with_descriptions
-from sweep.plan.toml_text import read_document
 from sweep.plugins.declared import recorded_plugins
 
 # --------------------------------------------------------------------------------------------------

@@ -25,9 +25,9 @@ from sweep.analysis.draws import stopped_level, with_common_trials
 from sweep.analysis.intervals import LEVEL, clopper_pearson, wilson
 from sweep.analysis.rates import detection_rate
 from sweep.errors import ArgumentError
+from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
 from sweep.model.marker import module_count
-from sweep.plan.schema import cf_attributes
 from sweep.typing import Floats, Integers, Masks
 
 SIZE_AXES = ("side_px", "distance_m")

@@ -23,10 +23,10 @@ from sweep.analysis.dataset import (
 )
 from sweep.analysis.poses import NOT_LOOKED_FOR
 from sweep.errors import DatasetError
+from sweep.experiment.draws import REPLICATES
+from sweep.experiment.parameters import Stage
+from sweep.experiment.schema import VARIABLES
 from sweep.measure.flags import DetectionStatus
-from sweep.plan.draws import REPLICATES
-from sweep.plan.parameters import Stage
-from sweep.plan.schema import VARIABLES
 from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -34,8 +34,8 @@ from sweep.typing import Floats, Integers, Masks
 #
 # A unit counts as one draw, whatever it holds: the pooled settings of a trial see the same images,
 # the errors of the markers of a photograph are correlated, and the points of a replicate
-# (`sweep.plan.draws`) fill their space evenly; the replicates have scrambles of their own. Means
-# follow from the sums of units, with Student's t of the spread between them; rates and quantiles
+# (`sweep.experiment.draws`) fill their space evenly; the replicates have scrambles of their own.
+# Means follow from the sums of units, with Student's t of the spread between them; rates and quantiles
 # have the intervals of a number of draws that they are worth.
 #
 # Owen, "Randomly permuted (t,m,s)-nets and (t,s)-sequences", 1995; L'Ecuyer and Lemieux, "Recent

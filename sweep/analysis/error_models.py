@@ -44,8 +44,8 @@ from sweep.analysis.intervals import DEVIATIONS
 from sweep.analysis.poses import SIGNED_INPUTS, bearing_of, pose_arrays, sight_rotation
 from sweep.analysis.statistic import INTERVAL
 from sweep.errors import ArgumentError, DatasetError
+from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
-from sweep.plan.schema import cf_attributes
 from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------

@@ -32,9 +32,9 @@ from sweep.analysis.requirements import (
     parse_requirements,
 )
 from sweep.errors import ArgumentError, DatasetError
+from sweep.experiment.sampling import LimitRule
+from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
-from sweep.plan.sampling import LimitRule
-from sweep.plan.schema import cf_attributes
 
 # --------------------------------------------------------------------------------------------------
 # How far requirements are met along an axis: "up to 2.25 m (2.0 to 2.5)".

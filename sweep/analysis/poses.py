@@ -14,10 +14,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.errors import ArgumentError, DatasetError
+from sweep.experiment.schema import VARIABLES, XYZ
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped, uncounted_values
 from sweep.messages import nearest
 from sweep.model.pose import angle_between, rotation_of_vector
-from sweep.plan.schema import VARIABLES, XYZ
 from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------

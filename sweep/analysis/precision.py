@@ -28,9 +28,9 @@ from sweep.analysis.rates import LOOKED_FOR
 from sweep.analysis.requirements import Requirable, named, requirable_arrays, requirables
 from sweep.analysis.statistic import INTERVAL, Statistic
 from sweep.errors import ArgumentError
+from sweep.experiment.sampling import PrecisionRule
+from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
-from sweep.plan.sampling import PrecisionRule
-from sweep.plan.schema import cf_attributes
 
 # --------------------------------------------------------------------------------------------------
 # Half-widths of intervals, by which sampling stops, and whether they are as small as is wanted.

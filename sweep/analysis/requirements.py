@@ -54,11 +54,11 @@ from sweep.analysis.summaries import (
     registered,
 )
 from sweep.errors import ArgumentError, DatasetError, PipelineError
+from sweep.experiment.parameters import Stage
+from sweep.experiment.sampling import RequirementText, read_requirement
+from sweep.experiment.schema import cf_attributes
 from sweep.measure.flags import Flag, flag
 from sweep.messages import MAX_LINE_LENGTH, label, nearest, plain, shown
-from sweep.plan.parameters import Stage
-from sweep.plan.sampling import RequirementText, read_requirement
-from sweep.plan.schema import cf_attributes
 from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------

@@ -34,9 +34,9 @@ from sweep.analysis.quantiles import quantile_intervals
 from sweep.analysis.rates import DETECTION_RATE, FLIP_RATE
 from sweep.analysis.statistic import OVER_ALL, Arrays, Blocks
 from sweep.errors import DatasetError
+from sweep.experiment.parameters import PARAMETERS, SIMULATED, Stage
+from sweep.experiment.schema import LABELS, cf_attributes
 from sweep.messages import label, shown
-from sweep.plan.parameters import PARAMETERS, SIMULATED, Stage
-from sweep.plan.schema import LABELS, cf_attributes
 from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------

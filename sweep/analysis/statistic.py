@@ -16,7 +16,7 @@ from numpy.lib.array_utils import normalize_axis_tuple
 from numpy.typing import ArrayLike, NDArray
 
 from sweep.analysis.draws import Design
-from sweep.plan.schema import cf_attributes
+from sweep.experiment.schema import cf_attributes
 from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------

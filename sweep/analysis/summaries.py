@@ -49,7 +49,7 @@ from sweep.analysis.statistic import (
     with_interval,
 )
 from sweep.errors import ArgumentError
-from sweep.plan.schema import POSE_PARAMETERS, XYZ
+from sweep.experiment.schema import POSE_PARAMETERS, XYZ
 from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from sweep.errors import (
 from sweep.messages import plain, quoted, to_json
 
 if TYPE_CHECKING:
-    from sweep.plan.pipeline import Pipeline
+    from sweep.experiment.pipeline import Pipeline
     from sweep.report.table import Findings
 
 

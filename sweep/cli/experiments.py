@@ -39,10 +39,10 @@ if TYPE_CHECKING:
     from sweep.execution.forecast import Forecast
     from sweep.execution.progress import Progress
     from sweep.execution.status import Summary
+    from sweep.experiment.pipeline import Pipeline
+    from sweep.experiment.reader import StoppingRule
     from sweep.integrity.reproduction import Reproduction
     from sweep.isolation.child_process import Child
-    from sweep.plan.pipeline import Pipeline
-    from sweep.plan.reader import StoppingRule
 
 
 # --------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from sweep.messages import notice, quoted
 
 if TYPE_CHECKING:
     from sweep.execution.status import Summary
-    from sweep.plan.pipeline import Pipeline
+    from sweep.experiment.pipeline import Pipeline
 
 
 # --------------------------------------------------------------------------------------------------

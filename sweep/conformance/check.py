@@ -15,6 +15,11 @@ from sweep.evaluation.block import detections_for, run_cells
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import CellsResult
 from sweep.evaluation.search import search, whole_frames
+from sweep.experiment.experiment import shows_boards
+from sweep.experiment.grid import detector_settings, estimators, scene_values
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import VARIABLES
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
 from sweep.measure.detectors import OPENCV, AnyDetectorSetting, make_detector
 from sweep.measure.estimators import SOLVERS, build
@@ -23,11 +28,6 @@ from sweep.model.extent import marker_boxes
 from sweep.model.marker import dictionary_names, marker_count, missing_package
 from sweep.model.renderers import render_all
 from sweep.model.scene import build_scenes
-from sweep.plan.experiment import shows_boards
-from sweep.plan.grid import detector_settings, estimators, scene_values
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import VARIABLES
 from sweep.plugins.declared import DeclaredPlugin, PluginSetting, described
 from sweep.typing import Floats, Grey, Integers
 

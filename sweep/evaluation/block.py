@@ -29,6 +29,19 @@ from sweep.evaluation.search import (
     visibility_flags,
     whole_frames,
 )
+from sweep.experiment.beliefs import CALIBRATED
+from sweep.experiment.experiment import largest_board, scene_plugins
+from sweep.experiment.grid import (
+    board_settings,
+    detector_settings,
+    estimators,
+    image_keys,
+    scene_axes,
+    scene_values,
+)
+from sweep.experiment.parameters import PHOTOGRAPHS, Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import SCHEMA, VARIABLES, drawn_variables, variables_of
 from sweep.measure.bound import Bounds, bounds, outside_model
 from sweep.measure.classify import Findings, TargetScenes, target_scenes
 from sweep.measure.estimation import (
@@ -50,19 +63,6 @@ from sweep.model.polygon import signed_areas
 from sweep.model.pose import vector_of_rotation, viewing_angle
 from sweep.model.renderers import beside_pixels
 from sweep.model.scene import Scenes, build_scenes
-from sweep.plan.beliefs import CALIBRATED
-from sweep.plan.experiment import largest_board, scene_plugins
-from sweep.plan.grid import (
-    board_settings,
-    detector_settings,
-    estimators,
-    image_keys,
-    scene_axes,
-    scene_values,
-)
-from sweep.plan.parameters import PHOTOGRAPHS, Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import SCHEMA, VARIABLES, drawn_variables, variables_of
 from sweep.typing import Floats, Masks
 
 # --------------------------------------------------------------------------------------------------
@@ -174,8 +174,8 @@ def estimate_poses(
 # --------------------------------------------------------------------------------------------------
 # How each variable of the dataset is computed from the results of its stage.
 #
-# To add a variable, add its record to :data:`sweep.plan.schema.SCHEMA` and its function to the
-# table of its stage below; a variable with one but not the other is refused on import.
+# To add a variable, add its record to :data:`sweep.experiment.schema.SCHEMA` and its function to
+# the table of its stage below; a variable with one but not the other is refused on import.
 
 @dataclass(frozen=True, slots=True)
 class SceneResults:

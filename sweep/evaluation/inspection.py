@@ -20,6 +20,17 @@ from sweep.evaluation.search import (
     visibility_flags,
     whole_frames,
 )
+from sweep.experiment.experiment import largest_board, scene_plugins
+from sweep.experiment.grid import (
+    board_settings,
+    detector_settings,
+    estimators,
+    image_keys,
+    scene_values,
+)
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import variables_of
 from sweep.measure.classify import target_scenes
 from sweep.measure.detectors import SearchOutput
 from sweep.measure.flags import DetectionStatus, EstimateStatus
@@ -28,17 +39,6 @@ from sweep.model.extent import marker_boxes
 from sweep.model.pose import rotation_of_vector, transform_points
 from sweep.model.renderers import render
 from sweep.model.scene import Scenes, build_scenes
-from sweep.plan.experiment import largest_board, scene_plugins
-from sweep.plan.grid import (
-    board_settings,
-    detector_settings,
-    estimators,
-    image_keys,
-    scene_values,
-)
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import variables_of
 from sweep.typing import Floats, Grey, Integers, Masks
 
 
@@ -124,7 +124,8 @@ def inspect_scene(pipeline: Pipeline, *, whole_frame: bool = False) -> SceneInsp
     Parameters
     ----------
     pipeline
-        Every axis but ``trial`` must be fixed, as :func:`sweep.plan.cell_selection.cell` does.
+        Every axis but ``trial`` must be fixed, as
+        :func:`sweep.experiment.cell_selection.cell` does.
     whole_frame
         Whether the image is the whole frame; the searched window is that of a run all the same.
 

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.plan.grid import Block
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import Variable, variables_of
+from sweep.experiment.grid import Block
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import Variable, variables_of
 from sweep.typing import Floats
 
 

@@ -28,10 +28,10 @@ from sweep.exchange.images import (
     write_errors,
 )
 from sweep.execution.forecast import free_disk
+from sweep.experiment.experiment import shows_boards
+from sweep.experiment.pipeline import Pipeline
 from sweep.messages import byte_count, plain
 from sweep.model.renderers import render
-from sweep.plan.experiment import shows_boards
-from sweep.plan.pipeline import Pipeline
 from sweep.store.files import write_whole
 from sweep.store.provenance import environment, fingerprint
 

@@ -18,16 +18,16 @@ from numpy.typing import NDArray
 from sweep.errors import StoreError
 from sweep.evaluation.block import GEOMETRY
 from sweep.evaluation.search import search_windows, visibility_flags, whole_frames
+from sweep.experiment.experiment import scene_plugins
+from sweep.experiment.grid import detector_settings, image_keys, scene_axes, scene_values
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import LABELS, VARIABLES, drawn_quantities
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import label, plain
 from sweep.model.camera import Column
 from sweep.model.extent import marker_boxes
 from sweep.model.pose import vector_of_rotation
 from sweep.model.scene import Scenes, build_scenes
-from sweep.plan.experiment import scene_plugins
-from sweep.plan.grid import detector_settings, image_keys, scene_axes, scene_values
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import LABELS, VARIABLES, drawn_quantities
 from sweep.store.files import write_whole
 from sweep.store.locations import reason_of
 from sweep.typing import Integers, Masks
@@ -48,7 +48,7 @@ class ImageBatch:
     numbers
         (N,) places in the grid of scene axes, the last axis fastest.
     keys
-        (N,) keys of the images (:func:`sweep.plan.grid.image_keys`).
+        (N,) keys of the images (:func:`sweep.experiment.grid.image_keys`).
     values, scenes
         Parameters and geometry.
     visible

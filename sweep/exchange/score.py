@@ -23,10 +23,10 @@ from sweep.errors import (
 from sweep.exchange.answers import CORNERS, Answers, Conventions, read_answers
 from sweep.exchange.export import EXPERIMENT, read_mark
 from sweep.exchange.images import image_batch, image_batches, write_errors
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
 from sweep.messages import plain
 from sweep.model.polygon import side_lengths
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
 from sweep.plugins.recording import REJECTED, SUFFIX, Recording
 from sweep.store.files import write_whole
 from sweep.typing import Floats, Integers

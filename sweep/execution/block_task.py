@@ -21,16 +21,16 @@ from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.results import CellsResult, to_dataset_layout
 from sweep.execution.limits import TIME_LIMIT_S
 from sweep.execution.reuse import LOST, ReusedCells, Source, match, read_cells
+from sweep.experiment.grid import Block, block_indices, scene_axes
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.plugins import lacking_plugins
+from sweep.experiment.reader import StoppingRule
+from sweep.experiment.rules import file_digest
+from sweep.experiment.schema import Variable
 from sweep.isolation.crash_isolation import WHOLE, check_repeatable, run_cells_isolated
 from sweep.isolation.watchdog import ending_after
 from sweep.measure.flags import DetectionStatus
-from sweep.plan.grid import Block, block_indices, scene_axes
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.plugins import lacking_plugins
-from sweep.plan.reader import StoppingRule
-from sweep.plan.rules import file_digest
-from sweep.plan.schema import Variable
 from sweep.processor import processor
 from sweep.sampling.rules import Decider, Decision, by_scene
 from sweep.store.blocks import (

@@ -36,6 +36,8 @@ from sweep.execution.limits import (
     THREAD_COUNT_TIMEOUT_S,
     VERSIONS_S,
 )
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.plugins import lacking_plugins
 from sweep.isolation.child_process import SINGLE_THREADED, in_main_thread
 from sweep.isolation.machine import (
     be_killed_before_others,
@@ -45,8 +47,6 @@ from sweep.isolation.machine import (
     text_of,
 )
 from sweep.messages import notice
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.plugins import lacking_plugins
 from sweep.processor import differing_processors, processor
 from sweep.store.provenance import changes, fingerprint
 

@@ -39,17 +39,17 @@ from sweep.execution.limits import (
     TIMING_S,
     WAVE_BLOCK_S,
 )
+from sweep.experiment.axes import TRIAL, Axis
+from sweep.experiment.experiment import effects_of
+from sweep.experiment.grid import Block, Blocks, block_indices, scene_axes
+from sweep.experiment.parameters import Stage
+from sweep.experiment.photographs import along_photographs, shows_photographs
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import bytes_per_block, variables_of
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
 from sweep.isolation.machine import default_workers
 from sweep.isolation.watchdog import compilation_s
 from sweep.messages import byte_count, duration
-from sweep.plan.axes import TRIAL, Axis
-from sweep.plan.experiment import effects_of
-from sweep.plan.grid import Block, Blocks, block_indices, scene_axes
-from sweep.plan.parameters import Stage
-from sweep.plan.photographs import along_photographs, shows_photographs
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import bytes_per_block, variables_of
 from sweep.sampling.rules import (
     GroupResults,
     Stopping,

@@ -14,10 +14,10 @@ from sweep.analysis.requirements import check_required
 from sweep.errors import ArgumentError, StoreError
 from sweep.execution.runner import execute
 from sweep.execution.status import Summary
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.sampling import LIMIT, LimitRule, limit_settings, texts_in
+from sweep.experiment.toml_text import MAX_BYTES, read_document
 from sweep.model.image_file import read_regular
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.sampling import LIMIT, LimitRule, limit_settings, texts_in
-from sweep.plan.toml_text import MAX_BYTES, read_document
 from sweep.store.lifecycle import (
     names_store,
     open_dataset,

@@ -21,13 +21,13 @@ import numpy as np
 
 from sweep.errors import ArgumentError, RunError
 from sweep.execution.limits import MAX_FAILED_BLOCKS
+from sweep.experiment.cell_selection import selection_text
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.reader import StoppingRule
+from sweep.experiment.sampling import PrecisionRule, digest_of
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import duration, notice
-from sweep.plan.cell_selection import selection_text
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.reader import StoppingRule
-from sweep.plan.sampling import PrecisionRule, digest_of
 from sweep.sampling.rules import Decider, Decision, Stopping, Waves, condition_axes
 from sweep.store.blocks import RunStore, committed, receipts
 from sweep.store.lifecycle import open_dataset

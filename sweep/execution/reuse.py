@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from sweep.errors import StoreError
 from sweep.evaluation.block import GEOMETRY
+from sweep.experiment.axes import TRIAL, Axis
+from sweep.experiment.grid import Block, scene_axes, scene_values
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.same_meaning import alike
+from sweep.experiment.schema import VARIABLES, Variable, variables_of
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.scene import build_scenes
-from sweep.plan.axes import TRIAL, Axis
-from sweep.plan.grid import Block, scene_axes, scene_values
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.same_meaning import alike
-from sweep.plan.schema import VARIABLES, Variable, variables_of
 from sweep.store.blocks import RunStore, check_whole, receipts
 from sweep.store.provenance import changes, fingerprint
 

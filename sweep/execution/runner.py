@@ -45,13 +45,13 @@ from sweep.execution.status import (
     summary_of,
     summary_of_complete,
 )
+from sweep.experiment.facts import notes
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.sampling import MAX_TRIALS
 from sweep.isolation.child_process import Child, Interrupts
 from sweep.isolation.crash_isolation import check_plugins
 from sweep.messages import notice
-from sweep.plan.facts import notes
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.sampling import MAX_TRIALS
 from sweep.sampling.rules import make_rule
 from sweep.store.blocks import RunStore, committed, drop_block, missing_chunks
 from sweep.store.lifecycle import (

@@ -13,10 +13,10 @@ import numpy as np
 
 from sweep.evaluation.block import bound_notes
 from sweep.execution.progress import InWaves, condition_count, sampled_conditions
+from sweep.experiment.axes import Axis
+from sweep.experiment.parameters import Stage
+from sweep.experiment.sampling import PrecisionRule
 from sweep.measure.flags import DetectionStatus, EstimateStatus, looked_for
-from sweep.plan.axes import Axis
-from sweep.plan.parameters import Stage
-from sweep.plan.sampling import PrecisionRule
 from sweep.processor import differing_processors
 from sweep.sampling.rules import make_rule
 from sweep.store.blocks import (

@@ -19,6 +19,11 @@ from sweep.analysis import simulation_gap
 from sweep.analysis.simulation_gaps import QUANTILES, RATES
 from sweep.errors import ArgumentError
 from sweep.execution.runner import execute
+from sweep.experiment.board_rules import read_board
+from sweep.experiment.parameters import PHOTOGRAPHS
+from sweep.experiment.photographs import SUFFIX, PhotographRecord, read_record
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.toml_text import document_text, read_document
 from sweep.fitting.fit import MARKERS, SceneFit, Term, fit_scene, scene_views, shortened
 from sweep.fitting.views import FittedPhotograph, PhotographScenes, photograph_scenes
 from sweep.measure.surroundings import BoardMarker, clear_modules
@@ -27,11 +32,6 @@ from sweep.model.board import Board
 from sweep.photographs.folder import name_of, setting_name
 from sweep.photographs.prepare import prepare
 from sweep.photographs.twins import twin_pipeline
-from sweep.plan.board_rules import read_board
-from sweep.plan.parameters import PHOTOGRAPHS
-from sweep.plan.photographs import SUFFIX, PhotographRecord, read_record
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.toml_text import document_text, read_document
 from sweep.store.files import write_whole
 from sweep.store.lifecycle import open_dataset
 from sweep.typing import Floats, Integers

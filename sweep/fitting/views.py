@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import compiled
+from sweep.experiment.grid import scene_axes, scene_values
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import TruthSource
 from sweep.measure.surroundings import BoardMarker, clear_modules, edges_alone, surroundings
 from sweep.model import coverage
@@ -25,8 +27,6 @@ from sweep.model.scene import Scenes, build_scenes
 from sweep.photographs.folder import find_corners, reference_detector
 from sweep.photographs.pose_fit import Lens
 from sweep.photographs.truth import board_poses
-from sweep.plan.grid import scene_axes, scene_values
-from sweep.plan.pipeline import Pipeline
 from sweep.typing import Floats, Grey, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------

@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from sweep.errors import StoreError, SweepError
 from sweep.evaluation.results import CellsResult, to_dataset_layout
 from sweep.execution.limits import TIME_LIMIT_S
+from sweep.experiment.cell_selection import selection_text
+from sweep.experiment.grid import Block, detector_settings, estimators, scene_axes
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import SCHEMA, VARIABLES, Tolerance, Variable
 from sweep.isolation.child_process import OUTSIDE_SIGNALS
 from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.measure.detectors import OPENCV
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.pose import rotation_of_vector
-from sweep.plan.cell_selection import selection_text
-from sweep.plan.grid import Block, detector_settings, estimators, scene_axes
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import SCHEMA, VARIABLES, Tolerance, Variable
 from sweep.plugins.declared import PluginSetting
 from sweep.processor import processor
 from sweep.sampling.rules import by_scene, scenes_needed
@@ -241,8 +241,8 @@ def computable(store: RunStore) -> Pipeline:
 #
 # On a processor with the same features every bit agrees. On another one, OpenCV, NumPy and the
 # mathematical library take other routines, and last bits differ; how far is the ``tolerance`` of
-# each variable in :mod:`sweep.plan.schema`, measured on 9,000 scenes with AVX-512, AVX2 and all
-# of AVX switched off in turn. Without AVX, 0.02 % of ordinary scenes, and at most 4.4 % of those
+# each variable in :mod:`sweep.experiment.schema`, measured on 9,000 scenes with AVX-512, AVX2 and
+# all of AVX switched off in turn. Without AVX, 0.02 % of ordinary scenes, and at most 4.4 % of those
 # of a pipeline of extremes, lie outside them, because a last bit can decide between two minima.
 
 Values = Mapping[str, NDArray[Any]]

@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from sweep.errors import RunError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene, scene_image
 from sweep.evaluation.results import Failure
+from sweep.experiment.cell_selection import cell, parse_selection, selection_text
+from sweep.experiment.grid import scene_axes
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import Variable
 from sweep.integrity.recomputation import StoredValues, compare, current_pipeline, stored_cell
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
 from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import nearest, plain, refusal
-from sweep.plan.cell_selection import cell, parse_selection, selection_text
-from sweep.plan.grid import scene_axes
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import Variable
 from sweep.store.lifecycle import open_store
 
 

@@ -15,6 +15,8 @@ import zarr
 from numpy.typing import NDArray
 
 from sweep.errors import ArgumentError, PipelineError, StoreError
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import LOST, UNSEEN, VARIABLES, Variable, with_description
 from sweep.integrity.recomputation import (
     Damage,
     IntegrityReport,
@@ -29,8 +31,6 @@ from sweep.measure.flags import (
     Flipped,
     present_values,
 )
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import LOST, UNSEEN, VARIABLES, Variable, with_description
 from sweep.sampling.rules import Decider, Decision, scenes_needed
 from sweep.store.blocks import (
     BEGUN,

@@ -14,17 +14,17 @@ from sweep.evaluation.block import run_cells
 from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.results import CellsResult, Failure, concatenate
+from sweep.experiment.cell_selection import selection_text
+from sweep.experiment.experiment import scene_plugins
+from sweep.experiment.grid import detector_settings, estimators, scene_axes
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import variables_of
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError, last_line
 from sweep.isolation.machine import explained
 from sweep.measure.detectors import make_detector
 from sweep.measure.estimators import PluggedEstimatorSetting, build
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.cell_selection import selection_text
-from sweep.plan.experiment import scene_plugins
-from sweep.plan.grid import detector_settings, estimators, scene_axes
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import variables_of
 from sweep.plugins.declared import PluginSetting
 
 # --------------------------------------------------------------------------------------------------

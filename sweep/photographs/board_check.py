@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from sweep.errors import ArgumentError, SweepError
+from sweep.experiment.board_rules import board_of
 from sweep.measure import intrinsics
 from sweep.measure.detectors import FindFunction
 from sweep.measure.flags import CalibrationStatus
@@ -25,7 +26,6 @@ from sweep.model.pose import rotation_of_vector
 from sweep.photographs.folder import FoundCorners, KnownCamera, Photograph, detect_markers
 from sweep.photographs.pose_fit import Lens
 from sweep.photographs.truth import fitted_board
-from sweep.plan.board_rules import board_of
 from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------

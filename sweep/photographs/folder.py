@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from sweep.errors import ArgumentError, StoreError
 from sweep.exchange.images import write_errors
+from sweep.experiment.photographs import SUFFIX, PhotographRecord
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import DetectorSetting, FindFunction, make_detector
 from sweep.messages import nearest_file, plain
 from sweep.model.board import Board
 from sweep.model.image_file import IMAGE_SUFFIXES, Part, decode_grey, read_image
 from sweep.photographs.pose_fit import Lens, Poses
-from sweep.plan.photographs import SUFFIX, PhotographRecord
-from sweep.plan.pipeline import Pipeline
 from sweep.store.files import write_whole
 from sweep.typing import Floats, Integers
 

@@ -13,6 +13,8 @@ import numpy as np
 
 from sweep.errors import ArgumentError
 from sweep.evaluation.opencv_threads import single_threaded
+from sweep.experiment.board_rules import board_document, board_of
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import FindFunction
 from sweep.measure.flags import TruthSource
 from sweep.messages import plain
@@ -43,8 +45,6 @@ from sweep.photographs.truth import (
     poses_of_file,
     stereo_of_file,
 )
-from sweep.plan.board_rules import board_document, board_of
-from sweep.plan.pipeline import Pipeline
 from sweep.typing import Floats
 
 PathName = str | os.PathLike[str]

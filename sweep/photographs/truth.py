@@ -13,6 +13,7 @@ import numpy as np
 
 from sweep.errors import ArgumentError, PipelineError
 from sweep.exchange.answers import Conventions, read_answers
+from sweep.experiment.cameras import file_and_camera
 from sweep.measure.estimation import rotation_difference
 from sweep.measure.flags import TruthSource
 from sweep.measure.solver import both_planar_solutions, reprojection_errors_px
@@ -26,7 +27,6 @@ from sweep.model.marker import marker_corners
 from sweep.model.pose import rotation_of_vector
 from sweep.photographs.folder import Folder, FoundCorners, KnownCamera, WantedMarkers, own_corners
 from sweep.photographs.pose_fit import MAD_TO_STD, FittedPose, Lens, Poses, fit_pose
-from sweep.plan.cameras import file_and_camera
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------

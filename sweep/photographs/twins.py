@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from sweep.errors import ArgumentError, PluginError
+from sweep.experiment.axes import TRIAL, parse_distribution
+from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, SIMULATED
+from sweep.experiment.photographs import PhotographRecord, read_record, shows_photographs
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.toml_text import MAX_BYTES, read_document
 from sweep.measure.surroundings import clear_modules
 from sweep.messages import plain
 from sweep.model.image_file import read_regular
-from sweep.plan.axes import TRIAL, parse_distribution
-from sweep.plan.parameters import PARAMETERS, PHOTOGRAPHS, SIMULATED
-from sweep.plan.photographs import PhotographRecord, read_record, shows_photographs
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.toml_text import MAX_BYTES, read_document
 
 NAME = "{}-twins"
 """Name of the twins of photographs of a name."""

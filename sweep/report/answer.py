@@ -20,7 +20,7 @@ from sweep.analysis.requirements import (
     verdicts,
 )
 from sweep.errors import DatasetError, StoreError
-from sweep.plan.experiment import shows_boards, target_word
+from sweep.experiment.experiment import shows_boards, target_word
 from sweep.report.comparison import Comparison, comparison, target_axes
 from sweep.report.decisions import WORDS, condition_table, decision_table, valued
 from sweep.report.error_model_file import error_model_tables

@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.analysis import compare, error_statistics
-from sweep.plan.parameters import PARAMETERS
+from sweep.experiment.parameters import PARAMETERS
 from sweep.report.figure import values_with_ends
 from sweep.report.formatting import interval_text, number
 from sweep.report.report_data import (

@@ -14,9 +14,9 @@ from sweep.analysis.dataset import DRAWS, axes_of, configuration_axes
 from sweep.analysis.draws import is_replicated
 from sweep.analysis.requirements import Decision, Verdict, described
 from sweep.errors import ArgumentError
+from sweep.experiment.cell_selection import parse_selection
+from sweep.experiment.draws import REPLICATES
 from sweep.messages import label, nearest, quoted
-from sweep.plan.cell_selection import parse_selection
-from sweep.plan.draws import REPLICATES
 from sweep.report.formatting import coordinate, interval_text, number, plural
 from sweep.report.table import Findings, Table
 from sweep.tradeoff.pareto import digits
@@ -24,7 +24,7 @@ from sweep.tradeoff.pareto import digits
 if TYPE_CHECKING:
     from sweep.analysis.choices import Answer, Cause
     from sweep.analysis.comparisons import Regression
-    from sweep.plan.pipeline import Pipeline
+    from sweep.experiment.pipeline import Pipeline
     from sweep.tradeoff.choice_search import Choice
 
 WORDS = {Decision.met: "met", Decision.not_met: "not met", Decision.undecided: "not decided",

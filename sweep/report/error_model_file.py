@@ -14,8 +14,8 @@ import xarray as xr
 from sweep.analysis.error_model_fit import CONDITIONS, PREDICTORS, QUANTITIES, VARIES
 from sweep.analysis.error_models import UNITS, WORDS, Use, cell_edges, error_models, model_errors
 from sweep.errors import ArgumentError
+from sweep.experiment.facts import camera_facts
 from sweep.messages import to_json
-from sweep.plan.facts import camera_facts
 from sweep.report.formatting import interval_text, number
 from sweep.report.output_file import check_output_file, write_output_file
 from sweep.report.report_data import ReportData

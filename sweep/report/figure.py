@@ -12,7 +12,7 @@ import xarray as xr
 
 from sweep.analysis.dataset import of_photographs
 from sweep.analysis.quantiles import IntervalOf
-from sweep.plan.parameters import Stage
+from sweep.experiment.parameters import Stage
 from sweep.report.charts import (
     FLOOR_NOTE,
     Panel,

@@ -26,11 +26,11 @@ from sweep.analysis.poses import SIGNED
 from sweep.analysis.precision import Reached
 from sweep.analysis.requirements import BOARDS
 from sweep.analysis.summaries import error_headings
+from sweep.experiment.experiment import target_word
+from sweep.experiment.parameters import Stage
+from sweep.experiment.sampling import PrecisionRule
 from sweep.measure.flags import BoundStatus, outcomes, present_values
 from sweep.model.camera import VIEW_PARAMETERS, intrinsics
-from sweep.plan.experiment import target_word
-from sweep.plan.parameters import Stage
-from sweep.plan.sampling import PrecisionRule
 from sweep.report.charts import Panel, Series, draw_dots, draw_lines, rows_height
 from sweep.report.figure import (
     Curve,

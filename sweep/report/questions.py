@@ -28,8 +28,8 @@ from sweep.analysis.requirements import (
 from sweep.analysis.simulation_gaps import is_measured
 from sweep.errors import ArgumentError
 from sweep.execution.progress import StageReport
+from sweep.experiment.pipeline import Pipeline
 from sweep.messages import byte_count, nearest, quoted
-from sweep.plan.pipeline import Pipeline
 from sweep.report import decisions
 from sweep.report.charts import write_figure
 from sweep.report.comparison_tables import (

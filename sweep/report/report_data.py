@@ -25,12 +25,12 @@ from sweep.analysis.requirements import (
 )
 from sweep.errors import StoreError, SweepError
 from sweep.evaluation.block import bound_notes
+from sweep.experiment.axes import TRIAL, Axis, Distribution
+from sweep.experiment.parameters import WORLD, Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.same_meaning import distinct, used_settings, wrong_configurations
 from sweep.measure.flags import DetectionStatus, uncounted_values
 from sweep.model.camera import VIEW_PARAMETERS
-from sweep.plan.axes import TRIAL, Axis, Distribution
-from sweep.plan.parameters import WORLD, Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.same_meaning import distinct, used_settings, wrong_configurations
 from sweep.report.formatting import bin_text, coordinates
 from sweep.store.lifecycle import open_dataset, open_store, unfinished_line
 from sweep.store.outcome import outcome_of_finished

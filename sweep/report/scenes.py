@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from sweep.errors import SweepError
 from sweep.evaluation.inspection import SceneInspection, inspect_scene
+from sweep.experiment.cell_selection import cell, coordinates_text, selection_text
+from sweep.experiment.experiment import target_word
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import VARIABLES, Variable, variables_of
 from sweep.integrity.recomputation import StoredValues, compare
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag, Flipped, uncounted_values
-from sweep.plan.cell_selection import cell, coordinates_text, selection_text
-from sweep.plan.experiment import target_word
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import VARIABLES, Variable, variables_of
 from sweep.report.figure import uncapitalised
 from sweep.report.formatting import coordinate, degrees, number, plural
 from sweep.report.report_data import AREA, ReportData, store_errors

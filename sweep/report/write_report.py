@@ -19,10 +19,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 
 from sweep.analysis.dataset import sampling_text
 from sweep.errors import ArgumentError, StoreError
+from sweep.experiment.axes import Axis
+from sweep.experiment.facts import camera_facts, camera_notes
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import label
-from sweep.plan.axes import Axis
-from sweep.plan.facts import camera_facts, camera_notes
 from sweep.report.answer import Answer, answer
 from sweep.report.charts import css_variables, panel_svg, panels_file
 from sweep.report.figure import Figure

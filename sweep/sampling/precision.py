@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sweep.analysis.precision import WantedPrecision, precision_table, wanted_precisions
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.sampling import PrecisionRule, wave_ends
 from sweep.messages import refusal
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.sampling import PrecisionRule, wave_ends
 from sweep.sampling.rules import GroupResults, condition_axes, unit_of
 from sweep.sampling.searches import group_dataset, with_flags
 from sweep.typing import Masks

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.errors import StoreError
+from sweep.experiment.axes import TRIAL, Axis
+from sweep.experiment.grid import Block, Blocks, scene_axes
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.reader import StoppingRule
+from sweep.experiment.sampling import ChoiceRule, LimitRule, PrecisionRule
+from sweep.experiment.schema import VARIABLES, Variable
 from sweep.measure.flags import DetectionStatus
-from sweep.plan.axes import TRIAL, Axis
-from sweep.plan.grid import Block, Blocks, scene_axes
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.reader import StoppingRule
-from sweep.plan.sampling import ChoiceRule, LimitRule, PrecisionRule
-from sweep.plan.schema import VARIABLES, Variable
 from sweep.store.blocks import RunStore, region
 from sweep.typing import Masks
 
@@ -237,8 +237,8 @@ RULES: Mapping[type, str] = {
 }
 """Class of what a section says -> module and function that make its rule, of a pipeline and that.
 
-The sections are in `sweep.plan.sampling.SECTIONS`. The function raises PipelineError with a line
-for each name that it does not know. Its module is imported on use: runs of fixed trials need none.
+The sections are in `sweep.experiment.sampling.SECTIONS`. The function raises PipelineError with a
+line for each name that it does not know. Its module is imported on use: runs of fixed trials need none.
 """
 
 

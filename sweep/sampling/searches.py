@@ -28,12 +28,12 @@ from sweep.analysis.requirements import (
     parse_requirements,
 )
 from sweep.errors import DatasetError
+from sweep.experiment.axes import TRIAL, Axis
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.sampling import ChoiceRule, LimitRule, wave_ends
+from sweep.experiment.schema import LABELS, VARIABLES, Variable
 from sweep.messages import refusal
-from sweep.plan.axes import TRIAL, Axis
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.sampling import ChoiceRule, LimitRule, wave_ends
-from sweep.plan.schema import LABELS, VARIABLES, Variable
 from sweep.sampling.rules import GroupResults, condition_axes, unit_of
 from sweep.typing import Masks
 

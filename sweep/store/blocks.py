@@ -18,10 +18,10 @@ from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
 from sweep.errors import StoreError, StoreReplacedError
-from sweep.plan.grid import Block, Blocks, scene_axes
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import VARIABLES, Variable, variables_of
+from sweep.experiment.grid import Block, Blocks, scene_axes
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import VARIABLES, Variable, variables_of
 from sweep.store.chunks import Chunks, receipt_key
 from sweep.store.files import (
     absent_files,

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.plan.grid import Block, Blocks, scene_axes
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import variables_of
+from sweep.experiment.grid import Block, Blocks, scene_axes
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import variables_of
 from sweep.store.layout import RECEIPTS, decoded_chunk, encoded_chunk
 
 

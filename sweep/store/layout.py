@@ -18,14 +18,13 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.dtype import parse_dtype
 from zarr.storage import MemoryStore
 
-from sweep.model.image_file import IMAGE_SUFFIXES
-from sweep.plan.axes import TRIAL, Axis
-from sweep.plan.draws import DISTANCE_PARAMETERS, distance_of_side
-from sweep.plan.grid import Blocks, scene_axes
-from sweep.plan.parameters import PHOTOGRAPHS
-from sweep.plan.photographs import is_simulated
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import (
+from sweep.experiment.axes import TRIAL, Axis
+from sweep.experiment.draws import DISTANCE_PARAMETERS, distance_of_side
+from sweep.experiment.grid import Blocks, scene_axes
+from sweep.experiment.parameters import PHOTOGRAPHS
+from sweep.experiment.photographs import is_simulated
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import (
     LABELS,
     VARIABLES,
     FixedValue,
@@ -34,6 +33,7 @@ from sweep.plan.schema import (
     variables_of,
     with_description,
 )
+from sweep.model.image_file import IMAGE_SUFFIXES
 from sweep.store.files import sync
 
 FORMAT = 6

@@ -25,14 +25,14 @@ from zarr.api import asynchronous
 from zarr.storage import LocalStore, WrapperStore
 
 from sweep.errors import PipelineError, StoreError
+from sweep.experiment.facts import camera_facts, camera_notes
+from sweep.experiment.grid import Blocks, scene_axes
+from sweep.experiment.pipeline import Pipeline, apply_settings, parse_settings
+from sweep.experiment.sampling import texts_in
+from sweep.experiment.schema import PHOTOGRAPH_SCHEMA, VARIABLES, with_descriptions
+from sweep.experiment.toml_text import MAX_BYTES, read_document
 from sweep.messages import plain, refusal
 from sweep.model.image_file import read_regular
-from sweep.plan.facts import camera_facts, camera_notes
-from sweep.plan.grid import Blocks, scene_axes
-from sweep.plan.pipeline import Pipeline, apply_settings, parse_settings
-from sweep.plan.sampling import texts_in
-from sweep.plan.schema import PHOTOGRAPH_SCHEMA, VARIABLES, with_descriptions
-from sweep.plan.toml_text import MAX_BYTES, read_document
 from sweep.plugins.declared import RECORDED, recorded_plugins
 from sweep.store.blocks import (
     BEGUN,

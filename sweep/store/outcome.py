@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sweep.experiment.axes import Axis
+from sweep.experiment.cell_selection import selection_text
+from sweep.experiment.grid import Block, scene_axes
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flag
 from sweep.messages import plain
-from sweep.plan.axes import Axis
-from sweep.plan.cell_selection import selection_text
-from sweep.plan.grid import Block, scene_axes
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
 from sweep.processor import differing_processors
 from sweep.store.blocks import RunStore, committed, receipts
 from sweep.store.receipt import Receipt, RecordedFailure

@@ -13,10 +13,10 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from sweep.experiment.draws import SAMPLINGS
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.sampling import not_continued
 from sweep.installation import check_installation
-from sweep.plan.draws import SAMPLINGS
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.sampling import not_continued
 from sweep.version import __version__
 
 NUMBERS_VERSION = 5

@@ -17,11 +17,11 @@ from sweep.analysis.draws import computed_scenes
 from sweep.analysis.requirements import Decision
 from sweep.execution.progress import ProgressReport, StageReport
 from sweep.execution.runner import execute
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.sampling import CHOOSE, ChoiceRule
 from sweep.isolation.child_process import Child, Interrupts
 from sweep.messages import refusal
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.sampling import CHOOSE, ChoiceRule
 from sweep.sampling.searches import store_cells
 from sweep.store.lifecycle import open_dataset
 from sweep.tradeoff.costs import measure, median_interval, sample_scenes

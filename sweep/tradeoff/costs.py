@@ -17,6 +17,10 @@ from scipy import stats
 from sweep.evaluation.block import detections_for
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import SearchResult, search, visibility_flags, whole_frames
+from sweep.experiment.axes import TRIAL
+from sweep.experiment.experiment import scene_plugins
+from sweep.experiment.grid import detector_settings, estimators, scene_axes, scene_values
+from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Interrupts
 from sweep.measure.detectors import (
     AnyDetectorSetting,
@@ -31,10 +35,6 @@ from sweep.measure.flags import DetectionStatus
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render_all
 from sweep.model.scene import Scenes, build_scenes
-from sweep.plan.axes import TRIAL
-from sweep.plan.experiment import scene_plugins
-from sweep.plan.grid import detector_settings, estimators, scene_axes, scene_values
-from sweep.plan.pipeline import Pipeline
 from sweep.typing import Floats, Grey
 
 # --------------------------------------------------------------------------------------------------

@@ -20,15 +20,15 @@ from sweep.analysis.draws import computed_scenes
 from sweep.analysis.summaries import guarded_error_statistics
 from sweep.errors import ArgumentError, StoreError
 from sweep.execution.progress import StageReport
+from sweep.experiment.axes import TRIAL, Axis
+from sweep.experiment.grid import estimators
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.same_meaning import distinct, used_settings, wrong_configurations
 from sweep.isolation.child_process import Interrupts
 from sweep.measure.estimators import build
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.messages import nearest
-from sweep.plan.axes import TRIAL, Axis
-from sweep.plan.grid import estimators
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.same_meaning import distinct, used_settings, wrong_configurations
 from sweep.plugins.loading import printing_to_stderr
 from sweep.plugins.recording import is_recording
 from sweep.store.lifecycle import open_dataset, open_store, unfinished_line, write_group

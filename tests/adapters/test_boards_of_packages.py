@@ -5,8 +5,8 @@ import pytest
 
 from sweep.errors import PipelineError
 from sweep.evaluation.block import run_cells
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.plan.pipeline import Pipeline
 from tests.adapters.test_adapters import MODULES
 
 BOARD = """

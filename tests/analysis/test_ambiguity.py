@@ -10,8 +10,8 @@ from scipy import stats
 from sweep.analysis import ambiguity
 from sweep.analysis.ambiguities import THRESHOLDS, ThresholdChoice
 from sweep.errors import ArgumentError, DatasetError
+from sweep.experiment.schema import XYZ
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.schema import XYZ
 
 
 def poses_of(ratio, flipped, solved=None, axes=("tilt_deg", "trial", "solver")):

@@ -24,8 +24,8 @@ from sweep.analysis.error_model_fit import focal_size_of
 from sweep.analysis.error_models import Use
 from sweep.analysis.poses import in_sight_frame, sight_rotation, viewing_angle_of
 from sweep.errors import ArgumentError, DatasetError
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.pipeline import Pipeline
 from sweep.report.error_model_file import error_model_text
 
 SIX = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")

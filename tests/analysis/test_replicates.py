@@ -6,7 +6,7 @@ import xarray as xr
 
 from sweep.analysis import compare, detection_rate, error_statistics, marker_ranking
 from sweep.errors import DatasetError
-from sweep.plan.draws import REPLICATES, sobol_uniform
+from sweep.experiment.draws import REPLICATES, sobol_uniform
 
 TRIALS = 256
 

@@ -12,8 +12,8 @@ from scipy import stats
 from support.small_datasets import perfect
 from sweep.analysis.requirements import ERROR_PROBABILITY, Decision, check_requirements
 from sweep.execution.runner import execute
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import open_dataset
 
 pytestmark = pytest.mark.long

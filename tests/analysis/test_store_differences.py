@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from support.example_results import example_results
 from sweep.analysis import per_marker, store_differences
 from sweep.errors import DatasetError
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.plan.pipeline import Pipeline
 
 pytestmark = pytest.mark.quick
 

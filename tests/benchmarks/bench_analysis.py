@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import SCHEMA
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import SCHEMA
 from sweep.store.blocks import region
 from sweep.store.lifecycle import create_store, finish
 

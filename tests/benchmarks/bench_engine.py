@@ -26,9 +26,9 @@ from tables import header, row
 from sweep.evaluation.block import run_cells
 from sweep.execution.forecast import forecast, seconds_of
 from sweep.execution.runner import execute
+from sweep.experiment.grid import Block, block_indices, scene_axes
+from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.machine import default_workers
-from sweep.plan.grid import Block, block_indices, scene_axes
-from sweep.plan.pipeline import Pipeline
 
 GRID = """
 seed = 1

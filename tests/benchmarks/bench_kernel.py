@@ -18,13 +18,13 @@ from tables import header, row
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search_windows, visibility_flags, whole_frames
+from sweep.experiment.grid import detector_settings, scene_values
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import Detector, charuco_board
 from sweep.measure.flags import DetectionStatus
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render_all
 from sweep.model.scene import build_scenes
-from sweep.plan.grid import detector_settings, scene_values
-from sweep.plan.pipeline import Pipeline
 
 SIZES = ((640, 480), (1920, 1080), (4000, 3000))
 POSES = {640: 1000, 1920: 400, 4000: 150}

@@ -23,6 +23,8 @@ from support.photographs import drawn_pose, photograph
 from sweep.evaluation.block import detections_for
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search, whole_frames
+from sweep.experiment.grid import detector_settings, estimators, scene_values
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.bound import bound_of_scene
 from sweep.measure.estimation import Detections
 from sweep.measure.flags import DetectionStatus, EstimateStatus
@@ -33,8 +35,6 @@ from sweep.model.board import single_marker
 from sweep.model.board_kinds import Charuco
 from sweep.model.extent import marker_boxes
 from sweep.model.scene import build_scenes
-from sweep.plan.grid import detector_settings, estimators, scene_values
-from sweep.plan.pipeline import Pipeline
 
 SCENES = 120
 SIDES = (20, 50, 100, 150)

@@ -43,11 +43,11 @@ from sweep.execution.cluster import QUIET_DASK_CONFIG
 from sweep.execution.forecast import block_work_s
 from sweep.execution.progress import Tally
 from sweep.execution.status import close, status
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.verification import verify
 from sweep.isolation.child_process import Interrupts
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
 from sweep.store.blocks import committed, missing_chunks, receipts
 from sweep.store.layout import RECEIPTS, checksum_of
 from sweep.store.lifecycle import create_store, open_store

@@ -19,7 +19,7 @@ import numpy as np
 
 import sweep
 from sweep.analysis.requirements import Decision, check_requirements
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline
 from sweep.report.decisions import headline
 from sweep.tradeoff.choice_search import search_choice
 

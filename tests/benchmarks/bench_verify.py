@@ -17,11 +17,11 @@ import xarray as xr
 from sweep.evaluation.results import CellsResult
 from sweep.execution import block_task as task
 from sweep.execution.status import close
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import variables_of
 from sweep.integrity.verification import verify
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import variables_of
 from sweep.store.lifecycle import create_store
 
 GRID = """

@@ -22,11 +22,11 @@ import numpy as np
 
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.results import Failure
+from sweep.experiment.grid import Block, block_indices, detector_settings, estimators, scene_axes
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import SCHEMA
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.grid import Block, block_indices, detector_settings, estimators, scene_axes
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import SCHEMA
 
 FILES = sorted((Path(__file__).parents[2] / "pipelines" / "extremes").glob("*.toml"))
 REFINEMENTS = ("none", "subpix", "contour", "apriltag")

@@ -7,7 +7,7 @@ import pytest
 from support.stores import by_hand
 from sweep.cli import main
 from sweep.execution.status import close
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline
 
 CLEAR = "\x1b[2J\x07\x9b"
 

@@ -14,7 +14,7 @@ from sweep import cli
 from sweep.errors import SweepError
 from sweep.execution.forecast import Demand, FreeDisk, objections
 from sweep.execution.status import close
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline
 from sweep.store.lifecycle import open_store
 from sweep.store.lock import writing
 

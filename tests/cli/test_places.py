@@ -12,8 +12,8 @@ from sweep import cli
 from sweep.errors import MachineFaultError, StoreError
 from sweep.execution.block_task import compute_block
 from sweep.execution.runner import execute
-from sweep.plan.grid import Block
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.grid import Block
+from sweep.experiment.pipeline import Pipeline
 from sweep.store.locations import check_writable, checked_url, exists
 
 PIPELINE = """

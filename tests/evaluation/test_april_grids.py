@@ -5,10 +5,10 @@ import pytest
 
 from support.blocks import run_block
 from sweep.errors import PipelineError
+from sweep.experiment.facts import notes
+from sweep.experiment.grid import Block
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.plan.facts import notes
-from sweep.plan.grid import Block
-from sweep.plan.pipeline import Pipeline
 
 TEXT = """
 [marker]

@@ -32,14 +32,14 @@ from support.blocks import run_block
 from support.lengths import lengths
 from support.solving import estimate
 from sweep.evaluation.block import assumed_cameras
+from sweep.experiment.grid import Block, block_indices, estimators, scene_axes, scene_values
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import SCHEMA
 from sweep.measure.estimation import pose_error
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.measure.solver import OPENCV_SOLVERS
 from sweep.model.scene import build_scenes
-from sweep.plan.grid import Block, block_indices, estimators, scene_axes, scene_values
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import SCHEMA
 
 GUARDED = tuple(name for name in OPENCV_SOLVERS if name != "epnp")  # epnp cannot be guarded
 IPPE = ("ippe", "ippe_square")

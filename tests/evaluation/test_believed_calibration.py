@@ -8,11 +8,11 @@ from sweep.errors import PipelineError, StoreError
 from sweep.evaluation.block import run_cells
 from sweep.execution.reuse import match
 from sweep.execution.runner import execute
+from sweep.experiment.facts import camera_notes
+from sweep.experiment.grid import scene_axes, scene_values
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import EstimateStatus
-from sweep.plan.facts import camera_notes
-from sweep.plan.grid import scene_axes, scene_values
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import create_store, open_store
 from tests.support.here import calls_here
 

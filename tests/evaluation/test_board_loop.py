@@ -9,11 +9,11 @@ from support.blocks import run_block
 from support.board_pictures import DICTIONARY, KINDS, NAME, SIZE_M, board_toml, opencv_board
 from support.lengths import first_of
 from sweep.evaluation.block import run_cells
+from sweep.experiment.grid import Block, block_indices, scene_axes, scene_values
+from sweep.experiment.pipeline import Pipeline
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
-from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
-from sweep.plan.pipeline import Pipeline
 
 CAMERA = np.array([[300.0, 0, 159.5], [0, 300, 119.5], [0, 0, 1]])
 LENS = [-0.2, 0.05, 0.0, 0.0]

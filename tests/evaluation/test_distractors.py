@@ -7,15 +7,15 @@ import pytest
 from support.lengths import lengths
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import search, search_windows, visibility_flags
+from sweep.experiment.experiment import largest_board
+from sweep.experiment.grid import Block, block_indices, scene_axes, scene_values
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.classify import target_scenes
 from sweep.measure.detectors import BoardDetectorSetting, DetectorSetting
 from sweep.measure.flags import DetectionStatus
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
-from sweep.plan.experiment import largest_board
-from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
-from sweep.plan.pipeline import Pipeline
 
 DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
 GRID = {"kind": "grid", "rows": 2, "columns": 2, "gap_m": 0.01}

@@ -15,9 +15,9 @@ from benchmarks.extremes import (
     measured,
 )
 from support.lengths import lengths
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
 
 PATHS = {path.stem: path for path in FILES}
 MAX_SCENES = 300

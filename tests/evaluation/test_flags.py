@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from support.blocks import run_block
+from sweep.experiment.grid import Block, scene_axes
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import SCHEMA
 from sweep.measure.classify import TargetScenes, classify
 from sweep.measure.detectors import SearchOutput
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.model.board import single_marker
-from sweep.plan.grid import Block, scene_axes
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import SCHEMA
 
 PLAIN = """
 seed = 9

@@ -5,11 +5,11 @@ import hashlib
 import numpy as np
 
 from support.solving import estimate
+from sweep.experiment.grid import scene_values
+from sweep.experiment.pipeline import Pipeline
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
-from sweep.plan.grid import scene_values
-from sweep.plan.pipeline import Pipeline
 from sweep.store.provenance import NUMBERS_VERSION
 
 TEXT = """

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sweep.evaluation.block import run_cells
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import BoundStatus, DetectionStatus
-from sweep.plan.pipeline import Pipeline
 
 TEXT = """
 [camera]

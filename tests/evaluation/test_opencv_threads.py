@@ -8,7 +8,7 @@ import pytest
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.inspection import inspect_scene
 from sweep.evaluation.opencv_threads import single_threaded
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline
 
 PIPELINE = Pipeline.from_dict({"pose": {"distance_m": 0.5}, "marker": {"size_m": 0.1}})
 

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from support.blocks import run_block
 from support.lengths import lengths
+from sweep.experiment.grid import Block, block_indices, scene_axes, scene_values
+from sweep.experiment.pipeline import Pipeline
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
-from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
-from sweep.plan.pipeline import Pipeline
 
 DICTIONARIES = {"DICT_4X4_50": cv2.aruco.DICT_4X4_50, "DICT_6X6_250": cv2.aruco.DICT_6X6_250}
 IDS = (0, 7, 42)

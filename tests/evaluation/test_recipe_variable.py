@@ -13,7 +13,7 @@ import pytest
 
 from sweep.evaluation import block as variables
 from sweep.evaluation.block import check_complete
-from sweep.plan.parameters import Stage
+from sweep.experiment.parameters import Stage
 
 TESTS = Path(__file__).parents[1]
 TOP = TESTS.parent
@@ -45,7 +45,7 @@ FUNCTION = """
 
 ADDITIONS = {
     # Module -> where its text is changed, and what is put there.
-    "sweep.plan.schema": (')\n"""Every variable, in the order', RECORD),
+    "sweep.experiment.schema": (')\n"""Every variable, in the order', RECORD),
     "sweep.evaluation.block": (
         '}\n"""Variable of the estimation -> its values (n, ...) for', FUNCTION),
 }

@@ -6,7 +6,7 @@ from scipy import stats
 
 import sweep
 from sweep.evaluation.block import run_cells
-from sweep.plan.draws import REPLICATES
+from sweep.experiment.draws import REPLICATES
 
 PIPELINE = {
     "camera": {"fx_px": 600},

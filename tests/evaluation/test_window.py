@@ -10,20 +10,20 @@ from support.windows import corners_of, outcomes_elsewhere
 from sweep.errors import PipelineError
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search, search_windows, visibility_flags
-from sweep.measure.detectors import REFINEMENTS, DetectorSetting, full_frame_reason, windows
-from sweep.measure.flags import DetectionStatus
-from sweep.model.extent import marker_boxes
-from sweep.model.marker import opencv_dictionary
-from sweep.model.renderers import render
-from sweep.model.scene import build_scenes
-from sweep.plan.grid import (
+from sweep.experiment.grid import (
     Block,
     block_indices,
     detector_settings,
     scene_axes,
     scene_values,
 )
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline
+from sweep.measure.detectors import REFINEMENTS, DetectorSetting, full_frame_reason, windows
+from sweep.measure.flags import DetectionStatus
+from sweep.model.extent import marker_boxes
+from sweep.model.marker import opencv_dictionary
+from sweep.model.renderers import render
+from sweep.model.scene import build_scenes
 
 SCENES = """
 seed = 11

@@ -16,9 +16,9 @@ from sweep.evaluation.block import run_cells
 from sweep.exchange import export as exporting
 from sweep.exchange.export import export
 from sweep.exchange.images import scene_indices
-from sweep.plan.cell_selection import cell
-from sweep.plan.grid import image_keys
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.cell_selection import cell
+from sweep.experiment.grid import image_keys
+from sweep.experiment.pipeline import Pipeline
 
 TEXT = """
 title = "Exported"

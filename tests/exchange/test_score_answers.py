@@ -21,9 +21,9 @@ from sweep.exchange.answers import Conventions
 from sweep.exchange.export import export
 from sweep.exchange.images import scene_indices
 from sweep.exchange.score import prepare
+from sweep.experiment.cell_selection import cell
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.plan.cell_selection import cell
-from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import open_store
 
 TEXT = """

@@ -14,8 +14,8 @@ from sweep.execution.forecast import (
     measured_or_assumed,
 )
 from sweep.execution.limits import BLOCK_S, BLOCKS_PER_S, MAX_BLOCKS
+from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child
-from sweep.plan.pipeline import Pipeline
 
 HUGE = """
 [camera]

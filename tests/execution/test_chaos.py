@@ -20,8 +20,8 @@ from support.lengths import lengths
 from support.stores import by_hand, same
 from sweep.errors import StoreError
 from sweep.execution.block_task import compute_block
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
 from sweep.store.blocks import committed, receipts
 from sweep.store.lifecycle import create_store, open_store
 
@@ -70,7 +70,7 @@ largest = "distance_m"
 CLIENT = """
 import sys
 from sweep.execution.runner import execute
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline
 
 if __name__ == "__main__":
     pipeline, store, scheduler = sys.argv[1:]

@@ -22,8 +22,8 @@ from sweep.execution import on_cluster
 from sweep.execution.cluster import WorkerState, borrowed, embedded
 from sweep.execution.on_cluster import OnCluster
 from sweep.execution.runner import execute
+from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Interrupts
-from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import create_store, open_store
 from sweep.store.provenance import fingerprint
 

@@ -23,8 +23,8 @@ from support.blocks import run_block
 from sweep.cli import main
 from sweep.errors import ArgumentError, StoreError
 from sweep.execution.cluster import external
-from sweep.plan.grid import Block, scene_axes
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.grid import Block, scene_axes
+from sweep.experiment.pipeline import Pipeline
 from sweep.store.blocks import committed
 from sweep.store.files import read_files, write_files
 from sweep.store.lifecycle import open_store
@@ -55,7 +55,7 @@ RUN = """
 import sys
 from sweep.execution.runner import execute
 from sweep.errors import StoreError, SweepError
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline
 
 if __name__ == "__main__":
     path, store, scheduler = sys.argv[1:]

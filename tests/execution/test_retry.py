@@ -12,8 +12,8 @@ from sweep.cli import main
 from sweep.execution.block_task import compute_block
 from sweep.execution.runner import execute
 from sweep.execution.status import close, drop_failed, status
+from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.verification import verify
-from sweep.plan.pipeline import Pipeline
 from sweep.store.blocks import begin_block, committed
 from sweep.store.lifecycle import create_store, open_store
 

@@ -22,9 +22,9 @@ from sweep.cli import main
 from sweep.errors import ArgumentError, MachineFaultError, StoreError
 from sweep.execution.block_task import compute_block
 from sweep.execution.runner import execute
-from sweep.plan.grid import Block, Blocks, scene_axes
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import variables_of
+from sweep.experiment.grid import Block, Blocks, scene_axes
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import variables_of
 from sweep.store.blocks import committed
 from sweep.store.lifecycle import create_store, open_store, remove_store
 

@@ -12,9 +12,9 @@ import pytest
 import xarray as xr
 from zarr.storage import LocalStore, WrapperStore
 
-from sweep.plan.grid import Blocks, scene_axes
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.grid import Blocks, scene_axes
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
 
 HERE = Path(__file__).parents[1] / "support"
 
@@ -32,8 +32,8 @@ import json, sys
 import synthetic
 synthetic.install()
 from sweep.execution.runner import execute
-from sweep.plan.grid import Blocks
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.grid import Blocks
+from sweep.experiment.pipeline import Pipeline
 import sweep.execution.runner as engine
 extents = 1, 200, max(int(sys.argv[4]) // 50, 1)
 engine.blocks_of = lambda *_: Blocks((50, 200, int(sys.argv[4])), extents)

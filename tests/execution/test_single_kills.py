@@ -11,7 +11,7 @@ import pytest
 from support.commands import started
 from support.stores import by_hand, same
 from sweep.errors import StoreError
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline
 from sweep.store.blocks import committed, receipts
 from sweep.store.lifecycle import open_store
 
@@ -31,7 +31,7 @@ trial = 200
 CLIENT = """
 import json, sys
 from sweep.execution.runner import execute
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline
 
 if __name__ == "__main__":
     pipeline, store, scheduler, options = sys.argv[1:]

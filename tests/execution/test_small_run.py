@@ -13,8 +13,8 @@ from sweep.errors import MachineFaultError, RunError, StoreReplacedError
 from sweep.execution import engines as small_run
 from sweep.execution.progress import Tally
 from sweep.execution.runner import execute, recompute
+from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child, ChildRaisedError, Interrupts
-from sweep.plan.pipeline import Pipeline
 from sweep.store.blocks import drop_block
 from sweep.store.lifecycle import open_store
 from sweep.store.lock import writing

@@ -13,7 +13,7 @@ from distributed import Client, LocalCluster
 import sweep
 from support.stores import by_hand
 from sweep.execution.status import close
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline
 from sweep.store.lifecycle import create_store, open_store
 
 PLUGINS = Path(__file__).parents[2] / "pipelines/plugins"

@@ -15,9 +15,9 @@ from sweep.cli import main
 from sweep.errors import SweepError
 from sweep.execution.block_task import compute_block
 from sweep.execution.status import close, status
+from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.repair import repair
 from sweep.integrity.verification import verify
-from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import create_store, open_store
 
 TEXT = """

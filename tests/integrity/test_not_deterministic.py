@@ -11,9 +11,9 @@ import pytest
 from support.here import Here, calls_here
 from sweep import cli
 from sweep.execution.runner import execute
+from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.repair import repair
 from sweep.integrity.verification import verify
-from sweep.plan.pipeline import Pipeline
 
 PLUGINS = """
 import itertools

@@ -16,7 +16,7 @@ from sweep.cli import main
 from sweep.evaluation.results import Failure
 from sweep.execution.block_task import compute_block
 from sweep.execution.status import close
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline
 from sweep.store.blocks import begin_block
 from sweep.store.lifecycle import create_store
 from sweep.store.outcome import MAX_CHARACTERS, recorded

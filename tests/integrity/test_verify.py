@@ -22,11 +22,11 @@ from support.stores import by_hand
 from sweep.errors import StoreError
 from sweep.execution.block_task import compute_block
 from sweep.execution.status import close
+from sweep.experiment.grid import scene_axes
+from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.recomputation import is_doubtful
 from sweep.integrity.repair import repair
 from sweep.integrity.verification import verify
-from sweep.plan.grid import scene_axes
-from sweep.plan.pipeline import Pipeline
 from sweep.store.blocks import begin_block, receipts
 from sweep.store.layout import checksum_of
 from sweep.store.lifecycle import create_store, open_store

@@ -9,9 +9,9 @@ import xarray as xr
 from support.commands import command
 from sweep.errors import MachineFaultError
 from sweep.evaluation.block import run_cells
+from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.crash_isolation import run_cells_isolated
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.plan.pipeline import Pipeline
 
 PLUGINS = '''
 import os

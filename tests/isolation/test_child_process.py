@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from sweep.errors import PipelineError, StoreError
+from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child, ChildDiedError, ChildRaisedError
-from sweep.plan.pipeline import Pipeline
 
 
 def test_child_calls_functions_and_tells_what_they_raise():

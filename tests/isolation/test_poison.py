@@ -11,12 +11,12 @@ import xarray as xr
 from support.commands import command
 from support.poison import RAISES, Poison, poisoned
 from support.stores import by_hand
+from sweep.experiment.cell_selection import cell as cell_at
+from sweep.experiment.grid import scene_axes
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import SCHEMA
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.cell_selection import cell as cell_at
-from sweep.plan.grid import scene_axes
-from sweep.plan.parameters import Stage
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import SCHEMA
 from sweep.store.blocks import committed
 from sweep.store.lifecycle import create_store, open_store
 

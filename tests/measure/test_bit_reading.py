@@ -16,10 +16,10 @@ import pytest
 
 import sweep
 from sweep.evaluation.block import run_cells
+from sweep.experiment.grid import Block, block_indices, scene_axes
 from sweep.measure.detectors import DetectorSetting
 from sweep.measure.flags import DetectionStatus
 from sweep.model.marker import modules
-from sweep.plan.grid import Block, block_indices, scene_axes
 
 PIPELINES = Path(__file__).parents[2] / "pipelines"
 sys.path.insert(0, str(PIPELINES / "open_question"))

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from sweep.evaluation.block import run_cells
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import EstimateStatus
-from sweep.plan.pipeline import Pipeline
 
 POSES, SIDE_M, SPAN_M = 200, 0.016, 0.12
 CAMERA = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])

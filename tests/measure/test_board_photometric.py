@@ -8,9 +8,9 @@ import pytest
 
 from sweep.errors import PipelineError
 from sweep.evaluation.block import run_cells
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import BoundStatus, EstimateStatus
 from sweep.measure.photometric import Photometric
-from sweep.plan.pipeline import Pipeline
 
 CHARUCO = 'kind = "charuco"\nsquares_x = 5\nsquares_y = 4\nsquare_m = 0.03'
 GRID = 'kind = "grid"\nrows = 3\ncolumns = 3\ngap_m = 0.01'

@@ -7,13 +7,13 @@ from scipy.spatial.transform import Rotation
 
 from support.solving import BOARD_METHODS, BoardPoints, detected
 from sweep.evaluation.block import run_cells
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.measure.solver import PointSolver
 from sweep.model.board_kinds import Charuco
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.pose import rotation_of_angles
-from sweep.plan.pipeline import Pipeline
 
 BOARD = Charuco(
     dictionary="DICT_5X5_100", squares_x=5, squares_y=4, square_m=0.03, marker_m=0.02

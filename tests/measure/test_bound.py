@@ -24,6 +24,7 @@ from support.exact_image import DICTIONARIES, LENSES, modules_of, values, visibl
 from support.lengths import lengths
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import visibility_flags
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.bound import BACKGROUND_MARGIN_PX, MAX_MIRROR_DISTANCE, bounds
 from sweep.measure.flags import BoundStatus, DetectionStatus
 from sweep.model.coverage import MarkerEdges, accumulate, sum_levels
@@ -31,7 +32,6 @@ from sweep.model.effects import Effects
 from sweep.model.extent import marker_boxes
 from sweep.model.polygon import Optics, Projection
 from sweep.model.scene import build_scenes
-from sweep.plan.pipeline import Pipeline
 
 NEUTRAL = {field.name: field.default for field in dataclasses.fields(Effects)}
 LENS_BY_COUNT = {len(lens): lens for lens in LENSES}

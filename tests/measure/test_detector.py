@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 
 from support.blocks import run_block
 from support.lengths import lengths
+from sweep.experiment.grid import Block, block_indices, scene_axes, scene_values
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import (
     ALIGNMENT_PX,
     MIN_WINDOW_PX,
@@ -23,8 +25,6 @@ from sweep.model.extent import marker_boxes
 from sweep.model.marker import marker_count, module_count, opencv_dictionary_names
 from sweep.model.renderers import render
 from sweep.model.scene import build_scenes
-from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
-from sweep.plan.pipeline import Pipeline
 
 FIELDS = {field.name: field.default for field in dataclasses.fields(DetectorSetting)}
 

@@ -24,6 +24,8 @@ from support.lengths import lengths
 from support.solving import estimate
 from sweep.evaluation import search as search_module
 from sweep.evaluation.search import search, visibility_flags
+from sweep.experiment.grid import Block, block_indices, scene_axes, scene_values
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import DetectorSetting, margin_px
 from sweep.measure.estimation import pose_error
 from sweep.measure.flags import DetectionStatus, EstimateStatus
@@ -32,8 +34,6 @@ from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.pose import vector_of_rotation
 from sweep.model.scene import build_scenes
-from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
-from sweep.plan.pipeline import Pipeline
 
 FOCAL_PX = 1600 / 3
 SQUARE = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5, -0.5, 0]])

@@ -21,6 +21,7 @@ from scipy.stats import binom, chi2, norm
 
 import sweep.evaluation.block
 from sweep.evaluation.block import run_cells
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.estimation import Detections, Estimates
 from sweep.measure.flags import BoundStatus, DetectionStatus, EstimateStatus, Flipped
 from sweep.measure.likelihood import (
@@ -34,7 +35,6 @@ from sweep.measure.likelihood import (
 from sweep.measure.photometric import Photometric, explains, found_targets, window_of
 from sweep.model.board import single_marker
 from sweep.model.derivatives import LEVELS, POSE, work_space
-from sweep.plan.pipeline import Pipeline
 
 ALARM = 1e-8
 """False alarm probability of one comparison; the short tests have less than a hundred."""

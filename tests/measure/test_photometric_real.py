@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 from support.board_scenes import BoardPose, board_scene, levels_of
 from sweep.evaluation.block import run_cells
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.estimation import Detections
 from sweep.measure.flags import EstimateStatus
 from sweep.measure.likelihood import state_of
@@ -21,7 +22,6 @@ from sweep.model.board_kinds import Charuco, Grid
 from sweep.model.camera import Cameras
 from sweep.model.lens import pack
 from sweep.model.marker import WHITE
-from sweep.plan.pipeline import Pipeline
 
 ALARM = 1e-7
 CHARUCO = Charuco(

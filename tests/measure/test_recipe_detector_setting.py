@@ -18,7 +18,7 @@ import json
 import numpy as np
 from sweep.errors import PipelineError
 from sweep.evaluation.block import run_cells
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline
 from support.guide_tables import TABLES
 
 TEXT = """

@@ -23,10 +23,10 @@ from sweep.evaluation.block import run_cells
 from sweep.evaluation.results import to_dataset_layout
 from sweep.integrity.verification import contradiction
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.grid import Block, block_indices
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.grid import Block, block_indices
 from support.guide_tables import TABLES
-from sweep.plan.schema import SCHEMA, VARIABLES
+from sweep.experiment.schema import SCHEMA, VARIABLES
 
 pipeline = Pipeline.from_text("[marker]\\nsize_m = 0.05\\n[axes]\\ndistance_m = [0.3, 0.5, 1e3]")
 block = Block((0,), (3,))

@@ -44,8 +44,8 @@ import json
 import numpy as np
 from sweep.errors import PipelineError
 from sweep.evaluation.block import run_cells
-from sweep.plan.facts import parts
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.facts import parts
+from sweep.experiment.pipeline import Pipeline
 from support.guide_tables import TABLES
 
 TEXT = """

@@ -12,12 +12,12 @@ from support.lengths import lengths
 from support.small_scenes import SMALL, image_of, scenes_of
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import search_windows
+from sweep.experiment.facts import parts
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import DetectorSetting
 from sweep.measure.flags import BoundStatus
 from sweep.model.extent import marker_boxes
 from sweep.model.sensor import compressed
-from sweep.plan.facts import parts
-from sweep.plan.pipeline import Pipeline
 
 EVERYTHING = [
     "blur_px=0.6", "sharpening=1", "sharpening_px=1.5", "bloom=0.2", "tone_gamma=0.8",

@@ -27,14 +27,14 @@ from support.exact_image import (
 from support.lengths import first_of, lengths
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import visibility_flags
+from sweep.experiment.grid import scene_values
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus
 from sweep.model.effects import Effects
 from sweep.model.exposure import defocus_px, marker_exposure
 from sweep.model.extent import marker_boxes, not_modelled
 from sweep.model.renderers import marker_levels, render_all
 from sweep.model.scene import build_scenes
-from sweep.plan.grid import scene_values
-from sweep.plan.pipeline import Pipeline
 
 NEUTRAL = {field.name: field.default for field in dataclasses.fields(Effects)}
 WIDTH, HEIGHT, FOCAL = 64, 48, 80.0

@@ -6,11 +6,11 @@ import pytest
 from support.windows import corners_of, outcomes_elsewhere
 from sweep.evaluation.opencv_threads import single_threaded
 from sweep.evaluation.search import search, visibility_flags
+from sweep.experiment.grid import scene_axes, scene_values
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.detectors import DetectorSetting
 from sweep.measure.flags import DetectionStatus
 from sweep.model.scene import build_scenes
-from sweep.plan.grid import scene_axes, scene_values
-from sweep.plan.pipeline import Pipeline
 
 DRAWN = """
 seed = 21

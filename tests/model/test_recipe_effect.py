@@ -37,9 +37,9 @@ from sweep.measure.flags import BoundStatus
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import marker_levels
 from sweep.model.scene import build_scenes
-from sweep.plan.facts import parts
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.grid import detector_settings, scene_values
+from sweep.experiment.facts import parts
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.grid import detector_settings, scene_values
 from support.guide_tables import TABLES
 
 TEXT = """

@@ -10,12 +10,12 @@ import pytest
 from scipy import stats
 
 from support.lengths import lengths
+from sweep.experiment.grid import scene_axes, scene_values
+from sweep.experiment.pipeline import Pipeline
 from sweep.model import sensor
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import marker_levels, render_all
 from sweep.model.scene import build_scenes
-from sweep.plan.grid import scene_axes, scene_values
-from sweep.plan.pipeline import Pipeline
 
 UNLIKELY = 1e-6
 FAR = 5.5

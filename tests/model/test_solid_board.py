@@ -8,14 +8,14 @@ from scipy.spatial.transform import Rotation
 from sweep.errors import PipelineError
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.search import visibility_flags
+from sweep.experiment.experiment import largest_board
+from sweep.experiment.grid import scene_values
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.classify import target_scenes
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.marker import modules
 from sweep.model.renderers import marker_levels
 from sweep.model.scene import build_scenes
-from sweep.plan.experiment import largest_board
-from sweep.plan.grid import scene_values
-from sweep.plan.pipeline import Pipeline
 
 LEVELS = 120.0, 10.0, 230.0
 

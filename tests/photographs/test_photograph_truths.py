@@ -18,9 +18,9 @@ from support.board_photographs import (
     write_set,
 )
 from sweep.errors import ArgumentError, PipelineError
+from sweep.experiment.photographs import read_record
 from sweep.measure.flags import TruthSource
 from sweep.photographs.prepare import prepare
-from sweep.plan.photographs import read_record
 
 SINGLE = ["dictionary=DICT_4X4_50", "size_m=0.022"]
 RIG = (cv2.Rodrigues(np.radians([1.0, -4.0, 2.0]))[0], np.array([-0.04, 0.001, 0.002]))

@@ -11,8 +11,8 @@ import sweep
 from support.board_photographs import POSES, board, marker_poses, write_set
 from support.here import calls_here
 from sweep.errors import PluginError
+from sweep.experiment.photographs import read_record
 from sweep.measure.flags import EstimateStatus
-from sweep.plan.photographs import read_record
 
 ALARM = 1e-7
 NUMBERS = (1, 2)

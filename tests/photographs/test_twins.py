@@ -10,12 +10,12 @@ from support.here import calls_here
 from sweep.errors import SweepError
 from sweep.evaluation.block import run_cells
 from sweep.execution.runner import execute
+from sweep.experiment.grid import Block, block_indices, scene_axes, scene_values
+from sweep.experiment.photographs import read_record
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus
 from sweep.photographs.prepare import prepare
 from sweep.photographs.twins import read_scene, twin_pipeline
-from sweep.plan.grid import Block, block_indices, scene_axes, scene_values
-from sweep.plan.photographs import read_record
-from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import open_dataset
 
 SCENE = {

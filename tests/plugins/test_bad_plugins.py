@@ -13,11 +13,11 @@ from sweep.errors import PipelineError, PluginError
 from sweep.evaluation.block import run_cells
 from sweep.execution.cluster import _worker_identity
 from sweep.execution.runner import execute
+from sweep.experiment.grid import detector_settings
+from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Child
 from sweep.isolation.crash_isolation import check_plugins, use
 from sweep.measure.flags import DetectionStatus, EstimateStatus
-from sweep.plan.grid import detector_settings
-from sweep.plan.pipeline import Pipeline
 from sweep.plugins.loading import call
 from sweep.tradeoff.costs import clock_of
 from tests.support.here import Here

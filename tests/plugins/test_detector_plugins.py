@@ -7,11 +7,11 @@ import pytest
 
 from sweep.errors import PipelineError, PluginError
 from sweep.evaluation.block import run_cells
+from sweep.experiment.cell_selection import cell
+from sweep.experiment.grid import detector_settings
+from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.crash_isolation import use
 from sweep.measure.flags import DetectionStatus
-from sweep.plan.cell_selection import cell
-from sweep.plan.grid import detector_settings
-from sweep.plan.pipeline import Pipeline
 
 MINE = '''
 from dataclasses import dataclass

@@ -10,13 +10,13 @@ import pytest
 
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.inspection import scene_image
+from sweep.experiment.grid import estimators, scene_values
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.estimation import Detections
 from sweep.measure.estimators import build
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.marker import modules
 from sweep.model.scene import build_scenes
-from sweep.plan.grid import estimators, scene_values
-from sweep.plan.pipeline import Pipeline
 
 FOLDER = Path(__file__).parents[2] / "pipelines" / "plugins"
 

@@ -12,7 +12,7 @@ from sweep.errors import OtherExperimentError, PipelineError, StoreError
 from sweep.evaluation.inspection import scene_image
 from sweep.execution.reuse import match
 from sweep.execution.runner import execute
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline
 from sweep.store.lifecycle import open_store
 from sweep.store.provenance import differences, fingerprint
 from tests.plugins.test_detector_plugins import MINE

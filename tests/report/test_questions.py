@@ -7,7 +7,7 @@ import pytest
 
 from support.reports import command, made
 from sweep.analysis.requirements import check_required
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline
 
 FOLDER = Path(__file__).parents[2] / "pipelines" / "questions"
 QUESTIONS = sorted(path.stem for path in FOLDER.glob("*.toml"))

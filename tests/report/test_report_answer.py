@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from support.reports import CAMERA, command, made
 from support.small_datasets import perfect
 from sweep.analysis.requirements import Decision
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.pipeline import Pipeline
 from sweep.report import comparison as comparisons
 from sweep.report.answer import answer
 from sweep.report.figures import figures_of

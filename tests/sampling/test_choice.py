@@ -11,8 +11,8 @@ from sweep.analysis.choices import answers
 from sweep.analysis.requirements import Decision
 from sweep.errors import PipelineError
 from sweep.execution.runner import execute
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.pipeline import Pipeline
 from sweep.report import decisions as size_lines
 from sweep.sampling.rules import GroupResults, make_rule
 from sweep.sampling.searches import group_dataset, store_cells

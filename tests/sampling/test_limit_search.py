@@ -14,9 +14,9 @@ from sweep.analysis.intervals import looks_factor
 from sweep.analysis.limits import requirement_limits
 from sweep.analysis.requirements import Decision
 from sweep.errors import PipelineError
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.sampling import wave_ends
 from sweep.measure.flags import DetectionStatus
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.sampling import wave_ends
 from sweep.report.limit_figure import as_json, limit_table
 from sweep.sampling.rules import GroupResults
 from sweep.sampling.searches import (

@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 
 from sweep.errors import PipelineError
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.pipeline import Pipeline
 from sweep.sampling.rules import GroupResults, make_rule
 
 TEXT = """

@@ -12,8 +12,8 @@ from sweep.analysis.draws import Design
 from sweep.analysis.intervals import LEVEL
 from sweep.analysis.poses import Poses
 from sweep.analysis.statistic import Blocks
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.pipeline import Pipeline
 from sweep.sampling.rules import GroupResults, make_rule
 
 REPETITIONS = 2000

@@ -11,8 +11,8 @@ from support.stores import by_hand, same
 from sweep.errors import StoreError
 from sweep.execution.runner import execute
 from sweep.execution.status import close
+from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.verification import verify
-from sweep.plan.pipeline import Pipeline
 from sweep.store.blocks import committed, missing_chunks
 from sweep.store.lifecycle import open_store
 

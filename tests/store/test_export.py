@@ -12,8 +12,8 @@ from support.stores import by_hand
 from sweep.analysis import detection_rate
 from sweep.errors import ArgumentError
 from sweep.execution.status import close
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.pipeline import Pipeline
 from sweep.store.blocks import drop_block
 
 TEXT = """

@@ -11,7 +11,7 @@ import pytest
 from sweep.errors import StoreError
 from sweep.execution.runner import execute
 from sweep.execution.status import drop_failed, status
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline
 from sweep.store import lock as locks
 from sweep.store.lifecycle import create_store, open_store, remove_store
 from sweep.store.lock import changing, closing, is_written, writing

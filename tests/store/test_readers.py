@@ -13,10 +13,10 @@ from support.stores import by_hand
 from sweep.errors import StoreError
 from sweep.execution.block_task import compute_block
 from sweep.execution.status import close, status
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.schema import SCHEMA, VARIABLES
 from sweep.integrity.verification import verify
 from sweep.measure.flags import EstimateStatus, present_values
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.schema import SCHEMA, VARIABLES
 from sweep.store.blocks import drop_block, receipts
 from sweep.store.lifecycle import create_store, open_store
 

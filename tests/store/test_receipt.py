@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline
 from sweep.store.blocks import receipt_texts
 from sweep.store.chunks import receipt_key
 from sweep.store.layout import RECEIPTS

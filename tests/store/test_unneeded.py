@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.pipeline import Pipeline
 from sweep.store.lifecycle import create_store
 from sweep.store.receipt import encoded
 

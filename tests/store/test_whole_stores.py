@@ -17,9 +17,9 @@ from sweep.errors import StoreError
 from sweep.execution.block_task import compute_block
 from sweep.execution.reuse import match
 from sweep.execution.status import close, status
+from sweep.experiment.pipeline import Pipeline
 from sweep.integrity.reproduction import reproduce
 from sweep.integrity.verification import verify
-from sweep.plan.pipeline import Pipeline
 from sweep.processor import processor
 from sweep.store.blocks import drop_block, receipts
 from sweep.store.layout import checksum_of

@@ -5,8 +5,8 @@ from typing import Any
 
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.results import Failure, to_dataset_layout
-from sweep.plan.grid import block_indices
-from sweep.plan.schema import variables_of
+from sweep.experiment.grid import block_indices
+from sweep.experiment.schema import variables_of
 
 
 @dataclass

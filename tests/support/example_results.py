@@ -4,8 +4,8 @@ import numpy as np
 import xarray as xr
 from scipy import special
 
+from sweep.experiment.schema import POSE_PARAMETERS, XYZ
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.schema import POSE_PARAMETERS, XYZ
 
 SIDES = [10.0, 20.0, 40.0]
 TRIALS = 8

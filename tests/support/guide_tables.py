@@ -14,12 +14,12 @@ from functools import partial
 from pathlib import Path
 
 from sweep.analysis.summaries import POSE_STATISTICS, error_headings
+from sweep.experiment.parameters import PARAMETERS, SECTIONS, Parameter
+from sweep.experiment.schema import VARIABLES, Variable
 from sweep.measure.estimators import SOLVERS
 from sweep.measure.flags import Flag
 from sweep.messages import label, nearest
 from sweep.model.effects import EFFECTS
-from sweep.plan.parameters import PARAMETERS, SECTIONS, Parameter
-from sweep.plan.schema import VARIABLES, Variable
 
 _MARKED = re.compile(r"(<!-- table: (\S+) -->\n)(.*?)(<!-- /table -->)", re.DOTALL)
 _OPENING = re.compile(r"<!-- table: \S+ -->")

@@ -6,8 +6,8 @@ import io
 from sweep import cli
 from sweep.execution.block_task import compute_block
 from sweep.execution.status import close
-from sweep.plan.grid import scene_axes
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.grid import scene_axes
+from sweep.experiment.pipeline import Pipeline
 from sweep.store.lifecycle import create_store
 
 CAMERA = """

@@ -3,8 +3,8 @@
 import numpy as np
 
 from sweep.analysis.limits import requirement_limits
+from sweep.experiment.pipeline import Pipeline
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
-from sweep.plan.pipeline import Pipeline
 from sweep.sampling.rules import GroupResults
 from sweep.sampling.searches import group_dataset, limit_sampling
 

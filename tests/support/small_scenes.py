@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from sweep.experiment.grid import scene_axes, scene_values
+from sweep.experiment.pipeline import Pipeline
 from sweep.model.extent import marker_boxes
 from sweep.model.renderers import render_all
 from sweep.model.scene import build_scenes
-from sweep.plan.grid import scene_axes, scene_values
-from sweep.plan.pipeline import Pipeline
 
 SMALL = """
 seed = 11

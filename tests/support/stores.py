@@ -4,8 +4,8 @@ import xarray as xr
 
 from sweep.execution.block_task import compute_block, compute_blocks
 from sweep.execution.progress import InWaves
-from sweep.plan.axes import TRIAL
-from sweep.plan.grid import scene_axes
+from sweep.experiment.axes import TRIAL
+from sweep.experiment.grid import scene_axes
 from sweep.sampling.rules import block_unit, make_rule
 from sweep.store.lifecycle import create_store
 

@@ -6,7 +6,7 @@ As a preload of Dask workers (``dask_setup``), and in the client by :func:`insta
 import numpy as np
 
 from sweep.evaluation.results import CellsResult
-from sweep.plan.schema import variables_of
+from sweep.experiment.schema import variables_of
 
 
 def synthetic_cells(pipeline, indices, need=None):  # noqa: ARG001

@@ -18,10 +18,10 @@ from sweep import cli
 from sweep.execution.block_task import compute_block
 from sweep.execution.runner import execute
 from sweep.execution.status import close, status
+from sweep.experiment.grid import scene_axes
+from sweep.experiment.pipeline import Pipeline
 from sweep.isolation.child_process import Interrupts
 from sweep.messages import to_json
-from sweep.plan.grid import scene_axes
-from sweep.plan.pipeline import Pipeline
 from sweep.store.lifecycle import create_store
 from sweep.tradeoff import costs as configuration_costs
 from sweep.tradeoff import costs as paired_timing

@@ -3,8 +3,8 @@
 import numpy as np
 import xarray as xr
 
-from sweep.plan.pipeline import Pipeline
-from sweep.plan.same_meaning import wrong_beliefs, wrong_configurations
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.same_meaning import wrong_beliefs, wrong_configurations
 from sweep.tradeoff.pareto import WRONG_BELIEF, advice, budget_advice, mark_front
 
 TEXT = """seed = 1

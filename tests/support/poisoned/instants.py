@@ -20,8 +20,8 @@ import zarr.storage._local as local
 from sweep.evaluation.block import run_cells
 from sweep.execution.block_task import compute_block
 from sweep.execution.status import close
-from sweep.plan.grid import block_indices
-from sweep.plan.pipeline import Pipeline
+from sweep.experiment.grid import block_indices
+from sweep.experiment.pipeline import Pipeline
 from sweep.store.lifecycle import create_store, open_store
 from sweep.store.lock import closing as alone
 

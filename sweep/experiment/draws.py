@@ -1,0 +1,562 @@
+"""Random draws: a function of (seed, quantity, geometry key, trial); Sobol' points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from hashlib import blake2b
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.experiment.axes import Distribution
+from sweep.experiment.parameters import GEOMETRY_SECTIONS, PARAMETERS, WORLD
+from sweep.model.camera import (
+    PER_SIDE,
+    VIEW_PARAMETERS,
+    Column,
+    Framing,
+    canonical_distortion,
+    intrinsics,
+    map_columns,
+)
+from sweep.model.coverage import mixed
+from sweep.model.marker import marker_corners, module_count, overhang
+from sweep.model.pose import (
+    angles_of_rotation,
+    orientation,
+    pose_in_camera,
+    rotation_of_angles,
+    rotation_of_view_angle,
+    rotation_of_yaw_pitch_roll,
+    transform_points,
+)
+from sweep.model.scene import build_cameras
+from sweep.typing import Floats, Integers
+
+# --------------------------------------------------------------------------------------------------
+# Sobol' points, scrambled: draws of several quantities that fill their space evenly.
+#
+# Points are those of Sobol' (USSR Computational Mathematics and Mathematical Physics 7(4), 1967)
+# with the direction numbers of Joe and Kuo ("Constructing Sobol sequences with better two-
+# dimensional projections", SIAM Journal on Scientific Computing 30(5), 2008; their file new-joe-
+# kuo-6.21201), in the order of Antonov and Saleev's Gray code. They are randomised by Owen's
+# nested uniform scrambling ("Randomly permuted (t,m,s)-nets and (t,s)-sequences", 1995): each
+# binary digit is flipped by a random bit that depends on the digits before it. So each point is
+# uniform, and replicates with scrambles of their own are independent.
+
+REPLICATES = 16
+"""Independent randomisations; the trial modulo this is the number of a trial's replicate."""
+
+BITS = 32
+"""Binary digits of a point; those beyond are random."""
+
+_NUMBERS = (
+    (3, 1), (7, 1, 3), (11, 1, 3, 1), (13, 1, 1, 1), (19, 1, 1, 3, 3), (25, 1, 3, 5, 13),
+    (37, 1, 1, 5, 5, 17), (41, 1, 1, 5, 5, 5), (47, 1, 1, 7, 11, 19), (55, 1, 1, 5, 1, 1),
+    (59, 1, 1, 1, 3, 11), (61, 1, 3, 5, 5, 31), (67, 1, 3, 3, 9, 7, 49),
+    (91, 1, 1, 1, 15, 21, 21), (97, 1, 3, 1, 13, 27, 49), (103, 1, 1, 1, 15, 7, 5),
+    (109, 1, 3, 1, 15, 13, 25), (115, 1, 1, 5, 5, 19, 61), (131, 1, 3, 7, 11, 23, 15, 103),
+    (137, 1, 3, 7, 13, 13, 15, 69), (143, 1, 1, 3, 13, 7, 35, 63), (145, 1, 3, 5, 9, 1, 25, 53),
+    (157, 1, 3, 1, 13, 9, 35, 107), (167, 1, 3, 1, 5, 27, 61, 31), (171, 1, 1, 5, 11, 19, 41, 61),
+    (185, 1, 3, 5, 3, 3, 13, 69), (191, 1, 1, 7, 13, 1, 19, 1), (193, 1, 3, 7, 5, 13, 19, 59),
+    (203, 1, 1, 3, 9, 25, 29, 41), (211, 1, 3, 5, 13, 23, 1, 55), (213, 1, 3, 7, 3, 13, 59, 17),
+    (229, 1, 3, 1, 3, 5, 53, 69), (239, 1, 1, 5, 5, 23, 33, 13), (241, 1, 1, 7, 7, 1, 61, 123),
+    (247, 1, 1, 7, 9, 13, 61, 49), (253, 1, 3, 3, 5, 3, 55, 33),
+    (285, 1, 3, 1, 15, 31, 13, 49, 245), (299, 1, 3, 5, 15, 31, 59, 63, 97),
+    (301, 1, 3, 1, 11, 11, 11, 77, 249), (333, 1, 3, 1, 11, 27, 43, 71, 9),
+    (351, 1, 1, 7, 15, 21, 11, 81, 45), (355, 1, 3, 7, 3, 25, 31, 65, 79),
+    (357, 1, 3, 1, 1, 19, 11, 3, 205), (361, 1, 1, 5, 9, 19, 21, 29, 157),
+    (369, 1, 3, 7, 11, 1, 33, 89, 185), (391, 1, 3, 3, 3, 15, 9, 79, 71),
+    (397, 1, 3, 7, 11, 15, 39, 119, 27), (425, 1, 1, 3, 1, 11, 31, 97, 225),
+    (451, 1, 1, 1, 3, 23, 43, 57, 177), (463, 1, 3, 7, 7, 17, 17, 37, 71),
+    (487, 1, 3, 1, 5, 27, 63, 123, 213), (501, 1, 1, 3, 5, 11, 43, 53, 133),
+    (529, 1, 3, 5, 5, 29, 17, 47, 173, 479), (539, 1, 3, 3, 11, 3, 1, 109, 9, 69),
+    (545, 1, 1, 1, 5, 17, 39, 23, 5, 343), (557, 1, 3, 1, 5, 25, 15, 31, 103, 499),
+    (563, 1, 1, 1, 11, 11, 17, 63, 105, 183), (601, 1, 1, 5, 11, 9, 29, 97, 231, 363),
+    (607, 1, 1, 5, 15, 19, 45, 41, 7, 383), (617, 1, 3, 7, 7, 31, 19, 83, 137, 221),
+    (623, 1, 1, 1, 3, 23, 15, 111, 223, 83), (631, 1, 1, 5, 13, 31, 15, 55, 25, 161),
+    (637, 1, 1, 3, 13, 25, 47, 39, 87, 257), (647, 1, 1, 1, 11, 21, 53, 125, 249, 293),
+    (661, 1, 1, 7, 11, 11, 7, 57, 79, 323), (675, 1, 1, 5, 5, 17, 13, 81, 3, 131),
+    (677, 1, 1, 7, 13, 23, 7, 65, 251, 475), (687, 1, 3, 5, 1, 9, 43, 3, 149, 11),
+    (695, 1, 1, 3, 13, 31, 13, 13, 255, 487), (701, 1, 3, 3, 1, 5, 63, 89, 91, 127),
+    (719, 1, 1, 3, 3, 1, 19, 123, 127, 237), (721, 1, 1, 5, 7, 23, 31, 37, 243, 289),
+    (731, 1, 1, 5, 11, 17, 53, 117, 183, 491), (757, 1, 1, 1, 5, 1, 13, 13, 209, 345),
+    (761, 1, 1, 3, 15, 1, 57, 115, 7, 33), (787, 1, 3, 1, 11, 7, 43, 81, 207, 175),
+    (789, 1, 3, 1, 1, 15, 27, 63, 255, 49), (799, 1, 3, 5, 3, 27, 61, 105, 171, 305),
+    (803, 1, 1, 5, 3, 1, 3, 57, 249, 149),
+    (817, 1, 1, 3, 5, 5, 57, 15, 13, 159), (827, 1, 1, 1, 11, 7, 11, 105, 141, 225),
+    (847, 1, 3, 3, 5, 27, 59, 121, 101, 271), (859, 1, 3, 5, 9, 11, 49, 51, 59, 115),
+    (865, 1, 1, 7, 1, 23, 45, 125, 71, 419), (875, 1, 1, 3, 5, 23, 5, 105, 109, 75),
+    (877, 1, 1, 7, 15, 7, 11, 67, 121, 453), (883, 1, 3, 7, 3, 9, 13, 31, 27, 449),
+    (895, 1, 3, 1, 15, 19, 39, 39, 89, 15), (901, 1, 1, 1, 1, 1, 33, 73, 145, 379),
+    (911, 1, 3, 1, 15, 15, 43, 29, 13, 483), (949, 1, 1, 7, 3, 19, 27, 85, 131, 431),
+    (953, 1, 3, 3, 3, 5, 35, 23, 195, 349), (967, 1, 3, 3, 7, 9, 27, 39, 59, 297),
+    (971, 1, 1, 3, 9, 11, 17, 13, 241, 157), (973, 1, 3, 7, 15, 25, 57, 33, 189, 213),
+    (981, 1, 1, 7, 1, 9, 55, 73, 83, 217), (985, 1, 3, 3, 13, 19, 27, 23, 113, 249),
+    (995, 1, 3, 5, 3, 23, 43, 3, 253, 479), (1001, 1, 1, 5, 5, 11, 5, 45, 117, 217),
+)
+"""Of each dimension after the first: the bits of its primitive polynomial, and m_1, m_2, ..."""
+
+DIMENSIONS = len(_NUMBERS) + 1
+"""The most quantities that can be drawn together."""
+
+_STEP_SOBOL = np.uint64(0x9E3779B97F4A7C15)
+_ONE = np.uint64(1)
+
+
+@cache
+def directions(dimension: int) -> tuple[int, ...]:
+    """Return the direction numbers (:data:`BITS`,) of a dimension from 0, as fractions of 2^32.
+
+    Joe and Kuo 2008, section 2, equations 2 and 3.
+    """
+    if dimension == 0:
+        numbers = [1] * BITS
+    else:
+        polynomial, *numbers = _NUMBERS[dimension - 1]
+        degree = polynomial.bit_length() - 1
+        for k in range(degree, BITS):
+            number = numbers[k - degree] ^ (numbers[k - degree] << degree)
+            for j in range(1, degree):
+                if polynomial >> (degree - j) & 1:
+                    number ^= numbers[k - j] << j
+            numbers.append(number)
+    return tuple(number << (BITS - 1 - k) for k, number in enumerate(numbers))
+
+
+def points(dimension: int, index: Integers) -> NDArray[np.uint64]:
+    """Return the points (N,) of a dimension at indices (N,) of the sequence, times 2^32."""
+    index = np.asarray(index, dtype=np.uint64)
+    gray = index ^ (index >> _ONE)
+    found = np.zeros(index.shape, dtype=np.uint64)
+    highest = int(gray.max(initial=0)).bit_length()
+    for k, direction in enumerate(directions(dimension)[:highest]):
+        bit = (gray >> np.uint64(k)) & _ONE
+        found ^= bit * np.uint64(direction)
+    return found
+
+
+def scrambled(digits: NDArray[np.uint64], keys: NDArray[np.uint64]) -> Floats:
+    """Return points (N,) of :data:`BITS` digits, scrambled by keys (N,), as numbers in (0, 1).
+
+    A digit is flipped by a random bit of the key and the digits before it; those beyond the last
+    are random bits of the key and all digits. 53 in all, in the middle of their interval.
+    """
+    result = np.zeros(digits.shape, dtype=np.uint64)
+    for k in range(BITS):
+        # The digits before it, and their number, so that prefixes of any length differ.
+        prefix = (digits >> np.uint64(BITS - k)) | np.uint64((k + 1) << BITS)
+        flip = mixed(keys ^ mixed(prefix)) >> np.uint64(63)
+        digit = (digits >> np.uint64(BITS - 1 - k)) & _ONE
+        result = (result << _ONE) | (digit ^ flip)
+    rest = mixed(keys ^ mixed(digits | np.uint64((BITS + 1) << BITS)))
+    result = (result << np.uint64(53 - BITS)) | (rest >> np.uint64(64 - (53 - BITS)))
+    return np.asarray((result + 0.5) * 2.0**-53)
+
+
+def sobol_uniform(
+    dimension: int, keys: NDArray[np.uint64], trials: Integers
+) -> Floats:
+    """Return uniform numbers in (0, 1) of scenes, (N,), evenly spread over the trials.
+
+    Parameters
+    ----------
+    dimension
+        Number of the quantity among those that are drawn.
+    keys
+        (N,) random bits of the seed, the quantity and the scene's geometry, not of its trial.
+    trials
+        (N,) trial ``t`` is point ``t // 16`` of replicate ``t % 16``, whatever other trials exist.
+    """
+    index, replicate = np.divmod(np.asarray(trials, dtype=np.uint64), np.uint64(REPLICATES))
+    own = mixed(keys + _STEP_SOBOL * (replicate + _ONE))
+    return scrambled(points(dimension, index), own)
+
+
+# --------------------------------------------------------------------------------------------------
+# The pose in the ways that users give it, resolved to the one that scenes are made from.
+#
+# A scene's pose is tilt, azimuth, roll, ``distance_m``, and bearings or ``x_m``, ``y_m``. The
+# other parameters of a pose are turned into these, step by step; a step whose parameters are not
+# given does nothing.
+
+Columns = dict[str, Column]
+
+ANGLES = ("tilt_deg", "azimuth_deg", "roll_deg")
+BEARINGS = ("bearing_x_deg", "bearing_y_deg")
+CENTRE = ("x_m", "y_m")
+SHARES = ("frame_x", "frame_y")
+SHIFTS = ("shift_u_px", "shift_v_px")
+
+DISTANCE_PARAMETERS = (*VIEW_PARAMETERS, "size_m", "side_px")
+"""The parameters that :func:`distance_of_side` needs."""
+
+KEY_DECIMALS = 10
+"""Decimals of degrees to which resolved angles enter the geometry key: they have rounding errors
+where angles that are given have none."""
+
+
+def distance_of_side(values: Mapping[str, Any]) -> Any:
+    """Return the distance in m at which the black square's side is ``side_px`` long.
+
+    ``fx · size / side``; ``values`` has numbers or arrays for :data:`DISTANCE_PARAMETERS`.
+    """
+    fx = intrinsics(*(values[name] for name in VIEW_PARAMETERS))[0]
+    return fx * values["size_m"] / values["side_px"]
+
+
+def resolve_pose(values: Columns) -> None:
+    """Add the parameters that scenes are made from to values, of which none is to be drawn yet.
+
+    The angles have names of their own: ``roll_deg`` of yaw, pitch and roll stays as it is given.
+    """
+    pose = dict(values)
+    for step in STEPS:
+        if step.is_given(pose):
+            pose.update(step.take(pose))
+    values.update({name: pose[name] for name in ("distance_m", *CENTRE)})
+    values.update({f"resolved_{name}": pose[name] for name in ANGLES})
+
+
+def canonical_pose(values: Mapping[str, Column], drawn: Collection[str]) -> Columns:
+    """Return the values with a pose that is the same in whichever way it is given.
+
+    That is tilt, azimuth, roll, distance and bearings, without jitter. What follows from values
+    that are ``drawn`` stays as it is given.
+    """
+    canonical: Columns = {**values, **dict.fromkeys(SHIFTS, Column.of(0.0))}
+    unknown = set(drawn)
+    for step in (*STEPS, _TO_BEARINGS):
+        if unknown.intersection(step.given):
+            unknown.update(step.makes)
+        elif step.is_given(canonical):
+            if unknown.intersection(step.others):
+                unknown.update(step.makes)
+                continue
+            made = step.take(canonical)
+            canonical |= dict.fromkeys(step.given, Column.of(None))
+            canonical |= {name: _rounded(name, column) for name, column in made.items()}
+    return canonical
+
+
+def _rounded(name: str, column: Column) -> Column:
+    if not name.endswith("_deg"):
+        return column
+    return Column(np.round(column.values, KEY_DECIMALS) + 0.0, column.constant)
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """The resolution of one way in which a part of the pose is given.
+
+    Attributes
+    ----------
+    given
+        The parameters of this way: the step is taken if one of them is given.
+    others
+        What it reads beside them.
+    makes
+        What it resolves.
+    resolve
+        Returns the values (n,) of ``makes`` for n scenes.
+    """
+
+    given: tuple[str, ...]
+    others: tuple[str, ...]
+    makes: tuple[str, ...]
+    resolve: Callable[[Mapping[str, Column], int], tuple[Floats, ...]]
+
+    def is_given(self, values: Mapping[str, Column]) -> bool:
+        """Return whether one of the parameters has a value."""
+        return any(name in values and not values[name].missing for name in self.given)
+
+    def take(self, values: Mapping[str, Column]) -> Columns:
+        """Return the columns that it makes: of one value where all scenes share what it reads."""
+        read = [values[name] for name in (*self.given, *self.others) if name in values]
+        each = [len(column.values) for column in read if not column.constant]
+        made = self.resolve(values, each[0] if each else 1)
+        return {
+            name: Column.of(array) if each else Column.of(float(array[0]))
+            for name, array in zip(self.makes, made, strict=True)
+        }
+
+
+def _numbers(
+    values: Mapping[str, Column], names: Collection[str], count: int, missing: float = 0.0
+) -> list[Floats]:
+    """Return parameters as arrays (count,); ``missing`` stands for one that is not given."""
+    columns = [values.get(name, Column.of(None)) for name in names]
+    return [
+        np.full(count, missing) if column.missing else column.broadcast(count)
+        for column in columns
+    ]
+
+
+def _from_side(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
+    numbers = {name: values[name].values for name in DISTANCE_PARAMETERS}
+    return (Column.of(distance_of_side(numbers)).broadcast(count),)
+
+
+def _from_world(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
+    """Resolve the places of camera and marker in the world."""
+    numbers = dict(zip(WORLD, _numbers(values, WORLD, count), strict=True))
+    located = []
+    for whose in ("camera", "marker"):
+        angles = (np.radians(numbers[f"{whose}_{name}_deg"]) for name in ("yaw", "pitch", "roll"))
+        origin = np.stack([numbers[f"{whose}_{axis}_m"] for axis in "xyz"], axis=1)
+        located += [origin, orientation(*angles)]
+    rotation, position = pose_in_camera(*located)
+    return (*_angles(rotation), *position.T)
+
+
+def _from_yaw_and_pitch(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
+    angles = _numbers(values, ("yaw_deg", "pitch_deg", "roll_deg"), count)
+    return _angles(rotation_of_yaw_pitch_roll(*map(np.radians, angles)))
+
+
+def _angles(rotation: Floats) -> tuple[Floats, ...]:
+    return tuple(np.degrees(angle) for angle in angles_of_rotation(rotation))
+
+
+def _from_view_angle(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
+    """Resolve the angle to the line of sight, which jitter moves, too."""
+    depth = values["distance_m"].broadcast(count)
+    centre_xy = _centres(values, count) + _shifts(values, count)
+    return _angles(_facing(values, count)(np.arange(count), np.column_stack([centre_xy, depth])))
+
+
+def _facing(
+    values: Mapping[str, Column], count: int
+) -> Callable[[NDArray[np.intp], Floats], Floats]:
+    """Return the function of rows (n,) and positions (n, 3) that returns the rotations there."""
+    tilt, azimuth, roll = map(np.radians, _numbers(values, ANGLES, count))
+    if values["view_angle_deg"].missing:
+        rotation = rotation_of_angles(tilt, azimuth, roll)
+        return lambda rows, _: rotation[rows]
+    view = np.radians(values["view_angle_deg"].broadcast(count))
+    return lambda rows, position: rotation_of_view_angle(
+        view[rows], azimuth[rows], roll[rows], position
+    )
+
+
+def _centres(values: Mapping[str, Column], count: int) -> Floats:
+    """Return the centre's x and y (count, 2) in metres, without jitter."""
+    depth = values["distance_m"].broadcast(count)
+    return np.stack([
+        depth * np.tan(np.radians(values[bearing].broadcast(count)))
+        if values[metres].missing else values[metres].broadcast(count)
+        for metres, bearing in zip(CENTRE, BEARINGS, strict=True)
+    ], axis=1)
+
+
+def _shifts(
+    values: Mapping[str, Column], count: int, names: tuple[str, str] = SHIFTS
+) -> Floats:
+    """Return what the jitter's pixels are at the centre's depth, along x and y, (count, 2) m."""
+    focal = intrinsics(
+        *(None if values[name].missing else values[name].broadcast(count)
+          for name in VIEW_PARAMETERS)
+    )[:2]
+    depth, pixels = values["distance_m"].broadcast(count), _numbers(values, names, count)
+    return np.stack(
+        [depth * (pixel / length) for pixel, length in zip(pixels, focal, strict=True)], axis=1
+    )
+
+
+def _from_frame(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
+    """Resolve the place between those at which the marker touches the frame."""
+    cameras = build_cameras(values, count)
+    modules = values["dictionary"].map(module_count).broadcast(count)
+    size, quiet = _numbers(values, ("size_m", "quiet_zone_modules"), count)
+    margin = quiet + values["dictionary"].map(overhang).broadcast(count)
+    outline = marker_corners(size * (1 + 2 * margin / modules))
+    depth = values["distance_m"].broadcast(count)
+    facing, given = _facing(values, count), _centres(values, count)
+    shift = _shifts(values, count)
+    margin = _shifts(values, count, ("jitter_px", "jitter_px"))
+    frame = np.stack(_numbers(values, ("width_px", "height_px"), count), axis=1)
+    share = np.stack(_numbers(values, SHARES, count, np.nan), axis=1)
+    centres = np.empty((count, 2))
+    # What a scene gets must not depend on whether others have a lens.
+    for curved in (False, True):
+        rows = np.flatnonzero(cameras.distorted == curved)
+        points = _along_sides(outline[rows], PER_SIDE if curved else 1)
+
+        def offsets(
+            part: NDArray[np.intp], centre_xy: Floats, rows: NDArray[np.intp] = rows,
+            points: Floats = points,
+        ) -> Floats:
+            position = np.column_stack([centre_xy, depth[rows[part]]])
+            rotation = facing(rows[part], position)
+            return transform_points(points[part], rotation, np.zeros_like(position))
+
+        centres[rows] = Framing(
+            cameras.take(rows), frame[rows], depth[rows], offsets, share[rows], given[rows],
+            margin[rows], shift[rows],
+        ).centres()
+    return tuple(centres.T)
+
+
+def _along_sides(corners: Floats, per_side: int) -> Floats:
+    """Return points (n, 4 · per_side, 3) along the sides of quadrilaterals (n, 4, 3)."""
+    t = (np.arange(per_side) / per_side)[:, None]
+    following = np.roll(corners, -1, axis=1)
+    points = corners[:, :, None] + t * (following - corners)[:, :, None]
+    return points.reshape(len(corners), 4 * per_side, 3)
+
+
+def _bearings(values: Mapping[str, Column], count: int) -> tuple[Floats, ...]:
+    depth, centres = values["distance_m"].broadcast(count), _centres(values, count)
+    return tuple(np.degrees(np.arctan2(across, depth)) for across in centres.T)
+
+
+_POSITION = ("distance_m", *CENTRE, *BEARINGS, *SHIFTS, *VIEW_PARAMETERS)
+
+STEPS = (
+    Step(("side_px",), (*VIEW_PARAMETERS, "size_m"), ("distance_m",), _from_side),
+    Step(WORLD, (), (*ANGLES, *CENTRE, "distance_m"), _from_world),
+    Step(("yaw_deg", "pitch_deg"), ("roll_deg",), ANGLES, _from_yaw_and_pitch),
+    Step(
+        SHARES,
+        (*_POSITION, *ANGLES, "view_angle_deg", "distortion", "jitter_px", "size_m",
+         "quiet_zone_modules", "dictionary"),
+        CENTRE, _from_frame,
+    ),
+    Step(
+        ("view_angle_deg",), ("azimuth_deg", "roll_deg", *_POSITION), ANGLES, _from_view_angle,
+    ),
+)
+"""Every step, each after those that make what it reads."""
+
+_TO_BEARINGS = Step(CENTRE, ("distance_m", *BEARINGS), BEARINGS, _bearings)
+
+
+# --------------------------------------------------------------------------------------------------
+# Random draws: a function of (seed, quantity, geometry key, trial), and of nothing else.
+#
+# The geometry key of a cell is the text of its own camera, marker and pose values: canonical (a
+# camera in mm as one in pixels, the pose in whichever way it is given as tilt, azimuth, roll,
+# distance and bearings, unless these depend on a draw), sorted by name, defaults left out,
+# numbers rounded to 12 significant digits. Whether a value is fixed or an axis, in which order
+# and on which grid, does not matter; nor do renderer, window, levels, detector or estimator.
+
+_DEFAULT_VIEW = dict(
+    zip(
+        ("fx_px", "fy_px"),
+        intrinsics(*(PARAMETERS[name].default for name in VIEW_PARAMETERS))[:2],
+        strict=True,
+    )
+)
+_PLAIN = (
+    "width_px", "height_px",
+    *(p.name for p in PARAMETERS.values()
+      if p.section in GEOMETRY_SECTIONS and p.section != "camera" and p.name != "side_px"),
+)
+
+
+def _text(value: Any) -> str:
+    """Return the canonical text of a value."""
+    if isinstance(value, str):
+        return value.upper()
+    if isinstance(value, tuple):
+        return ",".join(_text(item) for item in canonical_distortion(value))
+    return f"{float(value) + 0.0:.12g}"
+
+
+def _texts(name: str, column: Column, default: Any) -> Column:
+    """Return "name=value" of each value, empty where it is the default."""
+    left_out = None if default is None else _text(default)
+
+    @cache
+    def labelled(value: Any) -> str:
+        text = _text(value)
+        return "" if text == left_out else f"{name}={text}"
+
+    return column.map(labelled)
+
+
+def geometry_keys(
+    values: Mapping[str, Column], distributions: Mapping[str, Distribution], count: int
+) -> NDArray[np.uint64]:
+    """Return the hashed geometry keys (count,) of scenes.
+
+    ``values`` has every parameter of camera, marker and pose that is not drawn.
+    """
+    values = canonical_pose(values, distributions)
+    fx, fy, cx, cy = map(Column.of, intrinsics(*(values[name].values for name in VIEW_PARAMETERS)))
+    columns = {
+        "fx_px": _texts("fx_px", fx, _DEFAULT_VIEW["fx_px"]),
+        "fy_px": _texts("fy_px", fy, _DEFAULT_VIEW["fy_px"]),
+        "distortion": _texts("distortion", values["distortion"], ()),
+    }
+    for name, centre, length in (("cx_px", cx, "width_px"), ("cy_px", cy, "height_px")):
+        if not values[name].missing:
+            middle = Column.of((values[length].values - 1) / 2)
+            columns[name] = map_columns(
+                lambda text, default: "" if text == default else text,
+                [_texts(name, centre, None), _texts(name, middle, None)],
+            )
+    for name in _PLAIN:
+        if name not in distributions and name in values and not values[name].missing:
+            columns[name] = _texts(name, values[name], PARAMETERS[name].default)
+    for name, distribution in distributions.items():
+        if name in PARAMETERS and PARAMETERS[name].section in GEOMETRY_SECTIONS:
+            columns[name] = Column.of(f"{name}={distribution}")
+    used = [columns[name] for name in sorted(columns) if columns[name].differs_from("")]
+    joined = map_columns(lambda *texts: "|".join(filter(None, texts)), used)
+    return joined.map(cache(_hash)).broadcast(count, np.uint64)
+
+
+def _hash(text: str) -> np.uint64:
+    """Return 64 bits of a text's BLAKE2b hash."""
+    return np.uint64(int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little"))
+
+
+_STEP = np.uint64(0x9E3779B97F4A7C15)
+
+
+def uniform(
+    seed: int, quantity: str, keys: NDArray[np.uint64], trials: Integers
+) -> Floats:
+    """Return uniform numbers in (0, 1) of scenes, by geometry key and trial, (N,) each.
+
+    (seed, quantity) is hashed by BLAKE2b, as the keys are; trials are steps of SplitMix64 from
+    there. 53 bits, in the middle of their interval, so that neither 0 nor 1 occurs.
+    """
+    return np.asarray(((bits(seed, quantity, keys, trials) >> np.uint64(11)) + 0.5) * 2.0**-53)
+
+
+SAMPLINGS = ("independent", "sobol")
+"""How the draws of a cell's trials relate: not at all, or so that they fill their space evenly."""
+
+
+def jointly_drawn(distributions: Collection[str], others: Sequence[str] = ()) -> list[str]:
+    """Return the quantities that are drawn together, each at its dimension of Sobol's points.
+
+    The jitter comes after the distributions, so that whether there is any changes nothing for them;
+    then come ``others``.
+    """
+    return [*sorted(distributions), "shift_u_px", "shift_v_px", *others]
+
+
+def even_uniform(
+    seed: int, quantity: str, quantities: Sequence[str], keys: NDArray[np.uint64], trials: Integers
+) -> Floats:
+    """Return uniform numbers in (0, 1) of scenes that fill the space of ``quantities`` evenly.
+
+    They are scrambled by (seed, quantity, geometry key, number of the replicate); the other
+    arguments are as of :func:`uniform`.
+    """
+    start = mixed(keys ^ _hash(f"{seed}\nsobol\n{quantity}"))
+    return sobol_uniform(quantities.index(quantity), start, trials)
+
+
+def bits(
+    seed: int, quantity: str, keys: NDArray[np.uint64], trials: Integers
+) -> NDArray[np.uint64]:
+    """Return 64 random bits for each scene (arguments as :func:`uniform`)."""
+    start = mixed(keys ^ _hash(f"{seed}\n{quantity}"))
+    return np.asarray(mixed(start + _STEP * (np.asarray(trials).astype(np.uint64) + np.uint64(1))))

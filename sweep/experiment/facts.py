@@ -1,0 +1,638 @@
+"""What a pipeline's camera and poses are, which parts are active, and what may surprise."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sweep.experiment.beliefs import belief_notes
+from sweep.experiment.experiment import effects_of, relative_sizes, shows_boards, target_word
+from sweep.experiment.grid import detector_settings, scene_axes, scene_values
+from sweep.experiment.parameters import FIELDS_OF_VIEW, PARAMETERS, PHOTOGRAPHS, WORLD
+from sweep.experiment.pipeline import Pipeline
+from sweep.measure.detectors import (
+    NOISE_MARGIN_PX,
+    full_frame_reason,
+    margin_px,
+    uneven_light_needs_frame,
+)
+from sweep.measure.estimators import SOLVERS
+from sweep.messages import label
+from sweep.model.camera import (
+    VIEW_PARAMETERS,
+    Column,
+    are_square,
+    canonical_distortion,
+    field_of_view_deg,
+)
+from sweep.model.effects import Effect, is_coded
+from sweep.model.extent import hidden, outside_frame
+from sweep.model.lens import fold_radius
+from sweep.model.marker import module_count
+from sweep.model.pose import viewing_angle
+from sweep.model.scene import Scenes, build_cameras, build_scenes
+from sweep.plugins.declared import DeclaredPlugin
+from sweep.typing import Floats, Masks
+
+# --------------------------------------------------------------------------------------------------
+# What a pipeline's camera is: focal lengths, fields of view, the marker's side in pixels.
+
+Range = tuple[float, float]
+"""The least and the largest value on the grid."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFacts:
+    """The camera of a grid; each quantity has its least and its largest value.
+
+    Of large grids, and of what is drawn, by the scenes that are looked at.
+
+    Attributes
+    ----------
+    width_px, height_px, fx_px, fy_px, cx_px, cy_px
+        Frame, focal lengths and principal point.
+    hfov_deg, vfov_deg
+        Angle between the frame's edges, without lens distortion: 2 atan(width / (2 fx)).
+    aspect
+        fy / fx: the width of a pixel over its height.
+    off_centre_x, off_centre_y
+        Principal point minus the frame's centre, as a share of its width and height.
+    square
+        Whether the pixels are square everywhere on the grid.
+    side_px
+        Side of the black square parallel to the image plane, at the farthest and the nearest
+        pose; None if all are behind the camera. Of boards the sides of the smallest and the
+        largest marker.
+    boards
+        Whether scenes show boards.
+    """
+
+    width_px: Range
+    height_px: Range
+    fx_px: Range
+    fy_px: Range
+    cx_px: Range
+    cy_px: Range
+    hfov_deg: Range
+    vfov_deg: Range
+    aspect: Range
+    off_centre_x: Range
+    off_centre_y: Range
+    square: bool
+    side_px: Range | None
+    boards: bool
+
+    def line(self) -> str:
+        """Return the camera in one line."""
+        focal = f"fx = fy = {_text(self.fx_px)} px"
+        if not self.square:
+            focal = (
+                f"fx = {_text(self.fx_px)} px, fy = {_text(self.fy_px)} px "
+                f"(pixels are not square: fy/fx = {_text(self.aspect, 4)})"
+            )
+        parts = [
+            f"{_text(self.width_px)} x {_text(self.height_px)} px", focal,
+            f"HFOV {_text(self.hfov_deg, 4)}°", f"VFOV {_text(self.vfov_deg, 4)}°",
+        ]
+        if self.side_px is not None:
+            far, near = self.side_px
+            parts.append(
+                f"the markers have sides of {_text(self.side_px, 4)} px" if self.boards else
+                f"the marker's side is {far:.4g} px" if far == near else
+                f"the marker's side is {near:.4g} px at the nearest pose, {far:.4g} px at the "
+                "farthest"
+            )
+        return ", ".join(parts)
+
+    def attributes(self) -> dict[str, Any]:
+        """Return the dataset's attributes: a number, or the least and the largest one."""
+        named = {
+            "camera_fx_px": self.fx_px, "camera_fy_px": self.fy_px,
+            "camera_hfov_deg": self.hfov_deg, "camera_vfov_deg": self.vfov_deg,
+        }
+        attributes: dict[str, Any] = {
+            name: low if low == high else [low, high] for name, (low, high) in named.items()
+        }
+        if self.side_px is not None:
+            far, near = self.side_px
+            attributes |= {"nearest_side_px": near, "farthest_side_px": far}
+        return attributes
+
+
+def _text(ends: Range, digits: int = 6) -> str:
+    low, high = (f"{end:.{digits}g}" for end in ends)
+    return low if low == high else f"{low} to {high}"
+
+
+MAX_SAMPLE = 600
+"""Scenes that are looked at, of a larger grid: its corners first, then scenes anywhere."""
+
+MAX_CORNERS = 200
+"""The most corners of a grid that are looked at."""
+
+
+def sampled_scenes(pipeline: Pipeline) -> tuple[int, dict[str, Column]]:
+    """Return the number of the scenes that are looked at, and the values of their parameters.
+
+    Every quantity of a camera is monotonic in each of its parameters, so that the corners of the
+    grid have its ends; axes of the camera, the size and the distance are varied first.
+    """
+    axes = scene_axes(pipeline)
+    lengths = [len(axis) for axis in axes]
+    cells = math.prod(lengths)
+    if cells <= MAX_SAMPLE:
+        indices = [index.ravel() for index in np.indices(lengths, dtype=np.intp)]
+        return max(cells, 1), scene_values(pipeline, indices)
+    first = {*VIEW_PARAMETERS, "size_m", "distance_m", "side_px"}
+    # The last axis of a product varies fastest.
+    order = sorted(range(len(axes)), key=lambda k: not first.isdisjoint(axes[k].columns))
+    ends = itertools.product(*((0, lengths[k] - 1) if lengths[k] > 1 else (0,) for k in order))
+    corners = np.array(list(itertools.islice(ends, MAX_CORNERS)), dtype=np.intp)
+    chosen = np.random.default_rng(0)
+    anywhere = [chosen.integers(0, length, MAX_SAMPLE - len(corners)) for length in lengths]
+    return MAX_SAMPLE, scene_values(pipeline, [
+        np.concatenate([corners[:, order.index(k)], other]).astype(np.intp)
+        for k, other in enumerate(anywhere)
+    ])
+
+
+def camera_facts(pipeline: Pipeline) -> CameraFacts:
+    """Return what a pipeline's camera is, by the scenes that are looked at."""
+    count, values = sampled_scenes(pipeline)
+    fx, fy, cx, cy = build_cameras(values, count).view.T
+    width, height = (values[name].broadcast(count) for name in ("width_px", "height_px"))
+
+    def ends(numbers: Floats) -> Range:
+        return float(np.min(numbers)), float(np.max(numbers))
+
+    given = values["side_px"]
+    with np.errstate(divide="ignore"):
+        sides = given.broadcast(count) if not given.missing else (
+            fx * values["size_m"].broadcast(count) / values["distance_m"].broadcast(count))
+    sides = sides[sides > 0]  # before the camera
+    least, largest = relative_sizes(pipeline)
+    return CameraFacts(
+        width_px=ends(width), height_px=ends(height), fx_px=ends(fx), fy_px=ends(fy),
+        cx_px=ends(cx), cy_px=ends(cy), hfov_deg=ends(field_of_view_deg(width, fx)),
+        vfov_deg=ends(field_of_view_deg(height, fy)), aspect=ends(fy / fx),
+        off_centre_x=ends((cx - (width - 1) / 2) / width),
+        off_centre_y=ends((cy - (height - 1) / 2) / height),
+        square=bool(np.all(are_square(fx, fy))), boards=shows_boards(pipeline),
+        side_px=(float(sides.min()) * least, float(sides.max()) * largest) if len(sides) else None,
+    )
+
+
+def _ends(pipeline: Pipeline, name: str) -> Range | None:
+    """Return the least and the largest number that the document has for a parameter, if any."""
+    values = _numbers(pipeline, name)
+    return (min(values), max(values)) if values else None
+
+
+def _numbers(pipeline: Pipeline, name: str) -> list[float]:
+    """Return the numbers that the document has for a parameter: the ends or the mean of draws."""
+    if (drawn := pipeline.distributions.get(name)) is not None:
+        return [drawn.a, drawn.b] if drawn.kind == "uniform" else [drawn.a]
+    return [float(value) for value in pipeline.values_of(name) if value is not None]
+
+
+OFF_CENTRE = 0.15
+"""Distance of the principal point from the frame's centre, as a share of its side, that is told."""
+
+WIDE_DEG = 150.0
+"""Horizontal field of view above which it is told; lenses without fisheye reach about 130."""
+
+RADIANS = (0.2, math.pi)
+"""Fields of view between these look like radians: of 12 to 180 degrees."""
+
+POLE = 1e-9
+"""Denominator of the radial distortion at a fold below which it is a pole."""
+
+NOT_SQUARE = 0.01
+"""Difference of fy/fx from 1 that is told; calibrations of square pixels differ by less."""
+
+
+def camera_notes(pipeline: Pipeline) -> list[str]:
+    """Return a line for each property of the camera, or of beliefs about it, that may surprise."""
+    facts = camera_facts(pipeline)
+    hfov = _text(facts.hfov_deg, 4)
+    squareness = max(abs(ratio - 1) for ratio in facts.aspect)
+    fx_alone = _varies(pipeline, "width_px") and pipeline.fixed.get("fx_px") is not None
+    lines = [text for condition, text in (
+        (squareness > NOT_SQUARE,
+         (f"pixels are not square: fy/fx = {_text(facts.aspect, 4)}; a single side of the sensor, "
+         "or fx_px alone, makes them square")),
+        (facts.hfov_deg[1] > WIDE_DEG,
+         f"HFOV {hfov}°: hardly any pinhole camera is as wide; is a focal length in another unit?"),
+        (fx_alone, (f"fx_px is fixed while width_px varies: HFOV goes from {hfov}°; hfov_deg in "
+         "place of fx_px keeps it")),
+    ) if condition]
+    lines += [
+        f"{name} = {_text(ends)}: in degrees; {ends[1]:g} radians would be "
+        f"{math.degrees(ends[1]):.4g}"
+        for name in FIELDS_OF_VIEW
+        if (ends := _ends(pipeline, name)) and ends[0] > RADIANS[0] and ends[1] < RADIANS[1]
+    ]
+    return [
+        *lines, *_centre_notes(facts), *_fold_notes(pipeline, facts), *_side_notes(pipeline, facts),
+        *belief_notes(pipeline.given, pipeline.fixed, pipeline.values_of("believed")),
+    ]
+
+
+def _side_notes(pipeline: Pipeline, facts: CameraFacts) -> list[str]:
+    """Return a line if no marker of the grid is of a size that can be detected."""
+    if facts.side_px is None:
+        return []
+    far, near = facts.side_px
+    units = (
+        "" if "side_px" in pipeline.given
+        else "; are size_m and the distances in metres?" if "size_m" in pipeline.given
+        else f"; size_m is not given: {pipeline.fixed['size_m']:g} m"
+    )
+    line = ""
+    if near < min(map(module_count, pipeline.values_of("dictionary"))):
+        line = f"at most {near:.4g} px, less than a pixel a module: too small to be read"
+    elif far > max(facts.width_px[1], facts.height_px[1]):
+        line = f"at least {far:.4g} px, more than the frame's"
+    whose = "the markers' sides are" if facts.boards else "the marker's side is"
+    return [f"{whose} {line}{units}"] if line else []
+
+
+def _centre_notes(facts: CameraFacts) -> list[str]:
+    lines = []
+    frame = f"{_text(facts.width_px)} x {_text(facts.height_px)} px"
+    for name, ends, shares in (
+        ("cx_px", facts.cx_px, facts.off_centre_x), ("cy_px", facts.cy_px, facts.off_centre_y),
+    ):
+        off = max(map(abs, shares))
+        if off > 0.5:
+            lines.append(f"{name} = {_text(ends)}: outside the frame of {frame}")
+        elif off > OFF_CENTRE:
+            lines.append(
+                f"{name} = {_text(ends)}: far from the centre of the frame of {frame}; is it that "
+                "of another frame size?"
+            )
+    return lines
+
+
+def _fold_notes(pipeline: Pipeline, facts: CameraFacts) -> list[str]:
+    """Return a line if the radial distortion of the only lens stops growing within the frame."""
+    lens = canonical_distortion(pipeline.fixed.get("distortion", ()))
+    ends = (facts.width_px, facts.height_px, facts.fx_px, facts.fy_px, facts.cx_px, facts.cy_px)
+    if not lens or any(low != high for low, high in ends) or not math.isfinite(fold_radius(lens)):
+        return []
+    width, height, fx, fy, cx, cy = (low for low, _ in ends)
+    radius = fold_radius(lens)
+    k1, k2, _, _, k3, k4, k5, k6 = (*lens, *[0.0] * 8)[:8]
+    s = radius**2
+    denominator = 1 + s * (k4 + s * (k5 + s * k6))
+    if denominator <= POLE:
+        return []
+    fold = radius * (1 + s * (k1 + s * (k2 + s * k3))) / denominator
+    corner = math.hypot(
+        max(cx + 0.5, width - 0.5 - cx) / fx, max(cy + 0.5, height - 0.5 - cy) / fy
+    )
+    if fold >= corner:
+        return []
+    where = f"{fold * fx:.0f} px from the principal point, within the frame"
+    return [
+        f"the lens folds {where} (corner: {corner * fx:.0f} px): poses beyond are not_modelled"
+    ]
+
+
+def _varies(pipeline: Pipeline, name: str) -> bool:
+    axis = pipeline.axis_of(name)
+    return axis is not None and len(axis) > 1
+
+
+# --------------------------------------------------------------------------------------------------
+# What a pipeline's poses are: how they are seen, how far away, and what may surprise of them.
+
+APART_DEG = 5.0
+"""Difference of tilt and viewing angle that is told."""
+
+FARTHER = 1.1
+"""Range over depth that is told: a direction of 25° from the optical axis."""
+
+MIN_SHARE = 0.01
+"""Share of poses that is told."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoseFacts:
+    """Poses of a grid, all of them or a sample.
+
+    Attributes
+    ----------
+    poses, sampled
+        Scene cells of the grid, and how many of them were looked at.
+    tilt_deg, viewing_angle_deg, range_m
+        (n,) of each: angle to the image plane, angle to the line of sight, distance of the centre.
+    depth_m
+        (n,) of the centre, along the optical axis.
+    behind, averted, outside, cut
+        (n,) whether a corner is behind the camera; the marker is seen from behind or edge on; it
+        lies outside the frame; a corner of the black square does. Each without those before.
+    """
+
+    poses: int
+    sampled: int
+    tilt_deg: Floats
+    viewing_angle_deg: Floats
+    range_m: Floats
+    depth_m: Floats
+    behind: Masks
+    averted: Masks
+    outside: Masks
+    cut: Masks
+
+    def line(self) -> str:
+        """Return the poses in one line."""
+        parts = [
+            f"tilt {_extent(self.tilt_deg, '.4g')}°",
+            f"viewing angle {_extent(self.viewing_angle_deg, '.4g')}°",
+            f"{_extent(self.range_m, '.4g')} m away",
+        ]
+        sample = "" if self.sampled == self.poses else f" ({self.sampled:,} poses looked at)"
+        return ", ".join(parts) + sample
+
+    def ranges(self) -> dict[str, list[float]]:
+        """Return the least and the largest tilt, viewing angle and distance."""
+        return {
+            name: [float(numbers.min()), float(numbers.max())]
+            for name, numbers in (
+                ("tilt_deg", self.tilt_deg), ("viewing_angle_deg", self.viewing_angle_deg),
+                ("range_m", self.range_m),
+            )
+        }
+
+    def share(self, chosen: Masks) -> str:
+        """Return the share of the poses that are ``chosen``, in words."""
+        count = int(chosen.sum())
+        if count == self.sampled:
+            return "all poses" if self.sampled == self.poses else f"all {count:,} poses looked at"
+        roughly = "" if self.sampled == self.poses else "about "
+        return f"{roughly}{100 * chosen.mean():.2g} % of the poses"
+
+
+def pose_facts(pipeline: Pipeline) -> PoseFacts:
+    """Return what a pipeline's poses are."""
+    count, values = sampled_scenes(pipeline)
+    scenes = build_scenes(values, count)
+    normal, depth = scenes.rotation[:, 2, 2], scenes.translation[:, 2]
+    behind = np.asarray(~np.isfinite(scenes.outline_px).all(axis=(1, 2)))
+    averted = hidden(scenes) & ~behind
+    outside = np.zeros(count, dtype=bool)
+    seen = np.flatnonzero(~behind & ~averted)
+    outside[seen] = outside_frame(scenes, seen)
+    return PoseFacts(
+        poses=math.prod(len(axis) for axis in scene_axes(pipeline)),
+        sampled=count,
+        tilt_deg=np.degrees(np.arctan2(np.hypot(*scenes.rotation[:, :2, 2].T), -normal)),
+        viewing_angle_deg=np.degrees(viewing_angle(scenes.rotation, scenes.translation)),
+        range_m=np.linalg.norm(scenes.translation, axis=1),
+        depth_m=depth,
+        behind=behind, averted=averted, outside=outside,
+        cut=_cut(scenes) & ~behind & ~averted & ~outside,
+    )
+
+
+def _cut(scenes: Scenes) -> Masks:
+    """Return (n,) whether a corner of the black square is outside the frame."""
+    corners, limit = scenes.corners_px, scenes.frame[:, None, :] - 0.5
+    return np.asarray(((corners < -0.5) | (corners > limit)).any(axis=(1, 2)))
+
+
+def pose_notes(pipeline: Pipeline, facts: PoseFacts) -> list[str]:
+    """Return a line for each property of a pipeline's poses that may surprise."""
+    return [*_visibility_notes(pipeline, facts), *_axis_notes(pipeline, facts),
+            *_unit_notes(pipeline)]
+
+
+def _visibility_notes(pipeline: Pipeline, facts: PoseFacts) -> list[str]:
+    lines = []
+    world = any(name in pipeline.given for name in WORLD)
+    framed = {"frame_x", "frame_y"} & pipeline.given
+    target = target_word(pipeline)
+    where = "outside the frame of the camera" if world else "outside the frame"
+    for chosen, what in (
+        (facts.behind, "have a corner behind the camera: not_visible"),
+        (facts.averted,
+         f"show the {target}'s back or its edge (a viewing angle of 90° or more): not_visible"),
+        (facts.outside, f"are {where}: not_visible"
+         + ("" if world or framed else f"; frame_x and frame_y place a {target} within it")),
+        (facts.cut, "are cut off by the frame's edge"
+         + (f"; where the {target} is too large for the frame, frame_x and frame_y put it in the "
+            "middle" if framed else "")),
+    ):
+        if chosen.mean() > MIN_SHARE:
+            lines.append(f"{facts.share(chosen)} {what}")
+    unseen = facts.behind | facts.averted | facts.outside
+    if unseen.all() and len(lines) > 1:
+        lines.insert(0, f"{facts.share(unseen)} are not_visible:")
+    return lines
+
+
+def _axis_notes(pipeline: Pipeline, facts: PoseFacts) -> list[str]:
+    """Return a line for angles and distances that differ off the optical axis, or do nothing."""
+    given, shown = pipeline.given, ~facts.behind
+    in_camera = not given.intersection(WORLD)
+    tilt, view = facts.tilt_deg[shown], facts.viewing_angle_deg[shown]
+    apart = np.abs(view - tilt).max(initial=0)
+    farther = (facts.range_m[shown] / facts.depth_m[shown]).max(initial=0)
+    angles = "yaw_deg and pitch_deg are" if {"yaw_deg", "pitch_deg"} & given else "tilt_deg is"
+    distance = "side_px" if "side_px" in given else "distance_m"
+    turned = "view_angle_deg" if "view_angle_deg" in given else "tilt_deg"
+    azimuths = "azimuth_deg" in pipeline.distributions or len(pipeline.values_of("azimuth_deg")) > 1
+    tilted = turned in pipeline.distributions or pipeline.any_value(turned, bool)
+    lines = []
+    if in_camera and "view_angle_deg" not in given and apart > APART_DEG:
+        lines.append(
+            f"off the optical axis the viewing angle differs from the tilt by up to {apart:.3g}° "
+            f"(tilt {_extent(tilt, '.3g')}°, viewing angle {_extent(view, '.3g')}°): {angles} to "
+            "the image plane, view_angle_deg is to the line of sight")
+    if in_camera and farther > FARTHER:
+        lines.append(
+            f"{distance} counts along the optical axis: off it, the {target_word(pipeline)}'s "
+            f"centre is up to {farther:.3g} times as far away")
+    if azimuths and not tilted:
+        lines.append(
+            f"azimuth_deg has no effect: it is the direction of a tilt, and {turned} is 0")
+    return lines
+
+
+ROUNDED_RAD = 4e-3
+"""How far an angle in radians that someone rounded may be from a multiple of 15°."""
+
+
+def _unit_notes(pipeline: Pipeline) -> list[str]:
+    """Return a line for each angle whose values look like radians."""
+    lines = []
+    for parameter in PARAMETERS.values():
+        if parameter.section != "pose" or parameter.unit != "degree":
+            continue
+        values = _numbers(pipeline, parameter.name)
+        steps = np.array([value for value in values if value]) / (math.pi / 12)
+        close = np.abs(steps - np.round(steps)) * (math.pi / 12) < ROUNDED_RAD
+        if len(steps) > 0 and (close & (np.abs(steps) > 0.5) & (np.abs(steps) < 24.5)).all():
+            largest = max(values, key=abs)
+            lines.append(
+                f"{parameter.name} = {largest:g}: in degrees; {largest:g} radians would be "
+                f"{math.degrees(largest):.4g}"
+            )
+    return lines
+
+
+def _extent(numbers: Floats, form: str) -> str:
+    low, high = (format(round(float(end), 9) + 0.0, form) for end in (numbers.min(), numbers.max()))
+    return low if low == high else f"{low} to {high}"
+
+
+# --------------------------------------------------------------------------------------------------
+# What may surprise of a pipeline, in a line each: of its camera, and of its poses.
+
+def notes(pipeline: Pipeline) -> list[str]:
+    """Return the lines that `sweep plan` and the start of a run print."""
+    if PHOTOGRAPHS in pipeline.given:
+        return []
+    return [
+        *camera_notes(pipeline), *pose_notes(pipeline, pose_facts(pipeline)),
+        *_corner_square_notes(pipeline),
+    ]
+
+
+def _corner_square_notes(pipeline: Pipeline) -> list[str]:
+    """Return what to set where OpenCV's default threshold loses markers beside squares."""
+    squares = (
+        pipeline.any_value("kind", lambda kind: kind == "aprilgrid")
+        or pipeline.any_value("corner_squares", bool)
+    )
+    by_default = not any(name in pipeline.given for name in ("adaptiveThreshConstant", "detector"))
+    if not (squares and by_default):
+        return []
+    return [(
+        "board: squares touch its markers' corners, and OpenCV's default threshold joins both: it "
+        "finds a third of sharp markers; adaptiveThreshConstant = 60, adaptiveThreshWinSizeMax = "
+        "33 and adaptiveThreshWinSizeStep = 4 find four in five (pipelines/boards/README.md)"
+    )]
+
+
+# --------------------------------------------------------------------------------------------------
+# The optional parts of model and measurement that a pipeline needs, and why.
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """An optional part of the work.
+
+    Attributes
+    ----------
+    name
+        Its name.
+    active, reason
+        Whether it runs, and why.
+    switch
+        Of an effect: the parameter that switches it on.
+    """
+
+    name: str
+    active: bool
+    reason: str
+    switch: str = ""
+
+
+def _effect(pipeline: Pipeline, effect: Effect) -> Part:
+    name, switch = effect.label, effect.switch
+    if switch in pipeline.distributions:
+        return Part(name, True, f"{switch} is drawn: {pipeline.distributions[switch]}", switch)
+    values = [value for value in pipeline.values_of(switch) if effect.is_on(value)]
+    if not values:
+        return Part(name, False, f"{switch} is {effect.off_text}", switch)
+    if is_coded(effect.off):
+        extent = ", ".join(dict.fromkeys(map(label, values)))
+    else:
+        low, high = min(values), max(values)
+        extent = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+    return Part(name, True, f"{switch} is {extent}", switch)
+
+
+def _needs_images(pipeline: Pipeline, solver: str) -> bool:
+    plugin = pipeline.plugin("estimator", solver)
+    return SOLVERS[solver].needs_images if plugin is None else plugin.needs_images
+
+
+def _described(plugin: DeclaredPlugin) -> str:
+    """Return a plug-in in words: kind, name, versions."""
+    versions = ", ".join(f"{name} {version}" for name, version in plugin.versions)
+    threads = f", {plugin.threads} threads" if plugin.threads > 1 else ""
+    return f"{plugin.kind} {plugin.name}" + (f" ({versions})" if versions else "") + threads
+
+
+def _listed(name: str, values: Iterable[str], otherwise: str, form: str = "{}") -> Part:
+    """Return a part that is active if there are values, which are its reason."""
+    text = ", ".join(values)
+    return Part(name, bool(text), form.format(text) if text else otherwise)
+
+
+def parts(pipeline: Pipeline) -> list[Part]:
+    """Return every optional part, active or not."""
+    effects, target = effects_of(pipeline.plugins), target_word(pipeline)
+    on = [
+        effect for effect in effects if effect.switch in pipeline.distributions
+        or pipeline.any_value(effect.switch, effect.is_on)
+    ]
+    calibrated = "calibration" in pipeline.values_of("believed")
+    draws = [*pipeline.distributions]
+    if pipeline.any_value("jitter_px", lambda value: value > 0):
+        draws.append("jitter_px")
+    draws += [each.switch for each in on if each.random and each.switch not in draws]
+    draws += ["the believed calibration"] if calibrated else []
+    lens = pipeline.any_value("distortion", lambda value: len(canonical_distortion(value)) > 0)
+    image = pipeline.any_value("background", lambda value: isinstance(value, str))
+    asked = "full" in pipeline.values_of("window")
+    guarded = pipeline.any_value("guarded", bool)
+    settings = detector_settings(pipeline)
+    whole = sorted({reason for s in settings if (reason := full_frame_reason(s)) is not None})
+    gain = max([1.0, *(value for value in pipeline.values_of("gain"))])
+    if any("uneven light" in effect.worsens for effect in on):
+        gain = math.inf
+    uneven = any(effect.widens == "uneven light" for effect in on)
+    if uneven and any(uneven_light_needs_frame(setting, gain) for setting in settings):
+        whole.append("adaptiveThreshConstant is low for uneven light")
+    if image:
+        whole.append(
+            f"the background is an image: clutter near the {target} may change the detection")
+    if asked:
+        whole.append('window = "full"')
+    noisy = any(effect.switch in draws for effect in effects if effect.widens == "noise")
+    coarse = any("noise" in effect.worsens for effect in on)
+    noise = f", and {NOISE_MARGIN_PX * (1 + coarse)} more for noise" if noisy else ""
+    margins = sorted({margin_px(s) for s in settings if full_frame_reason(s) is None})
+    assumptions = [
+        name for name in PARAMETERS
+        if name.startswith("believed_") and pipeline.fixed.get(name, "varies") is not None
+    ] + (["believed: calibration"] if calibrated else [])
+    return [
+        Part("lens distortion", lens, "distortion is given" if lens else "distortion is empty"),
+        _listed("random draws", draws, "nothing is random",
+                "{}, Sobol' points" if pipeline.sampling == "sobol" else "{}"),
+        Part("background image", image, "background names a file" if image else "a level"),
+        _listed("window", [] if asked or image else map(str, margins), "the full frame",
+                f"{{}} px around the {target}'s pixels{noise}"),
+        _listed("plug-ins", map(_described, pipeline.plugins), "none is named"),
+        Part("full frame", bool(whole), "; ".join(whole) or "no setting needs it"),
+        Part("renderer", True, ", ".join(sorted(set(pipeline.values_of("renderer"))))),
+        *(_effect(pipeline, effect) for effect in effects),
+        Part("solver guard", guarded,
+             "guarded = true" if guarded else "guarded = false: plain cv2.solvePnP"),
+        _listed("accuracy bound", sorted(set(pipeline.values_of("bound")) - {"none"}),
+                "bound is none", "bound is {}"),
+        _listed("pixels kept",
+                (name for name in pipeline.values_of("solver") if _needs_images(pipeline, name)),
+                "no solver needs them", "solver {} needs them"),
+        _listed("wrong assumptions", assumptions,
+                "the estimator knows the true camera and size"),
+    ]

@@ -1,0 +1,347 @@
+"""Pieces of the grid: blocks of scene cells, every parameter's values on them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.experiment.axes import TRIAL, Axis, combinations
+from sweep.experiment.beliefs import CALIBRATED, believed_calibration, calibrated_columns
+from sweep.experiment.draws import (
+    bits,
+    even_uniform,
+    geometry_keys,
+    jointly_drawn,
+    resolve_pose,
+    uniform,
+)
+from sweep.experiment.experiment import Experiment, effects_of, shows_boards
+from sweep.experiment.parameters import PARAMETERS, Stage
+from sweep.experiment.photographs import is_simulated, recorded_poses, shows_photographs
+from sweep.measure.bound import BoundSetting
+from sweep.measure.detectors import AnyDetectorSetting, BoardDetectorSetting, DetectorSetting
+from sweep.measure.estimators import EstimatorSetting, PluggedEstimatorSetting
+from sweep.model.board_kinds import ARRANGING, arranged_board
+from sweep.model.camera import Column, canonical_distortion, map_columns
+from sweep.plugins.declared import DeclaredPlugin, PluginSetting
+from sweep.typing import Floats
+
+# --------------------------------------------------------------------------------------------------
+# Pieces of the grid: blocks of scene cells, and every parameter's values on them.
+
+@dataclass(frozen=True, slots=True, order=True)
+class Block:
+    """A box of scene cells: half-open index ranges along the scene axes, in their order.
+
+    It identifies a piece of the grid in tasks, receipts, logs and errors.
+
+    >>> str(Block((0, 10), (5, 20)))
+    '0-5,10-20'
+    """
+
+    starts: tuple[int, ...]
+    stops: tuple[int, ...]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Cells along each scene axis."""
+        return tuple(b - a for a, b in zip(self.starts, self.stops, strict=True))
+
+    def __len__(self) -> int:
+        return math.prod(self.shape)
+
+    def cell(self, scene: int) -> tuple[int, ...]:
+        """Return the indices of its scene number ``scene`` along each scene axis."""
+        if not self.shape:
+            return ()
+        within = np.unravel_index(scene, self.shape)
+        return tuple(start + int(k) for start, k in zip(self.starts, within, strict=True))
+
+    def __str__(self) -> str:
+        pairs = zip(self.starts, self.stops, strict=True)
+        return ",".join(f"{a}-{b}" for a, b in pairs) or "all"
+
+
+@dataclass(frozen=True, slots=True)
+class Blocks:
+    """The grid of scene cells cut into equal boxes, which are made on demand."""
+
+    lengths: tuple[int, ...]
+    extents: tuple[int, ...]
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Blocks along each scene axis."""
+        return tuple(
+            -(-length // extent)
+            for length, extent in zip(self.lengths, self.extents, strict=True)
+        )
+
+    def __len__(self) -> int:
+        return math.prod(self.counts)
+
+    def __iter__(self) -> Iterator[Block]:
+        return (self[number] for number in range(len(self)))
+
+    def __getitem__(self, number: int) -> Block:
+        """Return a block by its number; the last axis counts fastest."""
+        index = np.unravel_index(number, self.counts) if self.counts else ()
+        starts = tuple(int(i) * e for i, e in zip(index, self.extents, strict=True))
+        stops = tuple(
+            min(start + extent, length)
+            for start, extent, length in zip(starts, self.extents, self.lengths, strict=True)
+        )
+        return Block(starts, stops)
+
+    def number(self, block: Block) -> int:
+        """Return the number of a block."""
+        index = [start // extent
+                 for start, extent in zip(block.starts, self.extents, strict=True)]
+        return int(np.ravel_multi_index(index, self.counts)) if index else 0
+
+
+def scene_axes(pipeline: Experiment) -> tuple[Axis, ...]:
+    """Return the axes that blocks are cut along."""
+    return pipeline.axes_of(Stage.scene)
+
+
+def _column(values: Sequence[Any], indices: NDArray[np.intp]) -> Column:
+    """Return a parameter's values along an axis at indices (N,)."""
+    low, high = int(indices.min()), int(indices.max()) + 1
+    part = values[low:high]
+    if isinstance(part, range):
+        return Column.of(part.start + part.step * (indices - low))
+    if isinstance(part[0], (int, float)) and not any(isinstance(v, (bool, str)) for v in part):
+        return Column.of(np.asarray(part, dtype=np.float64)[indices - low])
+    return Column.of([part[i] for i in (indices - low).tolist()])
+
+
+def scene_values(
+    pipeline: Experiment, indices: Sequence[NDArray[np.intp]]
+) -> dict[str, Column]:
+    """Return the scene parameters' values for scenes at ``indices`` (N,) along each scene axis.
+
+    Random ones are drawn (those of later stages too), the pose is resolved, lenses are
+    canonical, images are absolute paths, and ``shift_u_px``, ``shift_v_px`` are the jitter.
+    """
+    axes, parameters = scene_axes(pipeline), pipeline.parameters
+    count = len(indices[0]) if axes else 1
+    values = {
+        name: Column(value, constant=True)
+        for name, value in pipeline.fixed.items() if parameters[name].stage is Stage.scene
+    }
+    for axis, index in zip(axes, indices, strict=True):
+        for name, along in axis.columns.items():
+            values[name] = _column(along, index)
+    trials = values.pop(TRIAL, Column(0, constant=True)).broadcast(count, np.int64)
+    values["distortion"] = values["distortion"].map(canonical_distortion)
+    if shows_boards(pipeline):
+        values["board"] = map_columns(arranged_board, [values[name] for name in ARRANGING])
+    drawn = pipeline.distributions
+    if "background" not in drawn:
+        values["background"] = values["background"].map(partial(_absolute, pipeline.folder))
+    jitter = np.asarray(values["jitter_px"].values, dtype=np.float64)
+    values["shift_u_px"] = values["shift_v_px"] = Column.of(0.0)
+    noisy = any(
+        effect.switch in drawn or values[effect.switch].differs_from(effect.off)
+        for effect in effects_of(pipeline.plugins) if effect.random
+    )
+    poses = {} if values["photographs"].missing else _photographed(pipeline, values, trials)
+    if shows_photographs(pipeline):
+        return values | poses
+    calibration = believed_calibration(pipeline.fixed, pipeline.values_of("believed"))
+    if not drawn and not noisy and not (jitter > 0).any() and calibration is None:
+        resolve_pose(values)
+        return values | poses
+    keys = geometry_keys(values, drawn, count)
+    draw: Callable[..., Floats] = uniform
+    if pipeline.sampling == "sobol":
+        calibrated = () if calibration is None else calibration.names
+        quantities = jointly_drawn(drawn, [CALIBRATED + name for name in calibrated])
+        draw = partial(even_uniform, quantities=quantities)
+    # What is drawn for a photograph is the same for all its markers; their noise is not.
+    shared = geometry_keys(values | ANY_MARKER, drawn, count) if poses else keys
+    for name, distribution in drawn.items():
+        number = draw(pipeline.seed, name, keys=shared, trials=trials)
+        values[name] = Column.of(distribution.at(number))
+    if (jitter > 0).any():
+        for name in ("shift_u_px", "shift_v_px"):
+            number = draw(pipeline.seed, name, keys=keys, trials=trials)
+            values[name] = Column.of(jitter * (2 * number - 1))
+    if calibration is not None:
+        values |= calibrated_columns(
+            calibration, values, count,
+            lambda quantity: draw(pipeline.seed, quantity, keys=keys, trials=trials),
+        )
+    if noisy:
+        values["noise_key"] = Column.of(bits(pipeline.seed, "noise", keys, trials))
+    resolve_pose(values)
+    return values | poses
+
+
+ANY_MARKER = {
+    name: Column(PARAMETERS[name].default, constant=True) for name in ("marker_id", "size_m")
+}
+"""Values of what differs from marker to marker in a photograph, as if it did not."""
+
+
+def _photographed(
+    pipeline: Experiment, values: Mapping[str, Column], trials: NDArray[np.int64]
+) -> dict[str, Column]:
+    """Return the parameters of scenes at the poses of photographs of numbers ``trials`` (N,)."""
+    names = values["photographs"].listed(len(trials))
+    ids = values["marker_id"].broadcast(len(trials), np.int64)
+    poses = recorded_poses(
+        names, pipeline.folder, trials, ids, simulated=is_simulated(pipeline)
+    )
+    return {name: Column.of(column) for name, column in poses.items()}
+
+
+def _absolute(folder: str, background: Any) -> Any:
+    """Return an image's absolute path; a grey level as it is."""
+    return str((Path(folder) / background).resolve()) if isinstance(background, str) else background
+
+
+def block_indices(block: Block) -> list[NDArray[np.intp]]:
+    """Return the indices (N,) of a block's cells along each scene axis, the last fastest."""
+    grids = np.meshgrid(
+        *(np.arange(a, b) for a, b in zip(block.starts, block.stops, strict=True)), indexing="ij"
+    )
+    return [grid.ravel() for grid in grids]
+
+
+def _settings(pipeline: Experiment, section: str, stage: Stage) -> list[dict[str, Any]]:
+    """Return the values of a section at all combinations of a stage's axes, in their order."""
+    fixed = {
+        p.name: pipeline.fixed.get(p.name, p.default)
+        for p in pipeline.parameters.values() if p.section == section
+    }
+    return [fixed | chosen for chosen in combinations(pipeline.axes_of(stage))]
+
+
+def detector_settings(pipeline: Experiment) -> list[AnyDetectorSetting]:
+    """Return the detector settings of the grid, in the order of its detection axes."""
+    return [
+        DetectorSetting(**{name: values[name] for name in OPENCV_FIELDS})
+        if (plugin := pipeline.plugin("detector", values["detector"])) is None
+        else _plugin_setting(pipeline, plugin, values)
+        for values in _settings(pipeline, "detector", Stage.detection)
+    ]
+
+
+def _plugin_setting(
+    pipeline: Experiment, plugin: DeclaredPlugin, values: Mapping[str, Any]
+) -> PluginSetting:
+    own = tuple((setting.name, values[setting.name]) for setting in plugin.settings)
+    return PluginSetting(plugin, own, pipeline.folder)
+
+
+OPENCV_FIELDS = tuple(field.name for field in dataclasses.fields(DetectorSetting))
+
+
+def board_settings(pipeline: Experiment) -> list[BoardDetectorSetting]:
+    """Return what the detector settings of the grid do with boards, in their order."""
+    names = [field.name for field in dataclasses.fields(BoardDetectorSetting)]
+    return [
+        BoardDetectorSetting(**{name: values[name] for name in names})
+        for values in _settings(pipeline, "detector", Stage.detection)
+    ]
+
+
+def estimators(pipeline: Experiment) -> list[EstimatorSetting]:
+    """Return the estimators of the grid, in the order of its estimation axes."""
+    return [
+        _estimator_setting(pipeline, values)
+        for values in _settings(pipeline, "estimator", Stage.estimation)
+    ]
+
+
+def _estimator_setting(pipeline: Experiment, values: Mapping[str, Any]) -> EstimatorSetting:
+    """Return the setting of an estimator that has these values; a plug-in takes its own, too."""
+    common = {name: values[name] for name in ESTIMATOR_FIELDS}
+    plugin = pipeline.plugin("estimator", values["solver"])
+    if plugin is None:
+        return EstimatorSetting(**common)
+    return PluggedEstimatorSetting(**common, own=_plugin_setting(pipeline, plugin, values))
+
+
+ESTIMATOR_FIELDS = tuple(field.name for field in dataclasses.fields(EstimatorSetting))
+
+
+# --------------------------------------------------------------------------------------------------
+# A key of each image: a function of its scene's own parameters and draws, not of the grid.
+#
+# By it an image that was exported is recognised again: on another grid that has the same scene,
+# or as a single cell. Keys are hashes of the texts of all parameters that change the image,
+# sorted by name, defaults left out, numbers rounded to 12 significant digits, mixed with the seed
+# and the trial.
+
+NOT_IN_IMAGE = {
+    "window", "camera_file", "calibration_sd", "calibration_covariance",
+    *(field.name for field in dataclasses.fields(BoundSetting)),
+}
+"""Parameters of the scene's stage that do not change its image."""
+
+
+def image_keys(pipeline: Experiment, indices: Sequence[NDArray[np.intp]]) -> NDArray[np.uint64]:
+    """Return the keys (N,) of the images of scenes at ``indices`` (N,) along each scene axis."""
+    axes, parameters = scene_axes(pipeline), pipeline.parameters
+    count = len(indices[0]) if axes else 1
+    values = {
+        name: Column(value, constant=True) for name, value in pipeline.fixed.items()
+        if parameters[name].stage is Stage.scene
+    }
+    for axis, index in zip(axes, indices, strict=True):
+        for name, along in axis.columns.items():
+            values[name] = Column.of([along[i] for i in index.tolist()])
+    trials = values.pop(TRIAL, Column(0, constant=True)).broadcast(count, np.int64)
+    texts = [
+        _texts(pipeline, name, values[name])
+        for name in sorted(values.keys() - NOT_IN_IMAGE - pipeline.distributions.keys())
+    ]
+    texts += [
+        Column.of(f"{name}={distribution}")
+        for name, distribution in sorted(pipeline.distributions.items())
+        if parameters[name].stage is Stage.scene
+    ]
+    used = [column for column in texts if column.differs_from("")]
+    joined = map_columns(lambda *each: "|".join(filter(None, each)), used) if used \
+        else Column.of("")
+    keys = joined.map(_hash).broadcast(count, np.uint64)
+    return bits(pipeline.seed, f"image {pipeline.sampling}", keys, trials)
+
+
+def _texts(pipeline: Experiment, name: str, column: Column) -> Column:
+    """Return "name=value" of each value, empty where it is the default."""
+    default = pipeline.parameters[name].default
+
+    @cache
+    def text(value: Any) -> str:
+        if value is None or value == default:
+            return ""
+        if name == "background" and isinstance(value, str):
+            return f"{name}={pipeline.files.get(value) or value}"
+        return f"{name}={_text(value)}"
+
+    return column.map(text)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, tuple):
+        return ",".join(_text(item) for item in value)
+    return str(value) if isinstance(value, (str, bool)) else f"{float(value) + 0.0:.12g}"
+
+
+@cache
+def _hash(text: str) -> np.uint64:
+    """Return 64 bits of a text's BLAKE2b hash."""
+    return np.uint64(int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little"))

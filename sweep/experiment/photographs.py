@@ -1,0 +1,232 @@
+"""The record of photographs: their files, and the pose of each marker in each of them.
+
+A pipeline names it by the parameter ``photographs``. Its scenes are then photographs, one a trial,
+and the poses are those of the record; with ``simulated`` the images are not the photographs.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.errors import PluginError, SweepError
+from sweep.experiment.axes import TRIAL, Axis
+from sweep.experiment.board_rules import board_of
+from sweep.experiment.parameters import PHOTOGRAPHS, SIMULATED
+from sweep.measure.surroundings import BoardMarker
+from sweep.messages import plain
+from sweep.model.board import Board
+from sweep.model.image_file import Part, reference
+from sweep.model.pose import angles_of_rotation
+from sweep.model.renderers import PHOTOGRAPH
+from sweep.plugins.array_file import array_file, read_arrays
+from sweep.typing import Floats, Integers, Masks
+
+if TYPE_CHECKING:
+    from sweep.experiment.experiment import Experiment
+
+SUFFIX = ".photographs.npz"
+"""End of the name of a record's file."""
+
+VERSION = 2
+
+POSE = 6
+
+_ARRAYS = ("paths", "digests", "part", "marker_id", "rotation", "translation", "std",
+           "source", "board")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotographRecord:
+    """P photographs of M markers, and their poses in the camera's frame.
+
+    Attributes
+    ----------
+    paths, digests
+        (P,) the photographs' files, relative to the record's folder, and their SHA-256.
+    part
+        The part of each image that is the photograph.
+    width_px, height_px
+        Of that part.
+    marker_id
+        (M,) IDs, increasing.
+    rotation, translation
+        (P, M, 3, 3) and (P, M, 3) in metres, marker to camera; NaN where a marker is not wholly
+        in the photograph.
+    std
+        (P, M, 6) standard deviations of the poses: rotation vector in rad, position in m, camera
+        frame; NaN where they are not known.
+    source
+        (P, M) :class:`~sweep.measure.flags.TruthSource`.
+    board
+        The document of the board's file as JSON; empty if the markers are single ones.
+    """
+
+    paths: tuple[str, ...]
+    digests: tuple[str, ...]
+    part: Part
+    width_px: int
+    height_px: int
+    marker_id: Integers
+    rotation: Floats
+    translation: Floats
+    std: Floats
+    source: NDArray[np.uint8]
+    board: str = ""
+
+    @property
+    def shown(self) -> Masks:
+        """Which marker is in which photograph, (P, M)."""
+        return np.asarray(np.isfinite(self.translation).all(axis=2))
+
+    def index_of(self, marker_id: NDArray[np.int64]) -> NDArray[np.intp]:
+        """Return the index of each of some markers; -1 for those that the record lacks."""
+        at = np.minimum(np.searchsorted(self.marker_id, marker_id), len(self.marker_id) - 1)
+        return np.where(self.marker_id[at] == marker_id, at, -1)
+
+    def on_board(self, marker_id: NDArray[np.int64]) -> list[BoardMarker | None]:
+        """Return the marker of the board that each of some markers is; None without a board."""
+        if not self.board:
+            return [None] * len(marker_id)
+        board = _board(self.board)
+        numbers = {each: number for number, each in enumerate(board.marker_ids)}
+        return [BoardMarker(board, numbers[each]) for each in marker_id.tolist()]
+
+    def content(self) -> bytes:
+        """Return the content of its file: the same bytes for the same record."""
+        size = np.array([self.width_px, self.height_px])
+        arrays = {name: getattr(self, name) for name in _ARRAYS}
+        return array_file({"version": VERSION, **arrays, "size": size})
+
+
+def read_record(path: str | Path) -> tuple[PhotographRecord, str]:
+    """Return a record and the SHA-256 of its file, which is read once in each process.
+
+    Raises
+    ------
+    PluginError
+        If it cannot be read, or is none; in words that follow "expected".
+    """
+    try:
+        state = Path(path).stat()
+        return _read(str(path), state.st_mtime_ns, state.st_size)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise PluginError(
+            f"a record of photographs that `sweep photos` writes ({plain(reason)})"
+        ) from None
+
+
+@lru_cache(maxsize=8)
+def _read(path: str, modified_ns: int, size: int) -> tuple[PhotographRecord, str]:  # noqa: ARG001
+    arrays, digest = read_arrays(path)
+    try:
+        if int(arrays["version"]) != VERSION:
+            raise ValueError("of another version")
+        record = PhotographRecord(
+            tuple(map(str, arrays["paths"])), tuple(map(str, arrays["digests"])),
+            Part(str(arrays["part"])), int(arrays["size"][0]), int(arrays["size"][1]),
+            arrays["marker_id"], arrays["rotation"], arrays["translation"], arrays["std"],
+            arrays["source"], str(arrays["board"]),
+        )
+    except (KeyError, IndexError, TypeError, AttributeError):
+        raise ValueError("it is none") from None
+    grid = (len(record.paths), len(record.marker_id))
+    shapes = {
+        "digests": (grid[0],), "rotation": (*grid, 3, 3), "translation": (*grid, 3),
+        "std": (*grid, POSE), "source": grid,
+    }
+    for name, shape in shapes.items():
+        if np.shape(arrays[name]) != shape:
+            raise ValueError(f"damaged: {name}")
+    try:
+        record.on_board(record.marker_id)
+    except (SweepError, AttributeError, KeyError, TypeError, ValueError):
+        raise ValueError("damaged: board") from None
+    return record, digest
+
+
+@lru_cache(maxsize=8)
+def _board(document: str) -> Board:
+    """Return the board of a record, the same object for the same document."""
+    return board_of(json.loads(document), "board")
+
+
+def along_photographs(axes: Iterable[Axis]) -> list[bool]:
+    """Return of each axis whether its values are other photographs."""
+    return [axis.name == TRIAL or PHOTOGRAPHS in axis.columns for axis in axes]
+
+
+def shows_photographs(pipeline: Experiment) -> bool:
+    """Return whether the images of a pipeline are photographs, not simulated at their poses."""
+    return PHOTOGRAPHS in pipeline.given and not is_simulated(pipeline)
+
+
+def is_simulated(pipeline: Experiment) -> bool:
+    """Return whether a pipeline's images are simulated at the poses of photographs."""
+    return pipeline.fixed.get(SIMULATED) is True
+
+
+def recorded_poses(
+    names: Sequence[str], folder: str, trials: NDArray[np.int64], marker_id: NDArray[np.int64],
+    *, simulated: bool = False,
+) -> dict[str, Any]:
+    """Return the parameters of N scenes that are photographs, by name.
+
+    They are the image, the pose (NaN where a photograph does not show the marker), ``truth`` (N,)
+    and ``truth_std`` (N, 6) as a record's ``source`` and ``std``, and ``on_board``: the marker of
+    a board that each is, or None.
+
+    Parameters
+    ----------
+    names, folder
+        The records' files (N,), and where relative paths start.
+    trials, marker_id
+        (N,) each: numbers of the photographs, and the markers.
+    simulated
+        Whether the images are simulated, each marker by itself: image and ``on_board`` are then
+        left out, and trials beyond the photographs begin again with the first.
+
+    Raises
+    ------
+    PluginError
+        If a record cannot be read, or has no such photograph or marker.
+    """
+    count = len(trials)
+    images: list[str] = [""] * count
+    rotation, translation = np.full((count, 3, 3), np.nan), np.full((count, 3), np.nan)
+    std, source = np.full((count, POSE), np.nan), np.zeros(count, dtype=np.uint8)
+    on_board: list[BoardMarker | None] = [None] * count
+    for name in dict.fromkeys(names):
+        rows = np.flatnonzero([each == name for each in names])
+        home = Path(folder) / name
+        record, _ = read_record(home)
+        known = record.index_of(marker_id[rows])
+        numbers = trials[rows] % len(record.paths) if simulated else trials[rows]
+        if (known < 0).any() or (numbers >= len(record.paths)).any():
+            raise PluginError(f"{plain(name)}: it lacks photographs or markers of the pipeline")
+        references = [
+            reference(home.parent / path, digest, record.part)
+            for path, digest in zip(record.paths, record.digests, strict=True)
+        ]
+        printed = record.on_board(marker_id[rows])
+        for row, number, each in zip(rows.tolist(), numbers.tolist(), printed, strict=True):
+            images[row], on_board[row] = references[number], each
+        at = numbers, known
+        rotation[rows], translation[rows] = record.rotation[at], record.translation[at]
+        std[rows], source[rows] = record.std[at], record.source[at]
+    with np.errstate(invalid="ignore"):
+        tilt, azimuth, roll = (np.degrees(each) for each in angles_of_rotation(rotation))
+    photograph = {"renderer": PHOTOGRAPH, "background": images, "on_board": on_board}
+    return ({} if simulated else photograph) | {
+        "x_m": translation[:, 0], "y_m": translation[:, 1], "distance_m": translation[:, 2],
+        "resolved_tilt_deg": tilt, "resolved_azimuth_deg": azimuth, "resolved_roll_deg": roll,
+        "truth": source, "truth_std": std,
+    }

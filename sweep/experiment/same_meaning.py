@@ -1,0 +1,202 @@
+"""Values and settings that mean the same, or change nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from sweep.experiment.axes import Axis
+from sweep.experiment.beliefs import STATED
+from sweep.experiment.experiment import Experiment
+from sweep.experiment.grid import OPENCV_FIELDS
+from sweep.experiment.pipeline import Pipeline
+from sweep.measure.detectors import OPENCV
+from sweep.measure.estimators import SOLVERS
+from sweep.model.camera import VIEW_PARAMETERS, canonical_distortion, intrinsics
+
+# --------------------------------------------------------------------------------------------------
+# The settings that a configuration uses: an axis may hold others, which change nothing for it.
+
+PIXEL_SETTINGS = {
+    "photometric": frozenset({"refined_starts", "estimate_blur"}),
+    "photometric_real": frozenset({"refined_starts", "estimate_tone"}),
+}
+"""Solver on pixels -> the settings that it has beside those of all solvers."""
+
+
+def used_settings(pipeline: Experiment, values: Mapping[str, Any]) -> dict[str, Any]:
+    r"""Return those of some axes' values that the detector and the solver among them have.
+
+    ``values`` has an axis' name -> its value, or its label if parameters go together.
+
+    Examples
+    --------
+    >>> pipeline = Pipeline.from_text(
+    ...     "seed = 1\n[pose]\nside_px = 40\n[axes]\n"
+    ...     'solver = ["ippe", "sqpnp"]\nestimate_blur = [false, true]\n')
+    >>> used_settings(pipeline, {"solver": "ippe", "estimate_blur": True})
+    {'solver': 'ippe'}
+    """
+    parameters = dict(_parameters(pipeline, values))
+    unused = {*_unused_by_detector(pipeline, _only(pipeline, "detector", parameters)),
+              *_unused_by_solver(pipeline, _only(pipeline, "solver", parameters))}
+    used = {}
+    for name, value in values.items():
+        axis = pipeline.axis(name)
+        if axis is None or not unused.issuperset(axis.columns):
+            used[name] = value
+    return used
+
+
+def distinct(pipeline: Experiment, combinations: Sequence[Mapping[str, Any]]) -> list[int]:
+    """Return the indices of the combinations of axes' values that no earlier one means, too."""
+    first: dict[tuple[tuple[str, Any], ...], int] = {}
+    for index, values in enumerate(combinations):
+        first.setdefault(tuple(used_settings(pipeline, values).items()), index)
+    return list(first.values())
+
+
+def _parameters(pipeline: Experiment, values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield name and value of each parameter of some axes' values."""
+    for name, value in values.items():
+        axis = pipeline.axis(name)
+        if axis is not None and value in list(axis.values):
+            yield from axis.at(list(axis.values).index(value)).items()
+
+
+def _only(pipeline: Experiment, name: str, parameters: Mapping[str, Any]) -> Any:
+    """Return the value of a parameter; None if the pipeline has several, and none is chosen."""
+    if name in parameters:
+        return parameters[name]
+    values = set(pipeline.values_of(name))
+    return values.pop() if len(values) == 1 else None
+
+
+def _settings_of_plugins(pipeline: Experiment, kind: str, name: str) -> set[str]:
+    """Return the settings of the plug-ins of a kind that the one of this name does not have."""
+    own = pipeline.plugin(kind, name)
+    every = {each.name for plugin in pipeline.plugins if plugin.kind == kind
+             for each in plugin.settings}
+    return every - {each.name for each in own.settings} if own is not None else every
+
+
+def _unused_by_detector(pipeline: Experiment, detector: str | None) -> set[str]:
+    if detector is None:
+        return set()
+    others = _settings_of_plugins(pipeline, "detector", detector)
+    return others if detector == OPENCV else {*others, *OPENCV_FIELDS}
+
+
+def _unused_by_solver(pipeline: Experiment, solver: str | None) -> set[str]:
+    if solver is None:
+        return set()
+    others = _settings_of_plugins(pipeline, "estimator", solver)
+    known = SOLVERS.get(solver)
+    if known is None or not known.guarded:
+        others.add("guarded")
+    every = frozenset().union(*PIXEL_SETTINGS.values())
+    return {*others, *(every - PIXEL_SETTINGS.get(solver, frozenset()))}
+
+
+# --------------------------------------------------------------------------------------------------
+# Values that mean the same in two pipelines: a belief that is not given, and the truth.
+
+FRAME = ("width_px", "height_px")
+
+
+def alike(first: Pipeline, second: Pipeline) -> tuple[Pipeline, Pipeline]:
+    """Return two pipelines with fixed values that are equal where they mean the same.
+
+    A belief that is not given is the truth, if this is a single value in one of the pipelines:
+    cells that both have are its. A camera's values may be given in other words, or by a file.
+    """
+    views = [_view(pipeline) for pipeline in (first, second)]
+    known = next(
+        ((pipeline, view) for pipeline, view in zip((first, second), views, strict=True)
+         if view is not None), None,
+    )
+    truth = {} if known is None else _truth(*known)
+    ignored: dict[str, Any] = {"camera_file": None}
+    if views[0] is not None and views[0] == views[1]:
+        ignored |= {name: first.fixed[name] for name in VIEW_PARAMETERS if name not in FRAME}
+    if not any("calibration" in each.values_of("believed") for each in (first, second)):
+        ignored |= dict.fromkeys(STATED, ())
+    return _with(first, truth, ignored), _with(second, truth, ignored)
+
+
+def wrong_beliefs(pipeline: Pipeline, axis: Axis) -> tuple[bool, ...]:
+    r"""Return for each value of an axis whether it makes the estimator believe what is not true.
+
+    A belief whose truth varies over the grid is right somewhere, and counts as not wrong.
+
+    Examples
+    --------
+    >>> pipeline = Pipeline.from_text(
+    ...     "seed = 1\n[pose]\nside_px = 40\n[axes]\nbelieved_focal_scale = [0.99, 1.0]\n")
+    >>> wrong_beliefs(pipeline, pipeline.axes[0])
+    (True, False)
+    """
+    view = _view(pipeline)
+    truths = _truth(pipeline, view or (None,) * 4) | {"believed": "truth"}
+    return tuple(
+        any(_differs(axis.at(k)[name], truths[name]) for name in axis.columns if name in truths)
+        for k in range(len(axis))
+    )
+
+
+def wrong_configurations(pipeline: Pipeline, axes: Sequence[Axis]) -> list[bool]:
+    """Return for each combination of axes' values, the last fastest, whether a belief is wrong.
+
+    Nowhere, if that is so for all of them: then none is the true one that others differ from.
+    """
+    wrong = [any(flags) for flags in itertools.product(
+        *(wrong_beliefs(pipeline, axis) for axis in axes))]
+    return [False] * len(wrong) if all(wrong) else wrong
+
+
+def _differs(believed: Any, truth: Any) -> bool:
+    """Return whether a belief is known to differ from the truth, beyond rounding."""
+    if believed is None or truth is None:
+        return False
+    if isinstance(believed, tuple):
+        return bool(canonical_distortion(believed) != truth)
+    if isinstance(believed, str):
+        return bool(believed != truth)
+    return not math.isclose(believed, truth, rel_tol=1e-9)
+
+
+def _with(pipeline: Pipeline, truth: dict[str, Any], ignored: dict[str, Any]) -> Pipeline:
+    fixed = {name: ignored.get(name, value) for name, value in pipeline.fixed.items()}
+    for name in ("distortion", "believed_distortion"):
+        if fixed.get(name) is not None:
+            fixed[name] = canonical_distortion(fixed[name])
+    for name, value in truth.items():
+        if name in fixed and fixed[name] is None:
+            fixed[name] = value
+    return dataclasses.replace(pipeline, fixed=fixed)
+
+
+def _view(pipeline: Pipeline) -> tuple[float, ...] | None:
+    """Return fx, fy, cx, cy of a pipeline that has a single camera."""
+    if any(name not in pipeline.fixed for name in VIEW_PARAMETERS):
+        return None
+    numbers = intrinsics(*(pipeline.fixed[name] for name in VIEW_PARAMETERS))
+    return tuple(float(number) for number in numbers)
+
+
+def _truth(pipeline: Pipeline, view: tuple[float | None, ...]) -> dict[str, Any]:
+    """Return the true value of each belief, None where it varies."""
+    fixed = pipeline.fixed
+    names = ("believed_fx_px", "believed_fy_px", "believed_cx_px", "believed_cy_px")
+    lens = fixed.get("distortion")
+    return {
+        **dict(zip(names, view, strict=True)),
+        "believed_focal_scale": 1.0,
+        "believed_distortion": None if lens is None else canonical_distortion(lens),
+        "believed_size_m": fixed.get("size_m"),
+        "believed_blur_px": fixed.get("blur_px"),
+        "believed_noise_grey": fixed.get("noise_grey"),
+    }

@@ -1,0 +1,632 @@
+"""The schema of the dataset: variables, their attributes, and coordinates beside the axes."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sweep.experiment.axes import MAX_DEVIATIONS, Axis, Distribution
+from sweep.experiment.beliefs import CALIBRATED, believed_calibration
+from sweep.experiment.experiment import largest_board, shows_boards
+from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, Parameter, Stage, superseded
+from sweep.measure.flags import (
+    BoundStatus,
+    DetectionStatus,
+    EstimateStatus,
+    Flag,
+    Flipped,
+    TruthSource,
+)
+from sweep.messages import label
+from sweep.model.calibration import VIEW, CalibrationError
+from sweep.model.camera import Column
+from sweep.typing import Floats
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from sweep.experiment.experiment import Experiment
+
+
+# --------------------------------------------------------------------------------------------------
+# Attributes of variables for readers: a short name for axes of charts, and the whole meaning.
+#
+# xarray labels the axes of its charts by ``long_name [units]``: a sentence there would be cut
+# off. So ``long_name`` is the variable's name in words, and ``description`` says what it means.
+
+UNIT = re.compile(r"_(m_s|deg_s|deg|rad|percent|px|mm|um|ms|m|s|e|grey|modules)$")
+"""The unit at the end of a name."""
+
+WORDS = {
+    "true_rvec": "true rotation vector", "true_tvec": "true position", "bound": "accuracy bound",
+    "bound_std": "bound of the standard deviation", "bound_kappa": "bound's bias of the depth",
+    "predicted_std": "predicted standard deviation", "nees": "NEES", "marker_id": "marker ID",
+    "alternative_rotation_error": "alternative rotation",
+    "alternative_reprojection_error": "alternative reprojection",
+    "side_px_per_module": "side per module", "xy": "image axis", "xyz": "axis",
+}
+"""Names whose words are not their own."""
+
+CAPITALS = {"rmse": "RMSE", "hfov": "HFOV", "vfov": "VFOV", "dfov": "DFOV", "sd": "SD"}
+
+
+def short_name(name: str, units: str = "") -> str:
+    """Return a variable's name in words, without its unit if it has one.
+
+    Examples
+    --------
+    >>> short_name("rotation_p95_deg_low", "degree"), short_name("marker_id")
+    ('rotation p95, low end', 'marker ID')
+    >>> short_name("adaptiveThreshWinSizeMin", "px")
+    'adaptiveThreshWinSizeMin'
+    """
+    name, end = next(((name.removesuffix(f"_{end}"), f", {end} end") for end in ("low", "high")
+                      if name.endswith(f"_{end}")), (name, ""))
+    if units not in ("", "1"):
+        name = UNIT.sub("", name)
+    words = (CAPITALS.get(word, word) for word in name.split("_"))
+    return WORDS.get(name, " ".join(words)) + end
+
+
+def with_description(name: str, attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return attributes with the ``long_name`` as ``description``, and a short one in its place.
+
+    Those without a ``long_name``, or with both, stay as they are.
+
+    Examples
+    --------
+    >>> with_description("tilt_deg", {"long_name": "angle to the image plane", "units": "degree"})
+    {'long_name': 'tilt', 'description': 'angle to the image plane', 'units': 'degree'}
+    """
+    if "long_name" not in attributes or "description" in attributes:
+        return dict(attributes)
+    short = short_name(name, str(attributes.get("units", "")))
+    return {"long_name": short, "description": attributes["long_name"],
+            **{key: value for key, value in attributes.items() if key != "long_name"}}
+
+
+def with_descriptions(dataset: xr.Dataset) -> xr.Dataset:
+    """Return a dataset whose variables and coordinates have short names; it shares the values."""
+    described = dataset.copy(deep=False)
+    for name, variable in described.variables.items():
+        variable.attrs = with_description(str(name), variable.attrs)
+    return described
+
+
+# --------------------------------------------------------------------------------------------------
+# Coordinates of the dataset beside its axes: what is fixed, and what is drawn for each scene.
+
+ALWAYS_GIVEN = ("marker", "pose")
+"""Sections whose fixed parameters are coordinates also where the file does not give them."""
+
+CALIBRATION_SCALE_PX = 1e4
+"""Size of a camera's numbers in pixels by which rounding of a calibration's is measured."""
+
+
+FIXED = "fixed"
+"""Attribute of the coordinates of fixed parameters; tables of analyses leave them out."""
+
+
+@dataclass(frozen=True, slots=True)
+class FixedValue:
+    """A parameter with one value on the whole grid: a coordinate without dimensions.
+
+    Attributes
+    ----------
+    name
+        The parameter's.
+    value
+        A number, a truth value, or a text (a list of numbers as "0.1, 0").
+    attributes
+        Meaning as ``long_name``, :data:`FIXED`, and ``units`` if it has a unit.
+    """
+
+    name: str
+    value: float | bool | str
+    attributes: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnQuantity:
+    """A number of each scene that is drawn, or follows from one that is.
+
+    Attributes
+    ----------
+    name
+        Of the coordinate: the parameter's name.
+    column
+        Its name among the scene's values (:func:`sweep.experiment.grid.scene_values`).
+    meaning, unit
+        What it means, and its ``units``.
+    scale
+        The largest numbers that it is added up from, by which rounding is measured; 0 if it is
+        a product.
+    """
+
+    name: str
+    column: str
+    meaning: str
+    unit: str
+    scale: float
+
+    def of(self, values: Mapping[str, Column], count: int) -> Floats:
+        """Return its values (count,) among those of scenes."""
+        return values[self.column].broadcast(count)
+
+
+def fixed_values(pipeline: Experiment) -> list[FixedValue]:
+    """Return the fixed parameters that are coordinates, in the order of their declaration.
+
+    They are those of marker and pose that have a value (unless the pose is given otherwise), and
+    all that the pipeline gives.
+    """
+    without = superseded(pipeline.given)
+    return [
+        FixedValue(parameter.name, value, _attributes(parameter))
+        for parameter in pipeline.parameters.values()
+        if parameter.section in ALWAYS_GIVEN or parameter.name in pipeline.given
+        if parameter.name not in without
+        if (value := _scalar(pipeline.fixed.get(parameter.name))) is not None
+    ]
+
+
+def _scalar(value: Any) -> float | bool | str | None:
+    return label(value) if isinstance(value, tuple) else value
+
+
+def _attributes(parameter: Parameter) -> dict[str, str]:
+    unit = {"units": parameter.unit} if parameter.unit else {}
+    return {"long_name": parameter.declaration.meaning, FIXED: "on the whole grid", **unit}
+
+
+def drawn_quantities(pipeline: Experiment) -> list[DrawnQuantity]:
+    """Return what is drawn for each scene of a pipeline, except the noise of pixels.
+
+    Examples
+    --------
+    >>> from sweep.experiment.pipeline import Pipeline
+    >>> pipeline = Pipeline.from_dict({"pose": {"side_px": {"uniform": [20, 40]}}})
+    >>> [quantity.name for quantity in drawn_quantities(pipeline)]
+    ['side_px', 'distance_m']
+    """
+    quantities = [
+        _of_parameter(pipeline.parameters[name], _scale(distribution))
+        for name, distribution in pipeline.distributions.items()
+    ]
+    if "side_px" in pipeline.distributions:
+        quantities.append(_of_parameter(PARAMETERS["distance_m"], 0.0))
+    jitter = [float(value) for value in pipeline.values_of("jitter_px")]
+    if any(jitter):
+        quantities += [
+            DrawnQuantity(
+                f"jitter_{axis}_px", f"shift_{axis}_px",
+                f"shift of the centre's undistorted projection along {axis}", "px", max(jitter),
+            )
+            for axis in ("u", "v")
+        ]
+    error = believed_calibration(pipeline.fixed, pipeline.values_of("believed"))
+    if error is not None:
+        quantities += [_calibrated(error, name) for name in error.names]
+    return quantities
+
+
+def _calibrated(error: CalibrationError, name: str) -> DrawnQuantity:
+    """Return a number of the camera that a calibration gives."""
+    unit = "px" if name in VIEW else ""
+    return DrawnQuantity(
+        f"believed_{name}", CALIBRATED + name, f"{name.removesuffix('_px')} as a calibration "
+        "gives it, for estimators that believe it", unit,
+        (CALIBRATION_SCALE_PX if unit else 1.0) + MAX_DEVIATIONS * error.sd(name),
+    )
+
+
+def _of_parameter(parameter: Parameter, scale: float) -> DrawnQuantity:
+    return DrawnQuantity(
+        parameter.name, parameter.name, parameter.declaration.meaning, parameter.unit, scale
+    )
+
+
+def _scale(distribution: Distribution) -> float:
+    """Return the largest number that a draw is added up from."""
+    a, b = abs(distribution.a), abs(distribution.b)
+    return float(np.maximum(a, b * (MAX_DEVIATIONS if distribution.kind == "normal" else 1.0)))
+
+
+# --------------------------------------------------------------------------------------------------
+# What the dataset knows of one variable, and the dimensions that are no axes.
+
+XYZ = ("x", "y", "z")
+CORNERS = ("top_left", "top_right", "bottom_right", "bottom_left")
+
+POSE_PARAMETERS = tuple(f"{part}_{axis}" for part in ("rotation", "translation") for axis in XYZ)
+
+LABELS: dict[str, tuple[str, ...]] = {
+    "corner": CORNERS, "xy": ("x", "y"), "xyz": XYZ, "pose_parameter": POSE_PARAMETERS,
+    "marker": (), "chessboard_corner": (),
+}
+"""Coordinates of the dimensions that are no axes; of boards' they are numbers, from 0 on."""
+
+
+def cf_attributes(
+    meaning: str, units: str = "", flags: type[IntEnum] | None = None
+) -> dict[str, Any]:
+    """Return the attributes of a variable, after the CF conventions.
+
+    `sweep.experiment.schema.with_description` gives it a short ``long_name`` for readers.
+    """
+    attributes: dict[str, Any] = {"long_name": meaning}
+    if units:
+        attributes["units"] = units
+    if flags is not None:
+        attributes["flag_values"] = [int(flag) for flag in flags]
+        attributes["flag_meanings"] = " ".join(flag.name for flag in flags)
+    return attributes
+
+
+@dataclass(frozen=True, slots=True)
+class FlagRule:
+    """Where a flag variable demands or forbids the numbers of another variable.
+
+    Attributes
+    ----------
+    flag
+        Name of the flag variable. "Present" below means that its flag says that the numbers of
+        its stage exist.
+    number
+        "always": a number wherever the flag is present, NaN elsewhere; "only": NaN wherever the
+        flag is not present; "unless_lost": a number unless every flag of the scene is in
+        :data:`LOST`; "if_seen": a number unless every flag of the scene is in :data:`UNSEEN`.
+    """
+
+    flag: str
+    number: Literal["always", "only", "unless_lost", "if_seen"]
+
+
+@dataclass(frozen=True, slots=True)
+class Tolerance:
+    """How far a recomputation on another processor may lie from a stored value.
+
+    On a processor with the same features every bit agrees. The limits were measured on 9,000
+    scenes with AVX-512, AVX2 and all of AVX switched off in turn.
+
+    Attributes
+    ----------
+    kind
+        "equal": no difference; "absolute": of each number; "relative": of each number;
+        "length": of each component, relative to the stored vector's norm; "distance": norm of
+        the difference, relative to the marker's true distance; "rotation": angle in radians
+        between the two rotation vectors' rotations.
+    limit
+        The largest difference, in the variable's unit where ``kind`` is "absolute".
+    """
+
+    kind: Literal["equal", "absolute", "relative", "length", "distance", "rotation"]
+    limit: float = 0.0
+
+
+LOST = (
+    DetectionStatus.failed, DetectionStatus.crashed, DetectionStatus.not_needed,
+    DetectionStatus.not_in_photograph,
+)
+"""Detections of a scene for which not even the truth may be known."""
+
+UNSEEN = (*LOST, DetectionStatus.not_visible)
+"""Detections of a scene in which a corner may be behind the camera: the marker has no image."""
+
+TRUTH_RTOL = 1e-12
+"""Of the true pose (relative to its length) and of the marker's area."""
+
+BOUND_RTOL = 1e-6
+"""Of the accuracy bound's numbers: they pass through the inverse of a 6 x 6 matrix."""
+
+CORNER_ATOL_PX = 1e-2
+"""Of corners and of the reprojection error."""
+
+ROTATION_ATOL_RAD = 1e-4
+"""Also, in degrees, of the angles that follow from the rotation: they change by no more."""
+
+TRANSLATION_RTOL = 1e-4
+"""Relative to the marker's distance."""
+
+
+@dataclass(frozen=True, slots=True)
+class Variable:
+    """One variable of the dataset: the record from which everything else about it follows.
+
+    Attributes
+    ----------
+    name
+        Its name in the dataset.
+    stage
+        The stage that makes it. It has the axes of this stage and of those before.
+    dtype
+        NumPy's type string, as stored.
+    meaning, units
+        What it means (``description``), and its ``units``.
+    inner
+        Names of its dimensions beside the axes: keys of :data:`LABELS`.
+    flags
+        The flags that it takes its values from; None for a number.
+    present_when
+        The flag variable that says where its number exists; None where none does.
+    tolerance
+        How far another processor may lie from its stored value; None if it is not compared there.
+        No scene may lie outside the tolerance of a scene's variable, few may outside the others'.
+    drawn_as
+        Name among the scene's values of the drawn quantity that it holds; such a variable is a
+        coordinate of the dataset. Empty for what is computed.
+    lengths
+        Length of each inner dimension without labels, which differs from pipeline to pipeline.
+
+    Examples
+    --------
+    >>> from sweep.experiment.schema import VARIABLES
+    >>> variable = VARIABLES["corner_error_px"]
+    >>> variable.stage.name, variable.inner_shape, variable.units
+    ('detection', (4, 2), 'px')
+    """
+
+    name: str
+    stage: Stage
+    dtype: str
+    meaning: str
+    units: str = ""
+    inner: tuple[str, ...] = ()
+    flags: type[Flag] | None = None
+    present_when: FlagRule | None = None
+    tolerance: Tolerance | None = None
+    drawn_as: str = ""
+    lengths: tuple[tuple[str, int], ...] = ()
+
+    @property
+    def fill(self) -> float | int:
+        """The value of cells that were not computed: NaN, or the flag ``not_run``."""
+        return 0 if self.flags is not None else float("nan")
+
+    @property
+    def not_needed(self) -> float | int:
+        """The value of cells that were not needed: NaN, or the flag ``not_needed``."""
+        if self.flags is None:
+            return self.fill
+        return int(getattr(self.flags, "not_needed", self.fill))
+
+    @property
+    def inner_shape(self) -> tuple[int, ...]:
+        """Lengths of the inner dimensions."""
+        lengths = dict(self.lengths)
+        return tuple(lengths.get(name, len(LABELS[name])) for name in self.inner)
+
+    def fitted(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return another store's values (..., inner) cut or filled to this one's inner lengths.
+
+        A store's boards have as many markers as the largest of its grid: what is cut or filled
+        lies beyond the boards of the cells that two grids share.
+        """
+        lengths = self.inner_shape
+        cut: list[Any] = [..., *(slice(length) for length in lengths)]
+        kept: NDArray[Any] = values[tuple(cut)]
+        outer = kept.ndim - len(lengths)
+        missing = [a - b for a, b in zip(lengths, kept.shape[outer:], strict=True)]
+        if not any(missing):
+            return kept
+        beyond = DetectionStatus.not_on_board if self.flags is DetectionStatus else math.nan
+        widths = [(0, 0)] * outer + [(0, each) for each in missing]
+        return np.pad(kept, widths, constant_values=beyond)
+
+    def configuration_axes(self, pipeline: Experiment) -> tuple[Axis, ...]:
+        """Return the axes of detection and estimation that it has, stage by stage.
+
+        They span its configurations, the last axis fastest; a scene's variable has none.
+        """
+        stages = [stage for stage in Stage if Stage.scene < stage <= self.stage]
+        return tuple(axis for stage in stages for axis in pipeline.axes_of(stage))
+
+    def configurations(self, pipeline: Experiment) -> int:
+        """Return the number of its configurations: one for a scene's variable."""
+        return math.prod(len(axis) for axis in self.configuration_axes(pipeline))
+
+    def axes(self, pipeline: Experiment) -> tuple[Axis, ...]:
+        """Return its axes in the pipeline's order: those of its stage and of the stages before."""
+        return pipeline.axes_of(*(stage for stage in Stage if stage <= self.stage))
+
+    def dimensions(self, pipeline: Experiment) -> tuple[str, ...]:
+        """Return the names of its dimensions: its axes, then ``inner``."""
+        return tuple(axis.name for axis in self.axes(pipeline)) + self.inner
+
+    def shape(self, pipeline: Experiment) -> tuple[int, ...]:
+        """Return the lengths of its dimensions."""
+        return tuple(len(axis) for axis in self.axes(pipeline)) + self.inner_shape
+
+    def attributes(self) -> dict[str, Any]:
+        """Return its attributes, after the CF conventions."""
+        return cf_attributes(self.meaning, self.units, self.flags)
+
+
+# --------------------------------------------------------------------------------------------------
+# The schema of the dataset: one record a variable, from which everything else about it follows.
+#
+# The evaluation fills it, the store is laid out by it, verification checks flags and tolerances
+# by it, analysis and report read by it.
+
+_S, _D, _E = Stage.scene, Stage.detection, Stage.estimation
+_TRUTH = FlagRule("detection", "unless_lost")
+_BOUND, _MAYBE_BOUND = FlagRule("bound", "always"), FlagRule("bound", "only")
+_DETECTED = FlagRule("detection", "always")
+_POSE, _MAYBE_POSE = FlagRule("estimate", "always"), FlagRule("estimate", "only")
+_EQUAL = Tolerance("equal")
+_ANGLE = Tolerance("absolute", math.degrees(ROTATION_ATOL_RAD))
+
+SCHEMA: tuple[Variable, ...] = (
+    Variable("true_rvec", _S, "f8", "true rotation vector, marker to camera", "radian", ("xyz",),
+             present_when=_TRUTH, tolerance=Tolerance("length", TRUTH_RTOL)),
+    Variable("true_tvec_m", _S, "f8", "true position of the marker's centre", "m", ("xyz",),
+             present_when=_TRUTH, tolerance=Tolerance("length", TRUTH_RTOL)),
+    Variable("marker_area_px", _S, "f8", "area of the projected black square", "px2",
+             present_when=FlagRule("detection", "if_seen"),
+             tolerance=Tolerance("relative", TRUTH_RTOL)),
+    Variable("viewing_angle_deg", _S, "f8",
+             "angle between the marker's normal and the line of sight to its centre", "degree",
+             present_when=_TRUTH, tolerance=Tolerance("absolute", 180 * TRUTH_RTOL)),
+    Variable("bound", _S, "u1", "what became of the accuracy bound", flags=BoundStatus,
+             tolerance=_EQUAL),
+    Variable("bound_std", _S, "f4",
+             "least standard deviation of an unbiased estimate, camera frame (Cramér-Rao)",
+             "radian, m", ("pose_parameter",),
+             present_when=_BOUND, tolerance=Tolerance("relative", BOUND_RTOL)),
+    Variable("bound_kappa", _S, "f4",
+             "bias of the depth from the bound's own spread of the tilt, in standard deviations",
+             present_when=_BOUND, tolerance=Tolerance("relative", BOUND_RTOL)),
+    Variable("mirror_distance", _S, "f4",
+             "standard deviations between the pose and its mirrored minimum; NaN: there is none",
+             present_when=_MAYBE_BOUND, tolerance=Tolerance("relative", BOUND_RTOL)),
+    Variable("detection", _D, "u1", "what became of the marker", flags=DetectionStatus,
+             tolerance=_EQUAL),
+    Variable("corner_error_px", _D, "f4", "found corner minus true corner", "px",
+             ("corner", "xy"),
+             present_when=_DETECTED, tolerance=Tolerance("absolute", CORNER_ATOL_PX)),
+    Variable("estimate", _E, "u1", "what became of the pose", flags=EstimateStatus,
+             tolerance=_EQUAL),
+    Variable("translation_error_m", _E, "f4", "estimated minus true, camera frame", "m",
+             ("xyz",),
+             present_when=_POSE, tolerance=Tolerance("distance", TRANSLATION_RTOL)),
+    Variable("rotation_error_rad", _E, "f4",
+             "rotation vector of estimated times true transposed, camera frame", "radian",
+             ("xyz",),
+             present_when=_POSE, tolerance=Tolerance("rotation", ROTATION_ATOL_RAD)),
+    Variable("rotation_error_deg", _E, "f4", "angle of the rotation error", "degree",
+             present_when=_POSE, tolerance=_ANGLE),
+    Variable("normal_error_deg", _E, "f4", "angle between true and estimated normal", "degree",
+             present_when=_POSE, tolerance=_ANGLE),
+    Variable("reprojection_error_px", _E, "f4", "RMS over the corners", "px",
+             present_when=_POSE, tolerance=Tolerance("absolute", CORNER_ATOL_PX)),
+    Variable("alternative_rotation_error_deg", _E, "f4",
+             "angle of the rotation error of the other planar solution", "degree",
+             present_when=_MAYBE_POSE),
+    Variable("alternative_reprojection_error_px", _E, "f4",
+             "RMS over the corners of the other planar solution", "px",
+             present_when=_MAYBE_POSE),
+    Variable("predicted_std", _E, "f4",
+             "standard deviation of the error that the estimator expects, camera frame",
+             "radian, m", ("pose_parameter",), present_when=_MAYBE_POSE),
+    Variable("nees", _E, "f4",
+             "squared error in units of the expected covariance; its mean is 6 where that is true",
+             present_when=_MAYBE_POSE),
+    Variable("residual_variance_ratio", _E, "f4",
+             "variance of the pixels' residuals over that of noise and rounding",
+             present_when=_MAYBE_POSE),
+    Variable("misfit_px", _E, "f4",
+             "standard deviation of shifts of the marker's parts beside the fitted pose that the "
+             "residuals of photometric_real show", "px", present_when=_MAYBE_POSE),
+    Variable("flipped", _E, "u1", "whether the solution is nearer to the mirror of the truth",
+             flags=Flipped),
+)
+"""Every variable, in the order in which the stages make them."""
+
+_BOARD_MARKER = FlagRule("marker_detection", "always")
+
+BOARD_SCHEMA: tuple[Variable, ...] = (
+    Variable("board_marker_id", _S, "f4", "ID of each marker of the board, in the board's order",
+             inner=("marker",)),
+    Variable("marker_detection", _D, "u1", "what became of each marker of the board",
+             inner=("marker",), flags=DetectionStatus, tolerance=_EQUAL),
+    Variable("marker_corner_error_px", _D, "f4", "found corner minus true corner, of each marker",
+             "px", ("marker", "corner", "xy"), present_when=_BOARD_MARKER,
+             tolerance=Tolerance("absolute", CORNER_ATOL_PX)),
+    Variable("chessboard_corner_error_px", _D, "f4",
+             "interpolated corner of the chessboard minus true corner; NaN: not found", "px",
+             ("chessboard_corner", "xy"), present_when=FlagRule("detection", "only"),
+             tolerance=Tolerance("absolute", CORNER_ATOL_PX)),
+    Variable("point_count", _E, "f4", "points that the pose was estimated from",
+             present_when=_POSE),
+)
+"""The variables that stores of boards have besides; those of :data:`NOT_OF_BOARDS` they lack."""
+
+NOT_OF_BOARDS = frozenset({"corner_error_px"})
+
+VARIABLES: dict[str, Variable] = {
+    variable.name: variable for variable in (*SCHEMA, *BOARD_SCHEMA)
+}
+"""Every variable by its name, those of boards included."""
+
+
+PHOTOGRAPH_SCHEMA: tuple[Variable, ...] = (
+    Variable("side_px", _S, "f8", "side of the black square if it were parallel to the image plane",
+             "px", present_when=_TRUTH, tolerance=Tolerance("relative", TRUTH_RTOL),
+             drawn_as="side_px"),
+    Variable("distance_m", _S, "f8", "depth of the marker's centre along the optical axis", "m",
+             present_when=_TRUTH, tolerance=Tolerance("relative", TRUTH_RTOL),
+             drawn_as="distance_m"),
+    Variable("tilt_deg", _S, "f8", "angle between the marker's plane and the image plane", "degree",
+             present_when=_TRUTH, tolerance=Tolerance("absolute", 180 * TRUTH_RTOL),
+             drawn_as="tilt_deg"),
+    Variable("image_x_px", _S, "f8", "image of the marker's centre, x", "px", present_when=_TRUTH,
+             tolerance=Tolerance("absolute", 1e-6), drawn_as="image_x_px"),
+    Variable("image_y_px", _S, "f8", "image of the marker's centre, y", "px", present_when=_TRUTH,
+             tolerance=Tolerance("absolute", 1e-6), drawn_as="image_y_px"),
+    Variable("truth", _S, "u1", "origin of the true pose", flags=TruthSource, tolerance=_EQUAL),
+    Variable("truth_std", _S, "f4",
+             "standard deviation of the true pose, as far as it is known; camera frame",
+             "radian, m", ("pose_parameter",),
+             tolerance=Tolerance("relative", 1e-6)),
+)
+"""The variables that stores of photographs have besides."""
+
+
+def drawn_variables(pipeline: Experiment) -> tuple[Variable, ...]:
+    """Return the variables that hold what is drawn for each scene of a pipeline."""
+    return tuple(
+        Variable(
+            drawn.name, Stage.scene, "f8", drawn.meaning, drawn.unit, present_when=_TRUTH,
+            tolerance=(
+                Tolerance("absolute", TRUTH_RTOL * drawn.scale) if drawn.scale
+                else Tolerance("relative", TRUTH_RTOL)
+            ),
+            drawn_as=drawn.column,
+        )
+        for drawn in drawn_quantities(pipeline)
+    )
+
+
+def variables_of(pipeline: Experiment) -> tuple[Variable, ...]:
+    """Return the variables that a pipeline's store has: the schema's, then draws.
+
+    >>> from sweep.experiment.pipeline import Pipeline
+    >>> pipeline = Pipeline.from_dict({"pose": {"distance_m": 1, "jitter_px": 0.5}})
+    >>> [variable.name for variable in variables_of(pipeline)[-2:]]
+    ['jitter_u_px', 'jitter_v_px']
+    """
+    drawn = drawn_variables(pipeline)
+    photographed = PHOTOGRAPH_SCHEMA if PHOTOGRAPHS in pipeline.given else ()
+    common = SCHEMA
+    if shows_boards(pipeline):
+        common = tuple(each for each in common if each.name not in NOT_OF_BOARDS)
+        common += _board_variables(pipeline)
+    return common + drawn + photographed
+
+
+def _board_variables(pipeline: Experiment) -> tuple[Variable, ...]:
+    """Return the variables of a pipeline's boards, as long as its largest board."""
+    markers, corners = largest_board(pipeline)
+    lengths = (("marker", markers), ("chessboard_corner", corners))
+    return tuple(
+        dataclasses.replace(variable, lengths=lengths) for variable in BOARD_SCHEMA
+        if corners or "chessboard_corner" not in variable.inner
+    )
+
+
+def bytes_per_block(pipeline: Experiment, scenes: int) -> int:
+    """Return the uncompressed bytes that ``scenes`` scene cells take in the store."""
+    return scenes * sum(
+        variable.configurations(pipeline)
+        * math.prod(variable.inner_shape)
+        * np.dtype(variable.dtype).itemsize
+        for variable in variables_of(pipeline)
+    )

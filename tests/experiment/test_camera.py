@@ -1,0 +1,286 @@
+"""A camera as users know it: fields of view, pixel sizes, square pixels, and no silent trap."""
+
+import itertools
+import math
+import tomllib
+
+import numpy as np
+import pytest
+
+import sweep
+from support.here import calls_here
+from support.lengths import first_of
+from sweep.cli import main
+from sweep.errors import PipelineError
+from sweep.execution.runner import execute
+from sweep.experiment.cell_selection import cell
+from sweep.experiment.facts import camera_facts, camera_notes
+from sweep.experiment.grid import scene_axes, scene_values
+from sweep.experiment.pipeline import Pipeline
+from sweep.model.camera import VIEW_PARAMETERS, intrinsics
+
+
+def pipeline(camera=None, settings=(), **sections):
+    return Pipeline.from_dict(
+        {"camera": camera or {}, "pose": {"distance_m": 1.0}, **sections}, settings
+    )
+
+
+def view(camera):
+    fixed = pipeline(camera).fixed
+    return [float(number) for number in intrinsics(*(fixed[name] for name in VIEW_PARAMETERS))]
+
+
+# 1. Ways to give a camera.
+
+@pytest.mark.parametrize("width", [640, 1280, 1921])
+@pytest.mark.parametrize("fov", [1e-3, 30.0, 60.0, 90.0, 179.0])
+def test_a_field_of_view_reaches_from_edge_to_edge_of_the_frame(fov, width):
+    fx, fy, cx, cy = view({"width_px": width, "height_px": 700, "hfov_deg": fov})
+    assert fx == fy == pytest.approx(width / 2 / math.tan(math.radians(fov / 2)), rel=1e-14)
+    # The rays through the outer edges of the first and the last pixel.
+    left, right = math.atan((-0.5 - cx) / fx), math.atan((width - 0.5 - cx) / fx)
+    assert math.degrees(right - left) == pytest.approx(fov, rel=1e-10)
+    fx, fy, cx, cy = view({"width_px": 700, "height_px": width, "vfov_deg": fov})
+    top, bottom = math.atan((-0.5 - cy) / fy), math.atan((width - 0.5 - cy) / fy)
+    assert fx == fy
+    assert math.degrees(bottom - top) == pytest.approx(fov, rel=1e-10)
+
+
+def test_a_diagonal_field_of_view_reaches_from_corner_to_corner():
+    # A webcam of 78 degrees at 1920 x 1080: 1360 px.
+    fx, fy, cx, cy = view({"width_px": 1920, "height_px": 1080, "dfov_deg": 78.0})
+    assert fx == fy == pytest.approx(math.hypot(960, 540) / math.tan(math.radians(39)), rel=1e-14)
+    rays = [np.array([(u - cx) / fx, (v - cy) / fy, 1]) for u, v in (
+        (-0.5, -0.5), (1919.5, 1079.5))]
+    cosine = rays[0] @ rays[1] / (np.linalg.norm(rays[0]) * np.linalg.norm(rays[1]))
+    assert math.degrees(math.acos(cosine)) == pytest.approx(78, rel=1e-12)
+
+
+def test_a_pixel_size_gives_the_focal_length_in_pixels():
+    # 8 mm before pixels of 3.45 um.
+    assert view({"pixel_size_um": 3.45, "focal_length_mm": 8.0})[:2] == pytest.approx(
+        [8.0 / 3.45e-3] * 2, rel=1e-15
+    )
+
+
+@pytest.mark.parametrize(("camera", "focal"), [
+    ({"width_px": 1280, "height_px": 720}, 4.0 / 4.8 * 1280),
+    ({"width_px": 100, "height_px": 100}, 4.0 / 4.8 * 100),
+    ({"height_px": 400}, 4.0 / 4.8 * 640),
+    ({"sensor_width_mm": 6.4}, 4.0 / 6.4 * 640),
+    ({"sensor_height_mm": 4.8}, 4.0 / 4.8 * 480),
+    ({"sensor_height_mm": 2.7, "width_px": 1280, "height_px": 720}, 4.0 / 2.7 * 720),
+    ({"focal_length_mm": 8.0, "width_px": 1920, "height_px": 1200}, 8.0 / 4.8 * 1920),
+    ({"fx_px": 700}, 700.0),
+])
+def test_pixels_are_square_unless_both_sides_are_given(camera, focal):
+    fx, fy, _, _ = view(camera)
+    assert [fx, fy] == pytest.approx([focal] * 2, rel=1e-15)
+    assert camera_facts(pipeline(camera)).square
+    assert not any("square" in line for line in camera_notes(pipeline(camera)))
+
+
+@pytest.mark.parametrize("camera", [
+    {"sensor_width_mm": 4.8, "sensor_height_mm": 3.6, "width_px": 1280, "height_px": 720},
+    {"fx_px": 500, "fy_px": 600},
+])
+def test_pixels_that_are_not_square_are_said_to_be(camera):
+    fx, fy, _, _ = view(camera)
+    facts = camera_facts(pipeline(camera))
+    assert not facts.square
+    assert f"pixels are not square: fy/fx = {fy / fx:.4g}" in facts.line()
+    assert camera_notes(pipeline(camera))[0].startswith(
+        f"pixels are not square: fy/fx = {fy / fx:.4g};"
+    )
+
+
+@pytest.mark.parametrize("focal_length", first_of([3.6, 12.5, 4.0, 6.0], 2))
+def test_frames_of_the_default_shape_keep_the_bits_that_the_default_sensor_gave(focal_length):
+    rng = np.random.default_rng(3)
+    for k in rng.integers(1, 20_000, 30).tolist():
+        camera = {"width_px": 4 * k, "height_px": 3 * k, "focal_length_mm": focal_length}
+        both = {"sensor_width_mm": 4.8, "sensor_height_mm": 3.6}
+        expected = [focal_length / 4.8 * (4 * k), focal_length / 3.6 * (3 * k)]
+        sides = [{name: both[name] for name in given} for given in ((), both, ["sensor_width_mm"])]
+        for given in sides:
+            assert view(camera | given)[:2] == expected
+            assert pipeline(camera | given).fixed == pipeline(camera | both).fixed
+
+
+def test_axes_of_the_camera_give_what_each_value_gives_on_its_own():
+    axes = {
+        "hfov_deg": [40.0, 60.0], "width_px": [640, 1280], "height_px": [480, 720],
+        "side_px": [20.0, 50.0],
+    }
+    grid = Pipeline.from_dict({"marker": {"size_m": 0.04}, "axes": axes})
+    lengths = [len(axis) for axis in scene_axes(grid)]
+    values = scene_values(grid, [index.ravel() for index in np.indices(lengths)])
+    columns = [values[name].values for name in VIEW_PARAMETERS]
+    fx, fy, _, _ = intrinsics(*columns)
+    for k, chosen in enumerate(itertools.product(*axes.values())):
+        camera = dict(zip(("hfov_deg", "width_px", "height_px"), chosen[:3], strict=True))
+        assert [fx[k], fy[k]] == view(camera)[:2]
+        alone = Pipeline.from_dict(
+            {"marker": {"size_m": 0.04}, "camera": camera, "pose": {"side_px": chosen[3]}}
+        )
+        distance = scene_values(alone, [])["distance_m"].values
+        assert values["distance_m"].values[k] == distance == fx[k] * 0.04 / chosen[3]
+
+
+def test_a_frame_size_on_an_axis_keeps_pixels_square():
+    grid = Pipeline.from_dict({
+        "pose": {"distance_m": 1}, "axes": {"width_px": [640, 1280], "height_px": [480, 720]},
+    })
+    facts = camera_facts(grid)
+    assert facts.square
+    assert facts.fx_px == facts.fy_px == (4 / 4.8 * 640, 4 / 4.8 * 1280)
+
+
+@pytest.mark.parametrize(("camera", "lines"), [
+    ({"hfov_deg": 60, "vfov_deg": 40}, ["vfov_deg = 40: expected hfov_deg or vfov_deg, not both"]),
+    ({"vfov_deg": 60, "focal_length_mm": 5, "sensor_width_mm": 6},
+     ["vfov_deg = 60: expected sensor_width_mm, focal_length_mm or vfov_deg, not both"]),
+    ({"hfov_deg": 60, "fy_px": 500}, ["hfov_deg = 60: expected fy_px or hfov_deg, not both"]),
+    ({"pixel_size_um": 3, "sensor_width_mm": 6, "focal_length_mm": 4},
+     ["pixel_size_um = 3: expected sensor_width_mm or pixel_size_um, not both"]),
+    ({"pixel_size_um": 3}, ["pixel_size_um = 3: expected focal_length_mm beside it"]),
+    ({"pixel_size_um": 0.003, "focal_length_mm": 4},
+     ["camera.pixel_size_um = 0.003: expected a number from 0.05 to 10000"]),
+    *(({"hfov_deg": bad}, [f"camera.hfov_deg = {bad}: expected a number from 1e-05 to 179.9"])
+      for bad in (180, 360, 0, -60)),
+    ({"fov_deg": 60}, ["camera.fov_deg: unknown key; did you mean"]),
+])
+def test_a_camera_given_in_two_ways_is_refused_in_a_line_for_each(camera, lines):
+    with pytest.raises(PipelineError) as refused:
+        pipeline(camera)
+    told = str(refused.value).split("\n")
+    assert len(told) == len(lines)
+    for line, expected in zip(told, lines, strict=True):
+        assert expected in line
+
+
+# 2. --set and --at.
+
+@pytest.mark.parametrize(("camera", "setting", "left"), [
+    ({"fx_px": 500, "fy_px": 510}, "hfov_deg=50", {"hfov_deg": 50}),
+    ({"focal_length_mm": 8, "sensor_width_mm": 6}, "hfov_deg=50", {"hfov_deg": 50}),
+    ({"hfov_deg": 50}, "vfov_deg=40", {"vfov_deg": 40}),
+    ({"hfov_deg": 50}, "dfov_deg=60", {"dfov_deg": 60}),
+    ({"hfov_deg": 50}, "fx_px=600", {"fx_px": 600}),
+    ({"hfov_deg": 50, "width_px": 1280}, "focal_length_mm=6",
+     {"width_px": 1280, "focal_length_mm": 6}),
+    ({"focal_length_mm": 8, "sensor_width_mm": 6}, "pixel_size_um=3",
+     {"focal_length_mm": 8, "pixel_size_um": 3}),
+    ({"focal_length_mm": 8, "pixel_size_um": 3}, "sensor_width_mm=6",
+     {"focal_length_mm": 8, "sensor_width_mm": 6}),
+])
+def test_choosing_one_way_to_give_a_camera_drops_the_others(camera, setting, left):
+    chosen = pipeline(camera, [setting])
+    assert tomllib.loads(chosen.to_toml())["camera"] == left
+    name = setting.partition("=")[0]
+    on_axis = Pipeline.from_dict({
+        "camera": {k: v for k, v in camera.items() if k != "fx_px"} if "fy_px" not in camera
+        else {"fy_px": 510},
+        "axes": {"distance_m": [1, 2], **({"fx_px": [500, 600]} if "fx_px" in camera else {})},
+    })
+    selected = cell(on_axis, f"{setting},distance_m=2")
+    assert selected.fixed[name] == left[name]
+    assert selected.fixed["fx_px"] == left.get("fx_px")
+
+
+def test_an_axis_of_fields_of_view_is_set_on_the_command_line():
+    chosen = pipeline({"fx_px": 500}, ["hfov_deg=[40, 50]"])
+    assert chosen.axis("hfov_deg").values == (40.0, 50.0)
+
+
+# 3. What is told.
+
+def test_sides_of_a_board_s_markers_are_their_own():
+    # 600 · 0.01 / 2 and 600 · 0.04 / 1 px; the size of [marker] is that of no marker.
+    board = Pipeline.from_dict({
+        "camera": {"fx_px": 600}, "estimator": {"solver": "sqpnp"}, "marker": {"size_m": 0.5},
+        "board": {"kind": "markers", "markers": [
+            {"marker_id": 0, "x_m": 0, "y_m": 0, "size_m": 0.04},
+            {"marker_id": 1, "x_m": 0.1, "y_m": 0, "size_m": 0.01},
+        ]}, "axes": {"distance_m": [1, 2]},
+    })
+    facts = camera_facts(board)
+    assert facts.side_px == pytest.approx((3, 24))
+    assert "the markers have sides of 3 to 24 px" in facts.line()
+
+
+def test_sides_of_poses_in_the_world_are_named():
+    # The camera looks along x; fx = 600.
+    world = Pipeline.from_dict({
+        "camera": {"fx_px": 600}, "marker": {"size_m": 0.1}, "pose": {"camera_x_m": 1.0},
+        "axes": {"marker_x_m": [3.0, 2.0, 0.0]},
+    })
+    assert camera_facts(world).side_px == pytest.approx((600 * 0.1 / 2, 600 * 0.1 / 1))
+
+
+def test_facts_of_parameters_that_go_together_are_those_of_each_row():
+    together = Pipeline.from_dict({"pose": {"distance_m": 1}, "axes": {"resolution": {"zip": {
+        "width_px": [640, 1280], "height_px": [480, 720], "fx_px": [500.0, 1000.0],
+        "cx_px": [319.5, 639.5], "cy_px": [239.5, 359.5],
+    }}}})
+    facts = camera_facts(together)
+    assert (facts.aspect, facts.off_centre_x, facts.off_centre_y) == ((1, 1), (0, 0), (0, 0))
+    assert facts.hfov_deg == pytest.approx((2 * math.degrees(math.atan(0.64)),) * 2)
+
+
+@pytest.mark.long
+def test_run_report_and_dataset_name_the_camera(tmp_path, capsys):
+    file, store = tmp_path / "p.toml", tmp_path / "p.zarr"
+    file.write_text(
+        "[camera]\nhfov_deg = 60\n[marker]\nsize_m = 0.1\n[axes]\ndistance_m = [0.5, 1]\n"
+    )
+    with calls_here():
+        assert main(["run", str(file), "--store", str(store)]) == 0
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.startswith("camera: 640 x 480 px, fx = fy = 554.256 px, HFOV 60°, VFOV 46.83°")
+    attributes = sweep.open(store).attrs
+    fx = 320 / math.tan(math.radians(30))
+    assert attributes["camera_fx_px"] == attributes["camera_fy_px"] == pytest.approx(fx)
+    assert attributes["camera_hfov_deg"] == pytest.approx(60)
+    assert attributes["nearest_side_px"] == pytest.approx(fx * 0.1 / 0.5)
+    assert attributes["farthest_side_px"] == pytest.approx(fx * 0.1)
+    page = tmp_path / "p.html"
+    assert main(["report", str(store), "-o", str(page)]) == 0
+    assert "fx = fy = 554.256 px, HFOV 60°" in page.read_text()
+
+
+@pytest.mark.parametrize(("sections", "line"), [
+    ({"camera": {"cx_px": 640, "cy_px": 360, "fx_px": 500}}, "cx_px = 640: outside the frame of"),
+    ({"camera": {"width_px": 1280, "height_px": 720, "cx_px": 320, "fx_px": 500}},
+     "cx_px = 320: far from the centre of the frame of 1280 x 720 px; is it that of another frame"),
+    ({"camera": {"fx_px": 500}, "axes": {"width_px": [640, 1280]}},
+     "fx_px is fixed while width_px varies: HFOV goes from 65.24 to 104°"),
+    ({"camera": {"fx_px": 4.0}}, "HFOV 178.6°: hardly any pinhole camera is as wide; is a focal"),
+    # r(1 - 0.3 r²) grows up to r = 1/sqrt(0.9); (2/3) of it are 421.6 px; the corner: 800 px.
+    ({"camera": {"fx_px": 600, "width_px": 1280, "height_px": 960, "distortion": [-0.3, 0, 0, 0]}},
+     "the lens folds 422 px from the principal point, within the frame (corner: 800 px): poses"),
+    ({"camera": {"hfov_deg": 1.2217}}, "hfov_deg = 1.2217: in degrees; 1.2217 radians would be 70"),
+    ({"camera": {"hfov_deg": 60}, "marker": {"size_m": 60}},
+     "more than the frame's; are size_m and the distances in metres?"),
+    ({"camera": {"hfov_deg": 60}, "marker": {"size_m": 0.06}, "pose": {"distance_m": 300}},
+     "at most 0.1109 px, less than a pixel a module: too small to be read; are size_m and"),
+    ({"camera": {"hfov_deg": 60}},
+     "less than a pixel a module: too small to be read; size_m is not given: 0.01 m"),
+    ({"camera": {"fx_px": 600, "calibration_sd": [1, 1, 1, 1]}},
+     "calibration_sd has no effect: no estimator has believed = calibration"),
+    ({"camera": {"cx_px": 319.5}, "axes": {"width_px": [640, 1280]}},
+     "cx_px = 319.5: far from the centre of the frame of 640 to 1280 x 480 px"),
+])
+def test_what_may_surprise_of_a_camera_is_told(sections, line):
+    camera = sections.pop("camera")
+    told = camera_notes(pipeline(camera, **sections))
+    assert [each for each in told if line in each], told
+
+
+def test_notes_are_told_by_a_run_from_python(tmp_path, capfd):
+    with calls_here():
+        execute(pipeline({"fx_px": 400, "fy_px": 500}), tmp_path / "s.zarr")
+    assert "pixels are not square: fy/fx = 1.25" in capfd.readouterr().err
+    told = sweep.open(tmp_path / "s.zarr").attrs["camera_notes"]
+    assert told.startswith("pixels are not square: fy/fx = 1.25")

@@ -1,0 +1,515 @@
+"""Camera files of OpenCV, ROS, Kalibr and PhotonVision: read to the last digit, or refused."""
+
+import hashlib
+import json
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from support.stores import by_hand
+from sweep.errors import PipelineError, StoreError
+from sweep.execution.runner import execute
+from sweep.experiment.cell_selection import cell
+from sweep.experiment.pipeline import Pipeline
+from sweep.store.lifecycle import open_store
+
+MATRIX = [[612.34567890123456, 0, 321.123456789], [0, 611.98765432109876, 1 / 3 + 238],
+          [0, 0, 1]]
+LENS = [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05, 1e-300]
+SD = [0.7, 0.71, 0.3, 0.4, 0.01, 0.02, 1e-4, 2e-4, 0.05]
+
+
+def camera(path, settings=(), **keys):
+    """The checked pipeline of a camera file; relative paths start beside it."""
+    return Pipeline.from_dict(
+        {"camera": {"camera_file": path.name, **keys}, "pose": {"side_px": 40}}, settings,
+        folder=path.parent,
+    )
+
+
+def refusals(path, **keys):
+    with pytest.raises(PipelineError) as refused:
+        camera(path, **keys)
+    return str(refused.value).split("\n")
+
+
+def write(path, text):
+    path.write_text(text)
+    return path
+
+
+def opencv_file(path, matrix=MATRIX, lens=LENS, names=("camera_matrix", "distortion_coefficients"),
+                size=("image_width", "image_height"), **more):
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for name, value in zip(size, (640, 480), strict=False):
+        storage.write(name, value)
+    storage.writeComment("flags: +fix_principal_point")
+    storage.write(names[0], np.array(matrix, dtype=np.float64))
+    storage.write(names[1], np.array([lens], dtype=np.float64))
+    for name, value in more.items():
+        storage.write(name, value)
+    storage.release()
+    return path
+
+
+def assert_camera(pipeline, matrix=MATRIX, lens=LENS, size=(640, 480)):
+    (fx, _, cx), (_, fy, cy), _ = matrix
+    expected = dict(zip(
+        ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px"), (*size, fx, fy, cx, cy),
+        strict=True,
+    )) | {"distortion": tuple(lens)}
+    assert {name: pipeline.fixed[name] for name in expected} == expected
+
+
+# 1. Files of each kind.
+
+@pytest.mark.parametrize("ending", ["yml", "yaml", "xml", "json"])
+@pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
+def test_files_of_opencv_are_read_to_the_last_digit(tmp_path, ending, count):
+    rng = np.random.default_rng(count)
+    matrix = np.diag([*rng.uniform(100, 3000, 2), 1.0])
+    matrix[:2, 2] = rng.uniform(100, 400, 2)
+    lens = (rng.normal(size=count) * 10.0 ** rng.uniform(-9, 0, count)).tolist()
+    path = opencv_file(tmp_path / f"c.{ending}", matrix, lens)
+    assert_camera(camera(path), matrix.tolist(), lens)
+    again = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    assert (again.getNode("camera_matrix").mat() == matrix).all()
+
+
+@pytest.mark.parametrize("names", [
+    ("cameraMatrix", "distCoeffs"), ("Camera_Matrix", "Distortion_Coefficients"), ("K", "D"),
+    ("M1", "D1"), ("cameraMatrix1", "distCoeffs1"), ("mtx", "dist"), ("M", "D"),
+    ("camera_matrix_1", "dist_coeffs_1"),
+])
+def test_names_of_other_programs_are_understood(tmp_path, names):
+    assert_camera(camera(opencv_file(tmp_path / "c.yml", names=names)))
+
+
+def test_numbers_of_single_precision_are_those_that_were_written(tmp_path):
+    storage = cv2.FileStorage(str(tmp_path / "c.yml"), cv2.FILE_STORAGE_WRITE)
+    matrix = np.array(MATRIX, dtype=np.float32)
+    lens = np.array([LENS[:4]], dtype=np.float32)
+    storage.write("camera_matrix", matrix)
+    storage.write("distortion_coefficients", lens)
+    storage.write("image_width", 640)
+    storage.write("image_height", 480)
+    storage.release()
+    assert_camera(camera(tmp_path / "c.yml"), matrix.tolist(), lens[0].tolist())
+
+
+def test_a_stereo_pair_has_two_cameras_that_are_named_and_no_frame_size(tmp_path):
+    storage = cv2.FileStorage(str(tmp_path / "intrinsics.yml"), cv2.FILE_STORAGE_WRITE)
+    second = np.array(MATRIX) + np.diag([5, 5, 0])
+    for name, value in (("M1", np.array(MATRIX)), ("D1", np.array([LENS])), ("M2", second),
+                        ("D2", np.array([LENS]))):
+        storage.write(name, value)
+    storage.release()
+    path = tmp_path / "intrinsics.yml"
+    line, = refusals(path)
+    assert "2 cameras: 1, 2; name one, as in FILE#1" in line
+    both = path.with_name("intrinsics.yml#2")
+    line, = refusals(both)
+    assert "expected width_px and height_px beside it: intrinsics.yml does not say" in line
+    assert_camera(camera(both, width_px=640, height_px=480), second.tolist())
+
+
+ROS = """image_width: 640
+image_height: 480
+camera_name: narrow_stereo
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [{matrix}]
+distortion_model: {model}
+distortion_coefficients:
+  rows: 1
+  cols: {count}
+  data: [{lens}]
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [500, 0, 320, 0, 0, 500, 240, 0, 0, 0, 1, 0]
+"""
+
+
+def ros_text(model="plumb_bob", lens=LENS, matrix=MATRIX):
+    return ROS.format(
+        matrix=", ".join(map(repr, np.ravel(matrix).tolist())), model=model, count=len(lens),
+        lens=", ".join(map(repr, lens)),
+    )
+
+
+@pytest.mark.parametrize(("model", "lens"), [
+    ("plumb_bob", LENS), ("rational_polynomial", [*LENS, 0.1, 0.2, 0.3]),
+])
+def test_camera_info_of_ros_is_the_raw_image_s_camera(tmp_path, model, lens):
+    assert_camera(camera(write(tmp_path / "c.yaml", ros_text(model, lens))), lens=lens)
+
+
+def test_a_camera_info_message_that_was_printed_is_read(tmp_path):
+    text = f"""header:
+  stamp: {{sec: 1, nanosec: 2}}
+height: 480
+width: 640
+distortion_model: plumb_bob
+d: {LENS}
+k: {np.ravel(MATRIX).tolist()}
+r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+p: [500, 0, 320, 0, 0, 500, 240, 0, 0, 0, 1, 0]
+binning_x: 0
+binning_y: 0
+roi: {{x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: false}}
+---
+"""
+    assert_camera(camera(write(tmp_path / "c.yaml", text)))
+    assert_camera(camera(write(tmp_path / "c.yaml", text.replace("d:", "D:").replace("k:", "K:"))))
+    line, = refusals(write(tmp_path / "c.yaml", text.replace("binning_x: 0", "binning_x: 2")))
+    assert "binning_x = 2: the matrix is that of the frame without binning" in line
+    line, = refusals(write(tmp_path / "c.yaml", text.replace("y_offset: 0", "y_offset: 8")))
+    assert "roi with y_offset = 8: the matrix is that of the whole frame" in line
+
+
+KALIBR = """cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
+  distortion_model: radtan
+  intrinsics: [458.654, 457.296, 367.215, 248.375]
+  resolution: [752, 480]
+  rostopic: /cam0/image_raw
+cam1:
+  T_cn_cnm1:
+  - [0.9, 0.1, 0.0, -0.11]
+  - [0.0, 1.0, 0.0, 0.0]
+  - [0.0, 0.0, 1.0, 0.0]
+  - [0.0, 0.0, 0.0, 1.0]
+  camera_model: pinhole
+  distortion_coeffs: []
+  distortion_model: none
+  intrinsics: [457.587, 456.134, 379.999, 255.238]
+  resolution: [752, 480]
+  rostopic: /cam1/image_raw
+"""
+
+
+def pinhole(fx, fy, cx, cy):
+    return [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+
+
+def test_a_camchain_of_kalibr_has_cameras_by_name(tmp_path):
+    path = write(tmp_path / "camchain.yaml", KALIBR)
+    for name, matrix, lens in (
+        ("cam0", pinhole(458.654, 457.296, 367.215, 248.375),
+         (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)),
+        ("cam1", pinhole(457.587, 456.134, 379.999, 255.238), ()),
+    ):
+        chosen = camera(path.with_name(f"camchain.yaml#{name}"))
+        assert_camera(chosen, matrix, lens, (752, 480))
+        assert chosen.files == {"camchain.yaml": hashlib.sha256(path.read_bytes()).hexdigest()}
+    line, = refusals(path)
+    assert "2 cameras: cam0, cam1; name one, as in FILE#cam0" in line
+    line, = refusals(path.with_name("camchain.yaml#cam2"))
+    assert "no camera cam2; did you mean cam" in line
+    single = write(tmp_path / "one.yaml", KALIBR.partition("cam1:")[0])
+    assert camera(single).fixed["fx_px"] == 458.654
+
+
+def test_names_of_folders_and_files_may_have_the_mark_of_a_camera(tmp_path):
+    (tmp_path / "a#b").mkdir()
+    write(tmp_path / "a#b" / "c#1.yaml", GOOD)
+    write(tmp_path / "a#b" / "chain.yaml", KALIBR)
+    for name, focal in (("c#1.yaml", MATRIX[0][0]), ("chain.yaml#cam1", 457.587)):
+        chosen = Pipeline.from_dict(
+            {"camera": {"camera_file": f"a#b/{name}"}, "pose": {"side_px": 40}}, folder=tmp_path
+        )
+        assert chosen.fixed["fx_px"] == focal
+        again = Pipeline.from_text(chosen.to_toml(), folder="/", files=chosen.files)
+        assert again.files == chosen.files
+    with pytest.raises(PipelineError, match=r"File name too long"):
+        camera(tmp_path / ("a" * 5000))
+
+
+def photonvision(width=1280, height=720, **more):
+    return {
+        "resolution": {"width": float(width), "height": float(height)},
+        "cameraIntrinsics": {"rows": 3, "cols": 3, "type": 6, "data": np.ravel(MATRIX).tolist()},
+        "distCoeffs": {"rows": 1, "cols": 8, "type": 6, "data": [*LENS, 0.1, 0.2, 0.3]},
+        "calobjectWarp": [], "observations": [], "calobjectSize": {"width": 7.0, "height": 7.0},
+        "calobjectSpacing": 0.0254, "lensmodel": "LENSMODEL_OPENCV", **more,
+    }
+
+
+def test_a_calibration_of_photonvision_is_read_alone_and_among_its_settings(tmp_path):
+    lens = [*LENS, 0.1, 0.2, 0.3]
+    path = write(tmp_path / "c.json", json.dumps(photonvision()))
+    assert_camera(camera(path), lens=lens, size=(1280, 720))
+    settings = {"nickname": "front", "calibrations": [photonvision(), photonvision(640, 480)]}
+    write(tmp_path / "config.json", json.dumps(settings))
+    chosen = camera(tmp_path / "config.json#640x480")
+    assert_camera(chosen, lens=lens, size=(640, 480))
+    line, = refusals(tmp_path / "config.json")
+    assert "2 cameras: 1280x720, 640x480; name one, as in FILE#1280x720" in line
+    line, = refusals(write(path, json.dumps(photonvision(lensmodel="LENSMODEL_STEREOGRAPHIC"))))
+    assert "lens model LENSMODEL_STEREOGRAPHIC: not supported" in line
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1", "utf-16"])
+def test_dates_and_shells_of_other_countries_are_read(tmp_path, encoding):
+    path = tmp_path / "c.yml"
+    text = 'calibration_time: "20 févr. 2026"\r\n' + ros_text().replace("\n", "\r\n")
+    path.write_bytes(text.encode(encoding))
+    assert_camera(camera(path))
+
+
+OTHERS = {
+    "OpenCV 2": f"""%YAML:1.0
+image_Size: [ 640, 480 ]
+Camera_Matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: {np.ravel(MATRIX).tolist()}
+Distortion_Coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: {LENS}
+""",
+    "EuRoC": f"""sensor_type: camera
+comment: VI-Sensor cam0 (MT9M034)
+rate_hz: 20
+resolution: [640, 480]
+camera_model: pinhole
+intrinsics: {[MATRIX[0][0], MATRIX[1][1], MATRIX[0][2], MATRIX[1][2]]} #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: {LENS[:4]}
+""",
+    "Limelight": json.dumps({
+        "camera_matrix": MATRIX, "distortion_coefficients": [LENS], "img_size": [640, 480],
+        "avg_reprojection_error": 0.4,
+    }),
+    "ROS, the whole region": (
+        ros_text() + "roi: {x_offset: 0, y_offset: 0, width: 640, height: 480}\n" + f"D: {LENS}\n"),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_files_of_other_programs_are_read(tmp_path, name):
+    lens = LENS[:4] if name == "EuRoC" else LENS
+    assert_camera(camera(write(tmp_path / "c.any", OTHERS[name])), lens=lens)
+
+
+# 2. What is refused, in one line each.
+
+def damaged(text, old, new):
+    assert old in text
+    return text.replace(old, new)
+
+
+GOOD = ros_text()
+REFUSED = {
+    "cut short": (GOOD[: GOOD.index("distortion_model") - 30], "cut short"),
+    "no lens": (GOOD[: GOOD.index("distortion_coeff")], "no distortion coefficients"),
+    "a pipeline": ("seed = 1\n[pose]\ndistance_m = 1\n", "not a camera file"),
+    "prose": ("It was a dark and stormy night.\n", "not a camera file: it has no camera matrix"),
+    "empty": ("", "empty"),
+    "binary": (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\xff\xfe", "not text"),
+    "compressed": (b"\x1f\x8b\x08\0\0", "compressed; unpack it"),
+    "zeros": (damaged(GOOD, ", ".join(map(repr, np.ravel(MATRIX).tolist())),
+                      "0, 0, 0, 0, 0, 0, 0, 0, 0"), "a matrix of zeros: the camera was not"),
+    "NaN": (damaged(GOOD, repr(MATRIX[0][0]), ".nan"), ".nan is not a number"),
+    "infinite": (damaged(GOOD, repr(MATRIX[0][0]), "1e999"), "1e999 is not a finite number"),
+    "words": (damaged(GOOD, repr(MATRIX[0][0]), "wide"), "wide is not a number"),
+    "singular": (damaged(GOOD, repr(MATRIX[1][1]), "0"), "focal lengths 612.346 and 0; expected"),
+    "skew": (ros_text(matrix=[[600, 0.1, 320], [0, 600, 240], [0, 0, 1]]),
+             "a skew of 0.1 is not supported"),
+    "transposed": (ros_text(matrix=np.transpose(MATRIX).tolist()), "0, 0, 1 as the last row"),
+    "2 x 3": (damaged(damaged(GOOD, "rows: 3\n  cols: 3\n  data: [61", "rows: 2\n  cols: 3\n"
+                              "  data: [61"), ", 0.0, 0.0, 1.0]", "]"), "expected a matrix of 3 x"),
+    "three coefficients": (ros_text(lens=[0.1, 0.2, 0.3]), "3 coefficients; expected 0 or 4 or 5"),
+    "equidistant": (ros_text("equidistant", [0.1] * 4), "lens model equidistant: not supported"),
+    "omni": (damaged(KALIBR, "pinhole", "omni"), "camera model omni: not supported"),
+    "Kalibr equidistant": (damaged(KALIBR, "radtan", "equidistant"), "lens model equidistant"),
+    "fisheye": (GOOD + "fisheye_model: 1\n", "a fisheye model: not supported"),
+    "no size": (damaged(damaged(GOOD, "image_width", "a"), "image_height", "b"),
+                "expected width_px and height_px beside it: c.any does not say which frame size"),
+    "half a pixel": (damaged(GOOD, "image_width: 640", "image_width: 640.5"),
+                     "image_width: 640.5; expected whole pixels"),
+    "twice": (GOOD + "image_width: 800\n", "YAML that has the key image_width twice"),
+    "a tag": ("!!python/object/apply:os.system ['true']\n", "YAML with the tag"),
+    "billion laughs": (
+        "a: &a [1,1]\n" + "".join(
+            f"{y}: &{y} [*{x},*{x}]\n" for x, y in zip("abcdefghi", "bcdefghij", strict=True)
+        ), "YAML with references (*)"),
+    "XML bomb": (('<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "aa">]><opencv_storage>&a;'
+                 "</opencv_storage>"), "XML with a document type"),
+    "web page": ("<html><body>404</body></html>", "XML of another kind: <html>"),
+    "cut XML": ("<opencv_storage><camera_matrix>", "not XML, or cut short"),
+    "deep JSON": ('{"a":' + "[" * 100_000, "nested too deeply"),
+    "deep XML": ("<opencv_storage>" + "<a>" * 300 + "</a>" * 300 + "</opencv_storage>",
+                 "nested too deeply"),
+    "huge": (b"#" * 4_000_001, "more than 4,000,000 bytes"),
+    "many values": ("a: [" + "1," * 400_000 + "]", "more than 300,000 values"),
+    "deviations below 0": (GOOD + f"std_deviations_intrinsics: {[-1] * 9}\n", "below 0"),
+    "odd covariance": (GOOD + f"covariance_intrinsics: {[1] * 80}\n", "expected 9 x 9"),
+    "two matrices": (GOOD + "K: [600, 0, 320, 0, 600, 240, 0, 0, 1]\n",
+                     "camera_matrix and K differ: delete one of them"),
+    "a region of the frame": (GOOD + "roi: {x_offset: 0, width: 320, height: 240}\n",
+                              "roi with width = 320: the matrix is that of the whole frame"),
+    "two calibrations of a size": (
+        json.dumps({"calibrations": [photonvision(), photonvision(distCoeffs=[0.1] * 5)]}),
+        "two calibrations of 1280x720 that differ"),
+    "focal length out of range": (damaged(GOOD, repr(MATRIX[0][0]), "1e12"),
+                                  "fx_px = 1000000000000.0: expected a number from 0.001"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_file_that_is_no_camera_s_is_refused_in_one_line(tmp_path, case, capfd):
+    content, expected = REFUSED[case]
+    path = tmp_path / "c.any"
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    if "cam1" in str(content):
+        path = path.with_name("c.any#cam0")
+    start = time.process_time()
+    line, = refusals(path)
+    assert time.process_time() - start < 10
+    assert line.startswith(f'pipeline: camera.camera_file = "{path.name}": expected ')
+    assert expected in line
+    assert len(line) < 500
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("ending", ["yml", "json"])
+def test_base64_is_refused_with_what_to_do(tmp_path, ending):
+    path = tmp_path / f"c.{ending}"
+    mode = cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_WRITE_BASE64
+    storage = cv2.FileStorage(str(path), mode)
+    storage.write("camera_matrix", np.array(MATRIX))
+    storage.release()
+    line, = refusals(path)
+    assert "base64; write the file with numbers" in line
+
+
+def test_a_path_without_a_file_is_refused_in_one_line(tmp_path):
+    assert "(No such file or directory)" in refusals(tmp_path / "none.yml")[0]
+    (tmp_path / "folder").mkdir()
+    assert "(Is a directory)" in refusals(tmp_path / "folder")[0]
+    with pytest.raises(PipelineError, match=r"expected a camera file \(Not a regular file\)"):
+        Pipeline.from_dict({"camera": {"camera_file": "/dev/zero"}, "pose": {"side_px": 9}})
+    with pytest.raises(PipelineError, match="a path without control characters"):
+        Pipeline.from_dict({"camera": {"camera_file": "a\nb"}, "pose": {"side_px": 9}})
+
+
+@pytest.mark.parametrize(("keys", "lines"), [
+    ({"width_px": 1280},
+     [("width_px = 1280: expected 640, which c.yaml has; delete it, or camera_file; a calibration "
+      "holds for its own frame size")]),
+    ({"fx_px": 600, "cx_px": 3},
+     ["fx_px = 600: expected 612.3456789012346, which c.yaml has; delete it, or camera_file",
+      "cx_px = 3: expected 321.123456789, which c.yaml has; delete it, or camera_file"]),
+    ({"distortion": []}, ["distortion = []: expected [-0.28340811"]),
+    ({"hfov_deg": 60},
+     ["hfov_deg = 60: expected no other camera beside camera_file; delete it, or camera_file"]),
+    ({"sensor_width_mm": 6, "focal_length_mm": 3},
+     ["sensor_width_mm = 6: expected no other camera beside camera_file",
+      "focal_length_mm = 3: expected no other camera beside camera_file"]),
+])
+def test_other_keys_of_the_camera_beside_a_file_are_refused(tmp_path, keys, lines):
+    path = write(tmp_path / "c.yaml", GOOD)
+    told = refusals(path, **keys)
+    assert len(told) == len(lines)
+    for expected in lines:
+        assert [line for line in told if expected in line], told
+
+
+def test_axes_of_what_a_file_determines_are_refused(tmp_path):
+    path = write(tmp_path / "c.yaml", GOOD)
+    for axis in ("fx_px=[500, 600]", "width_px=[320, 640]"):
+        with pytest.raises(PipelineError, match=r"which c\.yaml has; delete it, or camera_file"):
+            camera(path, [axis])
+    with pytest.raises(PipelineError, match="expected one file; cameras to compare are axes"):
+        camera(path, ['camera_file=["c.yaml", "d.yaml"]'])
+
+
+@pytest.mark.parametrize("ending", ["yml", "xml", "json"])
+@pytest.mark.parametrize("name", ["std_deviations_intrinsics", "stdDeviationsIntrinsics"])
+def test_standard_deviations_of_opencv_s_calibration_are_believed(tmp_path, ending, name):
+    # OpenCV writes 18 of them, zeros for what was not estimated.
+    all_18 = np.array([*SD, *[0.0] * 9])[:, None]
+    path = opencv_file(tmp_path / f"c.{ending}", **{name: all_18})
+    chosen = camera(path, ["believed=calibration"])
+    assert chosen.fixed["calibration_sd"] == tuple(SD)
+    assert Pipeline.from_text(chosen.to_toml(), folder=tmp_path) == chosen
+    assert "calibration_sd" in chosen.to_toml()
+    plain = opencv_file(tmp_path / f"plain.{ending}")
+    with pytest.raises(PipelineError, match=r"give calibration_sd under .* \(camera_file has"):
+        camera(plain, ["believed=calibration"])
+    given = camera(plain, ["believed=calibration"], calibration_sd=SD)
+    assert given.fixed["calibration_sd"] == tuple(SD)
+
+
+def test_a_covariance_in_a_file_is_believed(tmp_path):
+    matrix = np.diag(np.square(SD))
+    matrix[0, 1] = matrix[1, 0] = 0.9 * SD[0] * SD[1]
+    chosen = camera(
+        opencv_file(tmp_path / "c.yml", covariance_intrinsics=matrix), ["believed=calibration"]
+    )
+    assert chosen.fixed["calibration_covariance"] == tuple(matrix.ravel().tolist())
+
+
+# 3. Pipelines and stores with a camera file.
+
+def test_the_text_of_a_pipeline_has_the_values_of_its_camera_file(tmp_path):
+    path = write(tmp_path / "c.yaml", GOOD)
+    chosen = camera(path)
+    again = Pipeline.from_text(chosen.to_toml(), folder=tmp_path)
+    assert again == chosen
+    path.unlink()
+    moved = Pipeline.from_text(chosen.to_toml(), folder=tmp_path, files=chosen.files)
+    assert moved == chosen
+    assert cell(chosen, "side_px=30").fixed["fx_px"] == MATRIX[0][0]
+    wider = cell(chosen, "hfov_deg=90")
+    assert (wider.fixed["fx_px"], wider.fixed["cx_px"]) == (None, MATRIX[0][2])
+    assert wider.files == {}
+
+
+def test_another_value_for_a_store_s_camera_leaves_its_file(tmp_path):
+    text = camera(write(tmp_path / "c.yaml", GOOD)).to_toml()
+    (tmp_path / "c.yaml").unlink()
+    chosen = Pipeline.from_text(text, ["fx_px=700"], camera_files={"c.yaml": "0" * 64})
+    assert (chosen.fixed["camera_file"], chosen.fixed["fx_px"], chosen.files) == (None, 700, {})
+    assert chosen.fixed["distortion"] == tuple(LENS)
+
+
+def test_set_of_a_camera_file_replaces_the_camera_and_keeps_comments(tmp_path):
+    write(tmp_path / "c.yaml", GOOD)
+    write(tmp_path / "p.toml", "[camera]  # mine\nfocal_length_mm = 6\nwidth_px = 99\n"
+          "[pose]\nside_px = 30\n")
+    chosen = Pipeline.from_toml(tmp_path / "p.toml", ["camera_file=c.yaml"])
+    assert_camera(chosen)
+    assert "[camera]  # mine" in chosen.to_toml()
+    assert "focal_length_mm" not in chosen.to_toml()
+
+
+def test_a_store_does_not_need_its_camera_file_any_more(tmp_path):
+    url, rest = str(tmp_path / "s.zarr"), {"marker": {"size_m": 0.05}, "axes": {
+        "distance_m": [0.5, 0.8]}}
+
+    def pipeline(name):
+        return Pipeline.from_dict({"camera": {"camera_file": name}, **rest}, folder=tmp_path)
+
+    by_hand(url, pipeline(write(tmp_path / "c.yaml", GOOD).name))
+    (tmp_path / "c.yaml").rename(tmp_path / "moved.yaml")
+    assert_camera(open_store(url).pipeline)
+    # The file elsewhere has the same content: the run is finished.
+    assert execute(pipeline("moved.yaml"), url).computed_blocks == 0
+    write(tmp_path / "c.yaml", GOOD.replace(repr(MATRIX[0][0]), "700.0"))
+    with pytest.raises(StoreError, match=r"fx_px: the store has 612\.345\d+, this run 700\.0"):
+        execute(pipeline("c.yaml"), url)

@@ -1,0 +1,171 @@
+"""Pipelines of nested dictionaries: the same document, checks and messages as a file's."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomlkit
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from support.lengths import lengths
+from sweep.errors import PipelineError
+from sweep.experiment.axes import TRIAL
+from sweep.experiment.parameters import IN_CAMERA, PARAMETERS, superseded
+from sweep.experiment.pipeline import Pipeline
+from sweep.experiment.toml_text import document_text, read_document
+
+DRAWABLE = [
+    name for name in IN_CAMERA
+    if PARAMETERS[name].declaration.drawable and name not in ("side_px", "frame_x", "frame_y")
+]
+
+
+def numbers(parameter):
+    """Numbers that a parameter's declaration admits, within a thousand."""
+    low = max(parameter.declaration.low, -1000.0)
+    high = min(parameter.declaration.high, 1000.0)
+    if parameter.types == (int,):
+        return st.integers(math.ceil(low), math.floor(high))
+    return st.floats(low, high, exclude_min=parameter.declaration.open_low)
+
+
+@st.composite
+def documents(draw):
+    """Sound documents: fixed values, axes in several forms, distributions, trials."""
+    document = {"pose": {}, "axes": {}}
+    if draw(st.booleans()):
+        document["title"] = draw(st.text(st.characters(categories=["L", "N", "P", "Zs"],
+                                                       include_characters='"\\\''),
+                                         max_size=20)).replace("\xa0", " ")
+        document["title"] = "".join(c for c in document["title"] if c.isprintable())
+        document["seed"] = draw(st.integers(0, 2**63 - 1))
+    names = draw(st.lists(st.sampled_from(DRAWABLE), unique=True, max_size=4))
+    names = [name for k, name in enumerate(names) if name not in superseded(names[:k])]
+    for name in {*names, "distance_m"}:
+        number = numbers(PARAMETERS[name])
+        kind = draw(st.sampled_from(["fixed", "list", "range", "linspace", "uniform"]))
+        a, b = sorted(draw(st.lists(number, min_size=2, max_size=2, unique=True)))
+        if kind == "fixed":
+            document["pose"][name] = a
+        elif kind == "uniform":
+            document["pose"][name] = {"uniform": [a, b]}
+        else:
+            count = draw(st.integers(2, 5))
+            assume(len({*np.linspace(a, b, count).tolist()}) == count)  # doubles lie between
+            document["axes"][name] = {
+                "list": [a, b], "range": {"range": [1, draw(st.integers(2, 9))]},
+                "linspace": {"linspace": [a, b, count]},
+            }[kind]
+    if draw(st.booleans()):
+        document["axes"]["solver"] = ["ippe", "sqpnp"]
+        document["camera"] = {"distortion": [0.1, -0.2, 0.0, draw(st.floats(-1, 1))]}
+        document["estimator"] = {"guarded": draw(st.booleans())}
+    if draw(st.booleans()):
+        document["pose"] |= {"jitter_px": 0.5} if "jitter_px" not in names else {}
+        if document["pose"].get("jitter_px") == 0.5:
+            document["axes"][TRIAL] = draw(st.integers(1, 9))
+    return document
+
+
+def file_text(document):
+    """Return a document as tomlkit writes it, the axes' tables inline: their order counts."""
+    written = tomlkit.document()
+    for key, value in document.items():
+        if isinstance(value, dict):
+            table = tomlkit.table()
+            for name, item in value.items():
+                if isinstance(item, dict):
+                    inline = tomlkit.inline_table()
+                    inline.update(item)
+                    item = inline  # noqa: PLW2901
+                table[name] = item
+            value = table  # noqa: PLW2901
+        written[key] = value
+    return tomlkit.dumps(written)
+
+
+@lengths(40, 400)
+def test_text_of_a_pipeline_reads_back_to_an_equal_one(count):
+    @settings(max_examples=count, deadline=None)
+    @given(documents())
+    def check(document):
+        pipeline = Pipeline.from_dict(document, name="a")
+        assert Pipeline.from_text(pipeline.to_toml(), name="a") == pipeline
+        file = Pipeline.from_text(file_text(document), name="a")
+        assert dataclasses.replace(file, text=pipeline.text) == pipeline
+
+    check()
+
+
+@lengths(50, 500)
+def test_any_document_is_written_as_toml_that_means_the_same(count):
+    values = st.recursive(
+        st.one_of(st.booleans(), st.integers(), st.floats(allow_nan=False), st.dates(),
+                  st.text(max_size=9)),
+        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner,
+                                                                    max_size=3),
+        max_leaves=8,
+    )
+
+    @settings(max_examples=count, deadline=None)
+    @given(st.dictionaries(st.text(max_size=5), values, max_size=4))
+    def check(document):
+        try:
+            text = document_text(document)
+            text.encode()
+        except UnicodeEncodeError:
+            return  # a lone surrogate is no UTF-8
+        assert read_document(text) == document
+
+    check()
+
+
+def test_values_of_python_and_numpy_stand_for_those_of_toml(tmp_path):
+    pipeline = Pipeline.from_dict({
+        "seed": np.int64(3),
+        "camera": {"distortion": (0.1, 0.2, 0, 0), "width_px": np.int32(320)},
+        "pose": {"roll_deg": np.float32(0.5)},
+        "axes": {"distance_m": np.linspace(0.1, 1, 4), "marker_id": range(2, 10, 3)},
+    })
+    assert pipeline.seed == 3
+    assert pipeline.fixed["distortion"] == (0.1, 0.2, 0.0, 0.0)
+    assert pipeline.fixed["width_px"] == 320
+    assert pipeline.axis("distance_m").values == tuple(np.linspace(0.1, 1, 4).tolist())
+    assert pipeline.axis("marker_id").values == range(2, 10, 3)
+    with pytest.raises(PipelineError, match="expected a level or an image file"):
+        Pipeline.from_dict(
+            {"pose": {"distance_m": 1}, "scene": {"background": Path("none.png")}},
+            folder=tmp_path,
+        )
+
+
+def test_settings_replace_values_of_a_dictionary():
+    document = {"pose": {"distance_m": 1, "tilt_deg": 3}}
+    pipeline = Pipeline.from_dict(document, ["tilt_deg=[0, 45]", "title='two tilts'"])
+    assert pipeline.title == "two tilts"
+    assert pipeline.axis("tilt_deg").values == (0.0, 45.0)
+    assert document == {"pose": {"distance_m": 1, "tilt_deg": 3}}
+    assert Pipeline.from_text(pipeline.to_toml()) == pipeline
+
+
+LOOP = {}
+LOOP["pose"] = {"distance_m": LOOP}
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [({"pose": {"distance_m": None}}, "cell: pose.distance_m = None: expected a string, a number"),
+     ({"pose": {"distance_m": 1}, "axes": {"tilt_deg": {1, 2}}},
+      "axes.tilt_deg = {1, 2}: expected"),
+     ({"pose": {3: 1}}, "cell: pose.3: expected a string as key"),
+     ({"pose": {"distance_m": 1j}, "seed": None}, "pose.distance_m = 1j: .*\n.*seed = None"),
+     ({"pose": {"distance": 1}}, "pose.distance: unknown key; did you mean distance_m"),
+     ({"axes": {"distance_m": np.arange(1.0, 40_000)}}, "expected at most 250,000 bytes"),
+     (LOOP, "cell: pose.distance_m: nested too deeply")],
+)
+def test_values_that_toml_does_not_have_are_told_by_key(document, message):
+    with pytest.raises(PipelineError, match=message):
+        Pipeline.from_dict(document, source="cell")

@@ -1,0 +1,286 @@
+"""Pipelines that mean harm: each is refused in lines that are few, short and printable."""
+
+import os
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sweep.errors import PipelineError
+from sweep.experiment.cell_selection import cell
+from sweep.experiment.pipeline import Pipeline
+from sweep.messages import MAX_FAULTS, MAX_LINE_LENGTH, shown
+
+POSE = "[pose]\ndistance_m = 1\n"
+AXES = POSE + "jitter_px = 1\n[axes]\n"
+DEEP = ".a" * 7
+MANY = range(2000)
+
+
+def faults_of(read, *arguments, **options):
+    """Return what is told of a pipeline that must be refused; every line is fit to be printed."""
+    with pytest.raises(PipelineError) as told:
+        read(*arguments, **options)
+    lines = str(told.value).split("\n")
+    assert len(lines) <= MAX_FAULTS + 1
+    assert all(line.isprintable() and 0 < len(line) <= MAX_LINE_LENGTH for line in lines)
+    return lines
+
+
+HOSTILE = {
+    # Axes without end, in every form.
+    "range": (AXES + "marker_id = { range = [0, 1000000000000] }", "at most 1,000,000,000 values"),
+    "linspace": (AXES + "tilt_deg = { linspace = [0, 1, 1000000000000] }", "at most 1,000,000"),
+    "geom": (AXES + "size_m = { geom = [1, 2, 10000000] }", "at most 1,000,000 values"),
+    "arange, least step": (AXES + "tilt_deg = { arange = [0, 1e299, 5e-324] }", "at most 1,000"),
+    "trial": (AXES + "trial = 1000000000000", "from 1 to 1,000,000,000"),
+    "axes that are long together": (
+        AXES + "tilt_deg = { linspace = [0, 1, 600000] }\nroll_deg = { linspace = [0, 1, 600000] }",
+        "axes.roll_deg = {linspace = [0, 1, 600000]}: expected at most 1,000,000 values, all axes",
+    ),
+    "a product beyond all numbers": (
+        AXES + "".join(
+            f"{name} = {{ range = [1, 10000] }}\n" for name in (
+                "width_px", "height_px", "adaptiveThreshWinSizeStep", "minDistanceToBorder",
+                "cornerRefinementWinSize", "aprilTagMinClusterPixels", "minSideLengthCanonicalImg",
+            )
+        ),
+        "axes: 9.99e+27 poses: expected at most 1e+12",
+    ),
+    "detector settings times estimators": (
+        AXES + "minOtsuStdDev = { linspace = [0, 9, 1000] }\n"
+        "believed_size_m = { linspace = [0.1, 1, 1000] }",
+        "axes: 1e+06 detector settings times estimators: expected at most 10,000",
+    ),
+    "a frame too large to be searched whole": (
+        POSE + "[camera]\nwidth_px = 100000\nheight_px = 100000\n"
+        "[detector]\nuseAruco3Detection = true",
+        "detector.useAruco3Detection = true: expected what needs no whole frame",
+    ),
+    # Nesting, and what takes time that grows with a square.
+    "lists": ("x = " + "[" * 100_000, "not TOML: nested too deeply"),
+    "tables, closed": (POSE + "tilt_deg = " + "{a=" * 200 + "1" + "}" * 200, "= {a = {a = "),
+    "a dotted key": ("a" + ".a" * 100_000 + " = 1", "expected keys of at most 8 parts"),
+    "deep keys": ("".join(f"a{DEEP}{i} = 1\n" for i in MANY), "a: unknown; expected a section"),
+    "quotes, none a key": (POSE + "x = '" + '"\\' * 50_000 + "'", "pose.x: unknown key"),
+    # Size.
+    "text": ("# " + "x" * 10_000_000, "expected at most 250,000 bytes"),
+    "unknown keys": (POSE + "".join(f"k{i} = 1\n" for i in MANY), "... and 1,980 faults more"),
+    "a key": (POSE + "k" * 200_000 + " = 1", "kkk...: unknown key"),
+    "a string": (POSE + f'tilt_deg = "{"k" * 200_000}"', "kkk...: expected a number"),
+    "values": (AXES + f"tilt_deg = [{'1,' * 100_000}]", "each value once (1.0 is repeated)"),
+    "a title": (f'title = "{"k" * 1000}"\n' + POSE, "one line of at most 200 characters"),
+    "a path": (POSE + f'[scene]\nbackground = "{"a/" * 100_000}"', "(File name too long)"),
+    # Numbers without end.
+    "digits": (POSE + "tilt_deg = 1" + "0" * 100_000, "not TOML: a number of too many digits"),
+    **{
+        f"hexadecimal digits, {name}": (text % ("0x1" + "0" * 20_000), expected)
+        for name, text, expected in (
+            ("a value", POSE + "tilt_deg = %s", "pose.tilt_deg = 0x1000"),
+            ("a list", AXES + "tilt_deg = [%s]", "(not 0x1000"),
+            ("a range", AXES + "marker_id = { range = [0, %s] }", "expected range ="),
+            ("a lens", POSE + "[camera]\ndistortion = [%s, 0, 0, 0]", "expected a list of 0, 4"),
+            ("a draw", "[pose]\ndistance_m = { uniform = [0, %s] }", "expected uniform ="),
+        )
+    },
+    # What a terminal would obey, or take for a line of ours.
+    "control characters, a key": (
+        POSE + '"\\u001b[2J\\nforged: line" = 1', "pose.\\u001b[2J\\nforged: line: unknown key",
+    ),
+    "control characters, a value": (
+        POSE + 'tilt_deg = "\\u009b31m\\u202e\\u2028\\n"',
+        'tilt_deg = "\\u009b31m\\u202e\\u2028\\n": expected',
+    ),
+    "control characters, a path": (
+        POSE + '[scene]\nbackground = "\\u001b[31mx.png"', "a path without control characters",
+    ),
+    "control characters, the title": ('title = "\\u001b[2J"\n' + POSE, 'title = "\\u001b[2J"'),
+    "half a character": (POSE + "# \ud800", "expected UTF-8"),
+}
+
+
+@pytest.mark.parametrize(("text", "expected"), HOSTILE.values(), ids=HOSTILE)
+def test_a_hostile_text_is_refused_in_short_lines(text, expected):
+    assert any(expected in line for line in faults_of(Pipeline.from_text, text))
+
+
+SETTINGS = {
+    "nested lists": ("tilt_deg=" + "[" * 50_000, "expected a TOML value"),
+    "a dotted key": ("tilt_deg={a" + ".a" * 50_000 + "=1}", "expected a TOML value"),
+    "digits": ("tilt_deg=1" + "0" * 5000, "expected a TOML value"),
+    "hexadecimal digits": ("seed=0x1" + "0" * 5000, "seed = 0x1"),
+    "control characters, a key": ("\x1b\nforged: x=3", "--set \\u001b\\nforged: x=3: unknown"),
+    "no UTF-8": ('title="\udcff"', "expected a TOML value"),
+}
+
+
+@pytest.mark.parametrize(("setting", "expected"), SETTINGS.values(), ids=SETTINGS)
+def test_a_hostile_setting_is_refused_in_short_lines(setting, expected):
+    lines = faults_of(Pipeline.from_text, POSE, [setting])
+    assert any(expected in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    "text", [f"a{DEEP} = 1\n" + "\n" * 200_000, "[[a]]\n[a.b]\n" * 15_000,
+             POSE + f"k = [{'{a=1},' * 30_000}]"],
+    ids=["empty lines", "tables", "lists of tables"],
+)
+def test_a_hostile_text_is_refused_as_soon_where_a_setting_changes_it(text):
+    assert "unknown" in faults_of(Pipeline.from_text, text, ["tilt_deg=3"])[0]
+
+
+@pytest.mark.parametrize(
+    ("at", "expected"),
+    [
+        ("tilt_deg=" + "[" * 50_000, "expected a number"),
+        ("x=1," * 10_000, "... and 9,980 faults more"),
+        ("tilt_deg=0x1" + "0" * 5000, "expected a number"),
+        ("\x1b\nforged: x=3", "\\u001b\\nforged: x=3: unknown parameter"),
+        ("background=\udcff", "a path without control characters"),
+    ],
+)
+def test_a_hostile_place_is_refused_in_short_lines(at, expected):
+    lines = faults_of(cell, Pipeline.from_text(POSE), at)
+    assert any(expected in line for line in lines)
+
+
+def test_a_list_of_lists_may_be_a_place():
+    assert cell(Pipeline.from_text(POSE), "distortion=[0.1, 0, 0, 0],tilt_deg=3").fixed[
+        "distortion"] == (0.1, 0.0, 0.0, 0.0)
+
+
+def test_a_file_with_a_byte_order_mark_is_read(tmp_path):
+    (tmp_path / "p.toml").write_bytes(b"\xef\xbb\xbf" + POSE.encode())
+    assert Pipeline.from_toml(tmp_path / "p.toml").fixed["distance_m"] == 1
+
+
+@settings(derandomize=True, deadline=None, max_examples=100)
+@given(st.one_of(
+    st.text(),
+    st.binary().map(lambda data: data.decode("latin-1")),
+    st.lists(st.sampled_from([
+        "[pose]\n", "[axes]\n", "[scene]\n", "distance_m", "tilt_deg", "trial", "background", "=",
+        "{", "}", "[", "]", ",", ".", "linspace", "range", "values", "uniform", "0", "1", "-7",
+        "1e999", "nan", "0x" + "f" * 4000, '"', "'", "\\", "\n", "\r\n", "#", "2020-01-01", "true",
+        "\x1b", "\u202e", "é",
+    ]), max_size=40).map("".join),
+))
+def test_any_text_is_a_pipeline_or_is_refused(text):
+    for arguments in ((text,), (POSE, [text]), (POSE, ["tilt_deg=" + text])):
+        try:
+            Pipeline.from_text(*arguments)
+        except PipelineError as told:
+            lines = str(told).split("\n")
+            assert len(lines) <= MAX_FAULTS + 1
+            assert all(line.isprintable() and 0 < len(line) <= MAX_LINE_LENGTH for line in lines)
+
+
+@settings(derandomize=True, deadline=None, max_examples=50)
+@given(st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.dates(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+))
+def test_any_value_is_shown_in_a_short_line(value):
+    assert shown(value).isprintable()
+    assert len(shown(value)) <= MAX_LINE_LENGTH
+
+
+# Files.
+
+def png(width, height, data):
+    """Return a PNG file that declares a size and has any data."""
+    def chunk(kind, content):
+        body = kind + content
+        return struct.pack(">I", len(content)) + body + struct.pack(">I", zlib.crc32(body))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return (b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(data, 9))
+            + chunk(b"IEND", b""))
+
+
+def encoded(ending, image):
+    return cv2.imencode(ending, image)[1].tobytes()
+
+
+NOISE = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
+FRAME = POSE + "[camera]\nwidth_px = 64\nheight_px = 48\n[scene]\nbackground = '%s'\n"
+JPEG = encoded(".jpg", NOISE)
+FRAME_HEADER = JPEG.find(b"\xff\xc0") + 5
+
+BROKEN_IMAGES = {
+    "empty": (b"", "not an image"),
+    "text": (b"no image", "not an image"),
+    "a header alone": (encoded(".png", NOISE)[:33], "not an image"),
+    "half a PNG": (encoded(".png", NOISE)[:2000], "not an image"),
+    "half a JPEG": (JPEG[:1500], "not an image"),
+    "half a BMP": (encoded(".bmp", NOISE)[:2000], "not an image"),
+    "half a PGM": (encoded(".pgm", NOISE)[:2000], "not an image"),
+    "too little data": (png(64, 48, b"\0" * 100), "not an image"),
+    "no pixels": (png(0, 0, b""), "at most 500,000,000 pixels"),
+    "a PNG bomb": (png(60_000, 60_000, b"\0" * 10**6), "60000 x 60000; at most 500,000,000"),
+    "a smaller PNG bomb": (png(20_000, 20_000, b"\0" * 10**6), "it is 20000 x 20000, but width_px"),
+    "a JPEG bomb": (
+        JPEG[:FRAME_HEADER] + struct.pack(">HH", 20_000, 20_000) + JPEG[FRAME_HEADER + 4 :],
+        "it is 20000 x 20000, but width_px",
+    ),
+    "a BMP bomb": (
+        b"BM" + b"\0" * 12 + struct.pack("<Iii", 40, 30_000, -30_000) + b"\0" * 50,
+        "30000 x 30000; at most",
+    ),
+    "a PGM bomb": (b"P5 # so\n30000\n30000 255\n" + b"\0" * 50, "30000 x 30000; at most"),
+    "a TIFF": (encoded(".tiff", NOISE), "not an image that OpenCV can read: a PNG, JPEG, BMP"),
+    "a WebP": (encoded(".webp", NOISE), "not an image that OpenCV can read: a PNG, JPEG, BMP"),
+    "another size": (encoded(".png", NOISE[:40]), "it is 64 x 40, but height_px = 48"),
+    "a turned frame": (encoded(".png", NOISE.T.copy()), "it is 48 x 64, but width_px = 64"),
+}
+
+
+@pytest.mark.parametrize(("content", "expected"), BROKEN_IMAGES.values(), ids=BROKEN_IMAGES)
+def test_an_image_that_is_none_or_a_bomb_is_refused(content, expected, tmp_path, capfd):
+    (tmp_path / "image").write_bytes(content)
+    lines = faults_of(Pipeline.from_text, FRAME % "image", folder=tmp_path)
+    assert len(lines) == 1
+    assert expected in lines[0]
+    assert capfd.readouterr().err == ""
+
+
+IMAGES = {
+    **{ending: encoded(ending, np.dstack([NOISE] * 3)) for ending in (".png", ".jpg", ".bmp")},
+    **{ending: encoded(ending, NOISE) for ending in (".pgm", ".pbm")},
+    "16 bits": encoded(".png", NOISE.astype(np.uint16) * 256),
+    "alpha": encoded(".png", np.dstack([NOISE] * 4)),
+}
+
+
+@pytest.mark.parametrize("content", IMAGES.values(), ids=IMAGES)
+def test_an_image_of_the_frames_size_is_taken(content, tmp_path):
+    (tmp_path / "image").write_bytes(content)
+    assert list(Pipeline.from_text(FRAME % "image", folder=tmp_path).files) == ["image"]
+
+
+def test_special_files_are_refused_unread(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    with (tmp_path / "large").open("wb") as file:
+        file.write(encoded(".png", NOISE))
+        file.truncate(10**10)
+    for name, expected in (
+        ("pipe", "Not a regular file"), ("folder", "Is a directory"), ("loop", "symbolic links"),
+        ("zero", "Not a regular file"), ("large", "bytes"),
+    ):
+        for line, in (faults_of(Pipeline.from_toml, tmp_path / name),
+                      faults_of(Pipeline.from_text, FRAME % name, folder=tmp_path)):
+            assert expected in line
+
+
+def test_a_file_whose_name_forges_a_line_is_told_in_one(tmp_path):
+    line, = faults_of(Pipeline.from_toml, tmp_path / "a\nforged: \x1b[31m.toml")
+    assert "a\\nforged: \\u001b[31m.toml: cannot be read: No such file" in line
+    faults_of(Pipeline.from_toml, "x" * 5000)
+    faults_of(Pipeline.from_toml, "a\0b")

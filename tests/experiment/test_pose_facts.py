@@ -1,0 +1,63 @@
+"""What may surprise of poses is told in a line, by `plan` and at the start of a run."""
+
+
+import pytest
+
+from sweep.experiment.facts import MAX_SAMPLE, notes, pose_facts
+from sweep.experiment.pipeline import Pipeline
+
+
+def told(pose, axes=None, **sections):
+    return notes(Pipeline.from_dict({"pose": pose, "axes": axes or {}, **sections}))
+
+
+@pytest.mark.parametrize(("pose", "axes", "named"), [
+    ({"distance_m": 0.3}, {"tilt_deg": [0, 45, 80], "bearing_x_deg": [0, 4.9]}, []),
+    ({"distance_m": 0.3, "azimuth_deg": 90}, {"tilt_deg": [60], "bearing_x_deg": [-22, 22]},
+     ["by up to 22° (tilt 60°, viewing angle 38 to 82°): tilt_deg is to the image plane"]),
+    ({"distance_m": 0.3, "bearing_x_deg": 20}, {"yaw_deg": [0, 20]},
+     ["by up to 20° (tilt 0 to 20°, viewing angle 0 to 20°): yaw_deg and pitch_deg are to"]),
+    ({"distance_m": 0.3, "bearing_x_deg": 20}, {"view_angle_deg": [0, 80]}, []),
+    ({"distance_m": 0.3}, {"tilt_deg": [0, 120]}, ["50 % of the poses show the marker's back"]),
+    ({"distance_m": 0.3, "view_angle_deg": 0}, {"bearing_x_deg": [0, 35]},
+     ["50 % of the poses are outside the frame: not_visible; frame_x and frame_y",
+      "distance_m counts along the optical axis: off it, the marker's centre is up to 1.22 times"]),
+    ({"distance_m": 0.3, "view_angle_deg": 0, "y_m": 0.134}, {"trial": 1},
+     ["all poses are cut off by the frame's edge"]),
+    ({"distance_m": 0.01, "frame_x": 0.5}, {}, ["frame's edge; where the marker is too large"]),
+    ({"distance_m": 0.3, "azimuth_deg": {"uniform": [0, 360]}}, {"trial": 4},
+     ["azimuth_deg has no effect"]),
+    ({"distance_m": 0.3}, {"azimuth_deg": [0, 90], "tilt_deg": [0, 30]}, []),
+    ({"distance_m": 0.3}, {"tilt_deg": [0, 0.785, 1.571]},
+     ["tilt_deg = 1.571: in degrees; 1.571 radians would be 90.01"]),
+    ({"distance_m": 0.3}, {"tilt_deg": [0, 0.001, 1, 2, 3, 4, 5]}, []),
+    ({"camera_z_m": 1, "marker_yaw_deg": 180}, {"marker_x_m": [-2, -1]},
+     ["all poses have a corner behind the camera: not_visible"]),
+    ({"marker_yaw_deg": 180}, {"marker_x_m": [-2, 0.3]},
+     ["50 % of the poses have a corner behind the camera: not_visible"]),
+    ({"camera_z_m": 1}, {"marker_x_m": [0.5], "marker_yaw_deg": [0, 180]},
+     ["all poses are not_visible:", "50 % of the poses show the marker's back",
+      "50 % of the poses are outside the frame of the camera: not_visible"]),
+])
+def test_what_may_surprise_of_poses_is_a_line_each(pose, axes, named):
+    lines = told(pose, axes)
+    assert len(lines) == len(named), lines
+    for line, part in zip(lines, named, strict=True):
+        assert part in line
+
+
+def test_poses_of_a_large_grid_are_a_sample_with_its_corners():
+    pipeline = Pipeline.from_dict({
+        "pose": {"bearing_x_deg": {"uniform": [-40, 40]}},
+        "axes": {"tilt_deg": {"linspace": [0, 60, 61]}, "distance_m": {"geom": [0.1, 10, 1000]},
+                 "trial": 1000},
+    })
+    facts = pose_facts(pipeline)
+    assert facts.poses == 61 * 1000 * 1000
+    assert facts.sampled == MAX_SAMPLE
+    assert facts.tilt_deg.min() == 0
+    assert facts.tilt_deg.max() == pytest.approx(60, abs=1e-12)
+    assert (facts.depth_m.min(), facts.depth_m.max()) == (0.1, 10)
+    # tan 30.96° = 320 / 533.3 is the frame's edge: 9/40 of the bearings are outside: a share
+    # of 600 poses is off by 0.11, six standard deviations, with a probability of 1e-9.
+    assert abs(facts.outside.mean() - (1 - 30.96 / 40)) < 0.11

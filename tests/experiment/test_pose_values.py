@@ -1,0 +1,385 @@
+"""Ways of giving a pose: each against SciPy's Rotation and closed forms, and all against draws."""
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import sweep
+from support.here import calls_here
+from support.lengths import first_of, lengths
+from sweep.errors import PipelineError
+from sweep.evaluation.block import GEOMETRY
+from sweep.evaluation.search import visibility_flags
+from sweep.experiment.cell_selection import cell
+from sweep.experiment.grid import scene_axes, scene_values
+from sweep.experiment.parameters import CHOICES, IN_CAMERA, PARAMETERS, RIVALS, WORLD
+from sweep.experiment.pipeline import Pipeline
+from sweep.measure.flags import DetectionStatus
+from sweep.model.scene import build_scenes
+
+FLIP = np.diag([1.0, -1.0, -1.0])
+ANGLE_DEG = 1e-12
+"""Of an angle in degrees: 2e-14 rad, some hundred roundings."""
+
+LENS = [-0.3, 0.1, 0.001, -0.002]
+
+
+def made(pose, axes=None, seed=1, **sections):
+    """Return the values and scenes of a pipeline's whole grid."""
+    pipeline = Pipeline.from_dict({"seed": seed, "pose": pose, "axes": axes or {}, **sections})
+    lengths = [len(axis) for axis in scene_axes(pipeline)]
+    indices = [index.ravel() for index in np.indices(lengths, dtype=np.intp)]
+    values = scene_values(pipeline, indices)
+    return values, build_scenes(values, int(np.prod(lengths)))
+
+
+def viewing_angle_deg(scenes):
+    normal = scenes.rotation[:, :, 2]
+    line = -scenes.translation / np.linalg.norm(scenes.translation, axis=1, keepdims=True)
+    sine = np.linalg.norm(np.cross(normal, line), axis=1)
+    return np.degrees(np.arctan2(sine, np.sum(normal * line, axis=1)))
+
+
+EXTREME = {
+    "distance_m": [0.001, 0.7, 1000], "bearing_x_deg": [-80, 0, 33], "bearing_y_deg": [-5, 80],
+    "azimuth_deg": [0, 77, 251], "roll_deg": [0, -130],
+}
+
+
+def test_view_angle_is_the_angle_to_the_line_of_sight_at_the_extremes():
+    angles = [0, 1e-6, 45, 89.9, 180]
+    values, scenes = made({}, {"view_angle_deg": angles, **EXTREME})
+    expected = values["view_angle_deg"].broadcast(len(scenes))
+    np.testing.assert_allclose(viewing_angle_deg(scenes), expected, atol=ANGLE_DEG)
+    np.testing.assert_allclose(
+        scenes.translation[:, 2], values["distance_m"].values, rtol=0, atol=0
+    )
+
+
+def test_yaw_pitch_and_roll_are_scipys():
+    turns = [*range(-180, 181, 15), 1e-9, 89.9]
+    values, scenes = made(
+        {"distance_m": 1}, {"yaw_deg": turns, "pitch_deg": turns, "roll_deg": turns}
+    )
+    angles = [values[f"{name}_deg"].values for name in ("yaw", "pitch", "roll")]
+    expected = Rotation.from_euler("YXZ", np.stack(angles, axis=1), degrees=True).as_matrix()
+    np.testing.assert_allclose(scenes.rotation, expected @ FLIP, atol=1e-14)
+    one = made({"distance_m": 1, "pitch_deg": 20})[1]
+    np.testing.assert_allclose(
+        one.rotation[0], Rotation.from_euler("X", 20, degrees=True).as_matrix() @ FLIP, atol=1e-15
+    )
+
+
+def test_places_in_metres_are_the_truth():
+    values, scenes = made(
+        {}, {"x_m": [-1000, -0.001, 0, 2.5], "y_m": [0, 0.3], "distance_m": [0.001, 1, 1000]}
+    )
+    expected = [values[name].values for name in ("x_m", "y_m", "distance_m")]
+    np.testing.assert_array_equal(scenes.translation, np.stack(expected, axis=1))
+    mixed = made({"x_m": 0.2, "bearing_y_deg": 10, "distance_m": 2})[1].translation[0]
+    np.testing.assert_array_equal(mixed, [0.2, 2 * np.tan(np.radians(10)), 2])
+
+
+# A share of the frame
+
+def outline(scenes, quiet_modules, points):
+    """Return points (N, M, 3) along the sides of the quiet zone, in the marker's frame."""
+    half = scenes.size_m / 2 * (1 + 2 * quiet_modules / scenes.modules)
+    t = np.linspace(-1, 1, points)
+    one = np.ones_like(t)
+    sides = [np.stack(side, axis=1) for side in ((t, one), (t, -one), (one, t), (-one, t))]
+    square = np.column_stack([np.concatenate(sides), np.zeros(4 * points)])
+    return half[:, None, None] * square
+
+
+def projected(scenes, points, distortion):
+    """Return their pixels by ``cv2.projectPoints``."""
+    pixels = []
+    for k in range(len(scenes)):
+        rvec = Rotation.from_matrix(scenes.rotation[k]).as_rotvec()
+        image, _ = cv2.projectPoints(
+            points[k], rvec, scenes.translation[k], scenes.cameras.matrix(k),
+            np.array(distortion, float) if distortion else None,
+        )
+        pixels.append(image[:, 0])
+    return np.array(pixels)
+
+
+@pytest.mark.parametrize("distortion", [[], LENS, [0.25, 0.1, 0, 0]])
+@pytest.mark.parametrize("turn", first_of(["tilt_deg", "view_angle_deg", "yaw_deg"], 1))
+@lengths(200, 5000)
+def test_share_of_the_frame_never_leaves_it_and_reaches_its_edges(distortion, turn, count):
+    """No scene may be outside; that 200 leave a tenth empty has a chance below 0.9^200 = 7e-10."""
+    values, scenes = made(
+        {"frame_x": {"uniform": [0, 1]}, "frame_y": {"uniform": [0, 1]},
+         "distance_m": {"uniform": [0.5, 4]}, turn: {"uniform": [-75, 75]},
+         "roll_deg": {"uniform": [0, 360]}, "jitter_px": 2},
+        {"trial": count}, marker={"size_m": 0.1, "quiet_zone_modules": 2},
+        camera={"fx_px": 500, "distortion": distortion},
+    )
+    pixels = projected(scenes, outline(scenes, 2, 50), distortion)
+    assert (pixels > -0.5 - 1e-6).all()
+    assert (pixels < np.array([639.5, 479.5]) + 1e-6).all()
+    for axis, (name, length) in enumerate((("frame_x", 640), ("frame_y", 480))):
+        share = values[name].values
+        low, high = pixels[:, :, axis].min(axis=1), pixels[:, :, axis].max(axis=1)
+        # The free space before the marker is to all free space as the share, but for jitter and,
+        # as that is measured in pixels here, perspective.
+        free = (low + 0.5) / (length - 1 - (high - low) + 1)
+        assert np.abs(free - share).max() < 0.12
+        assert free.min() < 0.1
+        assert free.max() > 0.9
+
+
+@pytest.mark.parametrize("distortion", [[], LENS])
+def test_shares_of_0_and_1_touch_the_edges(distortion):
+    for share, edge, end in ((0, -0.5, np.min), (1, np.array([639.5, 479.5]), np.max)):
+        _, scenes = made(
+            {"frame_x": share, "frame_y": share, "distance_m": 1},
+            {"view_angle_deg": [0, 60], "azimuth_deg": [0, 200]}, marker={"size_m": 0.1},
+            camera={"fx_px": 500, "distortion": distortion},
+        )
+        pixels = projected(scenes, outline(scenes, 1, 50), distortion)
+        # Under a lens, 0.05 px are kept free.
+        tolerance = 0.06 if distortion else 1e-9
+        np.testing.assert_allclose(
+            end(pixels, axis=1), np.broadcast_to(edge, (4, 2)), atol=tolerance
+        )
+
+
+@pytest.mark.parametrize("distortion", [[], LENS])
+def test_a_marker_larger_than_the_frame_is_cut_off_alike_at_both_edges(distortion):
+    _, scenes = made(
+        {"frame_y": 0.9, "distance_m": 0.1}, {"frame_x": [0, 0.2, 1]}, marker={"size_m": 0.12},
+        camera={"fx_px": 500, "distortion": distortion},
+    )
+    assert np.isfinite(scenes.translation).all()
+    if not distortion:
+        np.testing.assert_allclose(scenes.translation[:, :2], 0, atol=1e-15)
+
+
+# The world
+
+def test_places_in_the_world_are_scipys():
+    axes = {
+        "camera_x_m": [0, -3], "camera_y_m": [1], "camera_z_m": [0.5, 1000], "camera_yaw_deg": [20],
+        "camera_pitch_deg": [-10, 90], "camera_roll_deg": [5], "marker_x_m": [2, -2],
+        "marker_z_m": [0.2], "marker_yaw_deg": [180, 30], "marker_pitch_deg": [-90, 0, 12],
+        "marker_roll_deg": [0, 40],
+    }
+    values, scenes = made({}, axes)
+    count = len(scenes)
+    of = {name: values[name].broadcast(count) if not values[name].missing else np.zeros(count)
+          for name in WORLD}
+
+    def part(whose):
+        place = np.stack([of[f"{whose}_{axis}_m"] for axis in "xyz"], axis=1)
+        angles = [of[f"{whose}_{name}_deg"] for name in ("yaw", "pitch", "roll")]
+        return place, Rotation.from_euler("ZYX", np.stack(angles, axis=1), degrees=True)
+
+    (camera, body), (marker, other) = part("camera"), part("marker")
+    image = Rotation.from_matrix([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    face = Rotation.from_matrix([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    expected = (image * body.inv() * other * face).as_matrix()
+    np.testing.assert_allclose(scenes.rotation, expected, atol=1e-14)
+    np.testing.assert_allclose(
+        scenes.translation, image.apply(body.inv().apply(marker - camera)), atol=1e-12
+    )
+
+
+# Any pose, to the ends of the ranges
+
+LENSES = [[], LENS, [0.3, 0.2, 0, 0], [-1.2, 0.3, 0, 0], [5, 0, 0, 0],
+          [-0.4, 0.2, 0, 0, 0, 0, 0, 0, 0.01, 0, 0.01, 0, 0.1, -0.1]]
+
+
+def any_value(rng, name):
+    declared = PARAMETERS[name].declaration
+    low, high = max(declared.low, -1e12), min(declared.high, 1e12)
+    ends = [1e-9 if declared.open_low else low, high, max(low, 1e-3)]
+    usual = [1e-9, 0.001, 1, 89.9999999, 90, 180]
+    number = [rng.choice(ends), rng.choice(usual), rng.uniform(low, min(high, 1000))]
+    return float(np.clip(number[rng.integers(3)], low, high))
+
+
+def any_document(rng):
+    """Return a document with a pose given in any way, at any value, fixed, as axis or drawn."""
+    if rng.random() < 0.25:
+        names = [str(name) for name in rng.choice(WORLD, rng.integers(1, 12), replace=False)]
+    else:
+        chosen = [ways[rng.integers(len(ways))] for ways in CHOICES
+                  if {*ways[0]} <= {*IN_CAMERA}]
+        turned = {"yaw_deg", "pitch_deg"} & {name for way in chosen for name in way}
+        without = ("tilt_deg", "view_angle_deg", "azimuth_deg") if turned else ()
+        given = dict.fromkeys(name for way in chosen for name in way)
+        names = [name for name in given if name not in without] + ["roll_deg"]
+    pose, axes = {name: any_value(rng, name) for name in names}, {}
+    if rng.random() < 0.5:
+        pose["jitter_px"] = float(rng.choice([0.5, 50]))
+    for name in names:
+        kind, other = rng.random(), any_value(rng, name)
+        if kind < 0.3 and other != pose[name]:
+            axes[name] = [pose.pop(name), other]
+        elif kind < 0.5 and other > pose[name]:
+            pose[name] = {"uniform": [pose[name], other]}
+    if "jitter_px" in pose or any(isinstance(value, dict) for value in pose.values()):
+        axes["trial"] = 3
+    return {
+        "pose": pose, "axes": axes,
+        "marker": {"size_m": float(rng.choice([0.05, 1e-9, 1e9])),
+                   "quiet_zone_modules": float(rng.choice([0, 1, 100]))},
+        "camera": {"fx_px": float(rng.choice([300, 600, 1e-3, 1e9])),
+                   "width_px": int(rng.choice([640, 1, 100_000])),
+                   "distortion": LENSES[rng.integers(len(LENSES))]},
+    }
+
+
+@lengths(20, 2000)
+def test_any_pose_has_a_truth_and_is_the_same_alone(count):
+    rng = np.random.default_rng(0)
+    for _ in range(count):
+        document = any_document(rng)
+        pipeline = Pipeline.from_dict(document)
+        indices = [index.ravel() for index in np.indices(
+            [len(axis) for axis in scene_axes(pipeline)], dtype=np.intp)]
+        scene_count = len(indices[0]) if indices else 1
+        values = scene_values(pipeline, indices)
+        scenes = build_scenes(values, scene_count)
+        unseen = visibility_flags(scenes) == DetectionStatus.not_visible
+        for name, function in GEOMETRY.items():
+            numbers = function(scenes)
+            if name == "marker_area_px":
+                numbers = numbers[~unseen]
+            assert np.isfinite(numbers).all(), (name, document)
+        if "view_angle_deg" in pipeline.given:
+            given = np.abs(values["view_angle_deg"].broadcast(scene_count))
+            found = GEOMETRY["viewing_angle_deg"](scenes)
+            np.testing.assert_allclose(found, given, atol=1e-10, err_msg=str(document))
+        one = int(rng.integers(scene_count))
+        alone = build_scenes(scene_values(pipeline, [each[one : one + 1] for each in indices]), 1)
+        np.testing.assert_array_equal(alone.translation[0], scenes.translation[one])
+        np.testing.assert_array_equal(alone.rotation[0], scenes.rotation[one])
+
+
+# Draws
+
+def key_draws(pose, axes=None, **sections):
+    values, _ = made({"jitter_px": 0.5, **pose}, {**(axes or {}), "trial": 3}, **sections)
+    return values["shift_u_px"].values
+
+
+@pytest.mark.parametrize(
+    ("given", "same"),
+    [({"yaw_deg": 30}, {"tilt_deg": 30, "azimuth_deg": 90}),
+     ({"pitch_deg": 30, "roll_deg": 10}, {"tilt_deg": 30, "roll_deg": 10}),
+     ({"yaw_deg": 0, "pitch_deg": 0}, {}),
+     ({"view_angle_deg": 40, "azimuth_deg": 20}, {"tilt_deg": 40, "azimuth_deg": 20}),
+     ({"view_angle_deg": 0, "roll_deg": 7}, {"roll_deg": 7}),
+     ({"x_m": 0.5}, {"bearing_x_deg": 45}), ({"x_m": 0, "y_m": 0}, {}),
+     ({"frame_x": 0.5, "frame_y": 0.5}, {})],
+)
+def test_a_fixed_pose_has_the_same_draws_in_whichever_way_it_is_given(given, same):
+    place = {"distance_m": 0.5}
+    np.testing.assert_array_equal(key_draws(place | given), key_draws(place | same))
+    roll = {"roll_deg": 33} if "roll_deg" not in given else {}
+    assert (key_draws(place | given) != key_draws({"distance_m": 0.6} | given)).all()
+    assert roll == {} or (key_draws(place | given) != key_draws(place | given | roll)).all()
+
+
+def test_a_pose_in_the_world_has_the_draws_of_that_in_the_camera():
+    world = {"camera_z_m": 1, "camera_pitch_deg": 90, "marker_yaw_deg": 180,
+             "marker_pitch_deg": -90}
+    np.testing.assert_array_equal(key_draws(world), key_draws({"distance_m": 1}))
+
+
+def test_draws_depend_on_the_distribution_and_not_on_axis_or_fixed():
+    drawn = {"distance_m": 1, "view_angle_deg": {"uniform": [0, 60]}}
+    one = key_draws({"azimuth_deg": 30, **drawn})
+    two = key_draws(drawn, {"azimuth_deg": [30, 60]})
+    np.testing.assert_array_equal(one, two[:3])
+    assert (one != two[3:]).all()
+    other = {"distance_m": 1, "view_angle_deg": {"uniform": [0, 61]}, "azimuth_deg": 30}
+    assert (key_draws(other) != one).all()
+    tilt = {"distance_m": 1, "tilt_deg": {"uniform": [0, 60]}, "azimuth_deg": 30}
+    assert (key_draws(tilt) != one).all()
+
+
+def test_coordinates_are_what_was_given_and_none_that_has_no_meaning(tmp_path):
+    pose = {"distance_m": 0.3, "yaw_deg": 10, "pitch_deg": 5, "roll_deg": {"uniform": [20, 40]},
+            "frame_x": {"uniform": [0, 1]}}
+    with calls_here():
+        results = sweep.run({"pose": pose, "axes": {"y_m": [0, 0.01], "trial": 2}},
+                            store=str(tmp_path / "given.zarr"))
+    coordinates = {name for name in (*IN_CAMERA, *WORLD) if name in results.coords}
+    assert coordinates == {"distance_m", "yaw_deg", "pitch_deg", "roll_deg", "frame_x", "y_m"}
+    turns = results.roll_deg.to_numpy().ravel()
+    assert turns.min() > 20
+    expected = Rotation.from_euler(
+        "YXZ", np.column_stack([np.full(4, 10), np.full(4, 5), turns]), degrees=True
+    ).as_matrix() @ FLIP
+    found = Rotation.from_rotvec(results.true_rvec.to_numpy().reshape(-1, 3)).as_matrix()
+    np.testing.assert_allclose(found, expected, atol=1e-14)
+
+
+# Rules and choices
+
+@pytest.mark.parametrize(
+    ("pose", "line"),
+    [({"distance_m": 1, "camera_x_m": 3, "marker_z_m": 0, "roll_deg": 2},
+      ("pose.camera_x_m = 3: expected a pose in the world or in the camera's frame, not both; "
+       "delete camera_x_m, marker_z_m, or distance_m, roll_deg")),
+     ({"x_m": 3}, "pose: expected distance_m or side_px, fixed or under [axes]"),
+     ({"distance_m": 1, "frame_x": {"normal": [0.5, 0.2]}},
+      "pose.frame_x = {normal = [0.5, 0.2]}: expected mean - 8.3 sd and mean + 8.3 sd from 0 to 1"),
+     ({"camera_x_m": "left"},
+      'pose.camera_x_m = "left": expected a number from -1e+12 to 1e+12')],
+)
+def test_contradictions_are_refused_in_a_line_that_says_what_to_delete(pose, line):
+    with pytest.raises(PipelineError) as refused:
+        Pipeline.from_dict({"pose": pose})
+    assert [fault.removeprefix("pipeline: ") for fault in refused.value.faults] == [line]
+
+
+@pytest.mark.parametrize(("first", "other"), [
+    pair for choice in CHOICES for pair in itertools.combinations(choice, 2)
+    if {*pair[0]} <= {*IN_CAMERA}
+])
+def test_two_ways_to_give_a_quantity_are_refused_in_a_line(first, other):
+    pose = {"distance_m": 1} | dict.fromkeys((first[0], other[0]), 0.4)
+    with pytest.raises(PipelineError) as refused:
+        Pipeline.from_dict({"pose": pose})
+    assert any(
+        line.startswith(f"pipeline: pose.{other[0]} = {pose[other[0]]}: expected ")
+        and f"{first[0]} or {other[0]}, not both; delete one" in line
+        for line in refused.value.faults), refused.value.faults
+
+
+def test_every_parameter_of_a_pose_can_be_drawn_and_be_an_axis():
+    for name in (*IN_CAMERA, *WORLD):
+        ends = [0.2, 0.4]
+        base = {} if name in (*WORLD, "distance_m", "side_px") else {"distance_m": 1}
+        drawn = made({**base, name: {"uniform": ends}}, {"trial": 2})[1]
+        axis = made(base, {name: ends})[1]
+        for scenes in (drawn, axis):
+            moved = np.abs(np.diff(scenes.translation, axis=0)).max()
+            turned = np.abs(np.diff(scenes.rotation, axis=0)).max()
+            assert moved + turned > 0 or name == "azimuth_deg", name
+
+
+@pytest.mark.parametrize(("name", "value"), [
+    ("view_angle_deg", 30), ("yaw_deg", 30), ("x_m", 0.1), ("frame_x", 0.2), ("side_px", 40),
+])
+def test_choosing_one_way_drops_the_others(name, value):
+    others = {"tilt_deg": 5, "azimuth_deg": 3, "bearing_x_deg": 2, "distance_m": 1}
+    pipeline = Pipeline.from_dict({"pose": others, "axes": {"roll_deg": [0, 1]}})
+    at = cell(pipeline, f"{name}={value}")
+    reset = Pipeline.from_dict({"pose": others}, [f"{name}={value}"])
+    for chosen in (at, reset):
+        assert chosen.fixed[name] == value
+        assert not RIVALS[name] & chosen.given
+    assert at.fixed["roll_deg"] == 0
+    with pytest.raises(PipelineError, match="not both"):
+        Pipeline.from_dict({"pose": others}, ["tilt_deg=3", "view_angle_deg=4"])

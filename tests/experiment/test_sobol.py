@@ -1,0 +1,153 @@
+"""Draws that are Sobol' points, scrambled."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.stats import qmc
+
+import sweep
+from sweep.errors import PipelineError
+from sweep.experiment.cell_selection import cell
+from sweep.experiment.draws import (
+    BITS,
+    DIMENSIONS,
+    REPLICATES,
+    jointly_drawn,
+    points,
+    scrambled,
+    sobol_uniform,
+)
+from sweep.experiment.grid import scene_values
+from sweep.experiment.parameters import PARAMETERS
+from sweep.model.calibration import CalibrationError
+from sweep.store.provenance import fingerprint
+
+
+def pipeline(*settings, trials=64, **sections):
+    document = {
+        "seed": 4, "sampling": "sobol",
+        "pose": {"distance_m": 0.5, "tilt_deg": {"uniform": [0, 60]},
+                 "roll_deg": {"normal": [0, 30]}, "jitter_px": 1},
+        "axes": {"azimuth_deg": [0, 40], "trial": trials},
+    }
+    return sweep.Pipeline.from_dict(document | sections, list(settings))
+
+
+def drawn(grid, *indices):
+    values = scene_values(grid, [np.asarray(index) for index in indices])
+    return {name: values[name].values for name in
+            ("tilt_deg", "roll_deg", "shift_u_px", "shift_v_px")}
+
+
+def test_points_are_those_of_scipy():
+    reference = qmc.Sobol(DIMENSIONS, scramble=False, bits=30)
+    expected = reference.random(2048)
+    far = qmc.Sobol(DIMENSIONS, scramble=False, bits=BITS).fast_forward(123_456).random(8)
+    for dimension in range(DIMENSIONS):
+        ours = points(dimension, np.arange(2048)) * 2.0**-BITS
+        np.testing.assert_array_equal(ours, expected[:, dimension])
+        ours = points(dimension, np.arange(123_456, 123_464)) * 2.0**-BITS
+        np.testing.assert_array_equal(ours, far[:, dimension])
+
+
+def test_every_drawable_quantity_has_a_dimension():
+    drawable = [name for name, each in PARAMETERS.items() if each.declaration.drawable]
+    calibrated = CalibrationError.of((1.0,) * 18, (), 14).names
+    assert len(jointly_drawn(drawable, calibrated)) <= DIMENSIONS
+
+
+def test_scrambling_is_nested_and_uniform():
+    # Owen: of any digits of a point, the first k of its scramble depend on the first k only, and
+    # every interval of 2^-k of the scramble has one interval of the points.
+    digits = points(3, np.arange(1024))
+    keys = np.full(1024, 99, dtype=np.uint64)
+    numbers = scrambled(digits, keys)
+    for k in (1, 4, 9, 10):
+        before, after = (digits >> np.uint64(BITS - k)).astype(int), np.floor(numbers * 2**k)
+        pairs = set(zip(before.tolist(), after.tolist(), strict=True))
+        assert len(pairs) == len(set(before.tolist())) == 2**k
+    # A point's scrambles by different keys are uniform and independent of the point.
+    keys = np.arange(20_000, dtype=np.uint64)
+    for point in (0, 1, 2**31):
+        numbers = scrambled(np.full(20_000, point, dtype=np.uint64), keys)
+        assert stats.kstest(numbers, "uniform").pvalue > 1e-6
+        low = np.floor(numbers * 2**40) % 2**10 / 2**10  # the digits beyond the 30th
+        assert stats.kstest(low, "uniform").pvalue > 1e-6
+    assert ((numbers > 0) & (numbers < 1)).all()
+
+
+def test_pairs_of_quantities_fill_their_square_evenly():
+    # Of 256 points of a replicate every elementary interval of area 1/256 of dimensions 0 and 1
+    # has exactly one: a (0, 8, 2)-net, which scrambling keeps.
+    trials = np.arange(256) * REPLICATES + 5
+    u, v = (sobol_uniform(d, np.full(256, 7 + d, dtype=np.uint64), trials) for d in (0, 1))
+    for k in range(9):
+        cells = np.floor(u * 2**k) * 2 ** (8 - k) + np.floor(v * 2 ** (8 - k))
+        assert len(set(cells.tolist())) == 256
+
+
+def test_a_draw_depends_on_its_own_cell_and_trial_alone():
+    grid, index = pipeline(), (np.repeat([0, 1], 64), np.tile(np.arange(64), 2))
+    ours = drawn(grid, *index)
+    # A grid that is extended, cut into other blocks, in other order, with a fixed azimuth.
+    longer = drawn(pipeline(trials=4096), *index)
+    fixed = pipeline(axes={"trial": 64}, pose={
+        "distance_m": 0.5, "tilt_deg": {"uniform": [0, 60]}, "roll_deg": {"normal": [0, 30]},
+           "jitter_px": 1, "azimuth_deg": 40,
+    })
+    for name, values in ours.items():
+        np.testing.assert_array_equal(longer[name], values)
+        np.testing.assert_array_equal(drawn(fixed, np.arange(64))[name], values[64:])
+        some = drawn(grid, [1, 0], [33, 2])[name]
+        np.testing.assert_array_equal(some, values[[64 + 33, 2]])
+    one = cell(grid, "azimuth_deg=40,trial=33")
+    assert drawn(one, [0])["tilt_deg"][0] == ours["tilt_deg"][64 + 33]
+    assert len(set(ours["tilt_deg"].tolist())) == 128
+
+
+def test_what_a_calibration_gives_is_drawn_evenly_with_all_else():
+    grid = pipeline(camera={"fx_px": 600, "calibration_sd": [5, 5, 2, 2]},
+                    estimator={"believed": "calibration"})
+    index = np.zeros(64, dtype=int), np.arange(64)
+    values = scene_values(grid, index)
+    for replicate in range(REPLICATES):
+        for name, (mean, sd) in {"calibrated_fx_px": (600, 5), "tilt_deg": (None, None)}.items():
+            numbers = values[name].values[replicate::REPLICATES]
+            share = numbers / 60 if mean is None else stats.norm.cdf((numbers - mean) / sd)
+            assert sorted(np.floor(share * 4).tolist()) == [0, 1, 2, 3], name
+
+
+def test_replicates_are_independent():
+    # The correlation of the means of two replicates over 4,000 cells is 0 to 0.08 but for a chance
+    # below 1e-6 (normal, 1 / sqrt(4000) = 0.016).
+    keys = np.repeat(np.arange(4000, dtype=np.uint64) * np.uint64(97), 4)
+    means = [
+        sobol_uniform(2, keys, np.tile(np.arange(4) * REPLICATES + r, 4000)).reshape(-1, 4).mean(1)
+        for r in (0, 1)
+    ]
+    assert abs(np.corrcoef(*means)[0, 1]) < 0.08
+    assert means[0].var() < 1 / 12 / 4 / 3
+
+
+@pytest.mark.parametrize(("settings", "sections", "line"), [
+    (["trial=40"], {}, "axes.trial = 40: expected a multiple of 16, at least 32, for sampling"),
+    (["sampling=halton"], {}, 'sampling = "halton": expected one of independent, sobol'),
+    ([], {"pose": {"distance_m": 1}, "scene": {"noise_grey": 1}},
+     'sampling = "sobol": expected a distribution or jitter_px above 0'),
+])
+def test_what_cannot_be_sampled_evenly_is_one_line(settings, sections, line):
+    with pytest.raises(PipelineError) as refusal:
+        pipeline(*settings, **sections)
+    assert str(refusal.value).removeprefix("pipeline: ").startswith(line)
+    assert "\n" not in str(refusal.value)
+
+
+def test_sampling_is_part_of_what_stores_must_share():
+    grid = pipeline()
+    assert sweep.Pipeline.from_text(grid.to_toml()) == grid
+    assert fingerprint(grid)["sampling"] == "sobol"
+    assert fingerprint(pipeline("sampling='Sobol'"))["sampling"] == "sobol"
+    plain = pipeline("sampling=independent")
+    assert "sampling" not in fingerprint(plain)
+    index = np.zeros(3, dtype=int), np.arange(3)
+    assert (drawn(plain, *index)["tilt_deg"] != drawn(grid, *index)["tilt_deg"]).all()

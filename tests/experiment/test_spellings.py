@@ -1,0 +1,174 @@
+"""Values as OpenCV, Python and users spell them, and names that are nearly right."""
+
+import cv2
+import pytest
+
+from sweep.errors import PipelineError, StoreError
+from sweep.experiment.board_rules import read_board
+from sweep.experiment.cell_selection import parse_selection
+from sweep.experiment.parameters import PARAMETERS
+from sweep.experiment.pipeline import Pipeline
+from sweep.measure.detectors import REFINEMENTS
+from sweep.measure.estimators import SOLVERS
+from sweep.store.lifecycle import open_store
+
+OPENCV = {
+    "cornerRefinementMethod": {f"CORNER_REFINE_{name.upper()}": name for name in REFINEMENTS},
+    "solver": {f"SOLVEPNP_{name.upper()}": name for name in SOLVERS
+               if name not in ("photometric", "photometric_real", "recorded")},
+    "dictionary": {name: name for name in dir(cv2.aruco) if name.startswith("DICT_")},
+}
+
+
+@pytest.mark.parametrize("name", OPENCV)
+def test_every_name_of_opencv_is_understood_in_any_case_and_with_its_module(name):
+    parameter = PARAMETERS[name]
+    twins = {choice.casefold(): set() for choice in parameter.declaration.choices}
+    for choice in parameter.declaration.choices:  # OpenCV has DICT_APRILTAG_16h5 and ..._16H5
+        twins[choice.casefold()].add(choice)
+    for spelled, choice in OPENCV[name].items():
+        module = "cv2." if name == "solver" else "cv2.aruco."
+        assert hasattr(cv2 if name == "solver" else cv2.aruco, spelled)
+        for written in (spelled, spelled.lower(), spelled.title(), module + spelled, choice,
+                        choice.upper(), f" {choice} ", f"cv::aruco::{spelled}",
+                        choice.removeprefix("DICT_")):
+            assert parameter.check(written) in twins[choice.casefold()], written
+        assert parameter.check(spelled if name == "dictionary" else choice) == choice
+
+
+@pytest.mark.parametrize(("written", "value"), [
+    ("36h11", "DICT_APRILTAG_36h11"), ("tag36h11", "DICT_APRILTAG_36h11"),
+    ("25h9", "DICT_APRILTAG_25h9"), ("Tag16H5", "DICT_APRILTAG_16h5"),
+    ("AprilTag-36h10", "DICT_APRILTAG_36h10"), ("DICT_36h11", "DICT_APRILTAG_36h11"),
+    ("mip_36h12", "DICT_ARUCO_MIP_36h12"), ("4x4-50", "DICT_4X4_50"), ("hd11", "STAG_HD11"),
+    ("standard41h12", "tagStandard41h12"), ("circle21h7", "tagCircle21h7"),
+])
+def test_a_dictionary_is_understood_by_its_number_where_that_is_one(written, value):
+    assert PARAMETERS["dictionary"].check(written) == value
+    if value.startswith("DICT"):
+        pipeline = Pipeline.from_text("[pose]\nside_px = 40", [f"dictionary={written}"])
+        assert pipeline.fixed["dictionary"] == value
+
+
+@pytest.mark.parametrize(("written", "meant"), [
+    ("DICT_4X4", "DICT_4X4_50, DICT_4X4_100, DICT_4X4_250 or DICT_4X4_1000"),
+    ("5x5", "DICT_5X5_50, DICT_5X5_100, DICT_5X5_250 or DICT_5X5_1000"),
+    ("apriltag", ", ".join(f"DICT_APRILTAG_{name}" for name in ("16h5", "25h9", "36h10"))
+     + " or DICT_APRILTAG_36h11"),
+    ("tag41h12", "tagStandard41h12"),
+])
+def test_of_several_dictionaries_the_nearest_are_named(written, meant):
+    with pytest.raises(ValueError, match=f"; did you mean {meant}\\?$"):
+        PARAMETERS["dictionary"].check(written)
+    with pytest.raises(PipelineError, match=f"; did you mean {meant}\\?"):
+        Pipeline.from_text("[pose]\nside_px = 40", [f'dictionary=["{written}", "36h11"]'])
+
+
+@pytest.mark.parametrize("name", sorted(PARAMETERS))
+def test_a_parameter_in_a_wrong_section_is_told_with_the_right_one(name):
+    home = PARAMETERS[name].section
+    for section in {"camera", "pose", "limit", "elsewhere"} - {home}:
+        with pytest.raises(PipelineError) as raised:
+            Pipeline.from_text(f"[{section}]\n{name} = 1")
+        (line,) = (line for line in raised.value.faults if f"{name}" in line and "belongs" in line)
+        assert f"belongs under [{home}]" in line
+        if section != "limit":
+            with pytest.raises(PipelineError, match=f"expected {name} or {home}.{name}"):
+                Pipeline.from_text("", [f"{section}.{name}=1"])
+
+
+@pytest.mark.parametrize(("text", "told"), [
+    ("[pose]\ntilt_deg = [0, 30]", "an axis: they go under [axes]"),
+    ("[estimator]\nsolver = ['ippe', 'sqpnp']", "an axis: they go under [axes]"),
+    ("[pose]\ntilt_deg = { linspace = [0, 30, 3] }", "goes under [axes]"),
+    ("[pose]\nboth = { zip = { tilt_deg = [0, 1], roll_deg = [1, 2] } }", "under [axes]"),
+    ("[pose]\ntrial = 3", "belongs under [axes]"), ("trial = 3", "it under [axes]"),
+    ("solver = 'ippe'", "it under [estimator]"), ("[pose]\nseed = 3", "at the top"),
+    ("[axes]\nseed = [3]", "at the top"),
+    ("[pose]\nvelocity_x = 3", "did you mean velocity_x_m_s under [scene]?"),
+    ("[camera]\nvelocty_x_m_s = 3", "did you mean velocity_x_m_s under [scene]?"),
+])
+def test_what_stands_in_a_wrong_place_is_told_with_the_right_one(text, told):
+    with pytest.raises(PipelineError) as raised:
+        Pipeline.from_text(text)
+    assert any(told in line for line in raised.value.faults), raised.value.faults
+
+
+@pytest.mark.parametrize(("wrong", "right"), [
+    ("smok.toml", "smoke.toml"), ("Smoke.TOML", "smoke.toml"), ("smoke", "smoke.toml"),
+    ("folder/smoek.toml", "folder/smoke.toml"),
+])
+def test_of_a_misspelled_file_the_nearest_in_its_folder_is_named(
+    wrong, right, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    for name in ("smoke.toml", "other.toml", "camera.yaml", "board.toml", "folder/smoke.toml"):
+        (tmp_path / name).touch()
+    with pytest.raises(PipelineError, match=f"; did you mean {right}\\?"):
+        Pipeline.from_toml(wrong)
+    with pytest.raises(PipelineError, match=r"did you mean board\.toml"):
+        read_board("bord.toml")
+    with pytest.raises(PipelineError, match=r"did you mean camera\.yaml"):
+        Pipeline.from_text('[camera]\ncamera_file = "camra.yaml"')
+    (tmp_path / "runs/smoke.zarr").mkdir(parents=True)
+    with pytest.raises(StoreError, match=r"did you mean runs/smoke\.zarr"):
+        open_store("smok.zarr")
+
+
+@pytest.mark.parametrize(
+    ("name", "written", "value"),
+    [
+        ("renderer", "Exact", "exact"), ("renderer", "Supersample-4-Jittered",
+                                         "supersample-4-jittered"),
+        ("window", "FULL", "full"), ("bound", "Known_Blur", "known_blur"),
+        ("solver", "Photometric", "photometric"),
+    ],
+)
+def test_every_choice_is_understood_in_any_case(name, written, value):
+    assert PARAMETERS[name].check(written) == value
+
+
+def test_the_canonical_value_is_what_is_kept_and_compared():
+    rest = "[pose]\nside_px = 40\n[marker]\nsize_m = 0.1"
+    plain = Pipeline.from_text(f'[axes]\nsolver = ["ippe", "sqpnp"]\n{rest}')
+    other = Pipeline.from_text(
+        f'[axes]\nsolver = ["SOLVEPNP_IPPE", "Sqpnp"]\n{rest}\ndictionary = "dict_5x5_50"')
+    assert other.axes == plain.axes
+    assert dict(other.fixed) == dict(plain.fixed)
+    assert parse_selection("solver=SOLVEPNP_IPPE") == {"solver": "ippe"}
+    with pytest.raises(PipelineError, match="each value once"):
+        Pipeline.from_text('[axes]\nsolver = ["ippe", "SOLVEPNP_IPPE"]')
+    set_so = Pipeline.from_text(
+        "[pose]\nside_px = 40", ["solver=SOLVEPNP_IPPE", "guarded=False"])
+    assert (set_so.fixed["solver"], set_so.fixed["guarded"]) == ("ippe", False)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("[detector]\ncornerRefinementMethod = 1", "OpenCV's constant 1 is subpix"),
+        ("[axes]\ncornerRefinementMethod = [0, 1]", "OpenCV's constant 0 is none"),
+        (f"[estimator]\nsolver = {cv2.SOLVEPNP_IPPE_SQUARE}", "is ippe_square"),
+        ("[marker]\ndictionary = 4", "OpenCV's constant 4 is DICT_5X5_50"),
+        ("[detector]\ncornerRefinementMethod = 99", "expected one of none, subpix"),
+        ("[estimator]\nsolver = true", "expected one of ippe"),
+        ('[estimator]\nsolver = "ippe_sqare"', "did you mean ippe_square?"),
+        ('[marker]\ndictionary = "DICT_5X5_51"', "did you mean DICT_5X5_50?"),
+        ("[pose]\nTilt_Deg = 3", "did you mean tilt_deg?"),
+        ("[marker]\nmarkerid = 3", "did you mean marker_id?"),
+        ("[marker]\nMARKER-ID = 3", "did you mean marker_id?"),
+        ("[detector]\ncorner_refinement_method = 'subpix'", "did you mean cornerRefinementMethod?"),
+        ("[axes]\nTrials = 3", "did you mean trial?"),
+        ("[Pose]\ntilt_deg = 3", "did you mean pose?"),
+        ("Seed = 3", "did you mean seed?"),
+        (["Tilt_Deg=3"], "did you mean tilt_deg?"),
+        (["pose.TiltDeg=3"], "did you mean tilt_deg?"),
+    ],
+)
+def test_what_is_nearly_right_is_told_with_what_is_right(text, told):
+    with pytest.raises(PipelineError) as raised:
+        Pipeline.from_text(*(("", text) if isinstance(text, list) else (text,)))
+    lines = [line for line in raised.value.faults if "expected distance_m or side_px" not in line]
+    assert len(lines) == 1
+    assert told in lines[0]

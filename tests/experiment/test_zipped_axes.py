@@ -1,0 +1,179 @@
+"""Axes along which parameters go together."""
+
+import numpy as np
+import pytest
+
+import sweep
+from sweep.errors import PipelineError
+from sweep.experiment.axes import combinations
+from sweep.experiment.cell_selection import cell, parse_selection, selection_text
+from sweep.experiment.grid import scene_values
+from sweep.experiment.parameters import Stage
+from sweep.experiment.pipeline import parse_settings
+
+POSE = {"pose": {"distance_m": 0.5}}
+
+
+def pipeline(axes, **sections):
+    return sweep.Pipeline.from_dict(POSE | sections | {"axes": axes})
+
+
+def refused(axes, **sections):
+    with pytest.raises(PipelineError) as refusal:
+        pipeline(axes, **sections)
+    return str(refusal.value).removeprefix("pipeline: ")
+
+
+def test_members_come_in_every_form_of_an_axis():
+    grid = pipeline({
+        "lens": {"zip": {
+            "fx_px": [600, 800, 1000], "fy_px": {"linspace": [600, 1000, 3]},
+            "marker_id": {"range": [0, 3]}, "size_m": {"geom": [0.01, 1, 3]},
+            "dictionary": {"values": ["DICT_4X4_50", "DICT_5X5_50", "DICT_4X4_50"]},
+            "distortion": [[], [0.1, 0, 0, 0], [0, 0, 0, 0, 0]],
+        }},
+        "tilt_deg": [0, 30],
+    })
+    (lens, tilt) = grid.axes
+    assert (lens.name, len(lens), lens.stage, lens.unit) == ("lens", 3, Stage.scene, "")
+    assert lens.values[1] == "800, 800, 1, 0.1, DICT_5X5_50, [0.1, 0.0, 0.0, 0.0]"
+    assert lens.at(1) == {
+        "fx_px": 800.0, "fy_px": 800.0, "marker_id": 1, "size_m": pytest.approx(0.1),
+        "dictionary": "DICT_5X5_50", "distortion": (0.1, 0.0, 0.0, 0.0),
+    }
+    assert list(grid.values_of("fx_px")) == [600, 800, 1000]
+    assert grid.any_value("marker_id", lambda value: value == 2)
+    assert grid.axis("fx_px") is None
+    assert grid.axis_of("fx_px") is lens
+    assert grid.size(Stage.scene) == 6
+    assert sweep.Pipeline.from_text(grid.to_toml()) == grid
+    assert [row["tilt_deg"] for row in combinations([lens, tilt])] == [0, 30] * 3
+
+
+def test_draws_are_those_of_the_same_values_on_axes_of_their_own():
+    drawn = {"pose": {"distance_m": 0.5, "tilt_deg": {"uniform": [0, 60]}, "jitter_px": 1}}
+    one = pipeline({"lens": {"zip": {"fx_px": [600, 800], "fy_px": [600, 805]}}, "trial": 9},
+                   **drawn)
+    two = pipeline({"fx_px": [600, 800], "fy_px": [600, 805], "trial": 9}, **drawn)
+    zipped = scene_values(one, [np.array([0, 1, 1]), np.array([3, 4, 8])])
+    apart = scene_values(two, [np.array(k) for k in ([0, 1, 1], [0, 1, 1], [3, 4, 8])])
+    for name in ("fx_px", "fy_px", "tilt_deg", "shift_u_px", "shift_v_px"):
+        assert zipped[name].values.tolist() == apart[name].values.tolist()
+    assert len(set(zipped["tilt_deg"].values.tolist())) == 3
+
+
+@pytest.mark.parametrize(("given", "named"), [
+    ({"fx_px": [600, 800], "fy_px": [600]}, ["axes.lens", "fx_px has 2", "fy_px has 1"]),
+    ({"fx_px": [600, 800]}, ["axes.lens", "at least two parameters"]),
+    ({}, ["axes.lens", "at least two parameters"]),
+    ({"fx_px": [600, 800], "solver": ["ippe", "iterative"]}, ["axes.lens", "of one stage"]),
+    ({"fx_px": [600, 800, 600], "fy_px": [600, 800, 600]}, ["axes.lens", "600, 600 is repeated"]),
+    ({"fx_px": [600, 800], "fy": [600, 800]}, ["axes.lens.fy: ", "did you mean fy_px?"]),
+    ({"fx_px": [600, 800], "trial": 2}, ["axes.lens.trial = 2", "an axis of its own"]),
+    ({"fx_px": [600, 800], "fy_px": {"uniform": [600, 800]}}, ["axes.lens.fy_px", "[camera]"]),
+    ({"fx_px": [600, 800], "fy_px": {"zip": {"cx_px": [1, 2], "cy_px": [1, 2]}}},
+     ["axes.lens.fy_px", "a name of your own"]),
+    ({"fx_px": [600, -1], "fy_px": [600, 800]}, ["axes.lens.fx_px", "(not -1)"]),
+    ({"fx_px": 600, "fy_px": [700]}, ["axes.lens.fx_px = 600", "expected a list"]),
+    ({"distance_m": [1, 2], "tilt_deg": [1, 2]}, ["axes.lens.distance_m", "pose.distance_m"]),
+    ({"side_px": [10, 20], "tilt_deg": [1, 2]}, ["side_px", "distance_m or side_px, not both"]),
+    ({"dictionary": ["DICT_4X4_50", "DICT_4X4_100"], "marker_id": [50, 99]},
+     ["marker_id", "IDs from 0 to 49"]),
+    ({"adaptiveThreshWinSizeMin": [3, 9], "adaptiveThreshWinSizeMax": [23, 5]},
+     ["adaptiveThreshWinSizeMax", "at least adaptiveThreshWinSizeMin"]),
+])
+def test_what_cannot_go_together_is_one_line(given, named):
+    text = refused({"lens": {"zip": given}})
+    assert all(each in text for each in named), text
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize("lens", [
+    {"zip": [600, 800]}, {"fx_px": [600, 800], "fy_px": [600, 805]},
+    {"zip": {"fx_px": [600, 800], "fy_px": [600, 805]}, "values": [1, 2]},
+])
+def test_an_axis_that_is_almost_of_parameters_that_go_together_is_told_how_to_write_it(lens):
+    line = refused({"lens": lens})
+    assert line.startswith("axes.lens = {")
+    assert line.endswith("{ zip = { fx_px = [600, 800], fy_px = [600, 805] } }, with nothing "
+                         "beside zip")
+
+
+TOGETHER = {"zip": {"fx_px": [600, 800], "fy_px": [600, 800]}}
+
+
+@pytest.mark.parametrize(("axes", "named"), [
+    *(({name: TOGETHER}, f"axes.{name}: expected another name: the dataset")
+      for name in ("detection", "xyz", "jitter_u_px", "solved", "outcome", "cost")),
+    ({"my lens": TOGETHER}, "letters, digits and underscores"),
+    ({"tilt_deg": TOGETHER}, "an axis of tilt_deg alone"),
+    ({"trial": TOGETHER}, "a whole number from 1"),
+    ({"fx_px": [1], "lens": TOGETHER}, "axes.fx_px is given too"),
+    ({"lens": TOGETHER, "fx_px": [1]}, "axes.lens.fx_px is given too"),
+    ({"a": TOGETHER, "b": TOGETHER}, "axes.a.fx_px is given too"),
+])
+def test_names_are_identifiers_of_their_own_and_a_member_is_given_once(axes, named):
+    assert named in refused(axes)
+
+
+def test_a_member_that_is_fixed_is_given_twice():
+    assert "camera.fx_px is given too" in refused({"lens": TOGETHER}, camera={"fx_px": 5})
+
+
+def test_pairs_are_checked_and_not_their_product():
+    pipeline({"tag": {"zip": {"dictionary": ["DICT_4X4_50", "DICT_4X4_100"],
+                              "marker_id": [49, 99]}}})
+    pipeline({"window_sizes": {"zip": {"adaptiveThreshWinSizeMin": [3, 25],
+                                       "adaptiveThreshWinSizeMax": [23, 45]}}})
+    pipeline({"frame": {"zip": {"width_px": [100_000, 100], "height_px": [100, 100_000]}}},
+             scene={"window": "full"})
+
+
+def test_a_million_rows_are_read_and_a_row_more_is_not():
+    def many(count):
+        return {"zip": {name: {"linspace": [1, 9, count]} for name in ("fx_px", "fy_px")}}
+
+    assert len(pipeline({"lens": many(100_000)}).axes[0]) == 100_000
+    assert "at most 1,000,000 values, all axes together" in refused({"lens": many(500_001)})
+    rest = {"linspace": [0, 1, 800_001]}
+    assert "at most 1,000,000 values" in refused({"lens": many(100_000), "tilt_deg": rest})
+    line = refused({"tag": {"zip": {"marker_id": {"range": [0, 10**6]},
+                                    "max_iterations": {"range": [1, 10**6 + 1]}}}})
+    assert line.count("\n") < 2
+
+
+def test_a_cell_is_named_by_values_a_label_or_a_number():
+    grid = pipeline({"lens": {"zip": {"fx_px": [600, 800, 600], "fy_px": [600, 805, 700]}},
+                     "tilt_deg": [0, 30], "trial": 1})
+    for at, fx, fy in (
+        ("", 600, 600), ("fx_px=800", 800, 805), ("fy_px=700", 600, 700), ("lens=2", 600, 700),
+        ('lens="800, 805",tilt_deg=30', 800, 805), ("fx_px=600,fy_px=700", 600, 700),
+        ("fx_px=123", 123, 600),
+    ):
+        fixed = cell(grid, at).fixed
+        assert (fixed["fx_px"], fixed["fy_px"]) == (fx, fy), at
+        assert [axis.name for axis in cell(grid, at).axes] == ["trial"]
+    index = {"lens": 1, "tilt_deg": 0, "trial": 0}
+    text = selection_text(grid.cell_at(index))
+    assert text == "fx_px=800.0,fy_px=805.0,tilt_deg=0.0,trial=0"
+    for at, line in (
+        ("lens=3", 'expected a number from 0 to 2, or a label such as "600, 600"'),
+        ("lens=600", "expected a number from 0 to 2"),
+        ("fx_px=600,lens=1", "fx_px is given twice"),
+        ("lense=1", "unknown parameter; did you mean lens?"),
+    ):
+        with pytest.raises(PipelineError, match=line):
+            parse_selection(at, grid)
+
+
+def test_settings_make_and_replace_such_axes():
+    text = "[pose]\ndistance_m = 0.5\n[axes]\ntilt_deg = [0, 1] # kept\n"
+    made = sweep.Pipeline.from_text(text, ["lens={zip={fx_px=[600, 800], fy_px=[600, 805]}}"])
+    assert made.axis_of("fy_px").values == ("600, 600", "800, 805")
+    assert "# kept" in made.text
+    again = sweep.Pipeline.from_text(made.text, ["axes.lens={zip={fx_px=[6, 8], fy_px=[6, 8]}}"])
+    assert list(again.values_of("fx_px")) == [6, 8]
+    with pytest.raises(PipelineError, match=r"axes.lens.fx_px is given too|camera.fx_px is given"):
+        sweep.Pipeline.from_text(made.text, ["fx_px=500"])
+    with pytest.raises(PipelineError, match="unknown parameter"):
+        parse_settings(["lens=[1, 2]"])

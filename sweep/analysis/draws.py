@@ -35,8 +35,8 @@ from sweep.typing import Floats, Integers, Masks
 # A unit counts as one draw, whatever it holds: the pooled settings of a trial see the same images,
 # the errors of the markers of a photograph are correlated, and the points of a replicate
 # (`sweep.experiment.draws`) fill their space evenly; the replicates have scrambles of their own.
-# Means follow from the sums of units, with Student's t of the spread between them; rates and quantiles
-# have the intervals of a number of draws that they are worth.
+# Means follow from the sums of units, with Student's t of the spread between them; rates
+# and quantiles have the intervals of a number of draws that they are worth.
 #
 # Owen, "Randomly permuted (t,m,s)-nets and (t,s)-sequences", 1995; L'Ecuyer and Lemieux, "Recent
 # advances in randomized quasi-Monte Carlo methods", 2002, section 2 (replicates).

@@ -242,8 +242,9 @@ def computable(store: RunStore) -> Pipeline:
 # On a processor with the same features every bit agrees. On another one, OpenCV, NumPy and the
 # mathematical library take other routines, and last bits differ; how far is the ``tolerance`` of
 # each variable in :mod:`sweep.experiment.schema`, measured on 9,000 scenes with AVX-512, AVX2 and
-# all of AVX switched off in turn. Without AVX, 0.02 % of ordinary scenes, and at most 4.4 % of those
-# of a pipeline of extremes, lie outside them, because a last bit can decide between two minima.
+# all of AVX switched off in turn. Without AVX, 0.02 % of ordinary scenes, and at most 4.4 %
+# of those of a pipeline of extremes, lie outside them, because a last bit can decide between two
+# minima.
 
 Values = Mapping[str, NDArray[Any]]
 """Variable -> values of one scene, of its inner dimensions last."""

@@ -238,7 +238,8 @@ RULES: Mapping[type, str] = {
 """Class of what a section says -> module and function that make its rule, of a pipeline and that.
 
 The sections are in `sweep.experiment.sampling.SECTIONS`. The function raises PipelineError with a
-line for each name that it does not know. Its module is imported on use: runs of fixed trials need none.
+line for each name that it does not know. Its module is imported on use: runs of fixed trials
+need none.
 """
 
 

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
     from sweep.analysis.dataset import decode_flags
+    from sweep.diagnosis.detection import DetectionModel
     from sweep.execution.cluster import Cluster
     from sweep.execution.progress import Progress
     from sweep.experiment.pipeline import Pipeline
@@ -48,9 +49,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ArgumentError", "DatasetError", "Pipeline", "PipelineError", "Progress", "RunError",
-    "StoreError", "SweepError", "__version__", "compare", "decode_flags", "diagnose", "fit",
-    "limit", "measure_tradeoff", "open", "photos", "require", "run", "size", "twins",
-    "write_report",
+    "StoreError", "SweepError", "__version__", "compare", "decode_flags", "diagnose",
+    "error_model", "fit", "limit", "measure_tradeoff", "open", "photos", "require", "run", "size",
+    "twins", "write_report",
 ]
 
 _IMPORTED_ON_USE = {"Pipeline": "sweep.experiment.pipeline", "Progress": "sweep.execution.progress",
@@ -609,6 +610,30 @@ def diagnose(
     return library.diagnosis.diagnose(
         observations, camera=camera, size_m=size_m, dictionary=dictionary, refinement=refinement,
         zero_sd_m=zero_sd_m, compared=compared, output=output)
+
+
+def error_model(store: str | os.PathLike[str] | xr.Dataset) -> DetectionModel:
+    """Make a model of the error of one detection: covariance, bias, probability of a flip.
+
+    Parameters
+    ----------
+    store
+        A simulation of one detector setting and one solver, with drawn poses: its path, or results
+        of `open`, of which one setting was chosen with ``.isel``.
+
+    Returns
+    -------
+    DetectionModel
+        ``model.at(rvec, tvec_m, ambiguity)`` has the 6 x 6 covariance, the bias and the probability
+        of a flip of estimated poses, and whether they are known: the simulation has poses there.
+        ``model.to_json()`` keeps it.
+
+    Raises
+    ------
+    StoreError, DatasetError
+        If there is no store, fewer than 2,000 solved poses, or several settings.
+    """
+    return library.detection.error_model(store)
 
 
 def measure_tradeoff(

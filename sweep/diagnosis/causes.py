@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sweep.diagnosis.observations import Observations
 from sweep.model.marker import module_count, overhang
@@ -60,6 +61,8 @@ class Correction(NamedTuple):
     spread
         Standard deviation of ln(ratio) about the middle of each way (c, causes), 0 if there is no
         ratio.
+    ratio
+        The middles (c, causes): how many times too large what was said is.
     labels
         Name of each way, empty for a number that may be anything.
     """
@@ -67,6 +70,7 @@ class Correction(NamedTuple):
     log_weight: Floats
     matrix: Floats
     spread: Floats
+    ratio: Floats
     labels: tuple[str, ...]
 
     def times(self, other: Correction) -> Correction:
@@ -75,13 +79,13 @@ class Correction(NamedTuple):
         return Correction(
             self.log_weight[a] + other.log_weight[b], self.matrix[a] @ other.matrix[b],
             np.concatenate([self.spread[a], other.spread[b]], axis=1),
+            np.concatenate([self.ratio[a], other.ratio[b]], axis=1),
             tuple(f"{self.labels[i]}; {other.labels[j]}".strip("; ")
                   for i, j in zip(a, b, strict=True)))
 
     def one(self, way: int) -> Correction:
         """Return one of the ways."""
-        return Correction(self.log_weight[[way]], self.matrix[[way]], self.spread[[way]],
-                          (self.labels[way],))
+        return Correction(*(each[way : way + 1] for each in self))
 
 
 @dataclass(frozen=True)
@@ -117,8 +121,14 @@ class Cause:
     unit: tuple[float, str] = (1.0, "")
 
 
+def unscaled(weight: ArrayLike, matrix: Floats, labels: Sequence[str]) -> Correction:
+    """Return ways without a ratio."""
+    nothing = np.zeros((len(labels), 1))
+    return Correction(np.log(weight), matrix, nothing, nothing + 1.0, tuple(labels))
+
+
 def _as_it_is(_: Observations) -> Correction:
-    return Correction(np.zeros(1), np.eye(3)[None], np.zeros((1, 1)), ("",))
+    return unscaled([1.0], np.eye(3)[None], [""])
 
 
 def _no_columns(_: Observations, points: Floats, _spread: Floats) -> Floats:
@@ -149,7 +159,7 @@ def ratios(
     labels = (*named.values(), *[""] * (len(weight) - len(named)))
     some = weight > 0
     return Correction(np.log(weight[some]), matrix[some], spread[some, None],
-                      labels[: int(some.sum())])
+                      np.exp(log_ratio)[some, None], labels[: int(some.sum())])
 
 
 def size_ratios(dictionary: str) -> dict[float, str]:
@@ -189,7 +199,7 @@ def _unit_ways(_: Observations) -> Correction:
     return Correction(
         np.full(len(named), -np.log(len(named))),
         np.eye(3) / np.array(list(named))[:, None, None], np.full((len(named), 1), NAMED_SD),
-        tuple(named.values()))
+        np.array(list(named))[:, None], tuple(named.values()))
 
 
 def _focal_ways(_: Observations) -> Correction:
@@ -230,8 +240,7 @@ def _axis_ways(_: Observations) -> Correction:
     labels = ["", *(", ".join(
         f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]} is {axis}"
         for row, axis in zip(swap, "xyz", strict=True)) for swap in swaps)]
-    return Correction(np.log(weight), np.stack([np.eye(3), *swaps]),
-                      np.zeros((len(labels), 1)), tuple(labels))
+    return unscaled(weight, np.stack([np.eye(3), *swaps]), labels)
 
 
 def _turn_columns(_: Observations, points: Floats, _spread: Floats) -> Floats:
@@ -244,7 +253,7 @@ def _half_pixel_ways(rows: Observations) -> Correction:
     slopes = (0.5 / camera.fx_px, 0.5 / camera.fy_px) if camera is not None else (0.0, 0.0)
     matrix = np.stack([np.eye(3)] * 2)
     matrix[:, :2, 2] = np.outer([1.0, -1.0], slopes)
-    return Correction(np.log([0.5, 0.5]), matrix, np.zeros((2, 1)), (
+    return unscaled([0.5, 0.5], matrix, (
         "centres of pixels counted from 0.5 in one place, from 0 in the other",
         "centres of pixels counted from 0 in one place, from 0.5 in the other"))
 

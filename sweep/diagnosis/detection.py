@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -101,19 +101,20 @@ class DetectionModel:
         rvec, tvec = (np.atleast_2d(np.asarray(each, dtype=np.float64)) for each in (rvec, tvec_m))
         frame, at = _conditions(rvec, tvec, self.focal_size_px_m)
         basis = hat_basis(at, [self.side_knots, self.angle_knots])
-        known = (np.abs(at - _clipped(at, (self.side_knots, self.angle_knots))) < 1e-9).all(axis=1)
+        knots = np.stack([(each[0], each[-1]) for each in (self.side_knots, self.angle_knots)])
+        known = ((knots[:, 0] <= at) & (at <= knots[:, 1])).all(axis=1)
         known &= bearing_of(tvec) <= self.max_bearing_deg
         known &= ((basis > 0) <= (self.poses >= MIN_AT_KNOT)).all(axis=1)
         turn = np.zeros((len(tvec), 6, 6))
         turn[:, :3, :3] = frame * np.linalg.norm(tvec, axis=1)[:, None, None]
         turn[:, 3:, 3:] = frame
-        covariance = turn @ _exponential(
-            np.einsum("nk,kij->nij", basis, self.log_covariance)) @ turn.transpose(0, 2, 1)
+        covariance = turn @ _of_symmetric(
+            np.einsum("nk,kij->nij", basis, self.log_covariance), np.exp) @ turn.transpose(0, 2, 1)
         bias = np.einsum("nij,nj->ni", turn, basis @ self.bias)
         middle = math.exp(float(np.median(self.ambiguity_knots)))
         ratio = np.broadcast_to(
             np.asarray(middle if ambiguity is None else ambiguity, dtype=np.float64), len(tvec))
-        odds = _flip_basis(at, ratio, self) @ self.flips
+        odds = _flip_basis(at, ratio, self.flip_knots) @ self.flips
         unknown = ~known
         for values in (covariance, bias, odds):
             values[unknown] = np.nan
@@ -122,6 +123,11 @@ class DetectionModel:
             "bias": (("pose", "row"), bias, {"units": "m, radian"}),
             "flip_probability": ("pose", 1.0 / (1.0 + np.exp(-odds)), {"units": "1"}),
             "known": ("pose", known)})
+
+    @property
+    def flip_knots(self) -> list[Floats]:
+        """Knots of ambiguity, side and viewing angle of the flips."""
+        return [self.ambiguity_knots, self.side_knots[::3], self.angle_knots[[0, 2, 5]]]
 
     def to_json(self) -> str:
         """Return it as a JSON object: its attributes."""
@@ -164,11 +170,11 @@ def error_model(store: xr.Dataset | str | os.PathLike[str]) -> DetectionModel:
             np.linalg.solve((basis.T / sd**2) @ basis + np.eye(len(poses)) * (1e-3 / sd**2).mean(),
                             (basis.T / sd**2) @ error)
             for error, sd in zip(errors.T, spread.T, strict=True)], axis=-1)
-        whitened = np.einsum("nij,nj->ni", _exponential(
-            -0.5 * np.einsum("nk,kij->nij", basis, log_covariance)), errors - basis @ bias)
-        root = _exponential(0.5 * log_covariance)
-        log_covariance = _logarithm(
-            root @ means(whitened[:, :, None] * whitened[:, None, :]) @ root)
+        whitened = np.einsum("nij,nj->ni", _of_symmetric(
+            -0.5 * np.einsum("nk,kij->nij", basis, log_covariance), np.exp), errors - basis @ bias)
+        root = _of_symmetric(0.5 * log_covariance, np.exp)
+        log_covariance = _of_symmetric(
+            root @ means(whitened[:, :, None] * whitened[:, None, :]) @ root, np.log)
     # Inverses of covariances of n poses are too large by n / (n - 7) on average (Anderson, "An
     # introduction to multivariate statistical analysis", 2003, section 7.7), and the means' errors
     # add 1 / n.
@@ -178,7 +184,7 @@ def error_model(store: xr.Dataset | str | os.PathLike[str]) -> DetectionModel:
     model = DetectionModel(
         focal_size, side, angle, ambiguity, bias, log_covariance, poses, np.zeros(0),
         float(bearing_of(tvec).max()))
-    return dataclasses.replace(model, flips=_flip_fit(at, ratio, flipped, model))
+    return dataclasses.replace(model, flips=_flip_fit(at, ratio, flipped, model.flip_knots))
 
 
 def estimated(results: xr.Dataset) -> tuple[Floats, Floats, Floats, Floats, Masks]:
@@ -231,37 +237,22 @@ def _conditions(rvec: Floats, tvec: Floats, focal_size: float) -> tuple[Floats, 
         [np.log(focal_size / tvec[:, 2]), viewing_angle_of(rvec, tvec)], axis=-1)
 
 
-def _clipped(at: Floats, knots: Sequence[Floats]) -> Floats:
-    return np.clip(at, [each[0] for each in knots], [each[-1] for each in knots])
-
-
-def _exponential(matrices: Floats) -> Floats:
-    """Return the exponentials of symmetric matrices (n, m, m)."""
+def _of_symmetric(matrices: Floats, function: Callable[[Floats], Floats]) -> Floats:
+    """Return a function of symmetric matrices (n, m, m), such as their exponentials."""
     values, vectors = np.linalg.eigh(matrices)
-    return np.asarray((vectors * np.exp(values)[:, None, :]) @ vectors.transpose(0, 2, 1))
+    return np.asarray((vectors * function(values)[:, None, :]) @ vectors.transpose(0, 2, 1))
 
 
-def _logarithm(matrices: Floats) -> Floats:
-    """Return the logarithms of symmetric positive matrices (n, m, m)."""
-    values, vectors = np.linalg.eigh(matrices)
-    return np.asarray((vectors * np.log(values)[:, None, :]) @ vectors.transpose(0, 2, 1))
-
-
-def _flip_basis(at: Floats, ratio: Floats, model: DetectionModel) -> Floats:
-    """Return hat functions (n, knots) of ambiguity, side (3 knots) and viewing angle (3 knots)."""
+def _flip_basis(at: Floats, ratio: Floats, knots: Sequence[Floats]) -> Floats:
+    """Return hat functions (n, knots) of ambiguity, side and viewing angle."""
     with np.errstate(divide="ignore"):
-        values = np.column_stack([np.log(ratio), at])
-    return hat_basis(values, _flip_knots(model))
+        return hat_basis(np.column_stack([np.log(ratio), at]), knots)
 
 
-def _flip_knots(model: DetectionModel) -> list[Floats]:
-    return [model.ambiguity_knots, model.side_knots[::3], model.angle_knots[[0, 2, 5]]]
-
-
-def _flip_fit(at: Floats, ratio: Floats, flipped: Masks, model: DetectionModel) -> Floats:
+def _flip_fit(at: Floats, ratio: Floats, flipped: Masks, knots: Sequence[Floats]) -> Floats:
     """Return the coefficients of a logistic regression, by iterated weighted least squares."""
-    basis = _flip_basis(at, ratio, model)
-    ridge = SCALE_OF_RIDGE * differences(_flip_knots(model)) + 1e-3 * np.eye(basis.shape[1])
+    basis = _flip_basis(at, ratio, knots)
+    ridge = SCALE_OF_RIDGE * differences(knots) + 1e-3 * np.eye(basis.shape[1])
     share = (flipped.sum() + 0.5) / (len(flipped) + 1.0)
     found = np.full(basis.shape[1], math.log(share / (1.0 - share)))
     for _ in range(30):

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from sweep.diagnosis.causes import AGREE, Cause
+from sweep.diagnosis.causes import AGREE
 from sweep.diagnosis.inference import (
     DECIDES,
     Explanation,
@@ -105,30 +106,20 @@ def title_of(each: Explanation) -> str:
 
 def size_of(each: Explanation, rows: Observations) -> str:
     """Return how large the causes are, with one standard deviation."""
-    texts, column, k = [], 0, each.best
-    label = each.correction.labels[k]
-    for number_of_cause, cause in enumerate(each.causes):
+    texts, first, k = [], 0, each.best
+    for cause, spread, ratio in zip(
+            each.causes, each.correction.spread[k], each.correction.ratio[k], strict=True):
         width = cause.columns(rows, np.ones((1, 1, 3)), np.ones(1)).shape[-1]
-        part = slice(column, column + width)
-        mean = each.numbers[k, part]
-        sd = np.sqrt(np.diagonal(each.covariance[k])[part])
-        column += width
-        if spread := each.correction.spread[k, number_of_cause]:
-            own = cause.ways(rows)
-            middle = own.matrix[k // _later_ways(each.causes[number_of_cause + 1:], rows)
-                                % len(own.labels), 2, 2]
-            texts.append(f"said is {1.0 / (middle * (1.0 + spread * mean[0])):.4g} times the truth "
-                         f"(± {100.0 * spread * sd[0]:.2g} %)")
-        else:
+        for number_of_column in range(first, first + width):
+            mean = each.numbers[k, number_of_column]
+            sd = math.sqrt(each.covariance[k, number_of_column, number_of_column])
             scale, unit = cause.unit
-            texts += [f"{scale * a:+.3g} ± {scale * b:.2g} {unit}"
-                      for a, b in zip(mean, sd, strict=True)]
+            texts.append(f"said is {ratio / (1.0 + spread * mean):.4g} times the truth "
+                         f"(± {100.0 * spread * sd:.2g} %)" if spread else
+                         f"{scale * mean:+.3g} ± {scale * sd:.2g} {unit}")
+        first += width
+    label = each.correction.labels[k]
     return "; ".join([*texts, *([label] if label else [])])
-
-
-def _later_ways(causes: Sequence[Cause], rows: Observations) -> int:
-    """Return the number of combinations of the ways of causes."""
-    return int(np.prod([len(cause.ways(rows).labels) for cause in causes], dtype=int))
 
 
 def _misfit(each: Explanation) -> float:

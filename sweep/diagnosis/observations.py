@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import math
 import os
@@ -24,6 +25,7 @@ TAPE = ("tape_m", "tape_sd_m", "x_m", "y_m", "z_m", "position_sd_m", "yaw_deg", 
         "speed_m_s")
 CORNERS = tuple(f"corner{k}_{axis}_px" for k in range(4) for axis in "xy")
 COLUMNS = {*SAID, *TAPE, *CORNERS}
+POSITIVE = ("tape_m", "tape_sd_m", "position_sd_m", "yaw_sd_deg")
 """Columns of a file of observations; further ones are refused, empty cells are unknown."""
 
 TAPE_SD_M, TAPE_SHARE = 0.002, 0.005
@@ -151,7 +153,7 @@ def read_observations(
     if compared not in ("z", "range"):
         raise ArgumentError("compared", plain(compared), "expected z or range")
     for name, value in (("size_m", size_m), ("zero_sd_m", zero_sd_m)):
-        if value is not None and not (math.isfinite(value) and value > 0):
+        if value is not None and not 0 < value < math.inf:
             raise ArgumentError(name, value, "expected metres above 0")
     known = _camera(camera)
     values = {name: _numbers(name, columns[name], count) if name in columns
@@ -173,32 +175,31 @@ def read_observations(
         row = int(np.argmin(np.isfinite(said).all(axis=1) & (said[:, 2] > 0))) + 1
         raise ArgumentError("observations", "", f"row {row}: expected tvec_z_m or range_m above 0: "
                             "the position that the program said")
-    measured = np.isfinite(values["tape_m"]) | np.isfinite(position).any(axis=1) | np.isfinite(
-        values["yaw_deg"])
+    measured = np.isfinite([values["tape_m"], *position.T, values["yaw_deg"]]).any(axis=0)
     if not measured.all():
         raise ArgumentError("observations", "", f"row {int(np.argmin(measured)) + 1}: expected "
                             "tape_m, or one of x_m, y_m, z_m: what was measured by tape")
     if not lateral and np.isfinite(position[:, :2]).any():
         raise ArgumentError("observations", "", "x_m and y_m need tvec_x_m and tvec_y_m")
-    if not (values["tape_m"][np.isfinite(values["tape_m"])] > 0).all():
-        raise ArgumentError("observations", "", "tape_m: expected metres above 0")
-    sds = {}
-    for name, of in (("tape_sd_m", values["tape_m"]),
-                     ("position_sd_m", np.linalg.norm(np.nan_to_num(position), axis=1))):
-        default = np.maximum(TAPE_SD_M, TAPE_SHARE * np.nan_to_num(of))
-        sds[name] = np.where(np.isfinite(values[name]), values[name], default)
-        if not (sds[name] > 0).all():
-            raise ArgumentError("observations", "", f"{name}: expected metres above 0")
-    if not np.isfinite(values["tape_sd_m"]).any() and not np.isfinite(
-            values["position_sd_m"]).any():
+    for name in POSITIVE:
+        if (values[name] <= 0).any():
+            raise ArgumentError("observations", "", f"{name}: expected numbers above 0")
+    if not np.isfinite([values["tape_sd_m"], values["position_sd_m"]]).any():
         notes.append("no uncertainty of the tape is given: 2 mm or 0.5 % are assumed")
-    yaws = _yaw(rotation_of_vector(rvec)), _yaw(mirrored(rotation_of_vector(rvec), said))
+
+    def filled(name: str, default: Any) -> Floats:
+        return np.where(np.isfinite(values[name]), values[name], default)
+
+    tape_sd, position_sd = (
+        filled(name, np.maximum(TAPE_SD_M, TAPE_SHARE * np.nan_to_num(length)))
+        for name, length in (("tape_sd_m", values["tape_m"]),
+                             ("position_sd_m", np.linalg.norm(np.nan_to_num(position), axis=1))))
+    rotation = rotation_of_vector(rvec)
     rows = Observations(
-        said, lateral, bool(np.isfinite(position).any()), values["tape_m"], sds["tape_sd_m"],
-        position, sds["position_sd_m"], values["yaw_deg"], *yaws,
-        np.where(np.isfinite(values["yaw_sd_deg"]), values["yaw_sd_deg"], YAW_SD_DEG),
-        values["speed_m_s"], known, math.nan if size_m is None else size_m, dictionary,
-        refinement, zero_sd_m, compared, ())
+        said, lateral, bool(np.isfinite(position).any()), values["tape_m"], tape_sd, position,
+        position_sd, values["yaw_deg"], _yaw(rotation), _yaw(mirrored(rotation, said)),
+        filled("yaw_sd_deg", YAW_SD_DEG), values["speed_m_s"], known,
+        math.nan if size_m is None else size_m, dictionary, refinement, zero_sd_m, compared, ())
     if known is None or size_m is None:
         notes.append("camera or size_m unknown: the expected bias and noise are a guess for a "
                      f"square of {UNKNOWN_SIDE_PX:g} px")
@@ -260,10 +261,8 @@ def _numbers(name: str, cells: Sequence[Any], count: int) -> Floats:
     for row, cell in enumerate(cells):
         if cell is None or cell == "":
             continue
-        try:
+        with contextlib.suppress(TypeError, ValueError):
             numbers[row] = float(cell)
-        except (TypeError, ValueError):
-            numbers[row] = np.nan
         if not math.isfinite(numbers[row]):
             raise ArgumentError("observations", "", f"row {row + 1}, {name} = {plain(cell)}: "
                                 "expected a number; leave the cell empty if it is unknown")
@@ -275,10 +274,9 @@ def _camera(camera: str | os.PathLike[str] | Calibration | None) -> Calibration 
         return camera
     try:
         return calibration_of(read_tree(read_regular(os.fspath(camera), MAX_BYTES)))
-    except OSError as error:
-        raise ArgumentError("camera", plain(camera), error.strerror or "unreadable") from None
-    except ValueError as error:
-        raise ArgumentError("camera", plain(camera), str(error)) from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ArgumentError("camera", plain(camera), reason) from None
 
 
 def _solved(values: Mapping[str, Floats], camera: Calibration, size_m: float) -> tuple[

@@ -160,9 +160,9 @@ def table(results):
 
 
 def test_causes_are_found_and_none_is_invented():
-    counts = table([judged(seed) for seed in range(60)])
-    assert counts["alarms"] <= 3
-    assert counts["first"] >= 0.9 * counts["told"] > 5
+    counts = table([judged(seed) for seed in range(25)])
+    assert counts["alarms"] == 0
+    assert counts["first"] >= 0.9 * counts["told"] > 2
 
 
 @pytest.mark.long

@@ -26,10 +26,15 @@ from sweep.typing import Floats, Masks
 # `sweep.analysis.error_models` is of the truth's conditions and one error at a time, without flips:
 # what a plan needs. Here conditions are those of the estimate, which is all that a user has, and
 # the six errors go together, in a frame in which they do so in one way: z along the line of sight,
-# x in the direction in which the estimated marker is tilted.
+# x in the direction in which the estimated marker is tilted. What goes with the image instead,
+# such as apriltag's corners, which are half a pixel off, moves and turns the pose as a turn of the
+# camera would.
 
-KNOTS = (7, 6, 6)
-"""Knots of ln(side), of the viewing angle, and of the ambiguity's logarithm."""
+KNOTS = (7, 6)
+"""Knots of ln(side) and of the viewing angle."""
+
+AMBIGUITY_SHARES = (0.02, 0.4, 0.7, 0.85, 0.93, 0.98, 0.998)
+"""Shares of the poses below the knots of the ambiguity: flips are where it is near 1."""
 
 MIN_POSES = 2000
 """Solved poses from which on a model is made."""
@@ -40,7 +45,7 @@ MIN_AT_KNOT = 25.0
 ROUNDS = 6
 """Rounds in which covariances at knots are fitted to what the last ones leave unexplained."""
 
-SCALE_OF_RIDGE = 1.0
+RIDGE = 0.05
 """Penalty on differences between neighbouring knots of the flips, in poses."""
 
 
@@ -54,8 +59,11 @@ class DetectionModel:
         fx times the side of the square, px m.
     side_knots, angle_knots, ambiguity_knots
         Knots of ln(side, px), viewing angle (degrees) and ln(ambiguity).
+    shift
+        Median error (6,) of position over z and of rotation (rad) that goes with the image; 0 along
+        and about z.
     bias
-        Mean errors (knots, 6): position over the range, and rotation vector (rad).
+        Mean errors that go with the tilt (knots, 6): position over the range, and rotation (rad).
     log_covariance
         Matrix logarithms (knots, 6, 6) of their covariances.
     poses
@@ -70,6 +78,7 @@ class DetectionModel:
     side_knots: Floats
     angle_knots: Floats
     ambiguity_knots: Floats
+    shift: Floats
     bias: Floats
     log_covariance: Floats
     poses: Floats
@@ -111,6 +120,7 @@ class DetectionModel:
         covariance = turn @ _of_symmetric(
             np.einsum("nk,kij->nij", basis, self.log_covariance), np.exp) @ turn.transpose(0, 2, 1)
         bias = np.einsum("nij,nj->ni", turn, basis @ self.bias)
+        bias += self.shift * np.repeat([tvec[:, 2], np.ones(len(tvec))], 3, axis=0).T
         middle = math.exp(float(np.median(self.ambiguity_knots)))
         ratio = np.broadcast_to(
             np.asarray(middle if ambiguity is None else ambiguity, dtype=np.float64), len(tvec))
@@ -150,10 +160,20 @@ def error_model(store: xr.Dataset | str | os.PathLike[str]) -> DetectionModel:
         raise DatasetError(f"{len(tvec):,} solved poses; a model of one detection needs "
                            f"{MIN_POSES:,} or more: more trials")
     focal_size = float(focal_size_of(results).mean())
-    _, at = _conditions(rvec, tvec, focal_size)
+    frame, at = _conditions(rvec, tvec, focal_size)
+    right = ~flipped
+    slant = tvec[:, 2] / np.linalg.norm(tvec, axis=1)
+    per_z = np.repeat([slant, np.ones(len(tvec))], 3, axis=0).T
+    # Across the line of sight, where errors are small: those along it would hide the shift.
+    across = sight_rotation(tvec).transpose(0, 2, 1)[:, :2]
+    moved = np.linalg.solve(across[:, :, :2] * slant[:, None, None],
+                            across @ errors[:, :3, None])[..., 0]
+    shift = np.zeros(6)
+    shift[[0, 1, 3, 4]] = np.median(np.concatenate([moved, errors[:, 3:5]], axis=1)[right], axis=0)
+    errors -= shift * per_z
+    errors = np.einsum("nji,nkj->nki", frame, errors.reshape(-1, 2, 3)).reshape(-1, 6)
     side, angle = (np.quantile(at[:, k], np.linspace(0.0, 1.0, KNOTS[k])) for k in (0, 1))
     angle[0] = 0.0 if angle[0] < FRONTAL_DEG else angle[0]
-    right = ~flipped
     basis, errors = hat_basis(at[right], [side, angle]), errors[right]
     poses = basis.sum(axis=0)
 
@@ -180,17 +200,17 @@ def error_model(store: xr.Dataset | str | os.PathLike[str]) -> DetectionModel:
     # add 1 / n.
     wider = np.log((poses + 1.0) / np.maximum(poses - 7.0, 1.0))
     log_covariance = log_covariance + wider[:, None, None] * np.eye(6)
-    ambiguity = np.quantile(np.log(ratio[ratio > 0]), np.linspace(0.005, 0.995, KNOTS[2]))
+    ambiguity = np.quantile(np.log(ratio[ratio > 0]), AMBIGUITY_SHARES)
     model = DetectionModel(
-        focal_size, side, angle, ambiguity, bias, log_covariance, poses, np.zeros(0),
+        focal_size, side, angle, ambiguity, shift, bias, log_covariance, poses, np.zeros(0),
         float(bearing_of(tvec).max()))
     return dataclasses.replace(model, flips=_flip_fit(at, ratio, flipped, model.flip_knots))
 
 
 def estimated(results: xr.Dataset) -> tuple[Floats, Floats, Floats, Floats, Masks]:
-    """Return errors (n, 6) in the frame of each estimate, its pose, its ambiguity, and the flips.
+    """Return errors (n, 6) of solved poses, the estimates, their ambiguity, and the flips.
 
-    Errors of positions are over the range. Only solved poses.
+    Errors are along and about the camera's axes, those of positions over the estimated range.
 
     Raises
     ------
@@ -216,10 +236,8 @@ def estimated(results: xr.Dataset) -> tuple[Floats, Floats, Floats, Floats, Mask
         *(dim for dim in scene if dim != "xyz")).values.ravel()[used] for name in names[4:7])
     estimate = tvec + position
     turned = vector_of_rotation(rotation_of_vector(rotation) @ rotation_of_vector(rvec))
-    frame, _ = _conditions(turned, estimate, 1.0)
-    errors = np.concatenate([
-        np.einsum("nji,nj->ni", frame, position) / np.linalg.norm(estimate, axis=1)[:, None],
-        np.einsum("nji,nj->ni", frame, rotation)], axis=1)
+    errors = np.concatenate(
+        [position / np.linalg.norm(estimate, axis=1)[:, None], rotation], axis=1)
     ratio = np.where(np.isfinite(other) & (other > 0), chosen / other, 0.0)
     return errors, turned, estimate, ratio, flipped == Flipped.flipped
 
@@ -252,12 +270,13 @@ def _flip_basis(at: Floats, ratio: Floats, knots: Sequence[Floats]) -> Floats:
 def _flip_fit(at: Floats, ratio: Floats, flipped: Masks, knots: Sequence[Floats]) -> Floats:
     """Return the coefficients of a logistic regression, by iterated weighted least squares."""
     basis = _flip_basis(at, ratio, knots)
-    ridge = SCALE_OF_RIDGE * differences(knots) + 1e-3 * np.eye(basis.shape[1])
+    ridge = RIDGE * differences(knots) + 1e-3 * np.eye(basis.shape[1])
     share = (flipped.sum() + 0.5) / (len(flipped) + 1.0)
-    found = np.full(basis.shape[1], math.log(share / (1.0 - share)))
+    start = np.full(basis.shape[1], math.log(share / (1.0 - share)))
+    found = start
     for _ in range(30):
         chance = 1.0 / (1.0 + np.exp(-(basis @ found)))
-        slope = basis.T @ (flipped - chance) - ridge @ (found - found.mean())
+        slope = basis.T @ (flipped - chance) - ridge @ (found - start)
         curve = (basis * (chance * (1.0 - chance))[:, None]).T @ basis + ridge
         found = found + np.clip(np.linalg.solve(curve, slope), -2.0, 2.0)
     return found

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from sweep.report import limit_figure as limit_figure
     from sweep.report import output_file as output_file
     from sweep.report import questions as questions
+    from sweep.report import reference as reference
     from sweep.report import report_data as report_data
     from sweep.report import scenes as scenes
     from sweep.report import table as table
@@ -95,6 +96,7 @@ _MODULES = (
     "sweep.report.limit_figure",
     "sweep.report.output_file",
     "sweep.report.questions",
+    "sweep.report.reference",
     "sweep.report.report_data",
     "sweep.report.scenes",
     "sweep.report.table",

@@ -12,6 +12,7 @@ from sweep.cli.answers import (
     compare,
     error_model,
     limit,
+    reference,
     report,
     require,
     size,
@@ -59,7 +60,7 @@ def completion(options: argparse.Namespace) -> int:
 
 COMMANDS = (
     run, plan, size, limit, show, repro, tradeoff, report, require, error_model, calibration,
-    verify, status, export, score, photos, fit, compare, plugins, completion,
+    verify, status, export, score, photos, fit, compare, plugins, reference, completion,
 )
 """Every command, in the order in which the help lists them."""
 

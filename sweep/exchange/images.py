@@ -16,7 +16,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sweep.errors import StoreError
-from sweep.evaluation.block import GEOMETRY
+from sweep.evaluation.variables import GEOMETRY
 from sweep.evaluation.search import search_windows, visibility_flags, whole_frames
 from sweep.experiment.experiment import scene_plugins
 from sweep.experiment.grid import detector_settings, image_keys, scene_axes, scene_values

@@ -212,7 +212,14 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
                        "delete it")
     reading.refuse_values(
         "renderer", f"{RENDERERS}, for boards", lambda name: not is_renderer(name))
-    reading.refuse_values("detector", "a detector that searches images, for boards", is_recording)
+    if any(map(is_recording, reading.values("detector"))):
+        for name, value, expected in (
+            ("points", "chessboard",
+             "markers beside recorded detections, which have no corners of chessboards"),
+            ("refineDetectedMarkers", True,
+             "false beside recorded detections: no image is searched"),
+        ):
+            reading.refuse_values(name, expected, lambda given, value=value: given == value)
     if "solver" not in reading.given:
         reading.faults.append(
             f"{reading.source}: estimator.solver: missing; a board needs one of "

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from sweep.evaluation import block as variables
-from sweep.evaluation.block import check_complete
+from sweep.evaluation import variables
+from sweep.evaluation.variables import check_complete
 from sweep.experiment.parameters import Stage
 
 TESTS = Path(__file__).parents[1]
@@ -46,7 +46,7 @@ FUNCTION = """
 ADDITIONS = {
     # Module -> where its text is changed, and what is put there.
     "sweep.experiment.schema": (')\n"""Every variable, in the order', RECORD),
-    "sweep.evaluation.block": (
+    "sweep.evaluation.variables": (
         '}\n"""Variable of the estimation -> its values (n, ...) for', FUNCTION),
 }
 

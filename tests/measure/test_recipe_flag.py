@@ -15,13 +15,12 @@ MEMBER = f'    unlikely = flag({VALUE}, "{SENTENCE}", present=True)\n'
 
 SCRIPT = """
 import json
-from types import SimpleNamespace
 import numpy as np
 import xarray as xr
 from sweep.analysis import failure_composition
 from sweep.evaluation.block import run_cells
 from sweep.evaluation.results import to_dataset_layout
-from sweep.integrity.verification import contradiction
+from support.flags_and_numbers import contradiction
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.grid import Block, block_indices
@@ -35,9 +34,7 @@ values = {v.name: to_dataset_layout(v, pipeline, block, columns[v.name]) for v i
 
 def judged(**changed):
     kept = values | changed
-    flags = ("detection", "estimate")
-    receipt = SimpleNamespace(**{name: np.bincount(kept[name].ravel()).tolist() for name in flags})
-    return contradiction(pipeline, SCHEMA, kept, receipt)
+    return contradiction(pipeline, SCHEMA, kept)
 
 unlikely, flipped = values["estimate"].copy(), values["flipped"].copy()
 unlikely[0], flipped[0] = EstimateStatus.unlikely, Flipped.no_estimate

@@ -119,7 +119,7 @@ def _assumed_noise_and_blur(
     estimator: EstimatorSetting, scenes: Scenes
 ) -> tuple[Floats, Floats]:
     """Return the noise of a pixel in grey levels and the point spread in px, (N,) each."""
-    truth = {"noise_grey": 0.0, "blur_px": 0.0} if scenes.effects is None else scenes.effects
+    truth = scenes.effects
     noise, blur = (
         np.broadcast_to(truth[name] if assumed is None else assumed, len(scenes))
         for name, assumed in (

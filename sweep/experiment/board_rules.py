@@ -26,7 +26,6 @@ from sweep.model.board_kinds import (
     is_solid,
     used_by,
 )
-from sweep.model.effects import GEOMETRIC
 from sweep.model.image_file import read_regular
 from sweep.model.renderers import MAX_BITMAP_PX, MAX_BITMAP_SIDE, bitmap_shape
 from sweep.model.scene import RENDERERS, is_renderer
@@ -263,10 +262,11 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
         )
 
 
-IN_ONE_PLANE = tuple(
-    name for name in GEOMETRIC if name not in ("blur_px", "marker_scale", "sharpening")
-)
-"""Switches of effects that boards in several planes cannot have."""
+IN_ONE_PLANE = {
+    "curvature_per_m": "a bend is that of one sheet",
+    "occlusion": "the sheet that hides lies in the target's plane",
+}
+"""Switches of effects that targets in several planes cannot have, and why."""
 
 
 def _several_planes(reading: Reading) -> None:
@@ -276,9 +276,9 @@ def _several_planes(reading: Reading) -> None:
     if target and {"markers", "chessboard"}.intersection(reading.values("points")):
         reading.refuse_values("solver", f"one of iterative, sqpnp, epnp, {why}",
                               lambda name: name in SOLVERS and SOLVERS[name].planar_only)
-    for name in IN_ONE_PLANE:
+    for name, reason in IN_ONE_PLANE.items():
         if reading.is_active(name):
-            reading.refuse(name, f"it absent, {why}")
+            reading.refuse(name, f"it absent, {why}: {reason}")
     reading.refuse_values("renderer", f"exact, {why}", lambda name: name != "exact")
     if target and any(reading.values("refineDetectedMarkers")):
         reading.fault("detector.refineDetectedMarkers", True, f"false, {why}")

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from sweep.analysis import camera_calibration as camera_calibration
     from sweep.analysis import requirements as requirements
     from sweep.conformance import check as check
+    from sweep.diagnosis import detection as detection
+    from sweep.diagnosis import diagnosis as diagnosis
+    from sweep.diagnosis import observations as observations
     from sweep.evaluation import block as block
     from sweep.evaluation import inspection as inspection
     from sweep.exchange import answers as answers
@@ -64,6 +67,9 @@ _MODULES = (
     "sweep.analysis.requirements",
     "sweep.compilation",
     "sweep.conformance.check",
+    "sweep.diagnosis.detection",
+    "sweep.diagnosis.diagnosis",
+    "sweep.diagnosis.observations",
     "sweep.evaluation.block",
     "sweep.evaluation.inspection",
     "sweep.exchange.answers",

@@ -24,7 +24,7 @@ from sweep.experiment.draws import (
     resolve_pose,
     uniform,
 )
-from sweep.experiment.experiment import Experiment, effects_of, shows_boards
+from sweep.experiment.experiment import Grid, effects_of, shows_boards
 from sweep.experiment.parameters import PARAMETERS, Stage
 from sweep.experiment.photographs import is_simulated, recorded_poses, shows_photographs
 from sweep.measure.bound import BoundSetting
@@ -109,7 +109,7 @@ class Blocks:
         return int(np.ravel_multi_index(index, self.counts)) if index else 0
 
 
-def scene_axes(pipeline: Experiment) -> tuple[Axis, ...]:
+def scene_axes(pipeline: Grid) -> tuple[Axis, ...]:
     """Return the axes that blocks are cut along."""
     return pipeline.axes_of(Stage.scene)
 
@@ -126,7 +126,7 @@ def _column(values: Sequence[Any], indices: NDArray[np.intp]) -> Column:
 
 
 def scene_values(
-    pipeline: Experiment, indices: Sequence[NDArray[np.intp]]
+    pipeline: Grid, indices: Sequence[NDArray[np.intp]]
 ) -> dict[str, Column]:
     """Return the scene parameters' values for scenes at ``indices`` (N,) along each scene axis.
 
@@ -195,7 +195,7 @@ ANY_MARKER = {
 
 
 def _photographed(
-    pipeline: Experiment, values: Mapping[str, Column], trials: NDArray[np.int64]
+    pipeline: Grid, values: Mapping[str, Column], trials: NDArray[np.int64]
 ) -> dict[str, Column]:
     """Return the parameters of scenes at the poses of photographs of numbers ``trials`` (N,)."""
     names = values["photographs"].listed(len(trials))
@@ -219,7 +219,7 @@ def block_indices(block: Block) -> list[NDArray[np.intp]]:
     return [grid.ravel() for grid in grids]
 
 
-def _settings(pipeline: Experiment, section: str, stage: Stage) -> list[dict[str, Any]]:
+def _settings(pipeline: Grid, section: str, stage: Stage) -> list[dict[str, Any]]:
     """Return the values of a section at all combinations of a stage's axes, in their order."""
     fixed = {
         p.name: pipeline.fixed.get(p.name, p.default)
@@ -228,7 +228,7 @@ def _settings(pipeline: Experiment, section: str, stage: Stage) -> list[dict[str
     return [fixed | chosen for chosen in combinations(pipeline.axes_of(stage))]
 
 
-def detector_settings(pipeline: Experiment) -> list[AnyDetectorSetting]:
+def detector_settings(pipeline: Grid) -> list[AnyDetectorSetting]:
     """Return the detector settings of the grid, in the order of its detection axes."""
     return [
         DetectorSetting(**{name: values[name] for name in OPENCV_FIELDS})
@@ -239,7 +239,7 @@ def detector_settings(pipeline: Experiment) -> list[AnyDetectorSetting]:
 
 
 def _plugin_setting(
-    pipeline: Experiment, plugin: DeclaredPlugin, values: Mapping[str, Any]
+    pipeline: Grid, plugin: DeclaredPlugin, values: Mapping[str, Any]
 ) -> PluginSetting:
     own = tuple((setting.name, values[setting.name]) for setting in plugin.settings)
     return PluginSetting(plugin, own, pipeline.folder)
@@ -248,7 +248,7 @@ def _plugin_setting(
 OPENCV_FIELDS = tuple(field.name for field in dataclasses.fields(DetectorSetting))
 
 
-def board_settings(pipeline: Experiment) -> list[BoardDetectorSetting]:
+def board_settings(pipeline: Grid) -> list[BoardDetectorSetting]:
     """Return what the detector settings of the grid do with boards, in their order."""
     names = [field.name for field in dataclasses.fields(BoardDetectorSetting)]
     return [
@@ -257,7 +257,7 @@ def board_settings(pipeline: Experiment) -> list[BoardDetectorSetting]:
     ]
 
 
-def estimators(pipeline: Experiment) -> list[EstimatorSetting]:
+def estimators(pipeline: Grid) -> list[EstimatorSetting]:
     """Return the estimators of the grid, in the order of its estimation axes."""
     return [
         _estimator_setting(pipeline, values)
@@ -265,7 +265,7 @@ def estimators(pipeline: Experiment) -> list[EstimatorSetting]:
     ]
 
 
-def _estimator_setting(pipeline: Experiment, values: Mapping[str, Any]) -> EstimatorSetting:
+def _estimator_setting(pipeline: Grid, values: Mapping[str, Any]) -> EstimatorSetting:
     """Return the setting of an estimator that has these values; a plug-in takes its own, too."""
     common = {name: values[name] for name in ESTIMATOR_FIELDS}
     plugin = pipeline.plugin("estimator", values["solver"])
@@ -292,7 +292,7 @@ NOT_IN_IMAGE = {
 """Parameters of the scene's stage that do not change its image."""
 
 
-def image_keys(pipeline: Experiment, indices: Sequence[NDArray[np.intp]]) -> NDArray[np.uint64]:
+def image_keys(pipeline: Grid, indices: Sequence[NDArray[np.intp]]) -> NDArray[np.uint64]:
     """Return the keys (N,) of the images of scenes at ``indices`` (N,) along each scene axis."""
     axes, parameters = scene_axes(pipeline), pipeline.parameters
     count = len(indices[0]) if axes else 1
@@ -320,7 +320,7 @@ def image_keys(pipeline: Experiment, indices: Sequence[NDArray[np.intp]]) -> NDA
     return bits(pipeline.seed, f"image {pipeline.sampling}", keys, trials)
 
 
-def _texts(pipeline: Experiment, name: str, column: Column) -> Column:
+def _texts(pipeline: Grid, name: str, column: Column) -> Column:
     """Return "name=value" of each value, empty where it is the default."""
     default = pipeline.parameters[name].default
 

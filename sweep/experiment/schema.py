@@ -33,7 +33,7 @@ from sweep.typing import Floats
 if TYPE_CHECKING:
     import xarray as xr
 
-    from sweep.experiment.experiment import Experiment
+    from sweep.experiment.experiment import Grid
 
 
 # --------------------------------------------------------------------------------------------------
@@ -162,7 +162,7 @@ class DrawnQuantity:
         return values[self.column].broadcast(count)
 
 
-def fixed_values(pipeline: Experiment) -> list[FixedValue]:
+def fixed_values(pipeline: Grid) -> list[FixedValue]:
     """Return the fixed parameters that are coordinates, in the order of their declaration.
 
     They are those of marker and pose that have a value (unless the pose is given otherwise), and
@@ -187,7 +187,7 @@ def _attributes(parameter: Parameter) -> dict[str, str]:
     return {"long_name": parameter.declaration.meaning, FIXED: "on the whole grid", **unit}
 
 
-def drawn_quantities(pipeline: Experiment) -> list[DrawnQuantity]:
+def drawn_quantities(pipeline: Grid) -> list[DrawnQuantity]:
     """Return what is drawn for each scene of a pipeline, except the noise of pixels.
 
     Examples
@@ -421,7 +421,7 @@ class Variable:
         widths = [(0, 0)] * outer + [(0, each) for each in missing]
         return np.pad(kept, widths, constant_values=beyond)
 
-    def configuration_axes(self, pipeline: Experiment) -> tuple[Axis, ...]:
+    def configuration_axes(self, pipeline: Grid) -> tuple[Axis, ...]:
         """Return the axes of detection and estimation that it has, stage by stage.
 
         They span its configurations, the last axis fastest; a scene's variable has none.
@@ -429,19 +429,19 @@ class Variable:
         stages = [stage for stage in Stage if Stage.scene < stage <= self.stage]
         return tuple(axis for stage in stages for axis in pipeline.axes_of(stage))
 
-    def configurations(self, pipeline: Experiment) -> int:
+    def configurations(self, pipeline: Grid) -> int:
         """Return the number of its configurations: one for a scene's variable."""
         return math.prod(len(axis) for axis in self.configuration_axes(pipeline))
 
-    def axes(self, pipeline: Experiment) -> tuple[Axis, ...]:
+    def axes(self, pipeline: Grid) -> tuple[Axis, ...]:
         """Return its axes in the pipeline's order: those of its stage and of the stages before."""
         return pipeline.axes_of(*(stage for stage in Stage if stage <= self.stage))
 
-    def dimensions(self, pipeline: Experiment) -> tuple[str, ...]:
+    def dimensions(self, pipeline: Grid) -> tuple[str, ...]:
         """Return the names of its dimensions: its axes, then ``inner``."""
         return tuple(axis.name for axis in self.axes(pipeline)) + self.inner
 
-    def shape(self, pipeline: Experiment) -> tuple[int, ...]:
+    def shape(self, pipeline: Grid) -> tuple[int, ...]:
         """Return the lengths of its dimensions."""
         return tuple(len(axis) for axis in self.axes(pipeline)) + self.inner_shape
 
@@ -580,7 +580,7 @@ PHOTOGRAPH_SCHEMA: tuple[Variable, ...] = (
 """The variables that stores of photographs have besides."""
 
 
-def drawn_variables(pipeline: Experiment) -> tuple[Variable, ...]:
+def drawn_variables(pipeline: Grid) -> tuple[Variable, ...]:
     """Return the variables that hold what is drawn for each scene of a pipeline."""
     return tuple(
         Variable(
@@ -595,7 +595,7 @@ def drawn_variables(pipeline: Experiment) -> tuple[Variable, ...]:
     )
 
 
-def variables_of(pipeline: Experiment) -> tuple[Variable, ...]:
+def variables_of(pipeline: Grid) -> tuple[Variable, ...]:
     """Return the variables that a pipeline's store has: the schema's, then draws.
 
     >>> from sweep.experiment.pipeline import Pipeline
@@ -612,7 +612,7 @@ def variables_of(pipeline: Experiment) -> tuple[Variable, ...]:
     return common + drawn + photographed
 
 
-def _board_variables(pipeline: Experiment) -> tuple[Variable, ...]:
+def _board_variables(pipeline: Grid) -> tuple[Variable, ...]:
     """Return the variables of a pipeline's boards, as long as its largest board."""
     markers, corners = largest_board(pipeline)
     lengths = (("marker", markers), ("chessboard_corner", corners))
@@ -622,7 +622,7 @@ def _board_variables(pipeline: Experiment) -> tuple[Variable, ...]:
     )
 
 
-def bytes_per_block(pipeline: Experiment, scenes: int) -> int:
+def bytes_per_block(pipeline: Grid, scenes: int) -> int:
     """Return the uncompressed bytes that ``scenes`` scene cells take in the store."""
     return scenes * sum(
         variable.configurations(pipeline)

@@ -21,7 +21,7 @@ from sweep.evaluation.search import search_windows, visibility_flags, whole_fram
 from sweep.experiment.experiment import scene_plugins
 from sweep.experiment.grid import detector_settings, image_keys, scene_axes, scene_values
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import LABELS, VARIABLES, drawn_quantities
+from sweep.experiment.schema import LABELS, VARIABLES, drawn_variables
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import label, plain
 from sweep.model.camera import Column
@@ -246,7 +246,7 @@ class TruthTables:
     def write(self, folder: Path) -> None:
         """Write ``truth.csv``, ``truth_coco.json`` and ``truth.nc`` into a folder."""
         columns: dict[str, list[Any]] = {name: [] for name in (*GEOMETRY, "true_corners_px")}
-        drawn = drawn_quantities(self.pipeline)
+        drawn = drawn_variables(self.pipeline)
         columns |= {each.name: [] for each in drawn}
         names: list[str] = []
         tables: list[pd.DataFrame] = []
@@ -254,8 +254,9 @@ class TruthTables:
             for name, function in GEOMETRY.items():
                 columns[name].append(function(batch.scenes))
             columns["true_corners_px"].append(batch.scenes.corners_px)
+            values = batch.values  # noqa: PD011  (of scenes, not of a table)
             for each in drawn:
-                columns[each.name].append(each.of(batch.values, len(batch)))
+                columns[each.name].append(values[each.drawn_as].broadcast(len(batch)))
             names += np.where(batch.visible, [f"{name}.png" for name in batch.names], "").tolist()
             tables.append(self._rows(batch, {name: parts[-1] for name, parts in columns.items()}))
         table = pd.concat(tables, ignore_index=True)
@@ -295,7 +296,7 @@ class TruthTables:
                 if name not in (*table, "marker_id"):
                     labels = [label(v) if isinstance(v, tuple) else v for v in values]
                     table[name] = [labels[k] for k in along.tolist()]
-        for each in drawn_quantities(self.pipeline):
+        for each in drawn_variables(self.pipeline):
             if each.name not in table:
                 table[each.name] = variables[each.name]
         return table.loc[batch.visible]
@@ -326,9 +327,9 @@ class TruthTables:
         drawn = {
             each.name: (
                 dims, shaped(np.concatenate(columns[each.name])),
-                {"long_name": each.meaning, **({"units": each.unit} if each.unit else {})},
+                each.attributes(),
             )
-            for each in drawn_quantities(self.pipeline)
+            for each in drawn_variables(self.pipeline)
         }
         coordinates: dict[str, Any] = {
             name: list(LABELS[name]) for name in ("corner", "xy", "xyz")

@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
-from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from sweep.experiment.draws import (
     bits,
     even_uniform,
     geometry_keys,
+    hashed,
     jointly_drawn,
     resolve_pose,
     uniform,
@@ -313,10 +313,7 @@ def image_keys(pipeline: Grid, indices: Sequence[NDArray[np.intp]]) -> NDArray[n
         for name, distribution in sorted(pipeline.distributions.items())
         if parameters[name].stage is Stage.scene
     ]
-    used = [column for column in texts if column.differs_from("")]
-    joined = map_columns(lambda *each: "|".join(filter(None, each)), used) if used \
-        else Column.of("")
-    keys = joined.map(_hash).broadcast(count, np.uint64)
+    keys = hashed(texts, count)
     return bits(pipeline.seed, f"image {pipeline.sampling}", keys, trials)
 
 
@@ -339,9 +336,3 @@ def _text(value: Any) -> str:
     if isinstance(value, tuple):
         return ",".join(_text(item) for item in value)
     return str(value) if isinstance(value, (str, bool)) else f"{float(value) + 0.0:.12g}"
-
-
-@cache
-def _hash(text: str) -> np.uint64:
-    """Return 64 bits of a text's BLAKE2b hash."""
-    return np.uint64(int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little"))

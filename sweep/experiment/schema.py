@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sweep.experiment.axes import MAX_DEVIATIONS, Axis, Distribution
+from sweep.experiment.axes import MAX_DEVIATIONS, Axis
 from sweep.experiment.beliefs import CALIBRATED, believed_calibration
 from sweep.experiment.experiment import largest_board, shows_boards
 from sweep.experiment.parameters import PARAMETERS, PHOTOGRAPHS, Parameter, Stage, superseded
@@ -26,9 +26,7 @@ from sweep.measure.flags import (
     TruthSource,
 )
 from sweep.messages import label
-from sweep.model.calibration import VIEW, CalibrationError
-from sweep.model.camera import Column
-from sweep.typing import Floats
+from sweep.model.calibration import VIEW
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -134,34 +132,6 @@ class FixedValue:
     attributes: Mapping[str, str]
 
 
-@dataclass(frozen=True, slots=True)
-class DrawnQuantity:
-    """A number of each scene that is drawn, or follows from one that is.
-
-    Attributes
-    ----------
-    name
-        Of the coordinate: the parameter's name.
-    column
-        Its name among the scene's values (:func:`sweep.experiment.grid.scene_values`).
-    meaning, unit
-        What it means, and its ``units``.
-    scale
-        The largest numbers that it is added up from, by which rounding is measured; 0 if it is
-        a product.
-    """
-
-    name: str
-    column: str
-    meaning: str
-    unit: str
-    scale: float
-
-    def of(self, values: Mapping[str, Column], count: int) -> Floats:
-        """Return its values (count,) among those of scenes."""
-        return values[self.column].broadcast(count)
-
-
 def fixed_values(pipeline: Grid) -> list[FixedValue]:
     """Return the fixed parameters that are coordinates, in the order of their declaration.
 
@@ -185,59 +155,6 @@ def _scalar(value: Any) -> float | bool | str | None:
 def _attributes(parameter: Parameter) -> dict[str, str]:
     unit = {"units": parameter.unit} if parameter.unit else {}
     return {"long_name": parameter.declaration.meaning, FIXED: "on the whole grid", **unit}
-
-
-def drawn_quantities(pipeline: Grid) -> list[DrawnQuantity]:
-    """Return what is drawn for each scene of a pipeline, except the noise of pixels.
-
-    Examples
-    --------
-    >>> from sweep.experiment.pipeline import Pipeline
-    >>> pipeline = Pipeline.from_dict({"pose": {"side_px": {"uniform": [20, 40]}}})
-    >>> [quantity.name for quantity in drawn_quantities(pipeline)]
-    ['side_px', 'distance_m']
-    """
-    quantities = [
-        _of_parameter(pipeline.parameters[name], _scale(distribution))
-        for name, distribution in pipeline.distributions.items()
-    ]
-    if "side_px" in pipeline.distributions:
-        quantities.append(_of_parameter(PARAMETERS["distance_m"], 0.0))
-    jitter = [float(value) for value in pipeline.values_of("jitter_px")]
-    if any(jitter):
-        quantities += [
-            DrawnQuantity(
-                f"jitter_{axis}_px", f"shift_{axis}_px",
-                f"shift of the centre's undistorted projection along {axis}", "px", max(jitter),
-            )
-            for axis in ("u", "v")
-        ]
-    error = believed_calibration(pipeline.fixed, pipeline.values_of("believed"))
-    if error is not None:
-        quantities += [_calibrated(error, name) for name in error.names]
-    return quantities
-
-
-def _calibrated(error: CalibrationError, name: str) -> DrawnQuantity:
-    """Return a number of the camera that a calibration gives."""
-    unit = "px" if name in VIEW else ""
-    return DrawnQuantity(
-        f"believed_{name}", CALIBRATED + name, f"{name.removesuffix('_px')} as a calibration "
-        "gives it, for estimators that believe it", unit,
-        (CALIBRATION_SCALE_PX if unit else 1.0) + MAX_DEVIATIONS * error.sd(name),
-    )
-
-
-def _of_parameter(parameter: Parameter, scale: float) -> DrawnQuantity:
-    return DrawnQuantity(
-        parameter.name, parameter.name, parameter.declaration.meaning, parameter.unit, scale
-    )
-
-
-def _scale(distribution: Distribution) -> float:
-    """Return the largest number that a draw is added up from."""
-    a, b = abs(distribution.a), abs(distribution.b)
-    return float(np.maximum(a, b * (MAX_DEVIATIONS if distribution.kind == "normal" else 1.0)))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -581,18 +498,54 @@ PHOTOGRAPH_SCHEMA: tuple[Variable, ...] = (
 
 
 def drawn_variables(pipeline: Grid) -> tuple[Variable, ...]:
-    """Return the variables that hold what is drawn for each scene of a pipeline."""
-    return tuple(
-        Variable(
-            drawn.name, Stage.scene, "f8", drawn.meaning, drawn.unit, present_when=_TRUTH,
-            tolerance=(
-                Tolerance("absolute", TRUTH_RTOL * drawn.scale) if drawn.scale
-                else Tolerance("relative", TRUTH_RTOL)
-            ),
-            drawn_as=drawn.column,
-        )
-        for drawn in drawn_quantities(pipeline)
-    )
+    """Return the variables that hold what is drawn for each scene, except the noise of pixels.
+
+    Examples
+    --------
+    >>> from sweep.experiment.pipeline import Pipeline
+    >>> pipeline = Pipeline.from_dict({"pose": {"side_px": {"uniform": [20, 40]}}})
+    >>> [variable.name for variable in drawn_variables(pipeline)]
+    ['side_px', 'distance_m']
+    """
+    variables = [
+        _drawn_parameter(pipeline.parameters[name], distribution.largest)
+        for name, distribution in pipeline.distributions.items()
+    ]
+    if "side_px" in pipeline.distributions:
+        variables.append(_drawn_parameter(PARAMETERS["distance_m"]))
+    jitter = max(map(float, pipeline.values_of("jitter_px")), default=0.0)
+    if jitter:
+        variables += [
+            _drawn(f"jitter_{axis}_px", f"shift of the centre's undistorted projection along "
+                   f"{axis}", "px", jitter, f"shift_{axis}_px")
+            for axis in ("u", "v")
+        ]
+    error = believed_calibration(pipeline.fixed, pipeline.values_of("believed"))
+    for name in () if error is None else error.names:
+        unit, scale = ("px", CALIBRATION_SCALE_PX) if name in VIEW else ("", 1.0)
+        variables.append(_drawn(
+            f"believed_{name}", f"{name.removesuffix('_px')} as a calibration gives it, for "
+            "estimators that believe it", unit, scale + MAX_DEVIATIONS * error.sd(name),
+            CALIBRATED + name,
+        ))
+    return tuple(variables)
+
+
+def _drawn_parameter(parameter: Parameter, scale: float = 0.0) -> Variable:
+    name = parameter.name
+    return _drawn(name, parameter.declaration.meaning, parameter.unit, scale, name)
+
+
+def _drawn(name: str, meaning: str, unit: str, scale: float, drawn_as: str) -> Variable:
+    """Return the variable of a number of each scene that is drawn, or follows from one that is.
+
+    ``scale`` is the largest number that it is added up from, by which rounding is measured; 0 if
+    it is a product.
+    """
+    tolerance = Tolerance("absolute", TRUTH_RTOL * scale) if scale else Tolerance(
+        "relative", TRUTH_RTOL)
+    return Variable(name, Stage.scene, "f8", meaning, unit, present_when=_TRUTH,
+                    tolerance=tolerance, drawn_as=drawn_as)
 
 
 def variables_of(pipeline: Grid) -> tuple[Variable, ...]:

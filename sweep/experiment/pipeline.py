@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from sweep.experiment.cameras import (
     resolve_sensor,
 )
 from sweep.experiment.experiment import Grid
+from sweep.experiment.grid import Experiment
 from sweep.experiment.parameters import PARAMETERS, RIVALS, Parameter, is_zip
 from sweep.experiment.plugins import EFFECTS_KEY, NAMED_BY, parameters_with, read_plugins
 from sweep.experiment.reader import (
@@ -197,7 +199,7 @@ def _is_axis(name: str, value: Any, parameters: Mapping[str, Parameter]) -> bool
 MAX_SHOWN_PATH_LENGTH = 400
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Pipeline(Grid):
     """A document that is checked as a whole: the grid, its fixed values and its random draws.
 
@@ -251,6 +253,15 @@ class Pipeline(Grid):
     stopping: StoppingRule | None = None
     budget_ms: float | None = None
     source: str = field(default="pipeline", compare=False)
+
+    @cached_property
+    def experiment(self) -> Experiment:
+        """The experiment that it describes, resolved once in each process."""
+        return Experiment(self)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what another process gets; it resolves the experiment itself."""
+        return {name: value for name, value in vars(self).items() if name != "experiment"}
 
     @property
     def heading(self) -> str:

@@ -556,7 +556,7 @@ def parts(pipeline: Pipeline) -> list[Part]:
         *(each.switch for each in on if each.random),
         *(["the believed calibration"] if calibrated else []),
     ]))
-    lens = pipeline.any_value("distortion", canonical_distortion)
+    lens = any(map(canonical_distortion, pipeline.values_of("distortion")))
     image = pipeline.any_value("background", lambda value: isinstance(value, str))
     asked = "full" in pipeline.values_of("window")
     guarded = pipeline.any_value("guarded", bool)

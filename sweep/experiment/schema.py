@@ -521,13 +521,14 @@ def drawn_variables(pipeline: Grid) -> tuple[Variable, ...]:
             for axis in ("u", "v")
         ]
     error = believed_calibration(pipeline.fixed, pipeline.values_of("believed"))
-    for name in () if error is None else error.names:
-        unit, scale = ("px", CALIBRATION_SCALE_PX) if name in VIEW else ("", 1.0)
-        variables.append(_drawn(
-            f"believed_{name}", f"{name.removesuffix('_px')} as a calibration gives it, for "
-            "estimators that believe it", unit, scale + MAX_DEVIATIONS * error.sd(name),
-            CALIBRATED + name,
-        ))
+    if error is not None:
+        variables += [
+            _drawn(f"believed_{name}", f"{name.removesuffix('_px')} as a calibration gives it, "
+                   "for estimators that believe it", unit, scale + MAX_DEVIATIONS * error.sd(name),
+                   CALIBRATED + name)
+            for name in error.names
+            for unit, scale in [("px", CALIBRATION_SCALE_PX) if name in VIEW else ("", 1.0)]
+        ]
     return tuple(variables)
 
 

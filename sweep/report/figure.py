@@ -169,7 +169,7 @@ class Figure:
     def panels(self) -> list[Panel]:
         """Its drawings."""
         curves = [each for each in self.curves if each.heading in self.table.headings]
-        rows = range(len(self.table.frame))
+        rows: Sequence[int] = range(len(self.table.frame))
         if self.shown:
             rows_of = [{cell_text(cell) for cell in row} for row in
                        self.table.frame.iloc[:, : self.table.stub].to_numpy().tolist()]
@@ -202,9 +202,10 @@ class Figure:
             values = [value_of(cells[curve.heading].iloc[k]) for k in order]
             known = [k for k, value in zip(order, values, strict=True)
                      if not math.isnan(value.value)]
-            ends = np.array([each for each in values if not math.isnan(each.value)]).reshape(-1, 3)
-            lines.append(Series(name, x[known], *ends.T, tuple(
-                cell_text(cells[self.labels].iloc[k]) for k in known) if self.labels else ()))
+            y, low, high = np.array(
+                [each for each in values if not math.isnan(each.value)]).reshape(-1, 3).T
+            texts = [cell_text(cells[self.labels].iloc[k]) for k in known] if self.labels else []
+            lines.append(Series(name, x[known], y, low, high, texts))
         title = heading_title(curve.heading) + (f", {words}" if words else "")
         return Panel(
             title, f"Lines of {curve.heading} against {self.x}{f', {words}' if words else ''}.",
@@ -455,7 +456,8 @@ MAX_NAMED = 8
 """Up to this many points that are not on the front have their names beside them."""
 
 ROW_LABEL_CHARS = 30
-REFERENCE = {"color": INK, "linewidth": 0.9, "linestyle": (0, (5, 3)), "zorder": 1.5}
+REFERENCE: dict[str, Any] = {
+    "color": INK, "linewidth": 0.9, "linestyle": (0, (5, 3)), "zorder": 1.5}
 """A line that marks a reference, such as a bound."""
 
 

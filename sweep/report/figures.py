@@ -412,7 +412,8 @@ def _ranking(data: ReportData) -> Figure | None:
                      "intervals", ["marker"], columns)
     return Figure(
         "ranking", "Marker IDs, the weakest first" + (f": {whose}" if whose else ""), sentences(
-            f"Detection rates of the {min(WEAKEST, len(names))} weakest IDs. {int(ranked['weak'].sum()):,} of {len(names):,} IDs are weak (diamonds): below the "
+            f"Detection rates of the {min(WEAKEST, len(names))} weakest IDs. "
+            f"{int(ranked['weak'].sum()):,} of {len(names):,} IDs are weak (diamonds): below the "
             "rate expected if all were alike, with an adjusted p-value under 0.05.",
             interval_sentence(data, summary), denominators(summary), data.pooled(*dims)),
         table, [DETECTED], shown=names[:WEAKEST], marked="weak", covers=(IDS,))

@@ -32,7 +32,8 @@ def test_the_table_has_a_row_for_each_statistic_configuration_and_bin():
         "statistic", "cornerRefinementMethod", "side_px", "photographs", "simulated",
         "compared by", "gap"]
     assert len(table.rows) == 7 * 2 * 2
-    row = next(row for row in table.rows if row[:3] == ["range bias, %", "subpix", "20\u201340"])
+    row = next(row for row in table.rows
+               if row[:3] == ["range bias, %", "subpix", "20\u201340"])
     at = gap.sel(cornerRefinementMethod="subpix").isel(side_px=0)
     assert float(row[3].replace("\u2212", "-")) == pytest.approx(
         at.range_bias_percent.values[0], rel=0.01)
@@ -46,7 +47,8 @@ def test_json_has_the_same_numbers_and_null_where_there_is_none():
     rng = np.random.default_rng(2)
     gap = simulation_gap(results_of(rng, 3), twins(rng))
     records = json.loads(to_json(gap_table(gap).as_json()))["rows"]
-    median = next(each for each in records if each["statistic"].startswith("rotation error, median"))
+    median = next(each for each in records
+                  if each["statistic"].startswith("rotation error, median"))
     assert median["compared by"] == "ratio"
     assert median["cornerRefinementMethod"] == "none"
     assert (median["gap"]["low"], median["gap"]["high"]) == (None, None)

@@ -145,7 +145,7 @@ def limit(options: argparse.Namespace) -> int:
     for line in summary.warnings if summary is not None else ():
         notice(line)
     if output is not None:
-        library.charts.write_figure(library.limit_figure.limit_panels(limits), output)
+        library.figure.write_figure([library.limit_figure.limit_figure(limits)], output)
     return answered(options, library.limit_figure.limit_findings(limits))
 
 

@@ -50,8 +50,8 @@ if TYPE_CHECKING:
 __all__ = [
     "ArgumentError", "DatasetError", "Pipeline", "PipelineError", "Progress", "RunError",
     "StoreError", "SweepError", "__version__", "compare", "decode_flags", "diagnose",
-    "error_model", "fit", "limit", "measure_tradeoff", "open", "photos", "require", "run", "size",
-    "twins", "write_report",
+    "error_model", "fit", "limit", "measure_tradeoff", "open", "photos", "reference", "require",
+    "run", "size", "twins", "write_report",
 ]
 
 _IMPORTED_ON_USE = {"Pipeline": "sweep.experiment.pipeline", "Progress": "sweep.execution.progress",
@@ -99,7 +99,7 @@ def run(
     store
         Path or URL of the store (default: ``runs/NAME.zarr`` with the pipeline's name).
     workers
-        Processes of the cluster that is started for the run (default: the available processors).
+        Processes that are started on this machine (default: the available processors).
     client
         A ``distributed.Client``, or a cluster object such as ``LocalCluster`` or ``SLURMCluster``,
         to run on instead. It stays open. Its workers must be processes that have the same versions
@@ -790,3 +790,29 @@ def write_report(
         os.fspath(store), None if output is None else os.fspath(output), require=require, per=per,
         form=form, figures=None if figures is None else os.fspath(figures),
         error_model=error_model, command=command)
+
+
+def reference(*names: str) -> Findings:
+    """Return parameters, effects, solvers, variables, flags or statistics, with their meaning.
+
+    Parameters
+    ----------
+    names
+        A subject ("camera", "effects", "flags", ...) or a parameter; without any, the subjects.
+
+    Returns
+    -------
+    Findings
+        A table of each subject, and one of the parameters.
+
+    Raises
+    ------
+    ArgumentError
+        For a name that is neither.
+
+    Examples
+    --------
+    >>> sweep.reference("tilt_deg").numbers["parameters"][0]["unit"]
+    'degree'
+    """
+    return library.reference.reference(names)

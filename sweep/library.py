@@ -43,14 +43,14 @@ if TYPE_CHECKING:
     from sweep.photographs import prepare as prepare
     from sweep.photographs import twins as twins
     from sweep.plugins import declared as declared
-    from sweep.report import charts as charts
     from sweep.report import comparison_tables as comparison_tables
     from sweep.report import decisions as decisions
     from sweep.report import error_model_file as error_model_file
-    from sweep.report import formatting as formatting
+    from sweep.report import figure as figure
     from sweep.report import limit_figure as limit_figure
     from sweep.report import output_file as output_file
     from sweep.report import questions as questions
+    from sweep.report import reference as reference
     from sweep.report import report_data as report_data
     from sweep.report import scenes as scenes
     from sweep.report import table as table
@@ -93,14 +93,14 @@ _MODULES = (
     "sweep.experiment.sampling",
     "sweep.plugins.declared",
     "sweep.processor",
-    "sweep.report.charts",
     "sweep.report.comparison_tables",
     "sweep.report.decisions",
+    "sweep.report.figure",
     "sweep.report.error_model_file",
-    "sweep.report.formatting",
     "sweep.report.limit_figure",
     "sweep.report.output_file",
     "sweep.report.questions",
+    "sweep.report.reference",
     "sweep.report.report_data",
     "sweep.report.scenes",
     "sweep.report.table",

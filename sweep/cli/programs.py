@@ -108,14 +108,14 @@ def fit(options: argparse.Namespace) -> int:
             "scene": found.scene, "photographs": found.photographs, "markers": found.markers,
             "terms": [each.as_json() for each in found.terms], "lines": list(found.lines),
             "check": [] if fitted.gap is None
-            else library.comparison_tables.gap_records(fitted.gap),
+            else library.comparison_tables.gap_table(fitted.gap).as_json()["rows"],
             "output": str(output),
         })
         return 0
     rows = [
         (
-            each.name, each.parameter, library.formatting.number(each.estimate.value),
-            library.formatting.interval_text(each.estimate.low, each.estimate.high)
+            each.name, each.parameter, library.table.number(each.estimate.value),
+            library.table.interval_text(each.estimate.low, each.estimate.high)
             if math.isfinite(each.estimate.low) else "",
             f"{'kept' if each.kept else 'left out'}{': ' if each.reason else ''}{each.reason}",
         )

@@ -85,7 +85,8 @@ class Correction(NamedTuple):
 
     def one(self, way: int) -> Correction:
         """Return one of the ways."""
-        return Correction(*(each[way : way + 1] for each in self))
+        return Correction(self.log_weight[[way]], self.matrix[[way]], self.spread[[way]],
+                          self.ratio[[way]], (self.labels[way],))
 
 
 @dataclass(frozen=True)

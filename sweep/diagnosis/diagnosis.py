@@ -21,10 +21,9 @@ from sweep.diagnosis.inference import (
 )
 from sweep.diagnosis.observations import Observations, read_observations
 from sweep.model.calibration import Calibration
-from sweep.report.charts import Panel, Series, draw_lines, write_figure
-from sweep.report.formatting import number
+from sweep.report.figure import Figure, write_figure
 from sweep.report.output_file import figure_file
-from sweep.report.table import UNDECIDED, Findings, Table
+from sweep.report.table import UNDECIDED, Column, Findings, Table, Value, number
 
 SHOWN = 6
 """Causes in the table and in the figure."""
@@ -49,7 +48,7 @@ def diagnose(
     rows = read_observations(observations, camera=camera, **settings)
     ranking = rank(rows)
     if figure is not None:
-        write_figure([residual_panel(rows, ranking)], figure)
+        write_figure([residual_figure(rows, ranking)], figure)
     return findings(rows, ranking)
 
 
@@ -165,18 +164,14 @@ def _sentence(rows: Observations, ranking: Ranking, measurement: Measurement | N
             f"differ by {measurement.difference:.1f} standard deviations; or {_test(first)}.")
 
 
-def residual_panel(rows: Observations, ranking: Ranking) -> Panel:
-    """Return a figure of measured minus predicted, in standard deviations, by cause and row."""
-    row, component, value = measured(rows)
-    series = []
-    for each, _ in _shown(ranking):
-        residual = (value - each.fitted) / np.sqrt(each.predicted.variance[each.best])
-        nothing = np.full(len(row), np.nan)
-        series.append(Series(
-            name_of(each), np.arange(1.0, len(row) + 1.0), residual, nothing, nothing))
-    labels = ("measured value: row by row, " + ", ".join(
-        sorted({COMPONENTS[k] for k in component})), "measured - predicted, standard deviations")
-    return Panel(
-        "What each cause leaves unexplained",
-        "Residuals of each measured value by cause, in standard deviations.",
-        lambda axes: draw_lines(axes, series, labels, level=0.0, linear=True), wide=True)
+def residual_figure(rows: Observations, ranking: Ranking) -> Figure:
+    """Return a figure of measured minus predicted, in standard deviations, by cause and value."""
+    _, _, value = measured(rows)
+    heading = Column("measured - predicted, standard deviations", "residual", level=0.0)
+    table = Table.of("What each cause leaves unexplained", (
+        "cause", "measured value, in the order of the rows", heading.heading), [
+        (name_of(each), k + 1, Value(float(residual)))
+        for each, _ in _shown(ranking) for k, residual in enumerate(
+            (value - each.fitted) / np.sqrt(each.predicted.variance[each.best]))], stub=2)
+    return Figure("residuals", table.caption, "", table, [heading],
+                  x=table.headings[1], by="cause")

@@ -197,8 +197,9 @@ def error_model(store: xr.Dataset | str | os.PathLike[str]) -> DetectionModel:
             root @ means(whitened[:, :, None] * whitened[:, None, :]) @ root, np.log)
     # Inverses of covariances of n poses are too large by n / (n - 7) on average (Anderson, "An
     # introduction to multivariate statistical analysis", 2003, section 7.7), and the means' errors
-    # add 1 / n.
-    wider = np.log((poses + 1.0) / np.maximum(poses - 7.0, 1.0))
+    # add 1 / n. Heavy tails are worth fewer normal poses: n over Mardia's kurtosis / 48.
+    tails = max(float(((whitened**2).sum(axis=1) ** 2).mean()) / 48.0, 1.0)
+    wider = np.log((poses + tails) / np.maximum(poses - 7.0 * tails, 0.5 * poses + 1.0))
     log_covariance = log_covariance + wider[:, None, None] * np.eye(6)
     ambiguity = np.quantile(np.log(ratio[ratio > 0]), AMBIGUITY_SHARES)
     model = DetectionModel(

@@ -1,8 +1,8 @@
 """Covariances of one detection on draws that were not fitted, beside those of others.
 
-    python tests/benchmarks/bench_detection.py FITTED.zarr HELD_OUT.zarr
+    python tests/benchmarks/bench_detection.py STORE.zarr
 
-Both stores are runs of pipelines/diagnose/detection.toml with different seeds.
+The store is a run of pipelines/diagnose/detection.toml: even trials are fitted, odd ones judged.
 """
 
 import os
@@ -31,9 +31,9 @@ PLANE = [0, 2, 4]
 class Sample:
     """Estimated poses of one refinement that are not flipped, with errors in the camera's frame."""
 
-    def __init__(self, path, refinement):
-        self.results = sweep.open(path).sel(cornerRefinementMethod=refinement).drop_vars(
-            "cornerRefinementMethod").load()
+    def __init__(self, path, refinement, half):
+        self.results = sweep.open(path).sel(cornerRefinementMethod=refinement).isel(
+            trial=slice(half, None, 2)).drop_vars("cornerRefinementMethod").load()
         errors, self.rvec, self.tvec, self.ratio, self.flipped = estimated(self.results)
         self.distance = np.linalg.norm(self.tvec, axis=1)
         self.angle = np.minimum(viewing_angle_of(self.rvec, self.tvec), 89.0)
@@ -94,9 +94,9 @@ FORMS = {
 """Form -> ln(variance) of x, z and yaw of numbers and a sample, and where the fit begins."""
 
 
-def main(fitted, held_out):
+def main(path):
     for refinement in ("subpix", "apriltag"):
-        a, b = Sample(fitted, refinement), Sample(held_out, refinement)
+        a, b = (Sample(path, refinement, half) for half in (0, 1))
         model = error_model(a.results)
         found = model.at(b.rvec, b.tvec, b.ratio)
         known = found["known"].values

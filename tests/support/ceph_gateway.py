@@ -29,6 +29,7 @@ mon initial members = a
 auth cluster required = none
 auth service required = none
 auth client required = none
+ms mon client mode = crc
 osd pool default size = 1
 osd pool default pg num = 8
 osd pool default pg autoscale mode = off
@@ -132,7 +133,7 @@ noise_grey = 1
 [axes]
 side_px = [20, 30, 40, 60]
 solver = ["ippe_square", "iterative"]
-trial = 2000
+trial = 3000
 """
 
 READ = """
@@ -173,8 +174,8 @@ def main():
             return ran
 
         local = f"{folder}/local.zarr"
-        command("run", str(pipeline), "--store", local, "--block-s", "0.2")
-        run = [sweep, "run", str(pipeline), "--store", url, "--block-s", "0.2", "--workers", "2"]
+        command("run", str(pipeline), "--store", local)
+        run = [sweep, "run", str(pipeline), "--store", url, "--workers", "2"]
         with subprocess.Popen(run, env=environment, stdout=subprocess.DEVNULL,
                               stderr=subprocess.DEVNULL, start_new_session=True) as first:
             until(lambda: first.poll() is not None or begun(sweep, url, environment))

@@ -79,9 +79,9 @@ class Chunks:
                 int(index[at]) * extent
                 for at, extent in zip(self._positions[name], self._blocks.extents, strict=True)
             )
+            number = self._blocks.number(Block(starts, starts))
         except (IndexError, ValueError):
             return None
-        number = self._blocks.number(Block(starts, starts))
         inside = 0 <= number < len(self._blocks)
         return number if inside and self.key(name, number) == key else None
 

@@ -30,12 +30,8 @@ from functools import lru_cache
 from pathlib import Path
 
 import dask
-import google_crc32c
-import numpy as np
 import psutil
 from distributed import Client, Worker
-from numcodecs.vlen import VLenUTF8
-from numcodecs.zstd import Zstd
 
 import sweep
 from sweep.execution import on_cluster
@@ -48,6 +44,8 @@ from sweep.integrity.verification import verify
 from sweep.isolation.child_process import Interrupts
 from sweep.measure.flags import DetectionStatus, EstimateStatus, Flipped
 from sweep.store.blocks import committed, missing_chunks, receipts
+from sweep.store.chunks import receipt_key
+from sweep.store.files import write_files
 from sweep.store.layout import RECEIPTS, checksum_of
 from sweep.store.lifecycle import create_store, open_store
 from sweep.store.receipt import Receipt
@@ -76,18 +74,17 @@ MONITORS = {
 }
 
 
-def receipt_text(store, number, wall_s, idle_s=0.0):
-    """Return the text of a receipt of a block whose poses were all detected and solved."""
+def receipt_of(store, number, wall_s, idle_s=0.0):
+    """Return the receipt of a block whose poses were all detected and solved."""
     scenes = len(store.blocks[number])
-    receipt = Receipt(
-        run_id=store.run_id, processors=["simulated"], scenes=scenes,
+    return Receipt(
+        run_id=store.run_id, processors=("simulated",), scenes=scenes,
         computed={"scenes": scenes, "detections": scenes, "estimates": scenes},
         detection=[0, scenes], estimate=[0, scenes],
-        seconds={"scene": [idle_s], "detection": [0.0], "estimation": [0.0]}, failures=[],
+        seconds={"scene": [idle_s], "detection": [0.0], "estimation": [0.0]}, failures=(),
         wall_s=wall_s, written=time.time(), block=number,
         checksums={variable.name: 123456789 for variable in store.variables},
     )
-    return receipt, receipt.to_json()
 
 
 @lru_cache(maxsize=1)
@@ -112,9 +109,9 @@ def simulated_blocks(url, run_id, blocks, _decision, _sources, time_limit_s, *_o
     store = opened(url, run_id)
     number = store.blocks.number(block)
     wanted = time_limit_s * share_of(number)
-    receipt, text = receipt_text(store, number, wanted, 0.0 if math.isnan(idle_s) else idle_s)
+    receipt = receipt_of(store, number, wanted, 0.0 if math.isnan(idle_s) else idle_s)
     time.sleep(max(wanted - (time.perf_counter() - begun), 0.0))
-    store.array(RECEIPTS)[number : number + 1] = np.array([text], dtype=object)
+    write_files(store.storage, {receipt_key(number): receipt.to_bytes()})
     LAST.end = begun + wanted
     return [receipt]
 
@@ -223,12 +220,6 @@ def measured(store, client, block_s, interrupts, scheduler):
     }
 
 
-def encoded(text):
-    """Return the bytes of a receipt's chunk."""
-    body = Zstd(level=0).encode(VLenUTF8().encode(np.array([text], dtype=object)))
-    return body + google_crc32c.value(body).to_bytes(4, "little")
-
-
 def fill(store, chunks):
     """Write all receipts of a store past Zarr, and with ``chunks`` a chunk for each variable."""
     root, count = Path(store.url), len(store.blocks)
@@ -239,17 +230,17 @@ def fill(store, chunks):
             there = variable.stage is Stage.scene and flag != "bound"
             empty = 0.0 if there else variable.fill
             value = empty if variable.flags is None else SOUND.get(variable.name, 0)
-            content = store.chunks.encoded(variable.name, 0, value)
+            content = store.chunks.encoded(variable.name, value)
             contents[variable.name], checksums[variable.name] = content, checksum_of(content)
     (root / RECEIPTS / "c").mkdir(parents=True, exist_ok=True)
     for number in range(count):
-        receipt, _ = receipt_text(store, number, 2.0)
+        receipt = receipt_of(store, number, 2.0)
         scenes = receipt.scenes
-        text = dataclasses.replace(
+        receipt = dataclasses.replace(
             receipt, checksums=checksums, detection=[0] * SOUND["detection"] + [scenes],
             estimate=[0] * SOUND["estimate"] + [scenes],
-        ).to_json()
-        (root / RECEIPTS / "c" / str(number)).write_bytes(encoded(text))
+        )
+        (root / receipt_key(number)).write_bytes(receipt.to_bytes())
     for name, content in contents.items():
         source = None
         for links in range(count):

@@ -43,6 +43,11 @@ class TargetScenes:
     chessboard_px: Floats
     flags: NDArray[np.uint8]
 
+    @property
+    def are_markers(self) -> bool:
+        """Whether each target is a marker alone."""
+        return all(target.is_marker for target in self.targets)
+
 
 def target_scenes(
     scenes: Scenes, visibility: NDArray[np.uint8], boards: Sequence[Board] | None = None,

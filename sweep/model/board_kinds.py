@@ -192,7 +192,7 @@ class Markers:
                 "margin_m", self.margin_m, "no one sheet for markers in several planes; delete it"
             ))
         if not faults:
-            pair = self._overlap()
+            pair = first_overlap(self._printed(self._placed()[1]))
             if pair is not None:
                 quiet = "" if self.margin_m is not None else " with their quiet zones"
                 faults.append(Fault(
@@ -201,37 +201,35 @@ class Markers:
                 ))
         return faults
 
-    def _overlap(self) -> tuple[int, int] | None:
-        """Return the first two markers of the same plane that overlap, or None."""
-        planes: dict[tuple[float, ...], list[int]] = {}
-        centres = np.array([[each.x_m, each.y_m, each.z_m] for each in self.markers])
-        for k, each in enumerate(self.markers):
-            if not each.is_flat:
-                printed, _ = solid_print(
-                    self._print(each), each.z_m, each.tilt_deg, each.azimuth_deg
+    def _placed(self) -> tuple[list[Print], Floats]:
+        """Return the prints of the markers, and the corners (n, 4, 3) of their squares."""
+        prints = [
+            marker_print(
+                self.dictionary, each.marker_id, each.size_m, self._quiet, each.x_m, each.y_m,
+                each.roll_deg,
+            )
+            for each in self.markers
+        ]
+        corners = np.array([
+            corners_of(each.size_m, each.x_m, each.y_m, each.roll_deg) for each in self.markers
+        ])
+        if not all(each.is_flat for each in self.markers):
+            for k, each in enumerate(self.markers):
+                prints[k], corners[k] = solid_print(
+                    prints[k], each.z_m, each.tilt_deg, each.azimuth_deg
                 )
-                centres[k] = centres[k] @ printed.turn
-            key = each.tilt_deg, each.azimuth_deg if each.tilt_deg else 0.0, round(centres[k, 2], 9)
-            planes.setdefault(key, []).append(k)
-        sides = self._sides()
-        rolls = np.radians([each.roll_deg for each in self.markers])
-        for some in planes.values():
-            pair = first_overlap(centres[some, :2], sides[some], rolls[some])
-            if pair is not None:
-                return some[pair[0]], some[pair[1]]
-        return None
+        return prints, corners
 
-    def _print(self, each: BoardMarker) -> Print:
-        return marker_print(
-            self.dictionary, each.marker_id, each.size_m, self._quiet, each.x_m, each.y_m,
-            each.roll_deg,
+    def _printed(self, corners: Floats) -> Floats:
+        """Return the corners (n, 4, 3) of all that is printed of each marker, its white included.
+
+        ``corners`` (n, 4, 3) are those of its square.
+        """
+        around = overhang(self.dictionary) + (self._quiet or 0.0)
+        middle = corners.mean(axis=1, keepdims=True)
+        return np.asarray(
+            middle + (corners - middle) * (1 + 2 * around / module_count(self.dictionary))
         )
-
-    def _sides(self) -> Floats:
-        """Return the side (n,) of what is printed of each marker, with its quiet zone."""
-        quiet = self._quiet or 0.0
-        around = 1 + 2 * (overhang(self.dictionary) + quiet) / module_count(self.dictionary)
-        return np.array([each.size_m * around for each in self.markers])
 
     @property
     def _quiet(self) -> float | None:
@@ -242,20 +240,9 @@ class Markers:
     def board(self) -> Board:
         """Return the board; ValueError with its faults, a line each."""
         refuse(self.faults())
-        prints = [self._print(each) for each in self.markers]
-        corners = np.array([
-            corners_of(each.size_m, each.x_m, each.y_m, each.roll_deg) for each in self.markers
-        ])
-        if not all(each.is_flat for each in self.markers):
-            for k, each in enumerate(self.markers):
-                prints[k], corners[k] = solid_print(
-                    prints[k], each.z_m, each.tilt_deg, each.azimuth_deg
-                )
+        prints, corners = self._placed()
         if self.margin_m is not None:
-            printed = np.concatenate([
-                corners_of(side, each.x_m, each.y_m, each.roll_deg)[:, :2] * [1.0, -1.0]
-                for each, side in zip(self.markers, self._sides().tolist(), strict=True)
-            ])
+            printed = self._printed(corners)[..., :2].reshape(-1, 2) * [1.0, -1.0]
             box = [*(printed.min(axis=0) - self.margin_m), *(printed.max(axis=0) + self.margin_m)]
             prints.append(rectangles_print(np.array([box]), OUTSIDE, WHITE))
         return Board(
@@ -356,7 +343,9 @@ def overlap_faults(board: Board, listed: Sequence[Sequence[Any]]) -> list[Fault]
     own = own_sheets(board)
     for number in range(len(sheets) - own):
         before = corners[: own + number]
-        overlapping = np.flatnonzero(sheets_overlap(corners[own + number], before))
+        overlapping = np.flatnonzero(
+            sheets_overlap(np.broadcast_to(corners[own + number], before.shape), before)
+        )
         if len(overlapping):
             other = int(overlapping[0]) - own
             name = f"distractors[{other}]" if other >= 0 else "the board"

@@ -271,30 +271,22 @@ EFFECTS: tuple[Effect, ...] = (
                 "is that at the middle row's", unit="s", low=0, high=1e6, drawable=True,
             ),
             # The velocities are those of both effects of motion.
-            "velocity_x_m_s": parameter(
-                0.0, "velocity of the marker's centre, right", unit="m/s", low=-1e9, high=1e9,
-                drawable=True,
-            ),
-            "velocity_y_m_s": parameter(
-                0.0, "velocity of the marker's centre, down", unit="m/s", low=-1e9, high=1e9,
-                drawable=True,
-            ),
-            "velocity_z_m_s": parameter(
-                0.0, "velocity of the marker's centre, away from the camera", unit="m/s",
-                low=-1e9, high=1e9, drawable=True,
-            ),
-            "rotation_x_deg_s": parameter(
-                0.0, "angular velocity about the axis through the marker's centre that points "
-                "right", unit="degree/s", low=-1e9, high=1e9, drawable=True,
-            ),
-            "rotation_y_deg_s": parameter(
-                0.0, "angular velocity about the axis through the marker's centre that points "
-                "down", unit="degree/s", low=-1e9, high=1e9, drawable=True,
-            ),
-            "rotation_z_deg_s": parameter(
-                0.0, "angular velocity about the axis through the marker's centre that points "
-                "forward", unit="degree/s", low=-1e9, high=1e9, drawable=True,
-            ),
+            **{
+                name: parameter(
+                    0.0, f"velocity of the marker's centre, {along}", unit="m/s", low=-1e9,
+                    high=1e9, drawable=True,
+                )
+                for name, along in zip(
+                    VELOCITIES[:3], ("right", "down", "away from the camera"), strict=True
+                )
+            },
+            **{
+                name: parameter(
+                    0.0, "angular velocity about the axis through the marker's centre that points "
+                    + along, unit="degree/s", low=-1e9, high=1e9, drawable=True,
+                )
+                for name, along in zip(VELOCITIES[3:], ("right", "down", "forward"), strict=True)
+            },
         },
         needs={
             "row_time_s": VELOCITIES,

@@ -415,30 +415,6 @@ def _marker_view(scenes: Scenes, row: int, box: Box) -> MarkerView:
     )
 
 
-@lru_cache(maxsize=1024)
-def _bitmap(
-    key: Board, black: float, white: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return a print's bitmap (height, width) at 10 px a module, and its black square's corners.
-
-    The corners (4, 2) are TL, TR, BR, BL in pixels of the bitmap, whose pixels' edges lie at
-    halves; of a board they are those of what is black.
-    """
-    if key.margin is None:
-        return _board_bitmap(key, black, white)
-    beyond = overhang(key.dictionary)
-    pad = round(WARP_PX_PER_MODULE * (key.margin - beyond))
-    cells = np.kron(
-        modules(key.dictionary, key.marker_ids[0]),
-        np.ones((WARP_PX_PER_MODULE, WARP_PX_PER_MODULE), dtype=bool),
-    )
-    bitmap = np.where(np.pad(cells, pad, constant_values=True), white, black)
-    near = pad + WARP_PX_PER_MODULE * beyond - 0.5
-    far = len(bitmap) - 1 - near
-    corners = np.array([[near, near], [far, near], [far, far], [near, far]], dtype=np.float32)
-    return bitmap.astype(np.float32), corners
-
-
 MAX_BITMAP_PX = 25_000_000
 """The most pixels of a board's bitmap, which take 0.5 GB while it is drawn."""
 
@@ -453,10 +429,16 @@ def bitmap_shape(board: Board) -> tuple[int, int]:
     return math.ceil(height), math.ceil(width)
 
 
-def _board_bitmap(
+@lru_cache(maxsize=1024)
+def _bitmap(
     board: Board, black: float, white: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """As :func:`_bitmap`, of a board: pixels on edges have the mean of their area, beside it 0."""
+    """Return a print's bitmap (height, width) at 10 px a module, and its black square's corners.
+
+    Pixels on edges have the mean of their area, beside the print 0. The corners (4, 2) are TL, TR,
+    BR, BL in pixels of the bitmap, whose pixels' edges lie at halves; of a board they are those of
+    what is black.
+    """
     extent = extent_of(board)
     scale = float(WARP_PX_PER_MODULE)
     left, top, _, _ = extent.sheet.tolist()

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sweep.model.board import first_overlap
+from sweep.model.board import corners_of, first_overlap
 from sweep.model.board_kinds import AprilGrid, BoardMarker, Charuco, Grid, Markers
 
 DICTIONARY = "DICT_4X4_250"
@@ -138,6 +138,11 @@ def test_edges_can_leave_a_marker_out():
     assert without.ends[:, [0, 2]].max() == pytest.approx(0.065)  # the sheet's
 
 
+def squares(centres, sides, rolls):
+    return np.array([corners_of(side, *centre, np.degrees(roll))
+                     for centre, side, roll in zip(centres, sides, rolls, strict=True)])
+
+
 def test_squares_overlap_as_their_clipped_polygons_do():
     rng = np.random.default_rng(4)
     seen = set()
@@ -150,9 +155,9 @@ def test_squares_overlap_as_their_clipped_polygons_do():
         area = 0.0 if region is None else cv2.contourArea(cv2.convexHull(region))
         if state == cv2.INTERSECT_NONE or area > 1e-4:
             seen.add(area > 0)
-            assert (first_overlap(centres, sides, rolls) is not None) == (area > 0)
+            assert (first_overlap(squares(centres, sides, rolls)) is not None) == (area > 0)
     assert seen == {True, False}
-    assert first_overlap(np.array([[0, 0], [1.0, 0]]), np.ones(2), np.zeros(2)) is None
+    assert first_overlap(squares([[0, 0], [1.0, 0]], [1.0, 1.0], [0.0, 0.0])) is None
 
 
 def test_a_board_that_cannot_be_is_a_value_error_with_every_fault():

@@ -167,7 +167,8 @@ def estimate_poses(
         return estimator(detections), []
     except Exception as batch_error:
         raise_machine_fault(batch_error)
-        parts, failed = [], []
+        parts: list[Estimates] = []
+        failed: list[tuple[int, str]] = []
         for i in range(len(detections)):
             try:
                 parts.append(estimator(detections.take(np.array([i]))))
@@ -345,8 +346,9 @@ def _run_batch(
         "estimation": [],
     }
     for k, result in enumerate(results):
-        result.flags = np.where(visible, result.flags, batch.visibility)
-        result.flags[~searched[:, k]] = DetectionStatus.not_run
+        flags = np.where(visible, result.flags, batch.visibility)
+        flags[~searched[:, k]] = DetectionStatus.not_run
+        result.flags = flags
         add(compute(DETECTION, result, columns))
         for j, estimator in enumerate(estimating):
             rows = np.flatnonzero((result.flags == DetectionStatus.detected) & need[:, k, j])

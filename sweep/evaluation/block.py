@@ -119,7 +119,7 @@ def _assumed_noise_and_blur(
     estimator: EstimatorSetting, scenes: Scenes
 ) -> tuple[Floats, Floats]:
     """Return the noise of a pixel in grey levels and the point spread in px, (N,) each."""
-    truth = {"noise_grey": 0.0, "blur_px": 0.0} if scenes.effects is None else scenes.effects
+    truth = scenes.effects
     noise, blur = (
         np.broadcast_to(truth[name] if assumed is None else assumed, len(scenes))
         for name, assumed in (
@@ -324,7 +324,7 @@ def _run_batch(
 
     start = time.perf_counter()
     batch = scenes_at(pipeline, indices)
-    visible = batch.visibility == DetectionStatus.not_run
+    visible: Masks = np.asarray(batch.visibility == DetectionStatus.not_run)
     geometry_s = time.perf_counter() - start
 
     builds = [build(estimator) for estimator in estimating]

@@ -282,10 +282,10 @@ def search_windows(
     ndarray
         (N, 4) left, top, right, bottom in pixels of the frame, half-open.
     """
-    margin = margin_px(setting) + NOISE_MARGIN_PX * scenes.noise_coarseness[:, None]
+    margin = margin_px(setting) + NOISE_MARGIN_PX * scenes.effects.noise_coarseness[:, None]
     cut = windows(boxes, scenes.frame, margin)
     whole = full | (full_frame_reason(setting) is not None)
-    whole |= uneven_light_needs_frame(setting, scenes.uneven_gain)
+    whole |= uneven_light_needs_frame(setting, scenes.effects.uneven_gain)
     frame = np.concatenate([np.zeros_like(scenes.frame), scenes.frame], axis=1)
     return np.where(whole[:, None], frame, cut)
 

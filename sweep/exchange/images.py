@@ -22,7 +22,7 @@ from sweep.evaluation.search import common_windows, search_windows, whole_frames
 from sweep.evaluation.variables import GEOMETRY, target_areas_px
 from sweep.experiment.grid import detector_settings, image_keys, scene_axes
 from sweep.experiment.pipeline import Pipeline
-from sweep.experiment.schema import LABELS, VARIABLES, DrawnQuantity, drawn_quantities
+from sweep.experiment.schema import LABELS, VARIABLES, Variable, drawn_variables
 from sweep.measure.classify import TargetScenes
 from sweep.measure.flags import DetectionStatus
 from sweep.messages import label, plain
@@ -229,12 +229,13 @@ class TruthTables:
 
         Of targets with a chessboard ``truth_chessboard.csv``, too.
         """
-        drawn = drawn_quantities(self.pipeline)
+        drawn = drawn_variables(self.pipeline)
         columns: dict[str, list[Any]] = {}
         tables: list[pd.DataFrame] = []
         chessboards: list[pd.DataFrame] = []
         for batch in image_batches(self.pipeline, windowed=self.windowed):
             scenes, targets = batch.scenes, batch.targets
+            drawn_values = batch.values  # noqa: PD011  (of scenes, not of a table)
             of_batch: dict[str, Any] = {
                 **{name: function(scenes) for name, function in GEOMETRY.items()},
                 "marker_area_px": target_areas_px(scenes, targets),
@@ -243,7 +244,8 @@ class TruthTables:
                 "true_corners_px": (
                     targets.corners_px[:, 0] if targets.are_markers else targets.corners_px
                 ),
-                **{each.name: each.of(batch.values, len(batch)) for each in drawn},
+                **{each.name: drawn_values[each.drawn_as].broadcast(len(batch))
+                   for each in drawn},
             }
             for name, values in of_batch.items():
                 columns.setdefault(name, []).append(values)
@@ -286,13 +288,13 @@ class TruthTables:
                 if name not in (*table, "marker_id", "dictionary"):
                     labels = [label(v) if isinstance(v, tuple) else v for v in values]
                     table[name] = [labels[k] for k in along.tolist()]
-        for each in drawn_quantities(self.pipeline):
+        for each in drawn_variables(self.pipeline):
             if each.name not in table:
                 table[each.name] = variables[each.name]
         return table
 
     def _dataset(
-        self, columns: dict[str, NDArray[Any]], drawn: Sequence[DrawnQuantity]
+        self, columns: dict[str, NDArray[Any]], drawn: Sequence[Variable]
     ) -> xr.Dataset:
         """Return the truth over the experiment's scene axes."""
         axes = scene_axes(self.pipeline)
@@ -304,12 +306,7 @@ class TruthTables:
                 "long_name": "true corners in the frame; pixel (0, 0) is the centre of the top "
                 "left pixel", "units": "px"},
             "image": {"long_name": "name of the image; empty where the target is not visible"},
-            **{
-                each.name: {
-                    "long_name": each.meaning, **({"units": each.unit} if each.unit else {}),
-                }
-                for each in drawn
-            },
+            **{each.name: each.attributes() for each in drawn},
         }
         inner |= {"true_corners_px": corner_dims}
         variables: dict[str, Any] = {

@@ -34,13 +34,13 @@ from sweep.measure.likelihood import (
     state_of,
 )
 from sweep.model import coverage
+from sweep.model.board import side_m
 from sweep.model.derivatives import (
     POSE,
     work_space,
 )
-from sweep.model.effects import IN_BOUND, NEUTRAL
+from sweep.model.effects import IN_BOUND
 from sweep.model.polygon import Projection
-from sweep.model.printed import side_m
 from sweep.model.renderers import beside_pixels
 from sweep.model.scene import Scenes
 from sweep.typing import Floats
@@ -165,11 +165,11 @@ def outside_model(scenes: Scenes, row: int) -> BoundStatus:
 
     The pose does not matter to it.
     """
-    effects = scenes.effect(row) if scenes.affected[row] else NEUTRAL
+    effects = scenes.effects.of(row)
     noise, levels = effects["noise_grey"], scenes.levels[row] * effects["gain"]
     margin = CLIPPING_DEVIATIONS * noise
     if isinstance(scenes.background[row], str) or any(
-        name not in IN_BOUND for name in scenes.active(row)
+        each.switch not in IN_BOUND for each in scenes.effects.active_in(row)
     ):
         return BoundStatus.not_in_model
     if noise < MIN_NOISE:
@@ -206,7 +206,7 @@ def bounds(
     high = np.minimum(boxes[:, 2:] + BACKGROUND_MARGIN_PX, frames)
     for i, row in enumerate(rows.tolist()):
         noise, gain, blur = (
-            (scenes.effect(row) if scenes.affected[row] else NEUTRAL)[name]
+            scenes.effects.of(row)[name]
             for name in ("noise_grey", "gain", "blur_px")
         )
         levels = scenes.levels[row] * gain

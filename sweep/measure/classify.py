@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from sweep.measure.detectors import SearchOutput
 from sweep.measure.flags import DetectionStatus
-from sweep.model.board import Board
+from sweep.model.board import Board, unseen_markers
+from sweep.model.exposure import solid_planes
 from sweep.model.extent import outside_of_frame
 from sweep.model.pose import transform_points
-from sweep.model.printed import unseen_markers
 from sweep.model.scene import Scenes
-from sweep.model.scene_sheet import solid_planes
 from sweep.typing import Floats, Integers, Masks
 
 # --------------------------------------------------------------------------------------------------

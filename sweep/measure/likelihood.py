@@ -11,7 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import choose_when_compiled, compiled
-from sweep.model.board import Board
+from sweep.model.board import (
+    Board,
+    extent_of,
+    moving_edges,
+    own_sheets,
+    sheet_planes,
+    sheets_m,
+    target_edges,
+    unit_m,
+    visible_prints,
+)
 from sweep.model.coverage import MarkerEdges
 from sweep.model.derivatives import (
     LEVELS,
@@ -22,16 +32,6 @@ from sweep.model.derivatives import (
 )
 from sweep.model.polygon import Optics, Projection
 from sweep.model.pose import rotations, vectors
-from sweep.model.printed import (
-    extent_of,
-    moving_edges,
-    own_sheets,
-    sheet_planes,
-    sheets_m,
-    target_edges,
-    unit_m,
-    visible_prints,
-)
 from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------

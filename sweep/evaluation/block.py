@@ -284,7 +284,7 @@ def run_cells(
     configurations = pipeline.size(Stage.detection), pipeline.size(Stage.estimation)
     if need is None:
         need = np.ones((count, *configurations), dtype=bool)
-    searched = need.any(axis=2)
+    searched: Masks = np.asarray(need.any(axis=2))
     if search_too is not None:
         searched |= search_too
     settings = estimators(pipeline)

@@ -167,7 +167,8 @@ def estimate_poses(
         return estimator(detections), []
     except Exception as batch_error:
         raise_machine_fault(batch_error)
-        parts, failed = [], []
+        parts: list[Estimates] = []
+        failed: list[tuple[int, str]] = []
         for i in range(len(detections)):
             try:
                 parts.append(estimator(detections.take(np.array([i]))))
@@ -283,7 +284,7 @@ def run_cells(
     configurations = pipeline.size(Stage.detection), pipeline.size(Stage.estimation)
     if need is None:
         need = np.ones((count, *configurations), dtype=bool)
-    searched = need.any(axis=2)
+    searched: Masks = np.asarray(need.any(axis=2))
     if search_too is not None:
         searched |= search_too
     settings = estimators(pipeline)
@@ -323,7 +324,7 @@ def _run_batch(
 
     start = time.perf_counter()
     batch = scenes_at(pipeline, indices)
-    visible = batch.visibility == DetectionStatus.not_run
+    visible: Masks = np.asarray(batch.visibility == DetectionStatus.not_run)
     geometry_s = time.perf_counter() - start
 
     builds = [build(estimator) for estimator in estimating]
@@ -345,8 +346,9 @@ def _run_batch(
         "estimation": [],
     }
     for k, result in enumerate(results):
-        result.flags = np.where(visible, result.flags, batch.visibility)
-        result.flags[~searched[:, k]] = DetectionStatus.not_run
+        flags = np.where(visible, result.flags, batch.visibility)
+        flags[~searched[:, k]] = DetectionStatus.not_run
+        result.flags = flags
         add(compute(DETECTION, result, columns))
         for j, estimator in enumerate(estimating):
             rows = np.flatnonzero((result.flags == DetectionStatus.detected) & need[:, k, j])

@@ -44,13 +44,13 @@ from sweep.typing import Floats, Grey, Integers, Masks
 class DetectionSource(Protocol):
     """Where the detections of N scenes with one setting come from.
 
-    Attributes
-    ----------
-    needs_images
-        Whether scenes are rendered for it, in windows; else its pixels are those of the frame.
+    One that needs images gets them in windows; else its pixels are those of the frame.
     """
 
-    needs_images: bool
+    @property
+    def needs_images(self) -> bool:
+        """Whether scenes are rendered for it."""
+        ...
 
     def __call__(self, row: int, image: Grey) -> SearchOutput:
         """Return what is found in the image of scene ``row``."""

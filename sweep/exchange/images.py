@@ -343,7 +343,7 @@ def _plain(values: Any) -> Any:
 
 
 def _csv(table: pd.DataFrame) -> bytes:
-    return table.to_csv(index=False, lineterminator="\n").encode()
+    return str(table.to_csv(index=False, lineterminator="\n")).encode()
 
 
 def _repeated(table: pd.DataFrame, rows: Integers, own: dict[str, Any]) -> pd.DataFrame:

@@ -199,7 +199,8 @@ def boards_are_searched_and_solved(reading: Reading) -> None:
             ("refineDetectedMarkers", True,
              "false beside recorded detections: no image is searched"),
         ):
-            reading.refuse_values(name, expected, lambda given, value=value: given == value)
+            if value in reading.values_of(name):
+                reading.fault(f"{reading.parameters[name].section}.{name}", value, expected)
     if "solver" not in reading.given:
         reading.faults.append(
             f"{reading.source}: estimator.solver: missing; a board needs one of "
@@ -255,7 +256,7 @@ def _several_planes(reading: Reading) -> None:
     target = any(map(is_solid, reading.values_of("markers")))
     why = f"for {'markers' if target else 'distractors'} with z_m or tilt_deg"
     if target and {"markers", "chessboard"}.intersection(reading.values_of("points")):
-        reading.refuse_values("solver", f"one of iterative, sqpnp, epnp, {why}",
+        reading.refuse_values("solver", f"one of iterative, sqpnp, epnp, photometric, {why}",
                               lambda name: name in SOLVERS and SOLVERS[name].planar_only)
     for name, reason in IN_ONE_PLANE.items():
         if reading.is_active(name):

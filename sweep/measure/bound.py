@@ -18,7 +18,6 @@ from sweep.measure.likelihood import (
     GREY_LEVELS,
     MIN_NOISE,
     MIN_SPREAD_PX,
-    POSITION,
     SETTLED,
     SPREAD,
     MarkerView,
@@ -35,70 +34,16 @@ from sweep.measure.likelihood import (
     state_of,
 )
 from sweep.model import coverage
-from sweep.model.board import moving_edges, own_sheets, side_m, visible_prints
+from sweep.model.board import side_m
 from sweep.model.derivatives import (
-    LEVELS,
     POSE,
-    differentiate,
-    normal_equations,
     work_space,
 )
 from sweep.model.effects import IN_BOUND
-from sweep.model.exposure import solid_planes
-from sweep.model.polygon import Optics, Projection
+from sweep.model.polygon import Projection
 from sweep.model.renderers import beside_pixels
 from sweep.model.scene import Scenes
-from sweep.typing import Floats, Integers
-
-# --------------------------------------------------------------------------------------------------
-# The Cramér-Rao bound of the pixels of a target in several planes.
-
-def solid_covariance(
-    scenes: Scenes, row: int, state: Floats, corner: Integers, image: Floats, variance: float,
-    *, spread_free: bool,
-) -> tuple[Floats, bool]:
-    """Return the bound's covariance (6, 6) of one scene, and whether it exists.
-
-    The slopes of all that is seen are summed; an edge at which a sheet hides another moves with
-    the sheet in front. Levels are eliminated, as is the point spread with ``spread_free``.
-
-    Parameters
-    ----------
-    scenes, row
-        The scene.
-    state
-        (16,) its true state, as :mod:`sweep.measure.likelihood` has it.
-    corner, image
-        (2,) the first pixel of a box, and its pixels: NaN for those that are left out.
-    variance
-        Of a pixel, in squared grey levels.
-    """
-    board, planes = scenes.target(row), solid_planes(scenes, row)
-    optics = scenes.cameras.optics(row)
-    local = optics.intrinsics.copy()
-    local[2:] -= corner
-    local_optics = Optics(local, optics.lens, optics.distorted)
-    work, count = work_space(*image.shape), 0
-    for seen in visible_prints(board, planes):
-        if seen.number >= own_sheets(board):
-            continue
-        for edges, plane in moving_edges(seen, planes):
-            count = differentiate(
-                work, edges, state[GREY_LEVELS], Projection(plane, local_optics), state[POSITION],
-                state[SPREAD], count,
-            )
-    free = POSE + 1 if spread_free else POSE
-    matrix, vector = np.empty((free + LEVELS, free + LEVELS)), np.empty(free + LEVELS)
-    normal_equations(image, work, free, matrix, vector)
-    covers = np.flatnonzero(np.diag(matrix)[free:] > 0) + free
-    mixed = matrix[:free, covers]
-    information = matrix[:free, :free] - mixed @ np.linalg.solve(
-        matrix[np.ix_(covers, covers)], mixed.T
-    )
-    covariance, exists = pose_covariance(np.ascontiguousarray(information), variance, 1.0)
-    # Beyond half a turn rounding has made a singular problem a regular one.
-    return covariance, bool(exists) and not (np.diag(covariance)[:3] > np.pi**2).any()
-
+from sweep.typing import Floats
 
 # --------------------------------------------------------------------------------------------------
 # The Cramér-Rao bound of the exact image's pixels: the least error of any unbiased estimate.
@@ -180,8 +125,9 @@ def bound_of_scene(
     -------
     tuple
         The Cramér-Rao bound's covariance (6, 6) and whether it exists; κ; and the noise-free
-        chi-square of the minimum that is reached from the mirrored pose, NaN if that minimum is
-        the pose itself, if none is reached, or if it is so high that no noise leads there.
+        chi-square of the minimum that is reached from the mirrored pose, NaN for a target in
+        several planes, if that minimum is the pose itself, if none is reached, or if it is so high
+        that no noise leads there.
     """
     free = POSE + 1 if spread_free else POSE
     information, gradient = np.empty((free, free)), np.empty(free)
@@ -195,6 +141,8 @@ def bound_of_scene(
     if not exists:
         return covariance, False, math.nan, math.nan
     kappa = depth_nonlinearity(covariance, state)
+    if len(view.sheets.planes) > 0:
+        return covariance, True, kappa, math.nan
     cover, levels = np.zeros((height, width + 2)), state[GREY_LEVELS]
     truth = Projection(plane_of(state, view), view.optics)
     coverage.accumulate(cover, view.edges, levels, truth, 0, 0, state[SPREAD])
@@ -265,13 +213,13 @@ def bounds(
         status[i] = outside_model(scenes, row)
         if status[i] != BoundStatus.given:
             continue
-        target = scenes.target(row)
+        target, translation = scenes.target(row), scenes.translation[row]
         view = marker_view(
             target, side_m(target, float(scenes.size_m[row])), scenes.cameras.optics(row), low[i],
-            noise_variance(noise),
+            noise_variance(noise), (scenes.rotation[row], translation),
         )
         arm = scenes.rotation[row] @ middle_m(target)
-        state = state_of(scenes.rotation[row], scenes.translation[row] + arm, blur, levels)
+        state = state_of(scenes.rotation[row], translation + arm, blur, levels)
         width, height = (high[i] - low[i]).tolist()
         if unknown_blur:
             state[SPREAD] = max(state[SPREAD], MIN_SPREAD_PX)
@@ -280,18 +228,9 @@ def bounds(
             left, top = low[i].tolist()
             box = left, top, left + width, top + height
             image[beside_pixels(scenes, row, box)] = np.nan
-        if not target.is_planar:
-            state[POSITION] = scenes.translation[row]
-            covariance, exists = solid_covariance(
-                scenes, row, state, low[i], image, view.variance, spread_free=unknown_blur
-            )
-            if exists:
-                kappa[i], arm = depth_nonlinearity(covariance, state), np.zeros(3)
-            mirror_chi_square = math.nan
-        else:
-            covariance, exists, kappa[i], mirror_chi_square = bound_of_scene(
-                state, view, image, unknown_blur
-            )
+        covariance, exists, kappa[i], mirror_chi_square = bound_of_scene(
+            state, view, image, unknown_blur
+        )
         if not exists:
             status[i] = BoundStatus.no_contrast
             continue

@@ -215,7 +215,7 @@ SOLVERS: dict[str, Solver] = {
     "photometric": Solver(
         "maximum likelihood on the pixels, started from ippe",
         lambda setting: Photometric(setting.refined_starts, setting.estimate_blur),
-        needs_images=True, planar_only=True, of_boards=True,
+        needs_images=True, of_boards=True,
     ),
     "photometric_real": Solver(
         "least squares on the pixels of photographs: what else is on the board, point spread "

@@ -11,7 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sweep.compilation import choose_when_compiled, compiled
-from sweep.model.board import Board, extent_of, target_edges, unit_m
+from sweep.model.board import (
+    Board,
+    extent_of,
+    moving_edges,
+    own_sheets,
+    sheet_planes,
+    sheets_m,
+    target_edges,
+    unit_m,
+    visible_prints,
+)
 from sweep.model.coverage import MarkerEdges
 from sweep.model.derivatives import (
     LEVELS,
@@ -22,7 +32,7 @@ from sweep.model.derivatives import (
 )
 from sweep.model.polygon import Optics, Projection
 from sweep.model.pose import rotations, vectors
-from sweep.typing import Floats
+from sweep.typing import Floats, Integers
 
 # --------------------------------------------------------------------------------------------------
 # Systems of equations with a positive definite matrix, and the covariance of a pose.
@@ -122,6 +132,28 @@ PATIENCE = 2
 ``worth``."""
 
 
+class Sheets(NamedTuple):
+    """The P sheets of a target in several planes; of a flat one there are none.
+
+    Attributes
+    ----------
+    first
+        (P + 1,) which edges move with each sheet: from the first of them to that of the next.
+    planes
+        (P, 3, 3) takes (column, row, 1) of each sheet to the target's frame, in metres.
+    radius_m
+        Largest distance of what is printed from the frame's origin.
+    """
+
+    first: Integers
+    planes: Floats
+    radius_m: float
+
+
+FLAT = Sheets(np.zeros(1, dtype=np.int64), np.empty((0, 3, 3)), 0.0)
+"""The sheets of a target in one plane, which is that of its pose."""
+
+
 class MarkerView(NamedTuple):
     """An image's known parameters: the marker or board, its size, the camera and the noise.
 
@@ -129,7 +161,8 @@ class MarkerView(NamedTuple):
     ----------
     edges
         The edges of all that is printed, in modules from the top left corner of the black square;
-        of a board, from that of a square of its first marker's size around the board's middle.
+        of a board, from that of a square of its first marker's size around the board's middle. Of
+        a target in several planes each in the coordinates of the sheet that it moves with.
     extent
         (4,) left, top, right and bottom of the outline, in the same coordinates.
     modules, size_m
@@ -140,6 +173,8 @@ class MarkerView(NamedTuple):
         Variance of a pixel's noise in squared grey levels; 0 if it is not known.
     least_spread_px
         Smallest point spread of a state.
+    sheets
+        Where the sheets of a target in several planes are.
     """
 
     edges: MarkerEdges
@@ -149,27 +184,64 @@ class MarkerView(NamedTuple):
     optics: Optics
     variance: float
     least_spread_px: float
+    sheets: Sheets
 
 
 def marker_view(
-    target: Board, size_m: float, optics: Optics, corner: NDArray[np.int64], variance: float
+    target: Board, size_m: float, optics: Optics, corner: NDArray[np.int64], variance: float,
+    seen_from: tuple[Floats, Floats] | None = None,
 ) -> MarkerView:
     """Return the view of a target in an image whose first pixel is ``corner`` (2,) of the frame.
 
     ``size_m`` is its first marker's side, and the pose is that of its middle, which
-    :func:`middle_m` gives: its perspective and the pose's mirror are those of a marker there.
+    :func:`middle_m` gives: its perspective and the pose's mirror are those of a marker there. Of a
+    target in several planes the edges are those that are seen at the pose ``seen_from``.
     """
     outline, box = _around_middle(target)
     local = optics.intrinsics.copy()
     local[2:] -= corner
+    modules, sheets = extent_of(target).modules, FLAT
+    if seen_from is not None and not target.is_planar:
+        outline, sheets = _seen_sheets(target, size_m / modules / unit_m(target), *seen_from)
     return MarkerView(
-        outline, box, extent_of(target).modules, float(size_m),
-        Optics(local, optics.lens, optics.distorted), float(variance), 0.0,
+        outline, box, modules, float(size_m), Optics(local, optics.lens, optics.distorted),
+        float(variance), 0.0, sheets,
+    )
+
+
+def _seen_sheets(
+    target: Board, scale: float, rotation: Floats, translation: Floats
+) -> tuple[MarkerEdges, Sheets]:
+    """Return the edges of a target in several planes that are seen at a pose, by sheets.
+
+    An edge at which a sheet hides another moves with the sheet in front.
+    """
+    planes = sheet_planes(target, rotation, translation, scale)
+    groups = [
+        group for seen in visible_prints(target, planes) if seen.number < own_sheets(target)
+        for group in moving_edges(seen, planes)
+    ]
+    in_frame = np.array([plane for _, plane in groups]).reshape(-1, 3, 3)
+    in_frame[:, :, 2] -= translation
+    radius = scale * float(np.linalg.norm(sheets_m(target)[: own_sheets(target)], axis=2).max())
+    first = np.cumsum([0, *(len(edges.ends) for edges, _ in groups)])
+    return (
+        MarkerEdges(
+            np.concatenate([np.empty((0, 4)), *(edges.ends for edges, _ in groups)]),
+            np.concatenate(
+                [np.empty((0, 2), dtype=np.int64), *(edges.sides for edges, _ in groups)]),
+        ),
+        Sheets(first, np.ascontiguousarray(rotation.T @ in_frame), radius),
     )
 
 
 def middle_m(target: Board) -> Floats:
-    """Return the middle (3,) of a target's sheet in its frame, in metres; 0 of a marker alone."""
+    """Return the middle (3,) of a target's sheet in its frame, in metres.
+
+    0 of a marker alone, and of a target in several planes.
+    """
+    if not target.is_planar:
+        return np.zeros(3)
     extent = extent_of(target)
     across, down = (extent.middle - extent.origin).tolist()
     return np.array([across, -down, 0.0]) * unit_m(target)
@@ -213,8 +285,22 @@ def plane_of(state: Floats, view: MarkerView) -> Floats:
 
 
 @compiled
+def _sheet_plane(state: Floats, in_frame: Floats) -> Floats:
+    """Return a sheet's plane (3, 3) at a state, from that in the target's frame."""
+    rotation, plane = rotation_of(state), np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                plane[i, j] += rotation[i, k] * in_frame[k, j]
+        plane[i, 2] += state[POSITION][i]
+    return plane
+
+
+@compiled
 def is_before_camera(state: Floats, view: MarkerView) -> bool:
     """Return whether the marker faces the camera with its whole outline in front of it."""
+    if len(view.sheets.planes) > 0:
+        return bool(state[DEPTH] > view.sheets.radius_m)
     plane = plane_of(state, view)
     rotation, position = rotation_of(state), state[POSITION]
     facing = 0.0
@@ -244,10 +330,19 @@ def curvature(
     free = information.shape[0]
     matrix, vector = np.empty((free + LEVELS, free + LEVELS)), np.empty(free + LEVELS)
     grey_levels = state[GREY_LEVELS]
-    count = differentiate(
-        work, view.edges, grey_levels, Projection(plane_of(state, view), view.optics),
-        state[POSITION], state[SPREAD], 0,
-    )
+    sheets, count = view.sheets, 0
+    if len(sheets.planes) == 0:
+        count = differentiate(
+            work, view.edges, grey_levels, Projection(plane_of(state, view), view.optics),
+            state[POSITION], state[SPREAD], 0,
+        )
+    for k in range(len(sheets.planes)):
+        some = slice(sheets.first[k], sheets.first[k + 1])
+        count = differentiate(
+            work, MarkerEdges(view.edges.ends[some], view.edges.sides[some]), grey_levels,
+            Projection(_sheet_plane(state, sheets.planes[k]), view.optics), state[POSITION],
+            state[SPREAD], count,
+        )
     distance = abs(state[DEPTH])
     for slot in range(count):
         for k in range(3, POSE):
@@ -521,7 +616,7 @@ def binned_view(view: MarkerView) -> MarkerView:
     return MarkerView(
         view.edges, view.extent, view.modules, view.size_m,
         Optics(intrinsics, view.optics.lens, view.optics.distorted), 0.25 * view.variance,
-        view.least_spread_px,
+        view.least_spread_px, view.sheets,
     )
 
 

@@ -11,6 +11,7 @@ from sweep.compilation import compiled, compiled_inline
 from sweep.measure.likelihood import (
     BLACK,
     DEPTH,
+    FLAT,
     MODELS,
     OUTSIDE,
     OUTSIDE_SHARE,
@@ -633,7 +634,7 @@ def photograph_view(
     )
     known = MarkerView(
         around, np.repeat([-extent, modules + extent], 2), float(modules), float(size_m), optics,
-        0.0, MIN_SPREAD_PX,
+        0.0, MIN_SPREAD_PX, FLAT,
     )
     to_modules[:, 2] += to_modules[:, :2] @ low
     at, spans = _fitted_pixels(
@@ -719,7 +720,7 @@ def binned_photograph(view: PhotographView) -> PhotographView:
     known = view.marker
     marker = MarkerView(
         known.edges, known.extent, known.modules, known.size_m, optics, known.variance,
-        known.least_spread_px,
+        known.least_spread_px, known.sheets,
     )
     return PhotographView(marker, levels, spans, rays, at, COARSE_PANEL_PX, view.toned)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -34,10 +34,13 @@ from sweep.measure.likelihood import (
     marker_view,
     middle_m,
     mirrored_state,
+    moved_state,
     noise_variance,
     overwrite,
     pose_covariance,
     rotation_of,
+    solve_positive,
+    squared_residuals,
     squares,
     state_of,
     turn_between,
@@ -62,7 +65,7 @@ from sweep.measure.solver import (
     reprojection_px,
 )
 from sweep.measure.surroundings import BoardMarker
-from sweep.model.board import Board, box_corners, extent_of, unit_m
+from sweep.model.board import Board, box_corners, extent_of, own_sheets, sheets_m, unit_m
 from sweep.model.camera import Cameras
 from sweep.model.derivatives import LEVELS, POSE, known_pixels, work_space
 from sweep.model.marker import module_count
@@ -255,6 +258,55 @@ def locate_exactly(
     return *found, freedom
 
 
+SIGHTS = 40
+"""How often at most it is determined what is seen of a target in several planes."""
+
+
+def locate_in_sight(
+    image: Floats, starts: Floats, seen_from: Callable[[Pose], MarkerView], information: Floats
+) -> tuple[Floats, float, bool, Floats, int]:
+    """Return what :func:`locate_exactly` does of a target in several planes.
+
+    Levenberg-Marquardt from each start. What sheets hide of others depends on the pose: it is
+    determined again, by ``seen_from``, at each state that is tried.
+    """
+    free, square_sum, work = len(information), squares(image), work_space(*image.shape)
+    freedom = known_pixels(image) - free - LEVELS
+    missing = np.full(STATE_LENGTH, math.nan)
+    fits = [(missing, math.inf, False), (missing, math.inf, False)]
+    found, gradient = np.empty((free, free)), np.empty(free)
+    for start in starts:
+        trial, state, lowest, damping = start, start, math.inf, 1e-3
+        matrix, downhill, reached = found, gradient, False
+        for _ in range(SIGHTS):
+            view = seen_from((rotation_of(trial), trial[POSITION]))
+            if is_before_camera(trial, view):
+                level = squared_residuals(
+                    Pixels(image, square_sum, view), trial, work, found, gradient
+                )
+                if level < lowest:
+                    state, lowest, damping = trial, level, 0.1 * damping
+                    matrix, downhill = found.copy(), gradient.copy()
+                else:
+                    damping = max(10.0 * damping, 1e-3)
+            newton = downhill.reshape(free, 1).copy()
+            if not (lowest < math.inf and solve_positive(matrix, newton)):
+                break
+            if downhill @ newton[:, 0] < SETTLED * view.variance:
+                reached = True
+                break
+            step = downhill.reshape(free, 1).copy()
+            solve_positive(matrix + damping * np.diag(np.diag(matrix)), step)
+            trial = moved_state(state, step[:, 0], view.least_spread_px)
+        if lowest < fits[0][1]:
+            information[:] = matrix
+        if all(not turn_between(state, each[0]) < SAME_TURN_RAD for each in fits):
+            fits.append((state, lowest, reached))
+        fits = sorted(fits, key=lambda fit: fit[1])
+    (state, level, reached), (other, _, _), *_ = fits
+    return state, level, reached, other, freedom
+
+
 @compiled
 def locate_photograph(
     view: PhotographView, starts: Floats, covariance: Floats
@@ -424,7 +476,11 @@ def window_of(found: Found, poses: list[Pose]) -> list[int]:
         low, high = low - margin, high + margin
     else:
         scale = found.size_m / module_count(found.key.dictionary)
-        sheet = box_corners(extent_of(found.key).target[None]) * scale
+        sheet = (
+            box_corners(extent_of(found.key).target[None]) * scale if found.key.is_planar
+            else sheets_m(found.key)[: own_sheets(found.key)].reshape(1, -1, 3)
+            * (scale / unit_m(found.key))
+        )
         pixels = np.concatenate([
             found.cameras.project(transform_points(sheet, rotation[None], translation[None]))[0]
             for rotation, translation in poses
@@ -517,16 +573,23 @@ class Photometric:
         left, top, right, bottom = window_of(found, poses)
         if not len(starts) or right - left < 2 or bottom - top < 2:
             return None
-        view = marker_view(
-            found.key, found.size_m, found.cameras.optics(0), found.origin + np.array([left, top]),
-            noise_variance(found.noise_grey),
-        )
         image = found.image[top:bottom, left:right].astype(np.float64)
         if found.beside is not None:
             image[found.beside[top:bottom, left:right]] = np.nan
         free = POSE + 1 if self.spread_free else POSE
         information = np.empty((free, free))
-        state, level, reached, other, freedom = locate_exactly(image, starts, view, information)
+
+        def seen_from(pose: Pose) -> MarkerView:
+            return marker_view(
+                found.key, found.size_m, found.cameras.optics(0),
+                found.origin + np.array([left, top]), noise_variance(found.noise_grey), pose,
+            )
+
+        view = seen_from(poses[0])
+        state, level, reached, other, freedom = (
+            locate_exactly(image, starts, view, information) if found.key.is_planar
+            else locate_in_sight(image, starts, seen_from, information)
+        )
         if not math.isfinite(level) or freedom < 1:
             return None
         if not reached:

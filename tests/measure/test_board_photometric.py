@@ -22,6 +22,15 @@ BESIDE = GRID + "".join(
 )
 """A grid whose sheet another touches, and two near it."""
 
+SOLID = 'kind = "markers"' + "".join(
+    f"\n[[board.markers]]\n{text}" for text in (
+        "marker_id = 3\nx_m = -0.022\ny_m = 0.0\nsize_m = 0.03\ntilt_deg = -30\nazimuth_deg = 90",
+        "marker_id = 8\nx_m = 0.022\ny_m = 0.0\nsize_m = 0.03\ntilt_deg = 30\nazimuth_deg = 90",
+        "marker_id = 5\nx_m = 0.0\ny_m = 0.03\nz_m = 0.02",
+    )
+)
+"""Three markers, each in a plane of its own; the third hides parts of the others."""
+
 TEXT = """
 seed = 5
 [camera]
@@ -64,8 +73,9 @@ def computed(board, trials, *settings):
     return columns, errors / columns["bound_std"]
 
 
-@pytest.mark.parametrize(("board", "trials", "near"), [(GRID, 1, 0.05), (BESIDE, 2, 0.1)],
-                         ids=["grid", "beside"])
+@pytest.mark.parametrize(("board", "trials", "near"), [
+    (GRID, 1, 0.05), (BESIDE, 2, 0.1), (SOLID, 2, 0.05),
+], ids=["grid", "beside", "several planes"])
 def test_board_s_pose_from_pixels_is_within_its_own_bound(board, trials, near):
     """One of six or twelve errors beyond six deviations: probability below 1e-7."""
     columns, relative = computed(board, trials)
@@ -76,7 +86,8 @@ def test_board_s_pose_from_pixels_is_within_its_own_bound(board, trials, near):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("board", [CHARUCO, GRID, BESIDE], ids=["charuco", "grid", "beside"])
+@pytest.mark.parametrize("board", [CHARUCO, GRID, BESIDE, SOLID],
+                         ids=["charuco", "grid", "beside", "several planes"])
 @pytest.mark.parametrize("blur", ["known_blur", "unknown_blur"])
 def test_board_s_pose_from_pixels_attains_the_bound(board, blur):
     """RMSE of 400 x 3 errors scatters by 2 %, the mean of 400 NEES by 0.17."""

@@ -339,10 +339,10 @@ def test_a_marker_alone_in_another_plane_is_a_marker_at_its_pose():
 
 
 @pytest.mark.parametrize(("change", "fault"), [
-    ({"estimator": {"solver": "ippe"}}, "one of iterative, sqpnp, epnp"),
+    ({"estimator": {"solver": "ippe"}}, "one of iterative, sqpnp, epnp, photometric"),
     ({"scene": {"curvature_per_m": 1.0}}, "it absent, for markers with z_m or tilt_deg"),
     ({"scene": {"renderer": "warp"}}, "exact, for markers"),
-    ({"estimator": {"solver": "photometric"}}, "one of iterative, sqpnp, epnp"),
+    ({"estimator": {"solver": "photometric_real"}}, "one of iterative, sqpnp, epnp, photometric"),
     ({"detector": {"refineDetectedMarkers": True}}, "false, for markers"),
 ])
 def test_what_needs_a_plane_is_refused(change, fault):

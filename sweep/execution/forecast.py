@@ -505,13 +505,10 @@ def demand_of(
 ) -> Demand:
     """Return what the ``left`` of a run's blocks take, if a share of their poses is needed.
 
-    A block has a file for each variable, and its receipt; one of which nothing is needed has the
-    flags alone.
+    A block has a file for each variable, and its receipt.
     """
     poses = math.ceil(share * pipeline.size(Stage.scene) * left / max(blocks, 1))
-    variables = variables_of(pipeline)
-    flags = sum(variable.flags is not None for variable in variables)
-    files = left * (flags + 1) + math.ceil(share * left) * (len(variables) - flags)
+    files = left * (len(variables_of(pipeline)) + 1)
     return Demand(poses * scene_s / workers, workers, bytes_per_block(pipeline, poses), files)
 
 

@@ -91,7 +91,7 @@ def whole(url, pipeline, reference):
     assert same(url, reference)
     with xr.open_zarr(url) as opened:  # a warning where its metadata is not in one place
         assert opened.sizes
-    computed = sum(receipt.any_needed for _, receipt in told)
+    computed = sum(receipt.scenes_needed > 0 for _, receipt in told)
     with xr.open_zarr(url, group="cost") as cost:
         assert cost.sizes["block"] == computed
 

@@ -7,7 +7,6 @@ import dataclasses
 import socket
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from sweep.evaluation.block import run_cells, warm_up
 from sweep.evaluation.machine_faults import local_fault, machine_faults_raised
 from sweep.evaluation.results import CellsResult, to_dataset_layout
 from sweep.execution.limits import TIME_LIMIT_S
-from sweep.execution.reuse import LOST, ReusedCells, Source, match, read_cells
+from sweep.execution.reuse import ReusedCells, Source, match, read_cells
 from sweep.experiment.grid import Block, block_indices, scene_axes
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
@@ -30,15 +29,13 @@ from sweep.experiment.rules import file_digest
 from sweep.experiment.schema import Variable
 from sweep.isolation.crash_isolation import WHOLE, check_repeatable, run_cells_isolated
 from sweep.isolation.watchdog import ending_after
-from sweep.measure.flags import DetectionStatus
 from sweep.processor import processor
-from sweep.sampling.rules import Decider, Decision, by_scene
+from sweep.sampling.rules import Decider, Decision, scenes_needed
 from sweep.store.blocks import (
     RunStore,
     begin_block,
     commit_block,
     receipt_of,
-    region,
     withdraw_block,
     write_block,
 )
@@ -47,68 +44,6 @@ from sweep.store.locations import exists
 from sweep.store.outcome import MAX_ROWS, recorded
 from sweep.store.provenance import changes, fingerprint
 from sweep.store.receipt import Receipt
-from sweep.typing import Masks
-
-# --------------------------------------------------------------------------------------------------
-# Blocks of which not all scenes are needed: what is written of those that are not.
-
-Values = dict[str, NDArray[Any]]
-
-
-@dataclass(frozen=True, slots=True)
-class OwnCells:
-    """What a committed block holds.
-
-    Attributes
-    ----------
-    values
-        Variable -> values in the dataset's dimensions.
-    needed
-        (N,) scenes that were needed.
-    whole
-        (N,) those of them of which no cell failed or crashed.
-    """
-
-    values: Values
-    needed: Masks
-    whole: Masks
-
-
-def own_cells(store: RunStore, block: Block) -> OwnCells:
-    """Return what a committed block of a store holds."""
-    pipeline = store.pipeline
-    values = {
-        variable.name: np.asarray(store.array(variable.name)[region(variable, pipeline, block)])
-        for variable in store.variables
-    }
-    flags = {
-        variable.name: by_scene(variable, pipeline, block, values[variable.name])
-        for variable in store.variables if variable.name in LOST
-    }
-    needed = (flags["detection"] != DetectionStatus.not_needed).all(axis=1)
-    lost = np.zeros(len(block), dtype=bool)
-    for name, losses in LOST.items():
-        lost |= np.isin(flags[name], losses).any(axis=1)
-    return OwnCells(values, needed, needed & ~lost)
-
-
-def with_scenes(
-    variables: Sequence[Variable], pipeline: Pipeline, block: Block, scenes: Masks,
-    values: Mapping[str, NDArray[Any]], others: Mapping[str, NDArray[Any]] | None = None,
-) -> Values:
-    """Return values of a block with the ``scenes`` (N,) taken from others.
-
-    Without others, they are not needed: their flags say so, and their numbers are NaN.
-    """
-    taken: Values = {}
-    for variable in variables:
-        names = variable.dimensions(pipeline)
-        along = dict(zip((axis.name for axis in scene_axes(pipeline)), block.shape, strict=True))
-        mask = scenes.reshape([along.get(name, 1) for name in names])
-        other = variable.not_needed if others is None else others[variable.name]
-        taken[variable.name] = np.where(mask, other, values[variable.name]).astype(variable.dtype)
-    return taken
-
 
 # --------------------------------------------------------------------------------------------------
 # The task of a worker: compute one block, write it, and return its receipt.
@@ -163,6 +98,13 @@ def _opened(url: str, run_id: str) -> RunStore:
 def _source(url: str, run_id: str, old: str) -> Source:
     """Match an old store to the new grid once in each process."""
     return match(_opened(url, run_id).pipeline, open_store(old))
+
+
+@lru_cache(maxsize=2)
+def _itself(url: str, run_id: str) -> Source:
+    """Return a store as the source of its own cells, once in each process."""
+    store = _opened(url, run_id)
+    return Source.of(store.pipeline, store, frozenset())
 
 
 @lru_cache(maxsize=2)
@@ -271,14 +213,14 @@ def _compute_begun(
     shape = (len(block), pipeline.size(Stage.detection), pipeline.size(Stage.estimation))
     reused: ReusedCells | None = None
     need = np.broadcast_to(needed[:, None, None], shape).copy()
-    own = None if before is None else own_cells(store, block)
-    if before is not None and own is not None:
-        if (needed == own.needed).all():
+    sources = [_source(url, store.run_id, old) for old in reuse]
+    if before is not None:
+        if (needed == scenes_needed(store, block)).all():
             return commit_block(
                 store, block, dataclasses.replace(before, basis=basis, computed=_NOTHING))
-        need[own.whole] = False
-    if reuse and need.any():
-        sources = [_source(url, store.run_id, old) for old in reuse]
+        own = frozenset([store.blocks.number(block)])
+        sources.insert(0, dataclasses.replace(_itself(url, store.run_id), done=own))
+    if sources and need.any():
         reused = read_cells(pipeline, block, sources)
         need &= ~reused.available.reshape(shape)
     # Scenes of which every cell is reused are not rendered.
@@ -295,16 +237,19 @@ def _compute_begun(
     }
     if reused is not None:
         values = {v.name: _merged(v, values, reused) for v in store.variables}
-    if own is not None:
-        values = with_scenes(
-            store.variables, pipeline, block, own.whole & needed, values, own.values
-        )
     if not needed.all():
-        values = with_scenes(store.variables, pipeline, block, ~needed, values)
+        for v in store.variables:
+            lengths = dict(zip(
+                (axis.name for axis in scene_axes(pipeline)), block.shape, strict=True))
+            mask = needed.reshape([lengths.get(name, 1) for name in v.dimensions(pipeline)])
+            values[v.name] = np.where(mask, values[v.name], v.not_needed).astype(v.dtype)
     seconds = _NO_SECONDS if cells is None else cells.seconds
     receipt = Receipt(
         run_id=store.run_id,
-        processors=_processors(cells, before, reused),
+        processors=tuple(sorted({
+            *(() if cells is None else [processor()]),
+            *(() if reused is None else reused.processors),
+        })),
         scenes=len(block),
         computed={
             "scenes": len(rows),
@@ -321,18 +266,6 @@ def _compute_begun(
         basis=basis,
     )
     return write_block(store, block, values, receipt)
-
-
-def _processors(
-    cells: CellsResult | None, before: Receipt | None, reused: ReusedCells | None
-) -> tuple[str, ...]:
-    """Return the features of the processors that computed a block's cells, here or before."""
-    found = set() if cells is None else {processor()}
-    if before is not None:
-        found.update(before.processors)
-    if reused is not None:
-        found.update(reused.processors)
-    return tuple(sorted(found))
 
 
 def _compute(

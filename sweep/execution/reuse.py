@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,26 +14,23 @@ from numpy.typing import NDArray
 from sweep.errors import StoreError
 from sweep.evaluation.variables import GEOMETRY
 from sweep.experiment.axes import TRIAL, Axis
-from sweep.experiment.grid import Block, scene_axes, scene_values
+from sweep.experiment.grid import Block, block_indices, scene_axes, scene_values
 from sweep.experiment.parameters import Stage
 from sweep.experiment.pipeline import Pipeline
 from sweep.experiment.same_meaning import alike
-from sweep.experiment.schema import VARIABLES, Variable, variables_of
+from sweep.experiment.schema import Variable, variables_of
 from sweep.measure.flags import DetectionStatus, EstimateStatus
 from sweep.model.scene import build_scenes
-from sweep.store.blocks import RunStore, check_whole, receipts
+from sweep.store.blocks import RunStore, check_whole, receipts, region
 from sweep.store.provenance import changes, fingerprint
+from sweep.typing import Masks
 
 # --------------------------------------------------------------------------------------------------
 # Where the cells of a new grid lie in an old one: cells agree where all parameter values do.
 #
 # Whether a parameter is fixed, an axis of its own, or goes together with others does not matter.
-# Axes of both grids that share parameters are matched together, along the rows of one axis where
-# each grid has one, and cell by cell where one grid has several.
-
-MISSING = -1
-"""In place of the index of a value that the old grid does not have."""
-
+# Axes of both grids that share parameters are matched together, by the key of each cell: the
+# values of these parameters.
 
 @dataclass(slots=True)
 class Group:
@@ -77,79 +73,111 @@ def fixed_value(pipeline: Pipeline, name: str) -> Any:
     return 0 if name == TRIAL else pipeline.fixed.get(name)
 
 
-def rows_in(group: Group, new: Pipeline, old: Pipeline) -> NDArray[np.int64]:
-    """Return the index in the old grid of each value along the new axis, or ``MISSING``.
+def row_index(axis: Axis) -> Callable[[tuple[Any, ...]], int | None]:
+    """Return what gives the index along an axis of a row of its columns' values, or None."""
+    first, *others = axis.columns.values()
+    if isinstance(first, range) and not others:  # of trials, which may be many
+        return lambda row: first.index(row[0]) if row[0] in first else None
+    return {row: k for k, row in enumerate(zip(first, *others, strict=True))}.get
 
-    The group has one new axis at most, and one old one at most. Without a new axis there is one
-    value, the fixed one; without an old axis the index is 0 where the values agree.
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """An old store, and where the cells of a new grid lie in it.
+
+    Attributes
+    ----------
+    store
+        The old store.
+    new, old
+        Both grids, with values in the same words.
+    groups
+        Their axes that share parameters.
+    done
+        Numbers of the old store's committed blocks.
     """
-    names = sorted(group.parameters)
-    ours, theirs = (
-        [_column(axes, pipeline, name) for name in names]
-        for axes, pipeline in ((group.new, new), (group.old, old))
-    )
-    if len(names) == 1:
-        return indices_in(ours[0], theirs[0])
-    return indices_in(_rows(group.new, ours), _rows(group.old, theirs))
 
+    store: RunStore
+    new: Pipeline
+    old: Pipeline
+    groups: list[Group]
+    done: frozenset[int]
+    _rows: dict[str, Callable[[tuple[Any, ...]], int | None]]
 
-def _column(axes: Sequence[Axis], pipeline: Pipeline, name: str) -> Sequence[Any]:
-    """Return a parameter's values along the one axis that there may be; else its fixed one."""
-    columns = axes[0].columns if axes else {}
-    return columns.get(name, (fixed_value(pipeline, name),))
+    @staticmethod
+    def of(new: Pipeline, store: RunStore, done: frozenset[int]) -> Source:
+        """Return where the cells of a new grid lie in a store."""
+        new, old = alike(new, store.pipeline)
+        rows = {axis.name: row_index(axis) for axis in old.axes}
+        return Source(store, new, old, groups(new, old), done, rows)
 
+    def cells_in(
+        self, group: Group, along: Sequence[range]
+    ) -> Iterator[tuple[int, tuple[int, ...]]]:
+        """Yield the cells of a group that both grids have.
 
-def _rows(axes: Sequence[Axis], columns: Sequence[Sequence[Any]]) -> list[tuple[Any, ...]]:
-    """Return the combinations of values along the one axis that there may be."""
-    count = len(axes[0]) if axes else 1
-    return list(zip(*(
-        column if len(column) == count else itertools.repeat(column[0], count)
-        for column in columns
-    ), strict=True))
+        Parameters
+        ----------
+        group
+            The group.
+        along
+            The indices along each new axis that are looked for.
 
+        Yields
+        ------
+        The number of the new cell within ``along``, the last axis fastest; its index along each
+        old axis.
+        """
+        owned = {name for axis in group.old for name in axis.columns}
+        fixed = {name: fixed_value(self.new, name) for name in group.parameters}
+        others = [(name, fixed_value(self.old, name)) for name in group.parameters - owned]
+        for number, chosen in enumerate(itertools.product(*along)):
+            values = dict(fixed)
+            for axis, index in zip(group.new, chosen, strict=True):
+                values |= axis.at(index)
+            if any(values[name] != value for name, value in others):
+                continue
+            at = [self._rows[axis.name](tuple(values[name] for name in axis.columns))
+                  for axis in group.old]
+            found = tuple(index for index in at if index is not None)
+            if len(found) == len(at):
+                yield number, found
 
-def indices_in(new: Sequence[Any], old: Sequence[Any]) -> NDArray[np.int64]:
-    """Return the index in ``old`` of each value of ``new``, or ``MISSING``."""
-    if isinstance(new, range) and isinstance(old, range):
-        low, step = old.start, old.step
-        values = np.arange(new.start, new.stop, new.step, dtype=np.int64)
-        index, remainder = np.divmod(values - low, step)
-        exists = (remainder == 0) & (index >= 0) & (index < len(old))
-        return np.where(exists, index, MISSING)
-    if isinstance(old, range):
-        indices = [old.index(value) if value in old else MISSING for value in new]
-        return np.array(indices, dtype=np.int64)
-    index_of = {value: i for i, value in enumerate(old)}
-    return np.array([index_of.get(value, MISSING) for value in new], dtype=np.int64)
+    def located(
+        self, order: Sequence[str], cuts: dict[str, range]
+    ) -> tuple[Masks, dict[str, NDArray[np.intp]]]:
+        """Return which cells of a box of the new grid the old one has, and where.
 
+        Parameters
+        ----------
+        order
+            The new grid's axes, along which the results' dimensions are.
+        cuts
+            The box: axis -> indices.
 
-def cells_in(
-    group: Group, new: Pipeline, old: Pipeline, along: Sequence[Sequence[int]]
-) -> Iterator[tuple[dict[str, int], dict[str, int]]]:
-    """Yield the cells of a group that both grids have: index along each new and each old axis.
-
-    ``along`` has the indices along each new axis that are looked for.
-    """
-    owner = {name: axis for axis in group.old for name in axis.columns}
-    tables: dict[str, Mapping[tuple[Any, ...], int]] = {
-        axis.name: {row: k for k, row in enumerate(zip(*axis.columns.values(), strict=True))}
-        for axis in group.old
-    }
-    names = sorted(group.parameters)
-    for chosen in itertools.product(*along):
-        values = {name: fixed_value(new, name) for name in names}
-        for axis, index in zip(group.new, chosen, strict=True):
-            values |= axis.at(index)
-        if any(values[name] != fixed_value(old, name) for name in names if name not in owner):
-            continue
-        at = {
-            axis.name: tables[axis.name].get(
-                tuple(values[name] for name in axis.columns), MISSING
-            )
-            for axis in group.old
-        }
-        if MISSING not in at.values():
-            yield {a.name: i for a, i in zip(group.new, chosen, strict=True)}, at
+        Returns
+        -------
+        Whether the old grid has a cell; old axis -> index along it.
+        """
+        shape = tuple(len(cuts[name]) for name in order)
+        exists = np.ones(shape, dtype=bool)
+        indices: dict[str, NDArray[np.intp]] = {}
+        for group in self.groups:
+            names = [axis.name for axis in group.new]
+            along = [cuts[name] for name in names]
+            found = np.zeros([len(part) for part in along], dtype=bool)
+            at = np.zeros([len(group.old), *found.shape], dtype=np.intp)
+            flat = at.reshape(len(group.old), found.size)
+            for number, index in self.cells_in(group, along):
+                found.reshape(-1)[number] = True
+                flat[:, number] = index
+            within = [name for name in order if name in names]
+            axes = [names.index(name) for name in within]
+            spread = tuple(slice(None) if name in names else None for name in order)
+            exists &= found.transpose(axes)[spread]
+            for axis, part in zip(group.old, at, strict=True):
+                indices[axis.name] = np.broadcast_to(part.transpose(axes)[spread], shape)
+        return exists, indices
 
 
 # --------------------------------------------------------------------------------------------------
@@ -163,39 +191,7 @@ LOST = {
     "detection": (DetectionStatus.failed, DetectionStatus.crashed),
     "estimate": (EstimateStatus.failed, EstimateStatus.crashed),
 }
-"""Flags of cells that are not reused."""
-
-PINNED = ""
-"""In place of the name of an old dimension of which one index is read."""
-
-
-@dataclass(frozen=True, slots=True)
-class Source:
-    """An old store, and where the values of each new axis lie in it.
-
-    Attributes
-    ----------
-    store
-        The old store.
-    old_index
-        New axis -> (length,) index along the old axis of its parameters, or ``MISSING``; 0 if they
-        are fixed in the old store.
-    renamed
-        Old axis -> the new axis of its parameters.
-    pinned
-        Old axis that is fixed in the new grid -> the index of the fixed value.
-    tangled
-        Axes whose cells are matched one by one.
-    done
-        Numbers of the old store's committed blocks.
-    """
-
-    store: RunStore
-    old_index: dict[str, NDArray[np.int64]]
-    renamed: dict[str, str]
-    pinned: dict[str, int]
-    tangled: list[Group]
-    done: frozenset[int]
+"""Flags of cells that are not reused, so that the new store has the reasons of all its failures."""
 
 
 def match(pipeline: Pipeline, store: RunStore) -> Source:
@@ -232,25 +228,18 @@ def match(pipeline: Pipeline, store: RunStore) -> Source:
             and pipeline.fixed[name] != old.fixed[name]
         ):
             faults.append(_difference(pipeline, old, name))
-    source = Source(store, {}, {}, {}, [], frozenset(check_whole(store)))
-    for group in groups(pipeline, old):
-        if group.parameters & (pipeline.distributions.keys() | old.distributions.keys()):
-            continue  # a fault that is noted already
-        if len(group.new) > 1 or len(group.old) > 1:
-            source.tangled.append(group)
-            continue
-        index = rows_in(group, pipeline, old)
-        if not (index != MISSING).any():
+    source = Source.of(pipeline, store, frozenset(check_whole(store)))
+    for group in source.groups:
+        if len(group.new) > 1 or len(group.old) > 1 or group.parameters & (
+                pipeline.distributions.keys() | old.distributions.keys()):
+            continue  # matched cell by cell, or a fault that is noted already
+        whole = [range(len(axis)) for axis in group.new]
+        if next(source.cells_in(group, whole), None) is None:
             first, *others = sorted(group.parameters)
             faults.append(
                 f"{group.names}: no values of {', '.join([first, *others])} go together in both"
                 if others else _difference(pipeline, old, first)
             )
-        for axis in group.new:
-            source.old_index[axis.name] = index
-            source.renamed.update({other.name: axis.name for other in group.old})
-        if not group.new:
-            source.pinned[group.old[0].name] = int(index[0])
     if faults:
         listed = "\n".join(f"  {fault}" for fault in faults)
         raise StoreError(f"{store.url}: no cell of it can be reused\n{listed}")
@@ -303,121 +292,90 @@ class ReusedCells:
 
 def read_cells(pipeline: Pipeline, block: Block, sources: Sequence[Source]) -> ReusedCells:
     """Read a block's reusable cells from old stores; of several, the first that has a cell."""
-    axes = scene_axes(pipeline)
-    cuts = {
-        axis.name: slice(start, stop)
-        for axis, start, stop in zip(axes, block.starts, block.stops, strict=True)
-    }
     settings = [*pipeline.axes_of(Stage.detection), *pipeline.axes_of(Stage.estimation)]
-    order = [axis.name for axis in (*axes, *settings)]
-    shape = {
-        **dict(zip((axis.name for axis in axes), block.shape, strict=True)),
-        **{axis.name: len(axis) for axis in settings},
-    }
+    # The last axis is that of a grid without any.
+    order = [*(axis.name for axis in (*scene_axes(pipeline), *settings)), ""]
+    parts = [range(*cut) for cut in zip(block.starts, block.stops, strict=True)]
+    parts += [*(range(len(axis)) for axis in settings), range(1)]
+    cuts = dict(zip(order, parts, strict=True))
+    variables = variables_of(pipeline)
     values = {
         v.name: np.full(
-            [shape[n] for n in v.dimensions(pipeline) if n in shape] + list(v.inner_shape),
+            [len(cuts[n]) for n in v.dimensions(pipeline) if n in cuts] + list(v.inner_shape),
             v.fill, dtype=v.dtype,
         )
-        for v in variables_of(pipeline)
+        for v in variables
     }
-    available = np.zeros([shape[name] for name in order], dtype=bool)
+    available = np.zeros([len(part) for part in parts], dtype=bool)
     processors: set[str] = set()
     for source in sources:
-        for untangled in _untangled(source, pipeline, cuts):
-            read = _read_from(untangled, pipeline, cuts, order, values, available)
-            for _, receipt in receipts(source.store, read):
-                processors.update(receipt.processors)
+        exists, at = source.located(order, cuts)
+        numbers = _block_numbers(source, at, exists.shape)
+        taken = np.zeros_like(available)
+        wanted = exists & ~available
+        for number in source.done.intersection(np.unique(numbers[wanted]).tolist()):
+            cells = np.nonzero(wanted & (numbers == number))
+            taken[_copied(source, number, variables, order, cells, at, values)] = True
+        present = {variable.name for variable in source.store.variables}
+        scenes = taken.reshape(len(block), -1).any(axis=1)
+        _compute(pipeline, block, [v for v in variables if v.name not in present], scenes, values)
+        used = np.unique(numbers[taken]).tolist()
+        for _, receipt in receipts(source.store, used):
+            processors.update(receipt.processors)
+        available |= taken
     searches = pipeline.size(Stage.detection)
     return ReusedCells(values, available.reshape(len(block), searches, -1), processors)
 
 
-def _untangled(source: Source, pipeline: Pipeline, cuts: dict[str, slice]) -> Iterator[Source]:
-    """Yield a source for each cell of the tangled axes: of new ones one value, old ones pinned."""
-    old = source.store.pipeline
-    cells = (
-        cells_in(group, pipeline, old, [
-            range(*cuts.get(axis.name, slice(None)).indices(len(axis))) for axis in group.new
-        ])
-        for group in source.tangled
-    )
-    for chosen in itertools.product(*cells):
-        new = {name: index for indices, _ in chosen for name, index in indices.items()}
-        one_value = {
-            axis.name: np.where(np.arange(len(axis)) == new[axis.name], 0, MISSING)
-            for axis in pipeline.axes if axis.name in new
-        }
-        yield dataclasses.replace(
-            source, tangled=[], old_index=source.old_index | one_value,
-            pinned=source.pinned | {name: k for _, at in chosen for name, k in at.items()},
-        )
-
-
-def _read_from(
-    source: Source,
-    pipeline: Pipeline,
-    cuts: dict[str, slice],
-    order: list[str],
-    values: dict[str, NDArray[Any]],
-    available: NDArray[np.bool_],
-) -> set[int]:
-    """Add an old store's cells to ``values`` and ``available``, of which ``order`` is the axes.
-
-    Returns the numbers of the old blocks that they come from.
-    """
-    positions: dict[str, NDArray[np.int64]] = {}
-    indices: dict[str, NDArray[np.int64]] = {}
-    for name in order:
-        index = source.old_index[name][cuts.get(name, slice(None))]
-        positions[name] = np.flatnonzero(index != MISSING)
-        indices[name] = index[positions[name]]
-        if len(positions[name]) == 0:
-            return set()
-    ready, numbers = _committed_cells(source, order, positions, indices)
-    if not ready.any():
-        return set()
-    variables = variables_of(pipeline)
-    present = {variable.name for variable in source.store.variables}
-    old = {
-        v.name: _read(source, pipeline, v, indices) for v in variables if v.name in present
-    }
-    old |= _computed(
-        pipeline, [v for v in variables if v.name not in present], cuts, positions,
-        np.isfinite(old["true_tvec_m"]).all(axis=-1),
-    )
-    # A cell is finished if its block is committed and its flags say that it was run. What failed is
-    # computed, so that the new store has the reasons of all its failures.
-    run = _along(order, pipeline, "estimate", old)
-    fresh = ready & ~np.isin(run, (EstimateStatus.not_run, EstimateStatus.not_needed))
-    for name, flags in LOST.items():
-        fresh &= ~np.isin(_along(order, pipeline, name, old), flags)
-    fresh &= ~available[np.ix_(*(positions[name] for name in order))]
-    if not fresh.any():
-        return set()
-    available[np.ix_(*(positions[name] for name in order))] |= fresh
-    for variable in variables:
-        names = [name for name in variable.dimensions(pipeline) if name in positions]
-        # With a configuration of a scene (or of a detection), what it shares is reused.
-        away = tuple(k for k, name in enumerate(order) if name not in names)
-        chosen = fresh.any(axis=away)
-        kept = [name for name in order if name in names]
-        chosen = np.transpose(chosen, [kept.index(name) for name in names])
-        target = values[variable.name]
-        grid = np.ix_(*(positions[name] for name in names)) if names else ...
-        part = target[grid]
-        part[chosen] = old[variable.name][chosen]
-        target[grid] = part
+def _block_numbers(
+    source: Source, at: dict[str, NDArray[np.intp]], shape: tuple[int, ...]
+) -> NDArray[np.intp]:
+    """Return the number of the old block that each cell lies in."""
+    blocks = source.store.blocks
+    numbers = np.zeros(shape, dtype=np.intp)
+    for axis, extent, count in zip(
+        scene_axes(source.old), blocks.extents, blocks.counts, strict=True
+    ):
+        numbers = numbers * count + at[axis.name] // extent
     return numbers
 
 
-def _along(
-    order: Sequence[str], pipeline: Pipeline, name: str, values: dict[str, NDArray[Any]]
-) -> NDArray[Any]:
-    """Return a variable's values along the axes ``order``, of length 1 along those it lacks."""
-    names = [axis for axis in VARIABLES[name].dimensions(pipeline) if axis in order]
-    kept = [axis for axis in order if axis in names]
-    moved = np.transpose(values[name], [names.index(axis) for axis in kept])
-    return moved[tuple(slice(None) if axis in names else None for axis in order)]
+def _copied(
+    source: Source, number: int, variables: Sequence[Variable], order: Sequence[str],
+    cells: tuple[NDArray[np.intp], ...], at: dict[str, NDArray[np.intp]],
+    values: dict[str, NDArray[Any]],
+) -> tuple[NDArray[np.intp], ...]:
+    """Copy the finished ones of some ``cells`` of an old block into ``values``; return these.
+
+    A cell is finished if its flags say that it was run. With a configuration of a scene (or of a
+    detection), what it shares is copied.
+    """
+    store, pipeline = source.store, source.store.pipeline
+    block = store.blocks[number]
+    first = dict(zip((axis.name for axis in scene_axes(pipeline)), block.starts, strict=True))
+    inside = {name: index[cells] - first.get(name, 0) for name, index in at.items()}
+    present = {variable.name: variable for variable in store.variables}
+
+    def read(variable: Variable) -> NDArray[Any]:
+        """Return a variable of the cells (cells, inner)."""
+        old = present[variable.name]
+        part = np.asarray(store.array(variable.name)[region(old, pipeline, block)])
+        names = [name for name in old.dimensions(pipeline) if name in inside]
+        return variable.fitted(part[tuple(inside[name] for name in names)])
+
+    flags = {v.name: read(v) for v in variables if v.name in LOST}
+    ended = ~np.isin(flags["estimate"], (EstimateStatus.not_run, EstimateStatus.not_needed))
+    for name, lost in LOST.items():
+        ended &= ~np.isin(flags[name], lost)
+    inside = {name: index[ended] for name, index in inside.items()}
+    finished = tuple(index[ended] for index in cells)
+    if ended.any():
+        for variable in variables:
+            if variable.name in present:
+                names = [n for n in variable.dimensions(source.new) if n in order]
+                target = tuple(finished[order.index(name)] for name in names)
+                values[variable.name][target] = read(variable)
+    return finished
 
 
 def _follows(variable: Variable) -> bool:
@@ -425,102 +383,17 @@ def _follows(variable: Variable) -> bool:
     return bool(variable.drawn_as) or variable.name in GEOMETRY
 
 
-def _computed(
-    pipeline: Pipeline, variables: Sequence[Variable], cuts: dict[str, slice],
-    positions: dict[str, NDArray[np.int64]], computed: NDArray[np.bool_],
-) -> dict[str, NDArray[np.float64]]:
-    """Return variables that the old store lacks, NaN where no truth was stored."""
-    if not variables:
-        return {}
-    along = [
-        cuts[axis.name].start + positions[axis.name].astype(np.intp)
-        for axis in scene_axes(pipeline)
-    ]
-    indices = [grid.ravel() for grid in np.meshgrid(*along, indexing="ij")]
-    values = scene_values(pipeline, indices)
-    scenes = build_scenes(values, computed.size)
-    columns = {
-        variable.name: values[variable.drawn_as].broadcast(computed.size) if variable.drawn_as
-        else GEOMETRY[variable.name](scenes)
-        for variable in variables
-    }
-    return {
-        name: np.where(computed, column.reshape(computed.shape), np.nan)
-        for name, column in columns.items()
-    }
-
-
-def _committed_cells(
-    source: Source,
-    order: list[str],
-    positions: dict[str, NDArray[np.int64]],
-    indices: dict[str, NDArray[np.int64]],
-) -> tuple[NDArray[np.bool_], set[int]]:
-    """Return for each candidate cell (axes ``order``) whether its old block is committed.
-
-    Also returns the numbers of these blocks.
-    """
-    store = source.store
-    blocks = store.blocks
-    along: list[NDArray[np.int64]] = []
-    names = []
-    for axis in scene_axes(store.pipeline):
-        if axis.name in source.pinned:
-            names.append(PINNED)
-            along.append(np.array([source.pinned[axis.name]]))
-        else:
-            names.append(source.renamed[axis.name])
-            along.append(indices[names[-1]])
-    counts = [
-        index // extent for index, extent in zip(along, blocks.extents, strict=True)
-    ]
-    ready = np.zeros([len(index) for index in along], dtype=bool)
-    numbers = set()
-    for chosen in itertools.product(*(np.unique(count) for count in counts)):
-        starts = tuple(int(c) * e for c, e in zip(chosen, blocks.extents, strict=True))
-        number = blocks.number(Block(starts, starts))
-        if number in source.done:
-            numbers.add(number)
-            ready[np.ix_(*(n == c for n, c in zip(counts, chosen, strict=True)))] = True
-    # Pinned dimensions are dropped; new ones that are fixed in the old store get length 1.
-    for k in reversed(range(len(names))):
-        if names[k] == PINNED:
-            ready = ready.take(0, axis=k)
-            del names[k]
-    full = ready.transpose([names.index(name) for name in order if name in names])
-    for k, name in enumerate(order):
-        if name not in names:
-            full = np.expand_dims(full, k)
-    cells = np.broadcast_to(full, [len(positions[name]) for name in order])
-    return np.array(cells), numbers
-
-
-def _read(
-    source: Source, pipeline: Pipeline, variable: Variable, indices: dict[str, NDArray[np.int64]]
-) -> NDArray[Any]:
-    """Read an old variable at ``indices``, in the new grid's dimensions."""
-    array = source.store.array(variable.name)
-    names = list(variable.dimensions(source.store.pipeline))
-    selection: list[Any] = []
-    for k, name in enumerate(names):
-        if name in variable.inner:
-            selection.append(slice(None))
-        elif name in source.pinned:
-            selection.append(np.array([source.pinned[name]]))
-            names[k] = PINNED
-        else:
-            names[k] = source.renamed[name]
-            selection.append(indices[names[k]])
-    part = np.asarray(array.oindex[tuple(selection)]) if names else np.asarray(array[...])
-    for k in reversed(range(len(names))):
-        if names[k] == PINNED:
-            part = part.take(0, axis=k)
-            del names[k]
-    new_names = list(variable.dimensions(pipeline))
-    part = part.transpose([names.index(name) for name in new_names if name in names])
-    for k, name in enumerate(new_names):
-        if name not in names:
-            part = np.expand_dims(part, k)
-    part = variable.fitted(part)
-    shape = [len(indices[n]) if n in indices else part.shape[k] for k, n in enumerate(new_names)]
-    return np.array(np.broadcast_to(part, shape))
+def _compute(
+    pipeline: Pipeline, block: Block, variables: Sequence[Variable], scenes: Masks,
+    values: dict[str, NDArray[Any]],
+) -> None:
+    """Compute variables that an old store lacks in some scenes, where it has their truth."""
+    rows = np.flatnonzero(scenes & np.isfinite(values["true_tvec_m"]).all(axis=-1))
+    if not (variables and len(rows)):
+        return
+    drawn = scene_values(pipeline, [index[rows] for index in block_indices(block)])
+    built = build_scenes(drawn, len(rows))
+    for variable in variables:
+        values[variable.name].reshape(-1)[rows] = (
+            drawn[variable.drawn_as].broadcast(len(rows)) if variable.drawn_as
+            else GEOMETRY[variable.name](built))

@@ -198,7 +198,7 @@ def test_an_unset_belief_is_the_truth_where_cells_are_reused(name, tmp_path):
     believing = pipeline({}, {"solver": "ippe", name: truth}, 1, **scene)
     for k, (old, new) in enumerate(((unset, believing), (believing, unset))):
         store = create_store(str(tmp_path / f"{k}.zarr"), old, (1,))
-        assert match(new, store).pinned == match(old, store).pinned
+        assert match(new, store).done == match(old, store).done
     wrong = [*truth[:-1], 0.5] if isinstance(truth, list) else truth + 0.5
     with pytest.raises(StoreError, match=f"  {name}: the store has"):
         match(pipeline({}, {"solver": "ippe", name: wrong}, 1, **scene),

@@ -11,7 +11,7 @@ from typing import Any, cast
 from sweep.experiment.axes import Axis, Distribution, combinations
 from sweep.experiment.parameters import Parameter, Stage
 from sweep.experiment.plugins import parameters_with
-from sweep.experiment.reader import StoppingRule
+from sweep.experiment.stopping import StoppingRule
 from sweep.messages import plain
 from sweep.model.board_kinds import ARRANGING, SINGLE, Markers, arranged
 from sweep.model.effects import EFFECTS, Effect, ScenePlugins, checked_effect, checked_renderer
@@ -54,7 +54,7 @@ class Experiment:
         What is required of the results, as texts, and the axes whose values are conditions: the
         section [require]. No part of an experiment's identity.
     stopping
-        When sampling stops, as a section such as [precision] says; None if every trial is computed.
+        When sampling stops, as [search] says; None if every trial is computed.
     budget_ms
         The most milliseconds of a frame, if [require] has a budget.
     source

@@ -28,10 +28,10 @@ from sweep.experiment.rules import check_rules
 from sweep.experiment.sampling import (
     MAX_TRIALS,
     REQUIRE_KEYS,
-    STOPPING_SECTIONS,
     read_required,
     read_stopping,
 )
+from sweep.experiment.stopping import SEARCH
 from sweep.experiment.toml_text import (
     MAX_BYTES,
     document_text,
@@ -87,12 +87,12 @@ def parse_settings(
             faults.append(f"{start}expected a TOML value, such as [0, 45] or 'text'")
             continue
         home = section_of(name, parameters)
-        if (section == REQUIRE and name in REQUIRE_KEYS) or section in STOPPING_SECTIONS:
+        if (section == REQUIRE and name in REQUIRE_KEYS) or section == SEARCH:
             chosen[f"{section}.{name}"] = value
         elif not home and name not in HEADER and not is_zip(value):
             known = [*parameters, TRIAL, *HEADER]
             hint = nearest(name, known) if len(faults) < MAX_FAULTS else ""
-            hint = f"; {REMOVED[name]}" if name in REMOVED else hint
+            hint = next((f"; {REMOVED[old]}" for old in (section, name) if old in REMOVED), hint)
             faults.append(f"{start}unknown parameter{hint}")
         elif is_zip(value) and section in ("", "axes"):
             chosen[name] = value
@@ -186,7 +186,7 @@ def fix_values(
     another value is chosen for one of them.
     """
     axes = document.get("axes", {})
-    for section in (REQUIRE, *STOPPING_SECTIONS):  # one pose fulfils or fails nothing
+    for section in (REQUIRE, SEARCH):  # one pose fulfils or fails nothing
         document.pop(section, None)
     _leave_camera_file(document, chosen)
     _delete(document, {
@@ -452,7 +452,7 @@ def _checked(
     plugins: Sequence[DeclaredPlugin] | None,
 ) -> Pipeline:
     """Return the pipeline of a document; PipelineError with all its faults."""
-    reading = read_keys(document, source, folder, files, camera_files, plugins, STOPPING_SECTIONS)
+    reading = read_keys(document, source, folder, files, camera_files, plugins)
     read_stopping(reading)
     read_camera_file(reading)
     resolve_sensor(reading)

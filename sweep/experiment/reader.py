@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any
 
 from sweep.declaration import Declaration, Declared, TablesError
 from sweep.experiment.axes import (
@@ -27,6 +27,7 @@ from sweep.experiment.plugins import (
     read_plugins,
     section_of_settings,
 )
+from sweep.experiment.stopping import SEARCH, StoppingRule
 from sweep.messages import MAX_FAULTS, nearest, plain, shown
 from sweep.plugins.declared import DeclaredPlugin
 
@@ -40,35 +41,6 @@ HEADER = ("title", "seed", "sampling", EFFECTS_KEY)
 
 REQUIRE = "require"
 """The section of what the results must fulfil (`sweep.experiment.sampling`)."""
-
-
-class StoppingRule(Protocol):
-    """What a section says: a frozen dataclass of plain values.
-
-    Attributes
-    ----------
-    section
-        The section's name.
-    max_trials
-        The most trials of a condition; the length of the axis ``trial``.
-    """
-
-    section: ClassVar[str]
-    __dataclass_fields__: ClassVar[dict[str, Any]]
-
-    def __hash__(self) -> int:
-        """Return the hash of a frozen dataclass."""
-
-    @property
-    def max_trials(self) -> int:
-        """The most trials of a condition."""
-
-    def looser(self, begun: Any) -> str:
-        """Return why a store that was begun under another rule of the section cannot be continued.
-
-        Empty if this rule asks for at least as much of every condition, so that nothing that was
-        computed is in vain.
-        """
 
 
 @dataclass(slots=True)
@@ -221,18 +193,18 @@ class Reading:
 def read_keys(
     document: Mapping[str, Any], source: str, folder: Path,
     known_files: Mapping[str, str] | None = None, known_cameras: Mapping[str, str] | None = None,
-    known_plugins: Sequence[DeclaredPlugin] | None = None, others: Collection[str] = (),
+    known_plugins: Sequence[DeclaredPlugin] | None = None,
 ) -> Reading:
     """Return what the keys of a document say, each checked on its own (as :class:`Reading`).
 
-    ``others`` are the names of sections that are read elsewhere.
+    The sections of requirements and of a search are read elsewhere.
     """
     reading = Reading(document, source, folder, known_files, known_cameras, known_plugins)
     _read_header(reading)
     _read_plugins(reading)
-    known = [*HEADER, *SECTIONS, "axes", REQUIRE, *others]
+    known = [*HEADER, *SECTIONS, "axes", REQUIRE, SEARCH]
     for key, value in document.items():
-        if key in HEADER or key == REQUIRE or key in others:
+        if key in (*HEADER, REQUIRE, SEARCH):
             continue
         if key == "axes" or key in SECTIONS:
             if not isinstance(value, dict):
